@@ -1,0 +1,33 @@
+# make paper   solve and replay the paper's maneuver: figures and table in results/paper
+# make test    lint, type check, tests (with CI set: the slow tests too)
+# make clean   remove the virtual environment and the results
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: paper test lint lock clean
+
+paper: $(VENV)/installed-plots
+	$(BIN)/python scripts/reproduce_paper.py
+
+test: $(VENV)/installed-test lint
+	$(BIN)/python -m pytest $(if $(CI),-m "")
+
+lint: $(VENV)/installed-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# A file per set of extras, so that a second run installs nothing.
+$(VENV)/installed-%: pyproject.toml requirements.lock
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable ".[$*]"
+	touch $@
+
+# Versions that are known to work together, for every supported Python; needs uv.
+lock:
+	uv pip compile --quiet --universal --all-extras --no-annotate --no-header --output-file requirements.lock pyproject.toml
+
+clean:
+	rm -rf $(VENV) results
