@@ -1,0 +1,63 @@
+"""Scenes: validated descriptions of a spacecraft with an arm, and of the maneuver asked of it."""
+
+from dq_space_arm_env.scene._problems import SceneError
+from dq_space_arm_env.scene.layout import (
+    ControlEntries,
+    StateEntries,
+    StateLayout,
+    TangentEntries,
+    draw_initial_state,
+    initial_state,
+)
+from dq_space_arm_env.scene.loading import list_scenes, load_scene, scenes_directory
+from dq_space_arm_env.scene.schema import (
+    INTEGRATORS,
+    Actuators,
+    AxisAngle,
+    AxisLimits,
+    Base,
+    Cost,
+    InitialState,
+    JointLimit,
+    Link,
+    Payload,
+    Pose,
+    Scene,
+    Simulation,
+    Spread,
+    Success,
+    Target,
+    TipWrench,
+    Wrist,
+)
+
+__all__ = [
+    "INTEGRATORS",
+    "Actuators",
+    "AxisAngle",
+    "AxisLimits",
+    "Base",
+    "ControlEntries",
+    "Cost",
+    "InitialState",
+    "JointLimit",
+    "Link",
+    "Payload",
+    "Pose",
+    "Scene",
+    "SceneError",
+    "Simulation",
+    "Spread",
+    "StateEntries",
+    "StateLayout",
+    "Success",
+    "TangentEntries",
+    "Target",
+    "TipWrench",
+    "Wrist",
+    "draw_initial_state",
+    "initial_state",
+    "list_scenes",
+    "load_scene",
+    "scenes_directory",
+]

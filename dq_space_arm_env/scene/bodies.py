@@ -1,0 +1,113 @@
+"""The bodies of a scene: base, links, wrist and payload, with the physics their numbers have to satisfy."""
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field, StrictBool, StrictStr
+
+from dq_space_arm_env.scene._fields import Finite, Limit, NonNegative, Positive, Three, Vector3, read_numbers
+from dq_space_arm_env.scene._problems import Model, problem
+from dq_space_arm_env.scene.pose import Matrix3, Pose
+
+_TOLERANCE = 1e-9
+_SINGULAR = 1e-12
+_FORMS = "3 numbers (diagonal) or 3x3"
+
+
+def _read_inertia(value: Any) -> Matrix3:
+    """Read 3 numbers (the diagonal) or a 3x3 matrix, and check that a rigid body can have it."""
+    matrix = _read_matrix(value)
+    size = float(np.abs(matrix).max())
+    if np.abs(matrix - matrix.T).max() > _TOLERANCE * size:
+        raise problem("must be symmetric")
+    matrix = 0.5 * (matrix + matrix.T)
+    principal = np.linalg.eigvalsh(matrix)
+    shown = ", ".join(f"{moment:.6g}" for moment in principal)
+    if principal[0] <= _SINGULAR * size:
+        raise problem(
+            f"must be positive definite: its principal moments are {shown}, all should be greater than 0"
+        )
+    if principal[0] + principal[1] < principal[2] * (1 - _TOLERANCE):
+        raise problem(
+            f"no rigid body has it: of the principal moments {shown} the two smaller must add up to at least "
+            "the largest"
+        )
+    first, second, third = (_three(row) for row in matrix)
+    return (first, second, third)
+
+
+def _read_matrix(value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise problem(f"must be {_FORMS}")
+    if any(isinstance(row, list | tuple | np.ndarray) for row in value):
+        return np.array([read_numbers(row, 3) for row in value])
+    return np.diag(read_numbers(value, 3))
+
+
+def _three(row: Any) -> Three:
+    x, y, z = (float(number) + 0.0 for number in row)
+    return (x, y, z)
+
+
+Inertia = Annotated[Matrix3, BeforeValidator(_read_inertia)]
+
+
+class Base(Model):
+    """The spacecraft: a free rigid body whose frame e0 sits at its center of mass."""
+
+    mass: Positive = Field(description="mass of the base, kg")
+    inertia: Inertia = Field(
+        description=f"inertia of the base about its center of mass, base axes, kg m^2: {_FORMS}"
+    )
+    motion: Literal["spatial", "planar"] = Field(
+        default="spatial",
+        description="'spatial': six degrees of freedom; 'planar': motion in the x-y plane, rotation about z",
+    )
+
+
+class Link(Model):
+    """A link and the revolute joint that carries it; the joint turns about the z axis of its own frame."""
+
+    name: StrictStr = Field(min_length=1, description="name of the link, unique in the scene")
+    mass: Positive = Field(description="mass of the link, kg")
+    inertia: Inertia = Field(
+        description=f"inertia of the link about its center of mass, joint-frame axes, kg m^2: {_FORMS}"
+    )
+    center_of_mass: Vector3 = Field(description="center of mass of the link in its joint frame, m")
+    joint: Pose = Field(
+        description="pose of the joint frame at zero angle in the parent's frame, m (first link: base frame "
+        "e0 at the center of mass; others: joint frame of the link before)"
+    )
+    actuated: StrictBool = Field(
+        default=True, description="whether a motor drives the joint; false: the joint is passive"
+    )
+    torque_limit: Limit | None = Field(
+        default=None,
+        description="largest motor torque of this joint, N m; absent: the limit of actuators.joint_torque",
+    )
+    stiffness: NonNegative = Field(default=0.0, description="stiffness of the joint spring, N m/rad")
+    rest_angle: Finite = Field(default=0.0, description="joint angle at which the spring is at rest, rad")
+    damping: NonNegative = Field(default=0.0, description="viscous damping of the joint, N m s/rad")
+
+
+class Wrist(Model):
+    """A massless spherical joint, commanded by its 3-2-1 Euler rates psi, theta, phi."""
+
+    frame: Pose = Field(
+        default_factory=Pose,
+        description="pose of the wrist frame at zero angles in the last link's (or the base's) frame, m",
+    )
+
+
+class Payload(Model):
+    """A body held rigidly at the tip."""
+
+    mass: Positive = Field(description="mass of the payload, kg")
+    inertia: Inertia = Field(
+        description=f"inertia of the payload about its center of mass, tip axes, kg m^2: {_FORMS}"
+    )
+    center_of_mass: Vector3 = Field(
+        default=(0.0, 0.0, 0.0), description="center of mass of the payload in the tip frame, m"
+    )

@@ -1,0 +1,113 @@
+"""From a name or a file to a validated scene; finds the scenes that ship with the package."""
+
+import importlib.resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+import yaml
+from pydantic import ValidationError
+
+from dq_space_arm_env.scene._problems import SceneError, did_you_mean
+from dq_space_arm_env.scene._yaml import parse_yaml
+from dq_space_arm_env.scene.schema import Scene
+
+_SUFFIXES = (".yaml", ".yml")
+
+
+def scenes_directory() -> Traversable:
+    """Find the folder of the scenes that ship with the package.
+
+    Returns:
+        `configs/scenes` inside the installed package, or at the top of the source checkout.
+
+    Raises:
+        SceneError: If there is neither.
+    """
+    installed = importlib.resources.files("dq_space_arm_env") / "configs" / "scenes"
+    checkout = Path(__file__).resolve().parents[2] / "configs" / "scenes"
+    for directory in (installed, checkout):
+        if directory.is_dir():
+            return directory
+    raise SceneError(
+        f"the scenes that ship with the package are missing: neither {installed} nor {checkout} is a folder"
+    )
+
+
+def list_scenes() -> list[str]:
+    """List the scenes that ship with the package.
+
+    Returns:
+        Their names, sorted.
+    """
+    files = (Path(entry.name) for entry in scenes_directory().iterdir())
+    return sorted(file.stem for file in files if file.suffix == ".yaml")
+
+
+def load_scene(source: str | Path | Scene) -> Scene:
+    """Load and validate a scene.
+
+    Args:
+        source: Name of a shipped scene ("paper"), path of a YAML file (with a slash or ending in .yaml), or a
+            scene, which is validated again.
+
+    Returns:
+        The validated scene.
+
+    Raises:
+        SceneError: If it cannot be found, read or validated; the message lists every problem.
+    """
+    if isinstance(source, Scene):
+        return _validated(source, f"scene {source.name!r}")
+    if isinstance(source, Path) or (isinstance(source, str) and _is_path(source)):
+        return _read(Path(source))
+    if not isinstance(source, str):
+        raise SceneError(
+            f"{source!r} is no scene: give the name of a scene, the path of a YAML file or a Scene; "
+            "Scene.model_validate makes a scene from a mapping"
+        )
+    names = list_scenes()
+    if source not in names:
+        raise SceneError(
+            f"no scene is named {source!r}; {did_you_mean(source, names)}The scenes are {', '.join(names)}; "
+            "a file of your own is given by its path, ending in .yaml"
+        )
+    return _read(scenes_directory() / f"{source}.yaml")
+
+
+def _is_path(source: str) -> bool:
+    return "/" in source or "\\" in source or source.endswith(_SUFFIXES)
+
+
+def _read(file: Traversable) -> Scene:
+    if not file.is_file():
+        raise SceneError(f"{file}: there is no such file")
+    try:
+        data = parse_yaml(file.read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{file}: must be a text file in UTF-8: {error}") from error
+    except OSError as error:
+        raise SceneError(f"{file}: cannot be read: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise SceneError(f"{file}: not valid YAML: {_yaml_problem(error)}") from error
+    if data is None:
+        raise SceneError(f"{file}: the file is empty; a scene needs at least name, base and target")
+    if not isinstance(data, dict):
+        raise SceneError(f"{file}: must be a mapping (key: value) at the top, not a {type(data).__name__}")
+    return _validated(data, str(file))
+
+
+def _yaml_problem(error: yaml.YAMLError) -> str:
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        mark = error.problem_mark
+        said = ", ".join(part for part in (error.context, error.problem) if part)
+        return f"line {mark.line + 1}, column {mark.column + 1}: {said}"
+    return str(error)
+
+
+def _validated(data: object, origin: str) -> Scene:
+    try:
+        return Scene.model_validate(data)
+    except ValidationError as error:
+        problems = [detail["msg"] for detail in error.errors(include_url=False)]
+        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        raise SceneError("\n  - ".join([f"{origin}: {count}", *problems])) from error
