@@ -1,0 +1,97 @@
+"""Sine, cosine and arctangent as straight-line vector arithmetic.
+
+A call into the C mathematics library would force the compiler to leave its vector registers, once for every
+lane. These versions use only operations that exist as vector instructions, and they compute the same bits in
+a scalar register and in every lane of a vector one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from llvmlite import ir
+
+    from dq_space_arm_env.compiler.emit import VectorBuilder
+
+# pi/2 in three pieces of 33 bits (the last one full), so that the first two products with an integer quotient
+# below # 2^20 are exact (Cody & Waite): the reduced argument keeps its digits up to angles of about 1e6 rad.
+_HALF_PI_HIGH = float.fromhex("0x1.921fb544p+0")
+_HALF_PI_MIDDLE = float.fromhex("0x1.0b4611a6p-34")
+_HALF_PI_LOW = float.fromhex("0x1.3198a2e037073p-69")
+
+# Taylor coefficients; on [-pi/4, pi/4] the first neglected terms are below 2e-17.
+_SINE = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(1, 9))
+_COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(1, 9))
+
+# Minimax coefficients of arctangent on |x| < 7/16 (Sun Microsystems fdlibm, s_atan.c): atan(x) = x - x^3
+# P(x^2).
+_ARCTANGENT = (
+    3.33333333333329318027e-01,
+    -1.99999999998764832476e-01,
+    1.42857142725034663711e-01,
+    -1.11111104054623557880e-01,
+    9.09088713343650656196e-02,
+    -7.69187620504482999495e-02,
+    6.66107313738753120669e-02,
+    -5.83357013379057348645e-02,
+    4.97687799461593236017e-02,
+    -3.65315727442169155270e-02,
+    1.62858201153657823623e-02,
+)
+
+
+def _horner(builder: VectorBuilder, x: ir.Value, coefficients: tuple[float, ...]) -> ir.Value:
+    """Evaluate coefficients[0] + x coefficients[1] + ... ."""
+    result = builder.constant(coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        result = builder.multiply_add(result, x, builder.constant(coefficient))
+    return result
+
+
+def sine_cosine(builder: VectorBuilder, x: ir.Value) -> tuple[ir.Value, ir.Value]:
+    """Emit sine and cosine of x rad: about one unit in the last place up to 1e6, NaN for infinity."""
+    quotient = builder.round(builder.multiply(x, builder.constant(2.0 / math.pi)))
+    reduced = builder.multiply_add(quotient, builder.constant(-_HALF_PI_HIGH), x)
+    reduced = builder.multiply_add(quotient, builder.constant(-_HALF_PI_MIDDLE), reduced)
+    reduced = builder.multiply_add(quotient, builder.constant(-_HALF_PI_LOW), reduced)
+    square = builder.multiply(reduced, reduced)
+    sine = builder.multiply_add(builder.multiply(reduced, square), _horner(builder, square, _SINE), reduced)
+    cosine = builder.multiply_add(square, _horner(builder, square, _COSINE), builder.constant(1.0))
+    # The quotient modulo 4 names the quadrant: odd ones swap sine and cosine, the signs follow.
+    quarter = builder.floor(builder.multiply(quotient, builder.constant(0.25)))
+    quadrant = builder.multiply_add(quarter, builder.constant(-4.0), quotient)
+    one, two, three = (builder.constant(c) for c in (1.0, 2.0, 3.0))
+    is_one, is_two, is_three = (builder.compare("==", quadrant, c) for c in (one, two, three))
+    odd = builder.either(is_one, is_three)
+    swapped_sine = builder.select(odd, cosine, sine)
+    swapped_cosine = builder.select(odd, sine, cosine)
+    return (
+        builder.negate_if(builder.either(is_two, is_three), swapped_sine),
+        builder.negate_if(builder.either(is_one, is_two), swapped_cosine),
+    )
+
+
+def arctangent2(builder: VectorBuilder, y: ir.Value, x: ir.Value) -> ir.Value:
+    """Emit the angle of the point (x, y) in (-pi, pi]; a few units in the last place; 0 at the origin."""
+    zero = builder.constant(0.0)
+    magnitude_y, magnitude_x = builder.absolute(y), builder.absolute(x)
+    steep = builder.compare(">", magnitude_y, magnitude_x)
+    numerator = builder.select(steep, magnitude_x, magnitude_y)
+    denominator = builder.select(steep, magnitude_y, magnitude_x)
+    # atan(n/d) = pi/4 + atan((n - d)/(n + d)) keeps the argument of the polynomial below 7/16.
+    far = builder.compare(">", numerator, builder.multiply(denominator, builder.constant(0.4140625)))
+    top = builder.select(far, builder.subtract(numerator, denominator), numerator)
+    bottom = builder.select(far, builder.add(numerator, denominator), denominator)
+    bottom = builder.select(builder.compare("==", bottom, zero), builder.constant(1.0), bottom)
+    ratio = builder.divide(top, bottom)
+    square = builder.multiply(ratio, ratio)
+    polynomial = _horner(builder, square, _ARCTANGENT)
+    angle = builder.multiply_add(builder.negate(builder.multiply(ratio, square)), polynomial, ratio)
+    angle = builder.select(far, builder.add(angle, builder.constant(math.pi / 4)), angle)
+    angle = builder.select(steep, builder.subtract(builder.constant(math.pi / 2), angle), angle)
+    angle = builder.select(
+        builder.compare("<", x, zero), builder.subtract(builder.constant(math.pi), angle), angle
+    )
+    return builder.negate_if(builder.compare("<", y, zero), angle)

@@ -1,0 +1,183 @@
+"""Expression graphs: what a function computes, as a flat list of scalar operations.
+
+A model function is written over plain scalars. `trace` runs it once with CasADi symbols in place of numbers;
+every constant folds, every structural zero disappears, common subexpressions are shared, and what remains is
+a `Graph`: a list of elementary operations in static single assignment form. The graph is all that the emitter
+(`emit.py`) needs to know; neither module knows what a robot is.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+
+Expression = Any  # a CasADi SX scalar, or a Python float that a trace folded
+
+
+@dataclass(frozen=True)
+class Node:
+    """One operation: its name, the nodes it reads, and a constant or an input position where it has one."""
+
+    operation: str
+    arguments: tuple[int, ...] = ()
+    constant: float = 0.0
+    slot: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A traced function.
+
+    Attributes:
+        name: Name of the function, an identifier.
+        inputs: Name and number of scalars of each input vector.
+        outputs: Name and number of scalars of each output vector.
+        nodes: Operations in evaluation order.
+        results: For each scalar of each output, in order, the index of the node that computes it.
+    """
+
+    name: str
+    inputs: tuple[tuple[str, int], ...]
+    outputs: tuple[tuple[str, int], ...]
+    nodes: tuple[Node, ...]
+    results: tuple[tuple[int, ...], ...]
+
+    @property
+    def operation_count(self) -> int:
+        """Number of arithmetic operations: everything but reading inputs and constants."""
+        return sum(node.operation not in ("input", "constant") for node in self.nodes)
+
+
+_OPERATION_NAMES = {
+    casadi.OP_ADD: "add",
+    casadi.OP_SUB: "subtract",
+    casadi.OP_MUL: "multiply",
+    casadi.OP_DIV: "divide",
+    casadi.OP_NEG: "negate",
+    casadi.OP_SQ: "square",
+    casadi.OP_TWICE: "twice",
+    casadi.OP_INV: "invert",
+    casadi.OP_SQRT: "sqrt",
+    casadi.OP_SIN: "sin",
+    casadi.OP_COS: "cos",
+    casadi.OP_ATAN2: "arctan2",
+    casadi.OP_FABS: "absolute",
+    casadi.OP_FMIN: "minimum",
+    casadi.OP_FMAX: "maximum",
+    casadi.OP_LT: "less",
+    casadi.OP_LE: "less_equal",
+    casadi.OP_EQ: "equal",
+    casadi.OP_NE: "not_equal",
+    casadi.OP_NOT: "not",
+    casadi.OP_AND: "and",
+    casadi.OP_OR: "or",
+    casadi.OP_IF_ELSE_ZERO: "if_else_zero",
+}
+
+
+def trace(
+    name: str,
+    inputs: Mapping[str, int],
+    function: Callable[..., Mapping[str, Sequence[Expression]]],
+) -> Graph:
+    """Run a function on symbols and record the operations that its outputs need.
+
+    Args:
+        name: Name of the graph, an identifier.
+        inputs: Number of scalars of each input; the function gets each as a list under its name.
+        function: Plain-scalar function returning, for each output name, a sequence of scalars.
+
+    Returns:
+        The graph of the function.
+
+    Raises:
+        NotImplementedError: If the trace holds an operation that the emitter has no instruction for.
+    """
+    symbols = {key: [casadi.SX.sym(f"{key}_{i}") for i in range(size)] for key, size in inputs.items()}
+    outputs = function(**symbols)
+    return graph_of(name, symbols, outputs)
+
+
+def graph_of(
+    name: str, symbols: Mapping[str, Sequence[Expression]], outputs: Mapping[str, Sequence[Expression]]
+) -> Graph:
+    """Record the operations that lead from symbols to expressions.
+
+    Args:
+        name: Name of the graph.
+        symbols: The symbols of each input, scalars.
+        outputs: The expressions of each output, scalars.
+
+    Returns:
+        The graph.
+
+    Raises:
+        NotImplementedError: If an operation has no instruction in the emitter.
+    """
+    flat = [casadi.SX(value) for values in outputs.values() for value in values]
+    shared = casadi.cse(casadi.vertcat(*flat)) if flat else casadi.SX(0, 1)
+    arguments = [casadi.vertcat(*values) if len(values) else casadi.SX(0, 1) for values in symbols.values()]
+    # A structurally zero output entry would be dropped from the result's sparsity pattern.
+    function = casadi.Function(name, arguments, [casadi.densify(shared)])
+    nodes, results = _static_single_assignment(function)
+    split, start = [], 0
+    for values in outputs.values():
+        split.append(tuple(results[start : start + len(values)]))
+        start += len(values)
+    return Graph(
+        name=name,
+        inputs=tuple((key, len(values)) for key, values in symbols.items()),
+        outputs=tuple((key, len(values)) for key, values in outputs.items()),
+        nodes=nodes,
+        results=tuple(split),
+    )
+
+
+def _static_single_assignment(function: casadi.Function) -> tuple[tuple[Node, ...], list[int]]:
+    """Turn CasADi's instructions on a reused work vector into nodes that are written once.
+
+    CasADi stores a polynomial's repeated subexpression once, but reuses registers, and it reads an input or
+    builds a constant again wherever that is cheaper; both are merged here.
+    """
+    nodes: list[Node] = []
+    index: dict[Node, int] = {}
+    register: dict[int, int] = {}
+    results = [-1] * function.nnz_out()
+
+    def add(node: Node) -> int:
+        if node not in index:
+            index[node] = len(nodes)
+            nodes.append(node)
+        return index[node]
+
+    for k in range(function.n_instructions()):
+        operation = function.instruction_id(k)
+        reads, writes = function.instruction_input(k), function.instruction_output(k)
+        if operation == casadi.OP_CONST:
+            register[writes[0]] = add(Node("constant", constant=function.instruction_constant(k)))
+        elif operation == casadi.OP_INPUT:
+            register[writes[0]] = add(Node("input", slot=(reads[0], reads[1])))
+        elif operation == casadi.OP_OUTPUT:
+            results[writes[1]] = register[reads[0]]
+        elif operation in _OPERATION_NAMES:
+            register[writes[0]] = add(Node(_OPERATION_NAMES[operation], tuple(register[r] for r in reads)))
+        else:
+            raise NotImplementedError(
+                f"graph {function.name()!r} holds CasADi operation {operation}, "
+                "which the emitter has no instruction for"
+            )
+    return tuple(nodes), results
+
+
+def use_counts(graph: Graph) -> Counter[int]:
+    """Count how often each node is read, by other nodes or as a result."""
+    counts: Counter[int] = Counter()
+    for node in graph.nodes:
+        counts.update(node.arguments)
+    for indices in graph.results:
+        counts.update(indices)
+    return counts

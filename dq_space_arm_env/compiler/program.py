@@ -1,0 +1,232 @@
+"""Programs: graphs called one after another on the same block of lanes, and the loop over blocks around them.
+
+A Runge-Kutta step evaluates the same acceleration four times. Tracing it as one graph would compile the same
+thousand operations four times over; a `Program` compiles them once and calls them four times, on vectors that
+stay in the first-level cache. The compiled program is a C function
+
+    void kernel(int64 begin, int64 end, const int64 *buffers)
+
+that, for every row k in [begin, end), reads row k of its input arrays and writes row k of its output arrays
+(C-contiguous float64); `buffers` holds the arrays' addresses, inputs first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from llvmlite import ir
+
+from dq_space_arm_env.compiler.emit import INDEX, POINTER, Target, VectorBuilder, emit_graph
+from dq_space_arm_env.compiler.graph import Graph
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """An array that a program reads or writes.
+
+    Attributes:
+        name: Name by which the calls refer to it.
+        size: Number of scalars that the graphs see per row.
+        shared: True for an input with a single row that all rows read.
+        positions: For an output, where in its row each scalar goes, when it is not simply one after another;
+            entries of the row that no scalar goes to are left as they are.
+        stride: Scalars per row of the array; `size` unless `positions` spreads them out.
+    """
+
+    name: str
+    size: int
+    shared: bool = False
+    positions: tuple[int, ...] | None = None
+    stride: int = 0
+
+    def __post_init__(self) -> None:
+        """Fill in the stride."""
+        if not self.stride:
+            object.__setattr__(self, "stride", self.size)
+
+
+@dataclass(frozen=True)
+class Call:
+    """One graph applied to named buffers."""
+
+    graph: Graph
+    bindings: Mapping[str, str]
+
+
+@dataclass
+class Program:
+    """A sequence of calls.
+
+    Attributes:
+        name: Name of the compiled function, an identifier.
+        inputs: Arrays that are read.
+        outputs: Arrays that are written.
+        calls: The calls in order. A buffer that is neither input nor output is scratch; it starts as zero.
+    """
+
+    name: str
+    inputs: Sequence[Buffer]
+    outputs: Sequence[Buffer]
+    calls: list[Call] = field(default_factory=list)
+
+    def call(self, graph: Graph, **bindings: str) -> None:
+        """Append a call.
+
+        Args:
+            graph: The graph to evaluate.
+            bindings: Buffer for each input and output of the graph whose name differs from the buffer's.
+        """
+        self.calls.append(Call(graph, bindings))
+
+    @property
+    def operation_count(self) -> int:
+        """Arithmetic operations per row, over all calls."""
+        return sum(call.graph.operation_count for call in self.calls)
+
+    def scratch_sizes(self) -> dict[str, int]:
+        """Number of vectors of every buffer, scratch included.
+
+        Raises:
+            ValueError: If two calls disagree on the size of a buffer.
+        """
+        sizes = {buffer.name: buffer.size for buffer in (*self.inputs, *self.outputs)}
+        for call in self.calls:
+            for name, size in (*call.graph.inputs, *call.graph.outputs):
+                buffer = call.bindings.get(name, name)
+                if sizes.setdefault(buffer, size) != size:
+                    raise ValueError(
+                        f"program {self.name!r}: graph {call.graph.name!r} takes {size} scalars for "
+                        f"{name!r}, buffer {buffer!r} has {sizes[buffer]}"
+                    )
+        return sizes
+
+    def read_before_written(self) -> set[str]:
+        """Scratch buffers that some call reads before any call has written them; they start as zero."""
+        known = {buffer.name for buffer in self.inputs}
+        early: set[str] = set()
+        for call in self.calls:
+            early.update({call.bindings.get(name, name) for name, _ in call.graph.inputs} - known)
+            known.update(call.bindings.get(name, name) for name, _ in call.graph.outputs)
+        return early
+
+
+def emit_program(module: ir.Module, program: Program, target: Target) -> None:
+    """Add a program to a module as an external function of its name, with the graphs that it calls.
+
+    The last block of a batch that is not a multiple of the lanes repeats its last row in the lanes left over:
+    they read and write the same values as the lane that owns the row.
+
+    Args:
+        module: LLVM module to add to.
+        program: The program.
+        target: Lanes and instructions to use.
+
+    Raises:
+        ValueError: If two calls disagree on the size of a buffer.
+    """
+    sizes, zeroed = program.scratch_sizes(), program.read_before_written()
+    functions: dict[str, ir.Function] = {}
+    for call in program.calls:
+        if call.graph.name not in functions:
+            functions[call.graph.name] = emit_graph(module, call.graph, target)
+
+    kernel = ir.Function(module, ir.FunctionType(ir.VoidType(), [INDEX, INDEX, POINTER]), program.name)
+    begin, end, addresses = kernel.args
+    entry = kernel.append_basic_block("entry")
+    head, body, done = (kernel.append_basic_block(name) for name in ("head", "body", "done"))
+    builder = ir.IRBuilder(entry)
+    vectors = VectorBuilder(builder, target)
+    # Each array's address, and a block of vectors on the stack for every buffer, stay fixed over the loop.
+    arrays = {}
+    for position, buffer in enumerate((*program.inputs, *program.outputs)):
+        slot = builder.gep(addresses, [INDEX(position)], source_etype=INDEX)
+        arrays[buffer.name] = builder.inttoptr(builder.load(slot, typ=INDEX), POINTER)
+    blocks = {}
+    for name, size in sizes.items():
+        block = builder.alloca(vectors.type, size=INDEX(max(size, 1)))
+        block.align = vectors.alignment
+        blocks[name] = block
+        if name in zeroed:
+            _clear(builder, block, 8 * target.lanes * size)
+    builder.branch(head)
+
+    builder.position_at_end(head)
+    row = builder.phi(INDEX)
+    row.add_incoming(begin, entry)
+    builder.cbranch(builder.icmp_signed("<", row, end), body, done)
+
+    builder.position_at_end(body)
+    last = builder.sub(end, INDEX(1))
+    rows = [_clamped(builder, row, lane, last) for lane in range(target.lanes)]
+    for buffer in program.inputs:
+        _gather(vectors, buffer, arrays[buffer.name], blocks[buffer.name], rows)
+    for call in program.calls:
+        names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
+        builder.call(functions[call.graph.name], [blocks[call.bindings.get(name, name)] for name in names])
+    for buffer in program.outputs:
+        _scatter(vectors, buffer, arrays[buffer.name], blocks[buffer.name], rows)
+    row.add_incoming(builder.add(row, INDEX(target.lanes)), builder.block)
+    builder.branch(head)
+
+    builder.position_at_end(done)
+    builder.ret_void()
+
+
+def _clear(builder: ir.IRBuilder, block: ir.Value, size: int) -> None:
+    """Set a block of the stack to zero."""
+    arguments = [POINTER, ir.IntType(8), INDEX, ir.IntType(1)]
+    signature = ir.FunctionType(ir.VoidType(), arguments)
+    memset = builder.module.declare_intrinsic("llvm.memset.p0.i64", (), signature)
+    builder.call(memset, [block, ir.IntType(8)(0), INDEX(size), ir.IntType(1)(0)])
+
+
+def _clamped(builder: ir.IRBuilder, row: ir.Value, lane: int, last: ir.Value) -> ir.Value:
+    if lane == 0:
+        return row
+    wanted = builder.add(row, INDEX(lane))
+    return builder.select(builder.icmp_signed("<", wanted, last), wanted, last)
+
+
+def _row_addresses(
+    vectors: VectorBuilder, buffer: Buffer, array: ir.Value, rows: list[ir.Value]
+) -> list[ir.Value]:
+    builder, scalar = vectors.ir, ir.DoubleType()
+    if buffer.shared:
+        return [array] * len(rows)
+    return [builder.gep(array, [builder.mul(row, INDEX(buffer.stride))], source_etype=scalar) for row in rows]
+
+
+def _gather(
+    vectors: VectorBuilder, buffer: Buffer, array: ir.Value, block: ir.Value, rows: list[ir.Value]
+) -> None:
+    """Transpose rows of an array into vectors with one row per lane."""
+    builder, scalar = vectors.ir, ir.DoubleType()
+    addresses = _row_addresses(vectors, buffer, array, rows)
+    for index in range(buffer.size):
+        values = []
+        for address in addresses[:1] if buffer.shared else addresses:
+            source = builder.gep(address, [INDEX(index)], source_etype=scalar)
+            values.append(builder.load(source, align=8, typ=scalar))
+        if len(rows) == 1:
+            vectors.store(values[0], block, index)
+            continue
+        vector = ir.Constant(vectors.type, ir.Undefined)
+        for lane in range(len(rows)):
+            value = values[0] if buffer.shared else values[lane]
+            vector = builder.insert_element(vector, value, ir.IntType(32)(lane))
+        vectors.store(vector, block, index)
+
+
+def _scatter(
+    vectors: VectorBuilder, buffer: Buffer, array: ir.Value, block: ir.Value, rows: list[ir.Value]
+) -> None:
+    """Transpose vectors with one row per lane into rows of an array."""
+    builder, scalar = vectors.ir, ir.DoubleType()
+    addresses = _row_addresses(vectors, buffer, array, rows)
+    positions = buffer.positions or range(buffer.size)
+    for index, position in zip(range(buffer.size), positions, strict=True):
+        vector = vectors.load(block, index)
+        for lane, address in enumerate(addresses):
+            value = vector if len(rows) == 1 else builder.extract_element(vector, ir.IntType(32)(lane))
+            builder.store(value, builder.gep(address, [INDEX(position)], source_etype=scalar), align=8)

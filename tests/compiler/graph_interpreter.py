@@ -1,0 +1,71 @@
+"""A second implementation of graphs: NumPy evaluates them node by node, in any number type it has."""
+
+import numpy as np
+
+from dq_space_arm_env.compiler.graph import Graph
+from dq_space_arm_env.compiler.program import Program
+
+
+def _real(value):
+    return np.real(value)
+
+
+_OPERATIONS = {
+    "add": lambda a, b: a + b,
+    "subtract": lambda a, b: a - b,
+    "multiply": lambda a, b: a * b,
+    "divide": lambda a, b: a / b,
+    "negate": lambda a: -a,
+    "square": lambda a: a * a,
+    "twice": lambda a: a + a,
+    "invert": lambda a: 1 / a,
+    "sqrt": np.sqrt,
+    "sin": np.sin,
+    "cos": np.cos,
+    "arctan2": np.arctan2,
+    "absolute": np.abs,
+    "minimum": np.minimum,
+    "maximum": np.maximum,
+    "less": lambda a, b: _real(a) < _real(b),
+    "less_equal": lambda a, b: _real(a) <= _real(b),
+    "equal": lambda a, b: _real(a) == _real(b),
+    "not_equal": lambda a, b: _real(a) != _real(b),
+    "not": np.logical_not,
+    "and": np.logical_and,
+    "or": np.logical_or,
+    "if_else_zero": lambda condition, a: np.where(condition, a, 0),
+}
+
+
+def evaluate_graph(graph: Graph, inputs: list[np.ndarray], dtype) -> list[np.ndarray]:
+    """Outputs of a graph for inputs of shape (n,), or (n, lanes) for many evaluations at once."""
+    values = []
+    for node in graph.nodes:
+        if node.operation == "constant":
+            values.append(dtype(node.constant))
+        elif node.operation == "input":
+            values.append(inputs[node.slot[0]][node.slot[1]])
+        else:
+            values.append(_OPERATIONS[node.operation](*(values[i] for i in node.arguments)))
+    lanes = next((value.shape[1:] for value in inputs if value.ndim == 2), ())
+    return [
+        np.array([np.broadcast_to(values[i], lanes) for i in indices], dtype=dtype).reshape(-1, *lanes)
+        for indices in graph.results
+    ]
+
+
+def evaluate_program(
+    program: Program, inputs: dict[str, np.ndarray], dtype=np.float64
+) -> dict[str, np.ndarray]:
+    """All buffers of a program after running it on one row (n,), or on many at once (n, lanes), by name."""
+    arrays = {name: np.asarray(value, dtype=dtype) for name, value in inputs.items()}
+    lanes = next((value.shape[1:] for value in arrays.values() if value.ndim == 2), ())
+    buffers = {name: np.zeros((size, *lanes), dtype=dtype) for name, size in program.scratch_sizes().items()}
+    for name, value in arrays.items():
+        buffers[name] = value if value.shape[1:] == lanes else np.repeat(value[:, None], lanes[0], axis=1)
+    for call in program.calls:
+        names = [call.bindings.get(name, name) for name, _ in call.graph.inputs]
+        results = evaluate_graph(call.graph, [buffers[name] for name in names], dtype)
+        for (name, _), result in zip(call.graph.outputs, results, strict=True):
+            buffers[call.bindings.get(name, name)] = result
+    return buffers

@@ -1,0 +1,146 @@
+"""The cache of object files: found by other processes, never trusted when damaged or foreign."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env.compiler import native
+from dq_space_arm_env.compiler.build import build_program
+from dq_space_arm_env.compiler.graph import trace
+from dq_space_arm_env.compiler.program import Buffer, Program
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("DQ_SPACE_ARM_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+class Builder:
+    """Builds y = factor x and counts how often it is asked to."""
+
+    def __init__(self, factor=2.0):
+        self.factor, self.calls = factor, 0
+
+    def __call__(self):
+        self.calls += 1
+        graph = trace("graph", {"x": 1}, lambda x: {"y": [self.factor * x[0]]})
+        program = Program("double", [Buffer("x", 1)], [Buffer("y", 1)])
+        program.call(graph)
+        return build_program(program, 1)
+
+
+def value(kernel):
+    x, y = np.array([[3.0]]), np.zeros((1, 1))
+    buffers = np.array([x.ctypes.data, y.ctypes.data], dtype=np.int64)
+    kernel.function(0, 1, buffers.ctypes.data)
+    return y[0, 0]
+
+
+def load(builder, key="key"):
+    return native.load_or_build("double", native.cache_key(key), builder)
+
+
+def the_file(cache):
+    (path,) = cache.glob("*.kernel")
+    return path
+
+
+def test_a_second_load_builds_nothing(cache):
+    builder = Builder()
+    assert value(load(builder)) == 6.0
+    assert value(load(builder)) == 6.0
+    assert builder.calls == 1
+
+
+def test_another_key_is_another_kernel(cache):
+    assert value(load(Builder(2.0), "a")) == 6.0
+    assert value(load(Builder(5.0), "b")) == 15.0
+
+
+@pytest.mark.parametrize("position", [0, 40, -1])
+def test_a_flipped_bit_is_found_and_rebuilt(cache, position):
+    builder = Builder()
+    load(builder)
+    path = the_file(cache)
+    content = bytearray(path.read_bytes())
+    content[position] ^= 1
+    path.write_bytes(content)
+    assert value(load(builder)) == 6.0
+    assert builder.calls == 2
+    assert value(load(builder)) == 6.0
+    assert builder.calls == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"DQSpaceArm native kernel 1\n", b"\x7fELF" + bytes(1000)])
+def test_a_truncated_or_foreign_file_is_rebuilt(cache, content):
+    builder = Builder()
+    load(builder)
+    the_file(cache).write_bytes(content)
+    assert value(load(builder)) == 6.0
+    assert builder.calls == 2
+
+
+def test_a_sound_file_under_the_wrong_name_is_rebuilt(cache):
+    load(Builder(5.0), "other")
+    foreign = the_file(cache)
+    load(Builder(2.0))
+    (own,) = set(cache.glob("*.kernel")) - {foreign}
+    own.write_bytes(foreign.read_bytes())
+    builder = Builder(2.0)
+    assert value(load(builder)) == 6.0
+    assert builder.calls == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
+def test_a_file_that_others_can_write_is_rebuilt(cache):
+    builder = Builder()
+    load(builder)
+    the_file(cache).chmod(0o666)
+    load(builder)
+    assert builder.calls == 2
+
+
+def test_a_folder_that_cannot_be_written_costs_only_the_cache(tmp_path, monkeypatch):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    monkeypatch.setenv("DQ_SPACE_ARM_CACHE", str(blocked / "cache"))
+    with pytest.warns(UserWarning, match="DQ_SPACE_ARM_CACHE"):
+        assert value(load(Builder())) == 6.0
+
+
+SECOND_PROCESS = """
+import sys
+from dq_space_arm_env import compile_scene
+kernels = compile_scene("planar")
+print(repr(kernels.step(kernels.layout.initial_state, [0.1] * kernels.n_u).tolist()))
+print("casadi" in sys.modules)
+"""
+
+
+def test_a_second_process_neither_traces_nor_compiles(cache):
+    environment = {**os.environ, "DQ_SPACE_ARM_CACHE": str(cache)}
+    command = [sys.executable, "-c", SECOND_PROCESS]
+    first, second = (
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split(
+            "\n"
+        )
+        for _ in range(2)
+    )
+    assert first[0] == second[0]
+    assert (first[1], second[1]) == ("True", "False")
+
+
+def test_two_processes_at_once_agree(cache):
+    environment = {**os.environ, "DQ_SPACE_ARM_CACHE": str(cache)}
+    command = [sys.executable, "-c", SECOND_PROCESS]
+    running = [
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)
+    ]
+    outputs = [process.communicate()[0].split("\n")[0] for process in running]
+    assert [process.returncode for process in running] == [0, 0, 0]
+    assert len(set(outputs)) == 1
+    assert not list(cache.glob("*.tmp"))

@@ -1,0 +1,187 @@
+"""Machine code: every operation against NumPy and mpmath, lanes against scalars, the loop over rows, the instructions."""
+
+import platform
+
+import casadi
+import mpmath
+import numpy as np
+import pytest
+from graph_interpreter import evaluate_graph
+
+from dq_space_arm_env.compiler import native
+from dq_space_arm_env.compiler.build import assembly, build_program
+from dq_space_arm_env.compiler.graph import trace
+from dq_space_arm_env.compiler.program import Buffer, Program
+
+LANES = (1, native.host_machine().lanes)
+EPS = np.finfo(float).eps
+
+
+def program_of(function, outputs, **sizes):
+    graph = trace("graph", sizes, function)
+    program = Program("program", [Buffer(*item) for item in sizes.items()], outputs)
+    program.call(graph)
+    return program
+
+
+def run(program, lanes, rows, *arrays):
+    kernel = native.NativeKernel(program.name, *build_program(program, lanes))
+    buffers = np.array([array.ctypes.data for array in arrays], dtype=np.int64)
+    kernel.function(0, rows, buffers.ctypes.data)
+
+
+def evaluate(function, size_out, lanes, x):
+    program = program_of(function, [Buffer("y", size_out)], x=x.shape[1])
+    y = np.zeros((len(x), size_out))
+    run(program, lanes, len(x), np.ascontiguousarray(x), y)
+    return y
+
+
+def everything(x):
+    a, b, c = x
+    smaller = a < b
+    return {
+        "y": [
+            a + b,
+            a - b,
+            a * b + c,
+            c - a * b,
+            a * b - c,
+            a / b,
+            -a,
+            a * a,
+            2 * a,
+            1 / a,
+            casadi.sqrt(casadi.fabs(a)),
+            casadi.fabs(c),
+            casadi.fmin(a, b),
+            casadi.fmax(a, b),
+            casadi.if_else(smaller, a, b),
+            casadi.if_else(casadi.logic_and(smaller, b <= c), a, b * c),
+            casadi.if_else(casadi.logic_or(a == b, a != c), a + 1, b + 2),
+            casadi.if_else(casadi.logic_not(smaller), a, c),
+            smaller + 1.0,
+            casadi.sin(a) * casadi.cos(a),
+            casadi.atan2(a, b),
+        ]
+    }
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_every_operation_agrees_with_numpy(lanes):
+    x = np.random.default_rng(0).normal(size=(100, 3))
+    x[:10, 1] = x[:10, 0]
+    graph = trace("graph", {"x": 3}, everything)
+    expected = np.array([evaluate_graph(graph, [row], np.float64)[0] for row in x])
+    np.testing.assert_allclose(
+        evaluate(everything, expected.shape[1], lanes, x), expected, rtol=4e-15, atol=4e-16
+    )
+
+
+@pytest.mark.parametrize("rows", [1, 2, 7, 8, 9, 16, 23])
+def test_lanes_give_the_bits_of_the_scalar_code(rows):
+    x = np.random.default_rng(rows).normal(size=(rows, 3)) * 10.0 ** np.arange(-2, 4, 2)
+    scalar, vector = (evaluate(everything, 21, lanes, x) for lanes in LANES)
+    np.testing.assert_array_equal(scalar, vector)
+
+
+def angles():
+    rng = np.random.default_rng(0)
+    spread = rng.choice([-1, 1], 4000) * 10.0 ** rng.uniform(-300, 6, 4000)
+    near_zeros = np.arange(-300, 300) * (np.pi / 2) * (1 + rng.choice([0, 1, -1], 600) * EPS)
+    return np.concatenate([spread, near_zeros, [0.0, 5e-324, 1e6, -1e6]])[:, None]
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_sine_and_cosine_are_right_to_the_last_place_up_to_1e6(lanes):
+    x = angles()
+    y = evaluate(lambda x: {"y": [casadi.sin(x[0]), casadi.cos(x[0])]}, 2, lanes, x)
+    with mpmath.workdps(60):
+        for (angle,), (sine, cosine) in zip(x, y, strict=True):
+            for value, exact in ((sine, mpmath.sin(angle)), (cosine, mpmath.cos(angle))):
+                # 1e-27: what three pieces of pi/2 leave where the function nearly vanishes at large angles.
+                tolerance = 1.5 * EPS * abs(exact) + 1e-27 * (1 + abs(angle)) + 5e-324
+                assert abs(value - exact) <= tolerance, angle
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_arctangent_is_right_in_all_quadrants(lanes):
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(3000, 2)) * 10.0 ** rng.uniform(-150, 150, (3000, 2))
+    x = np.concatenate([x, rng.normal(size=(3000, 2)), [[0.0, 1.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 0.0]]])
+    y = evaluate(lambda x: {"y": [casadi.atan2(x[0], x[1])]}, 1, lanes, x)[:, 0]
+    with mpmath.workdps(40):
+        exact = np.array([float(mpmath.atan2(*row)) for row in x])
+    assert np.max(np.abs(y - exact) / np.maximum(np.abs(exact), 1e-300)) < 3 * EPS
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_nan_and_infinity_pass_through(lanes):
+    x = np.array([[np.nan], [np.inf], [-np.inf]])
+    y = evaluate(
+        lambda x: {"y": [casadi.sin(x[0]), casadi.cos(x[0]), x[0] * 2, casadi.sqrt(x[0])]}, 4, lanes, x
+    )
+    assert np.isnan(y[:, :2]).all()
+    assert np.isnan(y[0]).all()
+    assert y[1:, 2].tolist() == [np.inf, -np.inf]
+    assert y[1, 3] == np.inf
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_a_shared_input_is_read_by_all_rows_and_scattered_outputs_leave_the_rest(lanes):
+    graph = trace("graph", {"x": 2, "h": 1}, lambda x, h: {"y": [h[0] * x[0], h[0] + x[1]]})
+    outputs = [Buffer("y", 2, positions=(3, 1), stride=5)]
+    program = Program("program", [Buffer("x", 2), Buffer("h", 1, shared=True)], outputs)
+    program.call(graph)
+    x = np.random.default_rng(2).normal(size=(11, 2))
+    h, y = np.array([0.5]), np.full((11, 5), 9.0)
+    run(program, lanes, 11, x, h, y)
+    np.testing.assert_array_equal(y[:, 3], 0.5 * x[:, 0])
+    np.testing.assert_array_equal(y[:, 1], 0.5 + x[:, 1])
+    assert (y[:, [0, 2, 4]] == 9.0).all()
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_only_the_rows_asked_for_are_written(lanes):
+    program = program_of(lambda x: {"y": [2 * x[0]]}, [Buffer("y", 1)], x=1)
+    kernel = native.NativeKernel(program.name, *build_program(program, lanes))
+    x, y = np.arange(20.0)[:, None].copy(), np.full((20, 1), -1.0)
+    buffers = np.array([x.ctypes.data, y.ctypes.data], dtype=np.int64)
+    kernel.function(5, 12, buffers.ctypes.data)
+    assert y[5:12, 0].tolist() == [2.0 * k for k in range(5, 12)]
+    assert (np.delete(y[:, 0], range(5, 12)) == -1.0).all()
+    kernel.function(3, 3, buffers.ctypes.data)
+    assert y[3, 0] == -1.0
+
+
+def test_calls_share_code_and_scratch_starts_as_zero():
+    total = trace("total", {"sum": 1, "x": 1}, lambda sum, x: {"next": [sum[0] + x[0]]})
+    program = Program("program", [Buffer("x", 1)], [Buffer("c", 1)])
+    program.call(total, sum="a", next="b")
+    program.call(total, sum="b", next="c")
+    for lanes in LANES:
+        x, y = np.arange(9.0)[:, None].copy(), np.zeros((9, 1))
+        run(program, lanes, 9, x, y)
+        np.testing.assert_array_equal(y, 2 * x)
+    assert program.operation_count == 2
+    assert assembly(program, 1).count("define internal") == 1
+
+
+def test_calls_that_disagree_on_a_size_are_refused():
+    graph = trace("graph", {"x": 3}, lambda x: {"y": [x[0]]})
+    program = Program("program", [Buffer("x", 2)], [Buffer("y", 1)])
+    program.call(graph)
+    with pytest.raises(ValueError, match="'graph' takes 3 scalars for 'x', buffer 'x' has 2"):
+        build_program(program, 1)
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names of x86 registers")
+def test_batches_use_the_widest_vector_registers_and_call_no_library():
+    lanes = native.host_machine().lanes
+    register = {8: "zmm", 4: "ymm", 2: "xmm"}[lanes]
+    program = program_of(everything, [Buffer("y", 21)], x=3)
+    instructions = native.disassemble(assembly(program, lanes))
+    packed = [line for line in instructions.splitlines() if "pd" in line and register in line]
+    assert len(packed) > 50
+    calls = [line for line in instructions.splitlines() if "call" in line.split("#")[0].split()]
+    assert all("graph" in line for line in calls), calls
