@@ -1,0 +1,1 @@
+"""Equations of motion over plain scalars: the paper's Newton-Euler system, and minimal coordinates."""

@@ -1,0 +1,275 @@
+"""Kinematics of the chain: poses (27) and their rates (30), velocities of the bodies, momentum, energy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra.scalars import cos, sin
+from dq_space_arm_env.algebra.vectors import (
+    add,
+    cross,
+    dot,
+    matrix_vector,
+    scale,
+    subtract,
+    transposed_matrix_vector,
+)
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.minimal import shift_wrench
+
+Scalar = Any
+DualQuaternion = Sequence[Scalar]
+Vector3 = Sequence[Scalar]
+
+
+def axis_rotation(axis: int, angle: Scalar) -> DualQuaternion:
+    """Pose that turns about a coordinate axis.
+
+    Args:
+        axis: 0, 1, 2 for x, y, z.
+        angle: Angle, rad.
+
+    Returns:
+        Unit dual quaternion, 8 numbers, without translation.
+    """
+    result: list[Scalar] = [cos(0.5 * angle), *[0.0] * 7]
+    result[1 + axis] = sin(0.5 * angle)
+    return result
+
+
+def wrist_rotation(wrist_angles: Sequence[Scalar]) -> DualQuaternion:
+    """Rz(psi) Ry(theta) Rx(phi), the 3-2-1 rotation of the spherical joint.
+
+    Args:
+        wrist_angles: psi, theta, phi, rad.
+
+    Returns:
+        Unit dual quaternion, 8 numbers.
+    """
+    psi, theta, phi = wrist_angles
+    return dq.multiply(dq.multiply(axis_rotation(2, psi), axis_rotation(1, theta)), axis_rotation(0, phi))
+
+
+def wrist_rate_matrix(wrist_angles: Sequence[Scalar]) -> Sequence[Vector3]:
+    """Angular velocity of the wrist per unit Euler rates (psi, theta, phi), in the axes of the end effector.
+
+    Args:
+        wrist_angles: psi, theta, phi, rad.
+
+    Returns:
+        3x3; its determinant vanishes at gimbal lock, theta = +-90 deg.
+    """
+    _, theta, phi = wrist_angles
+    return (
+        (-sin(theta), 0.0, 1.0),
+        (cos(theta) * sin(phi), cos(phi), 0.0),
+        (cos(theta) * cos(phi), -sin(phi), 0.0),
+    )
+
+
+def frame_poses(
+    chain: Chain, base_pose: DualQuaternion, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
+) -> list[DualQuaternion]:
+    """Poses of all frames with respect to the inertial frame, factor by factor as in (27).
+
+    Args:
+        chain: The robot.
+        base_pose: q_{e0/I}, 8.
+        joint_angles: n, rad.
+        wrist_angles: psi, theta, phi, rad; ignored without a wrist.
+
+    Returns:
+        Poses of the base, the n joint frames, the end-effector frame at the wrist (if there is one), and the
+        tip G.
+    """
+    poses = [base_pose]
+    for link, angle in zip(chain.links, joint_angles, strict=True):
+        joint = dq.multiply(link.joint.dual_quaternion, axis_rotation(2, angle))
+        poses.append(dq.multiply(poses[-1], joint))
+    if chain.wrist is not None:
+        wrist = dq.multiply(chain.wrist.dual_quaternion, wrist_rotation(wrist_angles))
+        poses.append(dq.multiply(poses[-1], wrist))
+    poses.append(dq.multiply(poses[-1], chain.tip.dual_quaternion))
+    return poses
+
+
+def tip_pose(
+    chain: Chain, base_pose: DualQuaternion, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
+) -> DualQuaternion:
+    """Pose of the tip q_{G/I}, eq. (27).
+
+    Args:
+        chain: The robot.
+        base_pose: q_{e0/I}, 8.
+        joint_angles: n, rad.
+        wrist_angles: psi, theta, phi, rad; ignored without a wrist.
+
+    Returns:
+        Unit dual quaternion, 8 numbers.
+    """
+    return dq.multiply(base_pose, arm_pose(chain, joint_angles, wrist_angles))
+
+
+def arm_pose(chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]) -> DualQuaternion:
+    """Pose of the tip in the base frame, q_{G/e0}: (27) without its first factor.
+
+    Args:
+        chain: The robot.
+        joint_angles: n, rad.
+        wrist_angles: psi, theta, phi, rad; ignored without a wrist.
+
+    Returns:
+        Unit dual quaternion, 8 numbers.
+    """
+    arm: DualQuaternion = chain.tip.dual_quaternion
+    if chain.wrist is not None:
+        arm = dq.multiply(wrist_rotation(wrist_angles), arm)
+        arm = dq.multiply(chain.wrist.dual_quaternion, arm)
+    for link, angle in zip(reversed(chain.links), reversed(list(joint_angles)), strict=True):
+        arm = dq.multiply(link.joint.dual_quaternion, dq.multiply(axis_rotation(2, angle), arm))
+    return arm
+
+
+def tip_pose_rate(
+    chain: Chain,
+    base_pose: DualQuaternion,
+    joint_angles: Sequence[Scalar],
+    wrist_angles: Sequence[Scalar],
+    base_twist: Sequence[Scalar],
+    joint_rates: Sequence[Scalar],
+    wrist_rates: Sequence[Scalar],
+) -> DualQuaternion:
+    """Rate of the tip's pose, eq. (30), with the last factor read as q_{G/e3} (paper-notes erratum).
+
+    Args:
+        chain: The robot.
+        base_pose: q_{e0/I}, 8.
+        joint_angles: n, rad.
+        wrist_angles: psi, theta, phi, rad.
+        base_twist: Angular [rad/s], then linear [m/s] velocity of the base in its axes, 6.
+        joint_rates: n, rad/s.
+        wrist_rates: psi, theta, phi rates, rad/s.
+
+    Returns:
+        Time derivative of q_{G/I}, 8 numbers, 1/s.
+    """
+    poses = frame_poses(chain, base_pose, joint_angles, wrist_angles)
+    tip = poses[-1]
+
+    def contribution(frame: DualQuaternion, twist: Sequence[Scalar]) -> DualQuaternion:
+        """1/2 q_{X/I} omega^X q_{G/X}."""
+        relative = dq.multiply(dq.conjugate(frame), tip)
+        return dq.scale(0.5, dq.multiply(dq.multiply(frame, (0.0, *twist[:3], 0.0, *twist[3:])), relative))
+
+    rate = contribution(base_pose, base_twist)
+    for frame, speed in zip(poses[1:], joint_rates, strict=False):
+        rate = dq.add(rate, contribution(frame, (0.0, 0.0, speed, 0.0, 0.0, 0.0)))
+    if chain.wrist is not None:
+        turning = matrix_vector(wrist_rate_matrix(wrist_angles), wrist_rates)
+        rate = dq.add(rate, contribution(poses[-2], (*turning, 0.0, 0.0, 0.0)))
+    return rate
+
+
+@dataclass(frozen=True)
+class BodyVelocity:
+    """Velocity of a body in its own frame.
+
+    Attributes:
+        angular: rad/s, 3.
+        linear: Of the frame's origin, m/s, 3.
+    """
+
+    angular: Vector3
+    linear: Vector3
+
+
+def body_velocities(
+    chain: Chain,
+    rotations: Sequence[Sequence[Vector3]],
+    base_twist: Sequence[Scalar],
+    joint_rates: Sequence[Scalar],
+) -> list[BodyVelocity]:
+    """Velocities of base and links from base to tip, the recursion behind (12).
+
+    Args:
+        chain: The robot.
+        rotations: From `minimal.joint_rotations`.
+        base_twist: Angular [rad/s], then linear [m/s] velocity of the base in its axes, 6.
+        joint_rates: n, rad/s.
+
+    Returns:
+        n + 1 velocities.
+    """
+    velocities = [BodyVelocity(tuple(base_twist[:3]), tuple(base_twist[3:]))]
+    for link, rotation, rate in zip(chain.links, rotations, joint_rates, strict=True):
+        parent = velocities[-1]
+        linear = transposed_matrix_vector(
+            rotation, add(parent.linear, cross(parent.angular, link.joint.position))
+        )
+        angular = transposed_matrix_vector(rotation, parent.angular)
+        velocities.append(BodyVelocity((angular[0], angular[1], angular[2] + rate), linear))
+    return velocities
+
+
+def momentum(
+    chain: Chain, rotations: Sequence[Sequence[Vector3]], velocities: Sequence[BodyVelocity]
+) -> tuple[Vector3, Vector3, Vector3]:
+    """Momentum of the whole system in the base frame.
+
+    Args:
+        chain: The robot.
+        rotations: From `minimal.joint_rotations`.
+        velocities: From `body_velocities`.
+
+    Returns:
+        Linear momentum [kg m/s] and angular momentum about the system's center of mass [kg m^2/s], in base
+        axes, and the position of the system's center of mass in the base frame [m], 3 each.
+    """
+    bodies = [chain.base, *(link.body for link in chain.links)]
+    linear: list[Vector3] = []
+    angular: list[Vector3] = []
+    moments: list[Vector3] = []
+    for body, velocity in zip(bodies, velocities, strict=True):
+        c = body.center_of_mass
+        p = scale(body.mass, add(velocity.linear, cross(velocity.angular, c)))
+        linear.append(p)
+        angular.append(add(matrix_vector(body.inertia, velocity.angular), cross(c, p)))
+        moments.append(scale(body.mass, c))
+    mass: Scalar = 0.0
+    for i in reversed(range(len(chain.links))):
+        rotation, position = rotations[i], chain.links[i].joint.position
+        mass = mass + chain.links[i].body.mass
+        linear_at_parent, angular_at_parent = shift_wrench(rotation, position, linear[i + 1], angular[i + 1])
+        linear[i] = add(linear[i], linear_at_parent)
+        angular[i] = add(angular[i], angular_at_parent)
+        moments[i] = add(moments[i], add(matrix_vector(rotation, moments[i + 1]), scale(mass, position)))
+    center = scale(1.0 / (mass + chain.base.mass), moments[0])
+    return linear[0], subtract(angular[0], cross(center, linear[0])), center
+
+
+def energy(
+    chain: Chain, joint_angles: Sequence[Scalar], velocities: Sequence[BodyVelocity]
+) -> tuple[Scalar, Scalar]:
+    """Kinetic energy, and potential energy of the joint springs.
+
+    Args:
+        chain: The robot.
+        joint_angles: n, rad.
+        velocities: From `body_velocities`.
+
+    Returns:
+        Two energies, J.
+    """
+    kinetic: Scalar = 0.0
+    for body, velocity in zip([chain.base, *(link.body for link in chain.links)], velocities, strict=True):
+        v = add(velocity.linear, cross(velocity.angular, body.center_of_mass))
+        rotational = dot(velocity.angular, matrix_vector(body.inertia, velocity.angular))
+        kinetic = kinetic + 0.5 * (body.mass * dot(v, v) + rotational)
+    potential: Scalar = 0.0
+    for link, angle in zip(chain.links, joint_angles, strict=True):
+        stretch = angle - link.rest_angle
+        potential = potential + 0.5 * link.stiffness * (stretch * stretch)
+    return kinetic, potential

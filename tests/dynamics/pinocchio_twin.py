@@ -1,0 +1,90 @@
+"""Random chains, and the same robots as Pinocchio models: a free flyer with revolute joints about z."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics.chain import Chain, Placement, RevoluteLink, RigidBody
+
+pin = pytest.importorskip("pinocchio")
+
+
+def random_rotation(rng: np.random.Generator) -> Rotation:
+    return Rotation.random(random_state=np.random.RandomState(rng.integers(2**31)))
+
+
+def random_placement(rng: np.random.Generator) -> Placement:
+    rotation = random_rotation(rng)
+    position = rng.uniform(-1.0, 1.0, 3)
+    x, y, z, w = rotation.as_quat()
+    dual_quaternion = poses.from_rotation_and_position((w, x, y, z), tuple(position.tolist()))
+    matrix, _ = poses.to_matrix(dual_quaternion)
+    return Placement(tuple(position.tolist()), matrix, dual_quaternion)
+
+
+def random_body(rng: np.random.Generator, at_origin: bool = False) -> RigidBody:
+    # Inertia of a cloud of points: it satisfies the triangle inequality by construction.
+    points = rng.normal(size=(6, 3))
+    points -= points.mean(axis=0)
+    mass = float(rng.uniform(0.5, 20.0))
+    inertia = mass / 6 * sum(p @ p * np.eye(3) - np.outer(p, p) for p in points)
+    center = np.zeros(3) if at_origin else rng.uniform(-0.5, 0.5, 3)
+    return RigidBody(mass, tuple(center.tolist()), tuple(tuple(row) for row in inertia.tolist()))
+
+
+def random_chain(rng: np.random.Generator, joints: int, wrist: bool = True) -> Chain:
+    links = tuple(
+        RevoluteLink(random_body(rng), random_placement(rng), 0.0, 0.0, 0.0, actuated=True)
+        for _ in range(joints)
+    )
+    return Chain(
+        base=random_body(rng, at_origin=True),
+        links=links,
+        wrist=random_placement(rng) if wrist else None,
+        tip=random_placement(rng),
+        tip_wrench=None,
+        planar=False,
+    )
+
+
+def pinocchio_model(chain: Chain) -> Any:
+    """The chain as a Pinocchio model without gravity."""
+    model = pin.Model()
+    model.gravity = pin.Motion.Zero()
+    parent = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
+    model.appendBodyToJoint(parent, _inertia(chain.base), pin.SE3.Identity())
+    for index, link in enumerate(chain.links):
+        placement = pin.SE3(np.array(link.joint.rotation), np.array(link.joint.position))
+        parent = model.addJoint(parent, pin.JointModelRZ(), placement, f"joint {index}")
+        model.appendBodyToJoint(parent, _inertia(link.body), pin.SE3.Identity())
+    return model
+
+
+def _inertia(body: RigidBody) -> Any:
+    return pin.Inertia(body.mass, np.array(body.center_of_mass), np.array(body.inertia))
+
+
+def configuration(base_pose: Any, joint_angles: Any) -> np.ndarray:
+    """Pinocchio's q: position, quaternion with the scalar last, joint angles."""
+    position = poses.position(tuple(base_pose))
+    w, x, y, z = base_pose[:4]
+    return np.array([*position, x, y, z, w, *joint_angles])
+
+
+def velocity(angular: Any, linear: Any, joint_rates: Any) -> np.ndarray:
+    """Pinocchio's v: linear, then angular velocity in body axes, joint rates."""
+    return np.array([*linear, *angular, *joint_rates])
+
+
+def tip_in_last_link(chain: Chain, wrist_angles: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation matrix and position of the tip in the last link's frame, by matrices."""
+    rotation, position = np.eye(3), np.zeros(3)
+    if chain.wrist is not None:
+        psi, theta, phi = wrist_angles
+        rotation = np.array(chain.wrist.rotation) @ Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix()
+        position = np.array(chain.wrist.position)
+    position = position + rotation @ np.array(chain.tip.position)
+    return rotation @ np.array(chain.tip.rotation), position

@@ -1,0 +1,244 @@
+"""Both formulations against Pinocchio on random chains: accelerations, reactions, kinematics, momentum, energy."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio_twin as twin
+import pytest
+
+from dq_space_arm_env.algebra import poses, vectors
+from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
+from dq_space_arm_env.dynamics.minimal import Accelerations, MassMatrix
+
+pin = pytest.importorskip("pinocchio")
+
+ZERO = (0.0, 0.0, 0.0)
+SAMPLES = 15
+
+
+def relative_error(actual, expected):
+    expected = np.asarray(expected)
+    return np.linalg.norm(np.asarray(actual, dtype=float) - expected) / max(np.linalg.norm(expected), 1e-300)
+
+
+def random_case(joints, seed, wrench=False):
+    rng = np.random.default_rng((joints, seed))
+    chain = twin.random_chain(rng, joints)
+    tip_wrench = tuple(rng.normal(size=6).tolist()) if wrench else None
+    chain = replace(chain, tip_wrench=tip_wrench)
+    base_pose = twin.random_placement(rng).dual_quaternion
+    return SimpleNamespace(
+        chain=chain,
+        model=twin.pinocchio_model(chain),
+        base_pose=base_pose,
+        angles=rng.uniform(-3.0, 3.0, joints).tolist(),
+        wrist=rng.uniform(-3.0, 3.0, 3).tolist(),
+        angular=tuple(rng.normal(size=3).tolist()),
+        linear=tuple(rng.normal(size=3).tolist()),
+        rates=rng.normal(size=joints).tolist(),
+        force=tuple(rng.normal(size=3).tolist()),
+        torque=tuple(rng.normal(size=3).tolist()),
+        motors=rng.normal(size=joints).tolist(),
+    )
+
+
+def external_forces(case):
+    """Pinocchio's external forces: the tip's wrench on the last body, about the body frame's origin."""
+    forces = pin.StdVec_Force()
+    for _ in range(case.model.njoints):
+        forces.append(pin.Force.Zero())
+    if case.chain.tip_wrench is not None:
+        rotation, position = twin.tip_in_last_link(case.chain, case.wrist)
+        force = rotation @ case.chain.tip_wrench[:3]
+        torque = rotation @ case.chain.tip_wrench[3:] + np.cross(position, force)
+        forces[case.model.njoints - 1] = pin.Force(force, torque)
+    return forces
+
+
+def pinocchio_accelerations(case):
+    q = twin.configuration(case.base_pose, case.angles)
+    v = twin.velocity(case.angular, case.linear, case.rates)
+    tau = np.array([*case.force, *case.torque, *case.motors])
+    a = pin.aba(case.model, case.model.createData(), q, v, tau, external_forces(case))
+    return np.array([*a[3:6], *a[:3], *a[6:]])
+
+
+def minimal_accelerations(case):
+    chain = case.chain
+    rotations = minimal.joint_rotations(chain, case.angles)
+    rest = Accelerations(ZERO, ZERO, [0.0] * len(chain.links))
+    bias = minimal.inverse_dynamics(chain, rotations, case.angular, case.rates, rest)
+    force, torque, joints = case.force, case.torque, case.motors
+    if chain.tip_wrench is not None:
+        tip = minimal.tip_wrench_forces(
+            chain, rotations, *twin.tip_in_last_link(chain, case.wrist), chain.tip_wrench
+        )
+        force, torque = vectors.add(force, tip.force), vectors.add(torque, tip.torque)
+        joints = [a + b for a, b in zip(joints, tip.joints, strict=True)]
+    solved = MassMatrix(chain, rotations).solve(
+        vectors.subtract(force, bias.force),
+        vectors.subtract(torque, bias.torque),
+        [a - b for a, b in zip(joints, bias.joints, strict=True)],
+    )
+    linear = vectors.subtract(solved.linear, vectors.cross(case.angular, case.linear))
+    return np.array([*solved.angular, *linear, *solved.joints], dtype=float)
+
+
+def paper_state(case):
+    """The case in the paper's coordinates: dual velocities of all bodies at their centers of mass."""
+    rotations = minimal.joint_rotations(case.chain, case.angles)
+    velocities = kinematics.body_velocities(case.chain, rotations, (*case.angular, *case.linear), case.rates)
+    bodies = [case.chain.base, *(link.body for link in case.chain.links)]
+    duals = [
+        (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
+        for body, v in zip(bodies, velocities, strict=True)
+    ]
+    return newton_euler.PaperState(case.base_pose, case.angles, case.wrist, duals)
+
+
+def paper_rates(case):
+    base_wrench = (0.0, *case.force, 0.0, *case.torque)
+    return newton_euler.paper_rates(case.chain, paper_state(case), base_wrench, case.motors, [0.0] * 3)
+
+
+def joint_accelerations_from_paper(case, accelerations):
+    """Base acceleration and joint accelerations that the paper's dual accelerations imply: the rate of (12)."""
+    frames = newton_euler.joint_frames(case.chain, case.angles, case.wrist)
+    bodies = np.reshape(accelerations, (-1, 8))
+    joints = [
+        newton_euler.joint_velocity(frames, j, [tuple(body) for body in bodies])[3]
+        for j in range(len(case.chain.links))
+    ]
+    return np.array([*bodies[0][1:4], *bodies[0][5:8], *joints], dtype=float)
+
+
+@pytest.mark.parametrize("wrench", [False, True])
+@pytest.mark.parametrize("joints", range(8))
+def test_minimal_coordinates_agree_with_pinocchio(joints, wrench):
+    errors = []
+    for seed in range(SAMPLES):
+        case = random_case(joints, seed, wrench and joints > 0)
+        errors.append(relative_error(minimal_accelerations(case), pinocchio_accelerations(case)))
+    assert max(errors) < 1e-12
+
+
+@pytest.mark.parametrize("wrench", [False, True])
+@pytest.mark.parametrize("joints", range(8))
+def test_newton_euler_system_agrees_with_pinocchio_13_to_22(joints, wrench):
+    errors = []
+    for seed in range(SAMPLES):
+        case = random_case(joints, seed, wrench and joints > 0)
+        rates, _ = paper_rates(case)
+        accelerations = rates[-8 * (joints + 1) :]
+        errors.append(
+            relative_error(joint_accelerations_from_paper(case, accelerations), pinocchio_accelerations(case))
+        )
+    assert max(errors) < 1e-12
+
+
+@pytest.mark.parametrize("joints", [1, 3, 6])
+def test_reaction_wrenches_agree_with_pinocchio_21(joints):
+    for seed in range(SAMPLES):
+        case = random_case(joints, seed, wrench=True)
+        _, reactions = paper_rates(case)
+        a = pinocchio_accelerations(case)
+        data = case.model.createData()
+        q = twin.configuration(case.base_pose, case.angles)
+        v = twin.velocity(case.angular, case.linear, case.rates)
+        acceleration = np.array([*a[3:6], *a[:3], *a[6:]])
+        pin.rnea(case.model, data, q, v, acceleration, external_forces(case))
+        expected = [
+            entry for j in range(joints) for entry in (*data.f[j + 2].linear, *data.f[j + 2].angular[:2])
+        ]
+        assert relative_error(reactions, expected) < 1e-12
+
+
+def test_schur_complement_solves_the_full_system_20():
+    for joints in range(1, 6):
+        case = random_case(joints, 0, wrench=True)
+        state = paper_state(case)
+        frames = newton_euler.joint_frames(case.chain, case.angles, case.wrist)
+        system = newton_euler.assemble(
+            case.chain, frames, state.velocities, (0.0, *case.force, 0.0, *case.torque), case.motors
+        )
+        size = 8 * (joints + 1)
+        full = np.zeros((size + 5 * joints, size + 5 * joints))
+        full[:size, :size], full[:size, size:], full[size:, :size] = system.s11, system.s12, system.s21
+        expected = np.linalg.solve(full, [*system.b1, *system.b2])
+        accelerations, reactions = newton_euler.solve_schur(case.chain, system)
+        assert relative_error([*accelerations, *reactions], expected) < 1e-12
+
+
+def test_tip_pose_27_and_its_rate_30():
+    for joints in range(5):
+        case = random_case(joints, 1)
+        twist, wrist_rates = (*case.angular, *case.linear), (0.3, -0.4, 0.5)
+        arguments = (case.chain, case.base_pose, case.angles, case.wrist)
+        data = case.model.createData()
+        pin.forwardKinematics(case.model, data, twin.configuration(case.base_pose, case.angles))
+        last = data.oMi[joints + 1]
+        rotation, position = twin.tip_in_last_link(case.chain, case.wrist)
+        matrix, origin = poses.to_matrix(kinematics.tip_pose(*arguments))
+        np.testing.assert_allclose(matrix, last.rotation @ rotation, atol=1e-13)
+        np.testing.assert_allclose(origin, last.translation + last.rotation @ position, atol=1e-12)
+        np.testing.assert_allclose(
+            kinematics.frame_poses(*arguments)[-1], kinematics.tip_pose(*arguments), atol=1e-13
+        )
+
+        def moved(h, case=case, twist=twist, wrist_rates=wrist_rates):
+            from dq_space_arm_env.algebra import dual_quaternion, screw
+
+            base = dual_quaternion.multiply(case.base_pose, screw.exponential([h * w for w in twist]))
+            angles = [a + h * r for a, r in zip(case.angles, case.rates, strict=True)]
+            wrist = [a + h * r for a, r in zip(case.wrist, wrist_rates, strict=True)]
+            return np.array(kinematics.tip_pose(case.chain, base, angles, wrist))
+
+        h = 1e-3
+        eighth_order = sum(
+            weight * (moved(k * h) - moved(-k * h))
+            for k, weight in ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+        )
+        rate = kinematics.tip_pose_rate(*arguments, twist, case.rates, wrist_rates)
+        np.testing.assert_allclose(rate, eighth_order / h, atol=2e-11)
+
+
+def test_momentum_and_energy_agree_with_pinocchio():
+    for joints in range(8):
+        case = random_case(joints, 2)
+        rotations = minimal.joint_rotations(case.chain, case.angles)
+        velocities = kinematics.body_velocities(
+            case.chain, rotations, (*case.angular, *case.linear), case.rates
+        )
+        linear, angular, _ = kinematics.momentum(case.chain, rotations, velocities)
+        kinetic, potential = kinematics.energy(case.chain, case.angles, velocities)
+        data = case.model.createData()
+        q = twin.configuration(case.base_pose, case.angles)
+        v = twin.velocity(case.angular, case.linear, case.rates)
+        centroidal = pin.computeCentroidalMomentum(case.model, data, q, v)
+        attitude, _ = poses.to_matrix(case.base_pose)
+        assert relative_error(np.array(attitude) @ linear, centroidal.linear) < 1e-12
+        assert relative_error(np.array(attitude) @ angular, centroidal.angular) < 1e-12
+        assert kinetic == pytest.approx(pin.computeKineticEnergy(case.model, data, q, v), rel=1e-12)
+        assert potential == 0.0
+
+
+def test_inverse_dynamics_undoes_forward_dynamics():
+    for joints in range(8):
+        case = random_case(joints, 3)
+        rotations = minimal.joint_rotations(case.chain, case.angles)
+        a = minimal_accelerations(case)
+        linear = vectors.add(tuple(a[3:6]), vectors.cross(case.angular, case.linear))
+        found = minimal.inverse_dynamics(
+            case.chain,
+            rotations,
+            case.angular,
+            case.rates,
+            Accelerations(tuple(a[:3]), linear, a[6:].tolist()),
+        )
+        assert (
+            relative_error(
+                [*found.force, *found.torque, *found.joints], [*case.force, *case.torque, *case.motors]
+            )
+            < 1e-12
+        )
