@@ -1,0 +1,126 @@
+"""What an integrator may ask of the equations of motion, and what it must offer: calls of traced graphs.
+
+The state is a pose (a unit dual quaternion) and a vector y of everything else; the pose moves with the twist
+that is part of y, and never feeds back into y'. An integrator therefore advances y with a method for vectors,
+and the pose with one for the group SE(3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from dq_space_arm_env.algebra import dual_quaternion, quaternion, screw
+from dq_space_arm_env.compiler.program import Program
+
+Scalar = Any
+Matrix = Any  # a CasADi SX matrix
+
+
+class VectorField(Protocol):
+    """The equations of motion of a scene, over CasADi symbols.
+
+    Attributes:
+        name: Identifier that prefixes the names of the graphs.
+        n_x: Number of stored states.
+        n_y: Number of states besides the pose; they are the last entries of the state and of the tangent
+            state.
+        n_u: Number of inputs.
+        n_pose: Number of stored numbers of the pose; 0 for a formulation whose pose is part of y.
+        directions: Which of the six twist directions the base can move in.
+        twist_indices: Where the twist stands in y; as many entries as the pose has tangent directions.
+        rate_indices: The entries of y whose time derivatives are accelerations; the others' are velocities or
+            inputs.
+    """
+
+    name: str
+    n_x: int
+    n_y: int
+    n_u: int
+    n_pose: int
+    directions: tuple[int, ...]
+    twist_indices: tuple[int, ...]
+    rate_indices: tuple[int, ...]
+
+    def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
+        """Time derivative of y, n_y."""
+        ...
+
+    def linearized_rates(
+        self, y: Sequence[Scalar], u: Sequence[Scalar]
+    ) -> tuple[list[Scalar], Matrix, Matrix]:
+        """Time derivative of y, its Jacobians with respect to y (n_y, n_y) and u (n_y, n_u)."""
+        ...
+
+    def full_pose(self, stored: Sequence[Scalar]) -> Sequence[Scalar]:
+        """All 8 numbers of the pose from the stored ones."""
+        ...
+
+    def stored_pose(self, pose: Sequence[Scalar]) -> list[Scalar]:
+        """The stored numbers of a pose."""
+        ...
+
+    def full_twist(self, twist: Sequence[Scalar]) -> Sequence[Scalar]:
+        """All 6 numbers of a twist from the free ones."""
+        ...
+
+
+class Integrator(Protocol):
+    """A one-step method.
+
+    Attributes:
+        name: Name in the scene file.
+        order: Order of convergence.
+        evaluations: Evaluations of the accelerations per step.
+    """
+
+    name: str
+    order: int
+    evaluations: int
+
+    def append_step(self, program: Program, field: VectorField) -> None:
+        """Append the calls that turn buffers x, u, h into x_next."""
+        ...
+
+    def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
+        """Append the calls that turn x, u, h into the nonzeros A, B of the step's exact tangent derivative.
+
+        Returns:
+            CasADi sparsity patterns of A (n_t, n_t) and B (n_t, n_u); the buffers hold their nonzeros, column
+            by column.
+        """
+        ...
+
+
+def move_pose(field: VectorField, stored: Sequence[Scalar], increment: Sequence[Scalar]) -> list[Scalar]:
+    """Compose a pose with the exponential of a twist increment, and remove the rounding errors of its norm.
+
+    Args:
+        field: The equations of motion.
+        stored: Stored numbers of the pose.
+        increment: Twist times time, 6 numbers (rad, m), in body axes.
+
+    Returns:
+        Stored numbers of q exp(increment / 2).
+    """
+    moved = dual_quaternion.multiply(field.full_pose(stored), screw.exponential(increment))
+    return field.stored_pose(nearly_unit(moved))
+
+
+def nearly_unit(pose: Sequence[Scalar]) -> tuple[Scalar, ...]:
+    """Project a pose that is unit up to rounding errors back onto the unit dual quaternions, to first order.
+
+    Without it, rounding errors of the products accumulate; one step of Newton's method for 1/sqrt(|q|^2)
+    removes them.
+
+    Args:
+        pose: Dual quaternion, 8 numbers, |q_r| = 1 and q_r . q_d = 0 up to small errors.
+
+    Returns:
+        The projected dual quaternion, 8 numbers.
+    """
+    real, dual = pose[:4], pose[4:]
+    scaling = 1.5 - 0.5 * quaternion.dot(real, real)[0]
+    overlap = quaternion.dot(real, dual)[0]
+    unit = [scaling * entry for entry in real]
+    return (*unit, *(scaling * (d - overlap * r) for r, d in zip(real, dual, strict=True)))

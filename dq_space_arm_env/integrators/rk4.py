@@ -1,0 +1,197 @@
+"""The classical Runge-Kutta method on the group: Munthe-Kaas for the pose, order 4, four evaluations.
+
+The pose is advanced by one exponential of Omega, where Omega solves Omega' = dexp^-1(omega) with the twists
+omega of the four stages (Munthe-Kaas, High order Runge-Kutta methods on manifolds, 1999); it stays a unit
+dual quaternion by construction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi
+
+from dq_space_arm_env.algebra.dual_vectors import cross as dual_cross
+from dq_space_arm_env.compiler.graph import graph_of, trace
+from dq_space_arm_env.compiler.program import Program
+from dq_space_arm_env.integrators.field import VectorField, move_pose
+from dq_space_arm_env.integrators.linearization import pose_blocks
+
+Scalar = Any
+Matrix = Any
+
+# Butcher tableau: stage i starts at y + OFFSETS[i] h k_{i-1}; the step is h sum WEIGHTS[i] k_i.
+OFFSETS = (0.0, 0.5, 0.5, 1.0)
+WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+
+
+class RungeKuttaMuntheKaas4:
+    """Classical Runge-Kutta for the velocities and angles, Munthe-Kaas for the pose."""
+
+    name = "rk4"
+    order = 4
+    evaluations = 4
+
+    def append_step(self, program: Program, field: VectorField) -> None:
+        """Append the calls that turn buffers x, u, h into x_next."""
+
+        def stage(x: list[Scalar], u: list[Scalar], k: list[Scalar], offset: list[Scalar]) -> dict[str, Any]:
+            y = [entry + offset[0] * rate for entry, rate in zip(x[field.n_pose :], k, strict=True)]
+            return {"rates": field.rates(y, u)}
+
+        def combine(x: list[Scalar], h: list[Scalar], **k: list[Scalar]) -> dict[str, Any]:
+            stages = list(k.values())
+            y = _advance(x[field.n_pose :], stages, h[0])
+            if not field.n_pose:
+                return {"x_next": y}
+            increment = _pose_increment(field, _stage_twists(field, x, stages, h[0]), h[0])
+            return {"x_next": [*move_pose(field, x[: field.n_pose], increment), *y]}
+
+        n_y = field.n_y
+        sizes = {"x": field.n_x, "u": field.n_u, "k": n_y, "offset": 1}
+        rates = trace(f"{field.name}_rk4_stage", sizes, stage)
+        sum_sizes = {"x": field.n_x, "h": 1, "k1": n_y, "k2": n_y, "k3": n_y, "k4": n_y}
+        total = trace(f"{field.name}_rk4_sum", sum_sizes, combine)
+        program.call(_offsets_graph(field), zero="offset1", half="offset2", full="offset4")
+        for number, offset in enumerate(("offset1", "offset2", "offset2", "offset4"), start=1):
+            program.call(rates, k=f"k{number - 1}", rates=f"k{number}", offset=offset)
+        program.call(total)
+
+    def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
+        """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
+        pattern = _stage_pattern(field)
+        stage = _linearized_stage(field, pattern)
+        total, a_pattern, b_pattern = _linearized_sum(field, pattern)
+        program.call(_offsets_graph(field), zero="offset1", half="offset2", full="offset4")
+        for number, offset in enumerate(("offset1", "offset2", "offset2", "offset4"), start=1):
+            program.call(
+                stage,
+                k=f"k{number - 1}",
+                change=f"K{number - 1}",
+                rates=f"k{number}",
+                rate_change=f"K{number}",
+                offset=offset,
+            )
+        program.call(total)
+        return a_pattern, b_pattern
+
+
+def _offsets_graph(field: VectorField) -> Any:
+    return trace(
+        f"{field.name}_rk4_offsets", {"h": 1}, lambda h: {"zero": [0.0], "half": [0.5 * h[0]], "full": [h[0]]}
+    )
+
+
+def _advance(y: Sequence[Scalar], stages: Sequence[Sequence[Scalar]], h: Scalar) -> list[Scalar]:
+    """Y + h (k1 + 2 k2 + 2 k3 + k4) / 6."""
+    sixth = h * (1 / 6)
+    return [
+        entry + sixth * (k1 + 2.0 * (k2 + k3) + k4) for entry, k1, k2, k3, k4 in zip(y, *stages, strict=True)
+    ]
+
+
+def _stage_twists(
+    field: VectorField, x: Sequence[Scalar], stages: Sequence[Sequence[Scalar]], h: Scalar
+) -> list[list[Scalar]]:
+    """Free entries of the base twist at the four stages."""
+    y = x[field.n_pose :]
+    twists = [[y[i] for i in field.twist_indices]]
+    for offset, k in zip(OFFSETS[1:], stages, strict=False):
+        twists.append([y[i] + offset * h * k[i] for i in field.twist_indices])
+    return twists
+
+
+def _pose_increment(field: VectorField, twists: Sequence[Sequence[Scalar]], h: Scalar) -> list[Scalar]:
+    """Omega after one step, 6 numbers.
+
+    Stage i starts from Omega_i = OFFSETS[i] h w_{i-1} and has the slope w_i = dexp^-1(omega_i), where dexp^-1
+    may stop after the second commutator without losing order 4. For twists the commutator is the dual cross
+    product.
+    """
+    slopes: list[Sequence[Scalar]] = []
+    for offset, free in zip(OFFSETS, twists, strict=True):
+        omega = field.full_twist(free)
+        if slopes:
+            start = [offset * h * entry for entry in slopes[-1]]
+            once = dual_cross(start, omega)
+            twice = dual_cross(start, once)
+            omega = [w + 0.5 * a + (1 / 12) * b for w, a, b in zip(omega, once, twice, strict=True)]
+        slopes.append(omega)
+    return _advance([0.0] * 6, slopes, h)
+
+
+def _stage_pattern(field: VectorField) -> Any:
+    """Sparsity that the derivative of any stage's rates with respect to (y, u) stays within."""
+    y = [casadi.SX.sym(f"y_{i}") for i in range(field.n_y)]
+    u = [casadi.SX.sym(f"u_{i}") for i in range(field.n_u)]
+    _, by_y, by_u = field.linearized_rates(y, u)
+    direct = casadi.horzcat(by_y.sparsity(), by_u.sparsity())
+    identity = casadi.horzcat(casadi.Sparsity.diag(field.n_y), casadi.Sparsity(field.n_y, field.n_u))
+    pattern = direct
+    while True:
+        product = casadi.mtimes(casadi.DM(by_y.sparsity(), 1), casadi.DM(pattern.unite(identity), 1))
+        grown = direct.unite(casadi.sparsify(product).sparsity())
+        if grown == pattern:
+            return pattern
+        pattern = grown
+
+
+def _linearized_stage(field: VectorField, pattern: Any) -> Any:
+    """Graph of a stage's rates and of their derivative K = F Y + [0, G] by (y, u) at the step's start."""
+    n_y, n_u = field.n_y, field.n_u
+    x = [casadi.SX.sym(f"x_{i}") for i in range(field.n_x)]
+    u = [casadi.SX.sym(f"u_{i}") for i in range(n_u)]
+    k = [casadi.SX.sym(f"k_{i}") for i in range(n_y)]
+    change = casadi.SX.sym("change", pattern)
+    offset = casadi.SX.sym("offset")
+    y = [entry + offset * rate for entry, rate in zip(x[field.n_pose :], k, strict=True)]
+    rates, by_y, by_u = field.linearized_rates(y, u)
+    start = casadi.horzcat(casadi.SX.eye(n_y), casadi.SX(n_y, n_u)) + offset * change
+    rate_change = casadi.mtimes(by_y, start) + casadi.horzcat(casadi.SX(n_y, n_y), by_u)
+    return graph_of(
+        f"{field.name}_rk4_linearized_stage",
+        {"x": x, "u": u, "k": k, "change": change.nonzeros(), "offset": [offset]},
+        {"rates": rates, "rate_change": casadi.project(rate_change, pattern).nonzeros()},
+    )
+
+
+def _linearized_sum(field: VectorField, pattern: Any) -> tuple[Any, Any, Any]:
+    """Graph of A and B from the stages' rates and derivatives, and their patterns."""
+    n_y, n_u = field.n_y, field.n_u
+    x = [casadi.SX.sym(f"x_{i}") for i in range(field.n_x)]
+    h = casadi.SX.sym("h")
+    stages = [[casadi.SX.sym(f"k{s}_{i}") for i in range(n_y)] for s in range(1, 5)]
+    changes = [casadi.SX.sym(f"K{s}", pattern) for s in range(1, 5)]
+    identity = casadi.horzcat(casadi.SX.eye(n_y), casadi.SX(n_y, n_u))
+    change = identity
+    for weight, rate_change in zip(WEIGHTS, changes, strict=True):
+        change = change + (weight * h) * rate_change
+    if field.n_pose:
+        n = len(field.twist_indices)
+        rows = list(field.twist_indices)
+        free = [[casadi.SX.sym(f"w{s}_{i}") for i in range(n)] for s in range(4)]
+        increment = casadi.vertcat(*_pose_increment(field, free, h))
+        moved = casadi.SX(n, n_y + n_u)
+        for s, offset in enumerate(OFFSETS):
+            twist_change = identity[rows, :]
+            if s:
+                twist_change = twist_change + (offset * h) * changes[s - 1][rows, :]
+            slope = casadi.jacobian(increment, casadi.vertcat(*free[s]))[list(field.directions), :]
+            moved = moved + casadi.mtimes(slope, twist_change)
+        twists = _stage_twists(field, x, stages, h)
+        symbols = casadi.vertcat(*(entry for twist in free for entry in twist))
+        values = casadi.vertcat(*(entry for twist in twists for entry in twist))
+        increment, moved = casadi.substitute([increment, moved], [symbols], [values])
+        by_pose, by_increment = pose_blocks(field, casadi.vertsplit(increment))
+        moved = casadi.mtimes(by_increment, moved)
+        a = casadi.horzcat(casadi.vertcat(by_pose, casadi.SX(n_y, n)), casadi.vertcat(moved, change)[:, :n_y])
+        b = casadi.vertcat(moved, change)[:, n_y:]
+    else:
+        a, b = change[:, :n_y], change[:, n_y:]
+    a, b = casadi.sparsify(a), casadi.sparsify(b)
+    inputs: dict[str, Sequence[Scalar]] = {"x": x, "h": [h]}
+    inputs |= {f"k{s}": k for s, k in enumerate(stages, start=1)}
+    inputs |= {f"K{s}": k.nonzeros() for s, k in enumerate(changes, start=1)}
+    graph = graph_of(f"{field.name}_rk4_linearized_sum", inputs, {"A": a.nonzeros(), "B": b.nonzeros()})
+    return graph, a.sparsity(), b.sparsity()

@@ -1,0 +1,302 @@
+"""The equations of motion of a scene, over CasADi symbols: what integrators advance and kernels evaluate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra.vectors import add, cross, subtract
+from dq_space_arm_env.dynamics import minimal
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematics import wrist_rotation
+from dq_space_arm_env.dynamics.minimal import Accelerations, MassMatrix, Wrenches
+from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
+
+Scalar = Any
+Matrix = Any
+
+ZERO = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Everything of a state but the pose.
+
+    Attributes:
+        joint_angles: n, rad.
+        wrist_angles: psi, theta, phi, rad; empty without a wrist.
+        angular: Angular velocity of the base, base axes, 3, rad/s.
+        linear: Velocity of the base's center of mass, base axes, 3, m/s.
+        joint_rates: n, rad/s.
+    """
+
+    joint_angles: Sequence[Scalar]
+    wrist_angles: Sequence[Scalar]
+    angular: Sequence[Scalar]
+    linear: Sequence[Scalar]
+    joint_rates: Sequence[Scalar]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Commanded forces and rates; what a scene has no actuator for is the number zero.
+
+    Attributes:
+        force: On the base, base axes, 3, N.
+        torque: On the base, base axes, 3, N m.
+        joint_torques: n, N m.
+        wrist_rates: psi, theta, phi rates, rad/s; empty without a wrist.
+    """
+
+    force: Sequence[Scalar]
+    torque: Sequence[Scalar]
+    joint_torques: Sequence[Scalar]
+    wrist_rates: Sequence[Scalar]
+
+
+class SpaceArmField:
+    """Vector field of a scene in minimal coordinates; implements `integrators.VectorField`."""
+
+    name = "minimal"
+
+    def __init__(self, chain: Chain, layout: StateLayout) -> None:
+        """Describe the coordinates.
+
+        Args:
+            chain: Constants of the robot.
+            layout: Where each quantity stands in state and input.
+        """
+        self.chain = chain
+        self.layout = layout
+        self.n_x = layout.n_x
+        self.n_u = layout.n_u
+        self.n_t = layout.n_t
+        self.n_pose = layout.state.pose.stop
+        self.n_y = self.n_x - self.n_pose
+        self.twist_indices = self._in_y(layout.state.base_velocity)
+        self.rate_indices = (*self.twist_indices, *self._in_y(layout.state.joint_rates))
+        self.directions = PLANAR_TWIST if chain.planar else tuple(range(6))
+
+    def _in_y(self, part: slice) -> tuple[int, ...]:
+        return tuple(range(part.start - self.n_pose, part.stop - self.n_pose))
+
+    def full_pose(self, stored: Sequence[Scalar]) -> Sequence[Scalar]:
+        """All 8 numbers of the base pose from the stored ones."""
+        return _spread(stored, PLANAR_POSE, 8) if self.chain.planar else stored
+
+    def stored_pose(self, pose: Sequence[Scalar]) -> list[Scalar]:
+        """The stored numbers of a base pose."""
+        return [pose[i] for i in PLANAR_POSE] if self.chain.planar else list(pose)
+
+    def full_twist(self, twist: Sequence[Scalar]) -> Sequence[Scalar]:
+        """All 6 numbers of a base twist from the free ones."""
+        return _spread(twist, PLANAR_TWIST, 6) if self.chain.planar else twist
+
+    def motion(self, y: Sequence[Scalar]) -> Motion:
+        """Name the parts of y."""
+        layout, shift = self.layout, self.n_pose
+
+        def part(where: slice) -> list[Scalar]:
+            return list(y[where.start - shift : where.stop - shift])
+
+        twist = self.full_twist(part(layout.state.base_velocity))
+        return Motion(
+            part(layout.state.joint_angles),
+            part(layout.state.wrist_angles),
+            twist[:3],
+            twist[3:],
+            part(layout.state.joint_rates),
+        )
+
+    def inputs(self, u: Sequence[Scalar]) -> Inputs:
+        """Name the parts of an input, with zeros for absent actuators."""
+        layout, planar = self.layout, self.chain.planar
+        force, torque = list(u[layout.control.base_force]), list(u[layout.control.base_torque])
+        torques: list[Scalar] = [0.0] * layout.n_joints
+        for joint, value in zip(layout.actuated_joints, u[layout.control.joint_torque], strict=True):
+            torques[joint] = value
+        wrist = list(u[layout.control.wrist_rate])
+        if not wrist and self.chain.wrist is not None:
+            wrist = [0.0, 0.0, 0.0]
+        return Inputs(
+            force=_spread(force, (0, 1) if planar else (0, 1, 2), 3) if force else ZERO,
+            torque=_spread(torque, (2,) if planar else (0, 1, 2), 3) if torque else ZERO,
+            joint_torques=torques,
+            wrist_rates=wrist,
+        )
+
+    def _tip_forces(
+        self, motion: Motion, rotations: Sequence[Any], wrench: Sequence[Scalar] | None
+    ) -> Wrenches:
+        n = len(self.chain.links)
+        if wrench is None:
+            return Wrenches(ZERO, ZERO, [0.0] * n, [(ZERO, ZERO)] * n)
+        pose: Sequence[Scalar] = self.chain.tip.dual_quaternion
+        if self.chain.wrist is not None:
+            turned = dq.multiply(self.chain.wrist.dual_quaternion, wrist_rotation(motion.wrist_angles))
+            pose = dq.multiply(turned, pose)
+        return minimal.tip_wrench_forces(self.chain, rotations, *poses.to_matrix(pose), wrench)
+
+    def _solve(
+        self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None
+    ) -> tuple[Accelerations, MassMatrix, Sequence[Any]]:
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        mass_matrix = MassMatrix(self.chain, rotations)
+        rest = Accelerations(ZERO, ZERO, [0.0] * len(self.chain.links))
+        needed = minimal.inverse_dynamics(self.chain, rotations, motion.angular, motion.joint_rates, rest)
+        tip = self._tip_forces(motion, rotations, wrench)
+        passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
+        accelerations = mass_matrix.solve(
+            subtract(add(inputs.force, tip.force), needed.force),
+            subtract(add(inputs.torque, tip.torque), needed.torque),
+            [
+                motor + other + load - bias
+                for motor, other, load, bias in zip(
+                    inputs.joint_torques, passive, tip.joints, needed.joints, strict=True
+                )
+            ],
+        )
+        return accelerations, mass_matrix, rotations
+
+    def accelerations(
+        self, y: Sequence[Scalar], u: Sequence[Scalar], wrench: Sequence[Scalar] | None = None
+    ) -> list[Scalar]:
+        """Dual acceleration of the base (free directions), then joint accelerations.
+
+        Args:
+            y: State without the pose.
+            u: Input.
+            wrench: Force and torque at the tip in tip axes, 6; None takes the scene's.
+
+        Returns:
+            Time derivatives of base twist (rad/s^2, m/s^2) and joint rates (rad/s^2).
+        """
+        motion = self.motion(y)
+        wrench = self.chain.tip_wrench if wrench is None else wrench
+        solved, _, _ = self._solve(motion, self.inputs(u), wrench)
+        return self._dual(motion, solved)
+
+    def _dual(self, motion: Motion, solved: Accelerations) -> list[Scalar]:
+        """Accelerations in the paper's sense: the components of the linear velocity turn with the base."""
+        turning = subtract(solved.linear, cross(motion.angular, motion.linear))
+        dual = [*solved.angular, *turning]
+        return [*(dual[i] for i in self.directions), *solved.joints]
+
+    def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
+        """Time derivative of y: rates of joints and wrist, base and joint accelerations."""
+        return [*self.motion(y).joint_rates, *self.inputs(u).wrist_rates, *self.accelerations(y, u)]
+
+    def reaction_wrenches(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
+        """The paper's T: what each joint transmits to its link, in joint axes about the joint origin.
+
+        Args:
+            y: State without the pose.
+            u: Input.
+
+        Returns:
+            fx, fy, fz [N], tx, ty [N m] for each joint, 5 n.
+        """
+        motion = self.motion(y)
+        wrench = self.chain.tip_wrench
+        solved, _, rotations = self._solve(motion, self.inputs(u), wrench)
+        needed = minimal.inverse_dynamics(self.chain, rotations, motion.angular, motion.joint_rates, solved)
+        tip = self._tip_forces(motion, rotations, wrench)
+        result: list[Scalar] = []
+        for (force, torque), (tip_force, tip_torque) in zip(needed.reactions, tip.reactions, strict=True):
+            result += [*subtract(force, tip_force), *subtract(torque, tip_torque)[:2]]
+        return result
+
+    def linearized_rates(
+        self, y: Sequence[Scalar], u: Sequence[Scalar]
+    ) -> tuple[list[Scalar], Matrix, Matrix]:
+        """Time derivative of y and its Jacobians.
+
+        With M a = f - ID(y, 0), differentiating the inverse dynamics at the solved accelerations gives da =
+        -M^-1 dID: far fewer operations than differentiating through the factorization.
+
+        Args:
+            y: State without the pose, n_y symbols.
+            u: Input, n_u symbols.
+
+        Returns:
+            Rates (n_y), Jacobian with respect to y (n_y, n_y), Jacobian with respect to u (n_y, n_u).
+        """
+        symbols = [casadi.SX.sym(f"v_{i}") for i in range(self.n_y)]
+        motion, inputs = self.motion(y), self.inputs(u)
+        solved, mass_matrix, _ = self._solve(motion, inputs, self.chain.tip_wrench)
+        residual, accelerations = self._residual(symbols)
+        by_y = casadi.jacobian(residual, casadi.vertcat(*symbols))
+        values = casadi.vertcat(*y, *solved.angular, *solved.linear, *solved.joints)
+        by_y = casadi.substitute(by_y, casadi.vertcat(*symbols, *accelerations), values)
+        columns = [self._response(mass_matrix, [-e for e in _dense(by_y[:, i])]) for i in range(self.n_y)]
+        response = casadi.horzcat(*(casadi.sparsify(casadi.vertcat(*column)) for column in columns))
+        rates = [*motion.joint_rates, *inputs.wrist_rates, *self._dual(motion, solved)]
+        angles_by_y, angles_by_u, turning_by_y = self._simple_jacobians(y)
+        jacobian_y = casadi.vertcat(angles_by_y, response + turning_by_y)
+        if not self.n_u:
+            return rates, jacobian_y, casadi.SX(self.n_y, 0)
+        by_u = casadi.horzcat(*(self._input_response(mass_matrix, i) for i in range(self.n_u)))
+        return rates, jacobian_y, casadi.vertcat(angles_by_u, by_u)
+
+    def _simple_jacobians(self, y: Sequence[Scalar]) -> tuple[Matrix, Matrix, Matrix]:
+        """Constant Jacobians of the angles' rates by y and u, and the Jacobian of -omega x v by y."""
+        free_y = [casadi.SX.sym(f"f_{i}") for i in range(self.n_y)]
+        free_u = [casadi.SX.sym(f"g_{i}") for i in range(self.n_u)]
+        motion = self.motion(free_y)
+        angles = casadi.vertcat(*motion.joint_rates, *self.inputs(free_u).wrist_rates)
+        turning = [*ZERO, *(-entry for entry in cross(motion.angular, motion.linear))]
+        kept = casadi.vertcat(*(turning[i] for i in self.directions), *[0.0] * len(self.chain.links))
+        symbols = casadi.vertcat(*free_y)
+        turning_by_y = casadi.substitute(casadi.jacobian(kept, symbols), symbols, casadi.vertcat(*y))
+        inputs = casadi.vertcat(*free_u) if free_u else casadi.SX(0, 1)
+        return casadi.jacobian(angles, symbols), casadi.jacobian(angles, inputs), turning_by_y
+
+    def _residual(self, y: Sequence[Scalar]) -> tuple[Matrix, list[Scalar]]:
+        """Forces that given accelerations need, less those that depend on y; and the acceleration symbols."""
+        n = len(self.chain.links)
+        acceleration = [casadi.SX.sym(f"a_{i}") for i in range(6 + n)]
+        motion = self.motion(y)
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
+        needed = minimal.inverse_dynamics(self.chain, rotations, motion.angular, motion.joint_rates, given)
+        tip = self._tip_forces(motion, rotations, self.chain.tip_wrench)
+        passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
+        joints = [
+            bias - other - load for bias, other, load in zip(needed.joints, passive, tip.joints, strict=True)
+        ]
+        forces = [*subtract(needed.force, tip.force), *subtract(needed.torque, tip.torque), *joints]
+        return casadi.vertcat(*forces), acceleration
+
+    def _response(self, mass_matrix: MassMatrix, forces: Sequence[Scalar]) -> list[Scalar]:
+        """Accelerations (free directions, joints) caused by generalized forces (force, torque, joints)."""
+        if all(casadi.SX(entry).is_zero() for entry in forces):
+            return [0.0] * (len(self.directions) + len(self.chain.links))
+        solved = mass_matrix.solve(forces[:3], forces[3:6], forces[6:])
+        dual = [*solved.angular, *solved.linear]
+        return [*(dual[i] for i in self.directions), *solved.joints]
+
+    def _input_response(self, mass_matrix: MassMatrix, index: int) -> Matrix:
+        unit = self.inputs([1.0 if i == index else 0.0 for i in range(self.n_u)])
+        response = self._response(mass_matrix, [*unit.force, *unit.torque, *unit.joint_torques])
+        return casadi.sparsify(casadi.vertcat(*response))
+
+
+def _spread(values: Sequence[Scalar], positions: Sequence[int], size: int) -> list[Scalar]:
+    result: list[Scalar] = [0.0] * size
+    for position, value in zip(positions, values, strict=True):
+        result[position] = value
+    return result
+
+
+def _dense(column: Matrix) -> list[Scalar]:
+    """Entries of a sparse column, with the number zero where nothing is stored."""
+    entries: list[Scalar] = [0.0] * column.shape[0]
+    for row, value in zip(column.row(), column.nonzeros(), strict=True):
+        entries[row] = value
+    return entries

@@ -1,0 +1,429 @@
+"""Functions on states, compiled for one scene: dynamics, steps, derivatives, cost, kinematics.
+
+`compile_scene` returns the `Kernels` of a scene. Nothing is compiled until its first call; what was compiled
+once is kept on disk, and the next process loads it without tracing or compiling, without even importing
+CasADi.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.compiler import native
+from dq_space_arm_env.scene import Scene, load_scene
+from dq_space_arm_env.scene.layout import StateLayout
+
+if TYPE_CHECKING:
+    from dq_space_arm_env.kernels.programs import ScenePrograms
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """An array of a kernel: its name, the scalars in a row, and whether all rows share one."""
+
+    name: str
+    stride: int
+    shared: bool
+
+
+class BoundKernel:
+    """A compiled program with what is known about its arrays.
+
+    Attributes:
+        address: Address of the C function `void (int64 begin, int64 end, const int64 *buffers)`.
+        inputs: Arrays that it reads.
+        outputs: Arrays that it writes.
+        operation_count: Arithmetic operations per row.
+    """
+
+    def __init__(self, kernel: native.NativeKernel) -> None:
+        """Read the notes that the compiler left."""
+        self.native = kernel
+        self.address = kernel.address
+        self.inputs = tuple(ArraySpec(*spec) for spec in kernel.metadata["inputs"])
+        self.outputs = tuple(ArraySpec(*spec) for spec in kernel.metadata["outputs"])
+        self.operation_count: int = kernel.metadata["operations"]
+
+    def __call__(self, arrays: Sequence[Array], rows: int) -> None:
+        """Run on rows 0 .. rows - 1 of C-contiguous float64 arrays, inputs first."""
+        buffers = np.array([array.ctypes.data for array in arrays], dtype=np.int64)
+        self.native.function(0, rows, buffers.ctypes.data)
+
+
+class Kernels:
+    """The compiled functions of a scene.
+
+    Every function takes one state (n_x,) or a batch (B, n_x), and returns results of the same form. Batches
+    run on vector instructions, several states at a time, and give bit for bit what the states give one by
+    one.
+
+    Attributes:
+        scene: The scene.
+        layout: Names, units and places of the entries of states, tangent states and inputs.
+        n_x: Number of states.
+        n_t: Number of tangent coordinates.
+        n_u: Number of inputs.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        """Prepare; nothing is compiled yet.
+
+        Args:
+            scene: A validated scene.
+        """
+        self.scene = scene
+        self.layout = StateLayout.of(scene)
+        self.n_x, self.n_t, self.n_u = self.layout.n_x, self.layout.n_t, self.layout.n_u
+        self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
+
+    @cached_property
+    def _programs(self) -> ScenePrograms:
+        # Imported here: a process that finds all kernels in the cache needs neither CasADi nor the model.
+        from dq_space_arm_env.kernels.programs import ScenePrograms
+
+        return ScenePrograms(self.scene)
+
+    def kernel(self, name: str, *, integrator: str | None = None, lanes: int | None = None) -> BoundKernel:
+        """Compile a program, or load it from the cache.
+
+        Args:
+            name: Name of the program (`kernels.programs.ScenePrograms`).
+            integrator: Integrator of programs that take a step; the scene's by default.
+            lanes: Rows that the code works on at a time: 1, or the processor's vector width (default).
+
+        Returns:
+            The kernel.
+
+        Raises:
+            ValueError: If there is no integrator of that name.
+        """
+        takes_step = name in ("step", "step_with_cost", "environment_step", "linearize")
+        method = (integrator or self.scene.simulation.integrator) if takes_step else ""
+        width = native.host_machine().lanes if lanes is None else lanes
+        key = (name, method, width)
+        if key not in self._kernels:
+            self._kernels[key] = self._load(*key)
+        return self._kernels[key]
+
+    def _load(self, name: str, method: str, lanes: int) -> BoundKernel:
+        parts = (self.scene.content_hash(), _source_hash(), name, method, str(lanes))
+
+        def build() -> tuple[bytes, dict[str, Any]]:
+            from dq_space_arm_env.compiler.build import build_program
+
+            return build_program(self._programs.build(name, method), lanes)
+
+        return BoundKernel(native.load_or_build(name, native.cache_key(*parts), build))
+
+    def operation_count(self, name: str, *, integrator: str | None = None) -> int:
+        """Arithmetic operations of a program per state.
+
+        Args:
+            name: Name of the program.
+            integrator: Integrator of programs that take a step; the scene's by default.
+
+        Returns:
+            The count after folding constants and sharing subexpressions.
+        """
+        return self.kernel(name, integrator=integrator).operation_count
+
+    def _call(
+        self, name: str, integrator: str | None = None, **inputs: ArrayLike | None
+    ) -> tuple[Array, ...]:
+        """Run a program on one row or a batch, and give each output the same form as the inputs."""
+        rows, batched, arrays = _rows_of(inputs)
+        kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)
+        ordered = []
+        for spec in kernel.inputs:
+            array = arrays[spec.name]
+            if array.shape[-1] != spec.stride:
+                raise ValueError(
+                    f"{name}: {spec.name} has {array.shape[-1]} entries per row, "
+                    f"scene {self.scene.name!r} has {spec.stride}"
+                )
+            ordered.append(np.ascontiguousarray(array))
+        results = [np.zeros((rows, spec.stride)) for spec in kernel.outputs]
+        kernel([*ordered, *results], rows)
+        return tuple(result if batched else result[0] for result in results)
+
+    def step(
+        self, x: ArrayLike, u: ArrayLike, dt: float | None = None, integrator: str | None = None
+    ) -> Array:
+        """Advance states by one time step under constant inputs.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x), units of `layout.state`.
+            u: Inputs, shape (n_u,) or (B, n_u), units of `layout.control`; not clipped to the limits.
+            dt: Time step, s; the scene's by default.
+            integrator: Name of the integrator; the scene's by default.
+
+        Returns:
+            States, shape (n_x,) or (B, n_x).
+
+        Raises:
+            ValueError: If shapes do not fit, dt is not a finite number, or the integrator is unknown.
+        """
+        return self._call("step", self._integrator(integrator), x=x, u=u, h=self._time_step(dt))[0]
+
+    def linearize(
+        self, x: ArrayLike, u: ArrayLike, dt: float | None = None, integrator: str | None = None
+    ) -> tuple[Array, Array]:
+        """Exact derivatives of a step in tangent coordinates: dx+ = A dx + B du.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u).
+            dt: Time step, s; the scene's by default.
+            integrator: Name of the integrator; the scene's by default.
+
+        Returns:
+            A, shape (n_t, n_t) or (B, n_t, n_t), and B, shape (n_t, n_u) or (B, n_t, n_u).
+
+        Raises:
+            ValueError: As for `step`.
+        """
+        a, b = self._call("linearize", self._integrator(integrator), x=x, u=u, h=self._time_step(dt))
+        lead = a.shape[:-1]
+        return a.reshape(*lead, self.n_t, self.n_t), b.reshape(*lead, self.n_t, self.n_u)
+
+    def forward_dynamics(self, x: ArrayLike, u: ArrayLike, w_tip: ArrayLike | None = None) -> Array:
+        """Accelerations, eq. (22) in minimal coordinates.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u).
+            w_tip: Force [N], then torque [N m] at the tip in tip axes (16), shape (6,) or (B, 6); the scene's
+                by default.
+
+        Returns:
+            Dual acceleration of the base in base axes, angular [rad/s^2] then linear [m/s^2], then joint
+            accelerations [rad/s^2], shape (6 + n,) or (B, 6 + n); (3 + n) for a planar base.
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        if w_tip is None:
+            return self._call("forward_dynamics", x=x, u=u)[0]
+        return self._call("forward_dynamics_with_tip_wrench", x=x, u=u, w_tip=w_tip)[0]
+
+    def reaction_wrenches(self, x: ArrayLike, u: ArrayLike) -> Array:
+        """The paper's T (21): wrenches of body i on body i+1, in joint axes about the joint origin.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u).
+
+        Returns:
+            fx, fy, fz [N], tx, ty [N m] joint by joint, shape (5 n,) or (B, 5 n).
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self._call("reaction_wrenches", x=x, u=u)[0]
+
+    def tip_pose(self, x: ArrayLike) -> Array:
+        """Pose of the tip q_{G/I}, eq. (27).
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+
+        Returns:
+            Unit dual quaternions, shape (8,) or (B, 8), real part dimensionless, dual part m.
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self._call("tip_pose", x=x)[0]
+
+    def frame_poses(self, x: ArrayLike) -> Array:
+        """Poses of base, joint frames, wrist frame (if any) and tip with respect to the inertial frame.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+
+        Returns:
+            Unit dual quaternions, shape (frames, 8) or (B, frames, 8), real part dimensionless, dual part m.
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        poses = self._call("frame_poses", x=x)[0]
+        return poses.reshape(*poses.shape[:-1], -1, 8)
+
+    def momentum(self, x: ArrayLike) -> Array:
+        """Momentum of the whole system in inertial axes.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+
+        Returns:
+            Linear momentum [kg m/s], then angular momentum about the system's center of mass [kg m^2/s],
+            shape (6,) or (B, 6).
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self._call("momentum", x=x)[0]
+
+    def energy(self, x: ArrayLike) -> Any:
+        """Kinetic energy and the potential energy of joint springs.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+
+        Returns:
+            Energy, J, a number or shape (B,).
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self._call("energy", x=x)[0][..., 0]
+
+    def cost(self, x: ArrayLike, u: ArrayLike) -> Any:
+        """Stage cost of the paper (section V), without a factor dt.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u).
+
+        Returns:
+            Cost, dimensionless, a number or shape (B,).
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self._call("cost", x=x, u=u)[0][..., 0]
+
+    def terminal_cost(self, x: ArrayLike) -> Any:
+        """Terminal cost of the paper (section V).
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+
+        Returns:
+            Cost, dimensionless, a number or shape (B,).
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self._call("terminal_cost", x=x)[0][..., 0]
+
+    def difference(self, x_reference: ArrayLike, x: ArrayLike) -> Array:
+        """Tangent coordinates of x seen from a reference: the inverse of `retract`.
+
+        Args:
+            x_reference: States, shape (n_x,) or (B, n_x).
+            x: States, shape (n_x,) or (B, n_x).
+
+        Returns:
+            Tangent states, shape (n_t,) or (B, n_t), units of `layout.tangent`.
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self._call("difference", x_reference=x_reference, x=x)[0]
+
+    def retract(self, x: ArrayLike, dx: ArrayLike) -> Array:
+        """Move a state along tangent coordinates; the base pose moves by q exp(dx / 2).
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            dx: Tangent states, shape (n_t,) or (B, n_t).
+
+        Returns:
+            States, shape (n_x,) or (B, n_x).
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self._call("retract", x=x, dx=dx)[0]
+
+    def observation(self, x: ArrayLike, time_left: ArrayLike) -> tuple[Array, Array]:
+        """What an agent sees of a state, and the tip's errors.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            time_left: Time to the end of the episode, shape (1,) or (B, 1), s.
+
+        Returns:
+            Observation, entries as documented in `DQSpaceArmEnv`, and (attitude error [rad], position error
+            [m]), shape (2,) or (B, 2).
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        observation, errors = self._call("observation", x=x, time_left=time_left)
+        return observation, errors
+
+    def _integrator(self, name: str | None) -> str | None:
+        from dq_space_arm_env.scene import INTEGRATORS
+
+        if name is not None and name not in INTEGRATORS:
+            raise ValueError(f"integrator: {name!r} is unknown; there are {', '.join(INTEGRATORS)}")
+        return name
+
+    def _time_step(self, dt: float | None) -> Array:
+        step = self.scene.simulation.dt if dt is None else float(dt)
+        if not np.isfinite(step):
+            raise ValueError(f"dt: {step} is not a finite time step in s")
+        return np.array([step])
+
+
+def _rows_of(inputs: dict[str, ArrayLike | None]) -> tuple[int, bool, dict[str, Array]]:
+    """Number of rows, whether there is a batch axis, and every input as an array of that many rows."""
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in inputs.items()}
+    shared = {name: arrays.pop(name) for name in ("h",) if name in arrays}
+    batches = {name: array.shape[0] for name, array in arrays.items() if array.ndim == 2}
+    for name, array in arrays.items():
+        if array.ndim not in (1, 2):
+            raise ValueError(f"{name}: shape {array.shape}, should be (n,) or (B, n)")
+    if len(set(batches.values())) > 1:
+        raise ValueError(f"batches differ in length: {batches}")
+    rows = next(iter(batches.values()), 1)
+    for name, array in arrays.items():
+        arrays[name] = np.broadcast_to(array, (rows, array.shape[-1]))
+    return rows, bool(batches), {**arrays, **shared}
+
+
+@cache
+def _source_hash() -> str:
+    """Hash of the source that kernels are made from, so that a changed model never meets an old kernel."""
+    package = Path(__file__).parent.parent
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        if path.relative_to(package).parts[0] in _MODEL_SOURCES:
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+_MODEL_SOURCES = ("algebra", "compiler", "cost.py", "dynamics", "integrators", "kernels", "scene")
+
+
+@cache
+def _compiled(scene: Scene) -> Kernels:
+    return Kernels(scene)
+
+
+def compile_scene(scene: Scene | str | Path) -> Kernels:
+    """Kernels of a scene; the same scene gives the same object within a process.
+
+    Args:
+        scene: A scene, the name of a shipped one, or a path to a YAML file.
+
+    Returns:
+        The kernels. Each is compiled at its first use, or loaded from the disk cache.
+
+    Raises:
+        SceneError: If the scene cannot be loaded.
+    """
+    return _compiled(load_scene(scene))

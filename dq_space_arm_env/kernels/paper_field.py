@@ -1,0 +1,141 @@
+"""The paper's own formulation as a vector field: 46 redundant states, and the tip's pose appended as 8 more.
+
+It exists for comparison: the dual velocities of all bodies are integrated side by side, and only the constraint on their
+accelerations keeps the arm together. `SpaceArmField` gives the same motion from 23 numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi
+
+from dq_space_arm_env.algebra import vectors
+from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
+from dq_space_arm_env.dynamics.newton_euler import PaperState, SchurComplement
+from dq_space_arm_env.kernels.field import Inputs, SpaceArmField
+
+Scalar = Any
+Matrix = Any
+
+
+class PaperField:
+    """Vector field of the paper's state with the tip's pose appended; implements `integrators.VectorField`.
+
+    For three links and a wrist: base pose (8), joint angles (3), wrist angles (3), dual velocities of the four
+    bodies (32), q_{G/I} (8).
+    """
+
+    name = "paper"
+    n_pose = 0  # the pose is integrated number by number, like everything else
+    directions: tuple[int, ...] = ()
+    twist_indices: tuple[int, ...] = ()
+
+    def __init__(self, minimal_field: SpaceArmField) -> None:
+        """Take over robot and inputs.
+
+        Args:
+            minimal_field: The same scene in minimal coordinates.
+        """
+        self.minimal = minimal_field
+        self.chain = minimal_field.chain
+        self.n_u = minimal_field.n_u
+        n = len(self.chain.links)
+        self._positions = 8 + n + (0 if self.chain.wrist is None else 3)
+        self.tip = slice(self._positions + 8 * (n + 1), self._positions + 8 * (n + 2))
+        self.base_twist = (*range(self._positions + 1, self._positions + 4), *range(self._positions + 5, self._positions + 8))
+        self.n_x = self.n_y = self.tip.stop
+        self.rate_indices = tuple(range(self._positions, self.tip.start))
+
+    def state_from_minimal(self, x: Sequence[Scalar]) -> list[Scalar]:
+        """The redundant state that describes the same motion.
+
+        Args:
+            x: State in minimal coordinates, n_x.
+
+        Returns:
+            State of the paper with the tip's pose appended.
+        """
+        field, chain = self.minimal, self.chain
+        pose = field.full_pose(x[: field.n_pose])
+        motion = field.motion(x[field.n_pose :])
+        rotations = minimal.joint_rotations(chain, motion.joint_angles)
+        velocities = kinematics.body_velocities(
+            chain, rotations, (*motion.angular, *motion.linear), motion.joint_rates
+        )
+        duals: list[Scalar] = []
+        for body, velocity in zip([chain.base, *(link.body for link in chain.links)], velocities, strict=True):
+            at_center = vectors.add(velocity.linear, vectors.cross(velocity.angular, body.center_of_mass))
+            duals += [0.0, *velocity.angular, 0.0, *at_center]
+        tip = kinematics.tip_pose(chain, pose, motion.joint_angles, motion.wrist_angles)
+        return [*pose, *motion.joint_angles, *motion.wrist_angles, *duals, *tip]
+
+    def _parts(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> tuple[PaperState, Inputs]:
+        return PaperState.from_vector(self.chain, y[: self.tip.start]), self.minimal.inputs(u)
+
+    def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
+        """Time derivative of the state: (11), (12), (22), and (30) for the tip."""
+        state, inputs = self._parts(y, u)
+        base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
+        rates, _ = newton_euler.paper_rates(
+            self.chain, state, base_wrench, inputs.joint_torques, inputs.wrist_rates
+        )
+        return [*rates, *newton_euler.paper_tip_rate(self.chain, state, inputs.wrist_rates)]
+
+    def linearized_rates(
+        self, y: Sequence[Scalar], u: Sequence[Scalar]
+    ) -> tuple[list[Scalar], Matrix, Matrix]:
+        """Time derivative of the state and its Jacobians, by differentiating (20) at its solution.
+
+        Args:
+            y: State, n_y symbols.
+            u: Input, n_u symbols.
+
+        Returns:
+            Rates (n_y), Jacobian with respect to y (n_y, n_y), Jacobian with respect to u (n_y, n_u).
+        """
+        symbols = casadi.vertcat(*y, *u)
+        state, inputs = self._parts(y, u)
+        base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
+        system = newton_euler.system_of(self.chain, state, base_wrench, inputs.joint_torques)
+        schur = SchurComplement(self.chain, system)
+        accelerations, reactions = schur.solve(system.b1, system.b2)
+        residual, unknowns = _residual(system)
+        change = casadi.substitute(
+            casadi.jacobian(residual, symbols), unknowns, casadi.vertcat(*accelerations, *reactions)
+        )
+        columns = []
+        for index in range(change.shape[1]):
+            column = change[:, index]
+            if column.nnz() == 0:
+                columns.append(casadi.SX(len(accelerations), 1))
+                continue
+            right = [-entry for entry in casadi.vertsplit(casadi.densify(column))]
+            response, _ = schur.solve(right[: len(accelerations)], right[len(accelerations) :])
+            columns.append(casadi.sparsify(casadi.vertcat(*response)))
+        positions = newton_euler.paper_position_rates(self.chain, state, inputs.wrist_rates)
+        tip = newton_euler.paper_tip_rate(self.chain, state, inputs.wrist_rates)
+        rates = [*positions, *accelerations, *tip]
+        jacobian = casadi.vertcat(
+            casadi.jacobian(casadi.vertcat(*positions), symbols),
+            casadi.horzcat(*columns),
+            casadi.jacobian(casadi.vertcat(*tip), symbols),
+        )
+        return rates, jacobian[:, : self.n_y], jacobian[:, self.n_y :]
+
+
+def _residual(system: newton_euler.NewtonEulerSystem) -> tuple[Matrix, Matrix]:
+    """S [ydot; T] - B of (20) with ydot and T as symbols, and these symbols."""
+    unknowns = casadi.SX.sym("unknown", len(system.b1) + len(system.b2))
+    ydot, reactions = unknowns[: len(system.b1)], unknowns[len(system.b1) :]
+
+    def matrix(rows: Sequence[Sequence[Scalar]]) -> Matrix:
+        return casadi.sparsify(casadi.vertcat(*(casadi.horzcat(*row) for row in rows)))
+
+    bodies = casadi.mtimes(matrix(system.s11), ydot) - casadi.vertcat(*system.b1)
+    if not system.b2:
+        return bodies, unknowns
+    bodies += casadi.mtimes(matrix(system.s12), reactions)
+    constraints = casadi.mtimes(matrix(system.s21), ydot) - casadi.vertcat(*system.b2)
+    return casadi.vertcat(bodies, constraints), unknowns

@@ -1,0 +1,412 @@
+"""The programs of a scene: one for each thing that a user may ask of it, traced only when asked for.
+
+A program's inputs are arrays with one row per state: `x` (n_x), `u` (n_u), and what else its name calls for;
+`h`, the time step in s, is shared by all rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import casadi
+import numpy as np
+
+from dq_space_arm_env.algebra import dual_matrices, poses, screw
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra.vectors import matrix_vector
+from dq_space_arm_env.compiler.graph import graph_of, trace
+from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.cost import weighted_square
+from dq_space_arm_env.dynamics import kinematics, minimal
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.integrators import INTEGRATORS
+from dq_space_arm_env.integrators.field import move_pose
+from dq_space_arm_env.kernels.field import SpaceArmField
+from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.scene.schema import Scene
+
+Scalar = Any
+Scalars = Sequence[Scalar]
+
+
+class ScenePrograms:
+    """Builds the programs of one scene by name."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Collect the scene's constants.
+
+        Args:
+            scene: A validated scene.
+        """
+        self.scene = scene
+        self.chain = Chain.from_scene(scene)
+        self.layout = StateLayout.of(scene)
+        self.field = SpaceArmField(self.chain, self.layout)
+        self._builders: Mapping[str, Callable[[], Program]] = {
+            "forward_dynamics": self._forward_dynamics,
+            "forward_dynamics_with_tip_wrench": self._forward_dynamics_with_tip_wrench,
+            "reaction_wrenches": self._reaction_wrenches,
+            "tip_pose": self._tip_pose,
+            "frame_poses": self._frame_poses,
+            "momentum": self._momentum,
+            "energy": self._energy,
+            "cost": self._cost,
+            "terminal_cost": self._terminal_cost,
+            "cost_derivatives": self._cost_derivatives,
+            "terminal_cost_derivatives": self._terminal_cost_derivatives,
+            "difference": self._difference,
+            "retract": self._retract,
+            "observation": self._observation,
+        }
+
+    def build(self, name: str, integrator: str = "") -> Program:
+        """Trace a program.
+
+        Args:
+            name: `step`, `step_with_cost`, `environment_step`, `linearize`, or one of the functions of a
+                state.
+            integrator: Name of the integrator, for those that take a step.
+
+        Returns:
+            The program.
+
+        Raises:
+            KeyError: If there is no such program or integrator.
+        """
+        if name in ("step", "step_with_cost", "environment_step"):
+            return self._step(name, integrator)
+        if name == "linearize":
+            return self._linearize(integrator)
+        return self._builders[name]()
+
+    # Functions of a state, and of an input.
+
+    def _program(self, name: str, outputs: Callable[..., Mapping[str, Scalars]], **sizes: int) -> Program:
+        """A program of a single graph."""
+        graph = trace(name + "_graph", sizes, outputs)
+        program = Program(
+            name,
+            [Buffer(key, size) for key, size in graph.inputs],
+            [Buffer(key, size) for key, size in graph.outputs],
+        )
+        program.call(graph)
+        return program
+
+    def _y(self, x: Scalars) -> Scalars:
+        return x[self.field.n_pose :]
+
+    def _base_pose(self, x: Scalars) -> Scalars:
+        return self.field.full_pose(x[: self.field.n_pose])
+
+    def _forward_dynamics(self) -> Program:
+        field = self.field
+        return self._program(
+            "forward_dynamics",
+            lambda x, u: {"accelerations": field.accelerations(self._y(x), u)},
+            x=field.n_x,
+            u=field.n_u,
+        )
+
+    def _forward_dynamics_with_tip_wrench(self) -> Program:
+        field = self.field
+        return self._program(
+            "forward_dynamics_with_tip_wrench",
+            lambda x, u, w_tip: {"accelerations": field.accelerations(self._y(x), u, w_tip)},
+            x=field.n_x,
+            u=field.n_u,
+            w_tip=6,
+        )
+
+    def _reaction_wrenches(self) -> Program:
+        field = self.field
+        return self._program(
+            "reaction_wrenches",
+            lambda x, u: {"wrenches": field.reaction_wrenches(self._y(x), u)},
+            x=field.n_x,
+            u=field.n_u,
+        )
+
+    def _tip(self, x: Scalars) -> Scalars:
+        motion = self.field.motion(self._y(x))
+        return kinematics.tip_pose(self.chain, self._base_pose(x), motion.joint_angles, motion.wrist_angles)
+
+    def _tip_pose(self) -> Program:
+        return self._program("tip_pose", lambda x: {"pose": self._tip(x)}, x=self.field.n_x)
+
+    def _frame_poses(self) -> Program:
+        def outputs(x: Scalars) -> Mapping[str, Scalars]:
+            motion = self.field.motion(self._y(x))
+            frames = kinematics.frame_poses(
+                self.chain, self._base_pose(x), motion.joint_angles, motion.wrist_angles
+            )
+            return {"poses": [entry for frame in frames for entry in frame]}
+
+        return self._program("frame_poses", outputs, x=self.field.n_x)
+
+    def _velocities(self, x: Scalars) -> tuple[Any, Any, Any]:
+        motion = self.field.motion(self._y(x))
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        velocities = kinematics.body_velocities(
+            self.chain, rotations, (*motion.angular, *motion.linear), motion.joint_rates
+        )
+        return motion, rotations, velocities
+
+    def _momentum(self) -> Program:
+        def outputs(x: Scalars) -> Mapping[str, Scalars]:
+            _, rotations, velocities = self._velocities(x)
+            linear, angular, _ = kinematics.momentum(self.chain, rotations, velocities)
+            attitude, _ = poses.to_matrix(self._base_pose(x))
+            return {"momentum": [*matrix_vector(attitude, linear), *matrix_vector(attitude, angular)]}
+
+        return self._program("momentum", outputs, x=self.field.n_x)
+
+    def _energy(self) -> Program:
+        def outputs(x: Scalars) -> Mapping[str, Scalars]:
+            motion, _, velocities = self._velocities(x)
+            kinetic, potential = kinematics.energy(self.chain, motion.joint_angles, velocities)
+            return {"energy": [kinetic + potential]}
+
+        return self._program("energy", outputs, x=self.field.n_x)
+
+    # The cost and its derivatives.
+
+    def _pose_cost(self, tip: Scalars, weights: Scalars) -> Scalar:
+        return weighted_square(tip, self.scene.target.pose.dual_quaternion, weights)
+
+    def _velocity_cost(self, x: Scalars, weights: Scalars) -> Scalar:
+        motion = self.field.motion(self._y(x))
+        return weighted_square((*motion.angular, *motion.linear), self.scene.target.base_velocity, weights)
+
+    def _cost_terms(self, x: Scalars, u: Scalars) -> list[Scalar]:
+        """Pose, base velocity and effort: the terms of the stage cost."""
+        cost = self.scene.cost
+        effort = weighted_square(u, [0.0] * self.field.n_u, self.layout.control_weight.tolist())
+        return [
+            self._pose_cost(self._tip(x), cost.pose),
+            self._velocity_cost(x, cost.base_velocity),
+            effort,
+        ]
+
+    def _terminal_cost_terms(self, x: Scalars) -> list[Scalar]:
+        cost = self.scene.cost
+        return [
+            self._pose_cost(self._tip(x), cost.terminal_pose),
+            self._velocity_cost(x, cost.terminal_base_velocity),
+        ]
+
+    def _cost(self) -> Program:
+        field = self.field
+        return self._program(
+            "cost", lambda x, u: {"cost": [_sum(self._cost_terms(x, u))]}, x=field.n_x, u=field.n_u
+        )
+
+    def _terminal_cost(self) -> Program:
+        return self._program(
+            "terminal_cost", lambda x: {"cost": [_sum(self._terminal_cost_terms(x))]}, x=self.field.n_x
+        )
+
+    def _state_cost_derivatives(self, x: Scalars, pose: Scalars, velocity: Scalars) -> tuple[Any, Any]:
+        """Gradient and Gauss-Newton Hessian of the state's cost in tangent coordinates, sparse SX.
+
+        The tip's pose moves with the base by q_{e0/I} d q_{G/e0} / 2 for a twist increment d, with the angles
+        by (27).
+        """
+        field = self.field
+        motion = field.motion(self._y(x))
+        arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
+        base = self._base_pose(x)
+        tip = dq.multiply(base, arm)
+        angles = casadi.vertcat(*x[field.n_pose : field.n_pose + self._angle_count()])
+        left, right = dual_matrices.left_matrix(base), dual_matrices.right_matrix(arm)
+        columns = []
+        for direction in field.directions:
+            twist = [0.0] * 8
+            twist[(1, 2, 3, 5, 6, 7)[direction]] = 0.5
+            moved = dual_matrices.matrix_multiply(left, dual_matrices.matrix_multiply(right, twist))
+            columns.append(casadi.vertcat(*moved))
+        by_angles = casadi.mtimes(_matrix(left), casadi.jacobian(casadi.vertcat(*arm), angles))
+        by_state = casadi.sparsify(
+            casadi.horzcat(*columns, by_angles, casadi.SX(8, field.n_t - len(columns) - self._angle_count()))
+        )
+        error = casadi.vertcat(*tip) - casadi.DM(self.scene.target.pose.dual_quaternion)
+        weighted = casadi.mtimes(casadi.diag(casadi.DM(pose)), by_state)
+        gradient = 2.0 * casadi.mtimes(weighted.T, error)
+        hessian = 2.0 * casadi.mtimes(by_state.T, weighted)
+        start = field.n_t - field.n_y
+        for index, direction in zip(field.twist_indices, field.directions, strict=True):
+            weight = velocity[direction]
+            deviation = x[field.n_pose + index] - self.scene.target.base_velocity[direction]
+            gradient[start + index] += 2.0 * weight * deviation
+            hessian[start + index, start + index] += 2.0 * weight
+        return gradient, casadi.sparsify(hessian)
+
+    def _angle_count(self) -> int:
+        return self.layout.n_joints + (3 if self.layout.has_wrist else 0)
+
+    def _cost_derivatives(self) -> Program:
+        field, cost = self.field, self.scene.cost
+        x, u = _symbols("x", field.n_x), _symbols("u", field.n_u)
+        gradient, hessian = self._state_cost_derivatives(x, cost.pose, cost.base_velocity)
+        weights = (2.0 * self.layout.control_weight).tolist()
+        outputs = {
+            "lx": casadi.densify(gradient).nonzeros(),
+            "lu": [weight * value for weight, value in zip(weights, u, strict=True)],
+            "lxx": hessian.nonzeros(),
+            "luu": weights,
+        }
+        graph = graph_of("cost_derivatives_graph", {"x": x, "u": u}, outputs)
+        n_t, n_u = field.n_t, field.n_u
+        diagonal = tuple(range(0, n_u * n_u, n_u + 1))
+        program = Program(
+            "cost_derivatives",
+            [Buffer("x", field.n_x), Buffer("u", n_u)],
+            [
+                Buffer("lx", n_t),
+                Buffer("lu", n_u),
+                _sparse_buffer("lxx", hessian.sparsity()),
+                Buffer("luu", n_u, positions=diagonal, stride=n_u * n_u),
+            ],
+        )
+        program.call(graph)
+        return program
+
+    def _terminal_cost_derivatives(self) -> Program:
+        field, cost = self.field, self.scene.cost
+        x = _symbols("x", field.n_x)
+        gradient, hessian = self._state_cost_derivatives(x, cost.terminal_pose, cost.terminal_base_velocity)
+        outputs = {"lx": casadi.densify(gradient).nonzeros(), "lxx": hessian.nonzeros()}
+        graph = graph_of("terminal_cost_derivatives_graph", {"x": x}, outputs)
+        program = Program(
+            "terminal_cost_derivatives",
+            [Buffer("x", field.n_x)],
+            [Buffer("lx", field.n_t), _sparse_buffer("lxx", hessian.sparsity())],
+        )
+        program.call(graph)
+        return program
+
+    # Tangent coordinates.
+
+    def _difference(self) -> Program:
+        field = self.field
+
+        def outputs(x_reference: Scalars, x: Scalars) -> Mapping[str, Scalars]:
+            relative = dq.multiply(dq.conjugate(self._base_pose(x_reference)), self._base_pose(x))
+            twist = screw.logarithm(relative)
+            rest = [a - b for a, b in zip(self._y(x), self._y(x_reference), strict=True)]
+            return {"dx": [*(twist[i] for i in field.directions), *rest]}
+
+        return self._program("difference", outputs, x_reference=field.n_x, x=field.n_x)
+
+    def _retract(self) -> Program:
+        field = self.field
+
+        def outputs(x: Scalars, dx: Scalars) -> Mapping[str, Scalars]:
+            n = len(field.directions)
+            pose = move_pose(field, x[: field.n_pose], field.full_twist(dx[:n]))
+            return {"x_next": [*pose, *(a + b for a, b in zip(self._y(x), dx[n:], strict=True))]}
+
+        return self._program("retract", outputs, x=field.n_x, dx=field.n_t)
+
+    # What an agent sees.
+
+    def _observe(self, x: Scalars, time_left: Scalar) -> dict[str, Scalars]:
+        """Observation, attitude error in rad and position error in m."""
+        tip, target = self._tip(x), self.scene.target.pose.dual_quaternion
+        error = poses.error_pose(tip, target)  # (31)
+        motion = self.field.motion(self._y(x))
+        layout = self.layout
+        observation = [
+            *error,
+            *(x[layout.state.base_velocity]),
+            *motion.joint_angles,
+            *motion.wrist_angles,
+            *motion.joint_rates,
+            time_left,
+        ]
+        return {
+            "observation": self._keep(observation),
+            "errors": [poses.error_angle(tip, target), poses.error_distance(tip, target)],
+        }
+
+    def _keep(self, observation: list[Scalar]) -> list[Scalar]:
+        """Leave out what a planar scene's error pose has identically zero."""
+        if not self.chain.planar:
+            return observation
+        return [*self.field.stored_pose(observation[:8]), *observation[8:]]
+
+    def _observation(self) -> Program:
+        return self._program(
+            "observation",
+            lambda x, time_left: self._observe(x, time_left[0]),
+            x=self.field.n_x,
+            time_left=1,
+        )
+
+    # Steps.
+
+    def _step(self, name: str, integrator: str) -> Program:
+        """A step alone, with its cost, or with everything that the environment reports."""
+        field = self.field
+        x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
+        program = Program(name, [x, u, h], [Buffer("x_next", field.n_x)])
+        if name == "environment_step":
+            program.inputs = [x, u, h, Buffer("time_left", 1)]
+        INTEGRATORS[integrator].append_step(program, field)
+        if name == "step_with_cost":
+            sizes = {"x": field.n_x, "u": field.n_u}
+            program.call(trace("cost_graph", sizes, lambda x, u: {"cost": [_sum(self._cost_terms(x, u))]}))
+            program.outputs = [*program.outputs, Buffer("cost", 1)]
+        elif name == "environment_step":
+            self._append_report(program)
+        return program
+
+    def _append_report(self, program: Program) -> None:
+        field = self.field
+        sizes = {"x": field.n_x, "u": field.n_u}
+        program.call(trace("terms_graph", sizes, lambda x, u: {"terms": self._cost_terms(x, u)}))
+        after = trace(
+            "report_graph",
+            {"x_next": field.n_x, "time_left": 1},
+            lambda x_next, time_left: {
+                **self._observe(x_next, time_left[0]),
+                "terminal_terms": self._terminal_cost_terms(x_next),
+            },
+        )
+        program.call(after)
+        reported = [("terms", 3), *after.outputs]
+        program.outputs = [*program.outputs, *(Buffer(name, size) for name, size in reported)]
+
+    def _linearize(self, integrator: str) -> Program:
+        field = self.field
+        program = Program(
+            "linearize",
+            [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)],
+            [],
+        )
+        a, b = INTEGRATORS[integrator].append_linearization(program, field)
+        program.outputs = [_sparse_buffer("A", a), _sparse_buffer("B", b)]
+        return program
+
+
+def _sum(terms: Scalars) -> Scalar:
+    total: Scalar = 0.0
+    for term in terms:
+        total = total + term
+    return total
+
+
+def _symbols(name: str, size: int) -> list[Scalar]:
+    return [casadi.SX.sym(f"{name}_{i}") for i in range(size)]
+
+
+def _matrix(rows: Sequence[Scalars]) -> Any:
+    return casadi.sparsify(casadi.vertcat(*(casadi.horzcat(*row) for row in rows)))
+
+
+def _sparse_buffer(name: str, pattern: Any) -> Buffer:
+    """An output that fills the nonzeros of a row-major matrix; the rest of the array stays as it is."""
+    rows, columns = pattern.get_triplet()
+    count, width = pattern.shape
+    positions = np.array(rows, dtype=int) * width + np.array(columns, dtype=int)
+    return Buffer(name, pattern.nnz(), positions=tuple(positions.tolist()), stride=count * width)

@@ -1,0 +1,122 @@
+"""The compiled dynamics of every shipped scene against the paper's Newton-Euler system (13)-(22), in plain numbers."""
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env import list_scenes
+from dq_space_arm_env.algebra import poses, vectors
+from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.kernels.field import SpaceArmField
+
+
+def relative_error(actual, expected):
+    return np.linalg.norm(np.asarray(actual) - expected) / max(np.linalg.norm(expected), 1e-300)
+
+
+def paper_solution(kernels, x, u):
+    """Dual accelerations of base and joints, and reaction wrenches, from the paper's system."""
+    chain = Chain.from_scene(kernels.scene)
+    field = SpaceArmField(chain, kernels.layout)
+    motion, inputs = field.motion(x[field.n_pose :].tolist()), field.inputs(u.tolist())
+    rotations = minimal.joint_rotations(chain, motion.joint_angles)
+    velocities = kinematics.body_velocities(
+        chain, rotations, (*motion.angular, *motion.linear), motion.joint_rates
+    )
+    bodies = [chain.base, *(link.body for link in chain.links)]
+    duals = [
+        (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
+        for body, v in zip(bodies, velocities, strict=True)
+    ]
+    pose = field.full_pose(x[: field.n_pose].tolist())
+    state = newton_euler.PaperState(pose, motion.joint_angles, motion.wrist_angles, duals)
+    base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
+    rates, reactions = newton_euler.paper_rates(
+        chain, state, base_wrench, inputs.joint_torques, inputs.wrist_rates
+    )
+    accelerations = [tuple(body) for body in np.reshape(rates[-8 * len(bodies) :], (-1, 8))]
+    frames = newton_euler.joint_frames(chain, motion.joint_angles, motion.wrist_angles)
+    joints = [newton_euler.joint_velocity(frames, j, accelerations)[3] for j in range(len(chain.links))]
+    base = np.array([*accelerations[0][1:4], *accelerations[0][5:8]])
+    return np.array([*base[list(field.directions)], *joints]), np.array(reactions)
+
+
+@pytest.mark.parametrize("scene", list_scenes())
+def test_minimal_coordinates_and_the_papers_system_agree_to_1e_12(scene, draw):
+    kernels, states, inputs = draw(scene, 30)
+    accelerations = kernels.forward_dynamics(states, inputs)
+    wrenches = kernels.reaction_wrenches(states, inputs)
+    for x, u, a, w in zip(states, inputs, accelerations, wrenches, strict=True):
+        expected_a, expected_w = paper_solution(kernels, x, u)
+        assert relative_error(a, expected_a) < 1e-12
+        assert relative_error(w, expected_w) < 1e-12
+
+
+def test_springs_and_dampers_agree_with_the_papers_system(draw):
+    from dq_space_arm_env import load_scene
+
+    paper = load_scene("paper")
+    links = [
+        {**link.model_dump(), "stiffness": 3.0 + i, "rest_angle": 0.2, "damping": 0.7}
+        for i, link in enumerate(paper.links)
+    ]
+    scene = paper.replace(links=links)
+    kernels, states, inputs = draw(scene, 10)
+    for x, u, a in zip(states, inputs, kernels.forward_dynamics(states, inputs), strict=True):
+        assert relative_error(a, paper_solution(kernels, x, u)[0]) < 1e-12
+    limp = paper.replace(links=[link.model_dump() for link in paper.links])
+    assert not np.allclose(a, draw(limp, 1)[0].forward_dynamics(x, u))
+
+
+def test_a_wrench_at_the_tip_given_to_the_call_replaces_the_scenes(draw):
+    kernels, states, inputs = draw("tip-load", 5)
+    wrench = kernels.scene.tip_wrench
+    own = kernels.forward_dynamics(states, inputs)
+    given = kernels.forward_dynamics(states, inputs, w_tip=[*wrench.force, *wrench.torque])
+    np.testing.assert_allclose(given, own, rtol=1e-13, atol=1e-13)
+    assert not np.allclose(kernels.forward_dynamics(states, inputs, w_tip=np.zeros(6)), own)
+
+
+def test_base_pose_and_velocity_do_not_change_the_motion(draw):
+    kernels, states, inputs = draw("paper", 10)
+    moved = states.copy()
+    moved[:, kernels.layout.state.pose] = states[::-1, kernels.layout.state.pose]
+    np.testing.assert_array_equal(
+        kernels.forward_dynamics(moved, inputs), kernels.forward_dynamics(states, inputs)
+    )
+
+
+@pytest.mark.parametrize("scene", list_scenes())
+def test_frame_poses_end_at_the_tip_27(scene, draw):
+    kernels, states, _ = draw(scene, 10)
+    frames, tips = kernels.frame_poses(states), kernels.tip_pose(states)
+    expected_frames = 2 + len(kernels.scene.links) + (kernels.scene.wrist is not None)
+    assert frames.shape == (10, expected_frames, 8)
+    np.testing.assert_allclose(frames[:, -1], tips, atol=1e-13)
+
+
+def test_cost_terms_follow_the_papers_formula(draw):
+    kernels, states, inputs = draw("paper", 20)
+    target = np.array([0.5, 0.5, -0.5, -0.5, 0.25, 2.25, 0.25, 2.25])
+    effort = np.diag([10.0] * 3 + [1.0] * 3 + [0.01] * 3 + [0.1] * 3)
+    tips = kernels.tip_pose(states)
+    twists = states[:, kernels.layout.state.base_velocity]
+    for x, u, q, w in zip(states, inputs, tips, twists, strict=True):
+        stage = 15.0 * (q - target) @ (q - target) + w @ w + u @ effort @ u
+        assert kernels.cost(x, u) == pytest.approx(stage, rel=1e-13)
+        assert kernels.terminal_cost(x) == pytest.approx(
+            150.0 * (q - target) @ (q - target) + w @ w, rel=1e-13
+        )
+
+
+def test_start_of_the_paper_scene_is_where_the_design_says(draw):
+    kernels, _, _ = draw("paper", 1)
+    x = kernels.layout.initial_state
+    _, (angle, distance) = kernels.observation(x, [0.0])
+    assert np.degrees(angle) == pytest.approx(74.4, abs=0.05)
+    assert distance == pytest.approx(1.330, abs=0.0005)
+    target = kernels.scene.target.pose.dual_quaternion
+    assert np.dot(kernels.tip_pose(x)[:4], target[:4]) >= 0.0
+    desired_axes = np.array(poses.to_matrix(target)[0]).T
+    np.testing.assert_allclose(desired_axes, [[0, -1, 0], [0, 0, 1], [-1, 0, 0]], atol=1e-15)
+    np.testing.assert_allclose(poses.position(target), [0.0, -4.0, 5.0], atol=1e-15)

@@ -1,0 +1,134 @@
+"""What a caller of the kernels sees: shapes, errors, bit equality of batches, and how much each scene needs."""
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env import compile_scene, list_scenes, load_scene
+from dq_space_arm_env.scene import INTEGRATORS as SCENE_INTEGRATORS
+
+
+def test_the_schema_knows_the_integrators_there_are():
+    from dq_space_arm_env.integrators import INTEGRATORS
+
+    assert set(SCENE_INTEGRATORS) == set(INTEGRATORS)
+
+
+@pytest.mark.parametrize("scene", list_scenes())
+def test_batches_give_the_bits_of_single_states(scene, draw):
+    kernels, states, inputs = draw(scene, 11)
+    functions = {
+        "step": kernels.step,
+        "forward_dynamics": kernels.forward_dynamics,
+        "cost": kernels.cost,
+        "tip_pose": lambda x, u: kernels.tip_pose(x),
+        "momentum": lambda x, u: kernels.momentum(x),
+        "energy": lambda x, u: kernels.energy(x),
+    }
+    for name, function in functions.items():
+        batch = function(states, inputs)
+        single = [function(x, u) for x, u in zip(states, inputs, strict=True)]
+        np.testing.assert_array_equal(batch, single, err_msg=name)
+
+
+def test_results_have_the_form_of_the_arguments(draw):
+    kernels, states, inputs = draw("paper", 3)
+    assert kernels.step(states[0], inputs[0]).shape == (23,)
+    assert kernels.step(states, inputs).shape == (3, 23)
+    assert kernels.step(states[:1], inputs[:1]).shape == (1, 23)
+    assert kernels.step(states, inputs[0]).shape == (3, 23)
+    a, b = kernels.linearize(states, inputs)
+    assert (a.shape, b.shape) == ((3, 21, 21), (3, 21, 12))
+    assert kernels.cost(states, inputs).shape == (3,)
+    assert np.ndim(kernels.cost(states[0], inputs[0])) == 0
+    assert kernels.reaction_wrenches(states, inputs).shape == (3, 15)
+    assert kernels.momentum(states[0]).shape == (6,)
+
+
+def test_inputs_are_not_changed_and_need_not_be_contiguous(draw):
+    kernels, states, inputs = draw("paper", 8)
+    before = states.copy()
+    strided = np.repeat(states, 2, axis=1)[:, ::2]
+    np.testing.assert_array_equal(kernels.step(strided, inputs), kernels.step(states, inputs))
+    np.testing.assert_array_equal(states, before)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda k, x, u: k.step(x[:-1], u), "x has 22 entries per row, scene 'paper' has 23"),
+        (lambda k, x, u: k.step(x, u[:-1]), "u has 11 entries per row, scene 'paper' has 12"),
+        (lambda k, x, u: k.step(x[None, None], u), r"x: shape \(1, 1, 23\)"),
+        (lambda k, x, u: k.step(np.tile(x, (2, 1)), np.tile(u, (3, 1))), "batches differ in length"),
+        (lambda k, x, u: k.step(x, u, integrator="rk5"), "integrator: 'rk5' is unknown; there are .*rk4"),
+        (lambda k, x, u: k.step(x, u, dt=float("nan")), "dt: nan is not a finite time step"),
+    ],
+)
+def test_wrong_arguments_are_named(call, message, draw):
+    kernels, states, inputs = draw("paper", 1)
+    with pytest.raises(ValueError, match=message):
+        call(kernels, states[0], inputs[0])
+
+
+def test_the_same_scene_gives_the_same_kernels():
+    assert compile_scene("paper") is compile_scene(load_scene("paper"))
+
+
+def test_difference_and_retraction_are_inverse(draw):
+    for scene in ("paper", "planar"):
+        kernels, states, _ = draw(scene, 20)
+        dx = np.random.default_rng(5).normal(size=(20, kernels.n_t)) * 0.5
+        moved = kernels.retract(states, dx)
+        np.testing.assert_allclose(kernels.difference(states, moved), dx, atol=2e-13)
+
+
+def size_of(scene):
+    kernels = compile_scene(scene)
+    return {
+        "states": kernels.n_x,
+        "inputs": kernels.n_u,
+        "dynamics": kernels.operation_count("forward_dynamics"),
+        "step": kernels.operation_count("step", integrator="rk4"),
+    }
+
+
+def test_what_a_scene_does_not_need_is_not_there():
+    sizes = {scene: size_of(scene) for scene in list_scenes()}
+    paper = sizes["paper"]
+    expected = {
+        "paper": (23, 12),
+        "far": (23, 12),
+        "tumbling": (23, 12),
+        "tip-load": (23, 12),
+        "free-floating": (23, 6),
+        "reaction-wheels": (23, 9),
+        "no-wrist": (20, 9),
+        "payload": (20, 9),
+        "planar": (13, 6),
+        "six-joint": (26, 12),
+    }
+    assert {name: (size["states"], size["inputs"]) for name, size in sizes.items()} == expected
+    # Leaving out actuators, the wrist, or dimensions of space leaves out operations; more joints or a load add some.
+    for smaller in ("free-floating", "reaction-wheels", "planar"):
+        assert sizes[smaller]["dynamics"] < paper["dynamics"], smaller
+    for smaller in ("free-floating", "reaction-wheels", "no-wrist", "planar"):
+        assert sizes[smaller]["step"] < paper["step"], smaller
+    assert sizes["free-floating"]["dynamics"] < sizes["reaction-wheels"]["dynamics"]
+    assert sizes["planar"]["step"] < 0.4 * paper["step"]
+    assert sizes["tip-load"]["dynamics"] > paper["dynamics"]
+    assert sizes["six-joint"]["dynamics"] > paper["dynamics"]
+    assert sizes["far"] == paper
+
+
+def test_a_feature_removed_from_the_paper_scene_pays():
+    paper = load_scene("paper")
+    whole = size_of(paper)
+    without_force = paper.actuators.model_copy(update={"base_force": None})
+    smaller = size_of(paper.replace(actuators=without_force))
+    assert smaller["inputs"] == whole["inputs"] - 3
+    assert smaller["dynamics"] < whole["dynamics"]
+    locked = [link.model_dump() | {"actuated": i > 0} for i, link in enumerate(paper.links)]
+    passive = size_of(paper.replace(links=locked))
+    assert passive["inputs"] == whole["inputs"] - 1
+    assert passive["dynamics"] <= whole["dynamics"]
+    springs = [link.model_dump() | {"stiffness": 1.0} for link in paper.links]
+    assert size_of(paper.replace(links=springs))["dynamics"] > whole["dynamics"]
