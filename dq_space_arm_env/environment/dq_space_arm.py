@@ -1,0 +1,391 @@
+"""The environment `DQSpaceArm-v0`: a spacecraft moves so that the tip of its arm reaches a given pose and rests there."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import EzPickle
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.algebra import dual_quaternion, poses
+from dq_space_arm_env.kernels import compile_scene
+from dq_space_arm_env.scene import Scene, load_scene
+from dq_space_arm_env.scene.start import draw_initial_state
+
+if TYPE_CHECKING:
+    from dq_space_arm_env.environment.rendering import Renderer
+
+Array = NDArray[np.float64]
+
+# An observation beyond this (m, rad, m/s, rad/s) comes from a simulation that has blown up, not from a spacecraft.
+OBSERVATION_LIMIT = 1e6
+
+_OPTIONS = ("nominal", "initial_state")
+
+
+class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
+    """
+    ## Description
+
+    A spacecraft floats freely; its arm has revolute joints and, at the end, a massless spherical wrist. Forces and torques on the base, joint
+    torques, and the wrist's Euler rates are to bring the tip of the arm to a target pose at rest, with little effort: the pose-stabilization maneuver of
+    A. Valverde and P. Tsiotras, "Modeling of Spacecraft-Mounted Robot Dynamics and Control Using Dual Quaternions" (ACC 2018).
+    The dynamics are those of Newton and Euler for the whole system: nothing holds the base in place.
+
+    The robot, its limits, the target, the cost, the start and the time step belong to a *scene*. What a scene does not have (wrist,
+    thrusters, wheels, joints) appears neither in the observation nor in the action. The tables show scene `paper`.
+
+    ## Action Space
+
+    A `Box(-1, 1, (12,), float32)`: inputs as fractions of their limits, constant over a time step. Values beyond the bounds are clipped, NaN is an
+    error. A float64 action is used at full precision.
+
+    | Num | Action                                                 | Min  | Max | Unit  | Limit at 1 |
+    |-----|--------------------------------------------------------|------|-----|-------|------------|
+    | 0-2 | force on the base at its center of mass, base axes     | -1   | 1   | N     | 10         |
+    | 3-5 | torque on the base, base axes                          | -1   | 1   | N m   | 5          |
+    | 6-8 | torques of joints 1 to 3                               | -1   | 1   | N m   | 2          |
+    | 9-11| wrist's Euler rates psi, theta, phi                    | -1   | 1   | rad/s | 0.5        |
+
+    ## Observation Space
+
+    A `Box` of shape `(24,)`, float64; the bound of 1e6 is where a simulation counts as diverged:
+
+    | Num   | Observation                                                           | Min  | Max | Unit  |
+    |-------|-----------------------------------------------------------------------|------|-----|-------|
+    | 0-3   | error dual quaternion q_{D/G} = q_{G/I}* q_{D/I}, real part            | -1   | 1   | -     |
+    | 4-7   | the same, dual part: half the position error (times rotation)         | -1e6 | 1e6 | m     |
+    | 8-10  | angular velocity of the base, base axes                               | -1e6 | 1e6 | rad/s |
+    | 11-13 | velocity of the base's center of mass, base axes                      | -1e6 | 1e6 | m/s   |
+    | 14-16 | angles of joints 1 to 3, not wrapped                                  | -1e6 | 1e6 | rad   |
+    | 17-19 | wrist angles psi, theta, phi, not wrapped                             | -1e6 | 1e6 | rad   |
+    | 20-22 | rates of joints 1 to 3                                                | -1e6 | 1e6 | rad/s |
+    | 23    | time left in the episode                                              | 0    | T   | s     |
+
+    The sign of q_{D/G}, of which both mean the same pose, is fixed at reset so that its scalar part is not negative, and then carried along by
+    continuity, as the cost does. The state follows from the observation; a planar scene's error has the four entries that are not identically zero.
+
+    ## Rewards
+
+    The reward of a step is minus the paper's stage cost of the state before the step and of the action; the last step of the episode also has minus the
+    terminal cost of the state after it, so the return of an episode is exactly -J. With weights of scene `paper`:
+
+    | Term (key in `info`)          | Formula                                                | Weight                               |
+    |-------------------------------|--------------------------------------------------------|--------------------------------------|
+    | `cost_pose`                   | (q_{G/I} - q_{D/I})' W (q_{G/I} - q_{D/I})             | 15                                   |
+    | `cost_base_velocity`          | (omega - omega_D)' W (omega - omega_D), 6 components   | 1                                    |
+    | `cost_control`                | u' R u, in N, N m, rad/s                               | 10 force, 1 torque, 0.01 joints, 0.1 wrist |
+    | `terminal_cost_pose`          | as `cost_pose`, at the end; 0 before                   | 150                                  |
+    | `terminal_cost_base_velocity` | as `cost_base_velocity`, at the end; 0 before          | 1                                    |
+
+    `info` further holds `attitude_error` [deg], `position_error` [m] of the tip, `is_success` (both within the scene's tolerances, 3 deg and 0.1 m)
+    and `diverged`.
+
+    ## Starting State
+
+    `reset(seed=...)` draws the start from the scene's spread, uniformly per component. `options={"nominal": True}` starts at the scene's initial state,
+    `options={"initial_state": x}` at a state x (`env.unwrapped.kernels.layout.state` names its entries).
+
+    ## Episode End
+
+    1. Termination: the scene's number of steps (1000) is reached. The time left is part of the observation and the terminal cost part of the task, so this is an
+       end of the task, not a truncation.
+    2. Termination: the simulation diverged (an observation that is not finite or beyond 1e6). `info["diverged"]` says so, and the remaining steps are charged at
+       the cost of the last sound state, so that ending early never pays.
+
+    ## Arguments
+
+    | Parameter     | Type                     | Default   | Description                                            |
+    |---------------|--------------------------|-----------|--------------------------------------------------------|
+    | `scene`       | **str, Path or Scene**   | `"paper"` | name of a shipped scene, path of a YAML file, a `Scene` |
+    | `render_mode` | **str or None**          | `None`    | `"rgb_array"` or `"human"`; needs the extra `render`   |
+
+    ```python
+    >>> import gymnasium
+    >>> import dq_space_arm_env
+    >>> env = gymnasium.make("DQSpaceArm-v0", scene="paper")
+    >>> observation, info = env.reset(seed=0)
+    >>> observation.shape, env.action_space.shape
+    ((24,), (12,))
+
+    ```
+
+    ## Version History
+
+    * v0: Initial version.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as in every Gymnasium environment
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 60,
+    }
+
+    def __init__(self, scene: Scene | str | Path = "paper", render_mode: str | None = None) -> None:
+        """Load a scene and compile what a step needs (or take it from the cache).
+
+        Args:
+            scene: Name of a shipped scene, path of a YAML file, or a scene.
+            render_mode: None, "rgb_array" or "human".
+
+        Raises:
+            SceneError: If the scene cannot be loaded.
+            ValueError: If the scene has no actuator, or one without a finite limit, or the render mode is unknown.
+        """
+        EzPickle.__init__(self, scene, render_mode)
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            modes = ", ".join(self.metadata["render_modes"])
+            raise ValueError(f"render_mode: {render_mode!r} is unknown; there are {modes}, or None")
+        self.scene = load_scene(scene)
+        self.kernels = compile_scene(self.scene)
+        layout = self.kernels.layout
+        unlimited = [
+            name
+            for name, limit in zip(layout.control.names, layout.control_limit, strict=True)
+            if np.isinf(limit)
+        ]
+        if unlimited or not layout.n_u:
+            problem = f"{', '.join(unlimited)} has no finite limit" if unlimited else "it has no actuator"
+            raise ValueError(
+                f"scene {self.scene.name!r} has no normalized actions: {problem}; give each actuator a finite limit"
+            )
+        self.render_mode = render_mode
+        self.metadata = {**type(self).metadata, "render_fps": round(1.0 / self.scene.simulation.dt)}
+        self.action_space = spaces.Box(-1.0, 1.0, (layout.n_u,), np.float32)
+        self._limit = layout.control_limit
+        self._bind_kernel()
+        self.observation_space = self._make_observation_space()
+        self._step_count = -1
+        self._trail: list[Array] = []
+        self._renderer: Renderer | None = None
+
+    def _make_observation_space(self) -> spaces.Space[Array]:
+        high = np.full(self._observation.shape, OBSERVATION_LIMIT)
+        real_part = 2 if self.kernels.layout.planar else 4
+        high[:real_part] = 1.0 + 1e-6  # a unit quaternion may exceed 1 by a rounding error
+        high[-1] = self.scene.simulation.steps * self.scene.simulation.dt
+        low = -high
+        low[-1] = 0.0
+        return spaces.Box(low, high, dtype=np.float64)
+
+    def _bind_kernel(self) -> None:
+        """Give the compiled step arrays of its own; their addresses are handed over once."""
+        self._kernel = self.kernels.kernel("environment_step", lanes=1)
+        arrays = {spec.name: np.zeros(spec.stride) for spec in (*self._kernel.inputs, *self._kernel.outputs)}
+        arrays["h"][0] = self.scene.simulation.dt
+        self._x, self._u, self._time_left = arrays["x"], arrays["u"], arrays["time_left"]
+        self._x_next, self._observation = arrays["x_next"], arrays["observation"]
+        self._terms, self._terminal_terms = arrays["terms"], arrays["terminal_terms"]
+        self._errors = arrays["errors"]
+        self._arrays = arrays
+        self._buffers = np.array([array.ctypes.data for array in arrays.values()], dtype=np.int64)
+        self._buffers_address = self._buffers.ctypes.data
+
+    @property
+    def state(self) -> Array:
+        """The state, shape (n_x,), units as in `kernels.layout.state`; a copy.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+        """
+        if self._step_count < 0:
+            raise ResetNeeded("call reset() before reading the state")
+        return self._x.copy()
+
+    def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Apply an action for one time step.
+
+        Args:
+            action: Inputs as fractions of their limits, shape (n_u,); clipped to [-1, 1].
+
+        Returns:
+            Observation, reward, terminated, truncated (always False), info.
+
+        Raises:
+            ResetNeeded: Before the first reset, and after the end of an episode.
+            ValueError: If the action has a wrong shape or a NaN.
+        """
+        steps = self.scene.simulation.steps
+        if not 0 <= self._step_count < steps:
+            state = "has not begun" if self._step_count < 0 else "is over"
+            raise ResetNeeded(f"the episode {state}: call reset() before step()")
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != self._u.shape:
+            raise ValueError(f"action: shape {values.shape}, should be {self._u.shape}")
+        if np.isnan(values).any():
+            raise ValueError(f"action: {values} holds NaN, should be numbers in [-1, 1]")
+        np.multiply(np.clip(values, -1.0, 1.0), self._limit, out=self._u)
+        self._time_left[0] = (steps - self._step_count - 1) * self.scene.simulation.dt
+        before = self._terminal_terms.copy()
+        self._kernel.native.function(0, 1, self._buffers_address)
+        if self._has_diverged():
+            return self._end_diverged(before)
+        self._step_count += 1
+        self._x[:] = self._x_next
+        done = self._step_count == steps
+        reward = -float(self._terms.sum())
+        if done:
+            reward -= float(self._terminal_terms.sum())
+        if self.render_mode is not None:
+            self._remember_tip()
+            if self.render_mode == "human":
+                self.render()
+        return self._observation.copy(), reward, done, False, self._info(terminal=done)
+
+    def _has_diverged(self) -> bool:
+        # Written so that NaN counts as diverged.
+        return not float(np.abs(self._observation).max()) <= OBSERVATION_LIMIT
+
+    def _end_diverged(self, terminal_terms: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """End the episode at the last sound state, which is kept, and charge what is left of it."""
+        remaining = self.scene.simulation.steps - self._step_count
+        reward = -float(self._terms.sum()) * remaining - float(terminal_terms.sum())
+        terms = self._terms.copy()
+        self._observe()
+        self._terms[:], self._terminal_terms[:] = terms, terminal_terms
+        self._step_count = self.scene.simulation.steps
+        info = self._info(terminal=True)
+        info.update(diverged=True, is_success=False)
+        return self._observation.copy(), reward, True, False, info
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: Seed of the random start; None goes on with the generator.
+            options: {"nominal": True} for the scene's initial state, or {"initial_state": x} with x of shape (n_x,).
+
+        Returns:
+            Observation and info.
+
+        Raises:
+            ValueError: If an option is unknown, or the initial state has a wrong shape, is not finite, or its pose is not a unit dual quaternion.
+        """
+        super().reset(seed=seed)
+        self._x[:] = self._start(options or {})
+        self._step_count = 0
+        self._time_left[0] = self.scene.simulation.steps * self.scene.simulation.dt
+        self._observe()
+        self._terms[:] = 0.0
+        self._trail = []
+        if self.render_mode is not None:
+            self._remember_tip()
+            if self.render_mode == "human":
+                self.render()
+        return self._observation.copy(), self._info(terminal=False)
+
+    def _start(self, options: dict[str, Any]) -> Array:
+        unknown = set(options) - set(_OPTIONS)
+        if unknown:
+            raise ValueError(f"options: {sorted(unknown)} unknown; there are {', '.join(_OPTIONS)}")
+        state = options.get("initial_state")
+        if state is None:
+            if options.get("nominal", False):
+                return self.kernels.layout.initial_state
+            return draw_initial_state(self.scene, self.np_random)
+        if options.get("nominal", False):
+            raise ValueError("options: nominal and initial_state exclude each other")
+        x = np.array(state, dtype=np.float64)
+        if x.shape != self._x.shape or not np.isfinite(x).all():
+            raise ValueError(
+                f"options: initial_state {x} of shape {x.shape}, should be finite numbers of shape {self._x.shape}"
+            )
+        return self._with_sign_of_target(self._with_unit_pose(x))
+
+    def _with_unit_pose(self, x: Array) -> Array:
+        """Refuse a base pose that is not a unit dual quaternion; remove rounding errors of one that is."""
+        pose = self.kernels.layout.state.pose
+        full = self._full_pose(x[pose])
+        length, overlap = math.hypot(*full[:4]), float(np.dot(full[:4], full[4:]))
+        if abs(length - 1.0) > 1e-6 or abs(overlap) > 1e-6 * (1.0 + math.hypot(*full[4:])):
+            raise ValueError(
+                f"options: initial_state has a base pose with |q_r| = {length:.9g}, q_r . q_d = {overlap:.3g}; "
+                "a unit dual quaternion has 1 and 0"
+            )
+        unit = np.array(dual_quaternion.normalize(tuple(full.tolist())))
+        x[pose] = unit[[0, 3, 5, 6]] if self.kernels.layout.planar else unit
+        return x
+
+    def _with_sign_of_target(self, x: Array) -> Array:
+        """Of q and -q, which are one pose but not one cost, take the one that puts the tip near the target's quaternion."""
+        target = np.array(self.scene.target.pose.dual_quaternion)
+        if self.kernels.tip_pose(x)[:4] @ target[:4] < 0.0:
+            pose = self.kernels.layout.state.pose
+            x[pose] = -x[pose]
+        return x
+
+    def _full_pose(self, stored: Array) -> Array:
+        if not self.kernels.layout.planar:
+            return stored
+        full = np.zeros(8)
+        full[[0, 3, 5, 6]] = stored
+        return full
+
+    def _observe(self) -> None:
+        """Observation, errors and terminal cost of the present state: what a step of no duration reports."""
+        self._u[:] = 0.0
+        h = self._arrays["h"]
+        h[0], step = 0.0, h[0]
+        self._kernel.native.function(0, 1, self._buffers_address)
+        h[0] = step
+
+    def _info(self, *, terminal: bool) -> dict[str, Any]:
+        pose, base_velocity, control = self._terms.tolist()
+        terminal_pose, terminal_velocity = self._terminal_terms.tolist() if terminal else (0.0, 0.0)
+        attitude_error, position_error = math.degrees(self._errors[0]), float(self._errors[1])
+        success = self.scene.success
+        return {
+            "cost_pose": pose,
+            "cost_base_velocity": base_velocity,
+            "cost_control": control,
+            "terminal_cost_pose": terminal_pose,
+            "terminal_cost_base_velocity": terminal_velocity,
+            "attitude_error": attitude_error,
+            "position_error": position_error,
+            "is_success": attitude_error <= success.attitude_error_deg
+            and position_error <= success.position_error,
+            "diverged": False,
+        }
+
+    def _remember_tip(self) -> None:
+        self._trail.append(np.array(poses.position(self.kernels.tip_pose(self._x).tolist())))
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the present state.
+
+        Returns:
+            Picture of shape (480, 640, 3), uint8, for render mode "rgb_array"; None for "human", which shows a window.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+            DependencyNotInstalled: If the extra `render` is not installed.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                'render() does nothing without a render mode, e.g. gymnasium.make("DQSpaceArm-v0", render_mode="rgb_array")'
+            )
+            return None
+        if self._step_count < 0:
+            raise ResetNeeded("call reset() before render()")
+        if self._renderer is None:
+            from dq_space_arm_env.environment.rendering import Renderer
+
+            self._renderer = Renderer(self.scene)
+        frames, trail = self.kernels.frame_poses(self._x), np.array(self._trail)
+        if self.render_mode == "rgb_array":
+            return self._renderer.draw(frames, trail)
+        self._renderer.show(frames, trail, self.metadata["render_fps"])
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

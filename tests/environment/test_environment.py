@@ -1,0 +1,277 @@
+"""`DQSpaceArm-v0`: Gymnasium's conventions, the paper's cost as reward, starts, ends, and bad input."""
+
+import copy
+import pickle
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env, data_equivalence
+
+import dq_space_arm_env
+from dq_space_arm_env import list_scenes, load_scene
+from dq_space_arm_env.algebra import poses
+
+TARGET = np.array([0.5, 0.5, -0.5, -0.5, 0.25, 2.25, 0.25, 2.25])
+
+
+def make(scene="paper", **arguments):
+    return gymnasium.make("DQSpaceArm-v0", scene=scene, **arguments)
+
+
+def short(scene="paper", steps=20):
+    scene = load_scene(scene)
+    return scene.replace(simulation=scene.simulation.model_copy(update={"steps": steps}))
+
+
+def test_importing_the_environment_loads_nothing_heavy():
+    heavy = ["torch", "stable_baselines3", "matplotlib", "numba", "pygame", "rich"]
+    code = (
+        "import sys, gymnasium, dq_space_arm_env\n"
+        "env = gymnasium.make('DQSpaceArm-v0'); env.reset(seed=0); env.step(env.action_space.sample())\n"
+        f"print([name for name in {heavy} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("scene", list_scenes())
+def test_check_env_has_no_complaint(scene):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(scene).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("scene", list_scenes())
+def test_a_thousand_random_steps(scene):
+    env = make(scene)
+    observation, _ = env.reset(seed=0)
+    env.action_space.seed(0)
+    for _ in range(1000):
+        assert env.observation_space.contains(observation)
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        assert np.isfinite(reward)
+        assert reward <= 0.0
+        assert not truncated
+        assert not info["diverged"]
+        if terminated:
+            observation, _ = env.reset()
+
+
+def test_same_seed_same_episode_to_the_bit():
+    episodes = []
+    for _ in range(2):
+        env = make(short())
+        env.action_space.seed(3)
+        record = [env.reset(seed=7)]
+        record += [env.step(env.action_space.sample()) for _ in range(20)]
+        episodes.append(record)
+    assert data_equivalence(*episodes, exact=True)
+    assert not data_equivalence(env.reset(seed=8)[0], episodes[0][0][0])
+
+
+def test_reward_is_the_papers_formula_step_by_step():
+    env = make(short())
+    env.reset(seed=1)
+    rng = np.random.default_rng(0)
+    limit = np.array([10.0] * 3 + [5.0] * 3 + [2.0] * 3 + [0.5] * 3)
+    effort = np.array([10.0] * 3 + [1.0] * 3 + [0.01] * 3 + [0.1] * 3)
+    kernels = env.unwrapped.kernels
+    terminated = False
+    while not terminated:
+        x, action = env.unwrapped.state, rng.uniform(-1, 1, 12)
+        error, twist, u = kernels.tip_pose(x) - TARGET, x[14:20], limit * action
+        terms = [15.0 * error @ error, twist @ twist, effort @ (u * u)]
+        _, reward, terminated, _, info = env.step(action)
+        expected = -sum(terms)
+        if terminated:
+            x = env.unwrapped.state
+            error, twist = kernels.tip_pose(x) - TARGET, x[14:20]
+            ends = [150.0 * error @ error, twist @ twist]
+            expected -= sum(ends)
+            assert [info["terminal_cost_pose"], info["terminal_cost_base_velocity"]] == pytest.approx(ends)
+        else:
+            assert info["terminal_cost_pose"] == info["terminal_cost_base_velocity"] == 0.0
+        assert reward == pytest.approx(expected, rel=1e-12)
+        assert [info["cost_pose"], info["cost_base_velocity"], info["cost_control"]] == pytest.approx(
+            terms, rel=1e-12
+        )
+
+
+@pytest.mark.parametrize("scene", list_scenes())
+def test_observation_is_what_the_documentation_says(scene):
+    env = make(short(scene))
+    env.reset(seed=2)
+    observation, *_, info = env.step(env.action_space.sample())
+    kernels, x = env.unwrapped.kernels, env.unwrapped.state
+    layout, target = kernels.layout.state, env.unwrapped.scene.target.pose.dual_quaternion
+    error = np.array(poses.error_pose(tuple(kernels.tip_pose(x)), target))  # (31)
+    if kernels.layout.planar:
+        np.testing.assert_allclose(error[[1, 2, 4, 7]], 0.0, atol=1e-15)
+        error = error[[0, 3, 5, 6]]
+    parts = [
+        error,
+        *(
+            x[part]
+            for part in (layout.base_velocity, layout.joint_angles, layout.wrist_angles, layout.joint_rates)
+        ),
+    ]
+    np.testing.assert_allclose(observation, np.concatenate([*parts, [19 * 0.015]]), atol=1e-14)
+    assert info["attitude_error"] == pytest.approx(
+        np.degrees(poses.error_angle(tuple(kernels.tip_pose(x)), target))
+    )
+    assert info["position_error"] == pytest.approx(poses.error_distance(tuple(kernels.tip_pose(x)), target))
+
+
+def test_the_documented_tables_have_the_sizes_of_the_spaces():
+    env = make()
+    assert env.observation_space.shape == (24,)
+    assert env.action_space.shape == (12,)
+    assert env.action_space.dtype == np.float32
+    assert (env.action_space.low == -1).all()
+    assert (env.action_space.high == 1).all()
+
+
+def test_the_sign_of_the_error_is_fixed_at_reset_and_carried_along():
+    env = make(short())
+    x = env.unwrapped.kernels.layout.initial_state.copy()
+    observation, _ = env.reset(options={"initial_state": x})
+    flipped = x.copy()
+    flipped[:8] *= -1
+    again, _ = env.reset(options={"initial_state": flipped})
+    np.testing.assert_array_equal(observation, again)
+    assert observation[0] >= 0.0
+
+
+def test_starts():
+    env = make()
+    nominal = env.unwrapped.kernels.layout.initial_state
+    first, _ = env.reset(options={"nominal": True})
+    np.testing.assert_array_equal(env.unwrapped.state, nominal)
+    second, _ = env.reset(seed=0, options={"nominal": True})
+    np.testing.assert_array_equal(first, second)
+    env.reset(seed=0)
+    drawn = env.unwrapped.state
+    assert not np.array_equal(drawn, nominal)
+    env.reset(options={"initial_state": drawn})
+    np.testing.assert_allclose(env.unwrapped.state, drawn, atol=1e-15)
+    assert env.reset(options={"nominal": True})[1].keys() == env.step(env.action_space.sample())[4].keys()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda x: x[:-1], r"shape \(22,\), should be finite numbers of shape \(23,\)"),
+        (lambda x: np.where(np.arange(23) == 9, np.nan, x), "should be finite"),
+        (lambda x: np.where(np.arange(23) == 9, np.inf, x), "should be finite"),
+        (
+            lambda x: np.where(np.arange(23) == 0, 1.1, x),
+            r"\|q_r\| = 1\.1.*a unit dual quaternion has 1 and 0",
+        ),
+        (lambda x: np.where(np.arange(23) == 4, 0.1, x), r"q_r \. q_d = 0\.1"),
+    ],
+)
+def test_bad_initial_states_are_refused(change, message):
+    env = make()
+    with pytest.raises(ValueError, match=message):
+        env.reset(options={"initial_state": change(env.unwrapped.kernels.layout.initial_state)})
+
+
+def test_bad_options_are_refused():
+    env = make()
+    with pytest.raises(ValueError, match=r"\['nominel'\] unknown; there are nominal, initial_state"):
+        env.reset(options={"nominel": True})
+    x = env.unwrapped.kernels.layout.initial_state
+    with pytest.raises(ValueError, match="exclude each other"):
+        env.reset(options={"nominal": True, "initial_state": x})
+
+
+def test_bad_actions_are_refused_and_large_ones_clipped():
+    env = make().unwrapped
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="holds NaN"):
+        env.step(np.full(12, np.nan))
+    with pytest.raises(ValueError, match=r"shape \(11,\), should be \(12,\)"):
+        env.step(np.zeros(11))
+    results = []
+    for action in (np.full(12, 1.0), np.full(12, 50.0), np.full(12, np.inf)):
+        env.reset(seed=0)
+        results.append(env.step(action)[0])
+    np.testing.assert_array_equal(results[0], results[1])
+    np.testing.assert_array_equal(results[0], results[2])
+
+
+def test_float64_actions_are_used_at_full_precision():
+    env = make().unwrapped
+    action = np.full(12, 0.1)
+    results = []
+    for values in (action, action.astype(np.float32)):
+        env.reset(seed=0)
+        results.append(env.step(values)[0])
+    assert not np.array_equal(*results)
+
+
+def test_order_of_calls_is_enforced():
+    env = make(short(steps=1)).unwrapped
+    for call in (lambda: env.step(np.zeros(12)), lambda: env.state):
+        with pytest.raises(ResetNeeded):
+            call()
+    env.reset(seed=0)
+    *_, terminated, truncated, _ = env.step(np.zeros(12))
+    assert (terminated, truncated) == (True, False)
+    with pytest.raises(ResetNeeded, match="the episode is over"):
+        env.step(np.zeros(12))
+
+
+def test_a_diverged_state_ends_the_episode_and_says_so():
+    """A stiff spring with symplectic Euler and a long step blows up within the episode."""
+    scene = load_scene("paper")
+    links = [link.model_dump() | {"stiffness": 1e6} for link in scene.links]
+    simulation = {"dt": 0.1, "steps": 500, "integrator": "symplectic_euler"}
+    env = make(scene.replace(links=links, simulation=simulation))
+    _, info = env.reset(seed=0)
+    assert not info["diverged"]
+    total, steps, terminated = 0.0, 0, False
+    while not terminated:
+        observation, reward, terminated, _, info = env.step(np.zeros(12))
+        total, steps = total + reward, steps + 1
+        assert env.observation_space.contains(observation)
+        assert np.isfinite(reward)
+    assert info["diverged"]
+    assert not info["is_success"]
+    assert steps < 500
+    # Ending early does not pay: the rest is charged at the last sound state's cost.
+    assert reward < -(500 - steps) * info["cost_pose"]
+
+
+def test_returned_arrays_are_the_callers():
+    env = make()
+    observation, _ = env.reset(seed=0)
+    kept = observation.copy()
+    env.step(env.action_space.sample())
+    np.testing.assert_array_equal(observation, kept)
+    state = env.unwrapped.state
+    state[:] = np.nan
+    assert np.isfinite(env.unwrapped.state).all()
+
+
+def test_environments_pickle_and_copy():
+    env = make("planar")
+    env.reset(seed=0)
+    for twin in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env)):
+        np.testing.assert_array_equal(twin.reset(seed=1)[0], env.reset(seed=1)[0])
+
+
+def test_scenes_that_have_no_normalized_actions_are_refused():
+    scene = load_scene("paper")
+    unlimited = scene.actuators.model_dump() | {"base_force": {"limit": float("inf")}}
+    with pytest.raises(ValueError, match="base f.* has no finite limit"):
+        make(scene.replace(actuators=unlimited))
+    with pytest.raises(ValueError, match="it has no actuator"):
+        make(scene.replace(actuators={}))
+    with pytest.raises(ValueError, match="render_mode: 'ansi' is unknown"):
+        dq_space_arm_env.DQSpaceArmEnv(render_mode="ansi")
