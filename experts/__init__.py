@@ -1,0 +1,7 @@
+"""Experts: optimal control of a scene, by control-limited differential dynamic programming."""
+
+from experts.box_ddp import BoxDDP
+from experts.problem import ShootingProblem
+from experts.solution import Solution, StopReason
+
+__all__ = ["BoxDDP", "ShootingProblem", "Solution", "StopReason"]

@@ -1,0 +1,53 @@
+"""A scene as a shooting problem: its kernels, bounds, horizon and initial state under the names that the solver uses."""
+
+from pathlib import Path
+
+from dq_space_arm_env import Scene, compile_scene, load_scene
+from experts.problem import FloatArray, Kernel
+
+
+class ArmProblem:
+    """The maneuver of a scene in minimal coordinates; implements `ShootingProblem`.
+
+    Attributes:
+        scene: The scene.
+        kernels: Its compiled functions.
+    """
+
+    def __init__(self, scene: Scene | str | Path, integrator: str | None = None) -> None:
+        """Take a scene.
+
+        Args:
+            scene: A scene, the name of a shipped one, or a path to a YAML file.
+            integrator: Name of the integrator; the scene's by default.
+
+        Raises:
+            SceneError: If the scene cannot be loaded.
+            ValueError: If the integrator is unknown.
+        """
+        self.scene = load_scene(scene)
+        if integrator is not None:
+            simulation = self.scene.simulation.model_copy(update={"integrator": integrator})
+            self.scene = self.scene.replace(simulation=simulation)
+        self.kernels = compile_scene(self.scene)
+        layout = self.kernels.layout
+        self.n_states, self.n_tangent, self.n_controls = layout.n_x, layout.n_t, layout.n_u
+        self.horizon = self.scene.simulation.steps
+        self.time_step = self.scene.simulation.dt
+        self.control_lower: FloatArray = -layout.control_limit
+        self.control_upper: FloatArray = layout.control_limit
+        self.initial_state: FloatArray = layout.initial_state
+
+    def kernel(self, name: str) -> Kernel:
+        """Return one of `experts.problem.KERNEL_NAMES`.
+
+        The rollout works through its rows one after another, everything else on many at once: the former get scalar code.
+
+        Args:
+            name: Name of the kernel.
+
+        Returns:
+            The kernel, compiled or loaded from the cache.
+        """
+        sequential = name in ("step_with_cost", "difference", "terminal_cost", "terminal_cost_derivatives")
+        return self.kernels.kernel(name, lanes=1 if sequential else None)

@@ -1,0 +1,243 @@
+"""The small quadratic program of every stage: minimize 1/2 x'Hx + g'x subject to lower <= x <= upper.
+
+Projected Newton of Tassa, Mansard & Todorov, "Control-limited differential dynamic programming", ICRA 2014,
+section IV and appendix. The plain Newton step is tried first; when it stays inside the box nothing else is
+needed, and its Cholesky factor serves the feedback gains too.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experts.compilation import compiled
+from experts.padded_algebra import (
+    FloatArray,
+    factorize,
+    padded,
+    solve_vector_in_place,
+)
+
+SOLVED = 0
+"""The free part of the gradient vanishes, and the clamped part points out of the box."""
+SMALL_IMPROVEMENT = 1
+"""The last step improved the value by less than `RELATIVE_IMPROVEMENT`."""
+ITERATION_LIMIT = 2
+"""`MAX_ITERATIONS` were not enough; the best point is returned."""
+STALLED = 3
+"""No step along the Newton direction improved the value; the best point is returned."""
+NOT_POSITIVE_DEFINITE = -1
+"""The Hessian has no Cholesky factor; there is no result."""
+
+MAX_ITERATIONS = 100
+GRADIENT_TOLERANCE = 1e-8  # of the free gradient, relative to the norm of g
+RELATIVE_IMPROVEMENT = 1e-8
+STEP_FACTOR = 0.6
+ARMIJO = 0.1
+SMALLEST_STEP = 1e-22
+
+
+class BoxQPWorkspace(NamedTuple):
+    """Work arrays of `box_qp`, and the results besides the minimizer.
+
+    Attributes:
+        factor: Cholesky factor U of the free block, H_ff = U' U, rows and columns in the order of `free`;
+            shape (n, padded(n)), its leading block and upper triangle count.
+        inverse_diagonal: 1 / U[i, i], shape (n,).
+        free: Indices of the free components in rising order, the leading n_free count; shape (n,).
+        clamped: Whether a component is held at its bound, shape (n,).
+        slope: Gradient at the current point, shape (n,).
+        search: Newton direction, first in the order of `free`; shape (n,).
+        trial: Candidate point, shape (n,).
+    """
+
+    factor: FloatArray
+    inverse_diagonal: FloatArray
+    free: NDArray[np.int64]
+    clamped: NDArray[np.bool_]
+    slope: FloatArray
+    search: FloatArray
+    trial: FloatArray
+
+
+def box_qp_workspace(size: int) -> BoxQPWorkspace:
+    """Allocate the work arrays of `box_qp`.
+
+    Args:
+        size: Number of unknowns n.
+
+    Returns:
+        The work arrays.
+    """
+    return BoxQPWorkspace(
+        factor=np.zeros((size, padded(size))),
+        inverse_diagonal=np.zeros(size),
+        free=np.zeros(size, dtype=np.int64),
+        clamped=np.zeros(size, dtype=np.bool_),
+        slope=np.zeros(size),
+        search=np.zeros(size),
+        trial=np.zeros(size),
+    )
+
+
+@compiled
+def box_qp(
+    hessian: FloatArray,
+    gradient: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    minimizer: FloatArray,
+    work: BoxQPWorkspace,
+) -> tuple[int, int]:
+    """Minimize 1/2 x'Hx + g'x over the box lower <= x <= upper.
+
+    Args:
+        hessian: H, symmetric, shape (n, >= n).
+        gradient: g, shape (n,).
+        lower: Lower bounds, -inf allowed, shape (n,).
+        upper: Upper bounds, +inf allowed, shape (n,).
+        minimizer: Holds a first guess, used when the plain Newton step leaves the box; receives the
+            minimizer; shape (n,).
+        work: Work arrays; `free` and `factor` are results.
+
+    Returns:
+        Status (one of the constants of this module) and the number of free components.
+    """
+    size = gradient.shape[0]
+    for i in range(size):
+        work.clamped[i] = False
+    if _factorize_free_block(hessian, work) < 0:
+        return NOT_POSITIVE_DEFINITE, size
+    for i in range(size):
+        work.search[i] = -gradient[i]
+    solve_vector_in_place(work.factor, work.inverse_diagonal, work.search, size)
+    inside = True
+    for i in range(size):
+        inside = inside and lower[i] <= work.search[i] <= upper[i]
+    if inside:
+        for i in range(size):
+            minimizer[i] = work.search[i]
+        return SOLVED, size
+    return _projected_newton(hessian, gradient, lower, upper, minimizer, work)
+
+
+@compiled
+def _projected_newton(
+    hessian: FloatArray,
+    gradient: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    minimizer: FloatArray,
+    work: BoxQPWorkspace,
+) -> tuple[int, int]:
+    """Run the iteration of `box_qp`, which has already factorized the whole Hessian."""
+    size = gradient.shape[0]
+    n_free = size
+    gradient_norm = 0.0
+    for i in range(size):
+        minimizer[i] = min(max(minimizer[i], lower[i]), upper[i])
+        gradient_norm += gradient[i] ** 2
+    value = _value(hessian, gradient, minimizer)
+    previous_value = np.inf
+    for _ in range(MAX_ITERATIONS):
+        changed = _find_clamped(hessian, gradient, lower, upper, minimizer, work)
+        if changed:
+            n_free = _factorize_free_block(hessian, work)
+            if n_free < 0:
+                return NOT_POSITIVE_DEFINITE, size
+        free_norm = 0.0
+        for a in range(n_free):
+            work.search[a] = -work.slope[work.free[a]]
+            free_norm += work.search[a] ** 2
+        if free_norm <= GRADIENT_TOLERANCE**2 * gradient_norm:
+            return SOLVED, n_free
+        if previous_value - value < RELATIVE_IMPROVEMENT * abs(previous_value):
+            return SMALL_IMPROVEMENT, n_free
+        solve_vector_in_place(work.factor, work.inverse_diagonal, work.search, n_free)
+        previous_value = value
+        value = _projected_step(hessian, gradient, lower, upper, minimizer, n_free, value, work)
+        if not value < previous_value:
+            return STALLED, n_free
+    if _find_clamped(hessian, gradient, lower, upper, minimizer, work):
+        n_free = _factorize_free_block(hessian, work)
+    return ITERATION_LIMIT if n_free >= 0 else NOT_POSITIVE_DEFINITE, n_free
+
+
+@compiled
+def _factorize_free_block(hessian: FloatArray, work: BoxQPWorkspace) -> int:
+    """List and count the components that are not clamped, and factorize their block; -1 if that fails."""
+    n_free = 0
+    for i in range(work.clamped.shape[0]):
+        if not work.clamped[i]:
+            work.free[n_free] = i
+            n_free += 1
+    for a in range(n_free):
+        row = hessian[work.free[a]]
+        for b in range(a, n_free):
+            work.factor[a, b] = row[work.free[b]]
+    return n_free if factorize(work.factor, work.inverse_diagonal, n_free) else -1
+
+
+@compiled
+def _find_clamped(
+    hessian: FloatArray,
+    gradient: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    point: FloatArray,
+    work: BoxQPWorkspace,
+) -> bool:
+    """Compute the slope at a point, clamp what it pushes out of the box, and say whether the set changed."""
+    changed = False
+    for i in range(point.shape[0]):
+        slope = gradient[i]
+        for j in range(point.shape[0]):
+            slope += hessian[i, j] * point[j]
+        work.slope[i] = slope
+        clamped = (point[i] == lower[i] and slope > 0.0) or (point[i] == upper[i] and slope < 0.0)
+        changed = changed or clamped != work.clamped[i]
+        work.clamped[i] = clamped
+    return changed
+
+
+@compiled
+def _projected_step(
+    hessian: FloatArray,
+    gradient: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    point: FloatArray,
+    n_free: int,
+    value: float,
+    work: BoxQPWorkspace,
+) -> float:
+    """Move along the projected Newton direction under Armijo's rule; return the new value, or the old one."""
+    slope_along = 0.0
+    for a in range(n_free):
+        slope_along += work.search[a] * work.slope[work.free[a]]
+    step = 1.0
+    while step >= SMALLEST_STEP:
+        for i in range(point.shape[0]):
+            work.trial[i] = point[i]
+        for a in range(n_free):
+            i = work.free[a]
+            work.trial[i] = min(max(point[i] + step * work.search[a], lower[i]), upper[i])
+        trial_value = _value(hessian, gradient, work.trial)
+        if trial_value - value <= ARMIJO * step * slope_along:
+            for i in range(point.shape[0]):
+                point[i] = work.trial[i]
+            return trial_value
+        step *= STEP_FACTOR
+    return value
+
+
+@compiled
+def _value(hessian: FloatArray, gradient: FloatArray, point: FloatArray) -> float:
+    """Evaluate 1/2 x'Hx + g'x."""
+    value = 0.0
+    for i in range(point.shape[0]):
+        product = 0.0
+        for j in range(point.shape[0]):
+            product += hessian[i, j] * point[j]
+        value += point[i] * (0.5 * product + gradient[i])
+    return value

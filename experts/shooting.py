@@ -1,0 +1,180 @@
+"""The work arrays of one solve and the native operations on them: roll out, differentiate, sweep, try a step.
+
+Everything here is done for all stages by compiled code; nothing is decided here.
+"""
+
+import numpy as np
+
+from experts.backward_sweep import (
+    SWEEP_DONE,
+    SweepOutcome,
+    Update,
+    allocate_derivatives,
+    allocate_update,
+    backward_sweep,
+    sweep_workspace,
+)
+from experts.native_call import BufferTable, buffer_table, run_kernel
+from experts.problem import KERNEL_NAMES, FloatArray, ShootingProblem
+from experts.rollout import FINISHED, closed_loop_rollout, rollout
+
+
+class Trajectory:
+    """States, controls and costs of one rollout, with the buffer tables of the kernels that fill them.
+
+    Attributes:
+        states: Shape (N + 1, n_x).
+        controls: Shape (N, n_u).
+        stage_costs: Shape (N,).
+        terminal_cost: Shape (1,).
+        cost: Total cost, inf if the rollout is not finite.
+        failing_stage: First stage with a number that is not finite, or `FINISHED`.
+        step_buffers: Buffers of `step_with_cost`.
+        terminal_buffers: Buffers of `terminal_cost`.
+    """
+
+    def __init__(self, problem: ShootingProblem, time_step: FloatArray) -> None:
+        """Allocate the arrays.
+
+        Args:
+            problem: Gives the sizes.
+            time_step: The scalar that all rows share, shape (1,), s.
+        """
+        self.states = np.zeros((problem.horizon + 1, problem.n_states))
+        self.controls = np.zeros((problem.horizon, problem.n_controls))
+        self.stage_costs = np.zeros(problem.horizon)
+        self.terminal_cost = np.zeros(1)
+        self.cost = np.inf
+        self.failing_stage = FINISHED
+        self.step_buffers = buffer_table(
+            self.states, self.controls, time_step, self.states[1:], self.stage_costs
+        )
+        self.terminal_buffers = buffer_table(self.states[-1:], self.terminal_cost)
+
+
+class ShootingWorkspace:
+    """A current trajectory with its derivatives and control update, and a trial trajectory.
+
+    Attributes:
+        problem: The problem.
+        current: The best trajectory so far.
+        trial: The trajectory of the last step that was tried.
+        update: Control update of the last sweep.
+        derivatives: Derivatives along the current trajectory, valid after `differentiate`.
+    """
+
+    def __init__(self, problem: ShootingProblem) -> None:
+        """Allocate all arrays of a solve.
+
+        Args:
+            problem: The problem.
+        """
+        sizes = problem.horizon, problem.n_tangent, problem.n_controls
+        self.problem = problem
+        self.derivatives = allocate_derivatives(*sizes)
+        self.update: Update = allocate_update(*sizes)
+        self._spare_update: Update = allocate_update(*sizes)
+        self._time_step = np.array([problem.time_step])
+        self._deviations = np.zeros((problem.horizon, problem.n_tangent))
+        self._sweep_work = sweep_workspace(problem.n_tangent, problem.n_controls)
+        self._lower = np.array(problem.control_lower, dtype=np.float64)
+        self._upper = np.array(problem.control_upper, dtype=np.float64)
+        self._kernels = {name: problem.kernel(name) for name in KERNEL_NAMES}
+        self.current = Trajectory(problem, self._time_step)
+        self.trial = Trajectory(problem, self._time_step)
+
+    def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
+        """Roll out given controls and make the result the current trajectory.
+
+        Args:
+            initial_state: Shape (n_x,).
+            controls: Inside the bounds, shape (N, n_u).
+        """
+        trajectory = self.current
+        trajectory.states[0] = self.trial.states[0] = initial_state
+        trajectory.controls[:] = controls
+        trajectory.cost, trajectory.failing_stage = rollout(
+            self._kernels["step_with_cost"].address,
+            trajectory.step_buffers,
+            self._kernels["terminal_cost"].address,
+            trajectory.terminal_buffers,
+            trajectory.states,
+            trajectory.stage_costs,
+            trajectory.terminal_cost,
+        )
+
+    def differentiate(self) -> None:
+        """Compute all derivatives along the current trajectory."""
+        states, controls, d = self.current.states, self.current.controls, self.derivatives
+        horizon = self.problem.horizon
+        self._run("linearize", horizon, buffer_table(states, controls, self._time_step, d.A, d.B))
+        self._run("cost_derivatives", horizon, buffer_table(states, controls, d.lx, d.lu, d.lxx, d.luu))
+        terminal_buffers = buffer_table(states[-1:], d.terminal_lx, d.terminal_lxx)
+        self._run("terminal_cost_derivatives", 1, terminal_buffers)
+
+    def sweep(self, regularization: float) -> SweepOutcome:
+        """Compute a control update; one that fails leaves the last update as it is.
+
+        Args:
+            regularization: lambda >= 0, in multiples of the control weights.
+
+        Returns:
+            How the sweep ended.
+        """
+        outcome = SweepOutcome(
+            *backward_sweep(
+                self.derivatives,
+                self.current.controls,
+                self._lower,
+                self._upper,
+                float(regularization),
+                self._spare_update,
+                self._sweep_work,
+            )
+        )
+        if outcome.status == SWEEP_DONE:
+            self.update, self._spare_update = self._spare_update, self.update
+        return outcome
+
+    def restore_update(self) -> None:
+        """Go back to the update before the last successful sweep."""
+        self.update, self._spare_update = self._spare_update, self.update
+
+    def try_step(self, alpha: float) -> float:
+        """Roll out the control update into the trial trajectory.
+
+        Args:
+            alpha: Step length, in (0, 1].
+
+        Returns:
+            Cost of the trial, inf if it is not finite.
+        """
+        trial, current = self.trial, self.current
+        trial.cost, trial.failing_stage = closed_loop_rollout(
+            self._kernels["difference"].address,
+            buffer_table(current.states, trial.states, self._deviations),
+            self._kernels["step_with_cost"].address,
+            trial.step_buffers,
+            self._kernels["terminal_cost"].address,
+            trial.terminal_buffers,
+            current.controls,
+            self.update.feedforward,
+            self.update.gains,
+            float(alpha),
+            self._lower,
+            self._upper,
+            trial.states,
+            trial.controls,
+            self._deviations,
+            trial.stage_costs,
+            trial.terminal_cost,
+        )
+        return trial.cost
+
+    def accept(self) -> None:
+        """Make the trial the current trajectory; its derivatives and update are then to be computed."""
+        self.current, self.trial = self.trial, self.current
+
+    def _run(self, name: str, rows: int, buffers: BufferTable) -> None:
+        """Run a kernel over the first rows of its buffers."""
+        run_kernel(self._kernels[name].address, 0, rows, buffers)

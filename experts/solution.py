@@ -1,0 +1,242 @@
+"""The result of a solve: trajectory, gains, why it stopped, how it went; and the policy that they make."""
+
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experts.native_call import buffer_table, run_kernel
+from experts.problem import FloatArray, ShootingProblem, as_problem
+
+Policy = Callable[[FloatArray, int], FloatArray]
+
+
+class StopReason(StrEnum):
+    """Why a solve ended."""
+
+    CONVERGED = "converged"
+    """An undamped step promises no decrease of the cost beyond the tolerance."""
+    MAX_ITERATIONS = "max_iterations"
+    """The iterations were used up."""
+    PLATEAU = "plateau"
+    """Many iterations in a row hardly lowered the cost, although the model still promises a decrease."""
+    REGULARIZATION_LIMIT = "regularization_limit"
+    """No step lowers the cost, however short."""
+    DIVERGED = "diverged"
+    """The first rollout, or a derivative along the trajectory, is not finite."""
+    INTERRUPTED = "interrupted"
+    """The user interrupted the solve."""
+
+
+class IterationRecord(NamedTuple):
+    """One iteration in numbers; a row of `Solution.history`.
+
+    Attributes:
+        iteration: Counts from 1.
+        cost: Cost after the iteration.
+        alpha: Accepted step length, 0 if every step was refused.
+        regularization: Weight lambda of the damping, in multiples of the control weights.
+        expected_decrease: Decrease of the cost that the full step promised, in the unit of the cost.
+        optimality: That decrease relative to the cost; it understates while the damping is strong.
+        clamped_share: Share of the inputs, over all stages, that were held at a bound; 0 to 1.
+        seconds: Wall-clock time, s.
+    """
+
+    iteration: int
+    cost: float
+    alpha: float
+    regularization: float
+    expected_decrease: float
+    optimality: float
+    clamped_share: float
+    seconds: float
+
+
+HISTORY_DTYPE = np.dtype(
+    [(name, np.int64 if name == "iteration" else np.float64) for name in IterationRecord._fields]
+)
+
+
+@dataclass(eq=False)
+class Solution:
+    """A trajectory, the best that a solve has found, with the feedback around it.
+
+    Attributes:
+        states: Shape (N + 1, n_x).
+        controls: Shape (N, n_u).
+        feedback_gains: K of u = u_k + K_k (x (-) x_k), zero in the rows of inputs at a bound; shape (N,
+            n_u, n_t).
+        cost: Total cost; inf if the first rollout diverged.
+        stop_reason: Why the solve ended.
+        message: The same in one sentence, with its numbers.
+        optimality: Decrease that an undamped step promises, relative to the cost; inf where it is unknown.
+        iterations: Number of iterations.
+        history: One row per iteration, fields as in `IterationRecord`.
+        metadata: Whatever should be saved along, for example the resolved scene; JSON values.
+        problem: The problem that was solved; absent after `load`.
+    """
+
+    states: FloatArray
+    controls: FloatArray
+    feedback_gains: FloatArray
+    cost: float
+    stop_reason: StopReason
+    message: str
+    optimality: float
+    iterations: int
+    history: NDArray[np.void]
+    metadata: dict[str, Any] = field(default_factory=dict)
+    problem: ShootingProblem | None = field(default=None, repr=False)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the solve ended at a minimum of the problem, to the solver's tolerance."""
+        return self.stop_reason is StopReason.CONVERGED
+
+    def policy(self, problem: Any = None) -> Policy:
+        """Make the feedback policy u = clip(u_k + K_k (x (-) x_k)).
+
+        Args:
+            problem: Problem or scene that gives the difference of states and the bounds; needed after `load`.
+
+        Returns:
+            Function of a state, shape (n_x,), and a stage k in [0, N); it returns a control, shape (n_u,).
+
+        Raises:
+            ValueError: If no problem is known, or its sizes are not those of the solution.
+        """
+        given = self.problem if problem is None else as_problem(problem)
+        if given is None:
+            raise ValueError(
+                "a loaded solution does not know its problem: call policy(problem) or policy(scene)"
+            )
+        return FeedbackPolicy(self, given)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the solution to a file; an existing one is replaced in one go or not at all.
+
+        Args:
+            path: File to write, in NumPy's npz format; its folder must exist.
+        """
+        facts = {
+            "cost": self.cost,
+            "stop_reason": self.stop_reason.value,
+            "message": self.message,
+            "optimality": self.optimality,
+            "iterations": self.iterations,
+            "metadata": self.metadata,
+            "versions": {
+                "python": platform.python_version(),
+                **{package: version(package) for package in ("numpy", "numba", "llvmlite")},
+            },
+        }
+        target = Path(path)
+        descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
+        temporary = Path(name)
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                np.savez(
+                    file,
+                    states=self.states,
+                    controls=self.controls,
+                    feedback_gains=self.feedback_gains,
+                    history=self.history,
+                    facts=np.array(json.dumps(facts)),
+                )
+            temporary.replace(target)
+        except BaseException:
+            temporary.unlink()
+            raise
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a solution that `save` wrote.
+
+        Args:
+            path: The file.
+
+        Returns:
+            The solution, without its problem.
+
+        Raises:
+            ValueError: If the file does not hold a solution.
+        """
+        with np.load(path, allow_pickle=False) as file:
+            missing = {"states", "controls", "feedback_gains", "history", "facts"} - set(file.files)
+            if missing:
+                raise ValueError(
+                    f"{os.fspath(path)} is not a solution: it lacks {', '.join(sorted(missing))}"
+                )
+            facts: Mapping[str, Any] = json.loads(str(file["facts"]))
+            return cls(
+                states=file["states"],
+                controls=file["controls"],
+                feedback_gains=file["feedback_gains"],
+                history=file["history"],
+                cost=facts["cost"],
+                stop_reason=StopReason(facts["stop_reason"]),
+                message=facts["message"],
+                optimality=facts["optimality"],
+                iterations=facts["iterations"],
+                metadata=facts["metadata"],
+            )
+
+
+class FeedbackPolicy:
+    """The policy of a solution; it owns its buffers, so give each thread its own."""
+
+    def __init__(self, solution: Solution, problem: ShootingProblem) -> None:
+        """Set up the buffers.
+
+        Args:
+            solution: Trajectory and gains.
+            problem: Gives the difference of states and the bounds.
+
+        Raises:
+            ValueError: If the sizes of the two differ.
+        """
+        horizon = solution.controls.shape[0]
+        expected = (horizon, problem.n_controls, problem.n_tangent)
+        if solution.feedback_gains.shape != expected or solution.states.shape[1] != problem.n_states:
+            raise ValueError(
+                f"the solution has gains {solution.feedback_gains.shape} and states {solution.states.shape}, "
+                f"the problem needs gains {expected} and states ({horizon + 1}, {problem.n_states})"
+            )
+        self._solution = solution
+        self._lower, self._upper = problem.control_lower, problem.control_upper
+        self._difference = problem.kernel("difference")
+        self._reference = np.zeros((1, problem.n_states))
+        self._state = np.zeros((1, problem.n_states))
+        self._deviation = np.zeros((1, problem.n_tangent))
+        self._buffers = buffer_table(self._reference, self._state, self._deviation)
+
+    def __call__(self, state: FloatArray, k: int) -> FloatArray:
+        """Compute the control at a stage.
+
+        Args:
+            state: Shape (n_x,).
+            k: Stage, in [0, N).
+
+        Returns:
+            Control within the bounds, shape (n_u,).
+
+        Raises:
+            IndexError: If the trajectory has no such stage.
+        """
+        horizon = self._solution.controls.shape[0]
+        if not 0 <= k < horizon:
+            raise IndexError(f"stage {k} is outside the trajectory, which has stages 0 to {horizon - 1}")
+        self._reference[0] = self._solution.states[k]
+        self._state[0] = state
+        run_kernel(self._difference.address, 0, 1, self._buffers)
+        control = self._solution.controls[k] + self._solution.feedback_gains[k] @ self._deviation[0]
+        return np.asarray(np.clip(control, self._lower, self._upper))

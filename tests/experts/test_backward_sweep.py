@@ -1,0 +1,146 @@
+"""The backward sweep against Tassa's formulas written out in NumPy, and against the Riccati equation."""
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from experts.backward_sweep import (
+    SWEEP_DONE,
+    SWEEP_NOT_FINITE,
+    SWEEP_NOT_POSITIVE_DEFINITE,
+    Derivatives,
+    SweepOutcome,
+    Update,
+    allocate_derivatives,
+    allocate_update,
+    backward_sweep,
+    sweep_workspace,
+)
+
+
+def random_derivatives(seed: int, horizon: int, n_tangent: int, n_controls: int) -> Derivatives:
+    rng = np.random.default_rng(seed)
+    d = allocate_derivatives(horizon, n_tangent, n_controls)
+    d.A[:] = np.eye(n_tangent) + 0.2 * rng.normal(size=d.A.shape) / np.sqrt(n_tangent)
+    d.B[:] = 0.3 * rng.normal(size=d.B.shape)
+    roots = rng.normal(size=(horizon + 1, n_tangent, n_tangent)) / np.sqrt(n_tangent)
+    d.lxx[:] = roots[:-1].transpose(0, 2, 1) @ roots[:-1]
+    d.terminal_lxx[0] = 5.0 * roots[-1].T @ roots[-1]
+    weights = 10.0 ** rng.uniform(-2.0, 1.0, size=n_controls)
+    d.luu[:] = np.diag(weights) + 0.1 * np.sqrt(np.outer(weights, weights)) * (1.0 - np.eye(n_controls))
+    for gradient in (d.lx, d.lu, d.terminal_lx):
+        gradient[:] = rng.normal(size=gradient.shape)
+    return d
+
+
+def sweep(
+    d: Derivatives, controls: np.ndarray, limit: float, regularization: float
+) -> tuple[SweepOutcome, Update]:
+    horizon, n_tangent, n_controls = d.B.shape
+    update = allocate_update(horizon, n_tangent, n_controls)
+    bound = np.full(n_controls, limit)
+    work = sweep_workspace(n_tangent, n_controls)
+    outcome = backward_sweep(d, controls, -bound, bound, regularization, update, work)
+    return SweepOutcome(*outcome), update
+
+
+def reference_sweep(
+    d: Derivatives, controls: np.ndarray, limit: float, regularization: float
+) -> tuple[float, float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Tassa's sweep: his value update with the Quu and Qux that are not regularized."""
+    Vx, Vxx = d.terminal_lx[0], d.terminal_lxx[0]
+    linear, quadratic = 0.0, 0.0
+    feedforward, gains = np.zeros(d.lu.shape), np.zeros(d.B.transpose(0, 2, 1).shape)
+    for stage in range(len(controls) - 1, -1, -1):
+        A, B = d.A[stage], d.B[stage]
+        Qx, Qu = d.lx[stage] + A.T @ Vx, d.lu[stage] + B.T @ Vx
+        Qxx, Quu, Qux = d.lxx[stage] + A.T @ Vxx @ A, d.luu[stage] + B.T @ Vxx @ B, B.T @ Vxx @ A
+        damped = Quu + regularization * np.diag(np.diag(d.luu[stage]))
+        if np.isinf(limit):
+            k, free = -np.linalg.solve(damped, Qu), np.full(len(Qu), True)
+        else:
+            root = np.linalg.cholesky(damped).T
+            bounds = (-limit - controls[stage], limit - controls[stage])
+            k = lsq_linear(root, -np.linalg.solve(root.T, Qu), bounds, method="bvls", tol=1e-15).x
+            free = (bounds[0] + 1e-12 < k) & (k < bounds[1] - 1e-12)
+        K = np.zeros(Qux.shape)
+        K[free] = -np.linalg.solve(damped[np.ix_(free, free)], Qux[free])
+        linear, quadratic = linear + k @ Qu, quadratic + 0.5 * k @ Quu @ k
+        Vx = Qx + K.T @ Quu @ k + K.T @ Qu + Qux.T @ k
+        Vxx = Qxx + K.T @ Quu @ K + K.T @ Qux + Qux.T @ K
+        feedforward[stage], gains[stage] = k, K
+    return linear, quadratic, feedforward, gains, Vx, Vxx
+
+
+@pytest.mark.parametrize("regularization", [0.0, 1.0, 300.0])
+@pytest.mark.parametrize("limit", [np.inf, 1.0, 0.2])
+@pytest.mark.parametrize(("n_tangent", "n_controls"), [(1, 1), (4, 3), (8, 8), (13, 5), (21, 12)])
+def test_agrees_with_the_formulas(
+    n_tangent: int, n_controls: int, limit: float, regularization: float
+) -> None:
+    d = random_derivatives(n_tangent, 12, n_tangent, n_controls)
+    controls = np.random.default_rng(1).uniform(-0.2, 0.2, size=d.lu.shape)
+    outcome, update = sweep(d, controls, limit, regularization)
+    linear, quadratic, k, K, Vx, Vxx = reference_sweep(d, controls, limit, regularization)
+    assert outcome.status == SWEEP_DONE
+    assert outcome.linear == pytest.approx(linear, rel=1e-8)
+    assert outcome.quadratic == pytest.approx(quadratic, rel=1e-8)
+    np.testing.assert_allclose(update.feedforward, k, atol=1e-8 * np.abs(k).max())
+    np.testing.assert_allclose(update.gains, K, atol=1e-8 * max(np.abs(K).max(), 1.0))
+    np.testing.assert_allclose(update.value_gradient, Vx, atol=1e-8 * np.abs(Vx).max())
+    np.testing.assert_allclose(update.value_hessian, Vxx, atol=1e-8 * np.abs(Vxx).max())
+
+
+@pytest.mark.parametrize("limit", [1.0, 0.2])
+def test_rows_of_clamped_inputs_are_zero_and_counted(limit: float) -> None:
+    d = random_derivatives(5, 30, 6, 4)
+    outcome, update = sweep(d, np.zeros(d.lu.shape), limit, 0.0)
+    on_bound = np.abs(update.feedforward) == limit
+    assert 0 < on_bound.sum() < on_bound.size
+    assert outcome.clamped == on_bound.sum()
+    assert np.all(update.gains[on_bound] == 0.0)
+    assert np.all(np.any(update.gains[~on_bound] != 0.0, axis=-1))
+
+
+def test_value_function_stays_symmetric_and_accurate_for_badly_scaled_inputs() -> None:
+    d = random_derivatives(2, 60, 9, 4)
+    d.luu[:] = np.diag([1e-7, 1e-3, 1.0, 1e5])
+    outcome, update = sweep(d, np.zeros(d.lu.shape), np.inf, 1e-2)
+    *_, Vx, Vxx = reference_sweep(d, np.zeros(d.lu.shape), np.inf, 1e-2)
+    assert outcome.status == SWEEP_DONE
+    np.testing.assert_array_equal(update.value_hessian, update.value_hessian.T)
+    np.testing.assert_allclose(update.value_hessian, Vxx, atol=1e-9 * np.abs(Vxx).max())
+    np.testing.assert_allclose(update.value_gradient, Vx, atol=1e-8 * np.abs(Vx).max())
+
+
+def test_horizon_of_time_invariant_system_reaches_the_riccati_solution() -> None:
+    scipy_linalg = pytest.importorskip("scipy.linalg")
+    d = random_derivatives(4, 400, 5, 2)
+    for array in d[:6]:
+        array[:] = array[0]
+    d.luu[:] = np.diag([0.5, 2.0])
+    outcome, update = sweep(d, np.zeros(d.lu.shape), np.inf, 0.0)
+    expected = scipy_linalg.solve_discrete_are(d.A[0], d.B[0], d.lxx[0], d.luu[0])
+    assert outcome.status == SWEEP_DONE
+    np.testing.assert_allclose(update.value_hessian, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_indefinite_stage_is_named_and_damping_repairs_it() -> None:
+    d = random_derivatives(0, 10, 4, 2)
+    d.lxx[7] = -50.0 * np.eye(4)
+    outcome, _ = sweep(d, np.zeros(d.lu.shape), np.inf, 0.0)
+    assert (outcome.status, outcome.stage) == (SWEEP_NOT_POSITIVE_DEFINITE, 6)
+    outcome, _ = sweep(d, np.zeros(d.lu.shape), np.inf, 1e6)
+    assert outcome.status == SWEEP_DONE
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("name", Derivatives._fields)
+@pytest.mark.parametrize("stage", [0, 5, 9])
+def test_derivatives_that_are_not_finite_are_reported(name: str, stage: int, bad: float) -> None:
+    d = random_derivatives(0, 10, 4, 2)
+    array = getattr(d, name)
+    array[min(stage, len(array) - 1)] = bad
+    for limit in (np.inf, 0.3):
+        outcome, _ = sweep(d, np.zeros(d.lu.shape), limit, 1.0)
+        assert outcome.status == SWEEP_NOT_FINITE
