@@ -1,0 +1,278 @@
+"""What a scene looks like: spacecraft, arm, payload and target as solids, and the region that they reach.
+
+A scene gives masses and frames, not shapes. Base and payload are drawn as the homogeneous boxes of their
+inertia; links join the origins of neighboring frames, in proportions taken from the length of the arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.environment.rendering.solids import Mesh, ball, box, cylinder, lathe
+from dq_space_arm_env.scene import Scene
+
+Array = NDArray[np.float64]
+
+FOIL = (0.93, 0.76, 0.45)
+METAL = (0.62, 0.65, 0.70)
+RADIATOR = (0.80, 0.82, 0.85)
+DARK_METAL = (0.24, 0.26, 0.31)
+CELLS = (0.17, 0.27, 0.52)
+LINK = (0.95, 0.95, 0.96)
+JOINT = (0.36, 0.42, 0.52)
+GRASPED = (0.42, 0.60, 0.58)
+AXIS_COLORS = ((0.84, 0.15, 0.16), (0.13, 0.60, 0.24), (0.14, 0.36, 0.85))
+
+_THINNEST = 0.05  # of the longest edge: even a flat body is drawn with some thickness
+
+
+def equivalent_box(mass: float, inertia: ArrayLike) -> tuple[Array, Array]:
+    """Find the homogeneous box of a given inertia: I_x = m (b^2 + c^2) / 12, and so on.
+
+    Args:
+        mass: Mass, kg.
+        inertia: Inertia about the center of mass, shape (3, 3), kg m^2.
+
+    Returns:
+        Edge lengths, none below 5 % of the longest, shape (3,), m, and their directions as columns, shape
+        (3, 3).
+    """
+    matrix = np.asarray(inertia, dtype=np.float64)
+    if np.count_nonzero(matrix - np.diag(np.diag(matrix))) == 0:
+        moments, axes = np.diag(matrix), np.eye(3)
+    else:
+        moments, axes = np.linalg.eigh(matrix)
+    edges = np.sqrt(np.maximum(6.0 / mass * (moments.sum() - 2.0 * moments), 0.0))
+    return np.maximum(edges, _THINNEST * edges.max()), axes
+
+
+class SpacecraftModel:
+    """The solids of a scene.
+
+    Frames are numbered as in `Kernels.frame_poses`: base, joints, wrist (if any), tip. The number after those
+    stands for the inertial frame.
+
+    Attributes:
+        scene: The scene.
+        frame_count: Number of frames of the robot.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        """Measure the scene.
+
+        Args:
+            scene: A validated scene.
+        """
+        self.scene = scene
+        offsets = [link.joint.position for link in scene.links]
+        if scene.wrist is not None:
+            offsets.append(scene.wrist.frame.position)
+        # Origin of each frame but the base, in the frame before it.
+        self._offsets = np.array([*offsets, scene.tip.position])
+        self.frame_count = len(self._offsets) + 1
+        self._body_size, self._body_axes = equivalent_box(scene.base.mass, scene.base.inertia)
+        lengths = np.linalg.norm(self._offsets, axis=1)
+        # Without links or wrist the tip is part of the base.
+        self._arm_length = float(lengths[1:].sum())
+        self._thickness = max(0.025 * self._arm_length, 0.03 * float(self._body_size.mean()))
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """All solids; the target's are fixed in the inertial frame."""
+        return Mesh.joined([*self._base(), *self._arm(), *self._hand(), *self._payload(), *self._axes()])
+
+    @cached_property
+    def axis_length(self) -> float:
+        """Length of the drawn axes of tip and target, m; without an arm they have to come out of the body."""
+        return 7.0 * self._thickness if self._arm_length else 0.8 * float(self._body_size.max())
+
+    @property
+    def region(self) -> tuple[Array, Array]:
+        """Balls that hold base, reach of the arm, and target: centers, (3, 3), m, and radii, (3,), m."""
+        start = self.scene.initial_state.base_pose
+        base = np.array(start.position)
+        shoulder = base + np.array(start.rotation_matrix) @ self._offsets[0]
+        centers = np.array([base, shoulder, self.scene.target.pose.position])
+        wings = float(np.linalg.norm(self._wing_tip))
+        return centers, np.array([wings, self._arm_length + self._overhang(), 1.2 * self.axis_length])
+
+    @cached_property
+    def _wing_axes(self) -> tuple[int, int, int]:
+        """Axes of the body for the wings' length, their width, and their normal.
+
+        The wings stretch in the body's x-y plane, sideways of the first joint.
+        """
+        shoulder = np.abs(self._body_axes.T @ self._offsets[0])
+        normal = int(np.abs(self._body_axes[2]).argmax())
+        first, second = (axis for axis in range(3) if axis != normal)
+        return (first, second, normal) if shoulder[first] < shoulder[second] else (second, first, normal)
+
+    @cached_property
+    def _wing_tip(self) -> Array:
+        along, across, _ = self._wing_axes
+        tip = np.zeros(3)
+        tip[along] = 0.5 * self._body_size[along] + 1.5 * self._body_size.mean()
+        tip[across] = 0.34 * self._body_size.mean()
+        return tip
+
+    def _base(self) -> Iterator[Mesh]:
+        size, axes = self._body_size, self._body_axes
+        yield box(0, (0.0, 0.0, 0.0), size, FOIL, axes)
+        yield from self._rims()
+        yield from self._wing(1.0)
+        yield from self._wing(-1.0)
+        if self.scene.actuators.base_force is not None:
+            yield from self._thrusters()
+
+    def _rims(self) -> Iterator[Mesh]:
+        """Decks at the two ends of the body, and rails along the edges between them."""
+        size, axes, mean = self._body_size, self._body_axes, float(self._body_size.mean())
+        along, across, normal = self._wing_axes
+        deck = size + 0.025 * mean
+        deck[normal] = 0.05 * size[normal]
+        plate = 0.84 * size
+        plate[normal] = 0.075 * size[normal]
+        rail = np.full(3, 0.05 * mean)
+        rail[normal] = size[normal]
+        for side in (-1.0, 1.0):
+            end = axes[:, normal] * side * 0.49 * size[normal]
+            yield box(0, end, deck, METAL, axes)
+            yield box(0, end, plate, RADIATOR, axes)
+            for other in (-1.0, 1.0):
+                edge = np.zeros(3)
+                edge[[along, across]] = (
+                    side * (0.5 * size[along] - 0.013 * mean),
+                    other * (0.5 * size[across] - 0.013 * mean),
+                )
+                yield box(0, axes @ edge, rail, METAL, axes)
+
+    def _wing(self, side: float) -> Iterator[Mesh]:
+        """A boom and three panels of solar cells."""
+        axes, mean = self._body_axes, float(self._body_size.mean())
+        along, across, normal = self._wing_axes
+        outward = side * axes[:, along]
+        root, width = 0.5 * float(self._body_size[along]), 2.0 * float(self._wing_tip[across])
+        length = float(self._wing_tip[along]) - root
+        yield cylinder(0, outward * root * 0.9, outward * (root + 0.2 * length), 0.02 * mean, METAL, 12)
+        panel_length = 0.88 * length / 3
+        for panel in range(3):
+            center = root + 0.12 * length + (panel + 0.5) * panel_length
+            size = np.empty(3)
+            size[[along, across, normal]] = 0.96 * panel_length, width, 0.02 * mean
+            yield box(0, outward * center, size, METAL, axes)
+            size[[along, across, normal]] = 0.42 * panel_length, 0.455 * width, 0.026 * mean
+            for row in (-1.0, 1.0):
+                for column in (-1.0, 1.0):
+                    offset = outward * 0.228 * panel_length * row + axes[:, across] * 0.24 * width * column
+                    yield box(0, outward * center + offset, size, CELLS, axes)
+
+    def _thrusters(self) -> Iterator[Mesh]:
+        """Nozzles at the edges of the body; for a planar base, in the plane."""
+        axes, size, mean = self._body_axes, self._body_size, float(self._body_size.mean())
+        along, across, normal = self._wing_axes
+        levels = (0.0,) if self.scene.base.motion == "planar" else (-0.38, 0.38)
+        bell = [(0.0, 0.0), (0.0, 0.022), (0.03, 0.022), (0.095, 0.05), (0.095, 0.042), (0.05, 0.0)]
+        profile = [(height * mean, radius * mean) for height, radius in bell]
+        colors = [METAL, METAL, METAL, METAL, DARK_METAL]
+        for level in levels:
+            for first in (-1.0, 1.0):
+                for second in (-1.0, 1.0):
+                    corner = np.zeros(3)
+                    corner[[along, across, normal]] = first * 0.36, second * 0.5, level
+                    yield lathe(0, axes @ (corner * size), second * axes[:, across], profile, colors, 16)
+
+    def _radius(self, frame: int) -> float:
+        """Radius of the link in a frame: the arm tapers toward the tip, m."""
+        return self._thickness * (1.15 - 0.4 * frame / self.frame_count)
+
+    def _arm(self) -> Iterator[Mesh]:
+        last = len(self._offsets) - 1
+        for frame, offset in enumerate(self._offsets):
+            radius, color = (self._radius(frame), LINK) if frame else (1.2 * self._radius(frame), METAL)
+            end = offset if frame < last else self._hand_start
+            if np.linalg.norm(end) > 0.1 * radius:
+                yield cylinder(frame, (0.0, 0.0, 0.0), end, radius, color)
+        for joint in range(1, len(self.scene.links) + 1):
+            yield from self._joint(joint)
+        if self.scene.wrist is not None:
+            frame = len(self.scene.links) + 1
+            yield ball(frame, (0.0, 0.0, 0.0), 1.5 * self._radius(frame), JOINT)
+
+    def _joint(self, frame: int) -> Iterator[Mesh]:
+        """A beveled housing along the joint's z axis."""
+        radius, half = 1.5 * self._radius(frame), 1.6 * self._radius(frame)
+        bevel = 0.2 * radius
+        profile = [(-half, 0.0), (-half, radius - bevel), (bevel - half, radius), (half - bevel, radius)]
+        profile += [(half, radius - bevel), (half, 0.0)]
+        yield lathe(frame, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), profile, JOINT)
+
+    @property
+    def _hand_length(self) -> float:
+        return 5.0 * self._thickness
+
+    @cached_property
+    def _approach(self) -> Array:
+        """Unit direction in which the hand points, in the frame before the tip's: on from the last link."""
+        direction = self._offsets[-1]
+        if not direction.any() and self.scene.wrist is not None:
+            direction = np.array(self.scene.wrist.frame.rotation_matrix).T @ self._offsets[-2]
+        if not direction.any():
+            direction = np.array([0.0, 0.0, 1.0])
+        return np.asarray(direction / np.linalg.norm(direction))
+
+    @cached_property
+    def _hand_start(self) -> Array:
+        """Where the hand begins, in the frame before the tip's: it ends at the tip if there is room, m."""
+        return self._approach * max(0.0, float(np.linalg.norm(self._offsets[-1])) - self._hand_length)
+
+    def _overhang(self) -> float:
+        """How far hand and payload may stretch beyond the tip, m."""
+        overhang = max(0.0, self._hand_length - float(np.linalg.norm(self._offsets[-1])))
+        payload = self.scene.payload
+        if payload is not None:
+            size, _ = equivalent_box(payload.mass, payload.inertia)
+            overhang = max(overhang, float(np.linalg.norm(payload.center_of_mass) + 0.5 * size.max()))
+        return overhang
+
+    def _hand(self) -> Iterator[Mesh]:
+        """A palm and two fingers."""
+        frame = len(self._offsets) - 1
+        radius, length, approach = 0.8 * self._thickness, self._hand_length, self._approach
+        opening = np.cross(approach, np.eye(3)[np.abs(approach).argmin()])
+        opening /= np.linalg.norm(opening)
+        axes = np.column_stack([opening, np.cross(approach, opening), approach])
+        profile = [(0.0, 0.0), (0.0, radius), (0.3, 1.3 * radius), (0.4, 1.3 * radius), (0.4, 0.0)]
+        scaled = [(height * length, ring) for height, ring in profile]
+        yield lathe(frame, self._hand_start, approach, scaled, JOINT)
+        for side in (-1.0, 1.0):
+            center = self._hand_start + 0.68 * length * approach + side * radius * opening
+            yield box(frame, center, (0.5 * radius, 1.2 * radius, 0.64 * length), DARK_METAL, axes)
+
+    def _payload(self) -> Iterator[Mesh]:
+        payload = self.scene.payload
+        if payload is not None:
+            size, axes = equivalent_box(payload.mass, payload.inertia)
+            yield box(self.frame_count - 1, payload.center_of_mass, size, GRASPED, axes)
+
+    def _axes(self) -> Iterator[Mesh]:
+        """Axes of the tip, and thicker and lighter ones at the target."""
+        pose = self.scene.target.pose
+        thickness, length = self._thickness, self.axis_length
+        yield from _arrows(self.frame_count - 1, np.zeros(3), np.eye(3), length, 0.2 * thickness, 0.0)
+        rotation, position = np.array(pose.rotation_matrix), np.array(pose.position)
+        yield from _arrows(self.frame_count, position, rotation, length, 0.42 * thickness, 0.45)
+
+
+def _arrows(
+    frame: int, origin: Array, directions: Array, length: float, radius: float, lightness: float
+) -> Iterator[Mesh]:
+    """Arrows along the columns of `directions`, x red, y green, z blue, mixed with white."""
+    head = length - 6.0 * radius
+    profile = [(0.0, 0.0), (0.0, radius), (head, radius), (head, 2.3 * radius), (length, 0.0)]
+    for direction, color in zip(directions.T, AXIS_COLORS, strict=True):
+        red, green, blue = (part + lightness * (1.0 - part) for part in color)
+        yield lathe(frame, origin, direction, profile, (red, green, blue), 12)

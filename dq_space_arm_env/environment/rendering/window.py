@@ -1,0 +1,90 @@
+"""A window that shows pictures."""
+
+from __future__ import annotations
+
+import os
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pygame
+
+# SDL falls back on these where there is no display; what they show nobody sees.
+_INVISIBLE_DRIVERS = ("dummy", "offscreen")
+_NO_DISPLAY = (
+    'render_mode="human" needs a display and there is none: use render_mode="rgb_array", or set DISPLAY '
+    "(or WAYLAND_DISPLAY) to one"
+)
+
+
+def import_pygame() -> ModuleType:
+    """Import pygame.
+
+    Returns:
+        The module.
+
+    Raises:
+        DependencyNotInstalled: If it is not installed.
+    """
+    try:
+        import pygame
+    except ImportError as error:
+        raise gymnasium.error.DependencyNotInstalled(
+            'pictures need pygame-ce, which is not installed: pip install "dq-space-arm[render]"'
+        ) from error
+    return pygame
+
+
+class Window:
+    """A window of the desktop. Once its user has closed it, it stays closed and the simulation goes on."""
+
+    def __init__(self, title: str, width: int, height: int) -> None:
+        """Open the window.
+
+        Args:
+            title: Its title.
+            width: Width of the pictures, pixels.
+            height: Height of the pictures, pixels.
+
+        Raises:
+            Error: If there is no display.
+        """
+        self._pygame = import_pygame()
+        try:
+            self._pygame.display.init()
+        except self._pygame.error as error:
+            raise gymnasium.error.Error(_NO_DISPLAY) from error
+        driver = self._pygame.display.get_driver()
+        if driver in _INVISIBLE_DRIVERS and os.environ.get("SDL_VIDEODRIVER") != driver:
+            self._pygame.display.quit()
+            raise gymnasium.error.Error(_NO_DISPLAY)
+        self._window: pygame.Window | None = self._pygame.Window(title, (width, height))
+        self._clock = self._pygame.time.Clock()
+
+    def show(self, image: NDArray[np.uint8], fps: float) -> None:
+        """Show a picture, and wait until it is time for the next one.
+
+        Args:
+            image: Picture, shape (height, width, 3).
+            fps: Pictures per second.
+        """
+        if self._window is None:
+            return
+        height, width, _ = image.shape
+        picture = self._pygame.image.frombuffer(image.tobytes(), (width, height), "RGB")
+        self._window.get_surface().blit(picture, (0, 0))
+        self._window.flip()
+        self._clock.tick(fps)
+        for event in self._pygame.event.get([self._pygame.QUIT, self._pygame.WINDOWCLOSE]):
+            if event.type == self._pygame.QUIT or event.window is self._window:
+                self.close()
+
+    def close(self) -> None:
+        """Close the window, if it is open."""
+        if self._window is not None:
+            self._window.destroy()
+            self._window = None

@@ -1,0 +1,344 @@
+"""Pictures of scenes: what they show, that near hides far, and what is said when they are impossible."""
+
+import itertools
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+
+pytest.importorskip("pygame")
+
+from dq_space_arm_env.algebra import dual_quaternion, poses
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematics import frame_poses
+from dq_space_arm_env.environment.rendering import Renderer
+from dq_space_arm_env.environment.rendering.spacecraft import LINK, SpacecraftModel
+from dq_space_arm_env.scene import Scene, list_scenes, load_scene
+
+pytestmark = pytest.mark.render
+
+NO_TRAIL = np.zeros((0, 3))
+
+
+def start_poses(scene, joint_angles=None):
+    """Poses of all frames at the scene's nominal start, from the equations themselves."""
+    start = scene.initial_state
+    angles = start.joint_angles if joint_angles is None else joint_angles
+    frames = frame_poses(Chain.from_scene(scene), start.base_pose.dual_quaternion, angles, start.wrist_angles)
+    return np.array(frames, dtype=np.float64)
+
+
+def empty_picture(renderer):
+    """What the renderer draws where nothing is: a gradient that is the same in every column."""
+    picture = renderer.draw(np.full((renderer._model.frame_count, 8), np.nan), NO_TRAIL)
+    return np.repeat(picture[:, -1:], picture.shape[1], axis=1)
+
+
+def scene_with(**fields):
+    base = {"mass": 50, "inertia": [[4, 0.8, 0], [0.8, 6, 0.3], [0, 0.3, 5]]}
+    data = {"name": "test", "base": base, "target": {"pose": {"position": [1.5, 1, 0]}}}
+    return Scene.model_validate({**data, **fields})
+
+
+LINKLESS = [
+    scene_with(),
+    scene_with(tip={"position": [0.9, 0.2, 0.3]}, actuators={"base_force": {"limit": 1}}),
+    scene_with(wrist={"frame": {"position": [0, 0, 0.8]}}, tip={"position": [0.3, 0, 0]}),
+]
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_every_shipped_scene_is_drawn_in_view(name):
+    scene = load_scene(name)
+    renderer = Renderer(scene, width=320, height=240)
+    picture = renderer.draw(start_poses(scene), NO_TRAIL)
+    assert picture.shape == (240, 320, 3)
+    assert picture.dtype == np.uint8
+    drawn = (picture != empty_picture(renderer)).any(axis=2)
+    assert 0.03 < drawn.mean() < 0.5
+    border = np.concatenate([drawn[0], drawn[-1], drawn[:, 0], drawn[:, -1]])
+    assert not border.any(), "something reaches the border of the picture"
+
+
+@pytest.mark.parametrize("scene", LINKLESS, ids=["base", "tip", "wrist"])
+def test_scene_without_links_is_drawn(scene):
+    renderer = Renderer(scene)
+    drawn = (renderer.draw(start_poses(scene), NO_TRAIL) != empty_picture(renderer)).any(axis=2)
+    assert drawn.mean() > 0.03
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (97, 301), (8, 5), (1, 1)])
+def test_picture_has_the_size_asked_for(width, height):
+    scene = load_scene("paper")
+    assert Renderer(scene, width, height).draw(start_poses(scene), NO_TRAIL).shape == (height, width, 3)
+
+
+def test_same_state_gives_same_bytes():
+    scene = load_scene("paper")
+    frames, trail = start_poses(scene), np.linspace((0.0, -3.0, 4.0), (0.5, -3.5, 5.0), 50)
+    first = Renderer(scene)
+    pictures = [first.draw(frames, trail), first.draw(frames, trail), Renderer(scene).draw(frames, trail)]
+    assert pictures[0].tobytes() == pictures[1].tobytes() == pictures[2].tobytes()
+    pictures[0][:] = 0
+    assert first.draw(frames, trail).tobytes() == pictures[1].tobytes(), (
+        "a picture is the renderer's own memory"
+    )
+
+
+@pytest.mark.parametrize("joint", range(3))
+def test_picture_changes_with_every_joint(joint):
+    scene = load_scene("paper")
+    renderer = Renderer(scene)
+    angles = list(scene.initial_state.joint_angles)
+    before = renderer.draw(start_poses(scene), NO_TRAIL)
+    angles[joint] += 0.3
+    changed = (renderer.draw(start_poses(scene, angles), NO_TRAIL) != before).any(axis=2)
+    assert changed.sum() > 500
+
+
+def test_picture_does_not_know_the_sign_of_a_dual_quaternion():
+    scene = load_scene("paper")
+    renderer, frames = Renderer(scene), start_poses(scene)
+    assert np.array_equal(renderer.draw(frames, NO_TRAIL), renderer.draw(-frames, NO_TRAIL))
+
+
+def test_target_is_seen_in_its_place_with_three_axes():
+    scene = load_scene("no-wrist")
+    renderer = Renderer(scene)
+    pose = scene.target.pose
+    empty = empty_picture(renderer).astype(int)
+    away = start_poses(scene)
+    away[:, 4:] = np.nan  # the robot alone is not drawn
+    picture = renderer.draw(away, NO_TRAIL).astype(int)
+    axes = np.array(pose.rotation_matrix).T * 0.5 * renderer._model.axis_length
+    columns, rows = renderer.camera.project(np.array(pose.position) + axes)[:, :2].astype(int).T
+    for axis, (column, row) in enumerate(zip(columns, rows, strict=True)):
+        color = picture[row, column]
+        assert (color != empty[row, column]).any()
+        assert color.argmax() == axis, f"axis {axis} has color {color}"
+
+
+def test_tip_axes_follow_the_tip():
+    scene = load_scene("planar")
+    renderer = Renderer(scene)
+    frames = start_poses(scene)
+    rotation, position = poses.to_matrix(frames[-1])
+    end = np.array(position) + 0.7 * renderer._model.axis_length * np.array(rotation)[:, 0]
+    column, row = renderer.camera.project(end)[:2].astype(int)
+    red, green, blue = renderer.draw(frames, NO_TRAIL)[row, column].astype(int)
+    assert red > 2 * green
+    assert red > 2 * blue
+
+
+def test_planar_scene_is_seen_from_above():
+    camera = Renderer(load_scene("planar")).camera
+    np.testing.assert_allclose(camera.axes, [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-15)
+
+
+def test_up_is_up():
+    camera = Renderer(load_scene("paper")).camera
+    bottom, top = camera.project(np.array([(0.3, -2.9, 4.4), (0.3, -2.9, 5.4)]))[:, :2]
+    assert top[0] == pytest.approx(bottom[0])
+    assert top[1] < bottom[1] - 50
+
+
+def test_link_is_seen_where_it_is():
+    scene = load_scene("paper")
+    renderer, frames = Renderer(scene), start_poses(scene)
+    middle = 0.5 * np.array(poses.position(frames[2])) + 0.5 * np.array(poses.position(frames[3]))
+    column, row = renderer.camera.project(middle)[:2].astype(int)
+    color = renderer.draw(frames, NO_TRAIL)[row, column] / 255.0
+    np.testing.assert_allclose(color / color.max(), np.array(LINK) / max(LINK), atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["paper", "payload", "six-joint", "planar"])
+def test_whole_reach_stays_in_view(name):
+    scene = load_scene(name)
+    renderer, rng = Renderer(scene), np.random.default_rng(4)
+    size = np.array([renderer.camera.width, renderer.camera.height])
+    for _ in range(200):
+        frames = start_poses(scene, rng.uniform(-np.pi, np.pi, len(scene.links)))
+        seen = renderer.camera.project(np.array(poses.position(frames.T)).T)[:, :2]
+        assert ((seen > 0) & (seen < size)).all()
+
+
+def test_trail_is_drawn_where_the_tip_was():
+    scene = load_scene("paper")
+    renderer, frames = Renderer(scene), start_poses(scene)
+    trail = np.linspace((0.3, -4.0, 6.0), (0.3, -2.0, 6.0), 300)
+    before, after = renderer.draw(frames, NO_TRAIL), renderer.draw(frames, trail)
+    columns, rows = renderer.camera.project(trail[5:-5])[:, :2].astype(int).T
+    assert (before[rows, columns] != after[rows, columns]).any(axis=1).all()
+    old, new = after[rows, columns].astype(int)[[0, -1]]
+    assert old[2] > new[2] + 50, "older parts are fainter"
+    np.testing.assert_array_equal(after, renderer.draw(frames, trail.tolist()))
+
+
+@pytest.mark.parametrize("points", [1, 2, 500])
+def test_resting_tip_leaves_no_trail(points):
+    scene = load_scene("paper")
+    renderer, frames = Renderer(scene), start_poses(scene)
+    resting = np.tile((0.3, -4.0, 6.0), (points, 1))
+    assert np.array_equal(renderer.draw(frames, resting), renderer.draw(frames, NO_TRAIL))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200, -1e300])
+def test_simulation_that_has_blown_up_is_drawn_without_warning(value):
+    scene = load_scene("paper")
+    renderer, good = Renderer(scene), start_poses(scene)
+    for part in itertools.product((slice(None), slice(2, None)), (slice(None), slice(4, None))):
+        frames = good.copy()
+        frames[part] = value
+        picture = renderer.draw(frames, np.array([(0.3, -4.0, 6.0), (value, value, 0.0), (0.3, -2.0, 6.0)]))
+        assert picture.shape == (480, 640, 3)
+
+
+def test_robot_may_pass_the_camera():
+    scene = load_scene("paper")
+    renderer, good = Renderer(scene), start_poses(scene)
+    toward = renderer.camera.position - np.array(scene.initial_state.base_pose.position)
+    counts = []
+    for distance in (0.0, 0.5, 0.9, 1.0, 1.1, 2.0):
+        move = poses.from_rotation_and_position((1.0, 0.0, 0.0, 0.0), distance * toward)
+        frames = np.array([dual_quaternion.multiply(move, frame) for frame in good])
+        picture = renderer.draw(frames, NO_TRAIL)
+        counts.append((picture != empty_picture(renderer)).any(axis=2).sum())
+    assert counts[0] < counts[1], "nearer is larger"
+    assert counts[-1] < 0.2 * counts[0], "what is behind the camera is not seen"
+
+
+def test_thrusters_are_drawn_if_there_are_any():
+    scene = scene_with()
+    with_thrusters = scene_with(actuators={"base_force": {"limit": 1}})
+    frames = start_poses(scene)
+    assert not np.array_equal(
+        Renderer(scene).draw(frames, NO_TRAIL), Renderer(with_thrusters).draw(frames, NO_TRAIL)
+    )
+
+
+def test_model_numbers_frames_as_the_kernels_do():
+    for name in list_scenes():
+        scene = load_scene(name)
+        model = SpacecraftModel(scene)
+        assert model.frame_count == len(start_poses(scene))
+        assert set(model.mesh.frames) <= set(range(model.frame_count + 1))
+
+
+@pytest.mark.parametrize(
+    ("frames", "trail", "sentence"),
+    [
+        ((5, 8), (0, 3), r"frame_poses: shape \(5, 8\), should be \(6, 8\)"),
+        ((1, 6, 8), (0, 3), r"frame_poses: shape \(1, 6, 8\), should be \(6, 8\)"),
+        ((6, 8), (4, 8), r"trail: shape \(4, 8\), should be \(m, 3\)"),
+        ((6, 8), (3,), r"trail: shape \(3,\), should be \(m, 3\)"),
+    ],
+)
+def test_wrong_shapes_are_refused(frames, trail, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        Renderer(load_scene("paper")).draw(np.zeros(frames), np.zeros(trail))
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "field"), [(0, 480, "width"), (640, -1, "height"), (640.0, 480, "width")]
+)
+def test_impossible_sizes_are_refused(width, height, field):
+    with pytest.raises(ValueError, match=f"{field}: .* must be a positive integer"):
+        Renderer(load_scene("paper"), width, height)
+
+
+def test_missing_pygame_is_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(gymnasium.error.DependencyNotInstalled) as caught:
+        Renderer(load_scene("paper"))
+    assert 'pip install "dq-space-arm[render]"' in str(caught.value)
+
+
+def test_rendering_loads_pygame_late_and_needs_no_display():
+    program = """
+import os, sys
+import dq_space_arm_env
+from dq_space_arm_env.environment.rendering import Renderer
+assert not {"pygame", "matplotlib"} & set(sys.modules)
+before = dict(os.environ)
+scene = dq_space_arm_env.load_scene("planar")
+renderer = Renderer(scene)
+renderer.draw([[1, 0, 0, 0, 0, 0, 0, 0]] * 5, [[0, 0, 0]])
+import pygame
+assert not pygame.display.get_init()
+assert dict(os.environ) == before
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.fixture
+def invisible_display(monkeypatch):
+    import pygame
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame.display.quit()
+    yield pygame
+    pygame.display.quit()
+
+
+def test_window_shows_the_picture(invisible_display):
+    scene = load_scene("paper")
+    renderer, frames = Renderer(scene, 160, 120), start_poses(scene)
+    renderer.show(frames, NO_TRAIL, 1000)
+    surface = renderer._window._window.get_surface()
+    shown = invisible_display.surfarray.array3d(surface).transpose(1, 0, 2)
+    np.testing.assert_array_equal(shown, renderer.draw(frames, NO_TRAIL))
+    renderer.close()
+    renderer.close()
+    renderer.show(frames, NO_TRAIL, 1000)
+    renderer.close()
+
+
+def test_window_that_its_user_closes_stays_closed(invisible_display):
+    scene = load_scene("paper")
+    renderer, other = Renderer(scene, 160, 120), Renderer(scene, 160, 120)
+    frames = start_poses(scene)
+    renderer.show(frames, NO_TRAIL, 1000)
+    other.show(frames, NO_TRAIL, 1000)
+    window = renderer._window._window
+    invisible_display.event.post(invisible_display.event.Event(invisible_display.WINDOWCLOSE, window=window))
+    renderer.show(frames, NO_TRAIL, 1000)
+    renderer.show(frames, NO_TRAIL, 1000)
+    assert renderer._window._window is None
+    other.show(frames, NO_TRAIL, 1000)
+    assert other._window._window is not None
+    other.close()
+
+
+def test_window_waits_for_the_next_picture(invisible_display):
+    import time
+
+    scene = load_scene("planar")
+    renderer, frames = Renderer(scene, 64, 48), start_poses(scene)
+    renderer.show(frames, NO_TRAIL, 50)
+    begin = time.perf_counter()
+    for _ in range(5):
+        renderer.show(frames, NO_TRAIL, 50)
+    assert time.perf_counter() - begin > 0.08
+    renderer.close()
+
+
+@pytest.mark.parametrize("driver", ["offscreen", "dummy"])
+def test_missing_display_is_one_sentence(monkeypatch, invisible_display, driver):
+    monkeypatch.delenv("SDL_VIDEODRIVER")
+    monkeypatch.setattr(invisible_display.display, "init", lambda: None)
+    monkeypatch.setattr(invisible_display.display, "get_driver", lambda: driver)
+    scene = load_scene("paper")
+    with pytest.raises(gymnasium.error.Error, match=r'use render_mode="rgb_array", or set DISPLAY'):
+        Renderer(scene).show(start_poses(scene), NO_TRAIL, 60)
+
+
+def test_display_that_refuses_is_one_sentence(monkeypatch, invisible_display):
+    def refuse():
+        raise invisible_display.error("No available video device")
+
+    monkeypatch.setattr(invisible_display.display, "init", refuse)
+    scene = load_scene("paper")
+    with pytest.raises(gymnasium.error.Error, match=r'use render_mode="rgb_array", or set DISPLAY'):
+        Renderer(scene).show(start_poses(scene), NO_TRAIL, 60)

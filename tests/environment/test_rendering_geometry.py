@@ -1,0 +1,261 @@
+"""Solids, camera and depth buffer of the pictures, against identities and against rays cast one by one."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dq_space_arm_env.environment.rendering.camera import Camera, camera_around
+from dq_space_arm_env.environment.rendering.drawing import (
+    OVERSAMPLING,
+    mean_of_subpixels,
+    mesh_faces,
+    paint_background,
+    paint_faces,
+)
+from dq_space_arm_env.environment.rendering.rasterizer import nearest_faces
+from dq_space_arm_env.environment.rendering.solids import Mesh, ball, box, cylinder, lathe
+from dq_space_arm_env.environment.rendering.spacecraft import SpacecraftModel, equivalent_box
+from dq_space_arm_env.scene import list_scenes, load_scene
+
+RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.9, 0.1)
+STILL = np.eye(3)[None], np.zeros((1, 3))
+
+# Looks along +x from the origin: y goes left, z up.
+FORWARD = Camera(np.zeros(3), np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), 60.0, 64, 48)
+
+
+def picture_of(*meshes, camera=FORWARD):
+    background = paint_background(OVERSAMPLING * camera.width, OVERSAMPLING * camera.height)
+    image = mean_of_subpixels(background).copy()
+    faces = mesh_faces(Mesh.joined(meshes), *STILL, camera.scaled(OVERSAMPLING))
+    paint_faces(image, background, *faces)
+    return image
+
+
+def volume_and_closure(corners):
+    """Volume by the divergence theorem, and the sum of the area vectors, zero for a closed surface."""
+    area = 0.5 * np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    return np.einsum("fi,fi->", corners.mean(axis=1), area) / 3.0, area.sum(axis=0)
+
+
+# Occlusion ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("near_is_first", [True, False])
+@pytest.mark.parametrize(("near_color", "far_color"), [(RED, GREEN), (GREEN, RED)])
+def test_near_solid_hides_far_one(near_is_first, near_color, far_color):
+    near = box(0, (4.0, 0.0, 0.0), (1.0, 1.0, 1.0), near_color)
+    far = box(0, (8.0, 0.0, 0.0), (1.0, 4.0, 1.0), far_color)
+    image = picture_of(near, far) if near_is_first else picture_of(far, near)
+    # They appear 17 and 32 pixels wide.
+    for column, color in ((32, near_color), (39, near_color), (42, far_color), (21, far_color)):
+        shown = image[24, column].astype(float)
+        np.testing.assert_allclose(shown / shown.max(), np.array(color) / max(color), atol=0.02)
+
+
+def test_intersecting_solids_show_their_line_of_intersection():
+    """Two slabs turned by +-45 degrees about z through one another: each hides the other on one side."""
+    half = math.sqrt(0.5)
+    turned = np.array([[half, -half, 0.0], [half, half, 0.0], [0.0, 0.0, 1.0]])
+    one = box(0, (6.0, 0.0, 0.0), (4.0, 0.02, 2.0), RED, turned)
+    other = box(0, (6.0, 0.0, 0.0), (4.0, 0.02, 2.0), GREEN, turned.T)
+    for meshes in ((one, other), (other, one)):
+        row = picture_of(*meshes)[24].astype(int)
+        # The first slab stretches from near right to far left (y goes left).
+        assert (row[36:48, 0] > 3 * row[36:48, 1]).all()
+        assert (row[16:28, 1] > 3 * row[16:28, 0]).all()
+
+
+def rays_one_by_one(corners, camera):
+    """Nearest face in every pixel by intersecting each pixel's ray with each face in space."""
+    nearest = np.zeros((camera.height, camera.width), dtype=int)
+    for row, column in itertools.product(range(camera.height), range(camera.width)):
+        right, down = column + 0.5 - 0.5 * camera.width, row + 0.5 - 0.5 * camera.height
+        ray = np.array([right, down, camera.focal_length]) @ camera.axes
+        best = math.inf
+        for face, (a, b, c, d) in enumerate(corners):
+            normal = np.cross(c - a, d - b)
+            along = normal @ ray
+            if along == 0.0:
+                continue
+            distance = normal @ (a - camera.position) / along
+            hit = camera.position + distance * ray
+            sides = [
+                np.cross(end - start, hit - start) @ normal >= 0.0
+                for start, end in ((a, b), (b, c), (c, d), (d, a))
+            ]
+            if 0.0 < distance < best and all(sides):
+                best, nearest[row, column] = distance, face + 1
+    return nearest
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_depth_buffer_agrees_with_rays_cast_one_by_one(seed):
+    rng = np.random.default_rng(seed)
+    camera = Camera(FORWARD.position, FORWARD.axes, 20.0, 24, 18)
+    boxes = [
+        box(0, rng.uniform((3, -1.5, -1.0), (7, 1.5, 1.0)), rng.uniform(0.2, 2.5, 3), RED, _rotation(rng))
+        for _ in range(5)
+    ]
+    corners = Mesh.joined(boxes).corners
+    found = nearest_faces(camera.project(corners), camera.width, camera.height)
+    expected = rays_one_by_one(corners, camera)
+    assert len(np.unique(expected)) > 8
+    assert (expected == 0).any()
+    np.testing.assert_array_equal(found, expected)
+
+
+def _rotation(rng):
+    matrix, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return matrix
+
+
+def test_tiles_leave_no_gap_and_do_not_overlap():
+    """A skewed grid of tiles at the same depth: each pixel center inside belongs to one of them."""
+    rng = np.random.default_rng(1)
+    grid = np.stack(np.meshgrid(np.arange(9) * 5.0 + 3.3, np.arange(7) * 5.0 + 2.1), axis=-1)
+    grid[1:-1, 1:-1] += rng.uniform(-1.5, 1.5, (5, 7, 2))
+    tiles = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=2).reshape(-1, 4, 2)
+    corners = np.concatenate([tiles, np.full((48, 4, 1), 0.5)], axis=2)
+    counts = sum((nearest_faces(corners[[tile]], 48, 36) > 0).astype(int) for tile in range(48))
+    assert (counts[2:32, 3:43] == 1).all()
+    assert counts.sum() == 30 * 40
+
+
+def test_order_of_the_corners_does_not_matter():
+    corners = np.array([[(3.2, 2.1, 0.2), (20.7, 4.0, 0.3), (17.0, 15.5, 0.25), (5.0, 12.2, 0.2)]])
+    expected = nearest_faces(corners, 24, 18)
+    assert expected.any()
+    for shift in range(4):
+        rolled = np.roll(corners, shift, axis=1)
+        for variant in (rolled, rolled[:, ::-1]):
+            np.testing.assert_array_equal(nearest_faces(variant, 24, 18), expected)
+
+
+def test_faces_reach_out_of_the_picture():
+    corners = np.array([[(-1e6, -1e6, 0.1), (1e6, -1e6, 0.1), (1e6, 1e6, 0.1), (-1e6, 1e6, 0.1)]])
+    assert (nearest_faces(corners, 24, 18) == 1).all()
+    assert not nearest_faces(corners + np.array([3e6, 0.0, 0.0]), 24, 18).any()
+    assert not nearest_faces(corners[:0], 24, 18).any()
+
+
+def test_subpixels_are_averaged_channel_by_channel():
+    rng = np.random.default_rng(0)
+    channels = rng.integers(0, 256, (6 * OVERSAMPLING, 5 * OVERSAMPLING, 4), dtype=np.uint8)
+    expected = channels.reshape(6, OVERSAMPLING, 5, OVERSAMPLING, 4).astype(int).sum(axis=(1, 3))
+    found = mean_of_subpixels(channels.view(np.uint32)[..., 0])
+    np.testing.assert_array_equal(found, expected[..., :3] // OVERSAMPLING**2)
+
+
+def test_edges_are_smooth():
+    slab = box(0, (5.0, 0.0, 0.0), (0.1, 2.0, 2.0), RED, _rotation(np.random.default_rng(3)))
+    image = picture_of(slab).astype(int)
+    inside, outside = image[24, 32], image[0, 0]
+    shades = {tuple(color) for color in image.reshape(-1, 3) if inside[1] < color[1] < outside[1] - 40}
+    assert len(shades) > 2
+
+
+# Solids ---------------------------------------------------------------------------------------------------
+
+
+def test_box_has_its_volume_and_is_closed():
+    mesh = box(0, (1.0, -2.0, 3.0), (0.5, 2.0, 3.0), RED, _rotation(np.random.default_rng(0)))
+    area = np.cross(mesh.corners[:, 2] - mesh.corners[:, 0], mesh.corners[:, 3] - mesh.corners[:, 1])
+    outward = np.einsum("fi,fi->f", mesh.corners.mean(axis=1) - (1.0, -2.0, 3.0), mesh.normals)
+    np.testing.assert_allclose(np.sort(outward), [0.25, 0.25, 1.0, 1.0, 1.5, 1.5])
+    np.testing.assert_allclose(
+        np.abs(np.einsum("fi,fi->f", area, mesh.normals)).sum() / 2, 2 * (1.0 + 1.5 + 6.0)
+    )
+
+
+@pytest.mark.parametrize("sides", [3, 8, 24])
+def test_cylinder_is_a_closed_prism(sides):
+    start, end = np.array([1.0, 2.0, 3.0]), np.array([-1.0, 2.5, 4.0])
+    mesh = cylinder(0, start, end, 0.7, RED, sides)
+    volume, closure = volume_and_closure(mesh.corners)
+    base = 0.5 * sides * 0.7**2 * math.sin(2.0 * math.pi / sides)
+    assert volume == pytest.approx(base * np.linalg.norm(end - start))
+    np.testing.assert_allclose(closure, 0.0, atol=1e-12)
+
+
+def test_ball_is_closed_and_its_volume_converges():
+    errors = []
+    for sides in (16, 32, 64):
+        volume, closure = volume_and_closure(ball(0, (0.0, 1.0, 0.0), 2.0, RED, sides).corners)
+        np.testing.assert_allclose(closure, 0.0, atol=1e-11)
+        errors.append(4.0 / 3.0 * math.pi * 8.0 - volume)
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
+    assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.05)
+
+
+def test_lathe_colors_its_bands():
+    profile = [(0.0, 0.0), (0.0, 1.0), (1.0, 1.0)]
+    mesh = lathe(3, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), profile, [RED, GREEN], 5)
+    np.testing.assert_array_equal(mesh.colors, [RED] * 5 + [GREEN] * 5)
+    np.testing.assert_array_equal(mesh.frames, [3] * 10)
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_solids_of_a_scene_have_planar_faces_with_unit_normals(name):
+    mesh = SpacecraftModel(load_scene(name)).mesh
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-12)
+    edges = np.diff(mesh.corners, axis=1)
+    np.testing.assert_allclose(np.einsum("fci,fi->fc", edges, mesh.normals), 0.0, atol=1e-9)
+    assert ((mesh.colors >= 0.0) & (mesh.colors <= 1.0)).all()
+
+
+def test_mesh_moves_with_its_frames():
+    mesh = Mesh.joined([box(0, (0, 0, 0), (1, 1, 1), RED), box(1, (1.0, 0.0, 0.0), (1, 1, 1), GREEN)])
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    corners, normals = mesh.placed(np.array([np.eye(3), turn]), np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 5.0)]))
+    np.testing.assert_array_equal(corners[:6], mesh.corners[:6])
+    np.testing.assert_allclose(corners[6:].mean(axis=(0, 1)), (0.0, 1.0, 5.0), atol=1e-15)
+    np.testing.assert_array_equal(normals[6:], mesh.normals[6:] @ turn.T)
+
+
+@given(st.tuples(*[st.floats(0.2, 3.0)] * 3), st.floats(0.5, 100.0), st.integers(0, 10))
+@settings(derandomize=True, deadline=None)
+def test_equivalent_box_has_the_inertia(edges, mass, seed):
+    """I = m / 12 diag(b^2 + c^2, c^2 + a^2, a^2 + b^2), turned."""
+    squares = np.array(edges) ** 2
+    moments = mass / 12.0 * (squares.sum() - squares)
+    axes = _rotation(np.random.default_rng(seed)) if seed else np.eye(3)
+    size, directions = equivalent_box(mass, axes @ np.diag(moments) @ axes.T)
+    inertia = directions @ np.diag(mass / 12.0 * ((size**2).sum() - size**2)) @ directions.T
+    np.testing.assert_allclose(inertia, axes @ np.diag(moments) @ axes.T, rtol=1e-9, atol=1e-9 * mass)
+
+
+def test_flat_body_keeps_some_thickness():
+    size, _ = equivalent_box(12.0, np.diag([1.0, 1.0, 2.0]))
+    np.testing.assert_allclose(size, [1.0, 1.0, 0.05])
+
+
+# Camera ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_camera_has_all_balls_in_view_and_no_farther_than_needed(seed):
+    rng = np.random.default_rng(seed)
+    centers, radii = rng.normal(size=(4, 3)) * 3.0, rng.uniform(0.1, 2.0, 4)
+    azimuth, elevation = rng.uniform(-3.0, 3.0), rng.uniform(-1.5, 1.5)
+    camera = camera_around(centers, radii, azimuth, elevation, 640, 480)
+    directions = rng.normal(size=(20000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = camera.project((centers[:, None] + radii[:, None, None] * directions).reshape(-1, 3))
+    low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
+    assert (low > -1e-6).all()
+    assert (high < (640 + 1e-6, 480 + 1e-6)).all()
+    used = (high - low) / (640, 480)
+    assert used.max() > 0.98, f"the balls use only {used} of the picture"
+
+
+def test_camera_projects_as_a_pinhole_does():
+    point = np.array([2.0, -0.5, 0.25])  # 2 m ahead, 0.5 m to the right, 0.25 m up
+    x, y, inverse_depth = FORWARD.project(point)
+    assert (x, y, inverse_depth) == pytest.approx((32 + 60 * 0.25, 24 - 60 * 0.125, 0.5))
+    assert np.isnan(FORWARD.project(-point)).all()
+    np.testing.assert_allclose(FORWARD.scaled(3).project(point)[:2], (3 * x, 3 * y))
