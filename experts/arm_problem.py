@@ -1,4 +1,4 @@
-"""A scene as a shooting problem: its kernels, bounds, horizon and initial state under the names that the solver uses."""
+"""A scene as a shooting problem: its kernels, bounds, horizon and start under the names the solver uses."""
 
 from pathlib import Path
 
@@ -41,7 +41,8 @@ class ArmProblem:
     def kernel(self, name: str) -> Kernel:
         """Return one of `experts.problem.KERNEL_NAMES`.
 
-        The rollout works through its rows one after another, everything else on many at once: the former get scalar code.
+        The rollout works through its rows one after another and gets scalar code; all else works on many at
+        once.
 
         Args:
             name: Name of the kernel.

@@ -1,4 +1,4 @@
-"""Shared by all tests: one cache of compiled kernels for the test run, and helper modules beside the tests."""
+"""Shared by all tests: where helper modules are found."""
 
 import sys
 from pathlib import Path

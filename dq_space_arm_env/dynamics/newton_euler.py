@@ -166,8 +166,8 @@ def assemble(
 class SchurComplement:
     """S21 S11^-1 S12 of (21), factorized: solves (20) for any right-hand side.
 
-    With the constraint rows in the order of the wrenches that enforce them, -S21 S11^-1 S12 is symmetric positive
-    definite.
+    With the constraint rows in the order of the wrenches that enforce them, -S21 S11^-1 S12 is symmetric
+    positive definite.
     """
 
     def __init__(self, chain: Chain, system: NewtonEulerSystem) -> None:
@@ -197,8 +197,8 @@ class SchurComplement:
             b2: Right-hand side of the constraints, 5 n.
 
         Returns:
-            Dual accelerations of all bodies, 8 (n+1), and reaction wrenches, 5 n (fx, fy, fz in N, tx, ty in N m
-            per joint).
+            Dual accelerations of all bodies, 8 (n+1), and reaction wrenches, 5 n (fx, fy, fz in N, tx, ty in
+            N m per joint).
         """
         accelerations = _solve_inertia(self._bodies, b1)
         right = [

@@ -8,6 +8,7 @@ and the pose with one for the group SE(3).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from dq_space_arm_env.algebra import dual_quaternion, quaternion, screw
@@ -15,6 +16,46 @@ from dq_space_arm_env.compiler.program import Program
 
 Scalar = Any
 Matrix = Any  # a CasADi SX matrix
+
+
+@dataclass(frozen=True)
+class PoseCoordinates:
+    """How the pose of the base is stored at the head of the state, and what moves it.
+
+    Attributes:
+        stored: Which of the 8 numbers of a dual quaternion are stored; the others are zero.
+        directions: Which of the 6 twist directions the base can move in.
+        twist_indices: Where the twist of these directions stands in y.
+    """
+
+    stored: tuple[int, ...]
+    directions: tuple[int, ...]
+    twist_indices: tuple[int, ...]
+
+    def full(self, stored: Sequence[Scalar]) -> list[Scalar]:
+        """All 8 numbers of a pose from the stored ones."""
+        return spread(stored, self.stored, 8)
+
+    def reduced(self, pose: Sequence[Scalar]) -> list[Scalar]:
+        """The stored numbers of a pose."""
+        return [pose[i] for i in self.stored]
+
+    def full_twist(self, free: Sequence[Scalar]) -> list[Scalar]:
+        """All 6 numbers of a twist from those of the free directions."""
+        return spread(free, self.directions, 6)
+
+    def moved(self, stored: Sequence[Scalar], increment: Sequence[Scalar]) -> list[Scalar]:
+        """Compose a pose with the exponential of a twist increment; rounding errors of the norm are removed.
+
+        Args:
+            stored: Stored numbers of the pose.
+            increment: Twist times time, 6 numbers (rad, m), in body axes.
+
+        Returns:
+            Stored numbers of q exp(increment / 2).
+        """
+        pose = dual_quaternion.multiply(self.full(stored), screw.exponential(increment))
+        return self.reduced(nearly_unit(pose))
 
 
 class VectorField(Protocol):
@@ -26,9 +67,7 @@ class VectorField(Protocol):
         n_y: Number of states besides the pose; they are the last entries of the state and of the tangent
             state.
         n_u: Number of inputs.
-        n_pose: Number of stored numbers of the pose; 0 for a formulation whose pose is part of y.
-        directions: Which of the six twist directions the base can move in.
-        twist_indices: Where the twist stands in y; as many entries as the pose has tangent directions.
+        pose: Coordinates of the pose; None for a formulation that has it among the entries of y.
         rate_indices: The entries of y whose time derivatives are accelerations; the others' are velocities or
             inputs.
     """
@@ -37,10 +76,12 @@ class VectorField(Protocol):
     n_x: int
     n_y: int
     n_u: int
-    n_pose: int
-    directions: tuple[int, ...]
-    twist_indices: tuple[int, ...]
     rate_indices: tuple[int, ...]
+
+    @property
+    def pose(self) -> PoseCoordinates | None:
+        """Coordinates of the pose."""
+        ...
 
     def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
         """Time derivative of y, n_y."""
@@ -50,18 +91,6 @@ class VectorField(Protocol):
         self, y: Sequence[Scalar], u: Sequence[Scalar]
     ) -> tuple[list[Scalar], Matrix, Matrix]:
         """Time derivative of y, its Jacobians with respect to y (n_y, n_y) and u (n_y, n_u)."""
-        ...
-
-    def full_pose(self, stored: Sequence[Scalar]) -> Sequence[Scalar]:
-        """All 8 numbers of the pose from the stored ones."""
-        ...
-
-    def stored_pose(self, pose: Sequence[Scalar]) -> list[Scalar]:
-        """The stored numbers of a pose."""
-        ...
-
-    def full_twist(self, twist: Sequence[Scalar]) -> Sequence[Scalar]:
-        """All 6 numbers of a twist from the free ones."""
         ...
 
 
@@ -92,19 +121,34 @@ class Integrator(Protocol):
         ...
 
 
-def move_pose(field: VectorField, stored: Sequence[Scalar], increment: Sequence[Scalar]) -> list[Scalar]:
-    """Compose a pose with the exponential of a twist increment, and remove the rounding errors of its norm.
+def split_state(field: VectorField, x: Sequence[Scalar]) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
+    """Stored numbers of the pose, and y.
 
     Args:
         field: The equations of motion.
-        stored: Stored numbers of the pose.
-        increment: Twist times time, 6 numbers (rad, m), in body axes.
+        x: State, n_x.
 
     Returns:
-        Stored numbers of q exp(increment / 2).
+        The n_x - n_y numbers of the pose (none, if it is part of y), and the n_y others.
     """
-    moved = dual_quaternion.multiply(field.full_pose(stored), screw.exponential(increment))
-    return field.stored_pose(nearly_unit(moved))
+    return x[: field.n_x - field.n_y], x[field.n_x - field.n_y :]
+
+
+def spread(values: Sequence[Scalar], positions: Sequence[int], size: int) -> list[Scalar]:
+    """Put values at given positions among zeros.
+
+    Args:
+        values: n values.
+        positions: n positions.
+        size: Length of the result.
+
+    Returns:
+        `size` scalars.
+    """
+    result: list[Scalar] = [0.0] * size
+    for position, value in zip(positions, values, strict=True):
+        result[position] = value
+    return result
 
 
 def nearly_unit(pose: Sequence[Scalar]) -> tuple[Scalar, ...]:

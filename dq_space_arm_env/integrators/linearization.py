@@ -14,17 +14,30 @@ import casadi
 
 from dq_space_arm_env.algebra import poses, screw
 from dq_space_arm_env.algebra.dual_vectors import transform_matrix
-from dq_space_arm_env.integrators.field import VectorField
+from dq_space_arm_env.integrators.field import PoseCoordinates
 
 Scalar = Any
 Matrix = Any
 
 
-def pose_blocks(field: VectorField, increment: Sequence[Scalar]) -> tuple[Matrix, Matrix]:
+def zero_matrix(rows: int, columns: int) -> Matrix:
+    """A matrix without a single stored entry.
+
+    Args:
+        rows: Number of rows.
+        columns: Number of columns.
+
+    Returns:
+        Sparse SX matrix.
+    """
+    return casadi.SX(rows, columns)
+
+
+def pose_blocks(pose: PoseCoordinates, increment: Sequence[Scalar]) -> tuple[Matrix, Matrix]:
     """Derivatives of q+ = q exp(increment / 2) with respect to q and to the increment.
 
     Args:
-        field: The equations of motion; tells which tangent directions the base has.
+        pose: Tells which directions the base can move in.
         increment: Twist times time, 6 expressions (rad, m).
 
     Returns:
@@ -33,7 +46,7 @@ def pose_blocks(field: VectorField, increment: Sequence[Scalar]) -> tuple[Matrix
     """
     backward = screw.exponential([-entry for entry in increment])
     adjoint = transform_matrix(*poses.to_matrix(backward))
-    kept = list(field.directions)
+    kept = list(pose.directions)
     jacobian = screw.exponential_right_jacobian(increment)
     return _matrix(adjoint, kept), _matrix(jacobian, kept)
 

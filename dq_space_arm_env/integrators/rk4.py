@@ -15,8 +15,8 @@ import casadi
 from dq_space_arm_env.algebra.dual_vectors import cross as dual_cross
 from dq_space_arm_env.compiler.graph import graph_of, trace
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.integrators.field import VectorField, move_pose
-from dq_space_arm_env.integrators.linearization import pose_blocks
+from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, split_state
+from dq_space_arm_env.integrators.linearization import pose_blocks, zero_matrix
 
 Scalar = Any
 Matrix = Any
@@ -37,16 +37,17 @@ class RungeKuttaMuntheKaas4:
         """Append the calls that turn buffers x, u, h into x_next."""
 
         def stage(x: list[Scalar], u: list[Scalar], k: list[Scalar], offset: list[Scalar]) -> dict[str, Any]:
-            y = [entry + offset[0] * rate for entry, rate in zip(x[field.n_pose :], k, strict=True)]
+            y = [entry + offset[0] * rate for entry, rate in zip(split_state(field, x)[1], k, strict=True)]
             return {"rates": field.rates(y, u)}
 
         def combine(x: list[Scalar], h: list[Scalar], **k: list[Scalar]) -> dict[str, Any]:
             stages = list(k.values())
-            y = _advance(x[field.n_pose :], stages, h[0])
-            if not field.n_pose:
+            stored, start = split_state(field, x)
+            y = _advance(start, stages, h[0])
+            if field.pose is None:
                 return {"x_next": y}
-            increment = _pose_increment(field, _stage_twists(field, x, stages, h[0]), h[0])
-            return {"x_next": [*move_pose(field, x[: field.n_pose], increment), *y]}
+            increment = _pose_increment(field.pose, _stage_twists(field.pose, start, stages, h[0]), h[0])
+            return {"x_next": [*field.pose.moved(stored, increment), *y]}
 
         n_y = field.n_y
         sizes = {"x": field.n_x, "u": field.n_u, "k": n_y, "offset": 1}
@@ -92,17 +93,16 @@ def _advance(y: Sequence[Scalar], stages: Sequence[Sequence[Scalar]], h: Scalar)
 
 
 def _stage_twists(
-    field: VectorField, x: Sequence[Scalar], stages: Sequence[Sequence[Scalar]], h: Scalar
+    pose: PoseCoordinates, y: Sequence[Scalar], stages: Sequence[Sequence[Scalar]], h: Scalar
 ) -> list[list[Scalar]]:
     """Free entries of the base twist at the four stages."""
-    y = x[field.n_pose :]
-    twists = [[y[i] for i in field.twist_indices]]
+    twists = [[y[i] for i in pose.twist_indices]]
     for offset, k in zip(OFFSETS[1:], stages, strict=False):
-        twists.append([y[i] + offset * h * k[i] for i in field.twist_indices])
+        twists.append([y[i] + offset * h * k[i] for i in pose.twist_indices])
     return twists
 
 
-def _pose_increment(field: VectorField, twists: Sequence[Sequence[Scalar]], h: Scalar) -> list[Scalar]:
+def _pose_increment(pose: PoseCoordinates, twists: Sequence[Sequence[Scalar]], h: Scalar) -> list[Scalar]:
     """Omega after one step, 6 numbers.
 
     Stage i starts from Omega_i = OFFSETS[i] h w_{i-1} and has the slope w_i = dexp^-1(omega_i), where dexp^-1
@@ -111,7 +111,7 @@ def _pose_increment(field: VectorField, twists: Sequence[Sequence[Scalar]], h: S
     """
     slopes: list[Sequence[Scalar]] = []
     for offset, free in zip(OFFSETS, twists, strict=True):
-        omega = field.full_twist(free)
+        omega = pose.full_twist(free)
         if slopes:
             start = [offset * h * entry for entry in slopes[-1]]
             once = dual_cross(start, omega)
@@ -145,7 +145,7 @@ def _linearized_stage(field: VectorField, pattern: Any) -> Any:
     k = [casadi.SX.sym(f"k_{i}") for i in range(n_y)]
     change = casadi.SX.sym("change", pattern)
     offset = casadi.SX.sym("offset")
-    y = [entry + offset * rate for entry, rate in zip(x[field.n_pose :], k, strict=True)]
+    y = [entry + offset * rate for entry, rate in zip(split_state(field, x)[1], k, strict=True)]
     rates, by_y, by_u = field.linearized_rates(y, u)
     start = casadi.horzcat(casadi.SX.eye(n_y), casadi.SX(n_y, n_u)) + offset * change
     rate_change = casadi.mtimes(by_y, start) + casadi.horzcat(casadi.SX(n_y, n_y), by_u)
@@ -167,31 +167,44 @@ def _linearized_sum(field: VectorField, pattern: Any) -> tuple[Any, Any, Any]:
     change = identity
     for weight, rate_change in zip(WEIGHTS, changes, strict=True):
         change = change + (weight * h) * rate_change
-    if field.n_pose:
-        n = len(field.twist_indices)
-        rows = list(field.twist_indices)
-        free = [[casadi.SX.sym(f"w{s}_{i}") for i in range(n)] for s in range(4)]
-        increment = casadi.vertcat(*_pose_increment(field, free, h))
-        moved = casadi.SX(n, n_y + n_u)
-        for s, offset in enumerate(OFFSETS):
-            twist_change = identity[rows, :]
-            if s:
-                twist_change = twist_change + (offset * h) * changes[s - 1][rows, :]
-            slope = casadi.jacobian(increment, casadi.vertcat(*free[s]))[list(field.directions), :]
-            moved = moved + casadi.mtimes(slope, twist_change)
-        twists = _stage_twists(field, x, stages, h)
-        symbols = casadi.vertcat(*(entry for twist in free for entry in twist))
-        values = casadi.vertcat(*(entry for twist in twists for entry in twist))
-        increment, moved = casadi.substitute([increment, moved], [symbols], [values])
-        by_pose, by_increment = pose_blocks(field, casadi.vertsplit(increment))
-        moved = casadi.mtimes(by_increment, moved)
-        a = casadi.horzcat(casadi.vertcat(by_pose, casadi.SX(n_y, n)), casadi.vertcat(moved, change)[:, :n_y])
-        b = casadi.vertcat(moved, change)[:, n_y:]
-    else:
+    if field.pose is None:
         a, b = change[:, :n_y], change[:, n_y:]
+    else:
+        start = split_state(field, x)[1]
+        by_pose, moved = _linearized_pose(field.pose, start, h, stages, changes, identity)
+        moved = casadi.vertcat(moved, change)
+        a = casadi.horzcat(casadi.vertcat(by_pose, casadi.SX(n_y, by_pose.shape[1])), moved[:, :n_y])
+        b = moved[:, n_y:]
     a, b = casadi.sparsify(a), casadi.sparsify(b)
     inputs: dict[str, Sequence[Scalar]] = {"x": x, "h": [h]}
     inputs |= {f"k{s}": k for s, k in enumerate(stages, start=1)}
     inputs |= {f"K{s}": k.nonzeros() for s, k in enumerate(changes, start=1)}
     graph = graph_of(f"{field.name}_rk4_linearized_sum", inputs, {"A": a.nonzeros(), "B": b.nonzeros()})
     return graph, a.sparsity(), b.sparsity()
+
+
+def _linearized_pose(
+    pose: PoseCoordinates,
+    y: Sequence[Scalar],
+    h: Scalar,
+    stages: Sequence[Sequence[Scalar]],
+    changes: Sequence[Matrix],
+    identity: Matrix,
+) -> tuple[Matrix, Matrix]:
+    """Derivatives of the pose update by the pose, and by (y, u) through Omega."""
+    rows = list(pose.twist_indices)
+    free = [[casadi.SX.sym(f"w{s}_{i}") for i in rows] for s in range(4)]
+    increment = casadi.vertcat(*_pose_increment(pose, free, h))
+    moved = zero_matrix(len(rows), identity.shape[1])
+    for s, offset in enumerate(OFFSETS):
+        twist_change = identity[rows, :]
+        if s:
+            twist_change = twist_change + (offset * h) * changes[s - 1][rows, :]
+        slope = casadi.jacobian(increment, casadi.vertcat(*free[s]))[list(pose.directions), :]
+        moved = moved + casadi.mtimes(slope, twist_change)
+    twists = _stage_twists(pose, y, stages, h)
+    symbols = casadi.vertcat(*(entry for twist in free for entry in twist))
+    values = casadi.vertcat(*(entry for twist in twists for entry in twist))
+    increment, moved = casadi.substitute([increment, moved], [symbols], [values])
+    by_pose, by_increment = pose_blocks(pose, casadi.vertsplit(increment))
+    return by_pose, casadi.mtimes(by_increment, moved)

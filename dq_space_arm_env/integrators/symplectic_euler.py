@@ -9,8 +9,8 @@ import casadi
 
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.integrators.field import VectorField, move_pose
-from dq_space_arm_env.integrators.linearization import pose_blocks
+from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, split_state
+from dq_space_arm_env.integrators.linearization import pose_blocks, zero_matrix
 
 Scalar = Any
 
@@ -25,30 +25,34 @@ class SymplecticEuler:
     def append_step(self, program: Program, field: VectorField) -> None:
         """Append the calls that turn buffers x, u, h into x_next."""
         x, u, h = _symbols(field)
-        y, increment = self._advance(field, x, u, h, field.rates(x[field.n_pose :], u))
-        x_next = [*move_pose(field, x[: field.n_pose], increment), *y] if field.n_pose else y
+        stored, start = split_state(field, x)
+        y = self._advance(field, start, u, h, field.rates(start, u))
+        x_next = (
+            y if field.pose is None else [*field.pose.moved(stored, self._increment(field.pose, y, h)), *y]
+        )
         graph = graph_of(f"{field.name}_euler", {"x": x, "u": u, "h": [h]}, {"x_next": x_next})
         program.call(graph)
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
         """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
         x, u, h = _symbols(field)
-        rates, by_y, by_u = field.linearized_rates(x[field.n_pose :], u)
+        start_y = split_state(field, x)[1]
+        rates, by_y, by_u = field.linearized_rates(start_y, u)
         identity = casadi.SX.eye(field.n_y)
         rate_change = casadi.horzcat(by_y, by_u)
         start = casadi.horzcat(identity, casadi.SX(field.n_y, field.n_u))
         # New rates first; positions then move with the new rates, whose derivative is already there.
-        change = casadi.SX(field.n_y, field.n_y + field.n_u)
+        change = zero_matrix(field.n_y, field.n_y + field.n_u)
         rows = list(field.rate_indices)
         change[rows, :] = start[rows, :] + h * rate_change[rows, :]
         others = [i for i in range(field.n_y) if i not in set(rows)]
         velocities = casadi.mtimes(by_y[others, rows], change[rows, :])
         inputs = casadi.horzcat(casadi.SX(len(others), field.n_y), by_u[others, :])
         change[others, :] = start[others, :] + h * (velocities + inputs)
-        if field.n_pose:
-            _, increment = self._advance(field, x, u, h, rates)
-            by_pose, by_increment = pose_blocks(field, increment)
-            moved = casadi.mtimes(by_increment, h * change[list(field.twist_indices), :])
+        if field.pose is not None:
+            increment = self._increment(field.pose, self._advance(field, start_y, u, h, rates), h)
+            by_pose, by_increment = pose_blocks(field.pose, increment)
+            moved = casadi.mtimes(by_increment, h * change[list(field.pose.twist_indices), :])
             change = casadi.vertcat(moved, change)
             pose_columns = casadi.vertcat(by_pose, casadi.SX(field.n_y, by_pose.shape[1]))
             a = casadi.horzcat(pose_columns, change[:, : field.n_y])
@@ -64,18 +68,20 @@ class SymplecticEuler:
         return a.sparsity(), b.sparsity()
 
     def _advance(
-        self, field: VectorField, x: Sequence[Scalar], u: Sequence[Scalar], h: Scalar, rates: list[Scalar]
-    ) -> tuple[list[Scalar], Sequence[Scalar]]:
-        """New y, and the twist times the time step."""
-        y = list(x[field.n_pose :])
+        self, field: VectorField, y: Sequence[Scalar], u: Sequence[Scalar], h: Scalar, rates: list[Scalar]
+    ) -> list[Scalar]:
+        """New y: first its velocities, then the rest with the new velocities."""
+        moved = list(y)
         for i in field.rate_indices:
-            y[i] = y[i] + h * rates[i]
-        positions = set(range(field.n_y)) - set(field.rate_indices)
-        velocities = field.rates(y, u)
-        for i in positions:
-            y[i] = y[i] + h * velocities[i]
-        increment = field.full_twist([h * y[i] for i in field.twist_indices])
-        return y, increment
+            moved[i] = y[i] + h * rates[i]
+        velocities = field.rates(moved, u)
+        for i in set(range(field.n_y)) - set(field.rate_indices):
+            moved[i] = y[i] + h * velocities[i]
+        return moved
+
+    def _increment(self, pose: PoseCoordinates, y: Sequence[Scalar], h: Scalar) -> list[Scalar]:
+        """The new twist times the time step."""
+        return pose.full_twist([h * y[i] for i in pose.twist_indices])
 
 
 def _symbols(field: VectorField) -> tuple[list[Scalar], list[Scalar], Scalar]:

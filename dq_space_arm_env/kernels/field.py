@@ -15,6 +15,7 @@ from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
 from dq_space_arm_env.dynamics.minimal import Accelerations, MassMatrix, Wrenches
+from dq_space_arm_env.integrators.field import PoseCoordinates, spread
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
 
@@ -77,35 +78,27 @@ class SpaceArmField:
         self.n_x = layout.n_x
         self.n_u = layout.n_u
         self.n_t = layout.n_t
-        self.n_pose = layout.state.pose.stop
-        self.n_y = self.n_x - self.n_pose
-        self.twist_indices = self._in_y(layout.state.base_velocity)
-        self.rate_indices = (*self.twist_indices, *self._in_y(layout.state.joint_rates))
-        self.directions = PLANAR_TWIST if chain.planar else tuple(range(6))
+        self.n_y = self.n_x - layout.state.pose.stop
+        twist = self._in_y(layout.state.base_velocity)
+        self.rate_indices = (*twist, *self._in_y(layout.state.joint_rates))
+        self.pose = PoseCoordinates(
+            stored=PLANAR_POSE if chain.planar else tuple(range(8)),
+            directions=PLANAR_TWIST if chain.planar else tuple(range(6)),
+            twist_indices=twist,
+        )
 
     def _in_y(self, part: slice) -> tuple[int, ...]:
-        return tuple(range(part.start - self.n_pose, part.stop - self.n_pose))
-
-    def full_pose(self, stored: Sequence[Scalar]) -> Sequence[Scalar]:
-        """All 8 numbers of the base pose from the stored ones."""
-        return _spread(stored, PLANAR_POSE, 8) if self.chain.planar else stored
-
-    def stored_pose(self, pose: Sequence[Scalar]) -> list[Scalar]:
-        """The stored numbers of a base pose."""
-        return [pose[i] for i in PLANAR_POSE] if self.chain.planar else list(pose)
-
-    def full_twist(self, twist: Sequence[Scalar]) -> Sequence[Scalar]:
-        """All 6 numbers of a base twist from the free ones."""
-        return _spread(twist, PLANAR_TWIST, 6) if self.chain.planar else twist
+        shift = self.n_x - self.n_y
+        return tuple(range(part.start - shift, part.stop - shift))
 
     def motion(self, y: Sequence[Scalar]) -> Motion:
         """Name the parts of y."""
-        layout, shift = self.layout, self.n_pose
+        layout, shift = self.layout, self.n_x - self.n_y
 
         def part(where: slice) -> list[Scalar]:
             return list(y[where.start - shift : where.stop - shift])
 
-        twist = self.full_twist(part(layout.state.base_velocity))
+        twist = self.pose.full_twist(part(layout.state.base_velocity))
         return Motion(
             part(layout.state.joint_angles),
             part(layout.state.wrist_angles),
@@ -125,8 +118,8 @@ class SpaceArmField:
         if not wrist and self.chain.wrist is not None:
             wrist = [0.0, 0.0, 0.0]
         return Inputs(
-            force=_spread(force, (0, 1) if planar else (0, 1, 2), 3) if force else ZERO,
-            torque=_spread(torque, (2,) if planar else (0, 1, 2), 3) if torque else ZERO,
+            force=spread(force, (0, 1) if planar else (0, 1, 2), 3) if force else ZERO,
+            torque=spread(torque, (2,) if planar else (0, 1, 2), 3) if torque else ZERO,
             joint_torques=torques,
             wrist_rates=wrist,
         )
@@ -186,7 +179,7 @@ class SpaceArmField:
         """Accelerations in the paper's sense: the components of the linear velocity turn with the base."""
         turning = subtract(solved.linear, cross(motion.angular, motion.linear))
         dual = [*solved.angular, *turning]
-        return [*(dual[i] for i in self.directions), *solved.joints]
+        return [*(dual[i] for i in self.pose.directions), *solved.joints]
 
     def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
         """Time derivative of y: rates of joints and wrist, base and joint accelerations."""
@@ -251,7 +244,7 @@ class SpaceArmField:
         motion = self.motion(free_y)
         angles = casadi.vertcat(*motion.joint_rates, *self.inputs(free_u).wrist_rates)
         turning = [*ZERO, *(-entry for entry in cross(motion.angular, motion.linear))]
-        kept = casadi.vertcat(*(turning[i] for i in self.directions), *[0.0] * len(self.chain.links))
+        kept = casadi.vertcat(*(turning[i] for i in self.pose.directions), *[0.0] * len(self.chain.links))
         symbols = casadi.vertcat(*free_y)
         turning_by_y = casadi.substitute(casadi.jacobian(kept, symbols), symbols, casadi.vertcat(*y))
         inputs = casadi.vertcat(*free_u) if free_u else casadi.SX(0, 1)
@@ -276,22 +269,15 @@ class SpaceArmField:
     def _response(self, mass_matrix: MassMatrix, forces: Sequence[Scalar]) -> list[Scalar]:
         """Accelerations (free directions, joints) caused by generalized forces (force, torque, joints)."""
         if all(casadi.SX(entry).is_zero() for entry in forces):
-            return [0.0] * (len(self.directions) + len(self.chain.links))
+            return [0.0] * (len(self.pose.directions) + len(self.chain.links))
         solved = mass_matrix.solve(forces[:3], forces[3:6], forces[6:])
         dual = [*solved.angular, *solved.linear]
-        return [*(dual[i] for i in self.directions), *solved.joints]
+        return [*(dual[i] for i in self.pose.directions), *solved.joints]
 
     def _input_response(self, mass_matrix: MassMatrix, index: int) -> Matrix:
         unit = self.inputs([1.0 if i == index else 0.0 for i in range(self.n_u)])
         response = self._response(mass_matrix, [*unit.force, *unit.torque, *unit.joint_torques])
         return casadi.sparsify(casadi.vertcat(*response))
-
-
-def _spread(values: Sequence[Scalar], positions: Sequence[int], size: int) -> list[Scalar]:
-    result: list[Scalar] = [0.0] * size
-    for position, value in zip(positions, values, strict=True):
-        result[position] = value
-    return result
 
 
 def _dense(column: Matrix) -> list[Scalar]:

@@ -8,7 +8,7 @@ CasADi.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -22,6 +22,7 @@ from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.layout import StateLayout
 
 if TYPE_CHECKING:
+    from dq_space_arm_env.compiler.program import Program
     from dq_space_arm_env.kernels.programs import ScenePrograms
 
 Array = NDArray[np.float64]
@@ -85,6 +86,7 @@ class Kernels:
         self.layout = StateLayout.of(scene)
         self.n_x, self.n_t, self.n_u = self.layout.n_x, self.layout.n_t, self.layout.n_u
         self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
+        self._paper_kernels: dict[tuple[str, int], BoundKernel] = {}
 
     @cached_property
     def _programs(self) -> ScenePrograms:
@@ -112,16 +114,39 @@ class Kernels:
         width = native.host_machine().lanes if lanes is None else lanes
         key = (name, method, width)
         if key not in self._kernels:
-            self._kernels[key] = self._load(*key)
+            self._kernels[key] = self._load(*key, lambda: self._programs.build(name, method))
         return self._kernels[key]
 
-    def _load(self, name: str, method: str, lanes: int) -> BoundKernel:
-        parts = (self.scene.content_hash(), _source_hash(), name, method, str(lanes))
+    def paper_kernel(self, name: str, *, lanes: int | None = None) -> BoundKernel:
+        """Compile a program of the paper's redundant formulation, or load it from the cache.
+
+        Args:
+            name: Name of the program (`kernels.paper_programs.PaperPrograms`).
+            lanes: Rows that the code works on at a time: 1, or the processor's vector width (default).
+
+        Returns:
+            The kernel.
+        """
+        width = native.host_machine().lanes if lanes is None else lanes
+        key = (name, width)
+        if key not in self._paper_kernels:
+
+            def trace() -> Program:
+                from dq_space_arm_env.kernels.paper_programs import PaperPrograms
+
+                return PaperPrograms(self.scene).build(name)
+
+            self._paper_kernels[key] = self._load(name, "paper", width, trace)
+        return self._paper_kernels[key]
+
+    def _load(self, name: str, variant: str, lanes: int, trace: Callable[[], Program]) -> BoundKernel:
+        """Load a kernel from the cache; trace and compile it if it is not there."""
+        parts = (self.scene.content_hash(), _source_hash(), name, variant, str(lanes))
 
         def build() -> tuple[bytes, dict[str, Any]]:
             from dq_space_arm_env.compiler.build import build_program
 
-            return build_program(self._programs.build(name, method), lanes)
+            return build_program(trace(), lanes)
 
         return BoundKernel(native.load_or_build(name, native.cache_key(*parts), build))
 

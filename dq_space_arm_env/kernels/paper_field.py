@@ -1,7 +1,8 @@
 """The paper's own formulation as a vector field: 46 redundant states, and the tip's pose appended as 8 more.
 
-It exists for comparison: the dual velocities of all bodies are integrated side by side, and only the constraint on their
-accelerations keeps the arm together. `SpaceArmField` gives the same motion from 23 numbers.
+It exists for comparison: the dual velocities of all bodies are integrated side by side, and only the
+constraint on their accelerations keeps the arm together. `SpaceArmField` gives the same motion from 23
+numbers.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import casadi
 from dq_space_arm_env.algebra import vectors
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
 from dq_space_arm_env.dynamics.newton_euler import PaperState, SchurComplement
+from dq_space_arm_env.integrators.field import split_state
 from dq_space_arm_env.kernels.field import Inputs, SpaceArmField
 
 Scalar = Any
@@ -23,14 +25,12 @@ Matrix = Any
 class PaperField:
     """Vector field of the paper's state with the tip's pose appended; implements `integrators.VectorField`.
 
-    For three links and a wrist: base pose (8), joint angles (3), wrist angles (3), dual velocities of the four
-    bodies (32), q_{G/I} (8).
+    For three links and a wrist: base pose (8), joint angles (3), wrist angles (3), dual velocities of the
+    four bodies (32), q_{G/I} (8).
     """
 
     name = "paper"
-    n_pose = 0  # the pose is integrated number by number, like everything else
-    directions: tuple[int, ...] = ()
-    twist_indices: tuple[int, ...] = ()
+    pose = None  # integrated number by number, like everything else
 
     def __init__(self, minimal_field: SpaceArmField) -> None:
         """Take over robot and inputs.
@@ -44,7 +44,10 @@ class PaperField:
         n = len(self.chain.links)
         self._positions = 8 + n + (0 if self.chain.wrist is None else 3)
         self.tip = slice(self._positions + 8 * (n + 1), self._positions + 8 * (n + 2))
-        self.base_twist = (*range(self._positions + 1, self._positions + 4), *range(self._positions + 5, self._positions + 8))
+        self.base_twist = (
+            *range(self._positions + 1, self._positions + 4),
+            *range(self._positions + 5, self._positions + 8),
+        )
         self.n_x = self.n_y = self.tip.stop
         self.rate_indices = tuple(range(self._positions, self.tip.start))
 
@@ -58,14 +61,16 @@ class PaperField:
             State of the paper with the tip's pose appended.
         """
         field, chain = self.minimal, self.chain
-        pose = field.full_pose(x[: field.n_pose])
-        motion = field.motion(x[field.n_pose :])
+        stored, y = split_state(field, x)
+        pose, motion = field.pose.full(stored), field.motion(y)
         rotations = minimal.joint_rotations(chain, motion.joint_angles)
         velocities = kinematics.body_velocities(
             chain, rotations, (*motion.angular, *motion.linear), motion.joint_rates
         )
         duals: list[Scalar] = []
-        for body, velocity in zip([chain.base, *(link.body for link in chain.links)], velocities, strict=True):
+        for body, velocity in zip(
+            [chain.base, *(link.body for link in chain.links)], velocities, strict=True
+        ):
             at_center = vectors.add(velocity.linear, vectors.cross(velocity.angular, body.center_of_mass))
             duals += [0.0, *velocity.angular, 0.0, *at_center]
         tip = kinematics.tip_pose(chain, pose, motion.joint_angles, motion.wrist_angles)
@@ -89,12 +94,15 @@ class PaperField:
         """Time derivative of the state and its Jacobians, by differentiating (20) at its solution.
 
         Args:
-            y: State, n_y symbols.
-            u: Input, n_u symbols.
+            y: State, n_y symbols or expressions.
+            u: Input, n_u symbols or expressions.
 
         Returns:
             Rates (n_y), Jacobian with respect to y (n_y, n_y), Jacobian with respect to u (n_y, n_u).
         """
+        values = casadi.vertcat(*y, *u)
+        y = [casadi.SX.sym(f"y_{i}") for i in range(self.n_y)]
+        u = [casadi.SX.sym(f"u_{i}") for i in range(self.n_u)]
         symbols = casadi.vertcat(*y, *u)
         state, inputs = self._parts(y, u)
         base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
@@ -105,7 +113,7 @@ class PaperField:
         change = casadi.substitute(
             casadi.jacobian(residual, symbols), unknowns, casadi.vertcat(*accelerations, *reactions)
         )
-        columns = []
+        columns: list[Matrix] = []
         for index in range(change.shape[1]):
             column = change[:, index]
             if column.nnz() == 0:
@@ -116,13 +124,14 @@ class PaperField:
             columns.append(casadi.sparsify(casadi.vertcat(*response)))
         positions = newton_euler.paper_position_rates(self.chain, state, inputs.wrist_rates)
         tip = newton_euler.paper_tip_rate(self.chain, state, inputs.wrist_rates)
-        rates = [*positions, *accelerations, *tip]
+        rates = casadi.vertcat(*positions, *accelerations, *tip)
         jacobian = casadi.vertcat(
             casadi.jacobian(casadi.vertcat(*positions), symbols),
             casadi.horzcat(*columns),
             casadi.jacobian(casadi.vertcat(*tip), symbols),
         )
-        return rates, jacobian[:, : self.n_y], jacobian[:, self.n_y :]
+        rates, jacobian = casadi.substitute([rates, jacobian], [symbols], [values])
+        return casadi.vertsplit(rates), jacobian[:, : self.n_y], jacobian[:, self.n_y :]
 
 
 def _residual(system: newton_euler.NewtonEulerSystem) -> tuple[Matrix, Matrix]:
@@ -133,7 +142,7 @@ def _residual(system: newton_euler.NewtonEulerSystem) -> tuple[Matrix, Matrix]:
     def matrix(rows: Sequence[Sequence[Scalar]]) -> Matrix:
         return casadi.sparsify(casadi.vertcat(*(casadi.horzcat(*row) for row in rows)))
 
-    bodies = casadi.mtimes(matrix(system.s11), ydot) - casadi.vertcat(*system.b1)
+    bodies: Matrix = casadi.mtimes(matrix(system.s11), ydot) - casadi.vertcat(*system.b1)
     if not system.b2:
         return bodies, unknowns
     bodies += casadi.mtimes(matrix(system.s12), reactions)

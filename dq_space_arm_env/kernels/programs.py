@@ -21,7 +21,7 @@ from dq_space_arm_env.cost import weighted_square
 from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.integrators import INTEGRATORS
-from dq_space_arm_env.integrators.field import move_pose
+from dq_space_arm_env.integrators.field import split_state
 from dq_space_arm_env.kernels.field import SpaceArmField
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.schema import Scene
@@ -94,10 +94,10 @@ class ScenePrograms:
         return program
 
     def _y(self, x: Scalars) -> Scalars:
-        return x[self.field.n_pose :]
+        return split_state(self.field, x)[1]
 
     def _base_pose(self, x: Scalars) -> Scalars:
-        return self.field.full_pose(x[: self.field.n_pose])
+        return self.field.pose.full(split_state(self.field, x)[0])
 
     def _forward_dynamics(self) -> Program:
         field = self.field
@@ -217,10 +217,10 @@ class ScenePrograms:
         arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
         base = self._base_pose(x)
         tip = dq.multiply(base, arm)
-        angles = casadi.vertcat(*x[field.n_pose : field.n_pose + self._angle_count()])
+        angles = casadi.vertcat(*self._y(x)[: self._angle_count()])
         left, right = dual_matrices.left_matrix(base), dual_matrices.right_matrix(arm)
         columns = []
-        for direction in field.directions:
+        for direction in field.pose.directions:
             twist = [0.0] * 8
             twist[(1, 2, 3, 5, 6, 7)[direction]] = 0.5
             moved = dual_matrices.matrix_multiply(left, dual_matrices.matrix_multiply(right, twist))
@@ -234,9 +234,9 @@ class ScenePrograms:
         gradient = 2.0 * casadi.mtimes(weighted.T, error)
         hessian = 2.0 * casadi.mtimes(by_state.T, weighted)
         start = field.n_t - field.n_y
-        for index, direction in zip(field.twist_indices, field.directions, strict=True):
+        for index, direction in zip(field.pose.twist_indices, field.pose.directions, strict=True):
             weight = velocity[direction]
-            deviation = x[field.n_pose + index] - self.scene.target.base_velocity[direction]
+            deviation = self._y(x)[index] - self.scene.target.base_velocity[direction]
             gradient[start + index] += 2.0 * weight * deviation
             hessian[start + index, start + index] += 2.0 * weight
         return gradient, casadi.sparsify(hessian)
@@ -264,7 +264,7 @@ class ScenePrograms:
             [
                 Buffer("lx", n_t),
                 Buffer("lu", n_u),
-                _sparse_buffer("lxx", hessian.sparsity()),
+                sparse_buffer("lxx", hessian.sparsity()),
                 Buffer("luu", n_u, positions=diagonal, stride=n_u * n_u),
             ],
         )
@@ -280,7 +280,7 @@ class ScenePrograms:
         program = Program(
             "terminal_cost_derivatives",
             [Buffer("x", field.n_x)],
-            [Buffer("lx", field.n_t), _sparse_buffer("lxx", hessian.sparsity())],
+            [Buffer("lx", field.n_t), sparse_buffer("lxx", hessian.sparsity())],
         )
         program.call(graph)
         return program
@@ -294,7 +294,7 @@ class ScenePrograms:
             relative = dq.multiply(dq.conjugate(self._base_pose(x_reference)), self._base_pose(x))
             twist = screw.logarithm(relative)
             rest = [a - b for a, b in zip(self._y(x), self._y(x_reference), strict=True)]
-            return {"dx": [*(twist[i] for i in field.directions), *rest]}
+            return {"dx": [*(twist[i] for i in field.pose.directions), *rest]}
 
         return self._program("difference", outputs, x_reference=field.n_x, x=field.n_x)
 
@@ -302,8 +302,8 @@ class ScenePrograms:
         field = self.field
 
         def outputs(x: Scalars, dx: Scalars) -> Mapping[str, Scalars]:
-            n = len(field.directions)
-            pose = move_pose(field, x[: field.n_pose], field.full_twist(dx[:n]))
+            n = len(field.pose.directions)
+            pose = field.pose.moved(split_state(field, x)[0], field.pose.full_twist(dx[:n]))
             return {"x_next": [*pose, *(a + b for a, b in zip(self._y(x), dx[n:], strict=True))]}
 
         return self._program("retract", outputs, x=field.n_x, dx=field.n_t)
@@ -331,9 +331,7 @@ class ScenePrograms:
 
     def _keep(self, observation: list[Scalar]) -> list[Scalar]:
         """Leave out what a planar scene's error pose has identically zero."""
-        if not self.chain.planar:
-            return observation
-        return [*self.field.stored_pose(observation[:8]), *observation[8:]]
+        return [*self.field.pose.reduced(observation[:8]), *observation[8:]]
 
     def _observation(self) -> Program:
         return self._program(
@@ -385,7 +383,7 @@ class ScenePrograms:
             [],
         )
         a, b = INTEGRATORS[integrator].append_linearization(program, field)
-        program.outputs = [_sparse_buffer("A", a), _sparse_buffer("B", b)]
+        program.outputs = [sparse_buffer("A", a), sparse_buffer("B", b)]
         return program
 
 
@@ -404,8 +402,16 @@ def _matrix(rows: Sequence[Scalars]) -> Any:
     return casadi.sparsify(casadi.vertcat(*(casadi.horzcat(*row) for row in rows)))
 
 
-def _sparse_buffer(name: str, pattern: Any) -> Buffer:
-    """An output that fills the nonzeros of a row-major matrix; the rest of the array stays as it is."""
+def sparse_buffer(name: str, pattern: Any) -> Buffer:
+    """An output that fills the nonzeros of a row-major matrix; the rest of the array stays as it is.
+
+    Args:
+        name: Name of the buffer.
+        pattern: CasADi sparsity; the graph's scalars are its nonzeros, column by column.
+
+    Returns:
+        The buffer.
+    """
     rows, columns = pattern.get_triplet()
     count, width = pattern.shape
     positions = np.array(rows, dtype=int) * width + np.array(columns, dtype=int)

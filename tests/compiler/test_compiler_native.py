@@ -1,4 +1,4 @@
-"""Machine code: every operation against NumPy and mpmath, lanes against scalars, the loop over rows, the instructions."""
+"""Machine code: operations against NumPy and mpmath, lanes against scalars, rows, instructions."""
 
 import platform
 

@@ -1,4 +1,4 @@
-"""Both formulations against Pinocchio on random chains: accelerations, reactions, kinematics, momentum, energy."""
+"""Both formulations against Pinocchio on random chains: accelerations, reactions, kinematics, invariants."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -103,7 +103,7 @@ def paper_rates(case):
 
 
 def joint_accelerations_from_paper(case, accelerations):
-    """Base acceleration and joint accelerations that the paper's dual accelerations imply: the rate of (12)."""
+    """Base and joint accelerations that the paper's dual accelerations imply: the rate of (12)."""
     frames = newton_euler.joint_frames(case.chain, case.angles, case.wrist)
     bodies = np.reshape(accelerations, (-1, 8))
     joints = [

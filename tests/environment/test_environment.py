@@ -269,7 +269,7 @@ def test_environments_pickle_and_copy():
 def test_scenes_that_have_no_normalized_actions_are_refused():
     scene = load_scene("paper")
     unlimited = scene.actuators.model_dump() | {"base_force": {"limit": float("inf")}}
-    with pytest.raises(ValueError, match="base f.* has no finite limit"):
+    with pytest.raises(ValueError, match=r"base f.* has no finite limit"):
         make(scene.replace(actuators=unlimited))
     with pytest.raises(ValueError, match="it has no actuator"):
         make(scene.replace(actuators={}))

@@ -1,4 +1,4 @@
-"""The expert's optimum on scene `paper`, handed to an independent solver: IPOPT on the full nonlinear program."""
+"""The expert's optimum on scene `paper`, handed to an independent solver: IPOPT."""
 
 import casadi
 import numpy as np
@@ -52,7 +52,7 @@ def test_ipopt_finds_nothing_better_near_the_experts_plan():
     cost = casadi.sum2(stage.map(n)(states[:, :-1], controls)) + terminal(states[:, -1])
     gaps = casadi.vec(step.map(n)(states[:, :-1], controls) - states[:, 1:])
     variables = casadi.veccat(states, controls)
-    # The expert's plan satisfies this discretization up to rounding; the start of a solver must be feasible in it.
+    # The two discretizations differ by 1e-7: the expert moves the pose by exponentials.
     plan = np.concatenate([solution.states.ravel(), solution.controls.ravel()])
     replay = casadi.Function("replay", [variables], [cost, gaps])
     assert float(replay(plan)[0]) == pytest.approx(solution.cost, rel=1e-7)
@@ -60,7 +60,10 @@ def test_ipopt_finds_nothing_better_near_the_experts_plan():
 
     free = np.full(solution.states.shape, np.inf)
     limit = np.tile(layout.control_limit, (n, 1))
-    lower, upper = np.concatenate([-free.ravel(), -limit.ravel()]), np.concatenate([free.ravel(), limit.ravel()])
+    lower, upper = (
+        np.concatenate([-free.ravel(), -limit.ravel()]),
+        np.concatenate([free.ravel(), limit.ravel()]),
+    )
     lower[: layout.n_x] = upper[: layout.n_x] = solution.states[0]
     options = {
         "ipopt": {

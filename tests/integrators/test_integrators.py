@@ -1,4 +1,4 @@
-"""Integrators: order of convergence, exactness on the group, agreement with an independent code, invariants."""
+"""Integrators: order of convergence, exactness on the group, an independent code, invariants."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from dq_space_arm_env.integrators import INTEGRATORS
 
 
 def rollout(kernels, x, controls, dt, integrator):
-    """States along a sequence of inputs: the scalar kernel walks down the rows, each of which it has just written."""
+    """States along a sequence of inputs: the scalar kernel walks down rows that it has just written."""
     steps = len(controls)
     states = np.empty((steps + 1, kernels.n_x))
     states[0], h = x, np.array([dt])
@@ -79,7 +79,7 @@ def test_the_pose_stays_a_unit_dual_quaternion(name):
 
 
 def test_a_screw_motion_is_exact_whatever_the_step():
-    """A single body spinning about a principal axis moves along a screw; the exponential has no error (8)."""
+    """A single body spinning about a principal axis moves along a screw: no error (8)."""
     scene = load_scene("paper").replace(
         links=[], wrist=None, actuators={"base_force": {"limit": 1.0}}, initial_state={}, spread={}
     )
@@ -107,8 +107,8 @@ def test_time_reversal_returns_to_the_start(scene):
 def test_free_motion_of_1500_s_keeps_momentum_and_energy():
     """RK4 at 15 ms; the starts are four times as fast as the scene's own random ones.
 
-    The drift grows with the fifth power of the rates; the bounds are what minimal coordinates reached on a robot
-    of this kind and size.
+    The drift grows with the fifth power of the rates; the bounds are what minimal coordinates reached on a
+    robot of this kind and size.
     """
     kernels = compile_scene("paper")
     for seed in range(4):
@@ -124,8 +124,8 @@ def test_free_motion_of_1500_s_keeps_momentum_and_energy():
         assert np.ptp(states[:, kernels.layout.state.joint_angles], axis=0).min() > 1.0
 
 
-def test_impulse_of_constant_forces_is_the_change_of_momentum():
-    """Base and joints are pushed: the system's linear momentum changes by the integral of the external force only."""
+def test_joint_torques_do_not_change_the_momentum():
+    """Joint torques are internal: whatever they do, the system's momentum stays."""
     kernels = compile_scene("free-floating")
     x = moving_start(kernels)
     rng = np.random.default_rng(4)

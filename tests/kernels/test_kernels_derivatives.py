@@ -1,4 +1,4 @@
-"""Exact derivatives: complex steps through the traced steps, in tangent coordinates, for every scene and integrator."""
+"""Exact derivatives: complex steps through the traced graphs, for every scene and integrator."""
 
 import numpy as np
 import pytest
@@ -107,7 +107,7 @@ def test_cost_derivatives_agree_with_complex_steps(scene, draw):
 
 
 def test_gauss_newton_hessian_is_exact_at_the_target():
-    """With no residual the Hessian of the pose cost is 2 J' W J; compare with differences of the exact gradient."""
+    """With no residual the Hessian of the pose cost is 2 J' W J: differences of the gradient."""
     from dq_space_arm_env import load_scene
 
     scene = load_scene("no-wrist")

@@ -1,4 +1,4 @@
-"""The compiled dynamics of every shipped scene against the paper's Newton-Euler system (13)-(22), in plain numbers."""
+"""The compiled dynamics of every shipped scene against the paper's Newton-Euler system (13)-(22)."""
 
 import numpy as np
 import pytest
@@ -7,6 +7,7 @@ from dq_space_arm_env import list_scenes
 from dq_space_arm_env.algebra import poses, vectors
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
 from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.integrators.field import split_state
 from dq_space_arm_env.kernels.field import SpaceArmField
 
 
@@ -18,7 +19,8 @@ def paper_solution(kernels, x, u):
     """Dual accelerations of base and joints, and reaction wrenches, from the paper's system."""
     chain = Chain.from_scene(kernels.scene)
     field = SpaceArmField(chain, kernels.layout)
-    motion, inputs = field.motion(x[field.n_pose :].tolist()), field.inputs(u.tolist())
+    stored, y = split_state(field, x.tolist())
+    motion, inputs = field.motion(y), field.inputs(u.tolist())
     rotations = minimal.joint_rotations(chain, motion.joint_angles)
     velocities = kinematics.body_velocities(
         chain, rotations, (*motion.angular, *motion.linear), motion.joint_rates
@@ -28,8 +30,7 @@ def paper_solution(kernels, x, u):
         (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
         for body, v in zip(bodies, velocities, strict=True)
     ]
-    pose = field.full_pose(x[: field.n_pose].tolist())
-    state = newton_euler.PaperState(pose, motion.joint_angles, motion.wrist_angles, duals)
+    state = newton_euler.PaperState(field.pose.full(stored), motion.joint_angles, motion.wrist_angles, duals)
     base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
     rates, reactions = newton_euler.paper_rates(
         chain, state, base_wrench, inputs.joint_torques, inputs.wrist_rates
@@ -38,7 +39,7 @@ def paper_solution(kernels, x, u):
     frames = newton_euler.joint_frames(chain, motion.joint_angles, motion.wrist_angles)
     joints = [newton_euler.joint_velocity(frames, j, accelerations)[3] for j in range(len(chain.links))]
     base = np.array([*accelerations[0][1:4], *accelerations[0][5:8]])
-    return np.array([*base[list(field.directions)], *joints]), np.array(reactions)
+    return np.array([*base[list(field.pose.directions)], *joints]), np.array(reactions)
 
 
 @pytest.mark.parametrize("scene", list_scenes())

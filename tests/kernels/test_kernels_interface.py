@@ -1,4 +1,4 @@
-"""What a caller of the kernels sees: shapes, errors, bit equality of batches, and how much each scene needs."""
+"""What a caller of the kernels sees: shapes, errors, bit equality, and how much each scene needs."""
 
 import numpy as np
 import pytest
@@ -107,7 +107,8 @@ def test_what_a_scene_does_not_need_is_not_there():
         "six-joint": (26, 12),
     }
     assert {name: (size["states"], size["inputs"]) for name, size in sizes.items()} == expected
-    # Leaving out actuators, the wrist, or dimensions of space leaves out operations; more joints or a load add some.
+    # Leaving out actuators, the wrist, or dimensions of space leaves out operations; more joints or a load
+    # add some.
     for smaller in ("free-floating", "reaction-wheels", "planar"):
         assert sizes[smaller]["dynamics"] < paper["dynamics"], smaller
     for smaller in ("free-floating", "reaction-wheels", "no-wrist", "planar"):

@@ -1,0 +1,68 @@
+"""The maneuver in the paper's own formulation: 46 states with the tip's pose appended, given to DDP.
+
+A slow reference. 54 numbers stand for 21 coordinates and rates, every derivative is 54 wide, and the value
+function is rank-deficient; the maneuver found is the same as in minimal coordinates (`ArmProblem`), which
+tests confirm.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from dq_space_arm_env import Scene, compile_scene, load_scene
+from experts.problem import FloatArray, Kernel
+
+
+class PaperProblem:
+    """A scene in the paper's formulation, stepped by the classical Runge-Kutta method; a `ShootingProblem`.
+
+    Attributes:
+        scene: The scene.
+        kernels: Its compiled functions.
+    """
+
+    def __init__(self, scene: Scene | str | Path = "paper") -> None:
+        """Take a scene.
+
+        Args:
+            scene: A scene, the name of a shipped one, or a path to a YAML file.
+
+        Raises:
+            SceneError: If the scene cannot be loaded.
+        """
+        self.scene = load_scene(scene)
+        self.kernels = compile_scene(self.scene)
+        layout = self.kernels.layout
+        self.initial_state = self.from_minimal(layout.initial_state)
+        self.n_states = self.n_tangent = len(self.initial_state)
+        self.n_controls = layout.n_u
+        self.horizon = self.scene.simulation.steps
+        self.time_step = self.scene.simulation.dt
+        self.control_lower: FloatArray = -layout.control_limit
+        self.control_upper: FloatArray = layout.control_limit
+
+    def from_minimal(self, x: FloatArray) -> FloatArray:
+        """The redundant state of a state in minimal coordinates.
+
+        Args:
+            x: State, shape (n_x,), units of `kernels.layout.state`.
+
+        Returns:
+            Base pose, angles, dual velocities of all bodies, tip pose; shape (54,) for scene `paper`.
+        """
+        kernel = self.kernels.paper_kernel("from_minimal", lanes=1)
+        result = np.zeros(kernel.outputs[0].stride)
+        kernel([np.ascontiguousarray(x, dtype=np.float64), result], 1)
+        return result
+
+    def kernel(self, name: str) -> Kernel:
+        """Return one of `experts.problem.KERNEL_NAMES`.
+
+        Args:
+            name: Name of the kernel.
+
+        Returns:
+            The kernel, compiled (half a minute for `linearize`) or loaded from the cache.
+        """
+        batched = name in ("linearize", "cost_derivatives")
+        return self.kernels.paper_kernel(name, lanes=None if batched else 1)
