@@ -79,7 +79,15 @@ class ShootingProblem(Protocol):
         """State at stage 0 unless `solve` is given another, shape (n_x,)."""
 
     def kernel(self, name: str) -> Kernel:
-        """Return one of the kernels in `KERNEL_NAMES`."""
+        """Return one of the kernels.
+
+        Args:
+            name: One of `KERNEL_NAMES`.
+
+        Returns:
+            The kernel.
+        """
+        ...
 
 
 def as_problem(scene_or_problem: Any) -> ShootingProblem:

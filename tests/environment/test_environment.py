@@ -46,6 +46,15 @@ def test_check_env_has_no_complaint(scene):
         check_env(make(scene).unwrapped, skip_render_check=True)
 
 
+@pytest.mark.render
+def test_check_env_has_no_complaint_about_pictures(monkeypatch):
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # "human" opens a window, which needs a display
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(render_mode="rgb_array").unwrapped)
+
+
 @pytest.mark.parametrize("scene", list_scenes())
 def test_a_thousand_random_steps(scene):
     env = make(scene)
