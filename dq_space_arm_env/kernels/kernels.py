@@ -8,8 +8,7 @@ CasADi.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.compiler import native
+from dq_space_arm_env.kernels.bound import BoundKernel, rows_of
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.layout import StateLayout
 
@@ -26,39 +26,6 @@ if TYPE_CHECKING:
     from dq_space_arm_env.kernels.programs import ScenePrograms
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class ArraySpec:
-    """An array of a kernel: its name, the scalars in a row, and whether all rows share one."""
-
-    name: str
-    stride: int
-    shared: bool
-
-
-class BoundKernel:
-    """A compiled program with what is known about its arrays.
-
-    Attributes:
-        address: Address of the C function `void (int64 begin, int64 end, const int64 *buffers)`.
-        inputs: Arrays that it reads.
-        outputs: Arrays that it writes.
-        operation_count: Arithmetic operations per row.
-    """
-
-    def __init__(self, kernel: native.NativeKernel) -> None:
-        """Read the notes that the compiler left."""
-        self.native = kernel
-        self.address = kernel.address
-        self.inputs = tuple(ArraySpec(*spec) for spec in kernel.metadata["inputs"])
-        self.outputs = tuple(ArraySpec(*spec) for spec in kernel.metadata["outputs"])
-        self.operation_count: int = kernel.metadata["operations"]
-
-    def __call__(self, arrays: Sequence[Array], rows: int) -> None:
-        """Run on rows 0 .. rows - 1 of C-contiguous float64 arrays, inputs first."""
-        buffers = np.array([array.ctypes.data for array in arrays], dtype=np.int64)
-        self.native.function(0, rows, buffers.ctypes.data)
 
 
 class Kernels:
@@ -166,7 +133,7 @@ class Kernels:
         self, name: str, integrator: str | None = None, **inputs: ArrayLike | None
     ) -> tuple[Array, ...]:
         """Run a program on one row or a batch, and give each output the same form as the inputs."""
-        rows, batched, arrays = _rows_of(inputs)
+        rows, batched, arrays = rows_of(inputs)
         kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)
         ordered = []
         for spec in kernel.inputs:
@@ -402,22 +369,6 @@ class Kernels:
         if not np.isfinite(step):
             raise ValueError(f"dt: {step} is not a finite time step in s")
         return np.array([step])
-
-
-def _rows_of(inputs: dict[str, ArrayLike | None]) -> tuple[int, bool, dict[str, Array]]:
-    """Number of rows, whether there is a batch axis, and every input as an array of that many rows."""
-    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in inputs.items()}
-    shared = {name: arrays.pop(name) for name in ("h",) if name in arrays}
-    batches = {name: array.shape[0] for name, array in arrays.items() if array.ndim == 2}
-    for name, array in arrays.items():
-        if array.ndim not in (1, 2):
-            raise ValueError(f"{name}: shape {array.shape}, should be (n,) or (B, n)")
-    if len(set(batches.values())) > 1:
-        raise ValueError(f"batches differ in length: {batches}")
-    rows = next(iter(batches.values()), 1)
-    for name, array in arrays.items():
-        arrays[name] = np.broadcast_to(array, (rows, array.shape[-1]))
-    return rows, bool(batches), {**arrays, **shared}
 
 
 @cache
