@@ -16,6 +16,7 @@ from dq_space_arm_env.compiler.elementary import arctangent2, sine_cosine
 from dq_space_arm_env.compiler.graph import Graph, Node, use_counts
 
 INDEX = ir.IntType(64)
+DOUBLE = ir.DoubleType()
 POINTER = ir.PointerType()
 
 
@@ -39,8 +40,7 @@ class VectorBuilder:
         """Append to `builder`, for `target`."""
         self.ir = builder
         self.target = target
-        scalar = ir.DoubleType()
-        self.type: ir.Type = ir.VectorType(scalar, target.lanes) if target.lanes > 1 else scalar
+        self.type: ir.Type = ir.VectorType(DOUBLE, target.lanes) if target.lanes > 1 else DOUBLE
         self.alignment = 8 * target.lanes
 
     def constant(self, value: float) -> ir.Constant:

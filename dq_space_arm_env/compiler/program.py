@@ -17,8 +17,9 @@ from dataclasses import dataclass, field
 
 from llvmlite import ir
 
-from dq_space_arm_env.compiler.emit import INDEX, POINTER, Target, VectorBuilder, emit_graph
+from dq_space_arm_env.compiler.emit import DOUBLE, INDEX, POINTER, Target, VectorBuilder, emit_graph
 from dq_space_arm_env.compiler.graph import Graph
+from dq_space_arm_env.compiler.transpose import gather, scatter
 
 
 @dataclass(frozen=True)
@@ -159,13 +160,24 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     builder.position_at_end(body)
     last = builder.sub(end, INDEX(1))
     rows = [_clamped(builder, row, lane, last) for lane in range(target.lanes)]
+
+    def addresses_of(buffer: Buffer) -> list[ir.Value]:
+        """Where the rows of this block begin in an array."""
+        if buffer.shared:
+            return [arrays[buffer.name]] * target.lanes
+        stride = INDEX(buffer.stride)
+        return [
+            builder.gep(arrays[buffer.name], [builder.mul(index, stride)], source_etype=DOUBLE)
+            for index in rows
+        ]
+
     for buffer in program.inputs:
-        _gather(vectors, buffer, arrays[buffer.name], blocks[buffer.name], rows)
+        gather(vectors, addresses_of(buffer), blocks[buffer.name], buffer.size, shared=buffer.shared)
     for call in program.calls:
         names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
         builder.call(functions[call.graph.name], [blocks[call.bindings.get(name, name)] for name in names])
     for buffer in program.outputs:
-        _scatter(vectors, buffer, arrays[buffer.name], blocks[buffer.name], rows)
+        scatter(vectors, blocks[buffer.name], addresses_of(buffer), buffer.size, buffer.positions)
     row.add_incoming(builder.add(row, INDEX(target.lanes)), builder.block)
     builder.branch(head)
 
@@ -186,47 +198,3 @@ def _clamped(builder: ir.IRBuilder, row: ir.Value, lane: int, last: ir.Value) ->
         return row
     wanted = builder.add(row, INDEX(lane))
     return builder.select(builder.icmp_signed("<", wanted, last), wanted, last)
-
-
-def _row_addresses(
-    vectors: VectorBuilder, buffer: Buffer, array: ir.Value, rows: list[ir.Value]
-) -> list[ir.Value]:
-    builder, scalar = vectors.ir, ir.DoubleType()
-    if buffer.shared:
-        return [array] * len(rows)
-    return [builder.gep(array, [builder.mul(row, INDEX(buffer.stride))], source_etype=scalar) for row in rows]
-
-
-def _gather(
-    vectors: VectorBuilder, buffer: Buffer, array: ir.Value, block: ir.Value, rows: list[ir.Value]
-) -> None:
-    """Transpose rows of an array into vectors with one row per lane."""
-    builder, scalar = vectors.ir, ir.DoubleType()
-    addresses = _row_addresses(vectors, buffer, array, rows)
-    for index in range(buffer.size):
-        values = []
-        for address in addresses[:1] if buffer.shared else addresses:
-            source = builder.gep(address, [INDEX(index)], source_etype=scalar)
-            values.append(builder.load(source, align=8, typ=scalar))
-        if len(rows) == 1:
-            vectors.store(values[0], block, index)
-            continue
-        vector = ir.Constant(vectors.type, ir.Undefined)
-        for lane in range(len(rows)):
-            value = values[0] if buffer.shared else values[lane]
-            vector = builder.insert_element(vector, value, ir.IntType(32)(lane))
-        vectors.store(vector, block, index)
-
-
-def _scatter(
-    vectors: VectorBuilder, buffer: Buffer, array: ir.Value, block: ir.Value, rows: list[ir.Value]
-) -> None:
-    """Transpose vectors with one row per lane into rows of an array."""
-    builder, scalar = vectors.ir, ir.DoubleType()
-    addresses = _row_addresses(vectors, buffer, array, rows)
-    positions = buffer.positions or range(buffer.size)
-    for index, position in zip(range(buffer.size), positions, strict=True):
-        vector = vectors.load(block, index)
-        for lane, address in enumerate(addresses):
-            value = vector if len(rows) == 1 else builder.extract_element(vector, ir.IntType(32)(lane))
-            builder.store(value, builder.gep(address, [INDEX(position)], source_etype=scalar), align=8)
