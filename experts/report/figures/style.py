@@ -1,0 +1,111 @@
+"""How the figures look: size, fonts, colors and line styles; and panels of curves in that look."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+
+from experts.problem import FloatArray
+
+WIDTH = 7.16
+"""Width of a figure over both columns of the page, inches."""
+DOTS_PER_INCH = 200
+
+# Okabe and Ito's palette, which color-blind readers tell apart; the line styles do so in black and white.
+BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
+BLACK, GRAY, LIGHT_GRAY = "#000000", "#707070", "#DDDDDD"
+COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
+LINE_STYLES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 1.5)),
+    (0, (6, 1.5, 1.2, 1.5)),
+    (0, (1.3, 1.3)),
+    (0, (2.6, 1.2)),
+    (0, (6, 1.3, 1.2, 1.3, 1.2, 1.3)),
+)
+LIMIT_STYLE: dict[str, Any] = {"color": GRAY, "linewidth": 0.8, "linestyle": (0, (4, 2)), "zorder": 1}
+"""Of limits and tolerances."""
+
+_SETTINGS: dict[Any, Any] = {
+    "font.family": "STIXGeneral",
+    "mathtext.fontset": "stix",
+    "font.size": 9.5,
+    "axes.labelsize": 9.5,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.xmargin": 0.0,
+    "grid.color": LIGHT_GRAY,
+    "grid.linewidth": 0.5,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "lines.linewidth": 1.25,
+    "patch.linewidth": 1.25,  # steps are patches
+    "legend.frameon": False,
+    "legend.handlelength": 2.8,
+    "legend.columnspacing": 1.6,
+    "legend.borderaxespad": 0.0,
+    "pdf.fonttype": 42,
+}
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Draw in this style inside the context; the user's own settings of matplotlib stay as they are."""
+    with matplotlib.rc_context({**matplotlib.rcParamsDefault, **_SETTINGS}):
+        yield
+
+
+def finish_panel(axes: Axes, title: str, label: str) -> None:
+    """Title on the left above a panel, legend on the right above it, label of the vertical axis.
+
+    Args:
+        axes: The panel.
+        title: Its title.
+        label: Quantity and unit of the vertical axis.
+    """
+    axes.set_title(title, loc="left", fontsize=9.5)
+    axes.set_ylabel(label)
+    handles, _ = axes.get_legend_handles_labels()
+    if len(handles) > 1:
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.025), ncols=len(handles))
+
+
+def draw_curves(
+    axes: Axes, time: FloatArray, values: FloatArray, symbols: Sequence[str], first: int = 0
+) -> None:
+    """Draw curves, each with its color and line style.
+
+    Args:
+        axes: Where to draw.
+        time: Shape (n,), s.
+        values: A column for each curve, shape (n, curves), any unit.
+        symbols: Name of each curve in the legend.
+        first: Place of the first curve in the order of colors and line styles.
+    """
+    for index, (column, symbol) in enumerate(zip(values.T, symbols, strict=True), first):
+        axes.plot(time, column, color=COLORS[index % 6], linestyle=LINE_STYLES[index % 6], label=symbol)
+
+
+def draw_steps(axes: Axes, edges: FloatArray, values: FloatArray, symbols: Sequence[str]) -> None:
+    """Draw what is constant between the edges, each column with its color and line style.
+
+    Args:
+        axes: Where to draw.
+        edges: Beginning of each step and end of the last one, shape (n + 1,), s.
+        values: A column for each input, shape (n, inputs), any unit.
+        symbols: Name of each input in the legend.
+    """
+    for index, (column, symbol) in enumerate(zip(values.T, symbols, strict=True)):
+        axes.stairs(
+            column,
+            edges,
+            baseline=None,
+            color=COLORS[index % 6],
+            linestyle=LINE_STYLES[index % 6],
+            label=symbol,
+        )

@@ -1,0 +1,97 @@
+"""The figures of a run as files."""
+
+import math
+from collections.abc import Callable, Sequence
+from io import BytesIO
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from experts.report.figures.curves import (
+    convergence_figure,
+    draw_angle,
+    draw_distance,
+    figure_3,
+    figure_4,
+    figure_5,
+    figure_6,
+)
+from experts.report.figures.snapshots import SnapshotPainter, figure_2, snapshot_stages
+from experts.report.figures.style import DOTS_PER_INCH, house_style
+from experts.report.files import write_atomically
+from experts.report.maneuver import Maneuver
+from experts.report.run import ManeuverRun
+
+_README_SIZE = (8.0, 3.5)  # inches
+_README_DOTS = 200
+
+
+def write_figures(run: ManeuverRun, folder: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
+    """Write Figures 2 to 6 and the convergence of the solver.
+
+    Args:
+        run: A run with a finite trajectory.
+        folder: An existing folder.
+        formats: File formats: "png", "pdf", or any other that matplotlib has.
+
+    Returns:
+        The files; figures of actuators that the scene does not have are left out.
+    """
+    maneuver = run.maneuver
+    figures: dict[str, Callable[[], Figure | None]] = {
+        "figure-2-snapshots": lambda: figure_2(maneuver),
+        "figure-3-pose-error": lambda: figure_3(maneuver),
+        "figure-4-error-norms": lambda: figure_4(maneuver),
+        "figure-5-base-inputs": lambda: figure_5(maneuver),
+        "figure-6-arm-inputs": lambda: figure_6(maneuver),
+        "convergence": lambda: convergence_figure(run),
+    }
+    files = []
+    with house_style():
+        for name, draw in figures.items():
+            figure = draw()
+            for format_ in formats:
+                file = folder / f"{name}.{format_}"
+                if figure is None:
+                    file.unlink(missing_ok=True)  # of an earlier run with another scene
+                    continue
+                write_atomically(file, _drawn(figure, format_, DOTS_PER_INCH))
+                files.append(file)
+    return files
+
+
+def write_readme_picture(run: ManeuverRun, file: Path) -> None:
+    """Write snapshots and error curves in one picture of 1600 x 700 pixels.
+
+    Args:
+        run: A run with a finite trajectory.
+        file: PNG file to write; its folder must exist.
+    """
+    with house_style():
+        write_atomically(file, _drawn(_readme_figure(run.maneuver), "png", _README_DOTS))
+
+
+def _readme_figure(maneuver: Maneuver) -> Figure:
+    """Two by two snapshots on the left, attitude and position error on the right."""
+    figure = Figure(figsize=_README_SIZE)
+    stages = snapshot_stages(maneuver, 4)
+    painter = SnapshotPainter(maneuver, stages, numbered=False)
+    for index, stage in enumerate(stages):
+        row, column = divmod(index, 2)
+        painter.draw(figure.add_axes((0.005 + 0.31 * column, 0.5 - 0.5 * row, 0.31, 0.5)), stage)
+    upper = figure.add_axes((0.69, 0.61, 0.29, 0.31))
+    lower = figure.add_axes((0.69, 0.14, 0.29, 0.31), sharex=upper)
+    draw_angle(upper, maneuver, f"Attitude error: {math.degrees(maneuver.angle[-1]):.2g}° at the end")
+    draw_distance(lower, maneuver, f"Position error: {maneuver.distance[-1]:.2g} m at the end")
+    lower.set_xlabel("time [s]")
+    lower.locator_params(axis="x", nbins=4)
+    return figure
+
+
+def _drawn(figure: Figure, format_: str, dots_per_inch: int) -> bytes:
+    """Draw without pyplot, which would choose a window system and keep the figure."""
+    FigureCanvasAgg(figure)
+    file = BytesIO()
+    figure.savefig(file, format=format_, dpi=dots_per_inch)
+    return file.getvalue()

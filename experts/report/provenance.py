@@ -1,0 +1,58 @@
+"""Where a result comes from: versions, commit and machine."""
+
+import importlib.metadata
+import platform
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import dq_space_arm_env
+from dq_space_arm_env.compiler.native import host_machine
+
+PACKAGES = ("casadi", "gymnasium", "llvmlite", "matplotlib", "numba", "numpy", "pydantic")
+
+
+def provenance() -> dict[str, Any]:
+    """Describe this process.
+
+    Returns:
+        Date, versions of packages, commit and machine; `None` for what is not installed or not known.
+    """
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": _commit(Path(dq_space_arm_env.__file__).parent.parent),
+        "versions": {
+            "dq-space-arm": dq_space_arm_env.__version__,
+            "python": platform.python_version(),
+            **{package: _version(package) for package in PACKAGES},
+        },
+        "machine": {
+            "system": platform.platform(),
+            "processor": host_machine().cpu,
+            "vector_lanes": host_machine().lanes,
+        },
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _commit(checkout: Path) -> dict[str, Any] | None:
+    """Hash of the checked-out commit, and whether files differ from it; None if there is no commit."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(checkout), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        # An installed package may lie inside somebody else's repository.
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != checkout.resolve():
+            return None
+        return {"hash": git("rev-parse", "HEAD"), "modified": bool(git("status", "--porcelain"))}
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,43 @@
+"""The README tells the truth: its code runs, its table has the right numbers, its pictures exist."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from dq_space_arm_env import compile_scene, list_scenes
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("number", range(len(BLOCKS)))
+def test_code_runs(number, capsys):
+    exec(compile(BLOCKS[number], f"README block {number}", "exec"), {})
+    capsys.readouterr()
+
+
+def test_there_is_code_to_run():
+    assert len(BLOCKS) >= 4
+
+
+def test_table_of_scenes_is_right():
+    rows = re.findall(r"^\| `([\w-]+)` \|[^|]*\| (\d+), (\d+) \| (\d+) \|$", README, flags=re.MULTILINE)
+    assert sorted(row[0] for row in rows) == sorted(list_scenes())
+    for name, *numbers in rows:
+        kernels = compile_scene(name)
+        expected = [kernels.n_x, kernels.n_u, kernels.operation_count("forward_dynamics")]
+        assert [int(number) for number in numbers] == expected, name
+
+
+def test_pictures_exist():
+    for path in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", README):
+        assert (ROOT / path).is_file()
+
+
+def test_commands_exist():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for command in re.findall(r"^make (\w+)", README, flags=re.MULTILINE):
+        assert re.search(rf"^{command}:", makefile, flags=re.MULTILINE)
+    assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
