@@ -79,7 +79,7 @@ def _result_rows(run: ManeuverRun) -> Iterable[tuple[str, str, str]]:
     yield "  inputs", f"{terms['cost_control']:.6f}", ""
     verdict = "converged" if solution.converged else f"NOT converged ({solution.stop_reason.value})"
     yield "solver", verdict, solution.message
-    seconds = f"{run.solve_seconds:.2f} s"
+    seconds = f"{run.solve_seconds:.2g} s"
     yield (
         "iterations",
         str(solution.iterations),

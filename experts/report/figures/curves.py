@@ -210,7 +210,7 @@ def convergence_figure(run: ManeuverRun) -> Figure | None:
             label=label,
         )
     finish_panel(step, "Step length and damping (zero is not shown)", "[$-$]")
-    step.set_xlabel(f"iterations done ({run.solve_seconds:.2f} s in all)")
+    step.set_xlabel(f"iterations done ({run.solve_seconds:.2g} s in all)")
     step.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
     step.set_xlim(-0.012 * done[-1], 1.012 * done[-1])
     return figure
