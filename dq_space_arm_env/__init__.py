@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from dq_space_arm_env.registration import register_environments
 
 if TYPE_CHECKING:
-    from dq_space_arm_env.environment import DQSpaceArmEnv
+    from dq_space_arm_env.environment import DQSpaceArmEnv, DQSpaceArmVectorEnv
     from dq_space_arm_env.kernels import Kernels, compile_scene
     from dq_space_arm_env.scene import Scene, SceneError, list_scenes, load_scene
 
@@ -20,6 +20,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "DQSpaceArmEnv",
+    "DQSpaceArmVectorEnv",
     "Kernels",
     "Scene",
     "SceneError",
@@ -30,6 +31,7 @@ __all__ = [
 
 _HOMES = {
     "DQSpaceArmEnv": "environment",
+    "DQSpaceArmVectorEnv": "environment",
     "Kernels": "kernels",
     "Scene": "scene",
     "SceneError": "scene",

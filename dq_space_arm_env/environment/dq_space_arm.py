@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +14,10 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.algebra import dual_quaternion, poses
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.environment.start_options import given_start
 from dq_space_arm_env.kernels import compile_scene
+from dq_space_arm_env.kernels.report import REPORT
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.start import draw_initial_state
 
@@ -23,10 +26,12 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# An observation beyond this (m, rad, m/s, rad/s) comes from a simulation that has blown up, not from a spacecraft.
+# An observation whose norm (m, rad, m/s, rad/s) is beyond this comes from a simulation that has blown up.
 OBSERVATION_LIMIT = 1e6
 
-_OPTIONS = ("nominal", "initial_state")
+_STAGE_COST, _TERMINAL_COST, _OBSERVATION_SQUARE = (
+    REPORT.index(name) for name in ("stage_cost", "terminal_cost", "observation_square")
+)
 
 
 class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
@@ -96,7 +101,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
     1. Termination: the scene's number of steps (1000) is reached. The time left is part of the observation and the terminal cost part of the task, so this is an
        end of the task, not a truncation.
-    2. Termination: the simulation diverged (an observation that is not finite or beyond 1e6). `info["diverged"]` says so, and the remaining steps are charged at
+    2. Termination: the simulation diverged (an observation that is not finite, or whose norm exceeds 1e6). `info["diverged"]` says so, and the remaining steps are charged at
        the cost of the last sound state, so that ending early never pays.
 
     ## Arguments
@@ -157,8 +162,11 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": round(1.0 / self.scene.simulation.dt)}
         self.action_space = spaces.Box(-1.0, 1.0, (layout.n_u,), np.float32)
-        self._limit = layout.control_limit
+        self._steps, self._dt = self.scene.simulation.steps, self.scene.simulation.dt
+        self._angle_tolerance = self.scene.success.attitude_error_deg
+        self._distance_tolerance = self.scene.success.position_error
         self._bind_kernel()
+        self._h[0] = self._dt
         self.observation_space = self._make_observation_space()
         self._step_count = -1
         self._trail: list[Array] = []
@@ -168,23 +176,21 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         high = np.full(self._observation.shape, OBSERVATION_LIMIT)
         real_part = 2 if self.kernels.layout.planar else 4
         high[:real_part] = 1.0 + 1e-6  # a unit quaternion may exceed 1 by a rounding error
-        high[-1] = self.scene.simulation.steps * self.scene.simulation.dt
+        high[-1] = self._steps * self._dt
         low = -high
         low[-1] = 0.0
         return spaces.Box(low, high, dtype=np.float64)
 
     def _bind_kernel(self) -> None:
         """Give the compiled step arrays of its own; their addresses are handed over once."""
-        self._kernel = self.kernels.kernel("environment_step", lanes=1)
-        arrays = {spec.name: np.zeros(spec.stride) for spec in (*self._kernel.inputs, *self._kernel.outputs)}
-        arrays["h"][0] = self.scene.simulation.dt
-        self._x, self._u, self._time_left = arrays["x"], arrays["u"], arrays["time_left"]
-        self._x_next, self._observation = arrays["x_next"], arrays["observation"]
-        self._terms, self._terminal_terms = arrays["terms"], arrays["terminal_terms"]
-        self._errors = arrays["errors"]
+        kernel = self.kernels.kernel("environment_step", lanes=1)
+        arrays = {spec.name: np.zeros(spec.stride) for spec in (*kernel.inputs, *kernel.outputs)}
         self._arrays = arrays
+        self._x, self._x_next = arrays["x"], arrays["x_next"]
+        self._action, self._time_left, self._h = arrays["action"], arrays["time_left"], arrays["h"]
+        self._observation, self._report = arrays["observation"], arrays["report"]
         self._buffers = np.array([array.ctypes.data for array in arrays.values()], dtype=np.int64)
-        self._buffers_address = self._buffers.ctypes.data
+        self._run_kernel = partial(kernel.native.function, 0, 1, self._buffers.ctypes.data)
 
     @property
     def state(self) -> Array:
@@ -210,46 +216,42 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             ResetNeeded: Before the first reset, and after the end of an episode.
             ValueError: If the action has a wrong shape or a NaN.
         """
-        steps = self.scene.simulation.steps
-        if not 0 <= self._step_count < steps:
+        remaining = self._steps - self._step_count - 1
+        if remaining < 0 or self._step_count < 0:
             state = "has not begun" if self._step_count < 0 else "is over"
             raise ResetNeeded(f"the episode {state}: call reset() before step()")
         values = np.asarray(action, dtype=np.float64)
-        if values.shape != self._u.shape:
-            raise ValueError(f"action: shape {values.shape}, should be {self._u.shape}")
-        if np.isnan(values).any():
+        if values.shape != self._action.shape:
+            raise ValueError(f"action: shape {values.shape}, should be {self._action.shape}")
+        if math.isnan(values.sum()) and np.isnan(values).any():
             raise ValueError(f"action: {values} holds NaN, should be numbers in [-1, 1]")
-        np.multiply(np.clip(values, -1.0, 1.0), self._limit, out=self._u)
-        self._time_left[0] = (steps - self._step_count - 1) * self.scene.simulation.dt
-        before = self._terminal_terms.copy()
-        self._kernel.native.function(0, 1, self._buffers_address)
-        if self._has_diverged():
-            return self._end_diverged(before)
+        self._action[:] = values
+        self._time_left[0] = remaining * self._dt
+        terminal_cost = self._report[_TERMINAL_COST]
+        self._run_kernel()
+        report = self._report.tolist()
+        # Written so that NaN counts as diverged.
+        if not report[_OBSERVATION_SQUARE] <= OBSERVATION_LIMIT**2:
+            return self._end_diverged(report, terminal_cost)
         self._step_count += 1
         self._x[:] = self._x_next
-        done = self._step_count == steps
-        reward = -float(self._terms.sum())
+        done = remaining == 0
+        reward = -report[_STAGE_COST]
         if done:
-            reward -= float(self._terminal_terms.sum())
+            reward -= report[_TERMINAL_COST]
         if self.render_mode is not None:
-            self._remember_tip()
-            if self.render_mode == "human":
-                self.render()
-        return self._observation.copy(), reward, done, False, self._info(terminal=done)
+            self._show()
+        return self._observation.copy(), reward, done, False, self._info(report, terminal=done)
 
-    def _has_diverged(self) -> bool:
-        # Written so that NaN counts as diverged.
-        return not float(np.abs(self._observation).max()) <= OBSERVATION_LIMIT
-
-    def _end_diverged(self, terminal_terms: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+    def _end_diverged(
+        self, report: list[float], terminal_cost: float
+    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """End the episode at the last sound state, which is kept, and charge what is left of it."""
-        remaining = self.scene.simulation.steps - self._step_count
-        reward = -float(self._terms.sum()) * remaining - float(terminal_terms.sum())
-        terms = self._terms.copy()
+        remaining = self._steps - self._step_count
+        reward = -report[_STAGE_COST] * remaining - float(terminal_cost)
         self._observe()
-        self._terms[:], self._terminal_terms[:] = terms, terminal_terms
-        self._step_count = self.scene.simulation.steps
-        info = self._info(terminal=True)
+        self._step_count = self._steps
+        info = self._info([*report[:3], *self._report.tolist()[3:]], terminal=True)
         info.update(diverged=True, is_success=False)
         return self._observation.copy(), reward, True, False, info
 
@@ -269,93 +271,44 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             ValueError: If an option is unknown, or the initial state has a wrong shape, is not finite, or its pose is not a unit dual quaternion.
         """
         super().reset(seed=seed)
-        self._x[:] = self._start(options or {})
+        start = given_start(self.kernels, options or {})
+        self._x[:] = draw_initial_state(self.scene, self.np_random) if start is None else start
         self._step_count = 0
-        self._time_left[0] = self.scene.simulation.steps * self.scene.simulation.dt
+        self._time_left[0] = self._steps * self._dt
         self._observe()
-        self._terms[:] = 0.0
         self._trail = []
         if self.render_mode is not None:
-            self._remember_tip()
-            if self.render_mode == "human":
-                self.render()
-        return self._observation.copy(), self._info(terminal=False)
-
-    def _start(self, options: dict[str, Any]) -> Array:
-        unknown = set(options) - set(_OPTIONS)
-        if unknown:
-            raise ValueError(f"options: {sorted(unknown)} unknown; there are {', '.join(_OPTIONS)}")
-        state = options.get("initial_state")
-        if state is None:
-            if options.get("nominal", False):
-                return self.kernels.layout.initial_state
-            return draw_initial_state(self.scene, self.np_random)
-        if options.get("nominal", False):
-            raise ValueError("options: nominal and initial_state exclude each other")
-        x = np.array(state, dtype=np.float64)
-        if x.shape != self._x.shape or not np.isfinite(x).all():
-            raise ValueError(
-                f"options: initial_state {x} of shape {x.shape}, should be finite numbers of shape {self._x.shape}"
-            )
-        return self._with_sign_of_target(self._with_unit_pose(x))
-
-    def _with_unit_pose(self, x: Array) -> Array:
-        """Refuse a base pose that is not a unit dual quaternion; remove rounding errors of one that is."""
-        pose = self.kernels.layout.state.pose
-        full = self._full_pose(x[pose])
-        length, overlap = math.hypot(*full[:4]), float(np.dot(full[:4], full[4:]))
-        if abs(length - 1.0) > 1e-6 or abs(overlap) > 1e-6 * (1.0 + math.hypot(*full[4:])):
-            raise ValueError(
-                f"options: initial_state has a base pose with |q_r| = {length:.9g}, q_r . q_d = {overlap:.3g}; "
-                "a unit dual quaternion has 1 and 0"
-            )
-        unit = np.array(dual_quaternion.normalize(tuple(full.tolist())))
-        x[pose] = unit[[0, 3, 5, 6]] if self.kernels.layout.planar else unit
-        return x
-
-    def _with_sign_of_target(self, x: Array) -> Array:
-        """Of q and -q, which are one pose but not one cost, take the one that puts the tip near the target's quaternion."""
-        target = np.array(self.scene.target.pose.dual_quaternion)
-        if self.kernels.tip_pose(x)[:4] @ target[:4] < 0.0:
-            pose = self.kernels.layout.state.pose
-            x[pose] = -x[pose]
-        return x
-
-    def _full_pose(self, stored: Array) -> Array:
-        if not self.kernels.layout.planar:
-            return stored
-        full = np.zeros(8)
-        full[[0, 3, 5, 6]] = stored
-        return full
+            self._show()
+        return self._observation.copy(), self._info(
+            [0.0, 0.0, 0.0, *self._report.tolist()[3:]], terminal=False
+        )
 
     def _observe(self) -> None:
         """Observation, errors and terminal cost of the present state: what a step of no duration reports."""
-        self._u[:] = 0.0
-        h = self._arrays["h"]
-        h[0], step = 0.0, h[0]
-        self._kernel.native.function(0, 1, self._buffers_address)
-        h[0] = step
+        self._action[:] = 0.0
+        self._h[0] = 0.0
+        self._run_kernel()
+        self._h[0] = self._dt
 
-    def _info(self, *, terminal: bool) -> dict[str, Any]:
-        pose, base_velocity, control = self._terms.tolist()
-        terminal_pose, terminal_velocity = self._terminal_terms.tolist() if terminal else (0.0, 0.0)
-        attitude_error, position_error = math.degrees(self._errors[0]), float(self._errors[1])
-        success = self.scene.success
+    def _info(self, report: list[float], *, terminal: bool) -> dict[str, Any]:
+        pose, base_velocity, control, terminal_pose, terminal_velocity, angle, distance = report[:7]
         return {
             "cost_pose": pose,
             "cost_base_velocity": base_velocity,
             "cost_control": control,
-            "terminal_cost_pose": terminal_pose,
-            "terminal_cost_base_velocity": terminal_velocity,
-            "attitude_error": attitude_error,
-            "position_error": position_error,
-            "is_success": attitude_error <= success.attitude_error_deg
-            and position_error <= success.position_error,
+            "terminal_cost_pose": terminal_pose if terminal else 0.0,
+            "terminal_cost_base_velocity": terminal_velocity if terminal else 0.0,
+            "attitude_error": angle,
+            "position_error": distance,
+            "is_success": angle <= self._angle_tolerance and distance <= self._distance_tolerance,
             "diverged": False,
         }
 
-    def _remember_tip(self) -> None:
+    def _show(self) -> None:
+        """Remember where the tip is, and update the window."""
         self._trail.append(np.array(poses.position(self.kernels.tip_pose(self._x).tolist())))
+        if self.render_mode == "human":
+            self.render()
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the present state.

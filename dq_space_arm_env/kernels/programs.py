@@ -6,6 +6,7 @@ A program's inputs are arrays with one row per state: `x` (n_x), `u` (n_u), and 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -344,36 +345,58 @@ class ScenePrograms:
     # Steps.
 
     def _step(self, name: str, integrator: str) -> Program:
-        """A step alone, with its cost, or with everything that the environment reports."""
+        """A step alone, with its cost, or as the environment takes it."""
+        if name == "environment_step":
+            return self._environment_step(integrator)
         field = self.field
         x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
         program = Program(name, [x, u, h], [Buffer("x_next", field.n_x)])
-        if name == "environment_step":
-            program.inputs = [x, u, h, Buffer("time_left", 1)]
         INTEGRATORS[integrator].append_step(program, field)
         if name == "step_with_cost":
             sizes = {"x": field.n_x, "u": field.n_u}
             program.call(trace("cost_graph", sizes, lambda x, u: {"cost": [_sum(self._cost_terms(x, u))]}))
             program.outputs = [*program.outputs, Buffer("cost", 1)]
-        elif name == "environment_step":
-            self._append_report(program)
         return program
 
-    def _append_report(self, program: Program) -> None:
+    def _environment_step(self, integrator: str) -> Program:
+        """Action to inputs, step, observation and report."""
         field = self.field
-        sizes = {"x": field.n_x, "u": field.n_u}
-        program.call(trace("terms_graph", sizes, lambda x, u: {"terms": self._cost_terms(x, u)}))
-        after = trace(
-            "report_graph",
-            {"x_next": field.n_x, "time_left": 1},
-            lambda x_next, time_left: {
-                **self._observe(x_next, time_left[0]),
-                "terminal_terms": self._terminal_cost_terms(x_next),
-            },
+        limits = self.layout.control_limit.tolist()
+
+        def to_inputs(action: Scalars) -> Mapping[str, Scalars]:
+            clipped = [casadi.fmin(casadi.fmax(value, -1.0), 1.0) for value in action]
+            return {"u": [limit * value for limit, value in zip(limits, clipped, strict=True)]}
+
+        def after(x_next: Scalars, time_left: Scalars, terms: Scalars) -> Mapping[str, Scalars]:
+            seen = self._observe(x_next, time_left[0])
+            terminal = self._terminal_cost_terms(x_next)
+            angle, distance = seen["errors"]
+            square = _sum([value * value for value in seen["observation"]])
+            sums = [_sum(terms), _sum(terminal), square]
+            report = [*terms, *terminal, angle * (180.0 / math.pi), distance, *sums]
+            return {"observation": seen["observation"], "report": report}
+
+        program = Program(
+            "environment_step",
+            [
+                Buffer("x", field.n_x),
+                Buffer("action", field.n_u),
+                Buffer("h", 1, shared=True),
+                Buffer("time_left", 1),
+            ],
+            [],
         )
-        program.call(after)
-        reported = [("terms", 3), *after.outputs]
-        program.outputs = [*program.outputs, *(Buffer(name, size) for name, size in reported)]
+        sizes = {"x": field.n_x, "u": field.n_u}
+        program.call(trace("inputs_graph", {"action": field.n_u}, to_inputs))
+        program.call(trace("terms_graph", sizes, lambda x, u: {"terms": self._cost_terms(x, u)}))
+        INTEGRATORS[integrator].append_step(program, field)
+        report = trace("report_graph", {"x_next": field.n_x, "time_left": 1, "terms": 3}, after)
+        program.call(report)
+        program.outputs = [
+            Buffer("x_next", field.n_x),
+            *(Buffer(name, size) for name, size in report.outputs),
+        ]
+        return program
 
     def _linearize(self, integrator: str) -> Program:
         field = self.field

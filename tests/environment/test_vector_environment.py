@@ -1,0 +1,156 @@
+"""The vector environment: bit for bit the single one, in every autoreset mode."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from dq_space_arm_env import DQSpaceArmVectorEnv, list_scenes, load_scene
+
+
+def short(scene="paper", steps=12):
+    scene = load_scene(scene)
+    return scene.replace(simulation=scene.simulation.model_copy(update={"steps": steps}))
+
+
+def twins(scene, copies, mode):
+    native = gymnasium.make_vec(
+        "DQSpaceArm-v0",
+        num_envs=copies,
+        scene=scene,
+        autoreset_mode=mode,
+        vectorization_mode="vector_entry_point",
+    )
+    single = [lambda: gymnasium.make("DQSpaceArm-v0", scene=scene) for _ in range(copies)]
+    return native, SyncVectorEnv(single, autoreset_mode=mode)
+
+
+def assert_same(actual, expected, path="result"):
+    if isinstance(expected, dict):
+        assert actual.keys() == expected.keys(), path
+        for key in expected:
+            assert_same(actual[key], expected[key], f"{path}[{key!r}]")
+    elif isinstance(expected, tuple) or (isinstance(expected, np.ndarray) and expected.dtype == object):
+        for i, (a, b) in enumerate(zip(actual, expected, strict=True)):
+            assert_same(a, b, f"{path}[{i}]")
+    else:
+        np.testing.assert_array_equal(actual, expected, err_msg=path)
+
+
+def test_make_vec_finds_the_native_environment():
+    venv = gymnasium.make_vec("DQSpaceArm-v0", num_envs=3)
+    assert isinstance(venv.unwrapped, DQSpaceArmVectorEnv)
+    assert venv.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    observations, _ = venv.reset(seed=0)
+    assert venv.observation_space.contains(observations)
+    assert observations.shape == (3, 24)
+
+
+@pytest.mark.parametrize("copies", [1, 3, 11])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_bits_are_those_of_single_environments_over_several_episodes(mode, copies):
+    native, sync = twins(short(), copies, mode)
+    assert_same(native.reset(seed=5), sync.reset(seed=5))
+    rng = np.random.default_rng(0)
+    for step in range(30):
+        actions = rng.uniform(-1.2, 1.2, (copies, 12)).astype(np.float32)
+        assert_same(native.step(actions), sync.step(actions), f"step {step}")
+
+
+@pytest.mark.parametrize("scene", list_scenes())
+def test_every_scene_agrees_with_single_environments(scene):
+    native, sync = twins(short(scene, 5), 9, AutoresetMode.NEXT_STEP)
+    assert_same(native.reset(seed=1), sync.reset(seed=1))
+    native.action_space.seed(0)
+    for step in range(8):
+        actions = native.action_space.sample()
+        assert_same(native.step(actions), sync.step(actions), f"step {step}")
+
+
+def test_copies_are_reset_by_hand_where_autoreset_is_disabled():
+    native, sync = twins(short(steps=4), 5, AutoresetMode.DISABLED)
+    assert_same(native.reset(seed=2), sync.reset(seed=2))
+    mask = np.array([True, False, False, True, False])
+    actions = np.zeros((5, 12), dtype=np.float32)
+    for _ in range(2):
+        assert_same(native.step(actions), sync.step(actions))
+    assert_same(
+        native.reset(seed=[7, None, None, 9, None], options={"reset_mask": mask}),
+        sync.reset(seed=[7, None, None, 9, None], options={"reset_mask": mask.copy()}),
+    )
+    for _ in range(2):
+        result = native.step(actions)
+        assert_same(result, sync.step(actions))
+    assert result[2].tolist() == (~mask).tolist()
+    with pytest.raises(ResetNeeded, match=r"copies \[1, 2, 4\] are over"):
+        native.step(actions)
+    native.reset(options={"reset_mask": ~mask})
+    native.step(actions)
+
+
+def test_diverged_copies_end_as_single_ones_do():
+    scene = load_scene("paper")
+    links = [link.model_dump() | {"stiffness": 1e6} for link in scene.links]
+    simulation = {"dt": 0.1, "steps": 60, "integrator": "symplectic_euler"}
+    native, sync = twins(scene.replace(links=links, simulation=simulation), 4, AutoresetMode.SAME_STEP)
+    assert_same(native.reset(seed=0), sync.reset(seed=0))
+    actions = np.zeros((4, 12))
+    ended = 0
+    for step in range(60):
+        result = native.step(actions)
+        assert_same(result, sync.step(actions), f"step {step}")
+        if "final_info" in result[4]:
+            ended += int(result[4]["final_info"]["diverged"].sum())
+    assert ended >= 4
+
+
+def test_starts_can_be_given():
+    venv = DQSpaceArmVectorEnv(3, short())
+    nominal = venv.kernels.layout.initial_state
+    venv.reset(options={"nominal": True})
+    np.testing.assert_array_equal(venv.states, np.tile(nominal, (3, 1)))
+    venv.reset(seed=0)
+    drawn = venv.states
+    venv.reset(options={"initial_state": drawn})
+    np.testing.assert_allclose(venv.states, drawn, atol=1e-15)
+    venv.reset(options={"initial_state": drawn[1]})
+    np.testing.assert_allclose(venv.states, np.tile(drawn[1], (3, 1)), atol=1e-15)
+
+
+def test_returned_arrays_are_the_callers():
+    venv = DQSpaceArmVectorEnv(4, short())
+    first, info = venv.reset(seed=0)
+    kept, kept_info = first.copy(), {key: value.copy() for key, value in info.items()}
+    for _ in range(3):
+        venv.step(venv.action_space.sample())
+    np.testing.assert_array_equal(first, kept)
+    assert_same(info, kept_info)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda v: v.step(np.zeros((3, 12))), r"shape \(3, 12\), should be \(4, 12\)"),
+        (lambda v: v.step(np.where(np.arange(48).reshape(4, 12) == 30, np.nan, 0)), r"NaN for copies \[2\]"),
+        (lambda v: v.reset(seed=[1, 2]), "2 seeds, should be 4"),
+        (lambda v: v.reset(options={"reset_mask": np.zeros(4, dtype=bool)}), "False everywhere"),
+        (lambda v: v.reset(options={"reset_mask": [True] * 4}), "should be a bool array"),
+        (lambda v: v.reset(options={"nominel": True}), "unknown; there are nominal"),
+        (lambda v: v.reset(options={"initial_state": np.full(23, np.nan)}), "should be finite"),
+    ],
+)
+def test_bad_input_is_refused(call, message):
+    venv = DQSpaceArmVectorEnv(4, short())
+    venv.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        call(venv)
+
+
+def test_bad_construction_is_refused():
+    with pytest.raises(ValueError, match="num_envs: 0, should be at least 1"):
+        DQSpaceArmVectorEnv(0)
+    with pytest.raises(ValueError, match="render_mode: 'human'"):
+        DQSpaceArmVectorEnv(2, render_mode="human")
+    with pytest.raises(ResetNeeded):
+        DQSpaceArmVectorEnv(2).step(np.zeros((2, 12)))
