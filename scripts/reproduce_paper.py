@@ -62,7 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         console.print(f"Interrupted; what there is lies in {folder}.")
         return INTERRUPTED
     console.print(_verdict(run), markup=False)
-    console.print(f"{folder}: {', '.join(file.name for file in files)}", markup=False)
+    written = ", ".join(file.name if file.parent == folder else str(file) for file in files)
+    console.print(f"{folder}: {written}", markup=False)
     return _status(run)
 
 

@@ -1,0 +1,223 @@
+"""The figures show the numbers of the maneuver, in the units that they name."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+matplotlib = pytest.importorskip("matplotlib")
+
+from matplotlib.image import imread  # noqa: E402
+
+from dq_space_arm_env import Scene, load_scene  # noqa: E402
+from dq_space_arm_env.algebra.poses import position  # noqa: E402
+from dq_space_arm_env.scene import StateLayout  # noqa: E402
+from experts.report import Maneuver, ManeuverRun  # noqa: E402
+from experts.report.figures import write_figures, write_readme_picture  # noqa: E402
+from experts.report.figures.curves import (  # noqa: E402
+    convergence_figure,
+    figure_3,
+    figure_4,
+    figure_5,
+    figure_6,
+)
+from experts.report.figures.snapshots import best_view, figure_2, snapshot_stages  # noqa: E402
+from experts.report.figures.space import Grid, View  # noqa: E402
+
+
+def still(scene: Scene) -> Maneuver:
+    """A maneuver in which nothing happens."""
+    layout = StateLayout.of(scene)
+    return Maneuver(scene, np.tile(layout.initial_state, (4, 1)), np.zeros((3, layout.n_u)))
+
+
+def test_figure_3_shows_the_error_pose(paper_maneuver: Maneuver) -> None:
+    upper, lower = figure_3(paper_maneuver).axes
+    shown = np.column_stack([line.get_ydata() for line in upper.lines])
+    assert np.array_equal(shown, paper_maneuver.error_pose[:, :4])
+    shown = np.column_stack([line.get_ydata() for line in lower.lines])
+    assert np.array_equal(shown, paper_maneuver.position_error)
+    assert lower.get_ylabel() == "position [m]"
+
+
+def test_curves_differ_in_color_and_in_line_style(paper_maneuver: Maneuver) -> None:
+    upper, _ = figure_3(paper_maneuver).axes
+    looks = [(line.get_color(), line._dash_pattern) for line in upper.lines]
+    assert len({color for color, _ in looks}) == 4
+    assert len({str(pattern) for _, pattern in looks}) == 4
+
+
+def test_figure_4_is_in_degrees_and_meters(paper_maneuver: Maneuver) -> None:
+    upper, lower = figure_4(paper_maneuver).axes
+    assert upper.lines[0].get_ydata()[0] == pytest.approx(74.4, abs=0.05)
+    assert lower.lines[0].get_ydata()[0] == pytest.approx(1.330, abs=5e-4)
+    assert (upper.get_ylabel(), lower.get_ylabel()) == ("angle [deg]", "distance [m]")
+    assert upper.lines[1].get_ydata()[0] == 3.0  # the tolerance
+
+
+def test_figure_5_shows_small_forces_in_millinewtons(paper_maneuver: Maneuver) -> None:
+    figure = figure_5(paper_maneuver)
+    assert figure is not None
+    force, torque = figure.axes
+    values, edges, _ = force.patches[1].get_data()
+    assert values == pytest.approx(1e3 * paper_maneuver.controls[:, 1])
+    assert np.array_equal(edges, paper_maneuver.time)
+    assert force.get_ylabel() == "force [mN]"
+    assert "±10 N, off the scale" in force.get_title(loc="left")
+    assert torque.get_ylabel() == "torque [N m]"
+    assert not force.lines
+
+
+def test_figure_6_shows_limits_that_are_near(paper_maneuver: Maneuver) -> None:
+    figure = figure_6(paper_maneuver)
+    assert figure is not None
+    joints, wrist = figure.axes
+    assert sorted(line.get_ydata()[0] for line in joints.lines) == [-2.0, 2.0]
+    assert sorted(line.get_ydata()[0] for line in wrist.lines) == [-0.5, 0.5]
+    assert len(joints.patches) == len(wrist.patches) == 3
+    low, high = joints.get_ylim()
+    assert low < -2.0 < 2.0 < high
+
+
+def test_panels_of_absent_actuators_are_left_out() -> None:
+    floating, wheels, no_wrist = (
+        still(load_scene(name)) for name in ("free-floating", "reaction-wheels", "no-wrist")
+    )
+    assert figure_5(floating) is None
+    for figure, title in ((figure_5(wheels), "Torque on the base"), (figure_6(no_wrist), "Joint torques")):
+        assert figure is not None
+        (axes,) = figure.axes
+        assert axes.get_title(loc="left").startswith(title)
+
+
+def test_different_limits_are_all_drawn() -> None:
+    maneuver = still(load_scene("six-joint"))
+    maneuver.controls[1, 6:12] = 2.0, 2.0, 2.0, 2.0, 2.0, 0.5
+    figure = figure_6(maneuver)
+    assert figure is not None
+    (axes,) = figure.axes
+    assert sorted(line.get_ydata()[0] for line in axes.lines) == [-2.0, -0.5, 0.5, 2.0]
+
+
+def test_planar_error_has_no_identically_zero_components(short_run: ManeuverRun) -> None:
+    upper, lower = figure_3(short_run.maneuver).axes
+    assert [line.get_label() for line in upper.lines] == ["$q_0$", "$q_3$"]
+    assert [line.get_label() for line in lower.lines] == ["$r_x$", "$r_y$"]
+
+
+def test_convergence_begins_with_doing_nothing(short_run: ManeuverRun) -> None:
+    figure = convergence_figure(short_run)
+    assert figure is not None
+    cost, promise, _ = figure.axes
+    shown = cost.lines[0].get_ydata()
+    assert shown[0] == short_run.zero_control_cost
+    assert shown[-1] == pytest.approx(short_run.solution.cost)
+    assert len(shown) == len(promise.lines[0].get_ydata()) == short_run.solution.iterations + 1
+
+
+def test_snapshots_are_spread_over_the_motion(short_run: ManeuverRun) -> None:
+    stages = snapshot_stages(short_run.maneuver, 6)
+    assert stages[0] == 0
+    assert stages[-1] == 60
+    assert len(stages) == 6
+    assert sorted(stages) == stages
+
+
+def test_snapshots_of_nothing(short_scene: Scene) -> None:
+    figure = figure_2(still(short_scene))
+    assert len(figure.axes) >= 2
+
+
+def test_view_has_the_tip_before_the_base(paper_maneuver: Maneuver) -> None:
+    view = best_view(paper_maneuver)
+    base, tip = (
+        np.stack(position(tuple(paper_maneuver.frames[:, frame].T)), axis=1).mean(axis=0) for frame in (0, -1)
+    )
+    assert view.toward @ (tip - base) > 0.0
+    basis = np.array(view)
+    assert basis @ basis.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.cross(view.right, view.up) == pytest.approx(view.toward)
+
+
+def test_planar_scene_is_seen_from_above(short_run: ManeuverRun) -> None:
+    view = best_view(short_run.maneuver)
+    assert view.project(np.array([[2.0, 3.0, 7.0]])) == pytest.approx(np.array([[2.0, 3.0]]))
+
+
+def test_view_keeps_lengths_across_the_line_of_sight() -> None:
+    view = View.of(0.7, 0.4)
+    assert np.linalg.norm(view.project(2.0 * view.right - view.up + 5.0 * view.toward)) == pytest.approx(
+        5.0**0.5
+    )
+
+
+def test_grid_lies_below_everything_at_round_numbers() -> None:
+    points = np.random.default_rng(1).normal(size=(50, 3))
+    grid = Grid.below(points)
+    assert grid.height < points[:, 2].min()
+    for axis in (0, 1):
+        lines = grid.lines(axis)
+        assert lines[0] <= points[:, axis].min()
+        assert lines[-1] >= points[:, axis].max()
+        assert lines / grid.cell == pytest.approx(np.round(lines / grid.cell))
+        assert len(lines) <= 9
+
+
+def test_files_are_pictures_and_stale_ones_go(short_run: ManeuverRun, tmp_path: Path) -> None:
+    settings = dict(matplotlib.rcParams)
+    files = write_figures(short_run, tmp_path)
+    assert [file.name for file in files] == [
+        "figure-2-snapshots.png",
+        "figure-3-pose-error.png",
+        "figure-4-error-norms.png",
+        "figure-5-base-inputs.png",
+        "figure-6-arm-inputs.png",
+        "convergence.png",
+    ]
+    for file in files:
+        picture = imread(file)
+        assert picture.shape[1] == 1432
+        assert 0.005 < np.mean(picture[..., :3].min(axis=2) < 0.9) < 0.5, file.name
+    assert dict(matplotlib.rcParams) == settings
+
+
+def test_figure_of_an_earlier_scene_is_removed(short_run: ManeuverRun, tmp_path: Path) -> None:
+    bare = Maneuver(short_run.scene, short_run.solution.states, short_run.solution.controls)
+    bare.__dict__["actuators"] = ()
+    run = ManeuverRun(**{name: getattr(short_run, name) for name in short_run.__dataclass_fields__})
+    run.__dict__["maneuver"] = bare
+    stale = tmp_path / "figure-5-base-inputs.png"
+    stale.write_bytes(b"")
+    assert stale not in write_figures(run, tmp_path)
+    assert not stale.exists()
+
+
+def test_other_formats(short_run: ManeuverRun, tmp_path: Path) -> None:
+    files = write_figures(short_run, tmp_path, ("pdf",))
+    assert len(files) == 6
+    assert all(file.read_bytes().startswith(b"%PDF") for file in files)
+
+
+def test_readme_picture_has_its_size(short_run: ManeuverRun, tmp_path: Path) -> None:
+    file = tmp_path / "picture.png"
+    write_readme_picture(short_run, file)
+    assert imread(file).shape[:2] == (700, 1600)
+    assert file.stat().st_size < 250_000
+
+
+def test_only_the_figures_import_matplotlib_and_never_pyplot() -> None:
+    code = (
+        "import sys, experts.report; assert 'matplotlib' not in sys.modules;"
+        "import experts.report.figures; assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
+
+
+def test_without_matplotlib_there_is_one_clear_sentence() -> None:
+    code = "import sys; sys.modules['matplotlib'] = None; import experts.report.figures"
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    assert result.returncode == 1
+    assert result.stderr.rstrip().endswith('figures need matplotlib: pip install "dq-space-arm[plots]"')

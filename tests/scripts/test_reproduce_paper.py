@@ -1,0 +1,228 @@
+"""The script as a user runs it: files, numbers, exit status; honesty about a solve that did not end well."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env import load_scene
+from experts import Solution
+from experts.report import SolveProgress
+
+pytest.importorskip("matplotlib")
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "scripts" / "reproduce_paper.py"
+FIGURES = {
+    "figure-2-snapshots.png",
+    "figure-3-pose-error.png",
+    "figure-4-error-norms.png",
+    "figure-5-base-inputs.png",
+    "figure-6-arm-inputs.png",
+    "convergence.png",
+}
+DATA = {"solution.npz", "scene.yaml", "summary.json"}
+
+# Compiles and solves in seconds.
+SCENE = """
+name: short
+base: {motion: planar, mass: 20, inertia: [1, 1, 1]}
+links:
+  - name: "[red]link"
+    mass: 2
+    inertia: [0.01, 0.05, 0.05]
+    center_of_mass: [0.3, 0, 0]
+    joint: {position: [0.3, 0, 0]}
+tip: {position: [0.6, 0, 0]}
+actuators: {base_torque: {limit: 2}, joint_torque: {limit: 0.5}}
+target: {pose: {position: [0.6, 0.5, 0], rotation: {axis: [0, 0, 1], angle: 60}}}
+simulation: {dt: 0.05, steps: 60}
+"""
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("reproduce_paper", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    file = tmp_path / "short.yaml"
+    file.write_text(SCENE)
+    return file
+
+
+def names(folder: Path) -> set[str]:
+    return {file.name for file in folder.iterdir()}
+
+
+def test_a_user_gets_every_file_and_the_right_numbers(scene_file: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(SCRIPT), "--scene", str(scene_file)]
+    folder = scene_file.parent
+    result = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    out = folder / "results" / "short"
+    assert names(out) == DATA | FIGURES
+    summary = json.loads((out / "summary.json").read_text())
+    solution = Solution.load(out / "solution.npz")
+    assert summary["result"]["converged"] is True
+    assert summary["result"]["cost"] == solution.cost == pytest.approx(42.95667, rel=1e-5)
+    assert summary["replay"]["relative_difference"] < 1e-12
+    assert solution.controls.shape == (60, 2)
+    assert np.abs(solution.controls).max() <= 2.0
+    assert load_scene(out / "scene.yaml") == load_scene(scene_file)
+    assert solution.metadata["scene"] == summary["resolved_scene"]
+    assert f"{solution.cost:.6f}" in result.stdout
+    assert f"{-solution.cost:.6f}" in result.stdout
+    assert "[red]link" in result.stdout
+    assert "converged" in result.stdout
+    assert "\x1b" not in result.stdout  # not a terminal: no colors, no cursor movements
+
+
+def test_no_color_is_respected_on_a_terminal(
+    script: ModuleType, scene_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("NO_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm-256color")
+    assert script.main(["--scene", str(scene_file), "--out", str(scene_file.parent), "--no-figures"]) == 0
+    output = capsys.readouterr().out
+    assert "\x1b[2K" in output  # the line of progress is rewritten
+    assert "\x1b[3" not in output
+    assert "\x1b[9" not in output
+
+
+def test_no_figures(script: ModuleType, scene_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "out"
+    assert script.main(["--scene", str(scene_file), "--out", str(out), "--no-figures"]) == 0
+    assert names(out) == DATA
+
+
+def test_integrator_is_in_the_saved_scene(script: ModuleType, scene_file: Path, tmp_path: Path) -> None:
+    arguments = ["--scene", str(scene_file), "--out", str(tmp_path), "--integrator", "symplectic_euler"]
+    assert script.main([*arguments, "--no-figures"]) == 0
+    assert load_scene(tmp_path / "scene.yaml").simulation.integrator == "symplectic_euler"
+    assert load_scene(tmp_path / "scene.yaml").simulation.steps == 60
+
+
+def test_unconverged_solve_is_reported_and_fails(
+    script: ModuleType, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    status = script.main(["--scene", str(scene_file), "--out", str(out), "--max-iterations", "2"])
+    assert status == 1
+    assert names(out) == DATA | FIGURES
+    assert "NOT CONVERGED" in capsys.readouterr().out
+    result = json.loads((out / "summary.json").read_text())["result"]
+    assert (result["converged"], result["stop_reason"], result["iterations"]) == (False, "max_iterations", 2)
+
+
+def test_interrupted_solve_saves_the_best_so_far(
+    script: ModuleType,
+    scene_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    costs = []
+
+    def interrupt(self: SolveProgress, record: object) -> None:
+        costs.append(record.cost)  # type: ignore[attr-defined]
+        if len(costs) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(SolveProgress, "update", interrupt)
+    out = tmp_path / "out"
+    assert script.main(["--scene", str(scene_file), "--out", str(out), "--no-figures"]) == 130
+    assert "INTERRUPTED after 3 iterations" in capsys.readouterr().out
+    solution = Solution.load(out / "solution.npz")
+    assert solution.stop_reason == "interrupted"
+    assert solution.cost == costs[-1] < costs[0]
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["replay"]["agrees"] is True
+
+
+def test_interrupt_before_the_solve_saves_nothing(
+    script: ModuleType, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(script, "run_maneuver", interrupt)
+    out = tmp_path / "out"
+    assert script.main(["--scene", str(scene_file), "--out", str(out)]) == 130
+    assert names(out) == set()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--scene", "papr"], "did you mean 'paper'?"),
+        (["--scene", "nowhere.yaml"], "there is no such file"),
+        (["--max-iterations", "-1"], "max_iterations is -1"),
+    ],
+)
+def test_unusable_input_is_one_sentence(
+    arguments: list[str],
+    sentence: str,
+    script: ModuleType,
+    scene_file: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    defaults = ["--scene", str(scene_file), "--out", str(tmp_path)]
+    assert script.main([*defaults, *arguments]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_scene_that_the_environment_refuses(
+    script: ModuleType, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene_file.write_text(SCENE.replace("{limit: 2}", "{limit: .inf}"))
+    assert script.main(["--scene", str(scene_file), "--out", str(tmp_path)]) == 2
+    assert "give each actuator a finite limit" in " ".join(capsys.readouterr().err.split())
+
+
+def test_missing_matplotlib_is_told_before_the_solve(
+    script: ModuleType,
+    scene_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(script, "find_spec", lambda name: None)
+    arguments = ["--scene", str(scene_file), "--out", str(tmp_path / "out")]
+    assert script.main(arguments) == 2
+    assert 'pip install "dq-space-arm[plots]"' in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+    assert script.main([*arguments, "--no-figures"]) == 0
+
+
+def test_diverged_solve_draws_nothing_and_says_so(
+    script: ModuleType, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # At this rate and with this step, the explicit integration of a stiff spring blows up.
+    stiff = (
+        SCENE.replace("joint: {", "stiffness: 1.0e+6\n    joint: {") + "initial_state: {joint_angles: [1]}\n"
+    )
+    scene_file.write_text(stiff)
+    out = tmp_path / "out"
+    assert script.main(["--scene", str(scene_file), "--out", str(out)]) == 1
+    assert "DIVERGED" in capsys.readouterr().out
+    assert names(out) == DATA
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["result"]["cost"] is None
+    assert summary["result"]["stop_reason"] == "diverged"
