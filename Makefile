@@ -18,6 +18,7 @@ lint: $(VENV)/installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy scripts
 
 # A file per set of extras, so that a second run installs nothing.
 $(VENV)/installed-%: pyproject.toml requirements.lock

@@ -216,7 +216,7 @@ def backward_sweep(
     regularization: float,
     update: Update,
     work: SweepWorkspace,
-) -> SweepOutcome:
+) -> tuple[int, int, float, float, int]:
     """Minimize the quadratic model of the cost-to-go at every stage, from the last to the first.
 
     Args:
@@ -230,7 +230,8 @@ def backward_sweep(
         work: Work arrays.
 
     Returns:
-        Status, failing stage, the two parts of the expected change of cost, number of clamped inputs.
+        The fields of `SweepOutcome`. A plain tuple: to make a named one, compiled code would call Python,
+        and a Ctrl-C that is pending there crashes the process.
     """
     horizon, n_controls = controls.shape
     n_tangent = derivatives.lx.shape[1]
@@ -250,7 +251,7 @@ def backward_sweep(
         status, n_free = box_qp(work.Quu_regular, work.Qu, work.room_below, work.room_above, work.k, work.box)
         if status == NOT_POSITIVE_DEFINITE:
             failure = SWEEP_NOT_POSITIVE_DEFINITE if _is_finite(work) else SWEEP_NOT_FINITE
-            return SweepOutcome(failure, stage, linear, quadratic, clamped)
+            return failure, stage, linear, quadratic, clamped
         stage_linear, stage_quadratic = _expected_change(work)
         linear += stage_linear
         quadratic += stage_quadratic
@@ -263,8 +264,8 @@ def backward_sweep(
         for j in range(n_tangent):
             update.value_hessian[i, j] = work.Vxx[i, j]
     if not (np.isfinite(linear + quadratic) and _is_finite(work)):
-        return SweepOutcome(SWEEP_NOT_FINITE, 0, linear, quadratic, clamped)
-    return SweepOutcome(SWEEP_DONE, 0, linear, quadratic, clamped)
+        return SWEEP_NOT_FINITE, 0, linear, quadratic, clamped
+    return SWEEP_DONE, 0, linear, quadratic, clamped
 
 
 @compiled

@@ -3,17 +3,18 @@
 import json
 import os
 import platform
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib.metadata import version
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from experts.files import write_atomically
 from experts.native_call import buffer_table, run_kernel
 from experts.problem import FloatArray, ShootingProblem, as_problem
 
@@ -139,23 +140,16 @@ class Solution:
                 **{package: version(package) for package in ("numpy", "numba", "llvmlite")},
             },
         }
-        target = Path(path)
-        descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
-        temporary = Path(name)
-        try:
-            with os.fdopen(descriptor, "wb") as file:
-                np.savez(
-                    file,
-                    states=self.states,
-                    controls=self.controls,
-                    feedback_gains=self.feedback_gains,
-                    history=self.history,
-                    facts=np.array(json.dumps(facts)),
-                )
-            temporary.replace(target)
-        except BaseException:
-            temporary.unlink()
-            raise
+        content = BytesIO()
+        np.savez(
+            content,
+            states=self.states,
+            controls=self.controls,
+            feedback_gains=self.feedback_gains,
+            history=self.history,
+            facts=np.array(json.dumps(facts)),
+        )
+        write_atomically(Path(path), content.getvalue())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:

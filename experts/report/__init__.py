@@ -9,7 +9,7 @@ summary, provenance   for `summary.json`
 figures      Figures 2 to 6 (not imported here: needs the extra `plots`)
 """
 
-from experts.report.files import write_atomically
+from experts.files import write_atomically
 from experts.report.maneuver import ActuatorHistory, Maneuver
 from experts.report.progress import SolveProgress
 from experts.report.replay import Replay, replay

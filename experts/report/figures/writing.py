@@ -8,6 +8,7 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from experts.files import write_atomically
 from experts.report.figures.curves import (
     convergence_figure,
     draw_angle,
@@ -19,7 +20,6 @@ from experts.report.figures.curves import (
 )
 from experts.report.figures.snapshots import SnapshotPainter, figure_2, snapshot_stages
 from experts.report.figures.style import DOTS_PER_INCH, house_style
-from experts.report.files import write_atomically
 from experts.report.maneuver import Maneuver
 from experts.report.run import ManeuverRun
 
