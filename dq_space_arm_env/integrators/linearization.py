@@ -10,27 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import casadi
-
 from dq_space_arm_env.algebra import poses, screw
 from dq_space_arm_env.algebra.dual_vectors import transform_matrix
+from dq_space_arm_env.compiler.symbols import matrix
 from dq_space_arm_env.integrators.field import PoseCoordinates
 
 Scalar = Any
 Matrix = Any
-
-
-def zero_matrix(rows: int, columns: int) -> Matrix:
-    """A matrix without a single stored entry.
-
-    Args:
-        rows: Number of rows.
-        columns: Number of columns.
-
-    Returns:
-        Sparse SX matrix.
-    """
-    return casadi.SX(rows, columns)
 
 
 def pose_blocks(pose: PoseCoordinates, increment: Sequence[Scalar]) -> tuple[Matrix, Matrix]:
@@ -48,9 +34,9 @@ def pose_blocks(pose: PoseCoordinates, increment: Sequence[Scalar]) -> tuple[Mat
     adjoint = transform_matrix(*poses.to_matrix(backward))
     kept = list(pose.directions)
     jacobian = screw.exponential_right_jacobian(increment)
-    return _matrix(adjoint, kept), _matrix(jacobian, kept)
+    return matrix(_kept(adjoint, kept)), matrix(_kept(jacobian, kept))
 
 
-def _matrix(rows: Sequence[Sequence[Scalar]], kept: Sequence[int]) -> Matrix:
-    """Rows and columns of a nested sequence as a sparse SX matrix without its structural zeros."""
-    return casadi.sparsify(casadi.vertcat(*(casadi.horzcat(*(rows[i][j] for j in kept)) for i in kept)))
+def _kept(rows: Sequence[Sequence[Scalar]], indices: Sequence[int]) -> list[list[Scalar]]:
+    """Some rows of a square matrix, and the same columns."""
+    return [[rows[i][j] for j in indices] for i in indices]

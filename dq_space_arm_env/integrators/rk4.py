@@ -15,8 +15,9 @@ import casadi
 from dq_space_arm_env.algebra.dual_vectors import cross as dual_cross
 from dq_space_arm_env.compiler.graph import graph_of, trace
 from dq_space_arm_env.compiler.program import Program
+from dq_space_arm_env.compiler.symbols import column, symbols, zeros
 from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, split_state
-from dq_space_arm_env.integrators.linearization import pose_blocks, zero_matrix
+from dq_space_arm_env.integrators.linearization import pose_blocks
 
 Scalar = Any
 Matrix = Any
@@ -123,8 +124,8 @@ def _pose_increment(pose: PoseCoordinates, twists: Sequence[Sequence[Scalar]], h
 
 def _stage_pattern(field: VectorField) -> Any:
     """Sparsity that the derivative of any stage's rates with respect to (y, u) stays within."""
-    y = [casadi.SX.sym(f"y_{i}") for i in range(field.n_y)]
-    u = [casadi.SX.sym(f"u_{i}") for i in range(field.n_u)]
+    y = symbols("y", field.n_y)
+    u = symbols("u", field.n_u)
     _, by_y, by_u = field.linearized_rates(y, u)
     direct = casadi.horzcat(by_y.sparsity(), by_u.sparsity())
     identity = casadi.horzcat(casadi.Sparsity.diag(field.n_y), casadi.Sparsity(field.n_y, field.n_u))
@@ -140,15 +141,15 @@ def _stage_pattern(field: VectorField) -> Any:
 def _linearized_stage(field: VectorField, pattern: Any) -> Any:
     """Graph of a stage's rates and of their derivative K = F Y + [0, G] by (y, u) at the step's start."""
     n_y, n_u = field.n_y, field.n_u
-    x = [casadi.SX.sym(f"x_{i}") for i in range(field.n_x)]
-    u = [casadi.SX.sym(f"u_{i}") for i in range(n_u)]
-    k = [casadi.SX.sym(f"k_{i}") for i in range(n_y)]
+    x = symbols("x", field.n_x)
+    u = symbols("u", n_u)
+    k = symbols("k", n_y)
     change = casadi.SX.sym("change", pattern)
     offset = casadi.SX.sym("offset")
     y = [entry + offset * rate for entry, rate in zip(split_state(field, x)[1], k, strict=True)]
     rates, by_y, by_u = field.linearized_rates(y, u)
-    start = casadi.horzcat(casadi.SX.eye(n_y), casadi.SX(n_y, n_u)) + offset * change
-    rate_change = casadi.mtimes(by_y, start) + casadi.horzcat(casadi.SX(n_y, n_y), by_u)
+    start = casadi.horzcat(casadi.SX.eye(n_y), zeros(n_y, n_u)) + offset * change
+    rate_change = casadi.mtimes(by_y, start) + casadi.horzcat(zeros(n_y, n_y), by_u)
     return graph_of(
         f"{field.name}_rk4_linearized_stage",
         {"x": x, "u": u, "k": k, "change": change.nonzeros(), "offset": [offset]},
@@ -159,11 +160,11 @@ def _linearized_stage(field: VectorField, pattern: Any) -> Any:
 def _linearized_sum(field: VectorField, pattern: Any) -> tuple[Any, Any, Any]:
     """Graph of A and B from the stages' rates and derivatives, and their patterns."""
     n_y, n_u = field.n_y, field.n_u
-    x = [casadi.SX.sym(f"x_{i}") for i in range(field.n_x)]
+    x = symbols("x", field.n_x)
     h = casadi.SX.sym("h")
-    stages = [[casadi.SX.sym(f"k{s}_{i}") for i in range(n_y)] for s in range(1, 5)]
+    stages = [symbols(f"k{s}", n_y) for s in range(1, 5)]
     changes = [casadi.SX.sym(f"K{s}", pattern) for s in range(1, 5)]
-    identity = casadi.horzcat(casadi.SX.eye(n_y), casadi.SX(n_y, n_u))
+    identity = casadi.horzcat(casadi.SX.eye(n_y), zeros(n_y, n_u))
     change = identity
     for weight, rate_change in zip(WEIGHTS, changes, strict=True):
         change = change + (weight * h) * rate_change
@@ -173,7 +174,7 @@ def _linearized_sum(field: VectorField, pattern: Any) -> tuple[Any, Any, Any]:
         start = split_state(field, x)[1]
         by_pose, moved = _linearized_pose(field.pose, start, h, stages, changes, identity)
         moved = casadi.vertcat(moved, change)
-        a = casadi.horzcat(casadi.vertcat(by_pose, casadi.SX(n_y, by_pose.shape[1])), moved[:, :n_y])
+        a = casadi.horzcat(casadi.vertcat(by_pose, zeros(n_y, by_pose.shape[1])), moved[:, :n_y])
         b = moved[:, n_y:]
     a, b = casadi.sparsify(a), casadi.sparsify(b)
     inputs: dict[str, Sequence[Scalar]] = {"x": x, "h": [h]}
@@ -193,18 +194,18 @@ def _linearized_pose(
 ) -> tuple[Matrix, Matrix]:
     """Derivatives of the pose update by the pose, and by (y, u) through Omega."""
     rows = list(pose.twist_indices)
-    free = [[casadi.SX.sym(f"w{s}_{i}") for i in rows] for s in range(4)]
-    increment = casadi.vertcat(*_pose_increment(pose, free, h))
-    moved = zero_matrix(len(rows), identity.shape[1])
+    free = [symbols(f"w{s}", len(rows)) for s in range(4)]
+    increment = column(*_pose_increment(pose, free, h))
+    moved = zeros(len(rows), identity.shape[1])
     for s, offset in enumerate(OFFSETS):
         twist_change = identity[rows, :]
         if s:
             twist_change = twist_change + (offset * h) * changes[s - 1][rows, :]
-        slope = casadi.jacobian(increment, casadi.vertcat(*free[s]))[list(pose.directions), :]
+        slope = casadi.jacobian(increment, column(*free[s]))[list(pose.directions), :]
         moved = moved + casadi.mtimes(slope, twist_change)
     twists = _stage_twists(pose, y, stages, h)
-    symbols = casadi.vertcat(*(entry for twist in free for entry in twist))
-    values = casadi.vertcat(*(entry for twist in twists for entry in twist))
-    increment, moved = casadi.substitute([increment, moved], [symbols], [values])
-    by_pose, by_increment = pose_blocks(pose, casadi.vertsplit(increment))
+    placeholders = column(*(entry for twist in free for entry in twist))
+    values = casadi.densify(column(*(entry for twist in twists for entry in twist)))
+    increment, moved = casadi.substitute([increment, moved], [placeholders], [values])
+    by_pose, by_increment = pose_blocks(pose, casadi.vertsplit(casadi.densify(increment)))
     return by_pose, casadi.mtimes(by_increment, moved)

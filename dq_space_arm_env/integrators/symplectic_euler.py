@@ -9,8 +9,9 @@ import casadi
 
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
+from dq_space_arm_env.compiler.symbols import symbols, zeros
 from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, split_state
-from dq_space_arm_env.integrators.linearization import pose_blocks, zero_matrix
+from dq_space_arm_env.integrators.linearization import pose_blocks
 
 Scalar = Any
 
@@ -24,7 +25,7 @@ class SymplecticEuler:
 
     def append_step(self, program: Program, field: VectorField) -> None:
         """Append the calls that turn buffers x, u, h into x_next."""
-        x, u, h = _symbols(field)
+        x, u, h = symbols("x", field.n_x), symbols("u", field.n_u), casadi.SX.sym("h")
         stored, start = split_state(field, x)
         y = self._advance(field, start, u, h, field.rates(start, u))
         x_next = (
@@ -35,26 +36,26 @@ class SymplecticEuler:
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
         """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
-        x, u, h = _symbols(field)
+        x, u, h = symbols("x", field.n_x), symbols("u", field.n_u), casadi.SX.sym("h")
         start_y = split_state(field, x)[1]
         rates, by_y, by_u = field.linearized_rates(start_y, u)
         identity = casadi.SX.eye(field.n_y)
         rate_change = casadi.horzcat(by_y, by_u)
-        start = casadi.horzcat(identity, casadi.SX(field.n_y, field.n_u))
+        start = casadi.horzcat(identity, zeros(field.n_y, field.n_u))
         # New rates first; positions then move with the new rates, whose derivative is already there.
-        change = zero_matrix(field.n_y, field.n_y + field.n_u)
+        change = zeros(field.n_y, field.n_y + field.n_u)
         rows = list(field.rate_indices)
         change[rows, :] = start[rows, :] + h * rate_change[rows, :]
         others = [i for i in range(field.n_y) if i not in set(rows)]
         velocities = casadi.mtimes(by_y[others, rows], change[rows, :])
-        inputs = casadi.horzcat(casadi.SX(len(others), field.n_y), by_u[others, :])
+        inputs = casadi.horzcat(zeros(len(others), field.n_y), by_u[others, :])
         change[others, :] = start[others, :] + h * (velocities + inputs)
         if field.pose is not None:
             increment = self._increment(field.pose, self._advance(field, start_y, u, h, rates), h)
             by_pose, by_increment = pose_blocks(field.pose, increment)
             moved = casadi.mtimes(by_increment, h * change[list(field.pose.twist_indices), :])
             change = casadi.vertcat(moved, change)
-            pose_columns = casadi.vertcat(by_pose, casadi.SX(field.n_y, by_pose.shape[1]))
+            pose_columns = casadi.vertcat(by_pose, zeros(field.n_y, by_pose.shape[1]))
             a = casadi.horzcat(pose_columns, change[:, : field.n_y])
         else:
             a = change[:, : field.n_y]
@@ -82,9 +83,3 @@ class SymplecticEuler:
     def _increment(self, pose: PoseCoordinates, y: Sequence[Scalar], h: Scalar) -> list[Scalar]:
         """The new twist times the time step."""
         return pose.full_twist([h * y[i] for i in pose.twist_indices])
-
-
-def _symbols(field: VectorField) -> tuple[list[Scalar], list[Scalar], Scalar]:
-    x = [casadi.SX.sym(f"x_{i}") for i in range(field.n_x)]
-    u = [casadi.SX.sym(f"u_{i}") for i in range(field.n_u)]
-    return x, u, casadi.SX.sym("h")

@@ -11,6 +11,7 @@ import casadi
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
+from dq_space_arm_env.compiler.symbols import column, columns, symbols
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
@@ -220,40 +221,39 @@ class SpaceArmField:
         Returns:
             Rates (n_y), Jacobian with respect to y (n_y, n_y), Jacobian with respect to u (n_y, n_u).
         """
-        symbols = [casadi.SX.sym(f"v_{i}") for i in range(self.n_y)]
+        free = symbols("v", self.n_y)
         motion, inputs = self.motion(y), self.inputs(u)
         solved, mass_matrix, _ = self._solve(motion, inputs, self.chain.tip_wrench)
-        residual, accelerations = self._residual(symbols)
-        by_y = casadi.jacobian(residual, casadi.vertcat(*symbols))
-        values = casadi.vertcat(*y, *solved.angular, *solved.linear, *solved.joints)
-        by_y = casadi.substitute(by_y, casadi.vertcat(*symbols, *accelerations), values)
-        columns = [self._response(mass_matrix, [-e for e in _dense(by_y[:, i])]) for i in range(self.n_y)]
-        response = casadi.horzcat(*(casadi.sparsify(casadi.vertcat(*column)) for column in columns))
+        residual, accelerations = self._residual(free)
+        by_y = casadi.jacobian(residual, column(*free))
+        values = casadi.densify(column(*y, *solved.angular, *solved.linear, *solved.joints))
+        by_y = casadi.substitute(by_y, column(*free, *accelerations), values)
+        responses = [self._response(mass_matrix, [-e for e in _dense(by_y[:, i])]) for i in range(self.n_y)]
+        response = columns(*(column(*entries) for entries in responses), rows=len(self.rate_indices))
         rates = [*motion.joint_rates, *inputs.wrist_rates, *self._dual(motion, solved)]
         angles_by_y, angles_by_u, turning_by_y = self._simple_jacobians(y)
         jacobian_y = casadi.vertcat(angles_by_y, response + turning_by_y)
-        if not self.n_u:
-            return rates, jacobian_y, casadi.SX(self.n_y, 0)
-        by_u = casadi.horzcat(*(self._input_response(mass_matrix, i) for i in range(self.n_u)))
+        inputs_one_by_one = (self._input_response(mass_matrix, i) for i in range(self.n_u))
+        by_u = columns(*inputs_one_by_one, rows=len(self.rate_indices))
         return rates, jacobian_y, casadi.vertcat(angles_by_u, by_u)
 
     def _simple_jacobians(self, y: Sequence[Scalar]) -> tuple[Matrix, Matrix, Matrix]:
         """Constant Jacobians of the angles' rates by y and u, and the Jacobian of -omega x v by y."""
-        free_y = [casadi.SX.sym(f"f_{i}") for i in range(self.n_y)]
-        free_u = [casadi.SX.sym(f"g_{i}") for i in range(self.n_u)]
+        free_y = symbols("f", self.n_y)
+        free_u = symbols("g", self.n_u)
         motion = self.motion(free_y)
-        angles = casadi.vertcat(*motion.joint_rates, *self.inputs(free_u).wrist_rates)
+        angles = column(*motion.joint_rates, *self.inputs(free_u).wrist_rates)
         turning = [*ZERO, *(-entry for entry in cross(motion.angular, motion.linear))]
-        kept = casadi.vertcat(*(turning[i] for i in self.pose.directions), *[0.0] * len(self.chain.links))
-        symbols = casadi.vertcat(*free_y)
-        turning_by_y = casadi.substitute(casadi.jacobian(kept, symbols), symbols, casadi.vertcat(*y))
-        inputs = casadi.vertcat(*free_u) if free_u else casadi.SX(0, 1)
-        return casadi.jacobian(angles, symbols), casadi.jacobian(angles, inputs), turning_by_y
+        kept = column(*(turning[i] for i in self.pose.directions), *[0.0] * len(self.chain.links))
+        by_y = casadi.substitute(
+            casadi.jacobian(kept, column(*free_y)), column(*free_y), casadi.densify(column(*y))
+        )
+        return casadi.jacobian(angles, column(*free_y)), casadi.jacobian(angles, column(*free_u)), by_y
 
     def _residual(self, y: Sequence[Scalar]) -> tuple[Matrix, list[Scalar]]:
         """Forces that given accelerations need, less those that depend on y; and the acceleration symbols."""
         n = len(self.chain.links)
-        acceleration = [casadi.SX.sym(f"a_{i}") for i in range(6 + n)]
+        acceleration = symbols("a", 6 + n)
         motion = self.motion(y)
         rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
         given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
@@ -264,7 +264,7 @@ class SpaceArmField:
             bias - other - load for bias, other, load in zip(needed.joints, passive, tip.joints, strict=True)
         ]
         forces = [*subtract(needed.force, tip.force), *subtract(needed.torque, tip.torque), *joints]
-        return casadi.vertcat(*forces), acceleration
+        return column(*forces), acceleration
 
     def _response(self, mass_matrix: MassMatrix, forces: Sequence[Scalar]) -> list[Scalar]:
         """Accelerations (free directions, joints) caused by generalized forces (force, torque, joints)."""
@@ -277,7 +277,7 @@ class SpaceArmField:
     def _input_response(self, mass_matrix: MassMatrix, index: int) -> Matrix:
         unit = self.inputs([1.0 if i == index else 0.0 for i in range(self.n_u)])
         response = self._response(mass_matrix, [*unit.force, *unit.torque, *unit.joint_torques])
-        return casadi.sparsify(casadi.vertcat(*response))
+        return column(*response)
 
 
 def _dense(column: Matrix) -> list[Scalar]:

@@ -13,6 +13,7 @@ from typing import Any
 import casadi
 
 from dq_space_arm_env.algebra import vectors
+from dq_space_arm_env.compiler.symbols import column, matrix, symbols, zeros
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
 from dq_space_arm_env.dynamics.newton_euler import PaperState, SchurComplement
 from dq_space_arm_env.integrators.field import split_state
@@ -100,10 +101,9 @@ class PaperField:
         Returns:
             Rates (n_y), Jacobian with respect to y (n_y, n_y), Jacobian with respect to u (n_y, n_u).
         """
-        values = casadi.vertcat(*y, *u)
-        y = [casadi.SX.sym(f"y_{i}") for i in range(self.n_y)]
-        u = [casadi.SX.sym(f"u_{i}") for i in range(self.n_u)]
-        symbols = casadi.vertcat(*y, *u)
+        values = casadi.densify(column(*y, *u))
+        y, u = symbols("y", self.n_y), symbols("u", self.n_u)
+        variables = column(*y, *u)
         state, inputs = self._parts(y, u)
         base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
         system = newton_euler.system_of(self.chain, state, base_wrench, inputs.joint_torques)
@@ -111,27 +111,29 @@ class PaperField:
         accelerations, reactions = schur.solve(system.b1, system.b2)
         residual, unknowns = _residual(system)
         change = casadi.substitute(
-            casadi.jacobian(residual, symbols), unknowns, casadi.vertcat(*accelerations, *reactions)
+            casadi.jacobian(residual, variables),
+            unknowns,
+            casadi.densify(column(*accelerations, *reactions)),
         )
-        columns: list[Matrix] = []
+        responses: list[Matrix] = []
         for index in range(change.shape[1]):
-            column = change[:, index]
-            if column.nnz() == 0:
-                columns.append(casadi.SX(len(accelerations), 1))
+            by_variable = change[:, index]
+            if by_variable.nnz() == 0:
+                responses.append(zeros(len(accelerations), 1))
                 continue
-            right = [-entry for entry in casadi.vertsplit(casadi.densify(column))]
+            right = [-entry for entry in casadi.vertsplit(casadi.densify(by_variable))]
             response, _ = schur.solve(right[: len(accelerations)], right[len(accelerations) :])
-            columns.append(casadi.sparsify(casadi.vertcat(*response)))
+            responses.append(column(*response))
         positions = newton_euler.paper_position_rates(self.chain, state, inputs.wrist_rates)
         tip = newton_euler.paper_tip_rate(self.chain, state, inputs.wrist_rates)
-        rates = casadi.vertcat(*positions, *accelerations, *tip)
+        rates = casadi.densify(column(*positions, *accelerations, *tip))
         jacobian = casadi.vertcat(
-            casadi.jacobian(casadi.vertcat(*positions), symbols),
-            casadi.horzcat(*columns),
-            casadi.jacobian(casadi.vertcat(*tip), symbols),
+            casadi.jacobian(column(*positions), variables),
+            casadi.horzcat(*responses),
+            casadi.jacobian(column(*tip), variables),
         )
-        rates, jacobian = casadi.substitute([rates, jacobian], [symbols], [values])
-        return casadi.vertsplit(rates), jacobian[:, : self.n_y], jacobian[:, self.n_y :]
+        rates, jacobian = casadi.substitute([rates, jacobian], [variables], [values])
+        return casadi.vertsplit(casadi.densify(rates)), jacobian[:, : self.n_y], jacobian[:, self.n_y :]
 
 
 def _residual(system: newton_euler.NewtonEulerSystem) -> tuple[Matrix, Matrix]:
@@ -139,12 +141,9 @@ def _residual(system: newton_euler.NewtonEulerSystem) -> tuple[Matrix, Matrix]:
     unknowns = casadi.SX.sym("unknown", len(system.b1) + len(system.b2))
     ydot, reactions = unknowns[: len(system.b1)], unknowns[len(system.b1) :]
 
-    def matrix(rows: Sequence[Sequence[Scalar]]) -> Matrix:
-        return casadi.sparsify(casadi.vertcat(*(casadi.horzcat(*row) for row in rows)))
-
-    bodies: Matrix = casadi.mtimes(matrix(system.s11), ydot) - casadi.vertcat(*system.b1)
+    bodies: Matrix = casadi.mtimes(matrix(system.s11), ydot) - column(*system.b1)
     if not system.b2:
         return bodies, unknowns
     bodies += casadi.mtimes(matrix(system.s12), reactions)
-    constraints = casadi.mtimes(matrix(system.s21), ydot) - casadi.vertcat(*system.b2)
+    constraints = casadi.mtimes(matrix(system.s21), ydot) - column(*system.b2)
     return casadi.vertcat(bodies, constraints), unknowns

@@ -18,6 +18,7 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra.vectors import matrix_vector
 from dq_space_arm_env.compiler.graph import graph_of, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.compiler.symbols import column, matrix, symbols, zeros
 from dq_space_arm_env.cost import weighted_square
 from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.chain import Chain
@@ -218,19 +219,18 @@ class ScenePrograms:
         arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
         base = self._base_pose(x)
         tip = dq.multiply(base, arm)
-        angles = casadi.vertcat(*self._y(x)[: self._angle_count()])
+        angles = column(*self._y(x)[: self._angle_count()])
         left, right = dual_matrices.left_matrix(base), dual_matrices.right_matrix(arm)
-        columns = []
+        directions = []
         for direction in field.pose.directions:
             twist = [0.0] * 8
             twist[(1, 2, 3, 5, 6, 7)[direction]] = 0.5
             moved = dual_matrices.matrix_multiply(left, dual_matrices.matrix_multiply(right, twist))
-            columns.append(casadi.vertcat(*moved))
-        by_angles = casadi.mtimes(_matrix(left), casadi.jacobian(casadi.vertcat(*arm), angles))
-        by_state = casadi.sparsify(
-            casadi.horzcat(*columns, by_angles, casadi.SX(8, field.n_t - len(columns) - self._angle_count()))
-        )
-        error = casadi.vertcat(*tip) - casadi.DM(self.scene.target.pose.dual_quaternion)
+            directions.append(column(*moved))
+        by_angles = casadi.mtimes(matrix(left), casadi.jacobian(column(*arm), angles))
+        others = zeros(8, field.n_t - len(directions) - self._angle_count())
+        by_state = casadi.sparsify(casadi.horzcat(*directions, by_angles, others))
+        error = column(*tip) - casadi.DM(self.scene.target.pose.dual_quaternion)
         weighted = casadi.mtimes(casadi.diag(casadi.DM(pose)), by_state)
         gradient = 2.0 * casadi.mtimes(weighted.T, error)
         hessian = 2.0 * casadi.mtimes(by_state.T, weighted)
@@ -247,7 +247,7 @@ class ScenePrograms:
 
     def _cost_derivatives(self) -> Program:
         field, cost = self.field, self.scene.cost
-        x, u = _symbols("x", field.n_x), _symbols("u", field.n_u)
+        x, u = symbols("x", field.n_x), symbols("u", field.n_u)
         gradient, hessian = self._state_cost_derivatives(x, cost.pose, cost.base_velocity)
         weights = (2.0 * self.layout.control_weight).tolist()
         outputs = {
@@ -274,7 +274,7 @@ class ScenePrograms:
 
     def _terminal_cost_derivatives(self) -> Program:
         field, cost = self.field, self.scene.cost
-        x = _symbols("x", field.n_x)
+        x = symbols("x", field.n_x)
         gradient, hessian = self._state_cost_derivatives(x, cost.terminal_pose, cost.terminal_base_velocity)
         outputs = {"lx": casadi.densify(gradient).nonzeros(), "lxx": hessian.nonzeros()}
         graph = graph_of("terminal_cost_derivatives_graph", {"x": x}, outputs)
@@ -415,14 +415,6 @@ def _sum(terms: Scalars) -> Scalar:
     for term in terms:
         total = total + term
     return total
-
-
-def _symbols(name: str, size: int) -> list[Scalar]:
-    return [casadi.SX.sym(f"{name}_{i}") for i in range(size)]
-
-
-def _matrix(rows: Sequence[Scalars]) -> Any:
-    return casadi.sparsify(casadi.vertcat(*(casadi.horzcat(*row) for row in rows)))
 
 
 def sparse_buffer(name: str, pattern: Any) -> Buffer:

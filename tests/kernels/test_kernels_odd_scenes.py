@@ -1,0 +1,70 @@
+"""Scenes at the edges of the schema: nothing but a base, nothing but a wrist, no actuator, no motor."""
+
+import numpy as np
+import pytest
+from test_kernels_derivatives import complex_step_jacobians
+from test_kernels_dynamics import paper_solution, relative_error
+
+from dq_space_arm_env import load_scene
+from dq_space_arm_env.scene import INTEGRATORS
+
+PAPER = load_scene("paper")
+LINKS = [link.model_dump() for link in PAPER.links]
+HERE = {"pose": {"position": [0.5, 0.0, 0.0]}}
+BASE_ONLY = {"base_force": {"limit": 1.0}, "base_torque": {"limit": 1.0}}
+
+
+def scene(**changes):
+    return PAPER.replace(**{"initial_state": {}, "spread": {}, "target": HERE, **changes})
+
+
+ODD = {
+    "base": scene(links=[], wrist=None, actuators=BASE_ONLY),
+    "wrist": scene(links=[], actuators={"base_force": {"limit": 1.0}, "wrist_rate": {"limit": 0.5}}),
+    "one link": scene(links=LINKS[1:2], wrist=None, actuators={"joint_torque": {"limit": 1.0}}),
+    "no actuator": scene(actuators={}),
+    "wrist without motor": scene(actuators=BASE_ONLY),
+    "passive middle joint": scene(links=[LINKS[0], LINKS[1] | {"actuated": False}, LINKS[2]]),
+    "five links": scene(links=[LINKS[i % 3] | {"name": f"link {i}"} for i in range(5)]),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_dynamics_agree_with_the_papers_system(name, draw):
+    kernels, states, inputs = draw(ODD[name], 5)
+    for x, u in zip(states, inputs, strict=True):
+        accelerations, wrenches = paper_solution(kernels, x, u)
+        assert relative_error(kernels.forward_dynamics(x, u), accelerations) < 1e-12
+        assert kernels.reaction_wrenches(x, u).shape == wrenches.shape
+        if wrenches.size:
+            assert relative_error(kernels.reaction_wrenches(x, u), wrenches) < 1e-12
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("name", ["base", "wrist", "one link", "no actuator", "wrist without motor"])
+def test_linearization_agrees_with_complex_steps(name, integrator, draw):
+    kernels, states, inputs = draw(ODD[name], 2)
+    a, b = kernels.linearize(states, inputs, integrator=integrator)
+    for k in range(2):
+        expected_a, expected_b = complex_step_jacobians(kernels, states[k], inputs[k], integrator)
+        np.testing.assert_allclose(a[k], expected_a, atol=2e-13 * max(1.0, np.abs(expected_a).max()))
+        np.testing.assert_allclose(b[k], expected_b.reshape(b[k].shape), atol=2e-13)
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_everything_else_can_be_asked_for(name, draw):
+    kernels, states, inputs = draw(ODD[name], 3)
+    assert np.isfinite(kernels.momentum(states)).all()
+    assert (kernels.energy(states) > 0.0).all()
+    assert (kernels.cost(states, inputs) > 0.0).all()
+    assert kernels.frame_poses(states).shape[1] == 2 + len(kernels.scene.links) + (
+        kernels.scene.wrist is not None
+    )
+    np.testing.assert_allclose(kernels.retract(states, np.zeros((3, kernels.n_t))), states, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["base", "wrist"])
+def test_the_expert_solves_scenes_without_joints(name):
+    from experts import BoxDDP
+
+    assert BoxDDP(ODD[name]).solve().converged
