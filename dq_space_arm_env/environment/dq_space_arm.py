@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -220,18 +219,18 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         if remaining < 0 or self._step_count < 0:
             state = "has not begun" if self._step_count < 0 else "is over"
             raise ResetNeeded(f"the episode {state}: call reset() before step()")
-        values = np.asarray(action, dtype=np.float64)
-        if values.shape != self._action.shape:
-            raise ValueError(f"action: shape {values.shape}, should be {self._action.shape}")
-        if math.isnan(values.sum()) and np.isnan(values).any():
-            raise ValueError(f"action: {values} holds NaN, should be numbers in [-1, 1]")
-        self._action[:] = values
+        if np.shape(action) != self._action.shape:
+            raise ValueError(f"action: shape {np.shape(action)}, should be {self._action.shape}")
+        self._action[:] = action
         self._time_left[0] = remaining * self._dt
         terminal_cost = self._report[_TERMINAL_COST]
         self._run_kernel()
         report = self._report.tolist()
         # Written so that NaN counts as diverged.
         if not report[_OBSERVATION_SQUARE] <= OBSERVATION_LIMIT**2:
+            if np.isnan(self._action).any():
+                self._observe()  # what the next step may need of the last report
+                raise ValueError(f"action: {action} holds NaN, should be numbers in [-1, 1]")
             return self._end_diverged(report, terminal_cost)
         self._step_count += 1
         self._x[:] = self._x_next

@@ -201,6 +201,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]]):
         # Written so that NaN counts as diverged.
         diverged = ~(reports[:, _COLUMN["observation_square"]] <= OBSERVATION_LIMIT**2) & ~resetting
         if diverged.any():
+            _refuse_nan(values)
             self._end_diverged(diverged, time_left, x_next, observations, reports, rewards)
         terminated = (last | diverged) & ~resetting
         self._x = x_next
@@ -219,9 +220,6 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]]):
         values = np.ascontiguousarray(actions, dtype=np.float64)
         if values.shape != (self.num_envs, self.kernels.n_u):
             raise ValueError(f"actions: shape {values.shape}, should be {(self.num_envs, self.kernels.n_u)}")
-        if np.isnan(values.sum()) and np.isnan(values).any():
-            copies = np.flatnonzero(np.isnan(values).any(axis=1)).tolist()
-            raise ValueError(f"actions: NaN for copies {copies}, should be numbers in [-1, 1]")
         if self.autoreset_mode is AutoresetMode.DISABLED and self._over.any():
             copies = np.flatnonzero(self._over).tolist()
             raise ResetNeeded(f"the episodes of copies {copies} are over: reset them with a reset_mask")
@@ -289,3 +287,11 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]]):
         info["is_success"] = close & (info["position_error"] <= success.position_error) & sound
         info["diverged"] = mask & ~sound
         return info | {f"_{name}": mask.copy() for name in info}
+
+
+def _refuse_nan(actions: Array) -> None:
+    """Raise ValueError if diverged states are the work of actions that are not numbers."""
+    missing = np.isnan(actions).any(axis=1)
+    if missing.any():
+        copies = np.flatnonzero(missing).tolist()
+        raise ValueError(f"actions: NaN for copies {copies}, should be numbers in [-1, 1]")

@@ -364,7 +364,8 @@ class ScenePrograms:
         limits = self.layout.control_limit.tolist()
 
         def to_inputs(action: Scalars) -> Mapping[str, Scalars]:
-            clipped = [casadi.fmin(casadi.fmax(value, -1.0), 1.0) for value in action]
+            # Written so that NaN passes: of two numbers that do not compare, the second is taken.
+            clipped = [casadi.fmin(1.0, casadi.fmax(-1.0, value)) for value in action]
             return {"u": [limit * value for limit, value in zip(limits, clipped, strict=True)]}
 
         def after(x_next: Scalars, time_left: Scalars, terms: Scalars) -> Mapping[str, Scalars]:
