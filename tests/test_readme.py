@@ -41,3 +41,13 @@ def test_commands_exist():
     for command in re.findall(r"^make (\w+)", README, flags=re.MULTILINE):
         assert re.search(rf"^{command}:", makefile, flags=re.MULTILINE)
     assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+
+
+def test_examples_in_the_environments_docstring_run():
+    import doctest
+
+    from dq_space_arm_env.environment import dq_space_arm
+
+    results = doctest.testmod(dq_space_arm)
+    assert results.attempted >= 5
+    assert results.failed == 0

@@ -120,6 +120,17 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
     ```
 
+    ## Vectorized environment
+
+    `DQSpaceArmVectorEnv` steps many copies with one call of vectorized machine code, and gives the bits of single environments with the same seeds.
+
+    ```python
+    >>> venv = gymnasium.make_vec("DQSpaceArm-v0", num_envs=3)
+    >>> venv
+    DQSpaceArmVectorEnv(DQSpaceArm-v0, num_envs=3)
+
+    ```
+
     ## Version History
 
     * v0: Initial version.
@@ -159,7 +170,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
                 f"scene {self.scene.name!r} has no normalized actions: {problem}; give each actuator a finite limit"
             )
         self.render_mode = render_mode
-        self.metadata = {**type(self).metadata, "render_fps": round(1.0 / self.scene.simulation.dt)}
+        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.scene.simulation.dt))}
         self.action_space = spaces.Box(-1.0, 1.0, (layout.n_u,), np.float32)
         self._steps, self._dt = self.scene.simulation.steps, self.scene.simulation.dt
         self._angle_tolerance = self.scene.success.attitude_error_deg
@@ -230,7 +241,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         if not report[_OBSERVATION_SQUARE] <= OBSERVATION_LIMIT**2:
             if np.isnan(self._action).any():
                 self._observe()  # what the next step may need of the last report
-                raise ValueError(f"action: {action} holds NaN, should be numbers in [-1, 1]")
+                raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
             return self._end_diverged(report, terminal_cost)
         self._step_count += 1
         self._x[:] = self._x_next
