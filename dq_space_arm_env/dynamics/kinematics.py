@@ -142,7 +142,7 @@ def tip_pose_rate(
     joint_rates: Sequence[Scalar],
     wrist_rates: Sequence[Scalar],
 ) -> DualQuaternion:
-    """Rate of the tip's pose, eq. (30), with the last factor read as q_{G/e3} (paper-notes erratum).
+    """Rate of the tip's pose, eq. (30); its last factor is q_{G/e3}, where the paper prints q_{G/3}.
 
     Args:
         chain: The robot.
