@@ -60,7 +60,6 @@ class RevoluteLink:
         stiffness: Torsional spring, N m/rad.
         rest_angle: Angle at which the spring is relaxed, rad.
         damping: Viscous friction, N m s/rad.
-        actuated: Whether a motor drives the joint.
     """
 
     body: RigidBody
@@ -68,7 +67,6 @@ class RevoluteLink:
     stiffness: float
     rest_angle: float
     damping: float
-    actuated: bool
 
 
 @dataclass(frozen=True)
@@ -112,9 +110,7 @@ class Chain:
         return cls(
             base=base,
             links=tuple(
-                RevoluteLink(
-                    body, _placement(link.joint), link.stiffness, link.rest_angle, link.damping, link.actuated
-                )
+                RevoluteLink(body, _placement(link.joint), link.stiffness, link.rest_angle, link.damping)
                 for body, link in zip(bodies, scene.links, strict=True)
             ),
             wrist=None if scene.wrist is None else _placement(scene.wrist.frame),
@@ -122,11 +118,6 @@ class Chain:
             tip_wrench=None if wrench is None else (*wrench.force, *wrench.torque),
             planar=scene.base.motion == "planar",
         )
-
-    @property
-    def tip_wrench_turns(self) -> bool:
-        """Whether the wrist's angles enter the dynamics: only through a wrench at the tip (16)."""
-        return self.tip_wrench is not None and self.wrist is not None
 
 
 def _placement(pose: Pose) -> Placement:

@@ -195,7 +195,6 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         """Give the compiled step arrays of its own; their addresses are handed over once."""
         kernel = self.kernels.kernel("environment_step", lanes=1)
         arrays = {spec.name: np.zeros(spec.stride) for spec in (*kernel.inputs, *kernel.outputs)}
-        self._arrays = arrays
         self._x, self._x_next = arrays["x"], arrays["x_next"]
         self._action, self._time_left, self._h = arrays["action"], arrays["time_left"], arrays["h"]
         self._observation, self._report = arrays["observation"], arrays["report"]

@@ -100,12 +100,10 @@ class Integrator(Protocol):
     Attributes:
         name: Name in the scene file.
         order: Order of convergence.
-        evaluations: Evaluations of the accelerations per step.
     """
 
     name: str
     order: int
-    evaluations: int
 
     def append_step(self, program: Program, field: VectorField) -> None:
         """Append the calls that turn buffers x, u, h into x_next."""

@@ -32,7 +32,6 @@ class RungeKuttaMuntheKaas4:
 
     name = "rk4"
     order = 4
-    evaluations = 4
 
     def append_step(self, program: Program, field: VectorField) -> None:
         """Append the calls that turn buffers x, u, h into x_next."""

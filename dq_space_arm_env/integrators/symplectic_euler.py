@@ -21,7 +21,6 @@ class SymplecticEuler:
 
     name = "symplectic_euler"
     order = 1
-    evaluations = 1
 
     def append_step(self, program: Program, field: VectorField) -> None:
         """Append the calls that turn buffers x, u, h into x_next."""

@@ -36,10 +36,7 @@ def random_body(rng: np.random.Generator, at_origin: bool = False) -> RigidBody:
 
 
 def random_chain(rng: np.random.Generator, joints: int, wrist: bool = True) -> Chain:
-    links = tuple(
-        RevoluteLink(random_body(rng), random_placement(rng), 0.0, 0.0, 0.0, actuated=True)
-        for _ in range(joints)
-    )
+    links = tuple(RevoluteLink(random_body(rng), random_placement(rng), 0.0, 0.0, 0.0) for _ in range(joints))
     return Chain(
         base=random_body(rng, at_origin=True),
         links=links,
