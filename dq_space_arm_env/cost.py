@@ -15,7 +15,7 @@ Scalar = Any
 
 
 def weighted_square(
-    values: Sequence[Scalar], references: Sequence[Scalar], weights: Sequence[Scalar]
+    values: Sequence[Scalar], references: Sequence[Scalar], weights: Sequence[float]
 ) -> Scalar:
     """Sum of w (value - reference)^2: each of the terms of the cost.
 
@@ -27,8 +27,12 @@ def weighted_square(
     Returns:
         The sum, dimensionless.
     """
-    total: Scalar = 0.0
+    # Squares that share a weight are added first: fewer products, and stage and terminal cost share the sums.
+    sums: dict[float, Scalar] = {}
     for value, reference, weight in zip(values, references, weights, strict=True):
         error = value - reference
-        total = total + weight * (error * error)
+        sums[weight] = sums.get(weight, 0.0) + error * error
+    total: Scalar = 0.0
+    for weight, squares in sums.items():
+        total = total + weight * squares
     return total

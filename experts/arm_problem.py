@@ -7,7 +7,7 @@ from experts.problem import FloatArray, Kernel
 
 
 class ArmProblem:
-    """The maneuver of a scene in minimal coordinates; implements `ShootingProblem`.
+    """The maneuver of a scene in minimal coordinates, in double precision; implements `ShootingProblem`.
 
     Attributes:
         scene: The scene.
@@ -25,10 +25,7 @@ class ArmProblem:
             SceneError: If the scene cannot be loaded.
             ValueError: If the integrator is unknown.
         """
-        self.scene = load_scene(scene)
-        if integrator is not None:
-            simulation = self.scene.simulation.model_copy(update={"integrator": integrator})
-            self.scene = self.scene.replace(simulation=simulation)
+        self.scene = in_double_precision(load_scene(scene), integrator)
         self.kernels = compile_scene(self.scene)
         layout = self.kernels.layout
         self.n_states, self.n_tangent, self.n_controls = layout.n_x, layout.n_t, layout.n_u
@@ -52,3 +49,20 @@ class ArmProblem:
         """
         sequential = name in ("step_with_cost", "difference", "terminal_cost", "terminal_cost_derivatives")
         return self.kernels.kernel(name, lanes=1 if sequential else None)
+
+
+def in_double_precision(scene: Scene, integrator: str | None = None) -> Scene:
+    """A scene as the solver takes it: convergence needs the digits, whatever agents simulate in.
+
+    Args:
+        scene: The scene.
+        integrator: Name of the integrator; the scene's by default.
+
+    Returns:
+        The scene with double precision and the integrator.
+
+    Raises:
+        ValueError: If the integrator is unknown.
+    """
+    changes = {"precision": "float64", "integrator": integrator or scene.simulation.integrator}
+    return scene.replace(simulation={**scene.simulation.model_dump(), **changes})

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
+from experts.arm_problem import in_double_precision
 from experts.problem import FloatArray, Kernel
 
 
@@ -30,7 +31,7 @@ class PaperProblem:
         Raises:
             SceneError: If the scene cannot be loaded.
         """
-        self.scene = load_scene(scene)
+        self.scene = in_double_precision(load_scene(scene))
         self.kernels = compile_scene(self.scene)
         layout = self.kernels.layout
         self.initial_state = self.from_minimal(layout.initial_state)

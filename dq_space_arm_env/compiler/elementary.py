@@ -8,6 +8,7 @@ a scalar register and in every lane of a vector one.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -15,31 +16,76 @@ if TYPE_CHECKING:
 
     from dq_space_arm_env.compiler.emit import VectorBuilder
 
-# pi/2 in three pieces of 33 bits (the last one full), so that the first two products with an integer quotient
-# below # 2^20 are exact (Cody & Waite): the reduced argument keeps its digits up to angles of about 1e6 rad.
-_HALF_PI_HIGH = float.fromhex("0x1.921fb544p+0")
-_HALF_PI_MIDDLE = float.fromhex("0x1.0b4611a6p-34")
-_HALF_PI_LOW = float.fromhex("0x1.3198a2e037073p-69")
 
-# Taylor coefficients; on [-pi/4, pi/4] the first neglected terms are below 2e-17.
-_SINE = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(1, 9))
-_COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(1, 9))
+@dataclass(frozen=True)
+class _Coefficients:
+    """What the functions need of a precision.
 
-# Minimax coefficients of arctangent on |x| < 7/16 (Sun Microsystems fdlibm, s_atan.c): atan(x) = x - x^3
-# P(x^2).
-_ARCTANGENT = (
-    3.33333333333329318027e-01,
-    -1.99999999998764832476e-01,
-    1.42857142725034663711e-01,
-    -1.11111104054623557880e-01,
-    9.09088713343650656196e-02,
-    -7.69187620504482999495e-02,
-    6.66107313738753120669e-02,
-    -5.83357013379057348645e-02,
-    4.97687799461593236017e-02,
-    -3.65315727442169155270e-02,
-    1.62858201153657823623e-02,
-)
+    Attributes:
+        half_pi: pi/2 in three pieces (Cody & Waite). The first two are short, so that their products with an
+            integer quotient are exact, up to 2^20 in double and 2^12 in single precision: the reduced
+            argument keeps its digits up to angles of about 1e6 and 6e3 rad.
+        sine: Taylor coefficients in x^2; on [-pi/4, pi/4] the first neglected term is below half a unit in
+            the last place.
+        cosine: The same.
+        arctangent: Minimax coefficients on |x| < 7/16 (Sun Microsystems fdlibm, s_atan.c and s_atanf.c):
+            atan(x) = x - x^3 P(x^2).
+    """
+
+    half_pi: tuple[float, float, float]
+    sine: tuple[float, ...]
+    cosine: tuple[float, ...]
+    arctangent: tuple[float, ...]
+
+
+def _sine_series(terms: int) -> tuple[float, ...]:
+    return tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(1, terms + 1))
+
+
+def _cosine_series(terms: int) -> tuple[float, ...]:
+    return tuple((-1.0) ** k / math.factorial(2 * k) for k in range(1, terms + 1))
+
+
+_COEFFICIENTS = {
+    "float64": _Coefficients(
+        half_pi=(
+            float.fromhex("0x1.921fb544p+0"),
+            float.fromhex("0x1.0b4611a6p-34"),
+            float.fromhex("0x1.3198a2e037073p-69"),
+        ),
+        sine=_sine_series(8),
+        cosine=_cosine_series(8),
+        arctangent=(
+            3.33333333333329318027e-01,
+            -1.99999999998764832476e-01,
+            1.42857142725034663711e-01,
+            -1.11111104054623557880e-01,
+            9.09088713343650656196e-02,
+            -7.69187620504482999495e-02,
+            6.66107313738753120669e-02,
+            -5.83357013379057348645e-02,
+            4.97687799461593236017e-02,
+            -3.65315727442169155270e-02,
+            1.62858201153657823623e-02,
+        ),
+    ),
+    "float32": _Coefficients(
+        half_pi=(
+            float.fromhex("0x1.92p+0"),
+            float.fromhex("0x1.fb4p-12"),
+            float.fromhex("0x1.4442d2p-24"),
+        ),
+        sine=_sine_series(4),
+        cosine=_cosine_series(5),
+        arctangent=(
+            3.3333328366e-01,
+            -1.9999158382e-01,
+            1.4253635705e-01,
+            -1.0648017377e-01,
+            6.1687607318e-02,
+        ),
+    ),
+}
 
 
 def _horner(builder: VectorBuilder, x: ir.Value, coefficients: tuple[float, ...]) -> ir.Value:
@@ -51,14 +97,18 @@ def _horner(builder: VectorBuilder, x: ir.Value, coefficients: tuple[float, ...]
 
 
 def sine_cosine(builder: VectorBuilder, x: ir.Value) -> tuple[ir.Value, ir.Value]:
-    """Emit sine and cosine of x rad: about one unit in the last place up to 1e6, NaN for infinity."""
+    """Emit sine and cosine of x rad: about a unit in the last place up to 1e6 (6e3 in single precision)."""
+    coefficients = _COEFFICIENTS[builder.target.precision]
     quotient = builder.round(builder.multiply(x, builder.constant(2.0 / math.pi)))
-    reduced = builder.multiply_add(quotient, builder.constant(-_HALF_PI_HIGH), x)
-    reduced = builder.multiply_add(quotient, builder.constant(-_HALF_PI_MIDDLE), reduced)
-    reduced = builder.multiply_add(quotient, builder.constant(-_HALF_PI_LOW), reduced)
+    reduced = x
+    for piece in coefficients.half_pi:
+        reduced = builder.multiply_add(quotient, builder.constant(-piece), reduced)
     square = builder.multiply(reduced, reduced)
-    sine = builder.multiply_add(builder.multiply(reduced, square), _horner(builder, square, _SINE), reduced)
-    cosine = builder.multiply_add(square, _horner(builder, square, _COSINE), builder.constant(1.0))
+    cube = builder.multiply(reduced, square)
+    sine = builder.multiply_add(cube, _horner(builder, square, coefficients.sine), reduced)
+    cosine = builder.multiply_add(
+        square, _horner(builder, square, coefficients.cosine), builder.constant(1.0)
+    )
     # The quotient modulo 4 names the quadrant: odd ones swap sine and cosine, the signs follow.
     quarter = builder.floor(builder.multiply(quotient, builder.constant(0.25)))
     quadrant = builder.multiply_add(quarter, builder.constant(-4.0), quotient)
@@ -87,7 +137,7 @@ def arctangent2(builder: VectorBuilder, y: ir.Value, x: ir.Value) -> ir.Value:
     bottom = builder.select(builder.compare("==", bottom, zero), builder.constant(1.0), bottom)
     ratio = builder.divide(top, bottom)
     square = builder.multiply(ratio, ratio)
-    polynomial = _horner(builder, square, _ARCTANGENT)
+    polynomial = _horner(builder, square, _COEFFICIENTS[builder.target.precision].arctangent)
     angle = builder.multiply_add(builder.negate(builder.multiply(ratio, square)), polynomial, ratio)
     angle = builder.select(far, builder.add(angle, builder.constant(math.pi / 4)), angle)
     angle = builder.select(steep, builder.subtract(builder.constant(math.pi / 2), angle), angle)

@@ -1,13 +1,14 @@
 """From expression graphs to LLVM: each graph becomes a function whose operations act on vectors of lanes.
 
-A lane is one state of a batch, or one time step of a trajectory. The vectors are explicit (`<8 x double>`
-where the processor has AVX-512), so nothing depends on an optimizer that may or may not vectorize a loop, and
-the scalar kernel (one lane) computes exactly the bits that each lane of the batched one does: fused
-multiply-adds are chosen here, not by the back end.
+A lane is one state of a batch, or one time step of a trajectory. The vectors are explicit (`<8 x double>` or
+`<16 x float>` where the processor has AVX-512), so nothing depends on an optimizer that may or may not
+vectorize a loop, and the scalar kernel (one lane) computes exactly the bits that each lane of the batched one
+does: fused multiply-adds are chosen here, not by the back end.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from llvmlite import ir
@@ -18,6 +19,9 @@ from dq_space_arm_env.compiler.graph import Graph, Node, use_counts
 INDEX = ir.IntType(64)
 DOUBLE = ir.DoubleType()
 POINTER = ir.PointerType()
+# Types of array elements by name; truth values take a byte.
+ELEMENTS: Mapping[str, ir.Type] = {"float64": DOUBLE, "float32": ir.FloatType(), "bool": ir.IntType(8)}
+BYTES = {"float64": 8, "float32": 4, "bool": 1}
 
 
 @dataclass(frozen=True)
@@ -27,21 +31,28 @@ class Target:
     Attributes:
         lanes: Number of lanes of a vector; 1 gives scalar code.
         fused: Whether the processor has a fused multiply-add instruction.
+        precision: What it computes in, "float64" or "float32".
     """
 
     lanes: int
     fused: bool
+    precision: str = "float64"
+
+
+def vector_type(element: ir.Type, lanes: int) -> ir.Type:
+    """Type of a vector; one lane is a plain number."""
+    return ir.VectorType(element, lanes) if lanes > 1 else element
 
 
 class VectorBuilder:
-    """Arithmetic on vectors of `lanes` doubles, appended to one basic block."""
+    """Arithmetic on vectors of `lanes` numbers, appended to one basic block."""
 
     def __init__(self, builder: ir.IRBuilder, target: Target) -> None:
         """Append to `builder`, for `target`."""
         self.ir = builder
         self.target = target
-        self.type: ir.Type = ir.VectorType(DOUBLE, target.lanes) if target.lanes > 1 else DOUBLE
-        self.alignment = 8 * target.lanes
+        self.type: ir.Type = vector_type(ELEMENTS[target.precision], target.lanes)
+        self.alignment = BYTES[target.precision] * target.lanes
 
     def constant(self, value: float) -> ir.Constant:
         """A vector with the same value in every lane."""
@@ -76,8 +87,8 @@ class VectorBuilder:
         return self._intrinsic("llvm.fma", a, b, c)
 
     def _intrinsic(self, name: str, *arguments: ir.Value) -> ir.Value:
-        lanes = self.target.lanes
-        full_name = f"{name}.v{lanes}f64" if lanes > 1 else f"{name}.f64"
+        lanes, bits = self.target.lanes, 8 * BYTES[self.target.precision]
+        full_name = f"{name}.v{lanes}f{bits}" if lanes > 1 else f"{name}.f{bits}"
         function = self.ir.module.globals.get(full_name)
         if function is None:
             signature = ir.FunctionType(self.type, [self.type] * len(arguments))
@@ -180,6 +191,9 @@ class _GraphEmitter:
     def _emit_sum(self, left: int, right: int, *, subtract: bool) -> ir.Value:
         """Emit left + right or left - right, fused with the product where one of them is fusible."""
         builder = self.builder
+        if not subtract and (choice := self._choice(left, right)):
+            condition, if_true, if_false = choice
+            return builder.select(self._truth(condition), self.value(if_true), self.value(if_false))
         if self.values[right] is None and self._is_fusible(right):
             a, b = self._factors(right)
             return builder.multiply_add(builder.negate(a) if subtract else a, b, self.value(left))
@@ -189,6 +203,19 @@ class _GraphEmitter:
             return builder.multiply_add(a, b, builder.negate(addend) if subtract else addend)
         operation = builder.subtract if subtract else builder.add
         return operation(self.value(left), self.value(right))
+
+    def _choice(self, left: int, right: int) -> tuple[int, int, int] | None:
+        """Condition and branches of a choice, which CasADi writes as the sum (c ? a : 0) + (!c ? b : 0)."""
+        nodes = self.graph.nodes
+        first, second = nodes[left], nodes[right]
+        if first.operation == second.operation == "if_else_zero":
+            for (condition, if_true), (negation, if_false) in (
+                (first.arguments, second.arguments),
+                (second.arguments, first.arguments),
+            ):
+                if nodes[negation] == Node("not", (condition,)):
+                    return condition, if_true, if_false
+        return None
 
     def _emit(self, node: Node) -> ir.Value:
         builder, operation, arguments = self.builder, node.operation, node.arguments

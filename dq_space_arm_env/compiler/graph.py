@@ -83,6 +83,7 @@ def trace(
     name: str,
     inputs: Mapping[str, int],
     function: Callable[..., Mapping[str, Sequence[Expression]]],
+    **given: Sequence[Expression],
 ) -> Graph:
     """Run a function on symbols and record the operations that its outputs need.
 
@@ -90,6 +91,7 @@ def trace(
         name: Name of the graph, an identifier.
         inputs: Number of scalars of each input; the function gets each as a list under its name.
         function: Plain-scalar function returning, for each output name, a sequence of scalars.
+        given: Further inputs, whose symbols the function knows already; an empty one is left out.
 
     Returns:
         The graph of the function.
@@ -99,7 +101,9 @@ def trace(
     """
     symbols = {key: [casadi.SX.sym(f"{key}_{i}") for i in range(size)] for key, size in inputs.items()}
     outputs = function(**symbols)
-    return graph_of(name, symbols, outputs)
+    return graph_of(
+        name, {**symbols, **{key: list(values) for key, values in given.items() if values}}, outputs
+    )
 
 
 def graph_of(

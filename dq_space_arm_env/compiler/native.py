@@ -134,6 +134,9 @@ class NativeKernel:
             name: Name of the function in it.
             object_code: The object file.
             metadata: Notes to keep with the kernel.
+
+        Raises:
+            LookupError: If the object file has no such function.
         """
         empty = llvm.parse_assembly("")
         # The engine takes ownership of its target machine, so it gets one of its own.
@@ -141,6 +144,8 @@ class NativeKernel:
         self._engine.add_object_file(llvm.ObjectFileRef.from_data(object_code))
         self._engine.finalize_object()
         self.address: int = self._engine.get_function_address(name)
+        if not self.address:
+            raise LookupError(f"the object file has no function {name!r}")
         self.function = KernelFunction(self.address)
         self.metadata = metadata
 

@@ -7,7 +7,8 @@ stay in the first-level cache. The compiled program is a C function
     void kernel(int64 begin, int64 end, const int64 *buffers)
 
 that, for every row k in [begin, end), reads row k of its input arrays and writes row k of its output arrays
-(C-contiguous float64); `buffers` holds the arrays' addresses, inputs first.
+(C-contiguous); `buffers` holds the arrays' addresses, inputs first. An indexed program works on the rows
+index[begin], ..., index[end - 1] instead; the address of `index` (int64) comes before all others.
 """
 
 from __future__ import annotations
@@ -17,9 +18,16 @@ from dataclasses import dataclass, field
 
 from llvmlite import ir
 
-from dq_space_arm_env.compiler.emit import DOUBLE, INDEX, POINTER, Target, VectorBuilder, emit_graph
+from dq_space_arm_env.compiler.emit import (
+    ELEMENTS,
+    INDEX,
+    POINTER,
+    Target,
+    VectorBuilder,
+    emit_graph,
+)
 from dq_space_arm_env.compiler.graph import Graph
-from dq_space_arm_env.compiler.transpose import gather, scatter
+from dq_space_arm_env.compiler.transpose import ArrayAccess
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,10 @@ class Buffer:
         positions: For an output, where in its row each scalar goes, when it is not simply one after another;
             entries of the row that no scalar goes to are left as they are.
         stride: Scalars per row of the array; `size` unless `positions` spreads them out.
+        dtype: Type of the array's elements, "float64", "float32" or "bool"; empty for the type that the
+            program computes in.
+        by_column: For an output, whether the array holds one column after another, shape (size, rows). The
+            entry after its address in `buffers` is then the number of elements from one column to the next.
     """
 
     name: str
@@ -40,6 +52,8 @@ class Buffer:
     shared: bool = False
     positions: tuple[int, ...] | None = None
     stride: int = 0
+    dtype: str = ""
+    by_column: bool = False
 
     def __post_init__(self) -> None:
         """Fill in the stride."""
@@ -64,12 +78,14 @@ class Program:
         inputs: Arrays that are read.
         outputs: Arrays that are written.
         calls: The calls in order. A buffer that is neither input nor output is scratch; it starts as zero.
+        indexed: Whether a list says which rows to work on.
     """
 
     name: str
     inputs: Sequence[Buffer]
     outputs: Sequence[Buffer]
     calls: list[Call] = field(default_factory=list)
+    indexed: bool = False
 
     def call(self, graph: Graph, **bindings: str) -> None:
         """Append a call.
@@ -124,8 +140,13 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
         target: Lanes and instructions to use.
 
     Raises:
-        ValueError: If two calls disagree on the size of a buffer.
+        ValueError: If two calls disagree on the size of a buffer, or an indexed program writes by column.
     """
+    for buffer in program.outputs:
+        if buffer.by_column and program.indexed:
+            raise ValueError(
+                f"program {program.name!r}: buffer {buffer.name!r} is by column, the program is indexed"
+            )
     sizes, zeroed = program.scratch_sizes(), program.read_before_written()
     functions: dict[str, ir.Function] = {}
     for call in program.calls:
@@ -139,17 +160,14 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     builder = ir.IRBuilder(entry)
     vectors = VectorBuilder(builder, target)
     # Each array's address, and a block of vectors on the stack for every buffer, stay fixed over the loop.
-    arrays = {}
-    for position, buffer in enumerate((*program.inputs, *program.outputs)):
-        slot = builder.gep(addresses, [INDEX(position)], source_etype=INDEX)
-        arrays[buffer.name] = builder.inttoptr(builder.load(slot, typ=INDEX), POINTER)
+    arrays = _Arrays(builder, program, addresses)
     blocks = {}
     for name, size in sizes.items():
         block = builder.alloca(vectors.type, size=INDEX(max(size, 1)))
         block.align = vectors.alignment
         blocks[name] = block
         if name in zeroed:
-            _clear(builder, block, 8 * target.lanes * size)
+            _clear(builder, block, vectors.alignment * size)
     builder.branch(head)
 
     builder.position_at_end(head)
@@ -159,30 +177,66 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
 
     builder.position_at_end(body)
     last = builder.sub(end, INDEX(1))
-    rows = [_clamped(builder, row, lane, last) for lane in range(target.lanes)]
-
-    def addresses_of(buffer: Buffer) -> list[ir.Value]:
-        """Where the rows of this block begin in an array."""
-        if buffer.shared:
-            return [arrays[buffer.name]] * target.lanes
-        stride = INDEX(buffer.stride)
-        return [
-            builder.gep(arrays[buffer.name], [builder.mul(index, stride)], source_etype=DOUBLE)
-            for index in rows
-        ]
-
+    rows = [arrays.row_number(_clamped(builder, row, lane, last)) for lane in range(target.lanes)]
+    access = {dtype: ArrayAccess(vectors, dtype) for dtype in ELEMENTS}
     for buffer in program.inputs:
-        gather(vectors, addresses_of(buffer), blocks[buffer.name], buffer.size, shared=buffer.shared)
+        lanes = arrays.rows_of(buffer, rows, target)
+        element = access[buffer.dtype or target.precision]
+        element.gather(lanes, blocks[buffer.name], buffer.size, shared=buffer.shared)
     for call in program.calls:
         names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
         builder.call(functions[call.graph.name], [blocks[call.bindings.get(name, name)] for name in names])
     for buffer in program.outputs:
-        scatter(vectors, blocks[buffer.name], addresses_of(buffer), buffer.size, buffer.positions)
+        element, block = access[buffer.dtype or target.precision], blocks[buffer.name]
+        if buffer.by_column:
+            address, pitch = arrays.addresses[buffer.name], arrays.pitches[buffer.name]
+            element.scatter_columns(block, address, pitch, row, end, buffer.size)
+        else:
+            element.scatter(block, arrays.rows_of(buffer, rows, target), buffer.size, buffer.positions)
     row.add_incoming(builder.add(row, INDEX(target.lanes)), builder.block)
     builder.branch(head)
 
     builder.position_at_end(done)
     builder.ret_void()
+
+
+class _Arrays:
+    """Where the arrays of a program are, read from `buffers` once."""
+
+    def __init__(self, builder: ir.IRBuilder, program: Program, buffers: ir.Value) -> None:
+        self._builder = builder
+        self._position = 0
+        self._buffers = buffers
+        self._index = builder.inttoptr(self._next(), POINTER) if program.indexed else None
+        self.addresses: dict[str, ir.Value] = {}
+        self.pitches: dict[str, ir.Value] = {}
+        for buffer in (*program.inputs, *program.outputs):
+            self.addresses[buffer.name] = builder.inttoptr(self._next(), POINTER)
+            if buffer.by_column:
+                self.pitches[buffer.name] = self._next()
+
+    def _next(self) -> ir.Value:
+        slot = self._builder.gep(self._buffers, [INDEX(self._position)], source_etype=INDEX)
+        self._position += 1
+        return self._builder.load(slot, typ=INDEX)
+
+    def row_number(self, position: ir.Value) -> ir.Value:
+        """The row to work on at a position: itself, or what the list of rows says."""
+        if self._index is None:
+            return position
+        slot = self._builder.gep(self._index, [position], source_etype=INDEX)
+        return self._builder.load(slot, typ=INDEX)
+
+    def rows_of(self, buffer: Buffer, rows: list[ir.Value], target: Target) -> list[ir.Value]:
+        """Where the rows of a block of lanes begin in an array."""
+        array = self.addresses[buffer.name]
+        if buffer.shared:
+            return [array] * len(rows)
+        element = ELEMENTS[buffer.dtype or target.precision]
+        stride = INDEX(buffer.stride)
+        return [
+            self._builder.gep(array, [self._builder.mul(row, stride)], source_etype=element) for row in rows
+        ]
 
 
 def _clear(builder: ir.IRBuilder, block: ir.Value, size: int) -> None:

@@ -1,8 +1,9 @@
 """Between arrays and registers: rows of an array become vectors with one row per lane, and back.
 
-Arrays hold one state after another, vectors one number of several states. A square of as many rows and
-columns as there are lanes is transposed in registers, by exchanging ever smaller blocks; moving its numbers
-one by one would cost more than a step of the dynamics.
+Arrays hold one state after another, vectors one number of several states. Squares of as many columns as rows
+are transposed in registers, by exchanging ever smaller blocks; moving their numbers one by one would cost
+more than a step of the dynamics. Elements are converted on the way where an array's type is not the one that
+is computed in.
 """
 
 from __future__ import annotations
@@ -11,116 +12,210 @@ from collections.abc import Iterator, Sequence
 
 from llvmlite import ir
 
-from dq_space_arm_env.compiler.emit import DOUBLE, INDEX, VectorBuilder
+from dq_space_arm_env.compiler.emit import BYTES, ELEMENTS, INDEX, POINTER, VectorBuilder, vector_type
+
+INT32 = ir.IntType(32)
 
 
-def gather(
-    vectors: VectorBuilder, rows: Sequence[ir.Value], block: ir.Value, size: int, *, shared: bool
-) -> None:
-    """Read rows of an array into a block of vectors.
+class ArrayAccess:
+    """Reads and writes of arrays with elements of one type, appended to a basic block."""
 
-    Args:
-        vectors: Builder to append to.
-        rows: Address of each lane's row.
-        block: Address of the block, `size` vectors.
-        size: Numbers in a row.
-        shared: Whether all lanes have the same row.
-    """
-    lanes = len(rows)
-    if shared or lanes == 1:
+    def __init__(self, vectors: VectorBuilder, dtype: str) -> None:
+        """Prepare.
+
+        Args:
+            vectors: Builder to append to.
+            dtype: Type of the array's elements: "float64", "float32" or "bool".
+        """
+        self.vectors = vectors
+        self.dtype = dtype
+        self.element = ELEMENTS[dtype]
+        self.lanes = vectors.target.lanes
+
+    def gather(self, rows: Sequence[ir.Value], block: ir.Value, size: int, *, shared: bool) -> None:
+        """Read rows of an array into a block of vectors.
+
+        Args:
+            rows: Address of each lane's row.
+            block: Address of the block, `size` vectors.
+            size: Numbers in a row.
+            shared: Whether all lanes have the same row.
+        """
+        vectors, lanes = self.vectors, self.lanes
+        width = _square_width(size, lanes)
+        if shared or width == 1:
+            for index in range(size):
+                if shared:
+                    values = [self._load(rows[0], index, 1)] * lanes
+                else:
+                    values = [self._load(row, index, 1) for row in rows]
+                vectors.store(self._computed(self._assembled(values)), block, index)
+            return
+        for start in _square_starts(size, width):
+            groups = [
+                self._transposed([self._load(row, start, width) for row in rows[first : first + width]])
+                for first in range(0, lanes, width)
+            ]
+            for column, parts in enumerate(zip(*groups, strict=True)):
+                vectors.store(self._computed(self._joined(list(parts))), block, start + column)
+
+    def scatter(
+        self, block: ir.Value, rows: Sequence[ir.Value], size: int, positions: Sequence[int] | None
+    ) -> None:
+        """Write a block of vectors to rows of an array.
+
+        Args:
+            block: Address of the block, `size` vectors.
+            rows: Address of each lane's row.
+            size: Numbers that are written to a row.
+            positions: Where in a row each of them goes; None for one after another.
+        """
+        lanes = self.lanes
+        width = 1 if positions else _square_width(size, lanes)
+        if width == 1:
+            for index, position in enumerate(positions or range(size)):
+                vector = self._stored(block, index)
+                for lane, row in enumerate(rows):
+                    self._store(self._lane_of(vector, lane), row, position)
+            return
+        for start in _square_starts(size, width):
+            columns = [self._stored(block, start + column) for column in range(width)]
+            for first in range(0, lanes, width):
+                square = self._transposed([self._part(column, first, width) for column in columns])
+                for row, vector in zip(rows[first : first + width], square, strict=True):
+                    self._store(vector, row, start)
+
+    def scatter_columns(
+        self, block: ir.Value, array: ir.Value, pitch: ir.Value, row: ir.Value, end: ir.Value, size: int
+    ) -> None:
+        """Write a block of vectors to an array that holds one column after another.
+
+        Args:
+            block: Address of the block, `size` vectors.
+            array: Address of the array.
+            pitch: Elements from one column to the next.
+            row: First row of the block.
+            end: Row to stop before.
+            size: Number of columns.
+        """
+        builder, lanes = self.vectors.ir, self.lanes
         for index in range(size):
-            value = _load(vectors, rows[0], index, DOUBLE)
-            vectors.store(_in_all_lanes(vectors, value), block, index)
-        return
-    for start in _square_starts(size, lanes):
-        square = _transposed(vectors, [_load(vectors, row, start, vectors.type) for row in rows])
-        for column, vector in enumerate(square):
-            vectors.store(vector, block, start + column)
-    for index in range(size if size < lanes else 0):
-        vector = ir.Constant(vectors.type, ir.Undefined)
-        for lane, row in enumerate(rows):
-            value = _load(vectors, row, index, DOUBLE)
-            vector = vectors.ir.insert_element(vector, value, _lane(lane))
-        vectors.store(vector, block, index)
+            offset = builder.add(builder.mul(pitch, INDEX(index)), row)
+            address = builder.gep(array, [offset], source_etype=self.element)
+            value = self._stored(block, index)
+            if lanes == 1:
+                builder.store(value, address, align=BYTES[self.dtype])
+            else:
+                self._masked_store(value, address, builder.sub(end, row))
+
+    def _masked_store(self, value: ir.Value, address: ir.Value, count: ir.Value) -> None:
+        """Store the first `count` lanes."""
+        builder, lanes = self.vectors.ir, self.lanes
+        truths = ir.VectorType(ir.IntType(1), lanes)
+        indices = ir.Constant(ir.VectorType(INDEX, lanes), list(range(lanes)))
+        limit = self._filled(count, lanes)
+        mask = builder.icmp_signed("<", indices, limit)
+        code = {"float64": "f64", "float32": "f32", "bool": "i8"}[self.dtype]
+        signature = ir.FunctionType(ir.VoidType(), [value.type, POINTER, INT32, truths])
+        name = f"llvm.masked.store.v{lanes}{code}.p0"
+        function = builder.module.globals.get(name) or ir.Function(builder.module, signature, name)
+        builder.call(function, [value, address, INT32(BYTES[self.dtype]), mask])
+
+    def _filled(self, value: ir.Value, lanes: int) -> ir.Value:
+        builder = self.vectors.ir
+        kind = ir.VectorType(value.type, lanes)
+        first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, INT32(0))
+        return builder.shuffle_vector(first, first, _mask([0] * lanes))
+
+    # Conversions between the array's elements and the numbers that are computed in.
+
+    def _computed(self, vector: ir.Value) -> ir.Value:
+        """From elements to numbers."""
+        builder, wanted = self.vectors.ir, self.vectors.type
+        if self.dtype == "bool":
+            return builder.uitofp(vector, wanted)
+        if self.dtype == self.vectors.target.precision:
+            return vector
+        return builder.fptrunc(vector, wanted) if self.dtype == "float64" else builder.fpext(vector, wanted)
+
+    def _stored(self, block: ir.Value, index: int) -> ir.Value:
+        """A vector of a block as elements; a truth value is whether the number is not zero."""
+        builder, wanted = self.vectors.ir, vector_type(self.element, self.lanes)
+        vector = self.vectors.load(block, index)
+        if self.dtype == "bool":
+            return builder.zext(self.vectors.compare("!=", vector, self.vectors.constant(0.0)), wanted)
+        if self.dtype == self.vectors.target.precision:
+            return vector
+        return builder.fptrunc(vector, wanted) if self.dtype == "float32" else builder.fpext(vector, wanted)
+
+    # Vectors of elements.
+
+    def _transposed(self, rows: list[ir.Value]) -> list[ir.Value]:
+        """Transpose a square of vectors: exchange off-diagonal blocks, halving their size."""
+        width = len(rows)
+        distance = width // 2
+        while distance:
+            for upper in range(width):
+                if upper & distance:
+                    continue
+                lower = upper + distance
+                a, b = rows[upper], rows[lower]
+                from_upper = [i if not i & distance else width + i - distance for i in range(width)]
+                from_lower = [i + distance if not i & distance else width + i for i in range(width)]
+                rows[upper] = self.vectors.ir.shuffle_vector(a, b, _mask(from_upper))
+                rows[lower] = self.vectors.ir.shuffle_vector(a, b, _mask(from_lower))
+            distance //= 2
+        return rows
+
+    def _joined(self, parts: list[ir.Value]) -> ir.Value:
+        """Vectors one after another in a single one."""
+        while len(parts) > 1:
+            width = 2 * parts[0].type.count
+            pairs = zip(parts[::2], parts[1::2], strict=True)
+            parts = [self.vectors.ir.shuffle_vector(a, b, _mask(range(width))) for a, b in pairs]
+        return parts[0]
+
+    def _part(self, vector: ir.Value, first: int, width: int) -> ir.Value:
+        """Some consecutive lanes of a vector."""
+        if width == self.lanes:
+            return vector
+        return self.vectors.ir.shuffle_vector(vector, vector, _mask(range(first, first + width)))
+
+    def _assembled(self, values: Sequence[ir.Value]) -> ir.Value:
+        """A vector from the value of each lane."""
+        if len(values) == 1:
+            return values[0]
+        vector: ir.Value = ir.Constant(vector_type(self.element, self.lanes), ir.Undefined)
+        for lane, value in enumerate(values):
+            vector = self.vectors.ir.insert_element(vector, value, INT32(lane))
+        return vector
+
+    def _lane_of(self, vector: ir.Value, lane: int) -> ir.Value:
+        return vector if self.lanes == 1 else self.vectors.ir.extract_element(vector, INT32(lane))
+
+    def _load(self, row: ir.Value, index: int, width: int) -> ir.Value:
+        address = self.vectors.ir.gep(row, [INDEX(index)], source_etype=self.element)
+        return self.vectors.ir.load(address, align=BYTES[self.dtype], typ=vector_type(self.element, width))
+
+    def _store(self, value: ir.Value, row: ir.Value, index: int) -> None:
+        address = self.vectors.ir.gep(row, [INDEX(index)], source_etype=self.element)
+        self.vectors.ir.store(value, address, align=BYTES[self.dtype])
 
 
-def scatter(
-    vectors: VectorBuilder,
-    block: ir.Value,
-    rows: Sequence[ir.Value],
-    size: int,
-    positions: Sequence[int] | None,
-) -> None:
-    """Write a block of vectors to rows of an array.
-
-    Args:
-        vectors: Builder to append to.
-        block: Address of the block, `size` vectors.
-        rows: Address of each lane's row.
-        size: Numbers that are written to a row.
-        positions: Where in a row each of them goes; None for one after another.
-    """
-    lanes = len(rows)
-    whole = positions is None and 1 < lanes <= size
-    for start in _square_starts(size, lanes) if whole else ():
-        square = _transposed(vectors, [vectors.load(block, start + column) for column in range(lanes)])
-        for row, vector in zip(rows, square, strict=True):
-            _store(vectors, vector, row, start)
-    for index, position in enumerate(() if whole else positions or range(size)):
-        vector = vectors.load(block, index)
-        for lane, row in enumerate(rows):
-            value = vector if lanes == 1 else vectors.ir.extract_element(vector, _lane(lane))
-            _store(vectors, value, row, position)
+def _square_width(size: int, lanes: int) -> int:
+    """Largest power of two that neither a row nor a vector is shorter than."""
+    width = 1
+    while 2 * width <= min(size, lanes):
+        width *= 2
+    return width
 
 
-def _square_starts(size: int, lanes: int) -> Iterator[int]:
+def _square_starts(size: int, width: int) -> Iterator[int]:
     """First columns of squares that cover a row; the last one overlaps its neighbor."""
-    if size >= lanes:
-        yield from range(0, size - lanes + 1, lanes)
-        if size % lanes:
-            yield size - lanes
-
-
-def _transposed(vectors: VectorBuilder, rows: list[ir.Value]) -> list[ir.Value]:
-    """Transpose a square of vectors: exchange off-diagonal blocks, halving their size."""
-    lanes = len(rows)
-    rows = list(rows)
-    distance = lanes // 2
-    while distance:
-        for upper in range(lanes):
-            if upper & distance:
-                continue
-            lower = upper + distance
-            a, b = rows[upper], rows[lower]
-            from_upper = [lane if not lane & distance else lanes + lane - distance for lane in range(lanes)]
-            from_lower = [lane + distance if not lane & distance else lanes + lane for lane in range(lanes)]
-            rows[upper] = vectors.ir.shuffle_vector(a, b, _mask(from_upper))
-            rows[lower] = vectors.ir.shuffle_vector(a, b, _mask(from_lower))
-        distance //= 2
-    return rows
+    yield from range(0, size - width + 1, width)
+    if size % width:
+        yield size - width
 
 
 def _mask(lanes: Sequence[int]) -> ir.Constant:
-    return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes))
-
-
-def _lane(index: int) -> ir.Constant:
-    return ir.IntType(32)(index)
-
-
-def _in_all_lanes(vectors: VectorBuilder, value: ir.Value) -> ir.Value:
-    if vectors.target.lanes == 1:
-        return value
-    vector: ir.Value = ir.Constant(vectors.type, ir.Undefined)
-    for lane in range(vectors.target.lanes):
-        vector = vectors.ir.insert_element(vector, value, _lane(lane))
-    return vector
-
-
-def _load(vectors: VectorBuilder, row: ir.Value, index: int, kind: ir.Type) -> ir.Value:
-    address = vectors.ir.gep(row, [INDEX(index)], source_etype=DOUBLE)
-    return vectors.ir.load(address, align=8, typ=kind)
-
-
-def _store(vectors: VectorBuilder, value: ir.Value, row: ir.Value, index: int) -> None:
-    vectors.ir.store(value, vectors.ir.gep(row, [INDEX(index)], source_etype=DOUBLE), align=8)
+    return ir.Constant(ir.VectorType(INT32, len(lanes)), list(lanes))

@@ -1,21 +1,32 @@
-"""The constants of a robot: what the equations of motion need of a scene, as plain numbers.
+"""The constants of a robot: what the equations of motion need of a scene, as plain scalars.
 
 A `Chain` is a base, revolute links in a row, perhaps a massless wrist, and a tip frame. Link frames are the
-joint frames of the
-paper: frame i is fixed in the distal body i+1, its z axis lies along the joint axis. A payload is merged into
-the body that holds it.
+joint frames of the paper: frame i is fixed in the distal body i+1, its z axis lies along the joint axis. A
+payload is merged into the body that holds it. Masses and inertias are numbers; where a scene draws them anew
+for each episode, they are symbols.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from dq_space_arm_env.algebra.vectors import (
+    add,
+    dot,
+    matrix_product,
+    matrix_vector,
+    scale,
+    subtract,
+    transpose,
+)
 
 if TYPE_CHECKING:
-    from dq_space_arm_env.scene import Payload, Pose, Scene
+    from dq_space_arm_env.scene import Base, Link, Payload, Pose, Scene
+    from dq_space_arm_env.scene.start import MassFactors
 
+Scalar = Any
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 
@@ -30,9 +41,9 @@ class RigidBody:
         inertia: Inertia about the center of mass, body axes, 3x3, kg m^2.
     """
 
-    mass: float
-    center_of_mass: Vector
-    inertia: Matrix
+    mass: Scalar
+    center_of_mass: Sequence[Scalar]
+    inertia: Sequence[Sequence[Scalar]]
 
 
 @dataclass(frozen=True)
@@ -90,25 +101,23 @@ class Chain:
     planar: bool
 
     @classmethod
-    def from_scene(cls, scene: Scene) -> Chain:
+    def from_scene(cls, scene: Scene, masses: MassFactors | None = None) -> Chain:
         """Collect a scene's constants.
 
         Args:
             scene: A validated scene.
+            masses: What masses and inertias are multiplied by; None for the scene's own.
 
         Returns:
             The chain.
+
+        Raises:
+            ValueError: If there is a payload but no link to hold it.
         """
-        bodies = [RigidBody(link.mass, link.center_of_mass, link.inertia) for link in scene.links]
-        base = RigidBody(scene.base.mass, (0.0, 0.0, 0.0), scene.base.inertia)
-        if scene.payload is not None:
-            if bodies:
-                bodies[-1] = _merged(bodies[-1], scene.payload, scene.tip)
-            else:
-                raise ValueError("payload: a scene without links cannot hold one; add its mass to the base")
         wrench = scene.tip_wrench
+        bodies = _link_bodies(scene, masses)
         return cls(
-            base=base,
+            base=_rigid_body(scene.base, (0.0, 0.0, 0.0), *_base_factors(masses)),
             links=tuple(
                 RevoluteLink(body, _placement(link.joint), link.stiffness, link.rest_angle, link.damping)
                 for body, link in zip(bodies, scene.links, strict=True)
@@ -120,21 +129,55 @@ class Chain:
         )
 
 
+def _base_factors(masses: MassFactors | None) -> tuple[Scalar, Scalar]:
+    return (1.0, 1.0) if masses is None else (masses.base_mass, masses.base_inertia)
+
+
+def _link_bodies(scene: Scene, masses: MassFactors | None) -> list[RigidBody]:
+    """Mass properties of the links in their joint frames, the payload merged into the last one."""
+    ones = (1.0,) * len(scene.links)
+    factors = (ones, ones) if masses is None else (masses.link_masses, masses.link_inertias)
+    bodies = [
+        _rigid_body(link, link.center_of_mass, mass, inertia)
+        for link, mass, inertia in zip(scene.links, *factors, strict=True)
+    ]
+    if scene.payload is not None:
+        if not bodies:
+            raise ValueError("payload: a scene without links cannot hold one; add its mass to the base")
+        factor = (1.0, 1.0) if masses is None else (masses.payload_mass, masses.payload_inertia)
+        payload = _rigid_body(scene.payload, scene.payload.center_of_mass, *factor)
+        bodies[-1] = _merged(bodies[-1], _moved(payload, scene.tip))
+    return bodies
+
+
+def _rigid_body(
+    body: Base | Link | Payload, center_of_mass: Vector, mass: Scalar, inertia: Scalar
+) -> RigidBody:
+    rows = tuple(tuple(inertia * entry for entry in row) for row in body.inertia)
+    return RigidBody(mass * body.mass, center_of_mass, rows)
+
+
 def _placement(pose: Pose) -> Placement:
     return Placement(pose.position, pose.rotation_matrix, pose.dual_quaternion)
 
 
-def _merged(body: RigidBody, payload: Payload, tip: Pose) -> RigidBody:
-    """Mass properties of a body and the payload it holds, by the parallel axis theorem."""
-    rotation = np.array(tip.rotation_matrix)
-    masses = np.array([body.mass, payload.mass])
-    centers = np.array([body.center_of_mass, np.array(tip.position) + rotation @ payload.center_of_mass])
-    inertias = [np.array(body.inertia), rotation @ np.array(payload.inertia) @ rotation.T]
-    center = masses @ centers / masses.sum()
-    inertia = np.zeros((3, 3))
-    for mass, position, own in zip(masses, centers, inertias, strict=True):
-        arm = position - center
-        inertia += own + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    inertia = 0.5 * (inertia + inertia.T)
-    rows = tuple(tuple(float(entry) for entry in row) for row in inertia)
-    return RigidBody(float(masses.sum()), tuple(float(c) for c in center), rows)  # type: ignore[arg-type]
+def _moved(body: RigidBody, pose: Pose) -> RigidBody:
+    """Mass properties of a body in the frame in which its own has a given pose."""
+    rotation = pose.rotation_matrix
+    inertia = matrix_product(matrix_product(rotation, body.inertia), transpose(rotation))
+    return RigidBody(body.mass, add(pose.position, matrix_vector(rotation, body.center_of_mass)), inertia)
+
+
+def _merged(a: RigidBody, b: RigidBody) -> RigidBody:
+    """Mass properties of two bodies that move as one, by the parallel axis theorem."""
+    mass = a.mass + b.mass
+    moments = add(scale(a.mass, a.center_of_mass), scale(b.mass, b.center_of_mass))
+    # About the common center of mass, the two act like their reduced mass at their distance.
+    d = subtract(b.center_of_mass, a.center_of_mass)
+    reduced = a.mass * b.mass / mass
+    inertia = [[0.0] * 3 for _ in range(3)]
+    for i in range(3):
+        for j in range(i + 1):
+            entry = a.inertia[i][j] + b.inertia[i][j] - reduced * (d[i] * d[j])
+            inertia[i][j] = inertia[j][i] = entry + reduced * dot(d, d) if i == j else entry
+    return RigidBody(mass, scale(1.0 / mass, moments), tuple(map(tuple, inertia)))

@@ -16,21 +16,18 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.environment.start_options import given_start
 from dq_space_arm_env.kernels import compile_scene
-from dq_space_arm_env.kernels.report import REPORT
+from dq_space_arm_env.kernels.bound import run_on_rows
+from dq_space_arm_env.kernels.report import REPORT, STATE_LIMIT
 from dq_space_arm_env.scene import Scene, load_scene
-from dq_space_arm_env.scene.start import draw_initial_state
+from dq_space_arm_env.scene.start import episode_scene
 
 if TYPE_CHECKING:
     from dq_space_arm_env.environment.rendering import Renderer
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
-# An observation whose norm (m, rad, m/s, rad/s) is beyond this comes from a simulation that has blown up.
-OBSERVATION_LIMIT = 1e6
-
-_STAGE_COST, _TERMINAL_COST, _OBSERVATION_SQUARE = (
-    REPORT.index(name) for name in ("stage_cost", "terminal_cost", "observation_square")
-)
+# No observation of a simulation that has not blown up (m, rad, m/s, rad/s) is beyond this.
+OBSERVATION_LIMIT = 2.0 * STATE_LIMIT
 
 
 class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
@@ -93,14 +90,16 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
     ## Starting State
 
-    `reset(seed=...)` draws the start from the scene's spread, uniformly per component. `options={"nominal": True}` starts at the scene's initial state,
-    `options={"initial_state": x}` at a state x (`env.unwrapped.kernels.layout.state` names its entries).
+    `reset(seed=...)` draws the start from the scene's spread, uniformly per component; where the scene has a spread for them, the target, masses and inertias too
+    (scenes `random-target` and `random-masses`). `options={"nominal": True}` starts at the scene's initial state, `options={"initial_state": x}` at a state x
+    (`env.unwrapped.kernels.layout.state` names its entries); both leave target and masses at their nominal values. `env.unwrapped.episode_scene` is the scene of
+    the running episode, with what was drawn as plain numbers: what an optimal controller may know.
 
     ## Episode End
 
     1. Termination: the scene's number of steps (1000) is reached. The time left is part of the observation and the terminal cost part of the task, so this is an
        end of the task, not a truncation.
-    2. Termination: the simulation diverged (an observation that is not finite, or whose norm exceeds 1e6). `info["diverged"]` says so, and the remaining steps are charged at
+    2. Termination: the simulation diverged (a state that is not finite, or whose norm exceeds 5e5). `info["diverged"]` says so, and the remaining steps are charged at
        the cost of the last sound state, so that ending early never pays.
 
     ## Arguments
@@ -172,34 +171,44 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.scene.simulation.dt))}
         self.action_space = spaces.Box(-1.0, 1.0, (layout.n_u,), np.float32)
-        self._steps, self._dt = self.scene.simulation.steps, self.scene.simulation.dt
-        self._angle_tolerance = self.scene.success.attitude_error_deg
-        self._distance_tolerance = self.scene.success.position_error
-        self._bind_kernel()
-        self._h[0] = self._dt
+        self._bind_kernels()
         self.observation_space = self._make_observation_space()
-        self._step_count = -1
+        self._begun, self._over = False, True
         self._trail: list[Array] = []
         self._renderer: Renderer | None = None
 
     def _make_observation_space(self) -> spaces.Space[Array]:
+        simulation, dtype = self.scene.simulation, self._observation.dtype
         high = np.full(self._observation.shape, OBSERVATION_LIMIT)
         real_part = 2 if self.kernels.layout.planar else 4
-        high[:real_part] = 1.0 + 1e-6  # a unit quaternion may exceed 1 by a rounding error
-        high[-1] = self._steps * self._dt
+        # A unit quaternion and the time left may exceed their bounds by a rounding error.
+        high[:real_part] = 1.0 + 1e-5
+        high[-1] = simulation.steps * simulation.dt * (1.0 + 1e-6)
         low = -high
         low[-1] = 0.0
-        return spaces.Box(low, high, dtype=np.float64)
+        return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
 
-    def _bind_kernel(self) -> None:
-        """Give the compiled step arrays of its own; their addresses are handed over once."""
-        kernel = self.kernels.kernel("environment_step", lanes=1)
-        arrays = {spec.name: np.zeros(spec.stride) for spec in (*kernel.inputs, *kernel.outputs)}
-        self._x, self._x_next = arrays["x"], arrays["x_next"]
-        self._action, self._time_left, self._h = arrays["action"], arrays["time_left"], arrays["h"]
-        self._observation, self._report = arrays["observation"], arrays["report"]
-        self._buffers = np.array([array.ctypes.data for array in arrays.values()], dtype=np.int64)
-        self._run_kernel = partial(kernel.native.function, 0, 1, self._buffers.ctypes.data)
+    def _bind_kernels(self) -> None:
+        """Give the compiled functions arrays of their own; those of a step get their addresses once."""
+        start = self.kernels.kernel("environment_start", lanes=1)
+        observe = self.kernels.kernel("environment_observe", lanes=1)
+        step = self.kernels.kernel("environment_step", lanes=1)
+        arrays = {
+            spec.name: np.zeros(spec.stride, dtype=spec.dtype)
+            for kernel in (start, observe, step)
+            for spec in (*kernel.inputs, *kernel.outputs)
+        }
+        # A step reads state and memory before it writes them: they stay where they are.
+        arrays["x_kept"], arrays["memory_kept"] = arrays["x"], arrays["memory"]
+        self._begin = partial(run_on_rows, start, np.zeros(1, dtype=np.int64), arrays)
+        self._look = partial(run_on_rows, observe, np.zeros(1, dtype=np.int64), arrays)
+        self._x, self._memory, self._draws = arrays["x"], arrays["memory"], arrays["draws"]
+        self._parameters = arrays.get("parameters", np.zeros(0, dtype=self.kernels.dtype))
+        self._action, self._observation = arrays["action"], arrays["observation"]
+        self._action_shape = self._action.shape
+        self._report, self._flags = arrays["report"], arrays["flags"]
+        self._errors, self._success = arrays["errors"], arrays["is_success"]
+        self._take_step = step.bind_one([arrays[spec.name] for spec in (*step.inputs, *step.outputs)])
 
     @property
     def state(self) -> Array:
@@ -208,9 +217,34 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         Raises:
             ResetNeeded: Before the first reset.
         """
-        if self._step_count < 0:
+        if not self._begun:
             raise ResetNeeded("call reset() before reading the state")
         return self._x.copy()
+
+    @property
+    def parameters(self) -> Array:
+        """What the scene drew for this episode besides the state, as the equations of motion read it; a copy.
+
+        Shape (n_p,), empty for a scene that draws states only; `EpisodeParameters.of(scene).names` in
+        `dq_space_arm_env.kernels.parameters` says what each is.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+        """
+        if not self._begun:
+            raise ResetNeeded("call reset() before reading the parameters")
+        return self._parameters.copy()
+
+    @property
+    def episode_scene(self) -> Scene:
+        """The scene with the target, masses and inertias of this episode, and without a spread.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+        """
+        if not self._begun:
+            raise ResetNeeded("call reset() before asking for the episode's scene")
+        return episode_scene(self.scene, self._draws.tolist())
 
     def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Apply an action for one time step.
@@ -225,44 +259,34 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             ResetNeeded: Before the first reset, and after the end of an episode.
             ValueError: If the action has a wrong shape or a NaN.
         """
-        remaining = self._steps - self._step_count - 1
-        if remaining < 0 or self._step_count < 0:
-            state = "has not begun" if self._step_count < 0 else "is over"
+        if self._over:
+            state = "is over" if self._begun else "has not begun"
             raise ResetNeeded(f"the episode {state}: call reset() before step()")
-        if np.shape(action) != self._action.shape:
-            raise ValueError(f"action: shape {np.shape(action)}, should be {self._action.shape}")
-        self._action[:] = action
-        self._time_left[0] = remaining * self._dt
-        terminal_cost = self._report[_TERMINAL_COST]
-        self._run_kernel()
-        report = self._report.tolist()
-        # Written so that NaN counts as diverged.
-        if not report[_OBSERVATION_SQUARE] <= OBSERVATION_LIMIT**2:
-            if np.isnan(self._action).any():
-                self._observe()  # what the next step may need of the last report
-                raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
-            return self._end_diverged(report, terminal_cost)
-        self._step_count += 1
-        self._x[:] = self._x_next
-        done = remaining == 0
-        reward = -report[_STAGE_COST]
-        if done:
-            reward -= report[_TERMINAL_COST]
+        # An array knows its shape; anything else is asked for it more slowly.
+        shape = action.shape if isinstance(action, np.ndarray) else np.shape(action)
+        if shape != self._action_shape:
+            raise ValueError(f"action: shape {shape}, should be {self._action_shape}")
+        self._action[...] = action
+        self._take_step()
+        over, success, diverged = self._flags.tolist()
+        reward, pose, velocity, control, end_pose, end_velocity, angle, distance = self._report.tolist()
+        if diverged and np.isnan(self._action).any():
+            raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
+        self._over = over
         if self.render_mode is not None:
             self._show()
-        return self._observation.copy(), reward, done, False, self._info(report, terminal=done)
-
-    def _end_diverged(
-        self, report: list[float], terminal_cost: float
-    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """End the episode at the last sound state, which is kept, and charge what is left of it."""
-        remaining = self._steps - self._step_count
-        reward = -report[_STAGE_COST] * remaining - float(terminal_cost)
-        self._observe()
-        self._step_count = self._steps
-        info = self._info([*report[:3], *self._report.tolist()[3:]], terminal=True)
-        info.update(diverged=True, is_success=False)
-        return self._observation.copy(), reward, True, False, info
+        info = {
+            "cost_pose": pose,
+            "cost_base_velocity": velocity,
+            "cost_control": control,
+            "terminal_cost_pose": end_pose,
+            "terminal_cost_base_velocity": end_velocity,
+            "attitude_error": angle,
+            "position_error": distance,
+            "is_success": success,
+            "diverged": diverged,
+        }
+        return self._observation.copy(), reward, over, False, info
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -281,37 +305,20 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         """
         super().reset(seed=seed)
         start = given_start(self.kernels, options or {})
-        self._x[:] = draw_initial_state(self.scene, self.np_random) if start is None else start
-        self._step_count = 0
-        self._time_left[0] = self._steps * self._dt
-        self._observe()
+        self._draws[:] = 0.0 if start is not None else self.np_random.uniform(-1.0, 1.0, self._draws.shape)
+        self._begin()
+        if start is not None:
+            self._x[:] = start
+        self._memory[0] = 0.0
+        self._look()
+        self._begun, self._over = True, False
         self._trail = []
         if self.render_mode is not None:
             self._show()
-        return self._observation.copy(), self._info(
-            [0.0, 0.0, 0.0, *self._report.tolist()[3:]], terminal=False
-        )
-
-    def _observe(self) -> None:
-        """Observation, errors and terminal cost of the present state: what a step of no duration reports."""
-        self._action[:] = 0.0
-        self._h[0] = 0.0
-        self._run_kernel()
-        self._h[0] = self._dt
-
-    def _info(self, report: list[float], *, terminal: bool) -> dict[str, Any]:
-        pose, base_velocity, control, terminal_pose, terminal_velocity, angle, distance = report[:7]
-        return {
-            "cost_pose": pose,
-            "cost_base_velocity": base_velocity,
-            "cost_control": control,
-            "terminal_cost_pose": terminal_pose if terminal else 0.0,
-            "terminal_cost_base_velocity": terminal_velocity if terminal else 0.0,
-            "attitude_error": angle,
-            "position_error": distance,
-            "is_success": angle <= self._angle_tolerance and distance <= self._distance_tolerance,
-            "diverged": False,
-        }
+        info = dict.fromkeys(REPORT[1:], 0.0)
+        info["attitude_error"], info["position_error"] = self._errors.tolist()
+        info |= {"is_success": bool(self._success[0]), "diverged": False}
+        return self._observation.copy(), info
 
     def _show(self) -> None:
         """Remember where the tip is, and update the window."""
@@ -334,7 +341,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
                 'render() does nothing without a render mode, e.g. gymnasium.make("DQSpaceArm-v0", render_mode="rgb_array")'
             )
             return None
-        if self._step_count < 0:
+        if not self._begun:
             raise ResetNeeded("call reset() before render()")
         if self._renderer is None:
             from dq_space_arm_env.environment.rendering import Renderer

@@ -70,6 +70,8 @@ class VectorField(Protocol):
         pose: Coordinates of the pose; None for a formulation that has it among the entries of y.
         rate_indices: The entries of y whose time derivatives are accelerations; the others' are velocities or
             inputs.
+        parameters: Symbols besides y and u that the equations hold, an input of every graph that evaluates
+            them.
     """
 
     name: str
@@ -77,6 +79,7 @@ class VectorField(Protocol):
     n_y: int
     n_u: int
     rate_indices: tuple[int, ...]
+    parameters: tuple[Scalar, ...]
 
     @property
     def pose(self) -> PoseCoordinates | None:
@@ -117,6 +120,19 @@ class Integrator(Protocol):
             by column.
         """
         ...
+
+
+def graph_inputs(field: VectorField, **symbols: Sequence[Scalar]) -> dict[str, Sequence[Scalar]]:
+    """Inputs of a graph that evaluates the equations of motion.
+
+    Args:
+        field: The equations of motion.
+        symbols: The symbols of each input.
+
+    Returns:
+        The same with the parameters of the equations, if there are any, as input `parameters`.
+    """
+    return {**symbols, "parameters": field.parameters} if field.parameters else symbols
 
 
 def split_state(field: VectorField, x: Sequence[Scalar]) -> tuple[Sequence[Scalar], Sequence[Scalar]]:

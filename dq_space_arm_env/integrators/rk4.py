@@ -16,7 +16,7 @@ from dq_space_arm_env.algebra.dual_vectors import cross as dual_cross
 from dq_space_arm_env.compiler.graph import graph_of, trace
 from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.compiler.symbols import column, symbols, zeros
-from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, split_state
+from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, graph_inputs, split_state
 from dq_space_arm_env.integrators.linearization import pose_blocks
 
 Scalar = Any
@@ -51,7 +51,7 @@ class RungeKuttaMuntheKaas4:
 
         n_y = field.n_y
         sizes = {"x": field.n_x, "u": field.n_u, "k": n_y, "offset": 1}
-        rates = trace(f"{field.name}_rk4_stage", sizes, stage)
+        rates = trace(f"{field.name}_rk4_stage", sizes, stage, parameters=field.parameters)
         sum_sizes = {"x": field.n_x, "h": 1, "k1": n_y, "k2": n_y, "k3": n_y, "k4": n_y}
         total = trace(f"{field.name}_rk4_sum", sum_sizes, combine)
         program.call(_offsets_graph(field), zero="offset1", half="offset2", full="offset4")
@@ -151,7 +151,7 @@ def _linearized_stage(field: VectorField, pattern: Any) -> Any:
     rate_change = casadi.mtimes(by_y, start) + casadi.horzcat(zeros(n_y, n_y), by_u)
     return graph_of(
         f"{field.name}_rk4_linearized_stage",
-        {"x": x, "u": u, "k": k, "change": change.nonzeros(), "offset": [offset]},
+        graph_inputs(field, x=x, u=u, k=k, change=change.nonzeros(), offset=[offset]),
         {"rates": rates, "rate_change": casadi.project(rate_change, pattern).nonzeros()},
     )
 

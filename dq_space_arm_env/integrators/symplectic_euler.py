@@ -10,7 +10,7 @@ import casadi
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.compiler.symbols import symbols, zeros
-from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, split_state
+from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, graph_inputs, split_state
 from dq_space_arm_env.integrators.linearization import pose_blocks
 
 Scalar = Any
@@ -30,7 +30,7 @@ class SymplecticEuler:
         x_next = (
             y if field.pose is None else [*field.pose.moved(stored, self._increment(field.pose, y, h)), *y]
         )
-        graph = graph_of(f"{field.name}_euler", {"x": x, "u": u, "h": [h]}, {"x_next": x_next})
+        graph = graph_of(f"{field.name}_euler", graph_inputs(field, x=x, u=u, h=[h]), {"x_next": x_next})
         program.call(graph)
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
@@ -61,7 +61,7 @@ class SymplecticEuler:
         a, b = casadi.sparsify(a), casadi.sparsify(change[:, field.n_y :])
         graph = graph_of(
             f"{field.name}_euler_linearization",
-            {"x": x, "u": u, "h": [h]},
+            graph_inputs(field, x=x, u=u, h=[h]),
             {"A": a.nonzeros(), "B": b.nonzeros()},
         )
         program.call(graph)

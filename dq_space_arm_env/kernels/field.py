@@ -67,14 +67,16 @@ class SpaceArmField:
 
     name = "minimal"
 
-    def __init__(self, chain: Chain, layout: StateLayout) -> None:
+    def __init__(self, chain: Chain, layout: StateLayout, parameters: Sequence[Scalar] = ()) -> None:
         """Describe the coordinates.
 
         Args:
             chain: Constants of the robot.
             layout: Where each quantity stands in state and input.
+            parameters: Symbols among the constants of the robot.
         """
         self.chain = chain
+        self.parameters = tuple(parameters)
         self.layout = layout
         self.n_x = layout.n_x
         self.n_u = layout.n_u

@@ -23,33 +23,43 @@ from dq_space_arm_env.scene.layout import StateLayout
 
 if TYPE_CHECKING:
     from dq_space_arm_env.compiler.program import Program
+    from dq_space_arm_env.kernels.environment_programs import EnvironmentPrograms
     from dq_space_arm_env.kernels.programs import ScenePrograms
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 class Kernels:
-    """The compiled functions of a scene.
+    """The compiled functions of a scene, with its nominal target, masses and inertias.
 
-    Every function takes one state (n_x,) or a batch (B, n_x), and returns results of the same form. Batches
-    run on vector instructions, several states at a time, and give bit for bit what the states give one by
-    one.
+    Every function takes one state (n_x,) or a batch (B, n_x), and returns results of the same form, arrays of
+    the scene's precision. Batches run on vector instructions, several states at a time, and give bit for bit
+    what the states give one by one.
 
     Attributes:
         scene: The scene.
+        threads: Most threads that a batch is shared among.
+        dtype: Type of all results, and of the arithmetic: the scene's precision.
         layout: Names, units and places of the entries of states, tangent states and inputs.
         n_x: Number of states.
         n_t: Number of tangent coordinates.
         n_u: Number of inputs.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, threads: int = 1) -> None:
         """Prepare; nothing is compiled yet.
 
         Args:
             scene: A validated scene.
+            threads: Most threads that a batch is shared among.
+
+        Raises:
+            ValueError: If the number of threads is not positive.
         """
-        self.scene = scene
+        if threads < 1:
+            raise ValueError(f"threads: {threads}, should be at least 1")
+        self.scene, self.threads = scene, threads
+        self.dtype = np.dtype(scene.simulation.precision)
         self.layout = StateLayout.of(scene)
         self.n_x, self.n_t, self.n_u = self.layout.n_x, self.layout.n_t, self.layout.n_u
         self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
@@ -62,11 +72,22 @@ class Kernels:
 
         return ScenePrograms(self.scene)
 
+    @cached_property
+    def _environment_programs(self) -> EnvironmentPrograms:
+        from dq_space_arm_env.kernels.environment_programs import EnvironmentPrograms
+
+        return EnvironmentPrograms(self.scene)
+
+    @property
+    def lanes(self) -> int:
+        """Rows that vector code works on at a time: numbers of the scene's precision in a vector register."""
+        return native.host_machine().lanes * 8 // self.dtype.itemsize
+
     def kernel(self, name: str, *, integrator: str | None = None, lanes: int | None = None) -> BoundKernel:
         """Compile a program, or load it from the cache.
 
         Args:
-            name: Name of the program (`kernels.programs.ScenePrograms`).
+            name: Name of the program (`ScenePrograms` or `EnvironmentPrograms`, both in `kernels`).
             integrator: Integrator of programs that take a step; the scene's by default.
             lanes: Rows that the code works on at a time: 1, or the processor's vector width (default).
 
@@ -76,12 +97,16 @@ class Kernels:
         Raises:
             ValueError: If there is no integrator of that name.
         """
-        takes_step = name in ("step", "step_with_cost", "environment_step", "linearize")
-        method = (integrator or self.scene.simulation.integrator) if takes_step else ""
-        width = native.host_machine().lanes if lanes is None else lanes
-        key = (name, method, width)
+        method = (integrator or self.scene.simulation.integrator) if name in _STEPS else ""
+        key = (name, method, self.lanes if lanes is None else lanes)
         if key not in self._kernels:
-            self._kernels[key] = self._load(*key, lambda: self._programs.build(name, method))
+
+            def trace() -> Program:
+                of_environment = name.startswith("environment_")
+                programs = self._environment_programs if of_environment else self._programs
+                return programs.build(name, method)
+
+            self._kernels[key] = self._load(*key, trace)
         return self._kernels[key]
 
     def paper_kernel(self, name: str, *, lanes: int | None = None) -> BoundKernel:
@@ -94,7 +119,7 @@ class Kernels:
         Returns:
             The kernel.
         """
-        width = native.host_machine().lanes if lanes is None else lanes
+        width = self.lanes if lanes is None else lanes
         key = (name, width)
         if key not in self._paper_kernels:
 
@@ -113,7 +138,7 @@ class Kernels:
         def build() -> tuple[bytes, dict[str, Any]]:
             from dq_space_arm_env.compiler.build import build_program
 
-            return build_program(trace(), lanes)
+            return build_program(trace(), lanes, self.scene.simulation.precision)
 
         return BoundKernel(native.load_or_build(name, native.cache_key(*parts), build))
 
@@ -133,7 +158,7 @@ class Kernels:
         self, name: str, integrator: str | None = None, **inputs: ArrayLike | None
     ) -> tuple[Array, ...]:
         """Run a program on one row or a batch, and give each output the same form as the inputs."""
-        rows, batched, arrays = rows_of(inputs)
+        rows, batched, arrays = rows_of(inputs, self.dtype)
         kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)
         ordered = []
         for spec in kernel.inputs:
@@ -144,8 +169,8 @@ class Kernels:
                     f"scene {self.scene.name!r} has {spec.stride}"
                 )
             ordered.append(np.ascontiguousarray(array))
-        results = [np.zeros((rows, spec.stride)) for spec in kernel.outputs]
-        kernel([*ordered, *results], rows)
+        results = [np.zeros((rows, spec.stride), self.dtype) for spec in kernel.outputs]
+        kernel([*ordered, *results], rows, self.threads)
         return tuple(result if batched else result[0] for result in results)
 
     def step(
@@ -384,22 +409,33 @@ def _source_hash() -> str:
 
 _MODEL_SOURCES = ("algebra", "compiler", "cost.py", "dynamics", "integrators", "kernels", "scene")
 
+_STEPS = (
+    "step",
+    "step_with_cost",
+    "linearize",
+    "environment_step",
+    "environment_step_float32_actions",
+)
+
 
 @cache
-def _compiled(scene: Scene) -> Kernels:
-    return Kernels(scene)
+def _compiled(scene: Scene, threads: int) -> Kernels:
+    return Kernels(scene, threads)
 
 
-def compile_scene(scene: Scene | str | Path) -> Kernels:
+def compile_scene(scene: Scene | str | Path, threads: int = 1) -> Kernels:
     """Kernels of a scene; the same scene gives the same object within a process.
 
     Args:
         scene: A scene, the name of a shipped one, or a path to a YAML file.
+        threads: Most threads that a batch is shared among. One is best unless batches are large and a core
+            is idle.
 
     Returns:
         The kernels. Each is compiled at its first use, or loaded from the disk cache.
 
     Raises:
         SceneError: If the scene cannot be loaded.
+        ValueError: If the number of threads is not positive.
     """
-    return _compiled(load_scene(scene))
+    return _compiled(load_scene(scene), threads)

@@ -40,6 +40,7 @@ class PaperField:
             minimal_field: The same scene in minimal coordinates.
         """
         self.minimal = minimal_field
+        self.parameters = minimal_field.parameters
         self.chain = minimal_field.chain
         self.n_u = minimal_field.n_u
         n = len(self.chain.links)

@@ -6,7 +6,6 @@ A program's inputs are arrays with one row per state: `x` (n_x), `u` (n_u), and 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -19,13 +18,10 @@ from dq_space_arm_env.algebra.vectors import matrix_vector
 from dq_space_arm_env.compiler.graph import graph_of, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.compiler.symbols import column, matrix, symbols, zeros
-from dq_space_arm_env.cost import weighted_square
 from dq_space_arm_env.dynamics import kinematics, minimal
-from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.integrators import INTEGRATORS
 from dq_space_arm_env.integrators.field import split_state
-from dq_space_arm_env.kernels.field import SpaceArmField
-from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.kernels.equations import SceneEquations, total
 from dq_space_arm_env.scene.schema import Scene
 
 Scalar = Any
@@ -42,9 +38,9 @@ class ScenePrograms:
             scene: A validated scene.
         """
         self.scene = scene
-        self.chain = Chain.from_scene(scene)
-        self.layout = StateLayout.of(scene)
-        self.field = SpaceArmField(self.chain, self.layout)
+        self.equations = SceneEquations.nominal(scene)
+        self.chain, self.layout = self.equations.chain, self.equations.layout
+        self.field = self.equations.field
         self._builders: Mapping[str, Callable[[], Program]] = {
             "forward_dynamics": self._forward_dynamics,
             "forward_dynamics_with_tip_wrench": self._forward_dynamics_with_tip_wrench,
@@ -66,8 +62,7 @@ class ScenePrograms:
         """Trace a program.
 
         Args:
-            name: `step`, `step_with_cost`, `environment_step`, `linearize`, or one of the functions of a
-                state.
+            name: `step`, `step_with_cost`, `linearize`, or one of the functions of a state.
             integrator: Name of the integrator, for those that take a step.
 
         Returns:
@@ -76,7 +71,7 @@ class ScenePrograms:
         Raises:
             KeyError: If there is no such program or integrator.
         """
-        if name in ("step", "step_with_cost", "environment_step"):
+        if name in ("step", "step_with_cost"):
             return self._step(name, integrator)
         if name == "linearize":
             return self._linearize(integrator)
@@ -95,17 +90,11 @@ class ScenePrograms:
         program.call(graph)
         return program
 
-    def _y(self, x: Scalars) -> Scalars:
-        return split_state(self.field, x)[1]
-
-    def _base_pose(self, x: Scalars) -> Scalars:
-        return self.field.pose.full(split_state(self.field, x)[0])
-
     def _forward_dynamics(self) -> Program:
         field = self.field
         return self._program(
             "forward_dynamics",
-            lambda x, u: {"accelerations": field.accelerations(self._y(x), u)},
+            lambda x, u: {"accelerations": field.accelerations(self.equations.y(x), u)},
             x=field.n_x,
             u=field.n_u,
         )
@@ -114,7 +103,7 @@ class ScenePrograms:
         field = self.field
         return self._program(
             "forward_dynamics_with_tip_wrench",
-            lambda x, u, w_tip: {"accelerations": field.accelerations(self._y(x), u, w_tip)},
+            lambda x, u, w_tip: {"accelerations": field.accelerations(self.equations.y(x), u, w_tip)},
             x=field.n_x,
             u=field.n_u,
             w_tip=6,
@@ -124,30 +113,26 @@ class ScenePrograms:
         field = self.field
         return self._program(
             "reaction_wrenches",
-            lambda x, u: {"wrenches": field.reaction_wrenches(self._y(x), u)},
+            lambda x, u: {"wrenches": field.reaction_wrenches(self.equations.y(x), u)},
             x=field.n_x,
             u=field.n_u,
         )
 
-    def _tip(self, x: Scalars) -> Scalars:
-        motion = self.field.motion(self._y(x))
-        return kinematics.tip_pose(self.chain, self._base_pose(x), motion.joint_angles, motion.wrist_angles)
-
     def _tip_pose(self) -> Program:
-        return self._program("tip_pose", lambda x: {"pose": self._tip(x)}, x=self.field.n_x)
+        return self._program("tip_pose", lambda x: {"pose": self.equations.tip(x)}, x=self.field.n_x)
 
     def _frame_poses(self) -> Program:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
-            motion = self.field.motion(self._y(x))
+            motion = self.field.motion(self.equations.y(x))
             frames = kinematics.frame_poses(
-                self.chain, self._base_pose(x), motion.joint_angles, motion.wrist_angles
+                self.chain, self.equations.base_pose(x), motion.joint_angles, motion.wrist_angles
             )
             return {"poses": [entry for frame in frames for entry in frame]}
 
         return self._program("frame_poses", outputs, x=self.field.n_x)
 
     def _velocities(self, x: Scalars) -> tuple[Any, Any, Any]:
-        motion = self.field.motion(self._y(x))
+        motion = self.field.motion(self.equations.y(x))
         rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
         velocities = kinematics.body_velocities(
             self.chain, rotations, (*motion.angular, *motion.linear), motion.joint_rates
@@ -158,7 +143,7 @@ class ScenePrograms:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             _, rotations, velocities = self._velocities(x)
             linear, angular, _ = kinematics.momentum(self.chain, rotations, velocities)
-            attitude, _ = poses.to_matrix(self._base_pose(x))
+            attitude, _ = poses.to_matrix(self.equations.base_pose(x))
             return {"momentum": [*matrix_vector(attitude, linear), *matrix_vector(attitude, angular)]}
 
         return self._program("momentum", outputs, x=self.field.n_x)
@@ -173,39 +158,17 @@ class ScenePrograms:
 
     # The cost and its derivatives.
 
-    def _pose_cost(self, tip: Scalars, weights: Scalars) -> Scalar:
-        return weighted_square(tip, self.scene.target.pose.dual_quaternion, weights)
-
-    def _velocity_cost(self, x: Scalars, weights: Scalars) -> Scalar:
-        motion = self.field.motion(self._y(x))
-        return weighted_square((*motion.angular, *motion.linear), self.scene.target.base_velocity, weights)
-
-    def _cost_terms(self, x: Scalars, u: Scalars) -> list[Scalar]:
-        """Pose, base velocity and effort: the terms of the stage cost."""
-        cost = self.scene.cost
-        effort = weighted_square(u, [0.0] * self.field.n_u, self.layout.control_weight.tolist())
-        return [
-            self._pose_cost(self._tip(x), cost.pose),
-            self._velocity_cost(x, cost.base_velocity),
-            effort,
-        ]
-
-    def _terminal_cost_terms(self, x: Scalars) -> list[Scalar]:
-        cost = self.scene.cost
-        return [
-            self._pose_cost(self._tip(x), cost.terminal_pose),
-            self._velocity_cost(x, cost.terminal_base_velocity),
-        ]
-
     def _cost(self) -> Program:
         field = self.field
         return self._program(
-            "cost", lambda x, u: {"cost": [_sum(self._cost_terms(x, u))]}, x=field.n_x, u=field.n_u
+            "cost", lambda x, u: {"cost": [total(self.equations.cost_terms(x, u))]}, x=field.n_x, u=field.n_u
         )
 
     def _terminal_cost(self) -> Program:
         return self._program(
-            "terminal_cost", lambda x: {"cost": [_sum(self._terminal_cost_terms(x))]}, x=self.field.n_x
+            "terminal_cost",
+            lambda x: {"cost": [total(self.equations.terminal_cost_terms(x))]},
+            x=self.field.n_x,
         )
 
     def _state_cost_derivatives(self, x: Scalars, pose: Scalars, velocity: Scalars) -> tuple[Any, Any]:
@@ -215,11 +178,11 @@ class ScenePrograms:
         by (27).
         """
         field = self.field
-        motion = field.motion(self._y(x))
+        motion = field.motion(self.equations.y(x))
         arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
-        base = self._base_pose(x)
+        base = self.equations.base_pose(x)
         tip = dq.multiply(base, arm)
-        angles = column(*self._y(x)[: self._angle_count()])
+        angles = column(*self.equations.y(x)[: self._angle_count()])
         left, right = dual_matrices.left_matrix(base), dual_matrices.right_matrix(arm)
         directions = []
         for direction in field.pose.directions:
@@ -237,7 +200,7 @@ class ScenePrograms:
         start = field.n_t - field.n_y
         for index, direction in zip(field.pose.twist_indices, field.pose.directions, strict=True):
             weight = velocity[direction]
-            deviation = self._y(x)[index] - self.scene.target.base_velocity[direction]
+            deviation = self.equations.y(x)[index] - self.scene.target.base_velocity[direction]
             gradient[start + index] += 2.0 * weight * deviation
             hessian[start + index, start + index] += 2.0 * weight
         return gradient, casadi.sparsify(hessian)
@@ -292,9 +255,11 @@ class ScenePrograms:
         field = self.field
 
         def outputs(x_reference: Scalars, x: Scalars) -> Mapping[str, Scalars]:
-            relative = dq.multiply(dq.conjugate(self._base_pose(x_reference)), self._base_pose(x))
+            relative = dq.multiply(
+                dq.conjugate(self.equations.base_pose(x_reference)), self.equations.base_pose(x)
+            )
             twist = screw.logarithm(relative)
-            rest = [a - b for a, b in zip(self._y(x), self._y(x_reference), strict=True)]
+            rest = [a - b for a, b in zip(self.equations.y(x), self.equations.y(x_reference), strict=True)]
             return {"dx": [*(twist[i] for i in field.pose.directions), *rest]}
 
         return self._program("difference", outputs, x_reference=field.n_x, x=field.n_x)
@@ -305,39 +270,16 @@ class ScenePrograms:
         def outputs(x: Scalars, dx: Scalars) -> Mapping[str, Scalars]:
             n = len(field.pose.directions)
             pose = field.pose.moved(split_state(field, x)[0], field.pose.full_twist(dx[:n]))
-            return {"x_next": [*pose, *(a + b for a, b in zip(self._y(x), dx[n:], strict=True))]}
+            return {"x_next": [*pose, *(a + b for a, b in zip(self.equations.y(x), dx[n:], strict=True))]}
 
         return self._program("retract", outputs, x=field.n_x, dx=field.n_t)
 
     # What an agent sees.
 
-    def _observe(self, x: Scalars, time_left: Scalar) -> dict[str, Scalars]:
-        """Observation, attitude error in rad and position error in m."""
-        tip, target = self._tip(x), self.scene.target.pose.dual_quaternion
-        error = poses.error_pose(tip, target)  # (31)
-        motion = self.field.motion(self._y(x))
-        layout = self.layout
-        observation = [
-            *error,
-            *(x[layout.state.base_velocity]),
-            *motion.joint_angles,
-            *motion.wrist_angles,
-            *motion.joint_rates,
-            time_left,
-        ]
-        return {
-            "observation": self._keep(observation),
-            "errors": [poses.error_angle(tip, target), poses.error_distance(tip, target)],
-        }
-
-    def _keep(self, observation: list[Scalar]) -> list[Scalar]:
-        """Leave out what a planar scene's error pose has identically zero."""
-        return [*self.field.pose.reduced(observation[:8]), *observation[8:]]
-
     def _observation(self) -> Program:
         return self._program(
             "observation",
-            lambda x, time_left: self._observe(x, time_left[0]),
+            lambda x, time_left: self.equations.observe(x, time_left[0]),
             x=self.field.n_x,
             time_left=1,
         )
@@ -345,58 +287,17 @@ class ScenePrograms:
     # Steps.
 
     def _step(self, name: str, integrator: str) -> Program:
-        """A step alone, with its cost, or as the environment takes it."""
-        if name == "environment_step":
-            return self._environment_step(integrator)
+        """A step alone, or with its cost."""
         field = self.field
         x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
         program = Program(name, [x, u, h], [Buffer("x_next", field.n_x)])
         INTEGRATORS[integrator].append_step(program, field)
         if name == "step_with_cost":
             sizes = {"x": field.n_x, "u": field.n_u}
-            program.call(trace("cost_graph", sizes, lambda x, u: {"cost": [_sum(self._cost_terms(x, u))]}))
+            program.call(
+                trace("cost_graph", sizes, lambda x, u: {"cost": [total(self.equations.cost_terms(x, u))]})
+            )
             program.outputs = [*program.outputs, Buffer("cost", 1)]
-        return program
-
-    def _environment_step(self, integrator: str) -> Program:
-        """Action to inputs, step, observation and report."""
-        field = self.field
-        limits = self.layout.control_limit.tolist()
-
-        def to_inputs(action: Scalars) -> Mapping[str, Scalars]:
-            # Written so that NaN passes: of two numbers that do not compare, the second is taken.
-            clipped = [casadi.fmin(1.0, casadi.fmax(-1.0, value)) for value in action]
-            return {"u": [limit * value for limit, value in zip(limits, clipped, strict=True)]}
-
-        def after(x_next: Scalars, time_left: Scalars, terms: Scalars) -> Mapping[str, Scalars]:
-            seen = self._observe(x_next, time_left[0])
-            terminal = self._terminal_cost_terms(x_next)
-            angle, distance = seen["errors"]
-            square = _sum([value * value for value in seen["observation"]])
-            sums = [_sum(terms), _sum(terminal), square]
-            report = [*terms, *terminal, angle * (180.0 / math.pi), distance, *sums]
-            return {"observation": seen["observation"], "report": report}
-
-        program = Program(
-            "environment_step",
-            [
-                Buffer("x", field.n_x),
-                Buffer("action", field.n_u),
-                Buffer("h", 1, shared=True),
-                Buffer("time_left", 1),
-            ],
-            [],
-        )
-        sizes = {"x": field.n_x, "u": field.n_u}
-        program.call(trace("inputs_graph", {"action": field.n_u}, to_inputs))
-        program.call(trace("terms_graph", sizes, lambda x, u: {"terms": self._cost_terms(x, u)}))
-        INTEGRATORS[integrator].append_step(program, field)
-        report = trace("report_graph", {"x_next": field.n_x, "time_left": 1, "terms": 3}, after)
-        program.call(report)
-        program.outputs = [
-            Buffer("x_next", field.n_x),
-            *(Buffer(name, size) for name, size in report.outputs),
-        ]
         return program
 
     def _linearize(self, integrator: str) -> Program:
@@ -409,13 +310,6 @@ class ScenePrograms:
         a, b = INTEGRATORS[integrator].append_linearization(program, field)
         program.outputs = [sparse_buffer("A", a), sparse_buffer("B", b)]
         return program
-
-
-def _sum(terms: Scalars) -> Scalar:
-    total: Scalar = 0.0
-    for term in terms:
-        total = total + term
-    return total
 
 
 def sparse_buffer(name: str, pattern: Any) -> Buffer:

@@ -73,6 +73,13 @@ def _non_negative(value: Any) -> float:
     return number
 
 
+def _fraction(value: Any) -> float:
+    number = _real(value)
+    if not 0 <= number < 1:
+        raise problem("must be a fraction: 0 or greater, and less than 1")
+    return number
+
+
 def _limit(value: Any) -> float:
     number = _real(value)
     if not number > 0:
@@ -125,6 +132,7 @@ Eight = tuple[float, float, float, float, float, float, float, float]
 Finite = Annotated[float, BeforeValidator(_finite)]
 Positive = Annotated[float, BeforeValidator(_positive)]
 NonNegative = Annotated[float, BeforeValidator(_non_negative)]
+Fraction = Annotated[float, BeforeValidator(_fraction)]
 Limit = Annotated[float, BeforeValidator(_limit)]
 Count = Annotated[int, BeforeValidator(_count)]
 Vector3 = Annotated[Three, BeforeValidator(_vector(3))]

@@ -4,6 +4,7 @@ from pydantic import Field
 
 from dq_space_arm_env.scene._fields import (
     ControlWeights3,
+    Fraction,
     Limit,
     Limits3,
     NonNegative,
@@ -121,7 +122,12 @@ class InitialState(Model):
 
 
 class Spread(Model):
-    """Half-widths of the uniform draws around the nominal start, one number for all components of a part."""
+    """Half-widths of the uniform draws with which an episode begins.
+
+    Around the nominal start and target, one number for all components of a part; around the nominal masses
+    and inertias as fractions of them, drawn for each body. What has no spread is a constant of the machine
+    code.
+    """
 
     base_rotation: NonNegative = Field(
         default=0.0, description="rotation vector of the base in base axes, rad"
@@ -136,6 +142,24 @@ class Spread(Model):
         default=0.0, description="linear velocity of the base, base axes, m/s"
     )
     joint_rates: NonNegative = Field(default=0.0, description="joint rates, rad/s")
+    target_rotation: NonNegative = Field(
+        default=0.0, description="rotation vector of the target in its own axes, rad"
+    )
+    target_position: NonNegative = Field(
+        default=0.0, description="position of the target in inertial axes, m"
+    )
+    base_mass: Fraction = Field(default=0.0, description="mass of the base, as a fraction of it")
+    base_inertia: Fraction = Field(
+        default=0.0, description="inertia of the base about its center of mass, as a fraction of it"
+    )
+    link_masses: Fraction = Field(default=0.0, description="mass of each link, as a fraction of it")
+    link_inertias: Fraction = Field(
+        default=0.0, description="inertia of each link about its center of mass, as a fraction of it"
+    )
+    payload_mass: Fraction = Field(default=0.0, description="mass of the payload, as a fraction of it")
+    payload_inertia: Fraction = Field(
+        default=0.0, description="inertia of the payload about its center of mass, as a fraction of it"
+    )
 
 
 class Success(Model):

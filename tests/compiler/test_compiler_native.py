@@ -15,6 +15,8 @@ from dq_space_arm_env.compiler.program import Buffer, Program
 
 LANES = (1, native.host_machine().lanes)
 EPS = np.finfo(float).eps
+PRECISIONS = ("float64", "float32")
+EVERY_CODE = [(lanes * (2 if p == "float32" and lanes > 1 else 1), p) for p in PRECISIONS for lanes in LANES]
 
 
 def program_of(function, outputs, **sizes):
@@ -24,16 +26,16 @@ def program_of(function, outputs, **sizes):
     return program
 
 
-def run(program, lanes, rows, *arrays):
-    kernel = native.NativeKernel(program.name, *build_program(program, lanes))
+def run(program, lanes, rows, *arrays, precision="float64"):
+    kernel = native.NativeKernel(program.name, *build_program(program, lanes, precision))
     buffers = np.array([array.ctypes.data for array in arrays], dtype=np.int64)
     kernel.function(0, rows, buffers.ctypes.data)
 
 
-def evaluate(function, size_out, lanes, x):
+def evaluate(function, size_out, lanes, x, precision="float64"):
     program = program_of(function, [Buffer("y", size_out)], x=x.shape[1])
-    y = np.zeros((len(x), size_out))
-    run(program, lanes, len(x), np.ascontiguousarray(x), y)
+    y = np.zeros((len(x), size_out), precision)
+    run(program, lanes, len(x), np.ascontiguousarray(x, precision), y, precision=precision)
     return y
 
 
@@ -67,21 +69,24 @@ def everything(x):
     }
 
 
-@pytest.mark.parametrize("lanes", LANES)
-def test_every_operation_agrees_with_numpy(lanes):
-    x = np.random.default_rng(0).normal(size=(100, 3))
+@pytest.mark.parametrize(("lanes", "precision"), EVERY_CODE)
+def test_every_operation_agrees_with_numpy(lanes, precision):
+    x = np.random.default_rng(0).normal(size=(100, 3)).astype(precision)
     x[:10, 1] = x[:10, 0]
     graph = trace("graph", {"x": 3}, everything)
-    expected = np.array([evaluate_graph(graph, [row], np.float64)[0] for row in x])
+    expected = np.array([evaluate_graph(graph, [row.astype(float)], np.float64)[0] for row in x])
+    eps = np.finfo(precision).eps
+    # Differences of products lose what cancels: their error is relative to the products.
     np.testing.assert_allclose(
-        evaluate(everything, expected.shape[1], lanes, x), expected, rtol=4e-15, atol=4e-16
+        evaluate(everything, expected.shape[1], lanes, x, precision), expected, rtol=18 * eps, atol=2 * eps
     )
 
 
-@pytest.mark.parametrize("rows", [1, 2, 7, 8, 9, 16, 23])
-def test_lanes_give_the_bits_of_the_scalar_code(rows):
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("rows", [1, 2, 7, 8, 9, 16, 23, 33])
+def test_lanes_give_the_bits_of_the_scalar_code(rows, precision):
     x = np.random.default_rng(rows).normal(size=(rows, 3)) * 10.0 ** np.arange(-2, 4, 2)
-    scalar, vector = (evaluate(everything, 21, lanes, x) for lanes in LANES)
+    scalar, vector = (evaluate(everything, 21, lanes, x, p) for lanes, p in EVERY_CODE if p == precision)
     np.testing.assert_array_equal(scalar, vector)
 
 
@@ -102,6 +107,21 @@ def test_sine_and_cosine_are_right_to_the_last_place_up_to_1e6(lanes):
                 # 1e-27: what three pieces of pi/2 leave where the function nearly vanishes at large angles.
                 tolerance = 1.5 * EPS * abs(exact) + 1e-27 * (1 + abs(angle)) + 5e-324
                 assert abs(value - exact) <= tolerance, angle
+
+
+@pytest.mark.parametrize(("lanes", "precision"), [code for code in EVERY_CODE if code[1] == "float32"])
+def test_single_precision_functions_are_right_to_the_last_places(lanes, precision):
+    rng = np.random.default_rng(3)
+    x = (rng.choice([-1, 1], 4000) * 10.0 ** rng.uniform(-30, np.log10(6e3), 4000)).astype(np.float32)
+    y = rng.normal(size=4000).astype(np.float32)
+    columns = lambda x: {"y": [casadi.sin(x[0]), casadi.cos(x[0]), casadi.atan2(x[1], x[0])]}  # noqa: E731
+    values = evaluate(columns, 3, lanes, np.column_stack([x, y]), precision)
+    exact = np.column_stack(
+        [np.sin(x.astype(float)), np.cos(x.astype(float)), np.arctan2(y, x.astype(float))]
+    )
+    eps = np.finfo(np.float32).eps
+    # 2e-14: what three pieces of pi/2 leave where the function nearly vanishes at large angles.
+    assert (np.abs(values - exact) <= 3 * eps * np.abs(exact) + 2e-14 * (1 + np.abs(x[:, None]))).all()
 
 
 @pytest.mark.parametrize("lanes", LANES)
@@ -154,6 +174,56 @@ def test_only_the_rows_asked_for_are_written(lanes):
     assert y[3, 0] == -1.0
 
 
+@pytest.mark.parametrize(("lanes", "precision"), EVERY_CODE)
+@pytest.mark.parametrize("dtype", ["", "float64", "float32", "bool"])
+def test_rows_of_every_size_and_type_pass_through_registers(lanes, precision, dtype):
+    kind = dtype or precision
+    for size in range(1, 2 * lanes + 4, 1 if lanes == 1 else 3):
+        graph = trace("graph", {"x": size}, lambda x: {"y": list(x), "z": list(x)})
+        outputs = [Buffer("y", size, dtype=dtype), Buffer("z", size, dtype=dtype, by_column=True)]
+        program = Program("program", [Buffer("x", size, dtype=dtype)], outputs)
+        program.call(graph)
+        kernel = native.NativeKernel(program.name, *build_program(program, lanes, precision))
+        rows = lanes + 3
+        x = np.random.default_rng(size).integers(0, 2, (rows + 2, size)).astype(kind)
+        y, z = np.full((rows + 2, size), 7, kind), np.full((size, rows + 2), 7, kind)
+        buffers = np.array([x.ctypes.data, y.ctypes.data, z.ctypes.data, rows + 2], dtype=np.int64)
+        kernel.function(1, rows + 1, buffers.ctypes.data)
+        inside = slice(1, rows + 1)
+        np.testing.assert_array_equal(y[inside], x[inside])
+        np.testing.assert_array_equal(z[:, inside], x[inside].T)
+        untouched = np.array(7).astype(kind)
+        assert (y[[0, -1]] == untouched).all()
+        assert (z[:, [0, -1]] == untouched).all()
+
+
+@pytest.mark.parametrize(("lanes", "precision"), EVERY_CODE)
+@pytest.mark.parametrize("count", [0, 1, 5, 19])
+def test_an_indexed_program_works_on_the_rows_of_its_list(lanes, precision, count):
+    graph = trace("graph", {"x": 3}, lambda x: {"y": [2 * entry for entry in x]})
+    program = Program("program", [Buffer("x", 3)], [Buffer("y", 3)], indexed=True)
+    program.call(graph)
+    x = np.arange(60).reshape(20, 3).astype(precision)
+    y = np.full((20, 3), -1, precision)
+    rows = np.random.default_rng(count).permutation(20)[:count]
+    run(program, lanes, count, rows, x, y, precision=precision)
+    np.testing.assert_array_equal(y[rows], 2 * x[rows])
+    assert (np.delete(y, rows, axis=0) == -1).all()
+
+
+def test_an_indexed_program_has_no_columns():
+    program = program_of(lambda x: {"y": [2 * x[0]]}, [Buffer("y", 1, by_column=True)], x=1)
+    program.indexed = True
+    with pytest.raises(ValueError, match="'y' is by column, the program is indexed"):
+        build_program(program, 1)
+
+
+def test_a_missing_function_is_noticed():
+    program = program_of(lambda x: {"y": [2 * x[0]]}, [Buffer("y", 1)], x=1)
+    with pytest.raises(LookupError, match="no function 'other'"):
+        native.NativeKernel("other", *build_program(program, 1))
+
+
 def test_calls_share_code_and_scratch_starts_as_zero():
     total = trace("total", {"sum": 1, "x": 1}, lambda sum, x: {"next": [sum[0] + x[0]]})
     program = Program("program", [Buffer("x", 1)], [Buffer("c", 1)])
@@ -176,12 +246,14 @@ def test_calls_that_disagree_on_a_size_are_refused():
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names of x86 registers")
-def test_batches_use_the_widest_vector_registers_and_call_no_library():
+@pytest.mark.parametrize(("precision", "suffix"), [("float64", "pd"), ("float32", "ps")])
+def test_batches_use_the_widest_vector_registers_and_call_no_library(precision, suffix):
     lanes = native.host_machine().lanes
     register = {8: "zmm", 4: "ymm", 2: "xmm"}[lanes]
     program = program_of(everything, [Buffer("y", 21)], x=3)
-    instructions = native.disassemble(assembly(program, lanes))
-    packed = [line for line in instructions.splitlines() if "pd" in line and register in line]
+    wide = lanes if precision == "float64" else 2 * lanes
+    instructions = native.disassemble(assembly(program, wide, precision))
+    packed = [line for line in instructions.splitlines() if suffix in line and register in line]
     assert len(packed) > 50
     calls = [line for line in instructions.splitlines() if "call" in line.split("#")[0].split()]
     assert all("graph" in line for line in calls), calls

@@ -117,7 +117,7 @@ def test_observation_is_what_the_documentation_says(scene):
     env.reset(seed=2)
     observation, *_, info = env.step(env.action_space.sample())
     kernels, x = env.unwrapped.kernels, env.unwrapped.state
-    layout, target = kernels.layout.state, env.unwrapped.scene.target.pose.dual_quaternion
+    layout, target = kernels.layout.state, env.unwrapped.episode_scene.target.pose.dual_quaternion
     error = np.array(poses.error_pose(tuple(kernels.tip_pose(x)), target))  # (31)
     if kernels.layout.planar:
         np.testing.assert_allclose(error[[1, 2, 4, 7]], 0.0, atol=1e-15)

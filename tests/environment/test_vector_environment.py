@@ -1,5 +1,7 @@
 """The vector environment: bit for bit the single one, in every autoreset mode."""
 
+import pickle
+
 import gymnasium
 import numpy as np
 import pytest
@@ -68,6 +70,89 @@ def test_every_scene_agrees_with_single_environments(scene):
         assert_same(native.step(actions), sync.step(actions), f"step {step}")
 
 
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("scene", ["paper", "random-masses", "planar"])
+def test_single_precision_agrees_with_single_environments(scene, mode):
+    scene = short(scene, 5)
+    scene = scene.replace(simulation=scene.simulation.model_copy(update={"precision": "float32"}))
+    native, sync = twins(scene, 19, mode)
+    first = native.reset(seed=1)
+    assert first[0].dtype == native.observation_space.dtype == np.float32
+    assert_same(first, sync.reset(seed=1))
+    native.action_space.seed(0)
+    for step in range(8):
+        actions = native.action_space.sample()
+        assert_same(native.step(actions), sync.step(actions), f"step {step}")
+
+
+def test_threads_give_the_same_bits():
+    one, two = (DQSpaceArmVectorEnv(700, short("random-masses", 4), threads=threads) for threads in (1, 2))
+    assert_same(one.reset(seed=0), two.reset(seed=0))
+    one.action_space.seed(0)
+    for _ in range(9):
+        actions = one.action_space.sample()
+        assert_same(one.step(actions), two.step(actions))
+
+
+def test_episodes_that_end_at_different_times_are_those_of_single_environments():
+    copies, scene = 9, short("random-target", 6)
+    native = DQSpaceArmVectorEnv(copies, scene, AutoresetMode.DISABLED)
+    single = [gymnasium.make("DQSpaceArm-v0", scene=scene) for _ in range(copies)]
+    seen = [env.reset(seed=i)[0] for i, env in enumerate(single)]
+    np.testing.assert_array_equal(native.reset(seed=0)[0], seen)
+    rng = np.random.default_rng(0)
+    over, ended = np.zeros(copies, dtype=bool), 0
+    for _ in range(25):
+        mask = over | (rng.random(copies) < 0.3)
+        if mask.any():
+            for i in np.flatnonzero(mask):
+                seen[i] = single[i].reset()[0]
+            np.testing.assert_array_equal(native.reset(options={"reset_mask": mask})[0], seen)
+        actions = rng.uniform(-1, 1, (copies, 12)).astype(np.float32)
+        results = [env.step(action) for env, action in zip(single, actions, strict=True)]
+        seen, rewards, ends = (list(part) for part in zip(*(result[:3] for result in results), strict=True))
+        observations, native_rewards, over, *_ = native.step(actions)
+        np.testing.assert_array_equal(observations, seen)
+        np.testing.assert_array_equal(native_rewards, rewards)
+        np.testing.assert_array_equal(over, ends)
+        ended += over.sum()
+    assert ended > 5
+
+
+def test_a_refused_step_changes_nothing():
+    venv = DQSpaceArmVectorEnv(9, short())
+    venv.reset(seed=0)
+    before, actions = venv.states, np.zeros((9, 12))
+    actions[4, 3] = np.nan
+    with pytest.raises(ValueError, match=r"NaN for copies \[4\]"):
+        venv.step(actions)
+    np.testing.assert_array_equal(venv.states, before)
+    twin = DQSpaceArmVectorEnv(9, short())
+    twin.reset(seed=0)
+    assert_same(venv.step(np.zeros((9, 12))), twin.step(np.zeros((9, 12))))
+
+
+def test_actions_of_a_copy_that_is_being_reset_do_not_matter():
+    venv = DQSpaceArmVectorEnv(2, short(steps=1))
+    venv.reset(seed=0)
+    venv.step(np.zeros((2, 12)))
+    *_, info = venv.step(np.full((2, 12), np.nan))
+    assert not info["diverged"].any()
+
+
+def test_actions_may_be_read_only_strided_or_whole_numbers():
+    results = []
+    base = np.repeat(np.ones((3, 12), np.float32), 2, axis=1)
+    frozen = np.ones((3, 12))
+    frozen.setflags(write=False)
+    for actions in (np.ones((3, 12)), frozen, base[:, ::2], np.ones((3, 12), int), [[1] * 12] * 3):
+        venv = DQSpaceArmVectorEnv(3, short())
+        venv.reset(seed=0)
+        results.append(venv.step(actions))
+    for result in results[1:]:
+        assert_same(result, results[0])
+
+
 def test_copies_are_reset_by_hand_where_autoreset_is_disabled():
     native, sync = twins(short(steps=4), 5, AutoresetMode.DISABLED)
     assert_same(native.reset(seed=2), sync.reset(seed=2))
@@ -105,6 +190,14 @@ def test_diverged_copies_end_as_single_ones_do():
     assert ended >= 4
 
 
+def test_vector_environments_pickle():
+    venv = DQSpaceArmVectorEnv(3, short(), autoreset_mode=AutoresetMode.SAME_STEP)
+    venv.reset(seed=0)
+    twin = pickle.loads(pickle.dumps(venv))
+    assert twin.autoreset_mode is AutoresetMode.SAME_STEP
+    assert_same(twin.reset(seed=1), venv.reset(seed=1))
+
+
 def test_starts_can_be_given():
     venv = DQSpaceArmVectorEnv(3, short())
     nominal = venv.kernels.layout.initial_state
@@ -126,6 +219,20 @@ def test_returned_arrays_are_the_callers():
         venv.step(venv.action_space.sample())
     np.testing.assert_array_equal(first, kept)
     assert_same(info, kept_info)
+
+
+def test_what_a_caller_does_to_results_does_not_matter():
+    venv, twin = DQSpaceArmVectorEnv(4, short(steps=3)), DQSpaceArmVectorEnv(4, short(steps=3))
+    venv.reset(seed=0)
+    twin.reset(seed=0)
+    actions = np.zeros((4, 12))
+    for _ in range(5):
+        result = venv.step(actions)
+        assert_same(result, twin.step(actions))
+        *arrays, info = result
+        for array in (*arrays, *(value for key, value in info.items() if not key.startswith("_"))):
+            array[:] = 1
+        assert not info["_attitude_error"].flags.writeable
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,8 @@ def test_what_a_scene_does_not_need_is_not_there():
         "payload": (20, 9),
         "planar": (13, 6),
         "six-joint": (26, 12),
+        "random-target": (23, 12),
+        "random-masses": (20, 9),
     }
     assert {name: (size["states"], size["inputs"]) for name, size in sizes.items()} == expected
     # Leaving out actuators, the wrist, or dimensions of space leaves out operations; more joints or a load

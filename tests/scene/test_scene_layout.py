@@ -28,6 +28,8 @@ SIZES = {  # n_x, n_t, n_u
     "paper": (23, 21, 12),
     "payload": (20, 18, 9),
     "planar": (13, 12, 6),
+    "random-masses": (20, 18, 9),
+    "random-target": (23, 21, 12),
     "reaction-wheels": (23, 21, 9),
     "six-joint": (26, 24, 12),
     "tip-load": (23, 21, 12),

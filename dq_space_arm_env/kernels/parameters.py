@@ -1,0 +1,133 @@
+"""What differs from episode to episode besides the state: the target and mass properties that a scene draws.
+
+Everything else of a scene is a constant of the machine code. Of the drawn masses and inertias only what the
+equations of motion read becomes a parameter, once per episode: with a payload, say, the mass, center of mass
+and inertia of the last link together with it, not the factors that were drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi
+
+from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.scene.start import (
+    PLANAR_POSE,
+    EpisodeStart,
+    episode_start,
+    has_target_spread,
+    is_planar,
+    number_of_draws,
+)
+
+Scalar = Any
+
+_AXES = "xyz"
+_POSE_NAMES = tuple(f"target q_{part}{index}" for part in "rd" for index in range(4))
+
+
+@dataclass(frozen=True)
+class EpisodeParameters:
+    """A scene's parameters, and its constants with symbols where there is a parameter.
+
+    Attributes:
+        names: What each parameter is.
+        symbols: A symbol for each parameter.
+        chain: The robot, with symbols for parameters.
+        target: Pose q_{D/I} of the target, 8 numbers, or symbols for parameters.
+    """
+
+    names: tuple[str, ...]
+    symbols: tuple[Scalar, ...]
+    chain: Chain
+    target: tuple[Scalar, ...]
+
+    @classmethod
+    def of(cls, scene: Scene) -> EpisodeParameters:
+        """Find out what a scene draws.
+
+        Args:
+            scene: A validated scene.
+
+        Returns:
+            Its parameters; none for a scene that draws states only.
+        """
+        collector = _Collector()
+        start = _symbolic_start(scene)
+        target = collector.target(scene, start)
+        chain = collector.chain(Chain.from_scene(scene, start.masses))
+        return cls(tuple(collector.names), tuple(collector.symbols), chain, target)
+
+    @staticmethod
+    def values(scene: Scene, draws: Sequence[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
+        """Compute initial state and parameters from an episode's draws.
+
+        Args:
+            scene: A validated scene.
+            draws: Numbers in [-1, 1] in the order of `scene.start.episode_start`, scalars.
+
+        Returns:
+            State, n_x entries, and the value of each parameter.
+        """
+        start = episode_start(scene, draws)
+        collector = _Collector()
+        collector.target(scene, start)
+        collector.chain(Chain.from_scene(scene, start.masses))
+        return start.state, collector.values
+
+
+def _symbolic_start(scene: Scene) -> EpisodeStart:
+    return episode_start(scene, [casadi.SX.sym(f"draw_{i}") for i in range(number_of_draws(scene))])
+
+
+class _Collector:
+    """Replaces what depends on draws by new symbols, always in the same order."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.symbols: list[Scalar] = []
+        self.values: list[Scalar] = []
+
+    def parameter(self, name: str, value: Scalar) -> Scalar:
+        """The value itself if it is a number, otherwise a symbol."""
+        if casadi.SX(value).is_constant():
+            return float(value)
+        self.names.append(name)
+        self.values.append(value)
+        self.symbols.append(casadi.SX.sym(f"parameter_{len(self.symbols)}"))
+        return self.symbols[-1]
+
+    def target(self, scene: Scene, start: EpisodeStart) -> tuple[Scalar, ...]:
+        """The target; a planar one has four numbers that are zero, whatever is drawn."""
+        if not has_target_spread(scene):
+            return start.target
+        stored = PLANAR_POSE if is_planar(scene) else range(8)
+        return tuple(
+            self.parameter(name, entry) if index in stored else 0.0
+            for index, (name, entry) in enumerate(zip(_POSE_NAMES, start.target, strict=True))
+        )
+
+    def chain(self, chain: Chain) -> Chain:
+        """A chain with symbols in place of whatever is not a number."""
+        links = tuple(
+            replace(link, body=self._body(f"link {number}", link.body))
+            for number, link in enumerate(chain.links, start=1)
+        )
+        return replace(chain, base=self._body("base", chain.base), links=links)
+
+    def _body(self, name: str, body: RigidBody) -> RigidBody:
+        mass = self.parameter(f"{name} mass", body.mass)
+        center = tuple(
+            self.parameter(f"{name} center of mass {axis}", entry)
+            for axis, entry in zip(_AXES, body.center_of_mass, strict=True)
+        )
+        inertia: list[list[Scalar]] = [[0.0] * 3 for _ in range(3)]
+        for i in range(3):
+            for j in range(i + 1):
+                entry = self.parameter(f"{name} inertia {_AXES[j]}{_AXES[i]}", body.inertia[i][j])
+                inertia[i][j] = inertia[j][i] = entry
+        return RigidBody(mass, center, inertia)

@@ -1,0 +1,165 @@
+"""Targets, masses and inertias that a scene draws for each episode: inputs of the machine code."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
+from dq_space_arm_env.kernels.parameters import EpisodeParameters
+from dq_space_arm_env.scene.start import MassFactors, episode_scene, episode_start, number_of_draws
+
+EVERYTHING = {
+    "joint_angles": 0.5,
+    "target_rotation": 0.4,
+    "target_position": 0.3,
+    "base_mass": 0.2,
+    "base_inertia": 0.3,
+    "link_masses": 0.4,
+    "link_inertias": 0.5,
+}
+PAYLOAD = {"payload_mass": 0.6, "payload_inertia": 0.7}
+
+
+def spread_out(name):
+    scene = load_scene(name)
+    return scene.replace(spread=EVERYTHING | (PAYLOAD if scene.payload else {}))
+
+
+def make(scene):
+    return gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped
+
+
+@pytest.mark.parametrize("name", ["paper", "payload", "planar", "tip-load", "no-wrist"])
+def test_an_episode_is_that_of_a_scene_with_the_drawn_numbers(name):
+    """The machine code with parameters against that of a scene in which they are constants."""
+    env = make(spread_out(name))
+    for seed in range(2):
+        env.reset(seed=seed)
+        twin = make(env.episode_scene)
+        observation, _ = twin.reset(options={"initial_state": env.state})
+        rng = np.random.default_rng(seed)
+        for _ in range(5):
+            action = rng.uniform(-1, 1, env.action_space.shape)
+            actual, expected = env.step(action), twin.step(action)
+            np.testing.assert_allclose(actual[0], expected[0], rtol=1e-12, atol=1e-12)
+            assert actual[1] == pytest.approx(expected[1], rel=1e-11)
+            for key, value in expected[4].items():
+                assert actual[4][key] == pytest.approx(value, rel=1e-10, abs=1e-10), key
+        assert (np.abs(observation - actual[0]) > 1e-6).any()
+
+
+def test_episodes_differ_in_what_is_drawn():
+    env = make(spread_out("payload"))
+    drawn = []
+    for seed in range(3):
+        env.reset(seed=seed)
+        drawn.append(env.parameters)
+    names = EpisodeParameters.of(env.scene).names
+    assert len(names) == len(drawn[0])
+    assert (np.ptp(drawn, axis=0) > 0).all()
+    mass = names.index("base mass")
+    scene = env.episode_scene
+    assert scene.base.mass == pytest.approx(drawn[-1][mass], rel=1e-15)
+    assert abs(scene.base.mass / 105 - 1) <= 0.2
+
+
+@pytest.mark.parametrize("options", [{"nominal": True}, "given"])
+def test_a_given_start_has_the_nominal_target_and_masses(options):
+    env = make(spread_out("payload"))
+    if options == "given":
+        options = {"initial_state": env.kernels.layout.initial_state}
+    env.reset(seed=0)
+    env.reset(options=options)
+    assert env.episode_scene.base == env.scene.base
+    np.testing.assert_allclose(
+        env.episode_scene.target.pose.dual_quaternion, env.scene.target.pose.dual_quaternion, atol=1e-15
+    )
+
+
+def test_only_what_the_equations_read_is_a_parameter():
+    paper, payload = load_scene("paper"), load_scene("payload")
+    assert EpisodeParameters.of(paper).names == ()
+    moved = EpisodeParameters.of(paper.replace(spread={"target_position": 0.1})).names
+    assert moved == ("target q_d0", "target q_d1", "target q_d2", "target q_d3")
+    heavier = EpisodeParameters.of(payload.replace(spread={"payload_mass": 0.1})).names
+    # The payload's mass moves the last link's center of mass along x, and counts for its inertia.
+    assert heavier == (
+        "link 3 mass",
+        "link 3 center of mass x",
+        "link 3 inertia yy",
+        "link 3 inertia zz",
+    )
+
+
+def test_a_scene_that_draws_states_only_pays_nothing():
+    inputs = {
+        name: [spec.name for spec in compile_scene(name).kernel("environment_step").inputs]
+        for name in ("paper", "random-target")
+    }
+    assert "parameters" not in inputs["paper"]
+    assert "parameters" in inputs["random-target"]
+    paper = load_scene("paper")
+    still = compile_scene(paper.replace(spread={})).operation_count("environment_step")
+    assert compile_scene("paper").operation_count("environment_step") == still
+    drawn = compile_scene("random-target").operation_count("environment_step")
+    assert still < drawn < 1.05 * still
+    fixed = compile_scene("payload").operation_count("environment_step")
+    assert fixed < compile_scene("random-masses").operation_count("environment_step") < 1.25 * fixed
+
+
+def test_copies_have_parameters_of_their_own():
+    venv = DQSpaceArmVectorEnv(5, spread_out("payload"))
+    venv.reset(seed=3)
+    for copy, parameters in enumerate(venv.parameters):
+        env = make(venv.scene)
+        env.reset(seed=3 + copy)
+        np.testing.assert_array_equal(parameters, env.parameters)
+
+
+def test_drawn_bodies_keep_their_proportions():
+    scene = spread_out("payload")
+    draws = np.random.default_rng(0).uniform(-1, 1, number_of_draws(scene))
+    masses = episode_start(scene, draws.tolist()).masses
+    assert isinstance(masses, MassFactors)
+    drawn = episode_scene(scene, draws.tolist())
+    bodies = zip((scene.base, *scene.links), (drawn.base, *drawn.links), strict=True)
+    factors = zip(
+        (masses.base_mass, *masses.link_masses), (masses.base_inertia, *masses.link_inertias), strict=True
+    )
+    for (nominal, body), (mass, inertia) in zip(bodies, factors, strict=True):
+        assert body.mass == pytest.approx(mass * nominal.mass, rel=1e-15)
+        np.testing.assert_allclose(body.inertia, inertia * np.array(nominal.inertia), rtol=1e-15)
+    assert not any(drawn.spread.model_dump().values())
+    # The last draws are the payload's.
+    assert masses.payload_mass == pytest.approx(1 + 0.6 * draws[-2], rel=1e-15)
+    assert masses.payload_inertia == pytest.approx(1 + 0.7 * draws[-1], rel=1e-15)
+
+
+def test_a_drawn_target_is_turned_in_its_axes_and_moved_in_inertial_ones():
+    from scipy.spatial.transform import Rotation
+
+    scene = load_scene("random-target")
+    draws = np.random.default_rng(1).uniform(-1, 1, number_of_draws(scene))
+    drawn = episode_scene(scene, draws.tolist()).target.pose
+    nominal = scene.target.pose
+    np.testing.assert_allclose(
+        drawn.position, nominal.position + scene.spread.target_position * draws[-3:], atol=1e-14
+    )
+    relative = Rotation.from_quat(nominal.rotation, scalar_first=True).inv() * Rotation.from_quat(
+        drawn.rotation, scalar_first=True
+    )
+    np.testing.assert_allclose(relative.as_rotvec(), scene.spread.target_rotation * draws[-6:-3], atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("spread", "message"),
+    [
+        ({"base_mass": 1.0}, r"spread.base_mass = 1.*must be a fraction: 0 or greater, and less than 1"),
+        ({"link_masses": -0.1}, "spread.link_masses = -0.1.*must be a fraction"),
+        ({"payload_mass": 0.1}, "spread.payload_mass = 0.1.*must be 0: the scene has no payload"),
+        ({"target_position": -1}, "spread.target_position = -1.*0 or greater"),
+    ],
+)
+def test_a_spread_without_sense_is_refused(spread, message):
+    with pytest.raises(ValueError, match=message):
+        load_scene("paper").replace(spread=spread)

@@ -1,0 +1,78 @@
+"""Work shared among threads: every row once, the same bits, and no wait for a helper that never ran."""
+
+import os
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dq_space_arm_env import Kernels, compile_scene, load_scene
+from dq_space_arm_env.kernels import threads
+
+
+@settings(derandomize=True, max_examples=60, deadline=None)
+@given(rows=st.integers(0, 3000), count=st.integers(1, 5))
+def test_every_row_is_worked_on_once(rows, count):
+    done = []
+    threads.run_shared(lambda begin, end, buffers: done.append((begin, end, buffers)), rows, 7, count)
+    covered = sorted(row for begin, end, _ in done for row in range(begin, end))
+    assert covered == list(range(rows))
+    assert {buffers for *_, buffers in done} <= {7}
+
+
+def test_results_are_those_of_one_thread(draw):
+    kernels, states, inputs = draw("paper", 1500)
+    shared = compile_scene("paper", threads=3)
+    assert shared is not kernels
+    np.testing.assert_array_equal(shared.step(states, inputs), kernels.step(states, inputs))
+
+
+def test_a_helper_that_has_not_begun_is_not_waited_for():
+    release = threading.Event()
+    blocked = threads._helpers(2).submit(release.wait)
+    try:
+        done = []
+        worker = threading.Thread(
+            target=threads.run_shared, args=(lambda *block: done.append(block), 2000, 0, 2)
+        )
+        worker.start()
+        worker.join(timeout=30)
+        assert not worker.is_alive()
+        assert sum(end - begin for begin, end, _ in done) == 2000
+    finally:
+        release.set()
+        blocked.result()
+
+
+def test_an_error_of_a_helper_is_raised():
+    main = threading.current_thread()
+    met = threading.Barrier(2, timeout=30)
+
+    def function(begin, end, buffers):
+        if threading.current_thread() is not main:
+            met.wait()
+            raise MemoryError("in the helper")
+        if not met.broken and begin < 256:
+            met.wait()
+
+    with pytest.raises(MemoryError, match="in the helper"):
+        threads.run_shared(function, 600, 0, 2)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork")
+def test_a_forked_process_does_its_work_alone():
+    threads.run_shared(lambda *block: None, 2000, 0, 2)
+    process = os.fork()
+    if process == 0:
+        done = []
+        threads.run_shared(lambda *block: done.append(block), 2000, 0, 2)
+        os._exit(0 if sum(end - begin for begin, end, _ in done) == 2000 else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 0
+
+
+def test_no_thread_at_all_is_refused():
+    with pytest.raises(ValueError, match="threads: 0, should be at least 1"):
+        Kernels(load_scene("paper"), threads=0)
