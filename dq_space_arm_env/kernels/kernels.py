@@ -7,29 +7,22 @@ CasADi.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.compiler import native
-from dq_space_arm_env.kernels.bound import BoundKernel, rows_of
+from dq_space_arm_env.kernels.bound import rows_of
+from dq_space_arm_env.kernels.library import KernelLibrary
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.layout import StateLayout
-
-if TYPE_CHECKING:
-    from dq_space_arm_env.compiler.program import Program
-    from dq_space_arm_env.kernels.environment_programs import EnvironmentPrograms
-    from dq_space_arm_env.kernels.programs import ScenePrograms
 
 Array = NDArray[Any]
 
 
-class Kernels:
+class Kernels(KernelLibrary):
     """The compiled functions of a scene, with its nominal target, masses and inertias.
 
     Every function takes one state (n_x,) or a batch (B, n_x), and returns results of the same form, arrays of
@@ -58,101 +51,10 @@ class Kernels:
         """
         if threads < 1:
             raise ValueError(f"threads: {threads}, should be at least 1")
-        self.scene, self.threads = scene, threads
-        self.dtype = np.dtype(scene.simulation.precision)
+        super().__init__(scene)
+        self.threads = threads
         self.layout = StateLayout.of(scene)
         self.n_x, self.n_t, self.n_u = self.layout.n_x, self.layout.n_t, self.layout.n_u
-        self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
-        self._paper_kernels: dict[tuple[str, int], BoundKernel] = {}
-
-    @cached_property
-    def _programs(self) -> ScenePrograms:
-        # Imported here: a process that finds all kernels in the cache needs neither CasADi nor the model.
-        from dq_space_arm_env.kernels.programs import ScenePrograms
-
-        return ScenePrograms(self.scene)
-
-    @cached_property
-    def _environment_programs(self) -> EnvironmentPrograms:
-        from dq_space_arm_env.kernels.environment_programs import EnvironmentPrograms
-
-        return EnvironmentPrograms(self.scene)
-
-    @property
-    def lanes(self) -> int:
-        """Rows that vector code works on at a time: numbers of the scene's precision in a vector register."""
-        return native.host_machine().lanes * 8 // self.dtype.itemsize
-
-    def kernel(self, name: str, *, integrator: str | None = None, lanes: int | None = None) -> BoundKernel:
-        """Compile a program, or load it from the cache.
-
-        Args:
-            name: Name of the program (`ScenePrograms` or `EnvironmentPrograms`, both in `kernels`).
-            integrator: Integrator of programs that take a step; the scene's by default.
-            lanes: Rows that the code works on at a time: 1, or the processor's vector width (default).
-
-        Returns:
-            The kernel.
-
-        Raises:
-            ValueError: If there is no integrator of that name.
-        """
-        method = (integrator or self.scene.simulation.integrator) if name in _STEPS else ""
-        key = (name, method, self.lanes if lanes is None else lanes)
-        if key not in self._kernels:
-
-            def trace() -> Program:
-                of_environment = name.startswith("environment_")
-                programs = self._environment_programs if of_environment else self._programs
-                return programs.build(name, method)
-
-            self._kernels[key] = self._load(*key, trace)
-        return self._kernels[key]
-
-    def paper_kernel(self, name: str, *, lanes: int | None = None) -> BoundKernel:
-        """Compile a program of the paper's redundant formulation, or load it from the cache.
-
-        Args:
-            name: Name of the program (`kernels.paper_programs.PaperPrograms`).
-            lanes: Rows that the code works on at a time: 1, or the processor's vector width (default).
-
-        Returns:
-            The kernel.
-        """
-        width = self.lanes if lanes is None else lanes
-        key = (name, width)
-        if key not in self._paper_kernels:
-
-            def trace() -> Program:
-                from dq_space_arm_env.kernels.paper_programs import PaperPrograms
-
-                return PaperPrograms(self.scene).build(name)
-
-            self._paper_kernels[key] = self._load(name, "paper", width, trace)
-        return self._paper_kernels[key]
-
-    def _load(self, name: str, variant: str, lanes: int, trace: Callable[[], Program]) -> BoundKernel:
-        """Load a kernel from the cache; trace and compile it if it is not there."""
-        parts = (self.scene.content_hash(), _source_hash(), name, variant, str(lanes))
-
-        def build() -> tuple[bytes, dict[str, Any]]:
-            from dq_space_arm_env.compiler.build import build_program
-
-            return build_program(trace(), lanes, self.scene.simulation.precision)
-
-        return BoundKernel(native.load_or_build(name, native.cache_key(*parts), build))
-
-    def operation_count(self, name: str, *, integrator: str | None = None) -> int:
-        """Arithmetic operations of a program per state.
-
-        Args:
-            name: Name of the program.
-            integrator: Integrator of programs that take a step; the scene's by default.
-
-        Returns:
-            The count after folding constants and sharing subexpressions.
-        """
-        return self.kernel(name, integrator=integrator).operation_count
 
     def _call(
         self, name: str, integrator: str | None = None, **inputs: ArrayLike | None
@@ -394,28 +296,6 @@ class Kernels:
         if not np.isfinite(step):
             raise ValueError(f"dt: {step} is not a finite time step in s")
         return np.array([step])
-
-
-@cache
-def _source_hash() -> str:
-    """Hash of the source that kernels are made from, so that a changed model never meets an old kernel."""
-    package = Path(__file__).parent.parent
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        if path.relative_to(package).parts[0] in _MODEL_SOURCES:
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-_MODEL_SOURCES = ("algebra", "compiler", "cost.py", "dynamics", "integrators", "kernels", "scene")
-
-_STEPS = (
-    "step",
-    "step_with_cost",
-    "linearize",
-    "environment_step",
-    "environment_step_float32_actions",
-)
 
 
 @cache

@@ -121,17 +121,31 @@ print("casadi" in sys.modules)
 """
 
 
-def test_a_second_process_neither_traces_nor_compiles(cache):
+def run_process(cache, code=SECOND_PROCESS):
     environment = {**os.environ, "DQ_SPACE_ARM_CACHE": str(cache)}
-    command = [sys.executable, "-c", SECOND_PROCESS]
-    first, second = (
-        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split(
-            "\n"
-        )
-        for _ in range(2)
-    )
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+
+
+def test_a_second_process_neither_traces_nor_compiles(cache):
+    first, second = (run_process(cache).stdout.split("\n") for _ in range(2))
     assert first[0] == second[0]
     assert (first[1], second[1]) == ("True", "False")
+
+
+def test_a_first_use_says_that_it_compiles_and_where_the_result_is(cache):
+    code = SECOND_PROCESS + "kernels.linearize(kernels.layout.initial_state, [0.0] * kernels.n_u)\n"
+    first, second = (run_process(cache, code).stderr for _ in range(2))
+    assert first == (
+        "dq_space_arm_env: compiling scene 'planar' for its first use, which takes seconds; "
+        f"the result is kept in {cache}\n"
+    )
+    assert second == ""
+
+
+def test_the_message_can_be_silenced(cache):
+    quiet = "import logging; logging.getLogger('dq_space_arm_env').setLevel(logging.WARNING)\n"
+    assert run_process(cache, quiet + SECOND_PROCESS).stderr == ""
 
 
 def test_two_processes_at_once_agree(cache):
