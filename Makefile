@@ -1,20 +1,23 @@
 # make paper   solve and replay the paper's maneuver: figures and table in results/paper
-# make test    lint, type check, tests (with CI set: the slow tests too)
+# make test    lint, type check, tests (with CI set: the slow tests too, and those of the extra agents, whose
+#              PyTorch is a download of gigabytes; without it they are skipped)
 # make clean   remove the virtual environment and the results
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+COMMA := ,
+TEST := test$(if $(CI),$(COMMA)agents)
 
 .PHONY: paper test lint lock clean
 
 paper: $(VENV)/installed-plots
 	$(BIN)/python scripts/reproduce_paper.py
 
-test: $(VENV)/installed-test lint
+test: $(VENV)/installed-$(TEST) lint
 	$(BIN)/python -m pytest $(if $(CI),-m "")
 
-lint: $(VENV)/installed-test
+lint: $(VENV)/installed-$(TEST)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

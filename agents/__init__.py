@@ -1,0 +1,33 @@
+"""Agents: what learns on the environment.
+
+`DQSpaceArmVecEnv` is the native vector environment as Stable-Baselines3 wants it. Importing this package
+loads neither that library nor PyTorch; using the name does.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from agents.vec_env import DQSpaceArmVecEnv
+
+__all__ = ["DQSpaceArmVecEnv"]
+
+_HOMES = {"DQSpaceArmVecEnv": "vec_env"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        module = import_module(f"{__name__}.{_HOMES[name]}")
+    except ModuleNotFoundError as error:
+        if error.name not in ("stable_baselines3", "torch"):
+            raise
+        raise ImportError(f'{name} needs {error.name}: pip install "dq-space-arm[agents]"') from error
+    return getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])
