@@ -192,5 +192,3 @@ _STEPS = (
     "environment_step",
     "environment_step_float32_actions",
 )
-
-

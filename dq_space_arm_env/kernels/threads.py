@@ -15,8 +15,10 @@ from functools import cache
 from itertools import count
 
 # Rows that a thread takes at a time, a multiple of every vector width: some tens of microseconds of work,
-# beside which the hand-over is small.
+# beside which taking a block is small.
 _BLOCK = 256
+# Rows for each thread below which waking it costs more than it can do.
+_ROWS_PER_THREAD = 1024
 
 KernelFunction = Callable[[int, int, int], None]
 
@@ -36,7 +38,7 @@ def run_shared(function: KernelFunction, rows: int, buffers: int, threads: int =
         threads: Most threads to use, this one included; small batches use fewer.
     """
     blocks = math.ceil(rows / _BLOCK)
-    threads = min(threads, blocks)
+    threads = min(threads, rows // _ROWS_PER_THREAD)
     if threads < 2:
         function(0, rows, buffers)
         return

@@ -86,7 +86,7 @@ def test_single_precision_agrees_with_single_environments(scene, mode):
 
 
 def test_threads_give_the_same_bits():
-    one, two = (DQSpaceArmVectorEnv(700, short("random-masses", 4), threads=threads) for threads in (1, 2))
+    one, two = (DQSpaceArmVectorEnv(2500, short("random-masses", 4), threads=threads) for threads in (1, 2))
     assert_same(one.reset(seed=0), two.reset(seed=0))
     one.action_space.seed(0)
     for _ in range(9):

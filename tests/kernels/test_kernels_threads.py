@@ -13,7 +13,7 @@ from dq_space_arm_env.kernels import threads
 
 
 @settings(derandomize=True, max_examples=60, deadline=None)
-@given(rows=st.integers(0, 3000), count=st.integers(1, 5))
+@given(rows=st.integers(0, 6000), count=st.integers(1, 5))
 def test_every_row_is_worked_on_once(rows, count):
     done = []
     threads.run_shared(lambda begin, end, buffers: done.append((begin, end, buffers)), rows, 7, count)
@@ -23,7 +23,7 @@ def test_every_row_is_worked_on_once(rows, count):
 
 
 def test_results_are_those_of_one_thread(draw):
-    kernels, states, inputs = draw("paper", 1500)
+    kernels, states, inputs = draw("paper", 3100)
     shared = compile_scene("paper", threads=3)
     assert shared is not kernels
     np.testing.assert_array_equal(shared.step(states, inputs), kernels.step(states, inputs))
@@ -35,15 +35,21 @@ def test_a_helper_that_has_not_begun_is_not_waited_for():
     try:
         done = []
         worker = threading.Thread(
-            target=threads.run_shared, args=(lambda *block: done.append(block), 2000, 0, 2)
+            target=threads.run_shared, args=(lambda *block: done.append(block), 3000, 0, 2)
         )
         worker.start()
         worker.join(timeout=30)
         assert not worker.is_alive()
-        assert sum(end - begin for begin, end, _ in done) == 2000
+        assert sum(end - begin for begin, end, _ in done) == 3000
     finally:
         release.set()
         blocked.result()
+
+
+def test_a_small_batch_stays_on_one_thread():
+    seen = set()
+    threads.run_shared(lambda *block: seen.add(threading.current_thread()), 2047, 0, 2)
+    assert seen == {threading.current_thread()}
 
 
 def test_an_error_of_a_helper_is_raised():
@@ -58,18 +64,18 @@ def test_an_error_of_a_helper_is_raised():
             met.wait()
 
     with pytest.raises(MemoryError, match="in the helper"):
-        threads.run_shared(function, 600, 0, 2)
+        threads.run_shared(function, 2048, 0, 2)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork")
 def test_a_forked_process_does_its_work_alone():
-    threads.run_shared(lambda *block: None, 2000, 0, 2)
+    threads.run_shared(lambda *block: None, 3000, 0, 2)
     process = os.fork()
     if process == 0:
         done = []
-        threads.run_shared(lambda *block: done.append(block), 2000, 0, 2)
-        os._exit(0 if sum(end - begin for begin, end, _ in done) == 2000 else 1)
+        threads.run_shared(lambda *block: done.append(block), 3000, 0, 2)
+        os._exit(0 if sum(end - begin for begin, end, _ in done) == 3000 else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 0
 
 
