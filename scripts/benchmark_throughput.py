@@ -1,8 +1,9 @@
-"""Time the compiled kernels and the environments on one thread, beside Pinocchio and MuJoCo if installed.
+"""Time the compiled kernels and the environments, beside Pinocchio and MuJoCo if installed.
 
-For each scene: forward dynamics and integrator steps in ns per state, by scalar and by vector code;
-environment steps per second; and how far the engines' results are apart. Then the time that a new process
-needs. The output folder gets throughput.json and, with the extra `plots`, throughput.png.
+For each scene: forward dynamics and steps in ns per state with their share of the core's peak, environment
+steps per second, float32 and two threads beside float64 and one, the other engines, and how far all results
+are apart; then the time that a new process needs. The output folder gets throughput.json and, with the extra
+`plots`, throughput.png. Everything at once: --all-scenes --features.
 Every number is the best of several samples, with the median beside it: on a shared machine the best says what
 the code can do, and a median far above it that the machine was busy.
 Exit status: 0; 2 if the input is unusable; 130 if interrupted.
@@ -20,15 +21,20 @@ from typing import Any
 
 from rich.console import Console
 
-from dq_space_arm_env import SceneError, list_scenes, load_scene
+from dq_space_arm_env import Scene, SceneError, list_scenes, load_scene
 from experts.report import to_json, write_atomically
+from experts.report.peak import measure_peak
 from experts.report.provenance import provenance
 from experts.report.start_up import measure_start_up
-from experts.report.throughput import QUICK, Effort, measure_scene, to_record
-from experts.report.throughput_tables import print_scene, print_start_up
+from experts.report.throughput.cost_tables import print_feature_costs, print_scene_costs, print_start_up
+from experts.report.throughput.features import feature_variants
+from experts.report.throughput.measurement import SceneThroughput, measure_scene
+from experts.report.throughput.records import cost_records, scene_record
+from experts.report.throughput.scene_costs import measure_costs
+from experts.report.throughput.tables import print_peaks, print_scene
+from experts.report.throughput.timing import QUICK, Effort
 
 SUCCESS, UNUSABLE, INTERRUPTED = 0, 2, 130
-SCENES = ("paper", "planar", "six-joint")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,35 +48,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parse(arguments)
     console = Console(highlight=False)
-    effort = QUICK if options.quick else Effort()
-    names = list_scenes() if options.all else options.scene or SCENES[: 1 if options.quick else None]
     try:
-        scenes = [load_scene(name) for name in names]
+        scenes = [load_scene(name) for name in options.scene or ["paper"]]
         options.out.mkdir(parents=True, exist_ok=True)
-        results = []
-        for scene in scenes:
-            results.append(measure_scene(scene, effort))
-            print_scene(console, results[-1])
-        start_up = measure_start_up(scenes[0], effort.repeats)
-        print_start_up(console, scenes[0].name, start_up)
-        record = {
-            "effort": asdict(effort),
-            "threads": 1,
-            "scenes": [to_record(result) for result in results],
-            "start_up": {"scene": scenes[0].name, "unit": "s", **start_up},
-            **_provenance(),
-        }
-        write_atomically(options.out / "throughput.json", to_json(record))
-        files = ["throughput.json"]
-        if options.picture and find_spec("matplotlib") is None:
-            console.print(
-                'No picture: it needs matplotlib (pip install "dq-space-arm[plots]").', markup=False
-            )
-        elif options.picture:
-            from experts.report.figures.throughput import picture
-
-            write_atomically(options.out / "throughput.png", picture(results))
-            files.append("throughput.png")
+        record, results = _measure(console, scenes, options)
+        files = _write(console, options, record, results)
     except (SceneError, ValueError, OSError) as error:
         Console(stderr=True, highlight=False).print(str(error), style="red", markup=False)
         return UNUSABLE
@@ -85,19 +67,73 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    scenes = parser.add_mutually_exclusive_group()
-    scenes.add_argument(
+    parser.add_argument(
         "--scene",
         action="append",
-        help=f"name of a shipped scene, or path of a YAML file; repeatable (default: {', '.join(SCENES)})",
+        help="name of a shipped scene, or path of a YAML file; repeatable (default: paper)",
     )
-    scenes.add_argument("--all", action="store_true", help="all shipped scenes")
-    parser.add_argument(
-        "--quick", action="store_true", help="three batch sizes, short samples, by default one scene"
-    )
+    parser.add_argument("--all-scenes", action="store_true", help="what each shipped scene costs")
+    parser.add_argument("--features", action="store_true", help="what each part of the first scene costs")
+    parser.add_argument("--quick", action="store_true", help="three batch sizes, short samples")
     parser.add_argument("--out", type=Path, default=Path("results/throughput"), help="output folder")
     parser.add_argument("--no-picture", dest="picture", action="store_false", help="tables and JSON only")
     return parser.parse_args(arguments)
+
+
+def _measure(
+    console: Console, scenes: Sequence[Scene], options: argparse.Namespace
+) -> tuple[dict[str, Any], list[SceneThroughput]]:
+    """Measure and print, part by part; the record for the file, and the scenes' results for the picture."""
+    effort = QUICK if options.quick else Effort()
+    peaks = measure_peak(effort.repeats)
+    print_peaks(console, peaks)
+    results = []
+    for scene in scenes:
+        results.append(measure_scene(scene, effort))
+        print_scene(console, results[-1], peaks)
+
+    compared = {scene.name: scene for scene in scenes}
+    if options.all_scenes:
+        compared |= {name: load_scene(name) for name in list_scenes()}
+    costs = measure_costs(compared, effort, environments=True)
+    print_scene_costs(console, costs, peaks)
+
+    feature_costs = []
+    if options.features:
+        feature_costs = measure_costs(feature_variants(scenes[0]), effort, environments=False)
+        print_feature_costs(console, feature_costs)
+
+    start_up = measure_start_up(scenes[0], effort.repeats)
+    print_start_up(console, scenes[0].name, start_up)
+    record = {
+        "effort": asdict(effort),
+        "peaks": {name: asdict(peak) for name, peak in peaks.items()},
+        "scenes": [scene_record(result, peaks) for result in results],
+        "scene_costs": cost_records(costs, peaks),
+        "feature_costs": cost_records(feature_costs, peaks),
+        "start_up": {"scene": scenes[0].name, "unit": "s", "durations": start_up},
+        **_provenance(),
+    }
+    return record, results
+
+
+def _write(
+    console: Console,
+    options: argparse.Namespace,
+    record: dict[str, Any],
+    results: Sequence[SceneThroughput],
+) -> list[str]:
+    """Write the files; their names."""
+    write_atomically(options.out / "throughput.json", to_json(record))
+    if not options.picture:
+        return ["throughput.json"]
+    if find_spec("matplotlib") is None:
+        console.print('No picture: it needs matplotlib (pip install "dq-space-arm[plots]").', markup=False)
+        return ["throughput.json"]
+    from experts.report.figures.throughput import picture
+
+    write_atomically(options.out / "throughput.png", picture(results))
+    return ["throughput.json", "throughput.png"]
 
 
 def _provenance() -> dict[str, Any]:

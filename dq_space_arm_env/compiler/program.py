@@ -140,13 +140,8 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
         target: Lanes and instructions to use.
 
     Raises:
-        ValueError: If two calls disagree on the size of a buffer, or an indexed program writes by column.
+        ValueError: If two calls disagree on the size of a buffer.
     """
-    for buffer in program.outputs:
-        if buffer.by_column and program.indexed:
-            raise ValueError(
-                f"program {program.name!r}: buffer {buffer.name!r} is by column, the program is indexed"
-            )
     sizes, zeroed = program.scratch_sizes(), program.read_before_written()
     functions: dict[str, ir.Function] = {}
     for call in program.calls:
@@ -190,7 +185,10 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
         element, block = access[buffer.dtype or target.precision], blocks[buffer.name]
         if buffer.by_column:
             address, pitch = arrays.addresses[buffer.name], arrays.pitches[buffer.name]
-            element.scatter_columns(block, address, pitch, row, end, buffer.size)
+            if program.indexed or target.lanes == 1:
+                element.scatter_columns(block, address, pitch, rows, buffer.size)
+            else:
+                element.scatter_adjacent(block, address, pitch, row, end, buffer.size)
         else:
             element.scatter(block, arrays.rows_of(buffer, rows, target), buffer.size, buffer.positions)
     row.add_incoming(builder.add(row, INDEX(target.lanes)), builder.block)

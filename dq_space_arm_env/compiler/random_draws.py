@@ -54,13 +54,21 @@ def draws_kernel(count: int) -> native.NativeKernel:
         count: Numbers that each generator draws, at least 1.
 
     Returns:
-        A kernel with buffers index (int64), states (rows of 4 uint64), draws (rows of `count` float64): for
-        each row in the index it draws uniform numbers in [-1, 1) and advances the state.
+        An indexed kernel with arrays `states` (rows of 4 uint64), which it advances, and `draws` (rows of
+        `count` float64), which it fills with uniform numbers in [-1, 1).
     """
+
+    def build() -> tuple[bytes, dict[str, Any]]:
+        metadata = {
+            "inputs": [["states", 4, False, "uint64", False]],
+            "outputs": [["draws", count, False, "float64", False]],
+            "operations": 0,
+            "indexed": True,
+        }
+        return native.compile_to_object(_assembly(count)), metadata
+
     key = native.cache_key("uniform_draws", Path(__file__).read_text(encoding="utf-8"), str(count))
-    return native.load_or_build(
-        "uniform_draws", key, lambda: (native.compile_to_object(_assembly(count)), {})
-    )
+    return native.load_or_build("uniform_draws", key, build)
 
 
 def _assembly(count: int) -> str:

@@ -86,9 +86,29 @@ class ArrayAccess:
                     self._store(vector, row, start)
 
     def scatter_columns(
+        self, block: ir.Value, array: ir.Value, pitch: ir.Value, rows: Sequence[ir.Value], size: int
+    ) -> None:
+        """Write a block of vectors to rows of an array that holds one column after another.
+
+        Args:
+            block: Address of the block, `size` vectors.
+            array: Address of the array.
+            pitch: Elements from one column to the next.
+            rows: Number of each lane's row.
+            size: Number of columns.
+        """
+        builder = self.vectors.ir
+        for index in range(size):
+            column = builder.gep(array, [builder.mul(pitch, INDEX(index))], source_etype=self.element)
+            vector = self._stored(block, index)
+            for lane, row in enumerate(rows):
+                address = builder.gep(column, [row], source_etype=self.element)
+                builder.store(self._lane_of(vector, lane), address, align=BYTES[self.dtype])
+
+    def scatter_adjacent(
         self, block: ir.Value, array: ir.Value, pitch: ir.Value, row: ir.Value, end: ir.Value, size: int
     ) -> None:
-        """Write a block of vectors to an array that holds one column after another.
+        """Write a block of vectors to adjacent rows of an array that holds one column after another.
 
         Args:
             block: Address of the block, `size` vectors.
@@ -98,15 +118,11 @@ class ArrayAccess:
             end: Row to stop before.
             size: Number of columns.
         """
-        builder, lanes = self.vectors.ir, self.lanes
+        builder = self.vectors.ir
         for index in range(size):
             offset = builder.add(builder.mul(pitch, INDEX(index)), row)
             address = builder.gep(array, [offset], source_etype=self.element)
-            value = self._stored(block, index)
-            if lanes == 1:
-                builder.store(value, address, align=BYTES[self.dtype])
-            else:
-                self._masked_store(value, address, builder.sub(end, row))
+            self._masked_store(self._stored(block, index), address, builder.sub(end, row))
 
     def _masked_store(self, value: ir.Value, address: ir.Value, count: ir.Value) -> None:
         """Store the first `count` lanes."""

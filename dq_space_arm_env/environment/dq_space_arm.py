@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.environment.start_options import given_start
 from dq_space_arm_env.kernels import compile_scene
-from dq_space_arm_env.kernels.bound import run_on_rows
-from dq_space_arm_env.kernels.report import REPORT, STATE_LIMIT
+from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.kernels.report import STATE_LIMIT
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.start import episode_scene
 
@@ -28,6 +27,8 @@ Array = NDArray[Any]
 
 # No observation of a simulation that has not blown up (m, rad, m/s, rad/s) is beyond this.
 OBSERVATION_LIMIT = 2.0 * STATE_LIMIT
+
+_ONLY = np.zeros(1, dtype=np.int64)  # the row of the only state
 
 
 class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
@@ -200,15 +201,14 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         }
         # A step reads state and memory before it writes them: they stay where they are.
         arrays["x_kept"], arrays["memory_kept"] = arrays["x"], arrays["memory"]
-        self._begin = partial(run_on_rows, start, np.zeros(1, dtype=np.int64), arrays)
-        self._look = partial(run_on_rows, observe, np.zeros(1, dtype=np.int64), arrays)
-        self._x, self._memory, self._draws = arrays["x"], arrays["memory"], arrays["draws"]
+        self._start, self._observe = KernelCall(start, arrays), KernelCall(observe, arrays)
+        self._take_step = KernelCall(step, arrays).of_one_row()
+        self._x, self._draws, self._action = arrays["x"], arrays["draws"], arrays["action"]
         self._parameters = arrays.get("parameters", np.zeros(0, dtype=self.kernels.dtype))
-        self._action, self._observation = arrays["action"], arrays["observation"]
+        self._observation, self._report, self._flags = (
+            arrays[name] for name in ("observation", "report", "flags")
+        )
         self._action_shape = self._action.shape
-        self._report, self._flags = arrays["report"], arrays["flags"]
-        self._errors, self._success = arrays["errors"], arrays["is_success"]
-        self._take_step = step.bind_one([arrays[spec.name] for spec in (*step.inputs, *step.outputs)])
 
     @property
     def state(self) -> Array:
@@ -268,25 +268,13 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             raise ValueError(f"action: shape {shape}, should be {self._action_shape}")
         self._action[...] = action
         self._take_step()
-        over, success, diverged = self._flags.tolist()
-        reward, pose, velocity, control, end_pose, end_velocity, angle, distance = self._report.tolist()
-        if diverged and np.isnan(self._action).any():
+        info = self._info()
+        if info["diverged"] and np.isnan(self._action).any():
             raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
-        self._over = over
+        self._over = over = self._flags.item(0)
         if self.render_mode is not None:
             self._show()
-        info = {
-            "cost_pose": pose,
-            "cost_base_velocity": velocity,
-            "cost_control": control,
-            "terminal_cost_pose": end_pose,
-            "terminal_cost_base_velocity": end_velocity,
-            "attitude_error": angle,
-            "position_error": distance,
-            "is_success": success,
-            "diverged": diverged,
-        }
-        return self._observation.copy(), reward, over, False, info
+        return self._observation.copy(), self._report.item(0), over, False, info
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -306,19 +294,31 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         super().reset(seed=seed)
         start = given_start(self.kernels, options or {})
         self._draws[:] = 0.0 if start is not None else self.np_random.uniform(-1.0, 1.0, self._draws.shape)
-        self._begin()
+        self._start.on_rows(_ONLY)
         if start is not None:
             self._x[:] = start
-        self._memory[0] = 0.0
-        self._look()
+        self._observe.on_rows(_ONLY)
         self._begun, self._over = True, False
         self._trail = []
         if self.render_mode is not None:
             self._show()
-        info = dict.fromkeys(REPORT[1:], 0.0)
-        info["attitude_error"], info["position_error"] = self._errors.tolist()
-        info |= {"is_success": bool(self._success[0]), "diverged": False}
-        return self._observation.copy(), info
+        return self._observation.copy(), self._info()
+
+    def _info(self) -> dict[str, Any]:
+        """What the last step, or the reset, reports besides reward and end."""
+        _, success, diverged = self._flags.tolist()
+        _, pose, velocity, control, end_pose, end_velocity, angle, distance = self._report.tolist()
+        return {
+            "cost_pose": pose,
+            "cost_base_velocity": velocity,
+            "cost_control": control,
+            "terminal_cost_pose": end_pose,
+            "terminal_cost_base_velocity": end_velocity,
+            "attitude_error": angle,
+            "position_error": distance,
+            "is_success": success,
+            "diverged": diverged,
+        }
 
     def _show(self) -> None:
         """Remember where the tip is, and update the window."""

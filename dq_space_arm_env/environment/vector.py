@@ -14,24 +14,20 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.compiler.random_draws import draws_kernel, generator_states
+from dq_space_arm_env.environment.copies import Copies, StepResult
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.environment.start_options import given_start
-from dq_space_arm_env.environment.vector_step import VectorStep
 from dq_space_arm_env.kernels import compile_scene
-from dq_space_arm_env.kernels.bound import run_on_rows
-from dq_space_arm_env.kernels.report import MEMORY, REPORT
+from dq_space_arm_env.kernels.report import REPORT
 from dq_space_arm_env.scene import Scene
-from dq_space_arm_env.scene.start import number_of_draws
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
-_ERRORS = slice(REPORT.index("attitude_error"), REPORT.index("position_error") + 1)
 # `info` holds the report without the reward, and the flags without the end of the episode.
 _KEYS = (*REPORT[1:], "is_success", "diverged")
-_MASK_KEYS = tuple(f"_{key}" for key in _KEYS)
+_NOBODY = np.empty(0, dtype=np.int64)
 
 
 class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle):
@@ -91,15 +87,13 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
-        self._begin = self.kernels.kernel("environment_start")
-        self._look = self.kernels.kernel("environment_observe")
-        self._copies = VectorStep(self.kernels, num_envs)
-        self._generators = np.empty((0, 4), dtype=np.uint64)
-        self._draws = np.zeros((num_envs, number_of_draws(self.scene)))
+        self._copies = Copies(self.kernels, num_envs)
+        self._begun = False
         self._everything = np.ones(num_envs, dtype=np.bool_)
         self._everything.setflags(write=False)
+        self._masks = dict.fromkeys((f"_{key}" for key in _KEYS), self._everything)
         # Copies whose episodes are over and that the next step, or the caller, is to reset.
-        self._over = np.empty(0, dtype=np.int64)
+        self._over = _NOBODY
         self._seen: Array | None = None
 
     @property
@@ -135,19 +129,16 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         rows, others = np.flatnonzero(mask), np.flatnonzero(~mask)
         states = self._given_starts(rows, rest)
         self._seed(seed, rows)
-        result = self._copies.empty_result()
-        result.report[:], result.flags[:] = 0.0, False
-        self._start(rows, states)
-        self._observe(rows, *result)
+        self._copies.begin(rows, states)
+        result = self._copies.observe(rows)
         if self._seen is None:
-            self._observe(
-                others, result.observations, np.empty_like(result.report), np.empty_like(result.flags)
-            )
+            result.observation[others] = self._copies.observe(others).observation[others]
         else:
-            result.observations[others] = self._seen[others]
+            result.observation[others] = self._seen[others]
+        result.report[:, others], result.flags[:, others] = 0.0, False
         self._over = np.setdiff1d(self._over, rows)
-        self._remember(result.observations)
-        return result.observations, self._info(result.report, result.flags, mask)
+        self._remember(result.observation)
+        return result.observation, self._info(result, mask)
 
     def _remember(self, observations: Array) -> None:
         """Where resets are the caller's, those of some copies show what the others saw last."""
@@ -173,11 +164,12 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
             seeds = list(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed: {len(seeds)} seeds, should be {self.num_envs}, one for each copy")
-        if not len(self._generators):
-            self._generators = generator_states(seeds)
+        if not self._begun:
+            self._copies.seed(np.arange(self.num_envs), seeds)
+            self._begun = True
         elif seed is not None:
             renewed = np.array([i for i in rows if seeds[i] is not None], dtype=np.int64)
-            self._generators[renewed] = generator_states([seeds[i] for i in renewed])
+            self._copies.seed(renewed, [seeds[i] for i in renewed])
 
     def _given_starts(self, rows: Rows, options: dict[str, Any]) -> Array | None:
         """States at which the options want copies to start, shape (n_x,) or (len(rows), n_x)."""
@@ -186,38 +178,6 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
             given = [given_start(self.kernels, {**options, "initial_state": states[i]}) for i in rows]
             return np.array(given)
         return given_start(self.kernels, options)
-
-    def _start(self, rows: Rows, states: Array | None = None) -> None:
-        """Put copies at the start of an episode: drawn, each from its own generator, or given."""
-        if states is None:
-            pointers = [array.ctypes.data for array in (rows, self._generators, self._draws)]
-            buffers = np.array(pointers, dtype=np.int64)
-            draws_kernel(self._draws.shape[1]).function(0, len(rows), buffers.ctypes.data)
-        else:
-            self._draws[rows] = 0.0
-        arrays = {"draws": self._draws, "x": self._copies.x, "parameters": self._copies.parameters}
-        run_on_rows(self._begin, rows, arrays)
-        if states is not None:
-            self._copies.x[rows] = states
-        self._copies.memory[rows, MEMORY.index("steps_taken")] = 0.0
-
-    def _observe(self, rows: Rows, observations: Array, report: Array, flags: Mask) -> None:
-        """Write what copies see and report without a step to their places in the arrays of a step."""
-        errors, success = np.empty((self.num_envs, 2)), np.empty(self.num_envs, dtype=np.bool_)
-        arrays = {
-            "x": self._copies.x,
-            "parameters": self._copies.parameters,
-            "memory": self._copies.memory,
-            "memory_kept": self._copies.memory,
-            "observation": observations,
-            "errors": errors,
-            "is_success": success,
-        }
-        run_on_rows(self._look, rows, arrays)
-        report[:, rows] = 0.0
-        report[_ERRORS, rows] = errors[rows].T
-        flags[:, rows] = False
-        flags[1, rows] = success[rows]
 
     def step(self, actions: ArrayLike) -> tuple[Array, Array, Mask, Mask, dict[str, Any]]:
         """Apply an action to every copy for one time step.
@@ -233,51 +193,64 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
             ValueError: If the actions have a wrong shape or a NaN; no copy has moved then.
         """
         resetting = self._over
-        if not len(self._generators):
+        if not self._begun:
             raise ResetNeeded("the episodes have not begun: call reset() before step()")
         if len(resetting) and self.autoreset_mode is AutoresetMode.DISABLED:
             raise ResetNeeded(
                 f"the episodes of copies {resetting.tolist()} are over: reset them with a reset_mask"
             )
-        observations, report, flags = self._copies(actions, resetting)
+        result = self._copies.step(actions, resetting)
         if len(resetting):
-            self._start(resetting)
-            self._observe(resetting, observations, report, flags)
-        rewards, terminated = report[0], flags[0]
-        info: dict[str, Any] = {}
+            self._begin_anew(resetting, result)
+            self._over = _NOBODY
+        rewards, terminated, final = result.report[0], result.flags[0], None
         if np.count_nonzero(terminated):
             rows = np.flatnonzero(terminated)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 rewards, terminated = rewards.copy(), terminated.copy()
-                info = self._final(rows, observations, report, flags)
-                self._start(rows)
-                self._observe(rows, observations, report, flags)
+                final = self._final(rows, result)
+                self._begin_anew(rows, result)
             else:
                 self._over = rows
-        elif len(resetting):
-            self._over = np.empty(0, dtype=np.int64)
-        self._remember(observations)
-        info = self._info(report, flags, self._everything) | info
-        return observations, rewards, terminated, np.zeros(self.num_envs, dtype=np.bool_), info
+        self._remember(result.observation)
+        info = self._info(result, self._everything)
+        if final is not None:
+            info |= final
+        return result.observation, rewards, terminated, np.zeros(self.num_envs, dtype=np.bool_), info
 
-    def _final(self, rows: Rows, observations: Array, report: Array, flags: Mask) -> dict[str, Any]:
+    def _begin_anew(self, rows: Rows, result: StepResult) -> None:
+        """Begin new episodes of copies, and put what they see where the old ones' stands."""
+        self._copies.begin(rows)
+        self._copies.observe(rows, result)
+
+    def _final(self, rows: Rows, result: StepResult) -> dict[str, Any]:
         """What episodes that a step ended and begins anew leave behind."""
-        ended = flags[0].copy()
+        ended = result.flags[0].copy()
         last_observations = np.full(self.num_envs, None, dtype=object)
         for i in rows:
-            last_observations[i] = observations[i].copy()
-        last = self._info(np.where(ended, report, 0.0), flags & ended, ended)
+            last_observations[i] = result.observation[i].copy()
+        last = result._replace(report=np.where(ended, result.report, 0.0), flags=result.flags & ended)
         return {
             "final_obs": last_observations,
             "_final_obs": ended,
-            "final_info": last,
+            "final_info": self._info(last, ended),
             "_final_info": ended.copy(),
         }
 
-    def _info(self, report: Array, flags: Mask, mask: Mask) -> dict[str, Any]:
+    def _info(self, result: StepResult, mask: Mask) -> dict[str, Any]:
         """What `DQSpaceArmEnv` reports, as arrays."""
-        _, *entries = report
-        info: dict[str, Any] = dict(zip(_KEYS, (*entries, flags[1], flags[2]), strict=True))
-        if mask is self._everything:
-            return info | dict.fromkeys(_MASK_KEYS, mask)
-        return info | {key: mask.copy() for key in _MASK_KEYS}
+        _, pose, velocity, control, end_pose, end_velocity, angle, distance = result.report
+        _, success, diverged = result.flags
+        whole = mask is self._everything
+        return {
+            "cost_pose": pose,
+            "cost_base_velocity": velocity,
+            "cost_control": control,
+            "terminal_cost_pose": end_pose,
+            "terminal_cost_base_velocity": end_velocity,
+            "attitude_error": angle,
+            "position_error": distance,
+            "is_success": success,
+            "diverged": diverged,
+            **(self._masks if whole else {key: mask.copy() for key in self._masks}),
+        }

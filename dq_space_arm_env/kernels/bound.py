@@ -57,47 +57,101 @@ class BoundKernel:
         self.indexed: bool = kernel.metadata["indexed"]
 
     def __call__(self, arrays: Sequence[Array], rows: int, threads: int = 1) -> None:
-        """Run on rows 0 .. rows - 1 of C-contiguous arrays, inputs first, none of them by column.
+        """Run on rows 0 .. rows - 1 of C-contiguous arrays.
 
         Args:
-            arrays: Inputs, then outputs, each of the element type that its `ArraySpec` says; the list of rows
-                before them if the kernel is indexed.
+            arrays: Inputs, then outputs, each of the shape and element type that its `ArraySpec` says.
             rows: Number of rows to work on.
             threads: Threads to share the work among.
         """
-        buffers = np.array([array.ctypes.data for array in arrays], dtype=np.int64)
-        run_shared(self.native.function, rows, buffers.ctypes.data, threads)
+        names = (spec.name for spec in (*self.inputs, *self.outputs))
+        KernelCall(self, dict(zip(names, arrays, strict=True)))(rows, threads)
 
-    def bind_one(self, arrays: Sequence[Array]) -> Callable[[], None]:
-        """Fix the arrays of a call on a single row, for callers that make it again and again.
+
+class KernelCall:
+    """A kernel with the addresses of its arrays, for callers that call it again and again.
+
+    Arrays that stay are handed over once, and kept alive; others take their place before a call. All of them
+    must be C-contiguous, of the shape and element type that the kernel's `ArraySpec`s say.
+    """
+
+    def __init__(self, kernel: BoundKernel, arrays: Mapping[str, Array]) -> None:
+        """Note the addresses of arrays.
 
         Args:
-            arrays: As for a call; they must stay alive, and where they are, as long as the result is used.
-
-        Returns:
-            A function that runs the kernel on row 0. It keeps the interpreter to itself: the work is shorter
-            than handing the interpreter over.
+            kernel: The kernel.
+            arrays: Arrays by name; those of names that the kernel does not know are left out.
         """
-        specs = (*self.inputs, *self.outputs)
-        addresses: list[int] = []
-        for spec, array in zip(specs, arrays, strict=True):
-            addresses += [array.ctypes.data, 1] if spec.by_column else [array.ctypes.data]
-        buffers = (ctypes.c_int64 * len(addresses))(*addresses)
+        self._kernel, self._function = kernel, kernel.native.function
+        self._slots: dict[str, int] = {}
+        position = 1 if kernel.indexed else 0
+        for spec in (*kernel.inputs, *kernel.outputs):
+            self._slots[spec.name] = position
+            # That of an array by column is followed by the columns' distance.
+            position += 2 if spec.by_column else 1
+        self._buffers = (ctypes.c_int64 * position)()
+        self._pointer = ctypes.addressof(self._buffers)
+        self._kept = [array for name, array in arrays.items() if name in self._slots]
+        for spec in (*kernel.inputs, *kernel.outputs):
+            if spec.name in arrays:
+                array = arrays[spec.name]
+                self.place(**{spec.name: array})
+                if spec.by_column:  # the columns of a single row are numbers
+                    self._buffers[self._slots[spec.name] + 1] = array.shape[1] if array.ndim == 2 else 1
+
+    def place(self, **arrays: Array) -> None:
+        """Take arrays in place of those of their names; each has the shape of the one before.
+
+        Args:
+            arrays: Arrays by name; the caller keeps them alive.
+        """
+        for name, array in arrays.items():
+            self._buffers[self._slots[name]] = address_of(array)
+
+    def __call__(self, rows: int, threads: int = 1) -> None:
+        """Run on rows 0 .. rows - 1.
+
+        Args:
+            rows: Number of rows to work on.
+            threads: Threads to share the work among.
+        """
+        run_shared(self._function, rows, self._pointer, threads)
+
+    def on_rows(self, rows: NDArray[np.int64]) -> None:
+        """Run an indexed kernel on some rows.
+
+        Args:
+            rows: Numbers of the rows, shape (k,).
+        """
+        self._buffers[0] = address_of(rows)
+        self._function(0, len(rows), self._pointer)
+
+    def of_one_row(self) -> Callable[[], None]:
+        """A function that runs the kernel on row 0.
+
+        It keeps the interpreter to itself: the work is shorter than handing the interpreter over.
+        """
         prototype = ctypes.PYFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
-        # Arguments that are converted beforehand; the buffers are kept alive by the pointer to them.
-        pointer = ctypes.cast(buffers, ctypes.c_void_p)
-        return partial(prototype(self.address), ctypes.c_int64(0), ctypes.c_int64(1), pointer)
+        # Converted beforehand, arguments cost nothing; the pointer keeps the addresses alive.
+        pointer = ctypes.cast(self._buffers, ctypes.c_void_p)
+        function = prototype(self._kernel.address)
+        return partial(function, ctypes.c_int64(0), ctypes.c_int64(1), pointer)
 
 
-def run_on_rows(kernel: BoundKernel, rows: NDArray[np.int64], arrays: Mapping[str, Array]) -> None:
-    """Run an indexed kernel on some rows of arrays that are known by name.
+def address_of(array: Array) -> int:
+    """Address of a contiguous array.
 
     Args:
-        kernel: An indexed kernel.
-        rows: Numbers of the rows, shape (k,).
-        arrays: C-contiguous arrays with the element types of the kernel, by the names in its `ArraySpec`s.
+        array: The array.
+
+    Returns:
+        The address of its first element.
     """
-    kernel([rows, *(arrays[spec.name] for spec in (*kernel.inputs, *kernel.outputs))], len(rows))
+    buffer: Any = array
+    try:  # four times as fast as the other way, but not for what is read-only or empty
+        return ctypes.addressof(ctypes.c_char.from_buffer(buffer))
+    except (TypeError, ValueError):
+        return array.ctypes.data
 
 
 def rows_of(inputs: dict[str, ArrayLike | None], dtype: DTypeLike) -> tuple[int, bool, dict[str, Array]]:

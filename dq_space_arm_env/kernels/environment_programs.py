@@ -13,12 +13,12 @@ from typing import Any
 
 import casadi
 
-from dq_space_arm_env.compiler.graph import trace
+from dq_space_arm_env.compiler.graph import Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.integrators import INTEGRATORS
 from dq_space_arm_env.kernels.equations import SceneEquations, total
 from dq_space_arm_env.kernels.parameters import EpisodeParameters
-from dq_space_arm_env.kernels.report import MEMORY, STATE_LIMIT
+from dq_space_arm_env.kernels.report import MEMORY, REPORT, STATE_LIMIT
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import number_of_draws
 
@@ -63,12 +63,13 @@ class EnvironmentPrograms:
         return [buffers[0], Buffer("parameters", len(self._parameters)), *buffers[1:]]
 
     def _start(self, integrator: str) -> Program:
-        """Draws to initial states and parameters, for the copies in a list."""
+        """Draws to initial states, memory and parameters, for the copies in a list."""
         count = number_of_draws(self.scene)
 
         def outputs(draws: Scalars) -> Mapping[str, Scalars]:
             state, parameters = EpisodeParameters.values(self.scene, draws)
-            return {"x": state, "parameters": parameters} if parameters else {"x": state}
+            begun = {"x": state, "memory": [0.0] * len(MEMORY)}
+            return {**begun, "parameters": parameters} if parameters else begun
 
         graph = trace("start_graph", {"draws": count}, outputs)
         buffers = [Buffer(name, size) for name, size in graph.outputs]
@@ -85,19 +86,18 @@ class EnvironmentPrograms:
         def outputs(x: Scalars, memory: Scalars) -> Mapping[str, Scalars]:
             seen = equations.observe(x, (simulation.steps - memory[0]) * simulation.dt)
             angle, distance = self._shown_errors(seen["errors"])
+            costs = [0.0] * (len(REPORT) - 2)
             return {
                 "memory_kept": [memory[0], *equations.state_cost_terms(x)],
                 "observation": seen["observation"],
-                "errors": [angle, distance],
-                "is_success": [self._within_tolerance(angle, distance)],
+                "report": [*costs, angle, distance],
+                "flags": [0.0, self._within_tolerance(angle, distance), 0.0],
             }
 
         sizes = {"x": equations.field.n_x, "memory": len(MEMORY)}
         graph = trace("observe_graph", sizes, outputs, parameters=self._parameters)
-        dtypes = {"errors": "float64", "is_success": "bool"}
-        buffers = [Buffer(name, size, dtype=dtypes.get(name, "")) for name, size in graph.outputs]
         inputs = self._inputs(*(Buffer(name, size) for name, size in sizes.items()))
-        program = Program("environment_observe", inputs, buffers, indexed=True)
+        program = Program("environment_observe", inputs, _outputs(graph), indexed=True)
         program.call(graph)
         return program
 
@@ -129,11 +129,7 @@ class EnvironmentPrograms:
         sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": len(MEMORY)}
         report = trace("report_graph", sizes, self._report, parameters=self._parameters)
         program.call(report)
-        columns = {"report": "float64", "flags": "bool"}
-        program.outputs = [
-            Buffer(name, size, dtype=columns.get(name, ""), by_column=name in columns)
-            for name, size in report.outputs
-        ]
+        program.outputs = _outputs(report)
         return program
 
     def _commanded(self, action: Scalars) -> Mapping[str, Scalars]:
@@ -171,6 +167,15 @@ class EnvironmentPrograms:
             "report": [reward, *terms, *terminal, angle, distance],
             "flags": [over, success, casadi.logic_not(sound)],
         }
+
+
+def _outputs(graph: Graph) -> list[Buffer]:
+    """Buffers of a graph's outputs; report and flags have a row for each of their entries."""
+    columns = {"report": "float64", "flags": "bool"}
+    return [
+        Buffer(name, size, dtype=columns.get(name, ""), by_column=name in columns)
+        for name, size in graph.outputs
+    ]
 
 
 PROGRAMS: Mapping[str, Callable[[EnvironmentPrograms, str], Program]] = {

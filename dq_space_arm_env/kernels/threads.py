@@ -37,11 +37,11 @@ def run_shared(function: KernelFunction, rows: int, buffers: int, threads: int =
         buffers: Address of the addresses of the kernel's arrays.
         threads: Most threads to use, this one included; small batches use fewer.
     """
-    blocks = math.ceil(rows / _BLOCK)
-    threads = min(threads, rows // _ROWS_PER_THREAD)
-    if threads < 2:
+    if threads == 1 or rows < 2 * _ROWS_PER_THREAD:
         function(0, rows, buffers)
         return
+    threads = min(threads, rows // _ROWS_PER_THREAD)
+    blocks = math.ceil(rows / _BLOCK)
     tickets = count()
 
     def work() -> None:

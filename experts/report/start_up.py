@@ -1,55 +1,78 @@
-"""The time that a new process needs before it simulates: imports, and kernels cached or compiled."""
+"""The time that a new process needs before it computes: imports, and kernels cached or compiled."""
 
 import os
 import subprocess
 import sys
 import tempfile
-from functools import partial
 from pathlib import Path
 
 import dq_space_arm_env
 from dq_space_arm_env import Scene
 
-_START_UP = """
+IMPORT, MAKE, LINEARIZE = "import", "gymnasium.make, reset, step", "first linearization"
+EMPTY, WARM = "empty cache", "warm cache"
+
+# Each prints its duration in s; the scene comes as JSON on the standard input.
+_IMPORT = """
 import time
 start = time.perf_counter()
 import dq_space_arm_env
-imported = time.perf_counter()
+print(time.perf_counter() - start)
+"""
+_MAKE = """
+import time
+import dq_space_arm_env
+start = time.perf_counter()
 import gymnasium
 env = gymnasium.make("DQSpaceArm-v0", scene=dq_space_arm_env.Scene.model_validate_json(input()))
 env.reset(seed=0)
 env.step(env.action_space.sample())
-print(imported - start, time.perf_counter() - imported)
+print(time.perf_counter() - start)
+"""
+_LINEARIZE = """
+import time
+import dq_space_arm_env
+start = time.perf_counter()
+kernels = dq_space_arm_env.compile_scene(dq_space_arm_env.Scene.model_validate_json(input()))
+kernels.linearize(kernels.layout.initial_state, [0.0] * kernels.n_u)
+print(time.perf_counter() - start)
 """
 
 
 def measure_start_up(scene: Scene, repeats: int) -> dict[str, list[float]]:
-    """Time new processes: import, then making an environment, its reset and its first step.
+    """Time new processes, after Python itself has started.
 
     Args:
         scene: The scene.
-        repeats: Processes that find the kernel in the cache, after the one that compiles it.
+        repeats: Processes of each kind; a third as many, at least one, where kernels are compiled.
 
     Returns:
-        Durations in s: "import", "make, warm cache" and, one number, "make, empty cache".
+        Durations in s: of the import alone; then, after it, of making an environment with its reset and first
+        step, and of a first linearization, each with the kernel in the cache and with an empty cache.
     """
-    root = str(Path(dq_space_arm_env.__file__).parent.parent)
     with tempfile.TemporaryDirectory() as folder:
-        paths = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
-        environment = {**os.environ, "DQ_SPACE_ARM_CACHE": folder, "PYTHONPATH": paths}
-        start = partial(
-            subprocess.run,
-            [sys.executable, "-c", _START_UP],
-            input=scene.model_dump_json() + "\n",
-            capture_output=True,
-            text=True,
-            check=True,
-            env=environment,
-        )
-        runs = [[float(part) for part in start().stdout.split()] for _ in range(1 + repeats)]
-    warm = runs[1:]
-    return {
-        "import": [imported for imported, _ in warm],
-        "make, warm cache": [made for _, made in warm],
-        "make, empty cache": [runs[0][1]],
-    }
+        found = {IMPORT: [_seconds(_IMPORT, scene, folder) for _ in range(repeats)]}
+    for name, program in ((MAKE, _MAKE), (LINEARIZE, _LINEARIZE)):
+        compiled = []
+        for _ in range(max(1, repeats // 3)):
+            with tempfile.TemporaryDirectory() as folder:
+                compiled.append(_seconds(program, scene, folder))
+                if len(compiled) == 1:  # its kernels are as good as any
+                    found[f"{name}, {WARM}"] = [_seconds(program, scene, folder) for _ in range(repeats)]
+        found[f"{name}, {EMPTY}"] = compiled
+    return found
+
+
+def _seconds(program: str, scene: Scene, cache: str) -> float:
+    """Run a program in a new process with a cache of its own, and read what it prints."""
+    root = str(Path(dq_space_arm_env.__file__).parent.parent)
+    paths = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+    result = subprocess.run(
+        [sys.executable, "-P", "-c", program],
+        input=scene.model_dump_json() + "\n",
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        env={**os.environ, "DQ_SPACE_ARM_CACHE": cache, "PYTHONPATH": paths},
+    )
+    return float(result.stdout)

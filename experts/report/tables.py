@@ -28,19 +28,31 @@ def print_tables(console: Console, run: ManeuverRun) -> None:
     """
     name = run.scene.name
     console.print(
-        _table("The paper's numbers (section V)", ("", "paper", f"scene {name}"), _paper_rows(run)),
-        _table(
+        plain_table("The paper's numbers (section V)", ("", "paper", f"scene {name}"), _paper_rows(run)),
+        plain_table(
             "Our own choice: the paper prints none of it",
             ("", f"scene {name}"),
             own_choices(run.scene).items(),
         ),
-        _table("Result", ("", "", ""), _result_rows(run)),
-        _table("Inputs", ("", "largest", "limit", "at a limit", "cost"), _input_rows(run)),
+        plain_table("Result", ("", "", ""), _result_rows(run)),
+        plain_table("Inputs", ("", "largest", "limit", "at a limit", "cost"), _input_rows(run)),
     )
 
 
-def _table(title: str, headings: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:
-    """Cells are plain text: brackets in the name of a link are no markup."""
+def plain_table(
+    title: str, headings: Iterable[str], rows: Iterable[Iterable[str]], right: int | None = None
+) -> Table:
+    """Make a table whose cells are plain text: brackets in the name of a link are no markup.
+
+    Args:
+        title: Title above the table.
+        headings: A heading for each column; none is shown if all are empty.
+        rows: The cells.
+        right: First of the columns that are flush right; None for none.
+
+    Returns:
+        The table.
+    """
     headings = list(headings)
     table = Table(
         title=Text(title),
@@ -49,8 +61,9 @@ def _table(title: str, headings: Iterable[str], rows: Iterable[Iterable[str]]) -
         box=SIMPLE_HEAD,
         show_header=any(headings),
     )
-    for heading in headings:
-        table.add_column(Text(heading), overflow="fold")
+    for index, heading in enumerate(headings):
+        flush_right = right is not None and index >= right
+        table.add_column(Text(heading), overflow="fold", justify="right" if flush_right else "left")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     return table

@@ -200,22 +200,21 @@ def test_rows_of_every_size_and_type_pass_through_registers(lanes, precision, dt
 @pytest.mark.parametrize(("lanes", "precision"), EVERY_CODE)
 @pytest.mark.parametrize("count", [0, 1, 5, 19])
 def test_an_indexed_program_works_on_the_rows_of_its_list(lanes, precision, count):
-    graph = trace("graph", {"x": 3}, lambda x: {"y": [2 * entry for entry in x]})
-    program = Program("program", [Buffer("x", 3)], [Buffer("y", 3)], indexed=True)
+    graph = trace("graph", {"x": 3}, lambda x: {"y": [2 * entry for entry in x], "z": x})
+    outputs = [Buffer("y", 3), Buffer("z", 3, by_column=True)]
+    program = Program("program", [Buffer("x", 3)], outputs, indexed=True)
     program.call(graph)
+    kernel = native.NativeKernel(program.name, *build_program(program, lanes, precision))
     x = np.arange(60).reshape(20, 3).astype(precision)
-    y = np.full((20, 3), -1, precision)
+    y, z = np.full((20, 3), -1, precision), np.full((3, 20), -1, precision)
     rows = np.random.default_rng(count).permutation(20)[:count]
-    run(program, lanes, count, rows, x, y, precision=precision)
+    addresses = [array.ctypes.data for array in (rows, x, y, z)]
+    buffers = np.array([*addresses, 20], dtype=np.int64)
+    kernel.function(0, count, buffers.ctypes.data)
     np.testing.assert_array_equal(y[rows], 2 * x[rows])
+    np.testing.assert_array_equal(z[:, rows], x[rows].T)
     assert (np.delete(y, rows, axis=0) == -1).all()
-
-
-def test_an_indexed_program_has_no_columns():
-    program = program_of(lambda x: {"y": [2 * x[0]]}, [Buffer("y", 1, by_column=True)], x=1)
-    program.indexed = True
-    with pytest.raises(ValueError, match="'y' is by column, the program is indexed"):
-        build_program(program, 1)
+    assert (np.delete(z, rows, axis=1) == -1).all()
 
 
 def test_a_missing_function_is_noticed():
