@@ -47,7 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status.
     """
     options = _parse(arguments)
-    console = Console(highlight=False)
+    # A file or a pipe has no width of its own; the tables are made for this one.
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
     try:
         scenes = [load_scene(name) for name in options.scene or ["paper"]]
         options.out.mkdir(parents=True, exist_ok=True)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.compiler.random_draws import draws_kernel, generator_states
+from dq_space_arm_env.environment.results import ResultArrays, StepResult
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
-from dq_space_arm_env.kernels.report import FLAGS, MEMORY, REPORT
+from dq_space_arm_env.kernels.report import FLAGS, MEMORY
 from dq_space_arm_env.scene.start import number_of_draws
 
 Array = NDArray[Any]
@@ -19,20 +20,6 @@ Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 _TERMINATED, _DIVERGED = FLAGS.index("terminated"), FLAGS.index("diverged")
-
-
-class StepResult(NamedTuple):
-    """What a step returns, in arrays that are the caller's.
-
-    Attributes:
-        observation: Shape (count, n_obs).
-        report: A row for each name in `REPORT`, shape (len(REPORT), count).
-        flags: A row for each name in `FLAGS`, shape (len(FLAGS), count).
-    """
-
-    observation: Array
-    report: Array
-    flags: Mask
 
 
 class Copies:
@@ -62,14 +49,14 @@ class Copies:
         self.parameters = np.zeros((count, sizes.get("parameters", 0)), kernels.dtype)
         self._draws = np.zeros((count, number_of_draws(kernels.scene)))
         self._generators = np.zeros((count, 4), dtype=np.uint64)
-        self._observation_shape, self._dtype = (count, sizes["observation"]), kernels.dtype
+        self._results = ResultArrays((count, sizes["observation"]), kernels.dtype)
         self._action_shape = (count, kernels.n_u)
 
         drawing = BoundKernel(draws_kernel(self._draws.shape[1]))
         self._draw = KernelCall(drawing, {"states": self._generators, "draws": self._draws})
         constant = {"draws": self._draws, "parameters": self.parameters}
         self._start = KernelCall(start, constant)
-        self._observe = KernelCall(observe, constant | self._empty_result()._asdict())
+        self._observe = KernelCall(observe, constant | self._results.fresh()._asdict())
         self._steps = self._step_calls(kernels)
         self._swap()
         self._steps_next = self._step_calls(kernels)
@@ -79,7 +66,7 @@ class Copies:
         """The step by the type of the actions, from the present arrays of states to the others."""
         arrays = {"x": self.x, "x_kept": self._x_next, "parameters": self.parameters}
         arrays |= {"memory": self._memory, "memory_kept": self._memory_next}
-        arrays |= self._empty_result()._asdict()
+        arrays |= self._results.fresh()._asdict()
         names = {np.float64: "environment_step", np.float32: "environment_step_float32_actions"}
         return {kind: KernelCall(kernels.kernel(name), arrays) for kind, name in names.items()}
 
@@ -87,14 +74,6 @@ class Copies:
         """Let the two sets of states change places."""
         self.x, self._x_next = self._x_next, self.x
         self._memory, self._memory_next = self._memory_next, self._memory
-
-    def _empty_result(self) -> StepResult:
-        """Fresh arrays with arbitrary contents."""
-        return StepResult(
-            np.empty(self._observation_shape, self._dtype),
-            np.empty((len(REPORT), self.count)),
-            np.empty((len(FLAGS), self.count), np.bool_),
-        )
 
     def seed(self, rows: Rows, seeds: Sequence[int | None]) -> None:
         """Renew random generators.
@@ -135,7 +114,7 @@ class Copies:
         Returns:
             What they see and report: no costs, and no end of an episode.
         """
-        seen = self._empty_result() if result is None else result
+        seen = self._results.fresh() if result is None else result
         self._observe.place(x=self.x, memory=self._memory, memory_kept=self._memory, **seen._asdict())
         self._observe.on_rows(rows)
         return seen
@@ -157,7 +136,7 @@ class Copies:
         if values.shape != self._action_shape:
             raise ValueError(f"actions: shape {values.shape}, should be {self._action_shape}")
         values = np.ascontiguousarray(values, np.float32 if values.dtype == np.float32 else np.float64)
-        result, call = self._empty_result(), self._steps[values.dtype.type]
+        result, call = self._results.take(), self._steps[values.dtype.type]
         observation, report, flags = result
         call.place(action=values, observation=observation, report=report, flags=flags)
         call(self.count, self._threads)

@@ -14,8 +14,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.environment.copies import Copies, StepResult
+from dq_space_arm_env.environment.copies import Copies
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
+from dq_space_arm_env.environment.results import StepResult
 from dq_space_arm_env.environment.start_options import given_start
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.report import REPORT

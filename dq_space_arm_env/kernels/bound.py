@@ -132,10 +132,10 @@ class KernelCall:
         It keeps the interpreter to itself: the work is shorter than handing the interpreter over.
         """
         prototype = ctypes.PYFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
-        # Converted beforehand, arguments cost nothing; the pointer keeps the addresses alive.
-        pointer = ctypes.cast(self._buffers, ctypes.c_void_p)
-        function = prototype(self._kernel.address)
-        return partial(function, ctypes.c_int64(0), ctypes.c_int64(1), pointer)
+        function: Any = prototype(self._kernel.address)
+        function.call = self  # keeps code and arrays alive
+        # Converted beforehand, arguments cost nothing.
+        return partial(function, ctypes.c_int64(0), ctypes.c_int64(1), ctypes.c_void_p(self._pointer))
 
 
 def address_of(array: Array) -> int:

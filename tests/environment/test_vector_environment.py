@@ -221,6 +221,34 @@ def test_returned_arrays_are_the_callers():
     assert_same(info, kept_info)
 
 
+def test_results_that_are_kept_stay_as_they_are():
+    venv = DQSpaceArmVectorEnv(4, short(steps=30))
+    venv.reset(seed=0)
+    venv.action_space.seed(0)
+    kept, copies = [], []
+    for step in range(20):
+        observations, rewards, _, _, info = venv.step(venv.action_space.sample())
+        # Any part of a result keeps it: here in turns the whole, a view, and a view of a view.
+        part = [
+            observations,
+            rewards,
+            observations[1:, 2:][0],
+            info["is_success"],
+            info["position_error"][2:],
+        ]
+        kept.append(part[step % 5])
+        copies.append(part[step % 5].copy())
+    assert_same(tuple(kept), tuple(copies))
+
+
+def test_results_that_nobody_holds_are_used_again():
+    venv = DQSpaceArmVectorEnv(4, short(steps=100))
+    venv.reset(seed=0)
+    actions = np.zeros((4, 12))
+    addresses = {venv.step(actions)[0].ctypes.data for _ in range(50)}
+    assert len(addresses) <= 4
+
+
 def test_what_a_caller_does_to_results_does_not_matter():
     venv, twin = DQSpaceArmVectorEnv(4, short(steps=3)), DQSpaceArmVectorEnv(4, short(steps=3))
     venv.reset(seed=0)

@@ -1,9 +1,13 @@
 """What a caller of the kernels sees: shapes, errors, bit equality, and how much each scene needs."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
 from dq_space_arm_env import compile_scene, list_scenes, load_scene
+from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import INTEGRATORS as SCENE_INTEGRATORS
 
 
@@ -67,6 +71,20 @@ def test_wrong_arguments_are_named(call, message, draw):
     kernels, states, inputs = draw("paper", 1)
     with pytest.raises(ValueError, match=message):
         call(kernels, states[0], inputs[0])
+
+
+def test_a_call_of_one_row_keeps_its_arrays_alive(draw):
+    kernels, states, inputs = draw("paper", 1)
+    kernel = kernels.kernel("step", lanes=1)
+    arrays = {"x": states[0].copy(), "u": inputs[0].copy(), "h": np.array([0.015]), "x_next": np.zeros(23)}
+    references = [weakref.ref(array) for array in arrays.values()]
+    result = arrays["x_next"]
+    run = KernelCall(kernel, arrays).of_one_row()
+    del arrays
+    gc.collect()
+    assert all(reference() is not None for reference in references)
+    run()
+    np.testing.assert_array_equal(result, kernels.step(states[0], inputs[0]))
 
 
 def test_the_same_scene_gives_the_same_kernels():

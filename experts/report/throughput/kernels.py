@@ -101,7 +101,10 @@ def kernel_case(
         threads=variant.threads,
         operations=kernel.operation_count,
     )
-    return Case(subject, partial(KernelCall(kernel, arrays), batch, variant.threads))
+    call = KernelCall(kernel, arrays)
+    # One row is called as the single environment does it, many as the vector environment does.
+    run = call.of_one_row() if batch == 1 else partial(call, batch, variant.threads)
+    return Case(subject, run)
 
 
 def _episodes(kernels: Kernels, count: int) -> dict[str, np.ndarray]:
