@@ -268,13 +268,13 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             raise ValueError(f"action: shape {shape}, should be {self._action_shape}")
         self._action[...] = action
         self._take_step()
-        info = self._info()
-        if info["diverged"] and np.isnan(self._action).any():
+        reward, over, info = self._outcome()
+        if over and np.isnan(self._action).any():
             raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
-        self._over = over = self._flags.item(0)
+        self._over = over
         if self.render_mode is not None:
             self._show()
-        return self._observation.copy(), self._report.item(0), over, False, info
+        return self._observation.copy(), reward, over, False, info
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -302,13 +302,13 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         self._trail = []
         if self.render_mode is not None:
             self._show()
-        return self._observation.copy(), self._info()
+        return self._observation.copy(), self._outcome()[2]
 
-    def _info(self) -> dict[str, Any]:
-        """What the last step, or the reset, reports besides reward and end."""
-        _, success, diverged = self._flags.tolist()
-        _, pose, velocity, control, end_pose, end_velocity, angle, distance = self._report.tolist()
-        return {
+    def _outcome(self) -> tuple[float, bool, dict[str, Any]]:
+        """Reward, whether the episode is over, and info of the last step, or of the reset."""
+        over, success, diverged = self._flags.tolist()
+        reward, pose, velocity, control, end_pose, end_velocity, angle, distance = self._report.tolist()
+        info = {
             "cost_pose": pose,
             "cost_base_velocity": velocity,
             "cost_control": control,
@@ -319,6 +319,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             "is_success": success,
             "diverged": diverged,
         }
+        return reward, over, info
 
     def _show(self) -> None:
         """Remember where the tip is, and update the window."""
