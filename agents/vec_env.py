@@ -84,8 +84,8 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
 
         Args:
             options: As for `DQSpaceArmEnv.reset`, one dictionary for all copies or one for each. In one for
-                all, "initial_state" may also have shape (num_envs, n_x), units of `kernels.layout.state`;
-                that is faster than a dictionary for each.
+                all, "initial_state" may also have shape (num_envs, n_x), units of `kernels.layout.state`, and
+                "target" shape (num_envs, 8); that is faster than a dictionary for each.
 
         Raises:
             ValueError: If the number of dictionaries is wrong, or one has a "reset_mask".

@@ -1,7 +1,7 @@
 """DQ Space Arm: a spacecraft with an arm in dual quaternions, as an environment and as compiled functions.
 
-Importing this package registers `DQSpaceArm-v0` and loads little else: each public name imports what it needs
-when it is first used.
+Importing this package registers `DQSpaceArm-v0` and `DQSpaceArmGoal-v0` and loads little else: each public
+name imports what it needs when it is first used.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from dq_space_arm_env.registration import register_environments
 
 if TYPE_CHECKING:
-    from dq_space_arm_env.environment import DQSpaceArmEnv, DQSpaceArmVectorEnv
+    from dq_space_arm_env.environment import DQSpaceArmEnv, DQSpaceArmGoalEnv, DQSpaceArmVectorEnv
     from dq_space_arm_env.kernels import Kernels, compile_scene
     from dq_space_arm_env.scene import Scene, SceneError, list_scenes, load_scene
 
@@ -20,6 +20,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "DQSpaceArmEnv",
+    "DQSpaceArmGoalEnv",
     "DQSpaceArmVectorEnv",
     "Kernels",
     "Scene",
@@ -31,6 +32,7 @@ __all__ = [
 
 _HOMES = {
     "DQSpaceArmEnv": "environment",
+    "DQSpaceArmGoalEnv": "environment",
     "DQSpaceArmVectorEnv": "environment",
     "Kernels": "kernels",
     "Scene": "scene",

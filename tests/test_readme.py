@@ -45,11 +45,11 @@ def test_commands_exist():
     assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
-def test_examples_in_the_environments_docstring_run():
+@pytest.mark.parametrize("name", ["dq_space_arm", "goal"])
+def test_examples_in_the_docstrings_of_environments_run(name):
     import doctest
+    from importlib import import_module
 
-    from dq_space_arm_env.environment import dq_space_arm
-
-    results = doctest.testmod(dq_space_arm)
+    results = doctest.testmod(import_module(f"dq_space_arm_env.environment.{name}"))
     assert results.attempted >= 5
     assert results.failed == 0

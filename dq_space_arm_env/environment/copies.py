@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.compiler.random_draws import draws_kernel, generator_states
 from dq_space_arm_env.environment.results import ResultArrays, StepResult
+from dq_space_arm_env.environment.start_options import GivenStart
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
 from dq_space_arm_env.kernels.report import FLAGS, MEMORY
@@ -41,7 +42,7 @@ class Copies:
             kernels: Functions of the scene.
             count: Number of copies.
         """
-        self.count, self._threads = count, kernels.threads
+        self.count, self._kernels = count, kernels
         start, observe = kernels.kernel("environment_start"), kernels.kernel("environment_observe")
         sizes = {spec.name: spec.stride for spec in (*start.outputs, *observe.outputs)}
         self.x, self._x_next = (np.zeros((count, kernels.n_x), kernels.dtype) for _ in range(2))
@@ -87,22 +88,24 @@ class Copies:
         """
         self._generators[rows] = generator_states(seeds)
 
-    def begin(self, rows: Rows, states: Array | None = None) -> None:
+    def begin(self, rows: Rows, given: GivenStart | None = None) -> None:
         """Put copies at the start of an episode.
 
         Args:
             rows: Numbers of the copies.
-            states: Where they start, shape (n_x,) or (len(rows), n_x), target and masses being nominal; None
-                to draw all of it, each copy from its own generator.
+            given: What is not to be drawn, by each copy from its own generator, of their starts; None to draw
+                all of it.
         """
-        if states is None:
+        if given is None or given.state is None:
             self._draw.on_rows(rows)
         else:
             self._draws[rows] = 0.0
         self._start.place(x=self.x, memory=self._memory)
         self._start.on_rows(rows)
-        if states is not None:
-            self.x[rows] = states
+        if given is not None:
+            x, parameters = self.x[rows], self.parameters[rows]
+            given.apply(self._kernels, x, parameters)
+            self.x[rows], self.parameters[rows] = x, parameters
 
     def observe(self, rows: Rows, result: StepResult | None = None) -> StepResult:
         """Find out what copies see, without a step.
@@ -139,7 +142,7 @@ class Copies:
         result, call = self._results.take(), self._steps[values.dtype.type]
         observation, report, flags = result
         call.place(action=values, observation=observation, report=report, flags=flags)
-        call(self.count, self._threads)
+        call(self.count, self._kernels.threads)
         # What has diverged is over, and hardly anything ever is: one look is enough.
         if np.count_nonzero(flags[_TERMINATED]) and flags[_DIVERGED].any():
             _refuse_nan(values, ignored)

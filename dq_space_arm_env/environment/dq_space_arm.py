@@ -18,7 +18,7 @@ from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.kernels.report import STATE_LIMIT
 from dq_space_arm_env.scene import Scene, load_scene
-from dq_space_arm_env.scene.start import episode_scene
+from dq_space_arm_env.scene.start import episode_scene, target_entries
 
 if TYPE_CHECKING:
     from dq_space_arm_env.environment.rendering import Renderer
@@ -93,8 +93,9 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
     `reset(seed=...)` draws the start from the scene's spread, uniformly per component; where the scene has a spread for them, the target, masses and inertias too
     (scenes `random-target` and `random-masses`). `options={"nominal": True}` starts at the scene's initial state, `options={"initial_state": x}` at a state x
-    (`env.unwrapped.kernels.layout.state` names its entries); both leave target and masses at their nominal values. `env.unwrapped.episode_scene` is the scene of
-    the running episode, with what was drawn as plain numbers: what an optimal controller may know.
+    (`env.unwrapped.kernels.layout.state` names its entries); both leave target and masses at their nominal values. `options={"target": q}`, alone or with either,
+    sets the target where the scene draws it. `env.unwrapped.episode_scene` is the scene of the running episode, with what was drawn or given as plain numbers:
+    what an optimal controller may know.
 
     ## Episode End
 
@@ -208,6 +209,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         self._observation, self._report, self._flags = (
             arrays[name] for name in ("observation", "report", "flags")
         )
+        self._given_target: Array | None = None
         self._action_shape = self._action.shape
 
     @property
@@ -236,6 +238,20 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         return self._parameters.copy()
 
     @property
+    def target(self) -> Array:
+        """Pose q_{D/I} of this episode's target, shape (8,), real part dimensionless, dual part m; a copy.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+        """
+        if not self._begun:
+            raise ResetNeeded("call reset() before reading the target")
+        target = np.array(self.scene.target.pose.dual_quaternion, dtype=self.kernels.dtype)
+        entries = list(target_entries(self.scene))
+        target[entries] = self._parameters[: len(entries)]
+        return target
+
+    @property
     def episode_scene(self) -> Scene:
         """The scene with the target, masses and inertias of this episode, and without a spread.
 
@@ -244,7 +260,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         """
         if not self._begun:
             raise ResetNeeded("call reset() before asking for the episode's scene")
-        return episode_scene(self.scene, self._draws.tolist())
+        given = None if self._given_target is None else self._given_target.tolist()
+        return episode_scene(self.scene, self._draws.tolist(), given)
 
     def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Apply an action for one time step.
@@ -283,20 +300,23 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
         Args:
             seed: Seed of the random start; None goes on with the generator.
-            options: {"nominal": True} for the scene's initial state, or {"initial_state": x} with x of shape (n_x,).
+            options: {"nominal": True} for the scene's initial state, or {"initial_state": x} with x of shape (n_x,);
+                {"target": q} for the target q_{D/I} of shape (8,), in a scene that draws it.
 
         Returns:
             Observation and info.
 
         Raises:
-            ValueError: If an option is unknown, or the initial state has a wrong shape, is not finite, or its pose is not a unit dual quaternion.
+            ValueError: If an option is unknown, or state or target have a wrong shape, are not finite, or their pose is not a unit dual quaternion; or if the
+                scene does not draw the target.
         """
         super().reset(seed=seed)
         start = given_start(self.kernels, options or {})
-        self._draws[:] = 0.0 if start is not None else self.np_random.uniform(-1.0, 1.0, self._draws.shape)
+        drawn = start.state is None
+        self._draws[:] = self.np_random.uniform(-1.0, 1.0, self._draws.shape) if drawn else 0.0
         self._start.on_rows(_ONLY)
-        if start is not None:
-            self._x[:] = start
+        start.apply(self.kernels, self._x, self._parameters)
+        self._given_target = start.target
         self._observe.on_rows(_ONLY)
         self._begun, self._over = True, False
         self._trail = []
@@ -348,6 +368,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             from dq_space_arm_env.environment.rendering import Renderer
 
             self._renderer = Renderer(self.scene)
+        self._renderer.aim_at(self.target)
         frames, trail = self.kernels.frame_poses(self._x), np.array(self._trail)
         if self.render_mode == "rgb_array":
             return self._renderer.draw(frames, trail)

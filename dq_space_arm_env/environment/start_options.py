@@ -1,74 +1,132 @@
-"""The options of `reset`: where an episode starts when it does not start at random."""
+"""The options of `reset`: where an episode starts, and what it aims at, when that is not left to chance."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.kernels import Kernels
-from dq_space_arm_env.scene.start import PLANAR_POSE
+from dq_space_arm_env.scene.start import PLANAR_POSE, target_entries
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
-_OPTIONS = ("nominal", "initial_state")
+_OPTIONS = ("nominal", "initial_state", "target")
 
 
-def given_start(kernels: Kernels, options: dict[str, Any]) -> Array | None:
-    """Read where an episode is to start.
+class GivenStart(NamedTuple):
+    """What is given of the start of one episode, or of several; None for what is left to chance.
+
+    Attributes:
+        state: State, shape (n_x,) or (B, n_x), units of `kernels.layout.state`. With it the target, if not
+            given, and the masses are the scene's nominal ones.
+        target: Pose q_{D/I} of the target, shape (8,) or (B, 8), real part dimensionless, dual part m.
+    """
+
+    state: Array | None = None
+    target: Array | None = None
+
+    def apply(self, kernels: Kernels, x: Array, parameters: Array) -> None:
+        """Put what is given in place of what was drawn.
+
+        Args:
+            kernels: Functions of the scene.
+            x: Drawn states, shape (n_x,) or (B, n_x); changed in place.
+            parameters: Drawn parameters, shape (n_p,) or (B, n_p); changed in place.
+        """
+        if self.state is not None:
+            x[...] = self.state
+        target = self.target
+        if target is not None:
+            entries = list(target_entries(kernels.scene))
+            parameters[..., : len(entries)] = target[..., entries]
+        elif self.state is not None:
+            target = np.array(kernels.scene.target.pose.dual_quaternion)
+        if target is not None:
+            _give_sign_of_target(kernels, x, target)
+
+
+def given_start(kernels: Kernels, options: dict[str, Any]) -> GivenStart:
+    """Read where an episode is to start, and what it is to aim at.
 
     Args:
         kernels: Functions of the scene.
         options: {"nominal": True} for the scene's initial state, or {"initial_state": x} with x of shape
-            (n_x,).
+            (n_x,); {"target": q} with q of shape (8,).
 
     Returns:
-        State, shape (n_x,), units of `kernels.layout.state`; None if the options leave it to chance.
+        What the options say.
 
     Raises:
-        ValueError: If an option is unknown, or the initial state has a wrong shape, is not finite, or its
-            pose is not a unit dual quaternion.
+        ValueError: If an option is unknown; if a number is missing or not finite; if the pose of the base or
+            the target is not a unit dual quaternion; or if the scene has the target as a constant.
     """
     unknown = set(options) - set(_OPTIONS)
     if unknown:
         raise ValueError(f"options: {sorted(unknown)} unknown; there are {', '.join(_OPTIONS)}")
-    state, nominal = options.get("initial_state"), options.get("nominal", False)
-    if state is None:
-        return kernels.layout.initial_state if nominal else None
-    if nominal:
-        raise ValueError("options: nominal and initial_state exclude each other")
-    x = np.array(state, dtype=np.float64)
-    if x.shape != (kernels.n_x,) or not np.isfinite(x).all():
-        raise ValueError(
-            f"options: initial_state {x} of shape {x.shape}, "
-            f"should be finite numbers of shape {(kernels.n_x,)}"
-        )
-    return _with_sign_of_target(kernels, _with_unit_pose(kernels, x))
+    state, target = options.get("initial_state"), options.get("target")
+    if state is not None:
+        if options.get("nominal", False):
+            raise ValueError("options: nominal and initial_state exclude each other")
+        state = _checked_state(kernels, state)
+    elif options.get("nominal", False):
+        state = kernels.layout.initial_state
+    return GivenStart(state, None if target is None else _checked_target(kernels, target))
 
 
-def _with_unit_pose(kernels: Kernels, x: Array) -> Array:
-    """Refuse a base pose that is not a unit dual quaternion; remove rounding errors of one that is."""
+def _checked_state(kernels: Kernels, state: Any) -> Array:
+    """Refuse a state that is none; remove rounding errors of the base's pose."""
+    x = _finite("initial_state", state, kernels.n_x)
     where = kernels.layout.state.pose
     stored = list(PLANAR_POSE) if kernels.layout.planar else list(range(8))
     pose = np.zeros(8)
     pose[stored] = x[where]
+    x[where] = _unit_pose("initial_state has a base pose", pose)[stored]
+    return x
+
+
+def _checked_target(kernels: Kernels, target: Any) -> Array:
+    """Refuse a target that is no pose, or none that the machine code can be given; remove rounding errors."""
+    entries = target_entries(kernels.scene)
+    if not entries:
+        raise ValueError(
+            f"options: target; scene {kernels.scene.name!r} has the same in every episode, a constant of its "
+            "machine code: give the scene a spread of target_position or target_rotation"
+        )
+    pose = _unit_pose("target is a pose", _finite("target", target, 8))
+    fixed = [index for index in range(8) if index not in entries]
+    if np.abs(pose[fixed]).max(initial=0.0) > 1e-6:
+        raise ValueError(
+            f"options: target {pose} leaves the plane, its entries {fixed} should be 0 in a planar scene"
+        )
+    pose[fixed] = 0.0
+    return pose
+
+
+def _finite(name: str, value: Any, size: int) -> Array:
+    numbers = np.array(value, dtype=np.float64)
+    if numbers.shape != (size,) or not np.isfinite(numbers).all():
+        raise ValueError(
+            f"options: {name} {numbers} of shape {numbers.shape}, should be finite numbers of shape {(size,)}"
+        )
+    return numbers
+
+
+def _unit_pose(what: str, pose: Array) -> Array:
+    """Refuse what is not a unit dual quaternion; remove rounding errors of one that is."""
     length, overlap = math.hypot(*pose[:4]), float(np.dot(pose[:4], pose[4:]))
     if abs(length - 1.0) > 1e-6 or abs(overlap) > 1e-6 * (1.0 + math.hypot(*pose[4:])):
         raise ValueError(
-            f"options: initial_state has a base pose with |q_r| = {length:.9g}, q_r . q_d = {overlap:.3g}; "
+            f"options: {what} with |q_r| = {length:.9g}, q_r . q_d = {overlap:.3g}; "
             "a unit dual quaternion has 1 and 0"
         )
-    x[where] = np.array(dual_quaternion.normalize(tuple(pose.tolist())))[stored]
-    return x
+    return np.array(dual_quaternion.normalize(tuple(pose.tolist())))
 
 
-def _with_sign_of_target(kernels: Kernels, x: Array) -> Array:
+def _give_sign_of_target(kernels: Kernels, x: Array, target: Array) -> None:
     """Of q and -q, one pose but not one cost, take the one that puts the tip near the target's quaternion."""
-    target = np.array(kernels.scene.target.pose.dual_quaternion)
-    if kernels.tip_pose(x)[:4] @ target[:4] < 0.0:
-        where = kernels.layout.state.pose
-        x[where] = -x[where]
-    return x
+    alignment = np.sum(kernels.tip_pose(x)[..., :4] * target[..., :4], axis=-1, keepdims=True)
+    x[..., kernels.layout.state.pose] *= np.where(alignment < 0.0, -1.0, 1.0)

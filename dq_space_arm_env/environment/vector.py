@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.environment.copies import Copies
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.environment.results import StepResult
-from dq_space_arm_env.environment.start_options import given_start
+from dq_space_arm_env.environment.start_options import GivenStart, given_start
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.report import REPORT
 from dq_space_arm_env.scene import Scene
@@ -38,8 +38,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
     ends are those of `DQSpaceArmEnv`; entries of `info` are arrays of shape (num_envs,), each with a mask of
     the same name preceded by an underscore (read-only where it is True everywhere). `reset(seed=s)` seeds
     copy i with s + i; a list gives each its own seed. `options` may hold "reset_mask", a bool array of shape
-    (num_envs,), to reset some copies only, and "initial_state" of shape (n_x,) or (num_envs, n_x). Actions
-    in float32, the type of the action space, are read as they are.
+    (num_envs,), to reset some copies only; "initial_state" and "target" may have a row for each copy, shape
+    (num_envs, n_x) and (num_envs, 8). Actions in float32, the type of the action space, are read as they are.
 
     What happens after the end of an episode is the autoreset mode's choice: the next step resets
     (`NEXT_STEP`, the default), the same step resets and `info` holds `final_obs` and `final_info`
@@ -128,9 +128,9 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         rest = dict(options or {})
         mask = self._checked_mask(rest.pop("reset_mask", None))
         rows, others = np.flatnonzero(mask), np.flatnonzero(~mask)
-        states = self._given_starts(rows, rest)
+        starts = self._given_starts(rows, rest)
         self._seed(seed, rows)
-        self._copies.begin(rows, states)
+        self._copies.begin(rows, starts)
         result = self._copies.observe(rows)
         if self._seen is None:
             result.observation[others] = self._copies.observe(others).observation[others]
@@ -172,13 +172,23 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
             renewed = np.array([i for i in rows if seeds[i] is not None], dtype=np.int64)
             self._copies.seed(renewed, [seeds[i] for i in renewed])
 
-    def _given_starts(self, rows: Rows, options: dict[str, Any]) -> Array | None:
-        """States at which the options want copies to start, shape (n_x,) or (len(rows), n_x)."""
-        states: Any = options.get("initial_state")
-        if np.ndim(states) == 2 and np.shape(states) == self._copies.x.shape:
-            given = [given_start(self.kernels, {**options, "initial_state": states[i]}) for i in rows]
-            return np.array(given)
-        return given_start(self.kernels, options)
+    def _given_starts(self, rows: Rows, options: dict[str, Any]) -> GivenStart:
+        """What the options want copies to start from: the same for all, or arrays with a row for each."""
+        shapes = {"initial_state": self._copies.x.shape, "target": (self.num_envs, 8)}
+        each = {
+            name: options[name]
+            for name, shape in shapes.items()
+            if name in options and np.shape(options[name]) == shape
+        }
+        if not each:
+            return given_start(self.kernels, options)
+        starts = [
+            given_start(self.kernels, {**options, **{name: values[i] for name, values in each.items()}})
+            for i in rows
+        ]
+        return GivenStart(
+            *(None if parts[0] is None else np.array(parts) for parts in zip(*starts, strict=True))
+        )
 
     def step(self, actions: ArrayLike) -> tuple[Array, Array, Mask, Mask, dict[str, Any]]:
         """Apply an action to every copy for one time step.

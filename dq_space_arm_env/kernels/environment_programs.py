@@ -1,4 +1,4 @@
-"""The programs of the environments: begin an episode, observe its start, and a whole step.
+"""The programs of the environments: begin an episode, observe its start, a whole step, and goals compared.
 
 They differ from those of `programs.py` in that target, masses and inertias are inputs (`parameters`) where
 the scene draws them for each episode; in every other scene there is no such input.
@@ -13,8 +13,10 @@ from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.compiler.graph import Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.cost import weighted_square
 from dq_space_arm_env.integrators import INTEGRATORS
 from dq_space_arm_env.kernels.equations import SceneEquations, total
 from dq_space_arm_env.kernels.parameters import EpisodeParameters
@@ -101,6 +103,32 @@ class EnvironmentPrograms:
         program.call(graph)
         return program
 
+    def _goal(self, integrator: str) -> Program:
+        """How far poses of the tip are from goals: errors, cost and success, whatever the target is."""
+        weights = self.scene.cost.pose
+
+        def outputs(achieved: Scalars, desired: Scalars) -> Mapping[str, Scalars]:
+            errors = [poses.error_angle(achieved, desired), poses.error_distance(achieved, desired)]
+            angle, distance = self._shown_errors(errors)
+            # q and -q are one goal: the nearer one counts.
+            signs = (desired, [-entry for entry in desired])
+            cost = casadi.fmin(*(weighted_square(achieved, goal, weights) for goal in signs))
+            return {
+                "errors": [angle, distance],
+                "cost": [cost],
+                "is_success": [self._within_tolerance(angle, distance)],
+            }
+
+        graph = trace("goal_graph", {"achieved": 8, "desired": 8}, outputs)
+        dtypes = {"errors": "float64", "cost": "float64", "is_success": "bool"}
+        program = Program(
+            "environment_goal",
+            [Buffer(name, size) for name, size in graph.inputs],
+            [Buffer(name, size, dtype=dtypes[name]) for name, size in graph.outputs],
+        )
+        program.call(graph)
+        return program
+
     def _shown_errors(self, errors: Scalars) -> tuple[Scalar, Scalar]:
         """Angle in degrees, distance in m."""
         return errors[0] * DEGREES, errors[1]
@@ -181,6 +209,7 @@ def _outputs(graph: Graph) -> list[Buffer]:
 PROGRAMS: Mapping[str, Callable[[EnvironmentPrograms, str], Program]] = {
     "environment_start": EnvironmentPrograms._start,
     "environment_observe": EnvironmentPrograms._observe,
+    "environment_goal": EnvironmentPrograms._goal,
     **{
         name: partial(EnvironmentPrograms._step, name=name, actions=actions)
         for name, actions in (

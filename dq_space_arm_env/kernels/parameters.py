@@ -1,6 +1,7 @@
 """What differs from episode to episode besides the state: the target and mass properties that a scene draws.
 
-Everything else of a scene is a constant of the machine code. Of the drawn masses and inertias only what the
+Everything else of a scene is a constant of the machine code. The target comes first, all of it even if only
+its position is drawn, so that an episode can be given any. Of the drawn masses and inertias only what the
 equations of motion read becomes a parameter, once per episode: with a payload, say, the mass, center of mass
 and inertia of the last link together with it, not the factors that were drawn.
 """
@@ -16,12 +17,10 @@ import casadi
 from dq_space_arm_env.dynamics.chain import Chain, RigidBody
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import (
-    PLANAR_POSE,
     EpisodeStart,
     episode_start,
-    has_target_spread,
-    is_planar,
     number_of_draws,
+    target_entries,
 )
 
 Scalar = Any
@@ -94,8 +93,9 @@ class _Collector:
 
     def parameter(self, name: str, value: Scalar) -> Scalar:
         """The value itself if it is a number, otherwise a symbol."""
-        if casadi.SX(value).is_constant():
-            return float(value)
+        return float(value) if casadi.SX(value).is_constant() else self._symbol(name, value)
+
+    def _symbol(self, name: str, value: Scalar) -> Scalar:
         self.names.append(name)
         self.values.append(value)
         self.symbols.append(casadi.SX.sym(f"parameter_{len(self.symbols)}"))
@@ -103,11 +103,11 @@ class _Collector:
 
     def target(self, scene: Scene, start: EpisodeStart) -> tuple[Scalar, ...]:
         """The target; a planar one has four numbers that are zero, whatever is drawn."""
-        if not has_target_spread(scene):
+        entries = target_entries(scene)
+        if not entries:
             return start.target
-        stored = PLANAR_POSE if is_planar(scene) else range(8)
         return tuple(
-            self.parameter(name, entry) if index in stored else 0.0
+            self._symbol(name, entry) if index in entries else 0.0
             for index, (name, entry) in enumerate(zip(_POSE_NAMES, start.target, strict=True))
         )
 

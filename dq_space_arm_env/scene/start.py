@@ -141,6 +141,20 @@ def has_target_spread(scene: Scene) -> bool:
     return bool(scene.spread.target_rotation or scene.spread.target_position)
 
 
+def target_entries(scene: Scene) -> tuple[int, ...]:
+    """Tell which of the target's eight numbers may differ from episode to episode.
+
+    Args:
+        scene: A validated scene.
+
+    Returns:
+        Their indices: none without a spread of the target, otherwise all that are not zero for every pose.
+    """
+    if not has_target_spread(scene):
+        return ()
+    return PLANAR_POSE if is_planar(scene) else tuple(range(8))
+
+
 def start_from_draws(scene: Scene, draws: Array) -> Array:
     """Turn random numbers into initial states.
 
@@ -230,12 +244,13 @@ def _drawn_masses(scene: Scene, draws: Iterator[Scalar]) -> MassFactors:
     )
 
 
-def episode_scene(scene: Scene, draws: Sequence[float]) -> Scene:
+def episode_scene(scene: Scene, draws: Sequence[float], target: Sequence[float] | None = None) -> Scene:
     """Write what an episode starts from as a scene of its own, in which nothing is left to chance.
 
     Args:
         scene: A validated scene.
         draws: Numbers in [-1, 1] in the order of `episode_start`, number_of_draws of them.
+        target: Pose q_{D/I} in place of the drawn one, 8 numbers.
 
     Returns:
         The scene with the drawn target, masses and inertias, and without a spread. Its initial state stays
@@ -254,7 +269,7 @@ def episode_scene(scene: Scene, draws: Sequence[float]) -> Scene:
     if scene.payload is not None:
         changes["payload"] = _scaled(scene.payload, masses.payload_mass, masses.payload_inertia)
     if has_target_spread(scene):
-        pose = {"dual_quaternion": start.target}
+        pose = {"dual_quaternion": start.target if target is None else target}
         changes["target"] = {"pose": pose, "base_velocity": scene.target.base_velocity}
     return scene.replace(**changes)
 

@@ -104,10 +104,15 @@ def test_picture_does_not_know_the_sign_of_a_dual_quaternion():
     assert np.array_equal(renderer.draw(frames, NO_TRAIL), renderer.draw(-frames, NO_TRAIL))
 
 
-def test_target_is_seen_in_its_place_with_three_axes():
+@pytest.mark.parametrize("moved", [False, True])
+def test_target_is_seen_in_its_place_with_three_axes(moved):
     scene = load_scene("no-wrist")
     renderer = Renderer(scene)
     pose = scene.target.pose
+    if moved:
+        elsewhere = {"rotation": {"axis": [0, 0, 1], "angle": -40}, "position": [0.5, 0.9, 1.2]}
+        pose = scene.replace(target={"pose": elsewhere}).target.pose
+        renderer.aim_at(pose.dual_quaternion)
     empty = empty_picture(renderer).astype(int)
     away = start_poses(scene)
     away[:, 4:] = np.nan  # the robot alone is not drawn
@@ -118,6 +123,18 @@ def test_target_is_seen_in_its_place_with_three_axes():
         color = picture[row, column]
         assert (color != empty[row, column]).any()
         assert color.argmax() == axis, f"axis {axis} has color {color}"
+
+
+def test_wherever_a_scene_draws_its_target_it_is_in_view():
+    scene = load_scene("random-target")
+    scene = scene.replace(spread={"target_position": 2.0})
+    renderer, nominal = Renderer(scene), scene.target.pose
+    frames = start_poses(scene)
+    for corner in itertools.product((-2.0, 2.0), repeat=3):
+        target = poses.from_rotation_and_position(nominal.rotation, np.add(nominal.position, corner))
+        renderer.aim_at(target)
+        drawn = (renderer.draw(frames, NO_TRAIL) != empty_picture(renderer)).any(axis=2)
+        assert not np.concatenate([drawn[0], drawn[-1], drawn[:, 0], drawn[:, -1]]).any()
 
 
 def test_tip_axes_follow_the_tip():

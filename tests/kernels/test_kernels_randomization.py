@@ -79,8 +79,9 @@ def test_a_given_start_has_the_nominal_target_and_masses(options):
 def test_only_what_the_equations_read_is_a_parameter():
     paper, payload = load_scene("paper"), load_scene("payload")
     assert EpisodeParameters.of(paper).names == ()
+    # The target is a parameter as a whole, so that it can be set to any.
     moved = EpisodeParameters.of(paper.replace(spread={"target_position": 0.1})).names
-    assert moved == ("target q_d0", "target q_d1", "target q_d2", "target q_d3")
+    assert moved == tuple(f"target q_{part}{index}" for part in "rd" for index in range(4))
     heavier = EpisodeParameters.of(payload.replace(spread={"payload_mass": 0.1})).names
     # The payload's mass moves the last link's center of mass along x, and counts for its inertia.
     assert heavier == (

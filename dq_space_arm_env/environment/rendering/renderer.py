@@ -33,6 +33,9 @@ _PLANAR_AZIMUTH, _PLANAR_ELEVATION = math.radians(-90.0), math.radians(90.0)
 class Renderer:
     """Draws a scene from a fixed camera that has the whole reach of the arm and the target in view.
 
+    The target is the scene's until another is given; where the scene draws it for each episode, the whole
+    spread of its position is in view.
+
     Attributes:
         camera: The camera.
     """
@@ -60,11 +63,26 @@ class Renderer:
         self._fine_camera = self.camera.scaled(OVERSAMPLING)
         self._background = paint_background(self._fine_camera.width, self._fine_camera.height)
         self._empty_image = mean_of_subpixels(self._background)
-        target = scene.target.pose
-        axes = self._model.axis_length * np.array(target.rotation_matrix).T
-        self._label = Label("target", self.camera, np.array(target.position), axes + target.position)
+        self._target = np.array(scene.target.pose.dual_quaternion)
+        self._label = self._label_of(self._target)
         self._title = f"DQ Space Arm: {scene.name}"
         self._window: Window | None = None
+
+    def _label_of(self, target: Array) -> Label:
+        """The word next to the target's axes."""
+        rotation, position = poses.to_matrix(target)
+        ends = self._model.axis_length * np.array(rotation).T + np.array(position)
+        return Label("target", self.camera, np.array(position), ends)
+
+    def aim_at(self, target: ArrayLike) -> None:
+        """Move the target.
+
+        Args:
+            target: Its pose in the inertial frame, shape (8,), real part dimensionless, dual part m.
+        """
+        pose = np.array(target, dtype=np.float64)
+        if not np.array_equal(pose, self._target):
+            self._target, self._label = pose, self._label_of(pose)
 
     def draw(self, frame_poses: ArrayLike, trail: ArrayLike) -> Image:
         """Draw a state; the same arguments give the same picture.
@@ -113,11 +131,10 @@ class Renderer:
     @np.errstate(over="ignore", invalid="ignore")
     def _faces(self, dual_quaternions: Array, trail: Array) -> tuple[Array, Array]:
         """Corners and colors of all that may be seen, in subpixels."""
-        frames = self._model.frame_count
-        # The frame after the robot's is the inertial one.
-        rotations, positions = np.tile(np.eye(3), (frames + 1, 1, 1)), np.zeros((frames + 1, 3))
-        matrices, origins = poses.to_matrix(dual_quaternions.T)
-        rotations[:frames], positions[:frames] = np.moveaxis(np.array(matrices), 2, 0), np.array(origins).T
+        # The frame after the robot's is the target's.
+        matrices, origins = poses.to_matrix(np.vstack([dual_quaternions, self._target]).T)
+        rotations: Array = np.moveaxis(np.array(matrices), 2, 0)
+        positions = np.array(origins).T
         solids = mesh_faces(self._model.mesh, rotations, positions, self._fine_camera)
         ribbon = trail_faces(trail, self._fine_camera)
         return np.concatenate([solids[0], ribbon[0]]), np.concatenate([solids[1], ribbon[1]])

@@ -6,6 +6,7 @@ inertia; links join the origins of neighboring frames, in proportions taken from
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cached_property
 
@@ -54,7 +55,7 @@ class SpacecraftModel:
     """The solids of a scene.
 
     Frames are numbered as in `Kernels.frame_poses`: base, joints, wrist (if any), tip. The number after those
-    stands for the inertial frame.
+    stands for the target.
 
     Attributes:
         scene: The scene.
@@ -82,7 +83,7 @@ class SpacecraftModel:
 
     @cached_property
     def mesh(self) -> Mesh:
-        """All solids; the target's are fixed in the inertial frame."""
+        """All solids; the frame after the robot's is the target's."""
         return Mesh.joined([*self._base(), *self._arm(), *self._hand(), *self._payload(), *self._axes()])
 
     @cached_property
@@ -98,7 +99,8 @@ class SpacecraftModel:
         shoulder = base + np.array(start.rotation_matrix) @ self._offsets[0]
         centers = np.array([base, shoulder, self.scene.target.pose.position])
         wings = float(np.linalg.norm(self._wing_tip))
-        return centers, np.array([wings, self._arm_length + self._overhang(), 1.2 * self.axis_length])
+        target = 1.2 * self.axis_length + math.sqrt(3.0) * self.scene.spread.target_position
+        return centers, np.array([wings, self._arm_length + self._overhang(), target])
 
     @cached_property
     def _wing_axes(self) -> tuple[int, int, int]:
@@ -260,19 +262,15 @@ class SpacecraftModel:
 
     def _axes(self) -> Iterator[Mesh]:
         """Axes of the tip, and thicker and lighter ones at the target."""
-        pose = self.scene.target.pose
         thickness, length = self._thickness, self.axis_length
-        yield from _arrows(self.frame_count - 1, np.zeros(3), np.eye(3), length, 0.2 * thickness, 0.0)
-        rotation, position = np.array(pose.rotation_matrix), np.array(pose.position)
-        yield from _arrows(self.frame_count, position, rotation, length, 0.42 * thickness, 0.45)
+        yield from _arrows(self.frame_count - 1, length, 0.2 * thickness, 0.0)
+        yield from _arrows(self.frame_count, length, 0.42 * thickness, 0.45)
 
 
-def _arrows(
-    frame: int, origin: Array, directions: Array, length: float, radius: float, lightness: float
-) -> Iterator[Mesh]:
-    """Arrows along the columns of `directions`, x red, y green, z blue, mixed with white."""
+def _arrows(frame: int, length: float, radius: float, lightness: float) -> Iterator[Mesh]:
+    """Arrows along the axes of a frame, x red, y green, z blue, mixed with white."""
     head = length - 6.0 * radius
     profile = [(0.0, 0.0), (0.0, radius), (head, radius), (head, 2.3 * radius), (length, 0.0)]
-    for direction, color in zip(directions.T, AXIS_COLORS, strict=True):
+    for direction, color in zip(np.eye(3), AXIS_COLORS, strict=True):
         red, green, blue = (part + lightness * (1.0 - part) for part in color)
-        yield lathe(frame, origin, direction, profile, (red, green, blue), 12)
+        yield lathe(frame, np.zeros(3), direction, profile, (red, green, blue), 12)

@@ -1,0 +1,354 @@
+"""The environment `DQSpaceArmGoal-v0`: the maneuver of `DQSpaceArm-v0` with the target as a goal, for hindsight experience replay."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import EzPickle
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.environment.dq_space_arm import OBSERVATION_LIMIT, DQSpaceArmEnv
+from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.scene import Scene
+
+Array = NDArray[Any]
+Observation = dict[str, Array]
+Info = Mapping[str, Any]
+RewardType = Literal["sparse", "dense"]
+
+
+class _Comparison(NamedTuple):
+    """How far achieved goals are from desired ones: arrays of the shape of the batch, () for a single pair."""
+
+    attitude_error: Array
+    position_error: Array
+    pose_cost: Array
+    is_success: NDArray[np.bool_]
+
+
+class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
+    """
+    ## Description
+
+    The spacecraft of `DQSpaceArm-v0` in the form that goal-conditioned agents and hindsight experience replay (HER; Andrychowicz et al., NeurIPS 2017) expect:
+    the tip of the arm is to reach a pose, the goal, and the reward can be computed anew for any other goal. Robot, limits, the draws of start and target, tolerances,
+    weights and the time step come from a scene. The interface is that of the multi-goal environments of Gymnasium-Robotics. The tables show scene `random-target`.
+
+    ## Action Space
+
+    That of `DQSpaceArm-v0`: a `Box(-1, 1, (12,), float32)`, inputs as fractions of their limits.
+
+    ## Observation Space
+
+    A `Dict` of three boxes of the scene's precision, float64. A goal is a pose, a unit dual quaternion of 8 numbers in every scene; of a planar pose four are zero.
+    The bound of 1e6 is where a simulation counts as diverged.
+
+    | Key             | Shape | Meaning                                                            | Min  | Max |
+    |-----------------|-------|--------------------------------------------------------------------|------|-----|
+    | `observation`   | (23,) | the state, in which the goal plays no part                         | -1e6 | 1e6 |
+    | `achieved_goal` | (8,)  | pose of the tip q_{G/I}: real part, then dual part in m            | -1, -1e6 | 1, 1e6 |
+    | `desired_goal`  | (8,)  | pose of the target q_{D/I} of the episode, likewise                | -1, -1e6 | 1, 1e6 |
+
+    `observation` has the entries of `env.unwrapped.kernels.layout.state`:
+
+    | Num   | Observation                                                           | Min  | Max | Unit  |
+    |-------|-----------------------------------------------------------------------|------|-----|-------|
+    | 0-3   | pose of the base q_{e0/I}, real part                                  | -1   | 1   | -     |
+    | 4-7   | the same, dual part                                                   | -1e6 | 1e6 | m     |
+    | 8-10  | angles of joints 1 to 3, not wrapped                                  | -1e6 | 1e6 | rad   |
+    | 11-13 | wrist angles psi, theta, phi, not wrapped                             | -1e6 | 1e6 | rad   |
+    | 14-16 | angular velocity of the base, base axes                               | -1e6 | 1e6 | rad/s |
+    | 17-19 | velocity of the base's center of mass, base axes                      | -1e6 | 1e6 | m/s   |
+    | 20-22 | rates of joints 1 to 3                                                | -1e6 | 1e6 | rad/s |
+
+    q and -q are one pose. The sign of `achieved_goal`, and with it that of the base's pose, is such that at reset its real part has a non-negative product with that
+    of `desired_goal`, and is then carried along by continuity. Rewards do not depend on the sign of either goal.
+
+    ## Rewards
+
+    | `reward_type` | Reward of a step                                                                                              |
+    |---------------|---------------------------------------------------------------------------------------------------------------|
+    | `"sparse"`    | 0 if the tip is within the scene's tolerances of the goal after the step (3 deg and 0.1 m), else -1           |
+    | `"dense"`     | -(q_{G/I} - q_{D/I})' W (q_{G/I} - q_{D/I}) after the step, weight 15: the paper's pose cost, the smaller over both signs |
+
+    `compute_reward(achieved_goal, desired_goal, info)` gives the reward for other goals, single ones (8,) or batches (B, 8); for those of a step and its `info` it gives
+    the reward of that step, bit for bit. Effort is not rewarded: it could not be computed from goals.
+
+    `info` has the keys of `DQSpaceArm-v0`, the terms of the paper's cost included; `is_success` says whether the tip is within the tolerances.
+
+    ## Starting State
+
+    As in `DQSpaceArm-v0`, with the same seeds and options. The goal of an episode is drawn if the scene has a spread of the target, or given by
+    `options={"target": q}`; without such a spread it is the scene's target always. HER chooses goals among the achieved ones in any case.
+
+    ## Episode End
+
+    Nothing terminates an episode: the goal is to be reached and held, and a success does not end it.
+
+    1. Truncation: the scene's number of steps (1000) is reached. This differs from `DQSpaceArm-v0`, where that is the end of the task: here the time left is not observed
+       and there is no terminal cost, so a step is worth the same at any time, and the value of what would follow should be estimated.
+    2. Truncation: the simulation diverged. The observation shows the last sound state, `info["diverged"]` is true, and the reward is that of a whole episode
+       spent there: the dense reward times the number of steps, or -1000 if sparse. So diverging never pays, neither for who adds up rewards nor for who estimates values.
+       Where rewards are computed anew without `info`, as HER does by default, a diverged step counts like any other; it is no loophole, since a truncated
+       transition goes on with the value of the last sound state.
+
+    ## Arguments
+
+    | Parameter     | Type                     | Default           | Description                                             |
+    |---------------|--------------------------|-------------------|---------------------------------------------------------|
+    | `scene`       | **str, Path or Scene**   | `"random-target"` | name of a shipped scene, path of a YAML file, a `Scene` |
+    | `reward_type` | **str**                  | `"sparse"`        | `"sparse"` or `"dense"`                                 |
+    | `render_mode` | **str or None**          | `None`            | `"rgb_array"` or `"human"`; needs the extra `render`    |
+
+    ```python
+    >>> import gymnasium
+    >>> import dq_space_arm_env
+    >>> env = gymnasium.make("DQSpaceArmGoal-v0", reward_type="sparse")
+    >>> observation, info = env.reset(seed=0)
+    >>> {key: value.shape for key, value in observation.items()}
+    {'observation': (23,), 'achieved_goal': (8,), 'desired_goal': (8,)}
+    >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    >>> reward, info["is_success"]
+    (-1.0, False)
+
+    ```
+
+    The same step would have been a success if the goal had been where the tip is:
+
+    ```python
+    >>> env.unwrapped.compute_reward(observation["achieved_goal"], observation["achieved_goal"], info)
+    0.0
+
+    ```
+
+    ## Version History
+
+    * v0: Initial version.
+    """
+
+    metadata: dict[str, Any] = DQSpaceArmEnv.metadata
+
+    def __init__(
+        self,
+        scene: Scene | str | Path = "random-target",
+        reward_type: RewardType = "sparse",
+        render_mode: str | None = None,
+    ) -> None:
+        """Load a scene and compile what a step needs (or take it from the cache).
+
+        Args:
+            scene: Name of a shipped scene, path of a YAML file, or a scene.
+            reward_type: "sparse" or "dense".
+            render_mode: None, "rgb_array" or "human".
+
+        Raises:
+            SceneError: If the scene cannot be loaded.
+            ValueError: If the type of reward or the render mode is unknown, or `DQSpaceArmEnv` refuses the scene.
+        """
+        EzPickle.__init__(self, scene, reward_type, render_mode)
+        if reward_type not in get_args(RewardType):
+            kinds = " and ".join(get_args(RewardType))
+            raise ValueError(f"reward_type: {reward_type!r} is unknown; there are {kinds}")
+        self._env = DQSpaceArmEnv(scene, render_mode)
+        self.scene, self.kernels = self._env.scene, self._env.kernels
+        self.reward_type, self.render_mode = reward_type, render_mode
+        self.metadata = self._env.metadata
+        self.action_space = self._env.action_space
+        self.observation_space: spaces.Space[Any] = spaces.Dict(
+            {
+                "observation": self._box(self.kernels.n_x, 2 if self.kernels.layout.planar else 4),
+                "achieved_goal": self._box(8, 4),
+                "desired_goal": self._box(8, 4),
+            }
+        )
+        self._compare_rows = KernelCall(self.kernels.kernel("environment_goal"), {})
+        self._truncated = False
+
+    def _box(self, size: int, real_part: int) -> spaces.Box:
+        """Bounds of numbers that begin with a unit quaternion, whose entries may exceed 1 by a rounding error."""
+        high = np.full(size, OBSERVATION_LIMIT, self.kernels.dtype)
+        high[:real_part] = 1.0 + 1e-5
+        return spaces.Box(-high, high, dtype=high.dtype.type)
+
+    @property
+    def state(self) -> Array:
+        """The state, shape (n_x,), units as in `kernels.layout.state`; a copy.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+        """
+        return self._env.state
+
+    @property
+    def parameters(self) -> Array:
+        """What the scene drew for this episode besides the state, shape (n_p,): see `DQSpaceArmEnv.parameters`.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+        """
+        return self._env.parameters
+
+    @property
+    def episode_scene(self) -> Scene:
+        """The scene with the target, masses and inertias of this episode, and without a spread.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+        """
+        return self._env.episode_scene
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: Seed of the random start and goal; None goes on with the generator.
+            options: As for `DQSpaceArmEnv.reset`; {"target": q} with q of shape (8,) sets the goal.
+
+        Returns:
+            Observation and info.
+
+        Raises:
+            ValueError: If an option is wrong.
+        """
+        super().reset(seed=seed)
+        self._env.np_random = self.np_random
+        _, info = self._env.reset(options=options)
+        self._truncated = False
+        observation = self._observe()
+        return observation, self._judged(info, self._compare_goals(observation))
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Apply an action for one time step.
+
+        Args:
+            action: Inputs as fractions of their limits, shape (n_u,); clipped to [-1, 1].
+
+        Returns:
+            Observation, reward, terminated (always False), truncated, info.
+
+        Raises:
+            ResetNeeded: Before the first reset, and after the end of an episode.
+            ValueError: If the action has a wrong shape or a NaN.
+        """
+        _, _, self._truncated, _, info = self._env.step(action)
+        observation = self._observe()
+        comparison = self._compare_goals(observation)
+        reward = float(self._rewards(comparison, info["diverged"]))
+        return observation, reward, False, self._truncated, self._judged(info, comparison)
+
+    def _observe(self) -> Observation:
+        x = self._env.state
+        return {"observation": x, "achieved_goal": self.kernels.tip_pose(x), "desired_goal": self._env.target}
+
+    def _judged(self, info: dict[str, Any], comparison: _Comparison) -> dict[str, Any]:
+        """Let `info` say of the goal what the reward says, to the last bit."""
+        info["attitude_error"] = float(comparison.attitude_error)
+        info["position_error"] = float(comparison.position_error)
+        info["is_success"] = bool(comparison.is_success) and not info["diverged"]
+        return info
+
+    def compute_reward(
+        self,
+        achieved_goal: ArrayLike,
+        desired_goal: ArrayLike,
+        info: Info | Sequence[Info] | NDArray[Any] | None = None,
+    ) -> float | Array:
+        """Compute the reward of steps that achieved some goals while others were desired.
+
+        Args:
+            achieved_goal: Poses of the tip after the step, shape (8,) or (B, 8), real part dimensionless, dual part m.
+            desired_goal: Goals, shape (8,) or (B, 8), real part dimensionless, dual part m.
+            info: What the step returned, one dictionary or a sequence of B, shape (B,). Only whether the simulation diverged is read from it; it did not
+                where nothing is said.
+
+        Returns:
+            Reward, dimensionless, a float or shape (B,).
+
+        Raises:
+            ValueError: If the goals have wrong or different shapes.
+        """
+        rewards = self._rewards(self._compare(achieved_goal, desired_goal), _diverged(info))
+        return rewards if rewards.ndim else float(rewards)
+
+    def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> bool:
+        """Tell whether a step terminates the episode; none does, whatever the goals.
+
+        Args:
+            achieved_goal: Poses of the tip after the step, shape (8,) or (B, 8).
+            desired_goal: Goals, shape (8,) or (B, 8).
+            info: What the step returned.
+
+        Returns:
+            False.
+        """
+        return False
+
+    def compute_truncated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> bool:
+        """Tell whether the latest step truncated the episode; that is the same for all goals.
+
+        Args:
+            achieved_goal: Poses of the tip after the step, shape (8,) or (B, 8).
+            desired_goal: Goals, shape (8,) or (B, 8).
+            info: What the step returned.
+
+        Returns:
+            True after the scene's number of steps and after a divergence.
+        """
+        return self._truncated
+
+    def _rewards(self, comparison: _Comparison, diverged: bool | NDArray[np.bool_]) -> Array:
+        steps = float(self.scene.simulation.steps)
+        if self.reward_type == "dense":
+            return np.where(diverged, steps, 1.0) * -comparison.pose_cost
+        return np.where(diverged, -steps, np.where(comparison.is_success, 0.0, -1.0))
+
+    def _compare_goals(self, observation: Observation) -> _Comparison:
+        return self._compare(observation["achieved_goal"], observation["desired_goal"])
+
+    def _compare(self, achieved: ArrayLike, desired: ArrayLike) -> _Comparison:
+        """Compare goals in machine code, which gives each pair the same bits alone and in a batch."""
+        goals = [np.asarray(goal, self.kernels.dtype) for goal in (achieved, desired)]
+        if any(goal.shape[-1:] != (8,) for goal in goals):
+            shapes = " and ".join(str(goal.shape) for goal in goals)
+            raise ValueError(f"goals: shapes {shapes}, should be (8,) or (B, 8)")
+        pairs = np.broadcast_arrays(*goals)
+        batch = pairs[0].shape[:-1]
+        rows = [np.ascontiguousarray(goal).reshape(-1, 8) for goal in pairs]
+        errors, cost, success = np.empty((*batch, 2)), np.empty(batch), np.empty(batch, dtype=np.bool_)
+        self._compare_rows.place(
+            achieved=rows[0], desired=rows[1], errors=errors, cost=cost, is_success=success
+        )
+        self._compare_rows(len(rows[0]))
+        return _Comparison(errors[..., 0], errors[..., 1], cost, success)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the present state, as `DQSpaceArmEnv.render` does.
+
+        Returns:
+            Picture of shape (480, 640, 3), uint8, for render mode "rgb_array"; None for "human", which shows a window.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+            DependencyNotInstalled: If the extra `render` is not installed.
+        """
+        return self._env.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._env.close()
+
+
+def _diverged(info: Info | Sequence[Info] | NDArray[Any] | None) -> bool | NDArray[np.bool_]:
+    """Whether simulations diverged, as far as their infos say so."""
+    if info is None:
+        return False
+    if isinstance(info, Mapping):
+        return np.asarray(info.get("diverged", False), dtype=np.bool_)
+    return np.array([bool(entry.get("diverged", False)) for entry in info])
