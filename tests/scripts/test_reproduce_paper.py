@@ -73,7 +73,8 @@ def test_a_user_gets_every_file_and_the_right_numbers(scene_file: Path) -> None:
     folder = scene_file.parent
     result = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
     assert result.returncode == 0, result.stderr
-    assert result.stderr == ""
+    compiling = "dq_space_arm_env: compiling scene 'short'"  # only where the cache does not know it yet
+    assert all(line.startswith(compiling) for line in result.stderr.splitlines())
     out = folder / "results" / "short"
     assert names(out) == DATA | FIGURES
     summary = json.loads((out / "summary.json").read_text())
