@@ -14,6 +14,8 @@ class ArmProblem:
         kernels: Its compiled functions.
     """
 
+    has_second_order = True
+
     def __init__(self, scene: Scene | str | Path, integrator: str | None = None) -> None:
         """Take a scene.
 
@@ -36,7 +38,7 @@ class ArmProblem:
         self.initial_state: FloatArray = layout.initial_state
 
     def kernel(self, name: str) -> Kernel:
-        """Return one of `experts.problem.KERNEL_NAMES`.
+        """Return one of the kernels that `experts.problem` lists.
 
         The rollout works through its rows one after another and gets scalar code; all else works on many at
         once.
@@ -47,8 +49,8 @@ class ArmProblem:
         Returns:
             The kernel, compiled or loaded from the cache.
         """
-        sequential = name in ("step_with_cost", "difference", "terminal_cost", "terminal_cost_derivatives")
-        return self.kernels.kernel(name, lanes=1 if sequential else None)
+        batched = name in ("linearize", "cost_derivatives", "lagrangian_hessian")
+        return self.kernels.kernel(name, lanes=None if batched else 1)
 
 
 def in_double_precision(scene: Scene, integrator: str | None = None) -> Scene:

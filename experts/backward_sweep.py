@@ -12,8 +12,10 @@ import numpy as np
 
 from experts.box_qp import NOT_POSITIVE_DEFINITE, BoxQPWorkspace, box_qp, box_qp_workspace
 from experts.compilation import compiled
+from experts.derivatives import Derivatives, Hessians
 from experts.padded_algebra import (
     FloatArray,
+    add_block,
     add_product_upper,
     add_vector_product,
     copy_block,
@@ -27,30 +29,6 @@ from experts.padded_algebra import (
 SWEEP_DONE = 0
 SWEEP_NOT_POSITIVE_DEFINITE = 1
 SWEEP_NOT_FINITE = 2
-
-
-class Derivatives(NamedTuple):
-    """Derivatives along a trajectory of N stages, in tangent coordinates.
-
-    Attributes:
-        A: Of the next state with respect to the state, shape (N, n_t, n_t).
-        B: Of the next state with respect to the control, shape (N, n_t, n_u).
-        lx: Gradient of the stage cost, state part, shape (N, n_t).
-        lu: Gradient of the stage cost, control part, shape (N, n_u).
-        lxx: Hessian of the stage cost, state block, shape (N, n_t, n_t).
-        luu: Hessian of the stage cost, control block, shape (N, n_u, n_u).
-        terminal_lx: Gradient of the terminal cost, shape (1, n_t).
-        terminal_lxx: Hessian of the terminal cost, shape (1, n_t, n_t).
-    """
-
-    A: FloatArray
-    B: FloatArray
-    lx: FloatArray
-    lu: FloatArray
-    lxx: FloatArray
-    luu: FloatArray
-    terminal_lx: FloatArray
-    terminal_lxx: FloatArray
 
 
 class Update(NamedTuple):
@@ -132,29 +110,6 @@ class SweepWorkspace(NamedTuple):
     box: BoxQPWorkspace
 
 
-def allocate_derivatives(horizon: int, n_tangent: int, n_controls: int) -> Derivatives:
-    """Allocate the derivatives of a trajectory.
-
-    Args:
-        horizon: Number of stages N.
-        n_tangent: Size n_t of the tangent state.
-        n_controls: Number n_u of inputs.
-
-    Returns:
-        Arrays of zeros.
-    """
-    return Derivatives(
-        A=np.zeros((horizon, n_tangent, n_tangent)),
-        B=np.zeros((horizon, n_tangent, n_controls)),
-        lx=np.zeros((horizon, n_tangent)),
-        lu=np.zeros((horizon, n_controls)),
-        lxx=np.zeros((horizon, n_tangent, n_tangent)),
-        luu=np.zeros((horizon, n_controls, n_controls)),
-        terminal_lx=np.zeros((1, n_tangent)),
-        terminal_lxx=np.zeros((1, n_tangent, n_tangent)),
-    )
-
-
 def allocate_update(horizon: int, n_tangent: int, n_controls: int) -> Update:
     """Allocate the results of the sweep.
 
@@ -210,6 +165,7 @@ def sweep_workspace(n_tangent: int, n_controls: int) -> SweepWorkspace:
 @compiled
 def backward_sweep(
     derivatives: Derivatives,
+    hessians: Hessians,
     controls: FloatArray,
     control_lower: FloatArray,
     control_upper: FloatArray,
@@ -221,6 +177,7 @@ def backward_sweep(
 
     Args:
         derivatives: Derivatives along the trajectory.
+        hessians: Second derivatives to take; they may be indefinite.
         controls: Controls u of the trajectory, inside the box, shape (N, n_u).
         control_lower: Lower bounds, -inf allowed, shape (n_u,).
         control_upper: Upper bounds, +inf allowed, shape (n_u,).
@@ -237,11 +194,11 @@ def backward_sweep(
     n_tangent = derivatives.lx.shape[1]
     for i in range(n_tangent):
         work.Vx[i] = derivatives.terminal_lx[0, i]
-    copy_block(work.Vxx, derivatives.terminal_lxx[0])
+    copy_block(work.Vxx, hessians.terminal_xx[0])
     work.k[:] = 0.0
     linear, quadratic, clamped = 0.0, 0.0, 0
     for stage in range(horizon - 1, -1, -1):
-        _expand(derivatives, stage, work)
+        _expand(derivatives, hessians, stage, work)
         mirror_upper(work.Quu, n_controls)
         _regularize(derivatives.luu[stage], regularization, work)
         for i in range(n_controls):
@@ -269,11 +226,10 @@ def backward_sweep(
 
 
 @compiled
-def _expand(derivatives: Derivatives, stage: int, work: SweepWorkspace) -> None:
-    """Expand Q to second order, Gauss-Newton in the dynamics; Qx and Qxx take the place of Vx and Vxx.
+def _expand(derivatives: Derivatives, hessians: Hessians, stage: int, work: SweepWorkspace) -> None:
+    """Expand Q to second order; Qx and Qxx take the place of Vx and Vxx.
 
-    Qx = lx + A' Vx, Qu = lu + B' Vx, Qxx = lxx + A' Vxx A, Qux = B' Vxx A, Quu = luu + B' Vxx B.
-    The exact second order would add one more term here, the Hessian of the dynamics contracted with Vx.
+    Qx = lx + A' Vx, Qu = lu + B' Vx, Qxx = Hxx + A' Vxx A, Qux = Hux + B' Vxx A, Quu = Huu + B' Vxx B.
     """
     n_tangent = derivatives.lx.shape[1]
     copy_block(work.A, derivatives.A[stage])
@@ -283,13 +239,17 @@ def _expand(derivatives: Derivatives, stage: int, work: SweepWorkspace) -> None:
         prefetch(derivatives.B[stage - 1])
     set_product(work.VA, work.Vxx, work.A, n_tangent)
     set_product(work.VB, work.Vxx, work.B, n_tangent)
-    copy_block(work.Vxx, derivatives.lxx[stage])
+    copy_block(work.Vxx, hessians.xx[stage])
     if stage > 0:
-        prefetch(derivatives.lxx[stage - 1])
-        prefetch(derivatives.luu[stage - 1])
+        prefetch(hessians.xx[stage - 1])
+        prefetch(hessians.uu[stage - 1])
     add_product_upper(work.Vxx, work.A, work.VA, n_tangent)
     set_product(work.Qux, work.B, work.VA, n_tangent)
-    copy_block(work.Quu, derivatives.luu[stage])
+    if hessians.ux.shape[0] > 0:
+        add_block(work.Qux, hessians.ux[stage])
+        if stage > 0:
+            prefetch(hessians.ux[stage - 1])
+    copy_block(work.Quu, hessians.uu[stage])
     add_product_upper(work.Quu, work.B, work.VB, n_tangent)
     for j in range(n_tangent):
         work.Qx[j] = derivatives.lx[stage, j]

@@ -1,14 +1,16 @@
 """Box-DDP: optimal control of a shooting problem with bounds on the controls.
 
 Control-limited differential dynamic programming of Tassa, Mansard & Todorov (ICRA 2014), with the
-Gauss-Newton model of the dynamics (iLQR). An iteration differentiates along the trajectory, sweeps backward
-for a control update and its gains, and rolls the update out with shorter and shorter steps until one lowers
-the cost as promised.
+Gauss-Newton model of the dynamics (iLQR), exact second derivatives (Newton's method), or a hybrid of the two
+(`models`). An iteration differentiates along the trajectory, sweeps backward for a control update and its
+gains, and rolls the update out with shorter and shorter steps until one lowers the cost as promised.
 
 **When it has converged.** The measure is the decrease of the cost that a full, undamped step promises,
 relative to the cost. It does not change with the units of states, controls or cost, it accounts for the
 bounds, and it is zero exactly at a point that satisfies the first-order conditions. A small decrease of the
-cost is no such sign: damping or a plateau of a curved problem make steps small far from any minimum.
+cost is no such sign: damping or a plateau of a curved problem make steps small far from any minimum. Where
+there are exact second derivatives the step is Newton's, which exists only if they are positive definite: a
+saddle does not pass, nor does a valley whose floor Gauss-Newton takes for steeper than it is.
 """
 
 from collections.abc import Callable
@@ -24,6 +26,8 @@ from experts.backward_sweep import (
     SWEEP_NOT_POSITIVE_DEFINITE,
     SweepOutcome,
 )
+from experts.checks import check_array, check_at_least
+from experts.models import EXACT_DAMPING, ModelSchedule, SecondOrder
 from experts.problem import FloatArray, ShootingProblem, as_problem
 from experts.regularization import Regularization
 from experts.rollout import FINISHED
@@ -39,6 +43,20 @@ COST_FLOOR = 1e-9
 Callback = Callable[[IterationRecord], None]
 
 
+class _Proposal(NamedTuple):
+    """A control update that a sweep has found, or how it failed.
+
+    Attributes:
+        exact: Whether it comes from exact second derivatives.
+        damping: Weight lambda of the damping.
+        outcome: How the sweep ended.
+    """
+
+    exact: bool
+    damping: float
+    outcome: SweepOutcome
+
+
 class _Stop(NamedTuple):
     """Why a solve ends, and the same in words."""
 
@@ -51,14 +69,14 @@ class _Progress:
     """What a solve carries from iteration to iteration.
 
     Attributes:
-        regularization: The damping.
+        schedule: Which model to take, and its damping.
         cost_floor: Costs below it count as zero, in the unit of the cost.
         optimality: Relative decrease that an undamped step promises, inf where unknown.
         idle_iterations: Iterations in a row that hardly lowered the cost.
         records: One per iteration.
     """
 
-    regularization: Regularization
+    schedule: ModelSchedule
     cost_floor: float
     optimality: float = np.inf
     idle_iterations: int = 0
@@ -76,7 +94,8 @@ class BoxDDP:
         tolerance: float = 1e-7,
         plateau_decrease: float = 1e-8,
         plateau_iterations: int = 50,
-        initial_regularization: float = 1.0,
+        initial_regularization: float = 1000.0,
+        second_order: str | None = None,
     ) -> None:
         """Prepare the solver.
 
@@ -87,23 +106,28 @@ class BoxDDP:
             plateau_decrease: An iteration is idle when it lowers the cost by less than this, relative to
                 the cost.
             plateau_iterations: Number of idle iterations in a row that end the solve.
-            initial_regularization: First weight of the damping, in multiples of the control weights.
+            initial_regularization: First weight of the damping, in multiples of the control weights. Small
+                ones let the first steps go so far that the solve may end in a poor minimum.
+            second_order: Second derivatives to take: "gauss_newton", "exact" or "hybrid", see
+                `models.SecondOrder`. None takes the hybrid if the problem has exact ones, else Gauss-Newton.
 
         Raises:
-            ValueError: If a setting is out of range, or the problem contradicts itself.
+            ValueError: If a setting is out of range, second_order is unknown or asks for derivatives that the
+                problem does not have, or the problem contradicts itself.
         """
-        _check_at_least("max_iterations", max_iterations, 0)
-        _check_at_least("tolerance", tolerance, 0.0)
-        _check_at_least("plateau_decrease", plateau_decrease, 0.0)
-        _check_at_least("plateau_iterations", plateau_iterations, 1)
-        _check_at_least("initial_regularization", initial_regularization, 0.0)
+        check_at_least("max_iterations", max_iterations, 0)
+        check_at_least("tolerance", tolerance, 0.0)
+        check_at_least("plateau_decrease", plateau_decrease, 0.0)
+        check_at_least("plateau_iterations", plateau_iterations, 1)
+        check_at_least("initial_regularization", initial_regularization, 0.0)
         self.problem: ShootingProblem = as_problem(scene_or_problem)
         self.max_iterations = max_iterations
         self.tolerance = tolerance
         self.plateau_decrease = plateau_decrease
         self.plateau_iterations = plateau_iterations
         self.initial_regularization = initial_regularization
-        self._work = ShootingWorkspace(self.problem)
+        self.second_order = SecondOrder.of(second_order, self.problem.has_second_order)
+        self._work = ShootingWorkspace(self.problem, self.second_order is not SecondOrder.GAUSS_NEWTON)
 
     def solve(
         self,
@@ -130,7 +154,8 @@ class BoxDDP:
         initial_state, controls = self._check_start(x0, u_init)
         work = self._work
         work.start(initial_state, controls)
-        progress = _Progress(Regularization(self.initial_regularization), COST_FLOOR * abs(work.current.cost))
+        schedule = ModelSchedule(self.second_order, Regularization(self.initial_regularization))
+        progress = _Progress(schedule, COST_FLOOR * abs(work.current.cost))
         if work.current.failing_stage != FINISHED:
             message = f"the first rollout is not finite from stage {work.current.failing_stage} on"
             return self._collect(progress, StopReason.DIVERGED, message, np.zeros_like(work.update.gains))
@@ -150,28 +175,64 @@ class BoxDDP:
                 work.differentiate()
             if not progress.records:
                 self._check_control_weights()
-            outcome = self._find_update(progress.regularization)
-            stop = self._stop_before_step(progress, outcome)
-            if stop is not None:
-                return stop
-            record = self._step(progress, outcome, started)
+            result = self._take_step(progress, started)
+            if isinstance(result, _Stop):
+                return result
             if callback is not None:
-                callback(record)
-            moved = record.alpha > 0.0
+                callback(result)
+            moved = result.alpha > 0.0
             stop = self._stop_after_step(progress)
             if stop is not None:
                 return stop
 
-    def _find_update(self, regularization: Regularization) -> SweepOutcome:
+    def _take_step(self, progress: _Progress, started: float) -> IterationRecord | _Stop:
+        """Search along an update, adapt the damping, and take the record; or say why there is no step."""
+        schedule, cost = progress.schedule, self._work.current.cost
+        if schedule.tries_exact_first:
+            proposal = self._try_exact()
+            if proposal.outcome.status != SWEEP_NOT_POSITIVE_DEFINITE:
+                stop = self._stop_before_step(progress, proposal)
+                if stop is not None:
+                    return stop
+                alpha = self._line_search(proposal.outcome)
+                if alpha > 0.0:
+                    return self._record(progress, proposal, cost, alpha, started)
+            schedule.postpone_exact()
+        proposal = self._find_update(
+            schedule.regularization, exact=schedule.second_order is SecondOrder.EXACT
+        )
+        stop = self._stop_before_step(progress, proposal)
+        if stop is not None:
+            return stop
+        alpha = self._line_search(proposal.outcome)
+        if alpha > 0.0:
+            schedule.regularization.follow(alpha)
+        else:
+            schedule.regularization.increase()
+        return self._record(progress, proposal, cost, alpha, started)
+
+    def _try_exact(self) -> _Proposal:
+        """Sweep with exact second derivatives under weak damping only; it may fail."""
+        self._work.differentiate_twice()
+        for damping in EXACT_DAMPING:
+            outcome = self._work.sweep(damping, exact=True)
+            if outcome.status != SWEEP_NOT_POSITIVE_DEFINITE:
+                break
+        return _Proposal(True, damping, outcome)
+
+    def _find_update(self, regularization: Regularization, *, exact: bool) -> _Proposal:
         """Sweep with as much damping as it takes to succeed; give up beyond the largest one."""
-        outcome = self._work.sweep(regularization.value)
+        if exact:
+            self._work.differentiate_twice()
+        outcome = self._work.sweep(regularization.value, exact=exact)
         while outcome.status == SWEEP_NOT_POSITIVE_DEFINITE and not regularization.exhausted:
             regularization.increase()
-            outcome = self._work.sweep(regularization.value)
-        return outcome
+            outcome = self._work.sweep(regularization.value, exact=exact)
+        return _Proposal(exact, regularization.value, outcome)
 
-    def _stop_before_step(self, progress: _Progress, outcome: SweepOutcome) -> _Stop | None:
+    def _stop_before_step(self, progress: _Progress, proposal: _Proposal) -> _Stop | None:
         """Judge a sweep: has it failed, is the trajectory optimal, may another iteration begin?"""
+        outcome = proposal.outcome
         if outcome.status == SWEEP_NOT_FINITE:
             return _Stop(StopReason.DIVERGED, f"the derivatives are not finite at stage {outcome.stage}")
         if outcome.status != SWEEP_DONE:
@@ -179,7 +240,7 @@ class BoxDDP:
                 StopReason.REGULARIZATION_LIMIT,
                 f"the model of the cost at stage {outcome.stage} is not convex, however strong the damping",
             )
-        if self._promise(progress, outcome) <= self.tolerance and self._is_optimal(progress, outcome):
+        if self._promise(progress, outcome) <= self.tolerance and self._is_optimal(progress, proposal):
             return _Stop(StopReason.CONVERGED, "no step promises to lower the cost")
         if len(progress.records) == self.max_iterations:
             return _Stop(
@@ -187,10 +248,17 @@ class BoxDDP:
             )
         return None
 
-    def _is_optimal(self, progress: _Progress, outcome: SweepOutcome) -> bool:
-        """Say whether an undamped step promises as little as the given one; if so, its update is kept."""
-        if progress.regularization.value > 0.0:
-            outcome = self._work.sweep(0.0)
+    def _is_optimal(self, progress: _Progress, proposal: _Proposal) -> bool:
+        """Say whether an undamped step promises as little as the given one; if so, its update is kept.
+
+        Exact second derivatives have the last word, where there are any.
+        """
+        outcome, exact = proposal.outcome, progress.schedule.has_exact
+        if exact:
+            progress.schedule.call_for_exact()
+            self._work.differentiate_twice()
+        if proposal.damping > 0.0 or proposal.exact != exact:
+            outcome = self._work.sweep(0.0, exact=exact)
             if outcome.status != SWEEP_DONE:
                 return False
         progress.optimality = self._promise(progress, outcome)
@@ -201,30 +269,28 @@ class BoxDDP:
 
     def _promise(self, progress: _Progress, outcome: SweepOutcome) -> float:
         """Relate the decrease that the full step promises to the cost."""
-        scale = max(abs(self._work.current.cost), progress.cost_floor, np.finfo(np.float64).tiny)
-        return -(outcome.linear + outcome.quadratic) / scale
+        return -(outcome.linear + outcome.quadratic) / _scale(self._work.current.cost, progress)
 
-    def _step(self, progress: _Progress, outcome: SweepOutcome, started: float) -> IterationRecord:
-        """Search along the update, adapt the damping, and take the record."""
-        current = self._work.current
-        promise, damping = self._promise(progress, outcome), progress.regularization.value
-        alpha = self._line_search(outcome)
-        if alpha > 0.0:
-            progress.regularization.follow(alpha)
-        else:
-            progress.regularization.increase()
+    def _record(
+        self, progress: _Progress, proposal: _Proposal, cost: float, alpha: float, started: float
+    ) -> IterationRecord:
+        """Take the record of an iteration that began at a cost."""
+        work, outcome = self._work, proposal.outcome
+        promised = -(outcome.linear + outcome.quadratic)
         record = IterationRecord(
             iteration=len(progress.records) + 1,
-            cost=self._work.current.cost,
+            cost=work.current.cost,
             alpha=alpha,
-            regularization=damping,
-            expected_decrease=-(outcome.linear + outcome.quadratic),
-            optimality=promise,
-            clamped_share=outcome.clamped / current.controls.size,
+            exact=proposal.exact,
+            regularization=proposal.damping,
+            expected_decrease=promised,
+            optimality=promised / _scale(cost, progress),
+            clamped_share=outcome.clamped / work.current.controls.size,
             seconds=perf_counter() - started,
         )
         progress.records.append(record)
-        idle = current.cost - record.cost < self.plateau_decrease * abs(record.cost)
+        progress.schedule.observe(record, cost)
+        idle = cost - record.cost < self.plateau_decrease * abs(record.cost)
         progress.idle_iterations = progress.idle_iterations + 1 if idle else 0
         return record
 
@@ -240,7 +306,7 @@ class BoxDDP:
 
     def _stop_after_step(self, progress: _Progress) -> _Stop | None:
         """Judge the progress: is there a step left to try, has the cost stayed where it is?"""
-        if progress.regularization.exhausted and progress.records[-1].alpha == 0.0:
+        if progress.schedule.regularization.exhausted and progress.records[-1].alpha == 0.0:
             return _Stop(
                 StopReason.REGULARIZATION_LIMIT, "no step lowers the cost, however strong the damping"
             )
@@ -258,17 +324,25 @@ class BoxDDP:
         if reason is not StopReason.CONVERGED:
             progress.optimality = np.inf
             work.differentiate()
-            damping = Regularization(0.0)
-            outcome = self._find_update(damping)
-            if outcome.status != SWEEP_DONE:
+            proposal = self._final_update(progress)
+            if proposal.outcome.status != SWEEP_DONE:
                 message += "; there are no feedback gains, they are zero"
                 return self._collect(progress, reason, message, np.zeros_like(work.update.gains))
-            if damping.value == 0.0:
-                progress.optimality = self._promise(progress, outcome)
+            if proposal.damping == 0.0 and proposal.exact == progress.schedule.has_exact:
+                progress.optimality = self._promise(progress, proposal.outcome)
             if progress.optimality <= self.tolerance and reason is not StopReason.INTERRUPTED:
                 reason, message = StopReason.CONVERGED, "no step promises to lower the cost"
         message += f"; an undamped step promises a relative decrease of {progress.optimality:.1e}"
         return self._collect(progress, reason, message, work.update.gains.copy())
+
+    def _final_update(self, progress: _Progress) -> _Proposal:
+        """Sweep without damping, with exact second derivatives if that succeeds."""
+        if progress.schedule.has_exact:
+            self._work.differentiate_twice()
+            outcome = self._work.sweep(0.0, exact=True)
+            if outcome.status == SWEEP_DONE:
+                return _Proposal(True, 0.0, outcome)
+        return self._find_update(Regularization(0.0), exact=False)
 
     def _collect(self, progress: _Progress, reason: StopReason, message: str, gains: FloatArray) -> Solution:
         """Copy the current trajectory into a solution."""
@@ -291,12 +365,12 @@ class BoxDDP:
         problem = self.problem
         lower, upper = np.asarray(problem.control_lower), np.asarray(problem.control_upper)
         state = np.asarray(problem.initial_state if x0 is None else x0, dtype=np.float64)
-        _check_array("x0", state, (problem.n_states,))
+        check_array("x0", state, (problem.n_states,))
         shape = (problem.horizon, problem.n_controls)
         if u_init is None:
             return state, np.broadcast_to(np.clip(0.0, lower, upper), shape)
         controls = np.asarray(u_init, dtype=np.float64)
-        _check_array("u_init", controls, shape)
+        check_array("u_init", controls, shape)
         outside = (controls < lower) | (controls > upper)
         if np.any(outside):
             k, i = (int(index[0]) for index in np.nonzero(outside))
@@ -318,17 +392,6 @@ class BoxDDP:
             )
 
 
-def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
-    """Raise ValueError if an array has another shape, or an entry that is not finite."""
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}; expected {shape}")
-    wrong = np.argwhere(~np.isfinite(array))
-    if len(wrong):
-        position = ", ".join(map(str, wrong[0]))
-        raise ValueError(f"{name}[{position}] is {array[tuple(wrong[0])]}; every entry must be finite")
-
-
-def _check_at_least(name: str, value: float, smallest: float) -> None:
-    """Raise ValueError if a setting is too small, or not a number."""
-    if not value >= smallest:
-        raise ValueError(f"{name} is {value}; it must be at least {smallest}")
+def _scale(cost: float, progress: _Progress) -> float:
+    """A cost to relate changes to: positive however small the cost is."""
+    return max(abs(cost), progress.cost_floor, float(np.finfo(np.float64).tiny))

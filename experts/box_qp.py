@@ -27,7 +27,7 @@ ITERATION_LIMIT = 2
 STALLED = 3
 """No step along the Newton direction improved the value; the best point is returned."""
 NOT_POSITIVE_DEFINITE = -1
-"""The Hessian has no Cholesky factor; there is no result."""
+"""The free block of the Hessian has no Cholesky factor; there is no result."""
 
 MAX_ITERATIONS = 100
 GRADIENT_TOLERANCE = 1e-8  # of the free gradient, relative to the norm of g
@@ -96,8 +96,9 @@ def box_qp(
         gradient: g, shape (n,).
         lower: Lower bounds, -inf allowed, shape (n,).
         upper: Upper bounds, +inf allowed, shape (n,).
-        minimizer: Holds a first guess, used when the plain Newton step leaves the box; receives the
-            minimizer; shape (n,).
+        minimizer: Holds a first guess, used when the plain Newton step leaves the box; where H is positive
+            definite only on the free components, the search begins at zero instead, and the minimum is a
+            local one; receives the minimizer; shape (n,).
         work: Work arrays; `free` and `factor` are results.
 
     Returns:
@@ -107,7 +108,10 @@ def box_qp(
     for i in range(size):
         work.clamped[i] = False
     if _factorize_free_block(hessian, work) < 0:
-        return NOT_POSITIVE_DEFINITE, size
+        # Components that the gradient holds at a bound need no convexity: start where they show.
+        for i in range(size):
+            minimizer[i] = 0.0
+        return _projected_newton(hessian, gradient, lower, upper, minimizer, NOT_POSITIVE_DEFINITE, work)
     for i in range(size):
         work.search[i] = -gradient[i]
     solve_vector_in_place(work.factor, work.inverse_diagonal, work.search, size)
@@ -118,7 +122,7 @@ def box_qp(
         for i in range(size):
             minimizer[i] = work.search[i]
         return SOLVED, size
-    return _projected_newton(hessian, gradient, lower, upper, minimizer, work)
+    return _projected_newton(hessian, gradient, lower, upper, minimizer, size, work)
 
 
 @compiled
@@ -128,11 +132,11 @@ def _projected_newton(
     lower: FloatArray,
     upper: FloatArray,
     minimizer: FloatArray,
+    n_free: int,
     work: BoxQPWorkspace,
 ) -> tuple[int, int]:
-    """Run the iteration of `box_qp`, which has already factorized the whole Hessian."""
+    """Run the iteration of `box_qp`; n_free is negative if the whole Hessian could not be factorized."""
     size = gradient.shape[0]
-    n_free = size
     gradient_norm = 0.0
     for i in range(size):
         minimizer[i] = min(max(minimizer[i], lower[i]), upper[i])
@@ -141,7 +145,7 @@ def _projected_newton(
     previous_value = np.inf
     for _ in range(MAX_ITERATIONS):
         changed = _find_clamped(hessian, gradient, lower, upper, minimizer, work)
-        if changed:
+        if changed or n_free < 0:
             n_free = _factorize_free_block(hessian, work)
             if n_free < 0:
                 return NOT_POSITIVE_DEFINITE, size

@@ -198,6 +198,20 @@ def copy_block(target: FloatArray, source: FloatArray) -> None:
 
 
 @compiled
+def add_block(target: FloatArray, source: FloatArray) -> None:
+    """Add a matrix to the leading block of a larger one.
+
+    Args:
+        target: Shape (>= n, >= m).
+        source: Shape (n, m).
+    """
+    for i in range(source.shape[0]):
+        target_row, source_row = target[i], source[i]
+        for j in range(source.shape[1]):
+            target_row[j] += source_row[j]
+
+
+@compiled
 def mirror_upper(matrix: FloatArray, size: int) -> None:
     """Copy the upper triangle onto the lower one.
 

@@ -22,6 +22,8 @@ class PaperProblem:
         kernels: Its compiled functions.
     """
 
+    has_second_order = False
+
     def __init__(self, scene: Scene | str | Path = "paper") -> None:
         """Take a scene.
 

@@ -12,9 +12,15 @@ kernels. Every kernel works on rows, see `native_call`; its buffers, each with t
 | `linearize` | x (n_x), u (n_u), h (one scalar for all rows); A (n_t, n_t), B (n_t, n_u) |
 | `cost_derivatives` | x (n_x), u (n_u); lx (n_t), lu (n_u), lxx (n_t, n_t), luu (n_u, n_u) |
 | `terminal_cost_derivatives` | x (n_x); lx (n_t), lxx (n_t, n_t) |
+| `lagrangian_hessian` | x, u, multiplier (n_t), h; Lxx (n_t, n_t), Lux (n_u, n_t), Luu (n_u, n_u) |
+| `terminal_cost_hessian` | x (n_x); Lxx (n_t, n_t) |
 
 Output arrays of the derivative kernels start as zeros and nobody else writes to them, so that a kernel may
 leave entries out that are always zero. The mixed derivative lux of the stage cost is taken to be zero.
+
+lxx and luu may be approximations, as long as they are convex: Gauss-Newton's. The last two kernels give exact
+second derivatives, and only problems with `has_second_order` need to have them: Lxx, Lux and Luu are those of
+the stage cost + multiplier . (step(x (+) z, u) (-) step(x, u)) with respect to tangent state z and control u.
 """
 
 from typing import Any, Protocol, runtime_checkable
@@ -32,6 +38,8 @@ KERNEL_NAMES = (
     "cost_derivatives",
     "terminal_cost_derivatives",
 )
+
+SECOND_ORDER_KERNEL_NAMES = ("lagrangian_hessian", "terminal_cost_hessian")
 
 
 class Kernel(Protocol):
@@ -78,11 +86,15 @@ class ShootingProblem(Protocol):
     def initial_state(self) -> FloatArray:
         """State at stage 0 unless `solve` is given another, shape (n_x,)."""
 
+    @property
+    def has_second_order(self) -> bool:
+        """Whether there are the kernels of `SECOND_ORDER_KERNEL_NAMES`."""
+
     def kernel(self, name: str) -> Kernel:
         """Return one of the kernels.
 
         Args:
-            name: One of `KERNEL_NAMES`.
+            name: One of `KERNEL_NAMES`, or of `SECOND_ORDER_KERNEL_NAMES` if the problem has those.
 
         Returns:
             The kernel.

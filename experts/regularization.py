@@ -11,7 +11,7 @@ FACTOR = 1.6
 SMALLEST = 1e-6  # below it the regularization is zero
 LARGEST = 1e10
 
-LONG_STEP = 0.5  # an accepted step length from here on lowers the regularization
+LONG_STEP = 1.0  # an accepted step length from here on lowers the regularization: the full step only
 SHORT_STEP = 0.2  # one below it raises the regularization
 
 

@@ -9,13 +9,18 @@ from experts.backward_sweep import (
     SWEEP_DONE,
     SweepOutcome,
     Update,
-    allocate_derivatives,
     allocate_update,
     backward_sweep,
     sweep_workspace,
 )
+from experts.derivatives import (
+    allocate_derivatives,
+    allocate_hessians,
+    find_costates,
+    gauss_newton_hessians,
+)
 from experts.native_call import BufferTable, buffer_table, run_kernel
-from experts.problem import KERNEL_NAMES, FloatArray, ShootingProblem
+from experts.problem import KERNEL_NAMES, SECOND_ORDER_KERNEL_NAMES, FloatArray, ShootingProblem
 from experts.rollout import FINISHED, closed_loop_rollout, rollout
 
 
@@ -63,11 +68,12 @@ class ShootingWorkspace:
         derivatives: Derivatives along the current trajectory, valid after `differentiate`.
     """
 
-    def __init__(self, problem: ShootingProblem) -> None:
+    def __init__(self, problem: ShootingProblem, second_order: bool) -> None:
         """Allocate all arrays of a solve.
 
         Args:
             problem: The problem.
+            second_order: Whether exact second derivatives will be asked for.
         """
         sizes = problem.horizon, problem.n_tangent, problem.n_controls
         self.problem = problem
@@ -79,7 +85,14 @@ class ShootingWorkspace:
         self._sweep_work = sweep_workspace(problem.n_tangent, problem.n_controls)
         self._lower = np.array(problem.control_lower, dtype=np.float64)
         self._upper = np.array(problem.control_upper, dtype=np.float64)
-        self._kernels = {name: problem.kernel(name) for name in KERNEL_NAMES}
+        names = (*KERNEL_NAMES, *SECOND_ORDER_KERNEL_NAMES) if second_order else KERNEL_NAMES
+        self._kernels = {name: problem.kernel(name) for name in names}
+        self._gauss_newton = gauss_newton_hessians(self.derivatives)
+        # Without second order there is no stage to store them for.
+        stages = problem.horizon if second_order else 0
+        self._exact = allocate_hessians(stages, problem.n_tangent, problem.n_controls)
+        self._costates = np.zeros((stages, problem.n_tangent))
+        self._exact_is_current = False
         self.current = Trajectory(problem, self._time_step)
         self.trial = Trajectory(problem, self._time_step)
 
@@ -104,19 +117,32 @@ class ShootingWorkspace:
         )
 
     def differentiate(self) -> None:
-        """Compute all derivatives along the current trajectory."""
+        """Compute all derivatives along the current trajectory that Gauss-Newton needs."""
         states, controls, d = self.current.states, self.current.controls, self.derivatives
         horizon = self.problem.horizon
         self._run("linearize", horizon, buffer_table(states, controls, self._time_step, d.A, d.B))
         self._run("cost_derivatives", horizon, buffer_table(states, controls, d.lx, d.lu, d.lxx, d.luu))
         terminal_buffers = buffer_table(states[-1:], d.terminal_lx, d.terminal_lxx)
         self._run("terminal_cost_derivatives", 1, terminal_buffers)
+        self._exact_is_current = False
 
-    def sweep(self, regularization: float) -> SweepOutcome:
+    def differentiate_twice(self) -> None:
+        """Compute exact second derivatives along the current trajectory, unless they are there already."""
+        if self._exact_is_current:
+            return
+        states, controls, exact = self.current.states, self.current.controls, self._exact
+        find_costates(self.derivatives, self._costates)
+        buffers = (states, controls, self._costates, self._time_step, exact.xx, exact.ux, exact.uu)
+        self._run("lagrangian_hessian", self.problem.horizon, buffer_table(*buffers))
+        self._run("terminal_cost_hessian", 1, buffer_table(states[-1:], exact.terminal_xx))
+        self._exact_is_current = True
+
+    def sweep(self, regularization: float, *, exact: bool = False) -> SweepOutcome:
         """Compute a control update; one that fails leaves the last update as it is.
 
         Args:
             regularization: lambda >= 0, in multiples of the control weights.
+            exact: Whether to take exact second derivatives; `differentiate_twice` must have been called.
 
         Returns:
             How the sweep ended.
@@ -124,6 +150,7 @@ class ShootingWorkspace:
         outcome = SweepOutcome(
             *backward_sweep(
                 self.derivatives,
+                self._exact if exact else self._gauss_newton,
                 self.current.controls,
                 self._lower,
                 self._upper,

@@ -45,6 +45,7 @@ class IterationRecord(NamedTuple):
         iteration: Counts from 1.
         cost: Cost after the iteration.
         alpha: Accepted step length, 0 if every step was refused.
+        exact: Whether the update came from exact second derivatives; from Gauss-Newton's otherwise.
         regularization: Weight lambda of the damping, in multiples of the control weights.
         expected_decrease: Decrease of the cost that the full step promised, in the unit of the cost.
         optimality: That decrease relative to the cost; it understates while the damping is strong.
@@ -55,6 +56,7 @@ class IterationRecord(NamedTuple):
     iteration: int
     cost: float
     alpha: float
+    exact: bool
     regularization: float
     expected_decrease: float
     optimality: float
@@ -62,9 +64,8 @@ class IterationRecord(NamedTuple):
     seconds: float
 
 
-HISTORY_DTYPE = np.dtype(
-    [(name, np.int64 if name == "iteration" else np.float64) for name in IterationRecord._fields]
-)
+_FIELD_TYPES = {"iteration": np.int64, "exact": np.bool_}
+HISTORY_DTYPE = np.dtype([(name, _FIELD_TYPES.get(name, np.float64)) for name in IterationRecord._fields])
 
 
 @dataclass(eq=False)

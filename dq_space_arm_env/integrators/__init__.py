@@ -1,4 +1,4 @@
-"""Integrators by name: each file holds one method, each method works for every scene."""
+"""Integrators by name: each method has a file of its own and works for every scene."""
 
 from dq_space_arm_env.integrators.field import Integrator, VectorField
 from dq_space_arm_env.integrators.rk4 import RungeKuttaMuntheKaas4

@@ -97,6 +97,27 @@ class VectorField(Protocol):
         ...
 
 
+class TwiceDifferentiableField(VectorField, Protocol):
+    """Equations of motion with second derivatives, and with a pose apart from y."""
+
+    @property
+    def pose(self) -> PoseCoordinates:
+        """Coordinates of the pose."""
+        ...
+
+    def rates_hessian(
+        self,
+        y: Sequence[Scalar],
+        u: Sequence[Scalar],
+        rates: Sequence[Scalar],
+        by_y: Matrix,
+        by_u: Matrix,
+        multiplier: Sequence[Scalar],
+    ) -> Matrix:
+        """Hessian of multiplier . rates with respect to (y, u), from `linearized_rates`; symmetric."""
+        ...
+
+
 class Integrator(Protocol):
     """A one-step method.
 
@@ -118,6 +139,18 @@ class Integrator(Protocol):
         Returns:
             CasADi sparsity patterns of A (n_t, n_t) and B (n_t, n_u); the buffers hold their nonzeros, column
             by column.
+        """
+        ...
+
+    def append_curvature(self, program: Program, field: TwiceDifferentiableField) -> Any:
+        """Append the calls that turn x, u, h, multiplier into the second derivative of multiplier . step.
+
+        The step is taken in tangent coordinates around x and around its own result at (x, u): the second
+        derivative of multiplier . (step(x (+) z, u) (-) step(x, u)) with respect to (z, u).
+
+        Returns:
+            CasADi sparsity pattern of the upper triangle (n_t + n_u, n_t + n_u); buffer `curvature` holds its
+            nonzeros, column by column.
         """
         ...
 

@@ -12,19 +12,29 @@ from typing import Any
 
 import casadi
 
-from dq_space_arm_env.algebra.dual_vectors import cross as dual_cross
 from dq_space_arm_env.compiler.graph import graph_of, trace
 from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.compiler.symbols import column, symbols, zeros
-from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, graph_inputs, split_state
+from dq_space_arm_env.integrators.field import (
+    PoseCoordinates,
+    TwiceDifferentiableField,
+    VectorField,
+    graph_inputs,
+    split_state,
+)
 from dq_space_arm_env.integrators.linearization import pose_blocks
+from dq_space_arm_env.integrators.rk4_curvature import StepCurvature
+from dq_space_arm_env.integrators.rk4_stages import (
+    OFFSETS,
+    WEIGHTS,
+    advance,
+    pose_increment,
+    stage_pattern,
+    stage_twists,
+)
 
 Scalar = Any
 Matrix = Any
-
-# Butcher tableau: stage i starts at y + OFFSETS[i] h k_{i-1}; the step is h sum WEIGHTS[i] k_i.
-OFFSETS = (0.0, 0.5, 0.5, 1.0)
-WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
 
 class RungeKuttaMuntheKaas4:
@@ -43,10 +53,10 @@ class RungeKuttaMuntheKaas4:
         def combine(x: list[Scalar], h: list[Scalar], **k: list[Scalar]) -> dict[str, Any]:
             stages = list(k.values())
             stored, start = split_state(field, x)
-            y = _advance(start, stages, h[0])
+            y = advance(start, stages, h[0])
             if field.pose is None:
                 return {"x_next": y}
-            increment = _pose_increment(field.pose, _stage_twists(field.pose, start, stages, h[0]), h[0])
+            increment = pose_increment(field.pose, stage_twists(field.pose, start, stages, h[0]), h[0])
             return {"x_next": [*field.pose.moved(stored, increment), *y]}
 
         n_y = field.n_y
@@ -61,7 +71,7 @@ class RungeKuttaMuntheKaas4:
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
         """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
-        pattern = _stage_pattern(field)
+        pattern = stage_pattern(field)
         stage = _linearized_stage(field, pattern)
         total, a_pattern, b_pattern = _linearized_sum(field, pattern)
         program.call(_offsets_graph(field), zero="offset1", half="offset2", full="offset4")
@@ -77,64 +87,15 @@ class RungeKuttaMuntheKaas4:
         program.call(total)
         return a_pattern, b_pattern
 
+    def append_curvature(self, program: Program, field: TwiceDifferentiableField) -> Any:
+        """Append the calls that turn x, u, h, multiplier into `curvature`; returns its pattern."""
+        return StepCurvature(field).append(program)
+
 
 def _offsets_graph(field: VectorField) -> Any:
     return trace(
         f"{field.name}_rk4_offsets", {"h": 1}, lambda h: {"zero": [0.0], "half": [0.5 * h[0]], "full": [h[0]]}
     )
-
-
-def _advance(y: Sequence[Scalar], stages: Sequence[Sequence[Scalar]], h: Scalar) -> list[Scalar]:
-    """Y + h (k1 + 2 k2 + 2 k3 + k4) / 6."""
-    sixth = h * (1 / 6)
-    return [
-        entry + sixth * (k1 + 2.0 * (k2 + k3) + k4) for entry, k1, k2, k3, k4 in zip(y, *stages, strict=True)
-    ]
-
-
-def _stage_twists(
-    pose: PoseCoordinates, y: Sequence[Scalar], stages: Sequence[Sequence[Scalar]], h: Scalar
-) -> list[list[Scalar]]:
-    """Free entries of the base twist at the four stages."""
-    twists = [[y[i] for i in pose.twist_indices]]
-    for offset, k in zip(OFFSETS[1:], stages, strict=False):
-        twists.append([y[i] + offset * h * k[i] for i in pose.twist_indices])
-    return twists
-
-
-def _pose_increment(pose: PoseCoordinates, twists: Sequence[Sequence[Scalar]], h: Scalar) -> list[Scalar]:
-    """Omega after one step, 6 numbers.
-
-    Stage i starts from Omega_i = OFFSETS[i] h w_{i-1} and has the slope w_i = dexp^-1(omega_i), where dexp^-1
-    may stop after the second commutator without losing order 4. For twists the commutator is the dual cross
-    product.
-    """
-    slopes: list[Sequence[Scalar]] = []
-    for offset, free in zip(OFFSETS, twists, strict=True):
-        omega = pose.full_twist(free)
-        if slopes:
-            start = [offset * h * entry for entry in slopes[-1]]
-            once = dual_cross(start, omega)
-            twice = dual_cross(start, once)
-            omega = [w + 0.5 * a + (1 / 12) * b for w, a, b in zip(omega, once, twice, strict=True)]
-        slopes.append(omega)
-    return _advance([0.0] * 6, slopes, h)
-
-
-def _stage_pattern(field: VectorField) -> Any:
-    """Sparsity that the derivative of any stage's rates with respect to (y, u) stays within."""
-    y = symbols("y", field.n_y)
-    u = symbols("u", field.n_u)
-    _, by_y, by_u = field.linearized_rates(y, u)
-    direct = casadi.horzcat(by_y.sparsity(), by_u.sparsity())
-    identity = casadi.horzcat(casadi.Sparsity.diag(field.n_y), casadi.Sparsity(field.n_y, field.n_u))
-    pattern = direct
-    while True:
-        product = casadi.mtimes(casadi.DM(by_y.sparsity(), 1), casadi.DM(pattern.unite(identity), 1))
-        grown = direct.unite(casadi.sparsify(product).sparsity())
-        if grown == pattern:
-            return pattern
-        pattern = grown
 
 
 def _linearized_stage(field: VectorField, pattern: Any) -> Any:
@@ -194,7 +155,7 @@ def _linearized_pose(
     """Derivatives of the pose update by the pose, and by (y, u) through Omega."""
     rows = list(pose.twist_indices)
     free = [symbols(f"w{s}", len(rows)) for s in range(4)]
-    increment = column(*_pose_increment(pose, free, h))
+    increment = column(*pose_increment(pose, free, h))
     moved = zeros(len(rows), identity.shape[1])
     for s, offset in enumerate(OFFSETS):
         twist_change = identity[rows, :]
@@ -202,7 +163,7 @@ def _linearized_pose(
             twist_change = twist_change + (offset * h) * changes[s - 1][rows, :]
         slope = casadi.jacobian(increment, column(*free[s]))[list(pose.directions), :]
         moved = moved + casadi.mtimes(slope, twist_change)
-    twists = _stage_twists(pose, y, stages, h)
+    twists = stage_twists(pose, y, stages, h)
     placeholders = column(*(entry for twist in free for entry in twist))
     values = casadi.densify(column(*(entry for twist in twists for entry in twist)))
     increment, moved = casadi.substitute([increment, moved], [placeholders], [values])

@@ -9,8 +9,15 @@ import casadi
 
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.compiler.symbols import symbols, zeros
-from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, graph_inputs, split_state
+from dq_space_arm_env.compiler.symbols import column, symbols, zeros
+from dq_space_arm_env.integrators.curvature import pose_curvature, upper_triangle
+from dq_space_arm_env.integrators.field import (
+    PoseCoordinates,
+    TwiceDifferentiableField,
+    VectorField,
+    graph_inputs,
+    split_state,
+)
 from dq_space_arm_env.integrators.linearization import pose_blocks
 
 Scalar = Any
@@ -66,6 +73,38 @@ class SymplecticEuler:
         )
         program.call(graph)
         return a.sparsity(), b.sparsity()
+
+    def append_curvature(self, program: Program, field: TwiceDifferentiableField) -> Any:
+        """Append the calls that turn x, u, h, multiplier into `curvature`; returns its pattern."""
+        x, u, h = symbols("x", field.n_x), symbols("u", field.n_u), casadi.SX.sym("h")
+        n_y, n_u, twist = field.n_y, field.n_u, list(field.pose.twist_indices)
+        multiplier = symbols("l", len(twist) + n_y)
+        weights = column(*multiplier[len(twist) :])
+        y = split_state(field, x)[1]
+        rates, by_y, by_u = field.linearized_rates(y, u)
+        increment = self._increment(field.pose, self._advance(field, y, u, h, rates), h)
+        curved = pose_curvature(field.pose, increment, multiplier[: len(twist)])
+        # Everything is linear in the new velocities but the pose: their multiplier collects what they move.
+        rows = list(field.rate_indices)
+        others = [i for i in range(n_y) if i not in set(rows)]
+        moved = zeros(n_y, 1)
+        moved[rows, 0] = weights[rows] + h * casadi.mtimes(by_y[others, rows].T, weights[others])
+        moved[twist, 0] = moved[twist, 0] + h * curved.by_increment
+        mu = h * casadi.densify(moved)
+        hessian = field.rates_hessian(y, u, rates, by_y, by_u, mu.nonzeros())
+        start = casadi.horzcat(casadi.SX.eye(n_y), zeros(n_y, n_u))
+        twist_change = h * (start + h * casadi.horzcat(by_y, by_u))[twist, :]
+        hessian = hessian + casadi.mtimes(twist_change.T, casadi.mtimes(curved.increment_twice, twist_change))
+        above = casadi.horzcat(zeros(len(twist), len(twist)), casadi.mtimes(curved.mixed, twist_change))
+        below = casadi.horzcat(zeros(n_y + n_u, len(twist)), hessian)
+        curvature = upper_triangle(casadi.vertcat(above, below))
+        graph = graph_of(
+            f"{field.name}_euler_curvature",
+            graph_inputs(field, x=x, u=u, h=[h], multiplier=multiplier),
+            {"curvature": curvature.nonzeros()},
+        )
+        program.call(graph)
+        return curvature.sparsity()
 
     def _advance(
         self, field: VectorField, y: Sequence[Scalar], u: Sequence[Scalar], h: Scalar, rates: list[Scalar]

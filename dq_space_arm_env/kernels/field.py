@@ -11,7 +11,7 @@ import casadi
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
-from dq_space_arm_env.compiler.symbols import column, columns, symbols
+from dq_space_arm_env.compiler.symbols import column, columns, symbols, zeros
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
@@ -238,6 +238,80 @@ class SpaceArmField:
         inputs_one_by_one = (self._input_response(mass_matrix, i) for i in range(self.n_u))
         by_u = columns(*inputs_one_by_one, rows=len(self.rate_indices))
         return rates, jacobian_y, casadi.vertcat(angles_by_u, by_u)
+
+    def rates_hessian(
+        self,
+        y: Sequence[Scalar],
+        u: Sequence[Scalar],
+        rates: Sequence[Scalar],
+        by_y: Matrix,
+        by_u: Matrix,
+        multiplier: Sequence[Scalar],
+    ) -> Matrix:
+        """Second derivative of multiplier . rates, from first derivatives that are there already.
+
+        With w = M^-1 multiplier, differentiating w . (M a + ID(y, 0) - f) = 0 twice gives multiplier . a_zz =
+        -[(w . ID)_zz + G' a_z + (G' a_z)'], G = d(M w)/dy: the factorization of M is not differentiated.
+
+        Args:
+            y: State without the pose, n_y expressions.
+            u: Input, n_u expressions.
+            rates: Time derivative of y at (y, u), n_y.
+            by_y: Its Jacobian with respect to y, SX (n_y, n_y).
+            by_u: Its Jacobian with respect to u, SX (n_y, n_u).
+            multiplier: Weights of the rates, n_y.
+
+        Returns:
+            Hessian with respect to (y, u), symmetric SX (n_y + n_u, n_y + n_u).
+        """
+        rows = list(self.rate_indices)
+        motion = self.motion(y)
+        dual = self.pose.full_twist([rates[i] for i in self.pose.twist_indices])
+        turning = cross(motion.angular, motion.linear)
+        joints = [rates[i] for i in rows[len(self.pose.directions) :]]
+        acceleration = [*dual[:3], *add(dual[3:], turning), *joints]
+        weights = self.pose.full_twist([multiplier[i] for i in self.pose.twist_indices])
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        response = MassMatrix(self.chain, rotations).solve(
+            weights[3:], weights[:3], [multiplier[i] for i in rows[len(self.pose.directions) :]]
+        )
+        by_accelerations, curvature = self._residual_curvature(y, acceleration, response)
+        turning_by_y = self._simple_jacobians(y)[2]
+        by_state = casadi.horzcat(by_y[rows, :] - turning_by_y, by_u[rows, :])
+        # As seen by an inertial observer moving along, the velocity of the base changes no acceleration.
+        linear = [
+            i for i, axis in zip(self.pose.twist_indices, self.pose.directions, strict=True) if axis > 2
+        ]
+        by_state[:, linear] = zeros(len(rows), len(linear))
+        coupling = casadi.mtimes(by_accelerations.T, casadi.sparsify(by_state))
+        n_y, n_u = self.n_y, self.n_u
+        coupling = casadi.vertcat(coupling, zeros(n_u, n_y + n_u))
+        free = symbols("v", n_y)
+        moving = self.motion(free)
+        bilinear = casadi.dot(column(*weights[3:]), column(*cross(moving.angular, moving.linear)))
+        curvature = curvature + casadi.jacobian(casadi.gradient(bilinear, column(*free)), column(*free))
+        curvature = casadi.diagcat(curvature, zeros(n_u, n_u))
+        return casadi.sparsify(-(curvature + coupling + coupling.T))
+
+    def _residual_curvature(
+        self, y: Sequence[Scalar], acceleration: Sequence[Scalar], response: Accelerations
+    ) -> tuple[Matrix, Matrix]:
+        """Derivatives of w . `_residual`: by (free accelerations, y), and by y twice; w is the response."""
+        free = symbols("v", self.n_y)
+        residual, accelerations = self._residual(free)
+        w = symbols("w", len(accelerations))
+        # The residual lists the force before the torque, an acceleration its angular part first.
+        power = casadi.dot(column(*w[3:6], *w[:3], *w[6:]), residual)
+        kept = [accelerations[i] for i in (*self.pose.directions, *range(6, len(accelerations)))]
+        y_column = column(*free)
+        mixed = (
+            casadi.jacobian(casadi.gradient(power, column(*kept)), y_column) if kept else zeros(0, self.n_y)
+        )
+        twice = casadi.hessian(power, y_column)[0]
+        values = column(*y, *acceleration, *response.angular, *response.linear, *response.joints)
+        names = column(*free, *accelerations, *w)
+        mixed, twice = casadi.substitute([mixed, twice], [names], [casadi.densify(values)])
+        return casadi.sparsify(mixed), casadi.sparsify(twice)
 
     def _simple_jacobians(self, y: Sequence[Scalar]) -> tuple[Matrix, Matrix, Matrix]:
         """Constant Jacobians of the angles' rates by y and u, and the Jacobian of -omega x v by y."""

@@ -189,6 +189,7 @@ _STEPS = (
     "step",
     "step_with_cost",
     "linearize",
+    "lagrangian_hessian",
     "environment_step",
     "environment_step_float32_actions",
 )

@@ -9,8 +9,9 @@ from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.cost import weighted_square
 from dq_space_arm_env.integrators import INTEGRATORS
+from dq_space_arm_env.kernels.derivative_programs import sparse_buffer
 from dq_space_arm_env.kernels.paper_field import PaperField
-from dq_space_arm_env.kernels.programs import ScenePrograms, sparse_buffer
+from dq_space_arm_env.kernels.programs import ScenePrograms
 from dq_space_arm_env.scene.schema import Scene
 
 Scalar = Any

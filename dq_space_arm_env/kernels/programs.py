@@ -9,18 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import casadi
-import numpy as np
-
-from dq_space_arm_env.algebra import dual_matrices, poses, screw
 from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import poses, screw
 from dq_space_arm_env.algebra.vectors import matrix_vector
-from dq_space_arm_env.compiler.graph import graph_of, trace
+from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
-from dq_space_arm_env.compiler.symbols import column, matrix, symbols, zeros
 from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.integrators import INTEGRATORS
 from dq_space_arm_env.integrators.field import split_state
+from dq_space_arm_env.kernels.derivative_programs import DerivativePrograms
 from dq_space_arm_env.kernels.equations import SceneEquations, total
 from dq_space_arm_env.scene.schema import Scene
 
@@ -41,6 +38,7 @@ class ScenePrograms:
         self.equations = SceneEquations.nominal(scene)
         self.chain, self.layout = self.equations.chain, self.equations.layout
         self.field = self.equations.field
+        derivatives = self._derivatives = DerivativePrograms(self.equations)
         self._builders: Mapping[str, Callable[[], Program]] = {
             "forward_dynamics": self._forward_dynamics,
             "forward_dynamics_with_tip_wrench": self._forward_dynamics_with_tip_wrench,
@@ -51,8 +49,9 @@ class ScenePrograms:
             "energy": self._energy,
             "cost": self._cost,
             "terminal_cost": self._terminal_cost,
-            "cost_derivatives": self._cost_derivatives,
-            "terminal_cost_derivatives": self._terminal_cost_derivatives,
+            "cost_derivatives": derivatives.cost,
+            "terminal_cost_derivatives": derivatives.terminal_cost,
+            "terminal_cost_hessian": derivatives.terminal_cost_hessian,
             "difference": self._difference,
             "retract": self._retract,
             "observation": self._observation,
@@ -62,7 +61,8 @@ class ScenePrograms:
         """Trace a program.
 
         Args:
-            name: `step`, `step_with_cost`, `linearize`, or one of the functions of a state.
+            name: `step`, `step_with_cost`, `linearize`, `lagrangian_hessian`, or one of the functions of a
+                state.
             integrator: Name of the integrator, for those that take a step.
 
         Returns:
@@ -74,7 +74,9 @@ class ScenePrograms:
         if name in ("step", "step_with_cost"):
             return self._step(name, integrator)
         if name == "linearize":
-            return self._linearize(integrator)
+            return self._derivatives.linearize(integrator)
+        if name == "lagrangian_hessian":
+            return self._derivatives.lagrangian_hessian(integrator)
         return self._builders[name]()
 
     # Functions of a state, and of an input.
@@ -156,7 +158,7 @@ class ScenePrograms:
 
         return self._program("energy", outputs, x=self.field.n_x)
 
-    # The cost and its derivatives.
+    # The cost.
 
     def _cost(self) -> Program:
         field = self.field
@@ -170,84 +172,6 @@ class ScenePrograms:
             lambda x: {"cost": [total(self.equations.terminal_cost_terms(x))]},
             x=self.field.n_x,
         )
-
-    def _state_cost_derivatives(self, x: Scalars, pose: Scalars, velocity: Scalars) -> tuple[Any, Any]:
-        """Gradient and Gauss-Newton Hessian of the state's cost in tangent coordinates, sparse SX.
-
-        The tip's pose moves with the base by q_{e0/I} d q_{G/e0} / 2 for a twist increment d, with the angles
-        by (27).
-        """
-        field = self.field
-        motion = field.motion(self.equations.y(x))
-        arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
-        base = self.equations.base_pose(x)
-        tip = dq.multiply(base, arm)
-        angles = column(*self.equations.y(x)[: self._angle_count()])
-        left, right = dual_matrices.left_matrix(base), dual_matrices.right_matrix(arm)
-        directions = []
-        for direction in field.pose.directions:
-            twist = [0.0] * 8
-            twist[(1, 2, 3, 5, 6, 7)[direction]] = 0.5
-            moved = dual_matrices.matrix_multiply(left, dual_matrices.matrix_multiply(right, twist))
-            directions.append(column(*moved))
-        by_angles = casadi.mtimes(matrix(left), casadi.jacobian(column(*arm), angles))
-        others = zeros(8, field.n_t - len(directions) - self._angle_count())
-        by_state = casadi.sparsify(casadi.horzcat(*directions, by_angles, others))
-        error = column(*tip) - casadi.DM(self.scene.target.pose.dual_quaternion)
-        weighted = casadi.mtimes(casadi.diag(casadi.DM(pose)), by_state)
-        gradient = 2.0 * casadi.mtimes(weighted.T, error)
-        hessian = 2.0 * casadi.mtimes(by_state.T, weighted)
-        start = field.n_t - field.n_y
-        for index, direction in zip(field.pose.twist_indices, field.pose.directions, strict=True):
-            weight = velocity[direction]
-            deviation = self.equations.y(x)[index] - self.scene.target.base_velocity[direction]
-            gradient[start + index] += 2.0 * weight * deviation
-            hessian[start + index, start + index] += 2.0 * weight
-        return gradient, casadi.sparsify(hessian)
-
-    def _angle_count(self) -> int:
-        return self.layout.n_joints + (3 if self.layout.has_wrist else 0)
-
-    def _cost_derivatives(self) -> Program:
-        field, cost = self.field, self.scene.cost
-        x, u = symbols("x", field.n_x), symbols("u", field.n_u)
-        gradient, hessian = self._state_cost_derivatives(x, cost.pose, cost.base_velocity)
-        weights = (2.0 * self.layout.control_weight).tolist()
-        outputs = {
-            "lx": casadi.densify(gradient).nonzeros(),
-            "lu": [weight * value for weight, value in zip(weights, u, strict=True)],
-            "lxx": hessian.nonzeros(),
-            "luu": weights,
-        }
-        graph = graph_of("cost_derivatives_graph", {"x": x, "u": u}, outputs)
-        n_t, n_u = field.n_t, field.n_u
-        diagonal = tuple(range(0, n_u * n_u, n_u + 1))
-        program = Program(
-            "cost_derivatives",
-            [Buffer("x", field.n_x), Buffer("u", n_u)],
-            [
-                Buffer("lx", n_t),
-                Buffer("lu", n_u),
-                sparse_buffer("lxx", hessian.sparsity()),
-                Buffer("luu", n_u, positions=diagonal, stride=n_u * n_u),
-            ],
-        )
-        program.call(graph)
-        return program
-
-    def _terminal_cost_derivatives(self) -> Program:
-        field, cost = self.field, self.scene.cost
-        x = symbols("x", field.n_x)
-        gradient, hessian = self._state_cost_derivatives(x, cost.terminal_pose, cost.terminal_base_velocity)
-        outputs = {"lx": casadi.densify(gradient).nonzeros(), "lxx": hessian.nonzeros()}
-        graph = graph_of("terminal_cost_derivatives_graph", {"x": x}, outputs)
-        program = Program(
-            "terminal_cost_derivatives",
-            [Buffer("x", field.n_x)],
-            [Buffer("lx", field.n_t), sparse_buffer("lxx", hessian.sparsity())],
-        )
-        program.call(graph)
-        return program
 
     # Tangent coordinates.
 
@@ -299,30 +223,3 @@ class ScenePrograms:
             )
             program.outputs = [*program.outputs, Buffer("cost", 1)]
         return program
-
-    def _linearize(self, integrator: str) -> Program:
-        field = self.field
-        program = Program(
-            "linearize",
-            [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)],
-            [],
-        )
-        a, b = INTEGRATORS[integrator].append_linearization(program, field)
-        program.outputs = [sparse_buffer("A", a), sparse_buffer("B", b)]
-        return program
-
-
-def sparse_buffer(name: str, pattern: Any) -> Buffer:
-    """An output that fills the nonzeros of a row-major matrix; the rest of the array stays as it is.
-
-    Args:
-        name: Name of the buffer.
-        pattern: CasADi sparsity; the graph's scalars are its nonzeros, column by column.
-
-    Returns:
-        The buffer.
-    """
-    rows, columns = pattern.get_triplet()
-    count, width = pattern.shape
-    positions = np.array(rows, dtype=int) * width + np.array(columns, dtype=int)
-    return Buffer(name, pattern.nnz(), positions=tuple(positions.tolist()), stride=count * width)

@@ -49,6 +49,12 @@ class PythonProblem:
     linearize: Callable[[Array, Array, float], tuple[Array, Array]]
     cost_derivatives: Callable[[Array, Array], tuple[Array, Array, Array, Array]]
     terminal_cost_derivatives: Callable[[Array], tuple[Array, Array]]
+    lagrangian_hessian: Callable[[Array, Array, Array, float], tuple[Array, Array, Array]] | None = None
+    terminal_cost_hessian: Callable[[Array], Array] | None = None
+
+    @property
+    def has_second_order(self) -> bool:
+        return self.lagrangian_hessian is not None
 
     def __post_init__(self) -> None:
         x, t, u, one = (self.n_states,), (self.n_tangent,), (self.n_controls,), (1,)
@@ -78,6 +84,12 @@ class PythonProblem:
             "cost_derivatives": kernel(self.cost_derivatives, [x, u], [t, u, tt, uu]),
             "terminal_cost_derivatives": kernel(self.terminal_cost_derivatives, [x], [t, tt]),
         }
+        if self.lagrangian_hessian is not None and self.terminal_cost_hessian is not None:
+            exact, terminal = self.lagrangian_hessian, self.terminal_cost_hessian
+            self._kernels["lagrangian_hessian"] = kernel(
+                lambda y, v, m, h: exact(y, v, m, h[0]), [x, u, t, one], [tt, u + t, uu], shared=3
+            )
+            self._kernels["terminal_cost_hessian"] = kernel(lambda y: (terminal(y),), [x], [tt])
 
     def kernel(self, name: str) -> PythonKernel:
         return self._kernels[name]
@@ -178,6 +190,10 @@ def pendulum() -> PythonProblem:
         rate = np.array([h * gravity * np.cos(x[0]), 1.0])
         return np.array([np.array([1.0, 0.0]) + h * rate, rate]), np.array([[h * h], [h]])
 
+    def lagrangian_hessian(x: Array, u: Array, m: Array, h: float) -> tuple[Array, Array, Array]:
+        curvature = -(h * m[0] + m[1]) * h * gravity * np.sin(x[0])
+        return np.diag([curvature, 0.0]), np.zeros((1, 2)), weight
+
     return PythonProblem(
         n_states=2,
         n_tangent=2,
@@ -194,6 +210,8 @@ def pendulum() -> PythonProblem:
         linearize=linearize,
         cost_derivatives=lambda x, u: (np.zeros(2), weight @ u, np.zeros((2, 2)), weight),
         terminal_cost_derivatives=lambda x: (terminal @ x, terminal),
+        lagrangian_hessian=lagrangian_hessian,
+        terminal_cost_hessian=lambda x: terminal,
     )
 
 

@@ -8,13 +8,18 @@ from experts.backward_sweep import (
     SWEEP_DONE,
     SWEEP_NOT_FINITE,
     SWEEP_NOT_POSITIVE_DEFINITE,
-    Derivatives,
     SweepOutcome,
     Update,
-    allocate_derivatives,
     allocate_update,
     backward_sweep,
     sweep_workspace,
+)
+from experts.derivatives import (
+    Derivatives,
+    Hessians,
+    allocate_derivatives,
+    find_costates,
+    gauss_newton_hessians,
 )
 
 
@@ -34,27 +39,39 @@ def random_derivatives(seed: int, horizon: int, n_tangent: int, n_controls: int)
 
 
 def sweep(
-    d: Derivatives, controls: np.ndarray, limit: float, regularization: float
+    d: Derivatives,
+    controls: np.ndarray,
+    limit: float,
+    regularization: float,
+    hessians: Hessians | None = None,
 ) -> tuple[SweepOutcome, Update]:
     horizon, n_tangent, n_controls = d.B.shape
     update = allocate_update(horizon, n_tangent, n_controls)
     bound = np.full(n_controls, limit)
     work = sweep_workspace(n_tangent, n_controls)
-    outcome = backward_sweep(d, controls, -bound, bound, regularization, update, work)
+    hessians = hessians or gauss_newton_hessians(d)
+    outcome = backward_sweep(d, hessians, controls, -bound, bound, regularization, update, work)
     return SweepOutcome(*outcome), update
 
 
 def reference_sweep(
-    d: Derivatives, controls: np.ndarray, limit: float, regularization: float
+    d: Derivatives,
+    controls: np.ndarray,
+    limit: float,
+    regularization: float,
+    hessians: Hessians | None = None,
 ) -> tuple[float, float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Tassa's sweep: his value update with the Quu and Qux that are not regularized."""
-    Vx, Vxx = d.terminal_lx[0], d.terminal_lxx[0]
+    if hessians is None:
+        hessians = gauss_newton_hessians(d)._replace(ux=np.zeros(d.B.transpose(0, 2, 1).shape))
+    Vx, Vxx = d.terminal_lx[0], hessians.terminal_xx[0]
     linear, quadratic = 0.0, 0.0
     feedforward, gains = np.zeros(d.lu.shape), np.zeros(d.B.transpose(0, 2, 1).shape)
     for stage in range(len(controls) - 1, -1, -1):
         A, B = d.A[stage], d.B[stage]
         Qx, Qu = d.lx[stage] + A.T @ Vx, d.lu[stage] + B.T @ Vx
-        Qxx, Quu, Qux = d.lxx[stage] + A.T @ Vxx @ A, d.luu[stage] + B.T @ Vxx @ B, B.T @ Vxx @ A
+        Qxx, Quu = hessians.xx[stage] + A.T @ Vxx @ A, hessians.uu[stage] + B.T @ Vxx @ B
+        Qux = hessians.ux[stage] + B.T @ Vxx @ A
         damped = Quu + regularization * np.diag(np.diag(d.luu[stage]))
         if np.isinf(limit):
             k, free = -np.linalg.solve(damped, Qu), np.full(len(Qu), True)
@@ -89,6 +106,64 @@ def test_agrees_with_the_formulas(
     np.testing.assert_allclose(update.gains, K, atol=1e-8 * max(np.abs(K).max(), 1.0))
     np.testing.assert_allclose(update.value_gradient, Vx, atol=1e-8 * np.abs(Vx).max())
     np.testing.assert_allclose(update.value_hessian, Vxx, atol=1e-8 * np.abs(Vxx).max())
+
+
+def random_hessians(d: Derivatives, seed: int) -> Hessians:
+    """Symmetric blocks that no Gauss-Newton model has: mixed ones, and indefinite ones of the state."""
+    rng = np.random.default_rng(seed)
+    xx, uu = (0.2 * rng.normal(size=array.shape) / array.shape[1] for array in (d.lxx, d.luu))
+    weights = np.sqrt(np.diagonal(d.luu, axis1=1, axis2=2))
+    return Hessians(
+        xx=d.lxx + xx + xx.transpose(0, 2, 1),
+        ux=0.1 * weights[:, :, None] * rng.normal(size=d.B.transpose(0, 2, 1).shape),
+        uu=d.luu + 0.1 * weights[:, :, None] * weights[:, None] * (uu + uu.transpose(0, 2, 1)),
+        terminal_xx=d.terminal_lxx + np.eye(d.lx.shape[1]),
+    )
+
+
+@pytest.mark.parametrize("limit", [np.inf, 0.2])
+@pytest.mark.parametrize(("n_tangent", "n_controls"), [(4, 3), (13, 5), (21, 12)])
+def test_second_derivatives_beyond_gauss_newton_enter_as_the_formulas_say(
+    n_tangent: int, n_controls: int, limit: float
+) -> None:
+    d = random_derivatives(n_tangent, 8, n_tangent, n_controls)
+    hessians = random_hessians(d, 3)
+    controls = np.random.default_rng(1).uniform(-0.2, 0.2, size=d.lu.shape)
+    outcome, update = sweep(d, controls, limit, 30.0, hessians)
+    linear, quadratic, k, K, Vx, Vxx = reference_sweep(d, controls, limit, 30.0, hessians)
+    assert outcome.status == SWEEP_DONE
+    assert (outcome.linear, outcome.quadratic) == pytest.approx((linear, quadratic), rel=1e-7)
+    np.testing.assert_allclose(update.feedforward, k, atol=1e-8 * np.abs(k).max())
+    np.testing.assert_allclose(update.gains, K, atol=1e-8 * max(np.abs(K).max(), 1.0))
+    np.testing.assert_allclose(update.value_gradient, Vx, atol=1e-8 * np.abs(Vx).max())
+    np.testing.assert_allclose(update.value_hessian, Vxx, atol=1e-8 * np.abs(Vxx).max())
+
+
+def test_costates_are_the_value_gradient_of_a_trajectory_that_stays() -> None:
+    """Where no control may move, the gradient of the value function is the costate."""
+    d = random_derivatives(6, 20, 7, 3)
+    costates = np.zeros(d.lx.shape)
+    find_costates(d, costates)
+    np.testing.assert_array_equal(costates[-1], d.terminal_lx[0])
+    _, update = sweep(d, np.zeros(d.lu.shape), 0.0, 0.0)
+    np.testing.assert_allclose(d.lx[0] + d.A[0].T @ costates[0], update.value_gradient, rtol=1e-9, atol=1e-12)
+
+
+def test_stage_that_is_concave_only_along_a_clamped_input_needs_no_damping() -> None:
+    d = random_derivatives(1, 6, 4, 2)
+    d.luu[:] = np.diag([1.0, 1.0])
+    hessians = gauss_newton_hessians(d)
+    hessians = hessians._replace(uu=hessians.uu.copy())
+    hessians.uu[3, 1, 1] = -50.0
+    d.lu[3, 1] = -500.0
+    controls = np.zeros(d.lu.shape)
+    controls[3, 1] = 0.5
+    outcome, update = sweep(d, controls, 0.5, 0.0, hessians)
+    assert outcome.status == SWEEP_DONE
+    assert update.feedforward[3, 1] == 0.0
+    assert np.all(update.gains[3, 1] == 0.0)
+    outcome, _ = sweep(d, np.zeros(d.lu.shape), np.inf, 0.0, hessians)
+    assert (outcome.status, outcome.stage) == (SWEEP_NOT_POSITIVE_DEFINITE, 3)
 
 
 @pytest.mark.parametrize("limit", [1.0, 0.2])
