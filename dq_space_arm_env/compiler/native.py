@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,21 @@ def disassemble(assembly: str) -> str:
     return str(machine.emit_assembly(module))
 
 
+@cache
+def _linker() -> llvm.LLJIT:
+    """What links object files into this process.
+
+    LLVM's JITLink keeps the code and the constants of an object file together. Its older linker may put them
+    further apart than an instruction reaches, where large libraries fill the address space, and then aborts.
+    """
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm.create_lljit_compiler(use_jit_link=True)
+
+
+_library_numbers = count()
+
+
 class NativeKernel:
     """A compiled program in memory.
 
@@ -136,16 +152,14 @@ class NativeKernel:
             metadata: Notes to keep with the kernel.
 
         Raises:
-            LookupError: If the object file has no such function.
+            LookupError: If the object file has no such function, or needs one that is nowhere to be found.
         """
-        empty = llvm.parse_assembly("")
-        # The engine takes ownership of its target machine, so it gets one of its own.
-        self._engine = llvm.create_mcjit_compiler(empty, _target_machine(opt=1))
-        self._engine.add_object_file(llvm.ObjectFileRef.from_data(object_code))
-        self._engine.finalize_object()
-        self.address: int = self._engine.get_function_address(name)
-        if not self.address:
-            raise LookupError(f"the object file has no function {name!r}")
+        builder = llvm.JITLibraryBuilder().add_object_img(object_code).add_current_process()
+        try:
+            self._library = builder.export_symbol(name).link(_linker(), f"{name} {next(_library_numbers)}")
+        except RuntimeError as error:
+            raise LookupError(f"the object file has no function {name!r} that can be linked") from error
+        self.address: int = self._library[name]
         self.function = KernelFunction(self.address)
         self.metadata = metadata
 
