@@ -2,6 +2,7 @@
 
 from experts.box_ddp import BoxDDP
 from experts.problem import ShootingProblem
+from experts.receding_horizon import RecedingHorizonExpert
 from experts.solution import Solution, StopReason
 
-__all__ = ["BoxDDP", "ShootingProblem", "Solution", "StopReason"]
+__all__ = ["BoxDDP", "RecedingHorizonExpert", "ShootingProblem", "Solution", "StopReason"]

@@ -32,19 +32,23 @@ SWEEP_NOT_FINITE = 2
 
 
 class Update(NamedTuple):
-    """What the sweep produces: u + alpha k + K dx, and the value function's derivatives at the start.
+    """What the sweep produces: u + alpha k + K dx, and derivatives of the value function.
 
     Attributes:
         feedforward: k, shape (N, n_u).
         gains: K, zero in the rows of clamped inputs, shape (N, n_u, n_t).
         value_gradient: Vx at stage 0, shape (n_t,).
         value_hessian: Vxx at stage 0, shape (n_t, n_t).
+        stage_gradients: Vx at every stage, shape (N, n_t); shape (0, n_t) if they are not kept.
+        stage_hessians: Vxx at every stage, shape (N, n_t, n_t); shape (0, n_t, n_t) if they are not kept.
     """
 
     feedforward: FloatArray
     gains: FloatArray
     value_gradient: FloatArray
     value_hessian: FloatArray
+    stage_gradients: FloatArray
+    stage_hessians: FloatArray
 
 
 class SweepOutcome(NamedTuple):
@@ -110,22 +114,26 @@ class SweepWorkspace(NamedTuple):
     box: BoxQPWorkspace
 
 
-def allocate_update(horizon: int, n_tangent: int, n_controls: int) -> Update:
+def allocate_update(horizon: int, n_tangent: int, n_controls: int, *, keep_values: bool = False) -> Update:
     """Allocate the results of the sweep.
 
     Args:
         horizon: Number of stages N.
         n_tangent: Size n_t of the tangent state.
         n_controls: Number n_u of inputs.
+        keep_values: Whether to keep the value function's derivatives at every stage.
 
     Returns:
         Arrays of zeros.
     """
+    stages = horizon if keep_values else 0
     return Update(
         feedforward=np.zeros((horizon, n_controls)),
         gains=np.zeros((horizon, n_controls, n_tangent)),
         value_gradient=np.zeros(n_tangent),
         value_hessian=np.zeros((n_tangent, n_tangent)),
+        stage_gradients=np.zeros((stages, n_tangent)),
+        stage_hessians=np.zeros((stages, n_tangent, n_tangent)),
     )
 
 
@@ -322,7 +330,7 @@ def _update_value(n_tangent: int, n_free: int, work: SweepWorkspace) -> None:
 
 @compiled
 def _store(stage: int, n_tangent: int, n_free: int, update: Update, work: SweepWorkspace) -> None:
-    """Write k and K of a stage, zero rows for clamped inputs."""
+    """Write k and K of a stage, zero rows for clamped inputs, and the value function if it is kept."""
     for i in range(work.k.shape[0]):
         update.feedforward[stage, i] = work.k[i]
         for j in range(n_tangent):
@@ -331,6 +339,11 @@ def _store(stage: int, n_tangent: int, n_free: int, update: Update, work: SweepW
         row, gain = update.gains[stage, work.box.free[a]], work.gains[a]
         for j in range(n_tangent):
             row[j] = -gain[j]
+    if update.stage_gradients.shape[0] > 0:
+        for i in range(n_tangent):
+            update.stage_gradients[stage, i] = work.Vx[i]
+            for j in range(n_tangent):
+                update.stage_hessians[stage, i, j] = work.Vxx[i, j]
 
 
 @compiled

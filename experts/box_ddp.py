@@ -27,6 +27,7 @@ from experts.backward_sweep import (
     SweepOutcome,
 )
 from experts.checks import check_array, check_at_least
+from experts.line_search import line_search
 from experts.models import EXACT_DAMPING, ModelSchedule, SecondOrder
 from experts.problem import FloatArray, ShootingProblem, as_problem
 from experts.regularization import Regularization
@@ -34,9 +35,6 @@ from experts.rollout import FINISHED
 from experts.shooting import ShootingWorkspace
 from experts.solution import HISTORY_DTYPE, IterationRecord, Solution, StopReason
 
-STEP_LENGTHS = 10.0 ** np.linspace(0.0, -3.0, 11)
-ACCEPTANCE = 1e-4
-"""Share of the promised decrease that a step must achieve."""
 COST_FLOOR = 1e-9
 """Costs below this share of the first one count as zero: relative measures are taken to it."""
 
@@ -194,7 +192,7 @@ class BoxDDP:
                 stop = self._stop_before_step(progress, proposal)
                 if stop is not None:
                     return stop
-                alpha = self._line_search(proposal.outcome)
+                alpha = line_search(self._work, proposal.outcome)
                 if alpha > 0.0:
                     return self._record(progress, proposal, cost, alpha, started)
             schedule.postpone_exact()
@@ -204,7 +202,7 @@ class BoxDDP:
         stop = self._stop_before_step(progress, proposal)
         if stop is not None:
             return stop
-        alpha = self._line_search(proposal.outcome)
+        alpha = line_search(self._work, proposal.outcome)
         if alpha > 0.0:
             schedule.regularization.follow(alpha)
         else:
@@ -293,16 +291,6 @@ class BoxDDP:
         idle = cost - record.cost < self.plateau_decrease * abs(record.cost)
         progress.idle_iterations = progress.idle_iterations + 1 if idle else 0
         return record
-
-    def _line_search(self, outcome: SweepOutcome) -> float:
-        """Move to the first trial that achieves enough of its promise; return its length, else 0."""
-        cost = self._work.current.cost
-        for alpha in STEP_LENGTHS:
-            promised = -alpha * (outcome.linear + alpha * outcome.quadratic)
-            if cost - self._work.try_step(alpha) > ACCEPTANCE * promised:
-                self._work.accept()
-                return float(alpha)
-        return 0.0
 
     def _stop_after_step(self, progress: _Progress) -> _Stop | None:
         """Judge the progress: is there a step left to try, has the cost stayed where it is?"""

@@ -3,6 +3,8 @@
 Everything here is done for all stages by compiled code; nothing is decided here.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from experts.backward_sweep import (
@@ -38,12 +40,15 @@ class Trajectory:
         terminal_buffers: Buffers of `terminal_cost`.
     """
 
-    def __init__(self, problem: ShootingProblem, time_step: FloatArray) -> None:
+    def __init__(
+        self, problem: ShootingProblem, time_step: FloatArray, terminal_inputs: Sequence[FloatArray] = ()
+    ) -> None:
         """Allocate the arrays.
 
         Args:
             problem: Gives the sizes.
             time_step: The scalar that all rows share, shape (1,), s.
+            terminal_inputs: What `terminal_cost` reads besides the last state; the caller keeps it alive.
         """
         self.states = np.zeros((problem.horizon + 1, problem.n_states))
         self.controls = np.zeros((problem.horizon, problem.n_controls))
@@ -54,7 +59,7 @@ class Trajectory:
         self.step_buffers = buffer_table(
             self.states, self.controls, time_step, self.states[1:], self.stage_costs
         )
-        self.terminal_buffers = buffer_table(self.states[-1:], self.terminal_cost)
+        self.terminal_buffers = buffer_table(self.states[-1:], *terminal_inputs, self.terminal_cost)
 
 
 class ShootingWorkspace:
@@ -68,18 +73,29 @@ class ShootingWorkspace:
         derivatives: Derivatives along the current trajectory, valid after `differentiate`.
     """
 
-    def __init__(self, problem: ShootingProblem, second_order: bool) -> None:
+    def __init__(
+        self,
+        problem: ShootingProblem,
+        second_order: bool,
+        *,
+        keep_values: bool = False,
+        terminal_inputs: Sequence[FloatArray] = (),
+    ) -> None:
         """Allocate all arrays of a solve.
 
         Args:
             problem: The problem.
             second_order: Whether exact second derivatives will be asked for.
+            keep_values: Whether sweeps keep the value function's derivatives at every stage.
+            terminal_inputs: Arrays that `terminal_cost` and `terminal_cost_derivatives` read, in their order,
+                between the last state and their outputs; they may change between calls.
         """
         sizes = problem.horizon, problem.n_tangent, problem.n_controls
         self.problem = problem
         self.derivatives = allocate_derivatives(*sizes)
-        self.update: Update = allocate_update(*sizes)
-        self._spare_update: Update = allocate_update(*sizes)
+        self.update: Update = allocate_update(*sizes, keep_values=keep_values)
+        self._spare_update: Update = allocate_update(*sizes, keep_values=keep_values)
+        self._terminal_inputs = tuple(terminal_inputs)
         self._time_step = np.array([problem.time_step])
         self._deviations = np.zeros((problem.horizon, problem.n_tangent))
         self._sweep_work = sweep_workspace(problem.n_tangent, problem.n_controls)
@@ -93,8 +109,8 @@ class ShootingWorkspace:
         self._exact = allocate_hessians(stages, problem.n_tangent, problem.n_controls)
         self._costates = np.zeros((stages, problem.n_tangent))
         self._exact_is_current = False
-        self.current = Trajectory(problem, self._time_step)
-        self.trial = Trajectory(problem, self._time_step)
+        self.current = Trajectory(problem, self._time_step, self._terminal_inputs)
+        self.trial = Trajectory(problem, self._time_step, self._terminal_inputs)
 
     def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
         """Roll out given controls and make the result the current trajectory.
@@ -122,7 +138,7 @@ class ShootingWorkspace:
         horizon = self.problem.horizon
         self._run("linearize", horizon, buffer_table(states, controls, self._time_step, d.A, d.B))
         self._run("cost_derivatives", horizon, buffer_table(states, controls, d.lx, d.lu, d.lxx, d.luu))
-        terminal_buffers = buffer_table(states[-1:], d.terminal_lx, d.terminal_lxx)
+        terminal_buffers = buffer_table(states[-1:], *self._terminal_inputs, d.terminal_lx, d.terminal_lxx)
         self._run("terminal_cost_derivatives", 1, terminal_buffers)
         self._exact_is_current = False
 
@@ -171,7 +187,7 @@ class ShootingWorkspace:
         """Roll out the control update into the trial trajectory.
 
         Args:
-            alpha: Step length, in (0, 1].
+            alpha: Step length, in [0, 1]; at 0 the feedback acts alone.
 
         Returns:
             Cost of the trial, inf if it is not finite.

@@ -284,6 +284,21 @@ class Kernels(KernelLibrary):
         observation, errors = self._call("observation", x=x, time_left=time_left)
         return observation, errors
 
+    def state_from_observation(self, observation: ArrayLike) -> Array:
+        """The state behind an observation of the scene with its nominal target.
+
+        Args:
+            observation: Shape (n_x + 1,) or (B, n_x + 1), entries as documented in `DQSpaceArmEnv`; the error
+                pose need not be exactly of unit norm.
+
+        Returns:
+            States, shape (n_x,) or (B, n_x), units of `layout.state`.
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self._call("state_from_observation", observation=observation)[0]
+
     def _integrator(self, name: str | None) -> str | None:
         from dq_space_arm_env.scene import INTEGRATORS
 

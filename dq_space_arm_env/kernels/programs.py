@@ -19,6 +19,7 @@ from dq_space_arm_env.integrators import INTEGRATORS
 from dq_space_arm_env.integrators.field import split_state
 from dq_space_arm_env.kernels.derivative_programs import DerivativePrograms
 from dq_space_arm_env.kernels.equations import SceneEquations, total
+from dq_space_arm_env.kernels.quadratic_programs import QuadraticPrograms
 from dq_space_arm_env.scene.schema import Scene
 
 Scalar = Any
@@ -39,6 +40,7 @@ class ScenePrograms:
         self.chain, self.layout = self.equations.chain, self.equations.layout
         self.field = self.equations.field
         derivatives = self._derivatives = DerivativePrograms(self.equations)
+        quadratic = QuadraticPrograms(self.equations)
         self._builders: Mapping[str, Callable[[], Program]] = {
             "forward_dynamics": self._forward_dynamics,
             "forward_dynamics_with_tip_wrench": self._forward_dynamics_with_tip_wrench,
@@ -52,9 +54,12 @@ class ScenePrograms:
             "cost_derivatives": derivatives.cost,
             "terminal_cost_derivatives": derivatives.terminal_cost,
             "terminal_cost_hessian": derivatives.terminal_cost_hessian,
+            "quadratic_cost": quadratic.cost,
+            "quadratic_cost_derivatives": quadratic.cost_derivatives,
             "difference": self._difference,
             "retract": self._retract,
             "observation": self._observation,
+            "state_from_observation": self._state_from_observation,
         }
 
     def build(self, name: str, integrator: str = "") -> Program:
@@ -207,6 +212,28 @@ class ScenePrograms:
             x=self.field.n_x,
             time_left=1,
         )
+
+    def _state_from_observation(self) -> Program:
+        field, state = self.field, self.layout.state
+        n_pose = len(field.pose.stored)
+        parts = (state.base_velocity, state.joint_angles, state.wrist_angles, state.joint_rates)
+
+        def outputs(observation: Scalars) -> Mapping[str, Scalars]:
+            x: list[Scalar] = [0.0] * field.n_x
+            start = n_pose
+            for entries in parts:
+                size = entries.stop - entries.start
+                x[entries] = observation[start : start + size]
+                start += size
+            # q_{D/G} = q_{G/I}* q_{D/I} and q_{G/I} = q_{e0/I} q_{G/e0}: solved for the base.
+            error = dq.normalize(field.pose.full(observation[:n_pose]))
+            motion = field.motion(self.equations.y(x))
+            arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
+            tip = dq.multiply(self.equations.target, dq.conjugate(error))
+            x[:n_pose] = field.pose.reduced(dq.multiply(tip, dq.conjugate(arm)))
+            return {"x": x}
+
+        return self._program("state_from_observation", outputs, observation=field.n_x + 1)
 
     # Steps.
 

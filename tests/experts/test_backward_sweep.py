@@ -139,6 +139,23 @@ def test_second_derivatives_beyond_gauss_newton_enter_as_the_formulas_say(
     np.testing.assert_allclose(update.value_hessian, Vxx, atol=1e-8 * np.abs(Vxx).max())
 
 
+@pytest.mark.parametrize("limit", [np.inf, 0.2])
+def test_the_value_function_is_kept_at_every_stage_where_asked_for(limit: float) -> None:
+    """What is kept at a stage is what a sweep over the rest alone ends with."""
+    d = random_derivatives(3, 9, 6, 4)
+    controls = np.random.default_rng(1).uniform(-0.2, 0.2, size=d.lu.shape)
+    update = allocate_update(9, 6, 4, keep_values=True)
+    bound = np.full(4, limit)
+    hessians = gauss_newton_hessians(d)
+    backward_sweep(d, hessians, controls, -bound, bound, 2.0, update, sweep_workspace(6, 4))
+    for stage in range(9):
+        stages = {key: value[stage:] for key, value in d._asdict().items() if not key.startswith("terminal")}
+        _, rest = sweep(d._replace(**stages), controls[stage:], limit, 2.0)
+        np.testing.assert_allclose(update.stage_gradients[stage], rest.value_gradient, rtol=1e-12)
+        np.testing.assert_allclose(update.stage_hessians[stage], rest.value_hessian, rtol=1e-12)
+    assert rest.stage_gradients.shape == (0, 6)
+
+
 def test_costates_are_the_value_gradient_of_a_trajectory_that_stays() -> None:
     """Where no control may move, the gradient of the value function is the costate."""
     d = random_derivatives(6, 20, 7, 3)

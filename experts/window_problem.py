@@ -1,0 +1,52 @@
+"""A stretch of a scene's maneuver as a shooting problem: from any state, over as many stages as one likes."""
+
+from experts.arm_problem import ArmProblem
+from experts.problem import FloatArray, Kernel
+
+_QUADRATIC = {
+    "terminal_cost": "quadratic_cost",
+    "terminal_cost_derivatives": "quadratic_cost_derivatives",
+}
+
+
+class WindowProblem:
+    """Some stages of a maneuver; implements `ShootingProblem`.
+
+    A window that ends before the maneuver does has a quadratic model of the remaining cost for its terminal
+    cost. The kernels of that one read three more arrays after the state (`ShootingWorkspace` takes them as
+    `terminal_inputs`): the state around which the model holds (n_x), its gradient (n_t) and its symmetric
+    Hessian (n_t, n_t).
+
+    Attributes:
+        maneuver: The whole maneuver.
+        horizon: Number of stages.
+        ends_early: Whether the maneuver goes on after the last stage.
+    """
+
+    def __init__(self, maneuver: ArmProblem, horizon: int, *, ends_early: bool) -> None:
+        """Take a stretch of a maneuver.
+
+        Args:
+            maneuver: The whole maneuver.
+            horizon: Number of stages.
+            ends_early: Whether the maneuver goes on after the last stage.
+        """
+        self.maneuver, self.horizon, self.ends_early = maneuver, horizon, ends_early
+        self.has_second_order = not ends_early
+        self.n_states, self.n_tangent = maneuver.n_states, maneuver.n_tangent
+        self.n_controls = maneuver.n_controls
+        self.time_step = maneuver.time_step
+        self.control_lower: FloatArray = maneuver.control_lower
+        self.control_upper: FloatArray = maneuver.control_upper
+        self.initial_state: FloatArray = maneuver.initial_state
+
+    def kernel(self, name: str) -> Kernel:
+        """Return one of the kernels that `experts.problem` lists.
+
+        Args:
+            name: Name of the kernel.
+
+        Returns:
+            The kernel, compiled or loaded from the cache.
+        """
+        return self.maneuver.kernel(_QUADRATIC.get(name, name) if self.ends_early else name)
