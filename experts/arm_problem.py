@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from experts.problem import FloatArray, Kernel
 
@@ -36,6 +38,19 @@ class ArmProblem:
         self.control_lower: FloatArray = -layout.control_limit
         self.control_upper: FloatArray = layout.control_limit
         self.initial_state: FloatArray = layout.initial_state
+
+    def is_success(self, state: FloatArray) -> bool:
+        """Tell whether an episode that ends in a state counts as a success.
+
+        Args:
+            state: Final state, shape (n_x,), units of `kernels.layout.state`.
+
+        Returns:
+            Whether the tip's errors are within the scene's tolerances.
+        """
+        angle, distance = self.kernels.observation(state, [0.0])[1]
+        success = self.scene.success
+        return bool(np.degrees(angle) <= success.attitude_error_deg and distance <= success.position_error)
 
     def kernel(self, name: str) -> Kernel:
         """Return one of the kernels that `experts.problem` lists.

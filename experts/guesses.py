@@ -1,0 +1,239 @@
+"""The initial guess as part of the expert: solved maneuvers, followed from the start that is asked for.
+
+From zero controls a solve may end in a poor minimum, with joints wound up and the tip far from its target;
+the controls of a maneuver solved for another start do little better, for their errors add up over the
+stages. The policy of a solved maneuver u = u_k + K_k (x (-) x_k), rolled out from the new start, does not
+forget where it should be: its trajectory lies in the valley of the minimum that it was made for. So one
+good maneuver per scene is enough, and it is worth some effort, see `START_REGULARIZATIONS`.
+"""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from experts.box_ddp import BoxDDP, Callback
+from experts.checks import check_array, check_at_least
+from experts.native_call import buffer_table
+from experts.problem import FloatArray, ShootingProblem
+from experts.rollout import FINISHED, closed_loop_rollout
+from experts.shooting import Trajectory
+from experts.solution import Solution, StopReason
+
+START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
+"""First dampings with which the initial state is solved from zero controls; the cheapest end is kept."""
+POLICY_REGULARIZATION = 1e2
+"""First damping from a policy's trajectory: it is near a minimum, so longer steps than usual are safe."""
+ZERO_REGULARIZATION = 1e4
+"""First damping from zero controls: short first steps seldom end in a poor minimum."""
+
+
+@runtime_checkable
+class _HasGoal(Protocol):
+    """A problem that knows whether a final state is what the task asks for."""
+
+    def is_success(self, state: FloatArray) -> bool:
+        """Judge a final state."""
+
+
+class _Guess(NamedTuple):
+    """Controls to start a solve from.
+
+    Attributes:
+        name: What the solution's metadata call it.
+        controls: Shape (N, n_u); None for zeros.
+        regularization: First damping of the solve.
+    """
+
+    name: str
+    controls: FloatArray | None
+    regularization: float
+
+
+class GuidedDDP:
+    """Box-DDP that makes its own guesses; give each thread its own.
+
+    Guesses are, the cheapest rollout first, the policies of a library of solved maneuvers, then zero
+    controls. They are solved one after another until one converges to a final state that the task counts as
+    a success, if the problem has `is_success`; the cheapest solution wins.
+    """
+
+    def __init__(
+        self,
+        scene_or_problem: Any,
+        *,
+        library: Iterable[Solution] | None = None,
+        remember: int = 0,
+        attempts: int = 2,
+        max_iterations: int = 200,
+        tolerance: float = 1e-7,
+        second_order: str | None = None,
+    ) -> None:
+        """Prepare the solver.
+
+        Args:
+            scene_or_problem: A scene, or a `ShootingProblem`.
+            library: Solutions of this problem or of a similar one, such as the scene with another target;
+                None solves the problem's own initial state, once, when a start is first asked for.
+            remember: Number of converged solutions that may join the library. With 0 a solution depends on
+                nothing but its start, with more also on those solved before.
+            attempts: Largest number of guesses that are solved for a start.
+            max_iterations: Largest number of iterations from one guess.
+            tolerance: See `BoxDDP`.
+            second_order: See `BoxDDP`.
+
+        Raises:
+            ValueError: If a setting is out of range or unknown, the problem contradicts itself, or a solution
+                of the library is not finite or has other sizes than the problem.
+        """
+        check_at_least("remember", remember, 0)
+        check_at_least("attempts", attempts, 1)
+        self._solver = BoxDDP(
+            scene_or_problem, max_iterations=max_iterations, tolerance=tolerance, second_order=second_order
+        )
+        self.problem: ShootingProblem = self._solver.problem
+        self.attempts = attempts
+        self._vacancies = remember
+        self._library = None if library is None else list(library)
+        for i, solution in enumerate(self._library or ()):
+            _check_sizes(f"library[{i}]", solution, self.problem)
+
+    @property
+    def library(self) -> tuple[Solution, ...]:
+        """The solved maneuvers, whose policies are guesses; at the first look they may have to be solved.
+
+        Raises:
+            KeyboardInterrupt: If the user interrupts that.
+        """
+        if self._library is None:
+            self._library = self._solve_initial_state()
+        return tuple(self._library)
+
+    def solve(self, x0: FloatArray | None = None, callback: Callback | None = None) -> Solution:
+        """Minimize the cost from a start.
+
+        Args:
+            x0: State at stage 0, shape (n_x,), units of the state; the problem's initial state if None.
+            callback: Called with the record of every iteration from this start; it may raise
+                KeyboardInterrupt to end the solve.
+
+        Returns:
+            The cheapest trajectory found. Its `metadata["guess"]` names the guess that it came from, and
+            `metadata["attempts"]` tells for each guess that was solved its name, cost, iterations and stop
+            reason.
+
+        Raises:
+            ValueError: If x0 has the wrong shape or is not finite, or an input has no cost of its own.
+            KeyboardInterrupt: If the user interrupts the preparation of the library.
+        """
+        start = np.asarray(self.problem.initial_state if x0 is None else x0, dtype=np.float64)
+        check_array("x0", start, (self.problem.n_states,))
+        attempts: list[tuple[str, Solution]] = []
+        for guess in self._guesses(start):
+            solution = self._solve_from(guess, start, callback)
+            attempts.append((guess.name, solution))
+            if self._is_good(solution) or solution.stop_reason is StopReason.INTERRUPTED:
+                break
+        name, best = min(attempts, key=lambda attempt: attempt[1].cost)
+        best.metadata["guess"] = name
+        best.metadata["attempts"] = [_summary(*attempt) for attempt in attempts]
+        self._remember(best)
+        return best
+
+    def _remember(self, solution: Solution) -> None:
+        """Add a solution to the library, if there is a place left for it and it is worth one."""
+        known = solution.iterations == 0  # its guess, a policy, was as good
+        if self._vacancies > 0 and self._library is not None and solution.converged and not known:
+            self._library.append(solution)
+            self._vacancies -= 1
+
+    def _guesses(self, start: FloatArray) -> list[_Guess]:
+        """The guesses to solve, the most promising first; zero controls are the last resort."""
+        rollouts = [(*follow(solution, self.problem, start), i) for i, solution in enumerate(self.library)]
+        finite = sorted((r for r in rollouts if np.isfinite(r[1])), key=lambda r: r[1])
+        policies = [_Guess(f"policy {i}", controls, POLICY_REGULARIZATION) for controls, _, i in finite]
+        zero = _Guess("zero controls", None, ZERO_REGULARIZATION)
+        # Of two attempts or more the last one is left to zero controls.
+        return [*policies[: max(self.attempts - 1, 1)], zero][: self.attempts]
+
+    def _solve_from(self, guess: _Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
+        self._solver.initial_regularization = guess.regularization
+        return self._solver.solve(start, guess.controls, callback)
+
+    def _is_good(self, solution: Solution) -> bool:
+        """Whether a solution is converged, and a success if the problem knows what that is."""
+        if not solution.converged:
+            return False
+        return not isinstance(self.problem, _HasGoal) or self.problem.is_success(solution.states[-1])
+
+    def _solve_initial_state(self) -> list[Solution]:
+        """The best solution of the problem's own initial state; none if every rollout diverges."""
+        start = np.asarray(self.problem.initial_state, dtype=np.float64)
+        solutions: list[Solution] = []
+        for regularization in START_REGULARIZATIONS:
+            solution = self._solve_from(_Guess("zero controls", None, regularization), start)
+            if solution.stop_reason is StopReason.INTERRUPTED:
+                raise KeyboardInterrupt
+            solutions.append(solution)
+        best = min(solutions, key=lambda solution: solution.cost)
+        return [best] if np.isfinite(best.cost) else []
+
+
+def follow(solution: Solution, problem: ShootingProblem, x0: FloatArray) -> tuple[FloatArray, float]:
+    """Roll out the policy of a solution from another start.
+
+    Args:
+        solution: Trajectory and gains.
+        problem: Gives dynamics, cost and bounds; its sizes are those of the solution.
+        x0: State at stage 0, shape (n_x,), units of the state.
+
+    Returns:
+        Controls within the bounds, shape (N, n_u), units of the inputs, and the cost of the rollout, inf if
+        it is not finite.
+    """
+    reference, time_step = np.ascontiguousarray(solution.states), np.array([problem.time_step])
+    trial = Trajectory(problem, time_step)
+    trial.states[0] = x0
+    deviations = np.zeros((problem.horizon, problem.n_tangent))
+    difference, step, terminal = (
+        problem.kernel(name) for name in ("difference", "step_with_cost", "terminal_cost")
+    )
+    cost, failing_stage = closed_loop_rollout(
+        difference.address,
+        buffer_table(reference, trial.states, deviations),
+        step.address,
+        trial.step_buffers,
+        terminal.address,
+        trial.terminal_buffers,
+        solution.controls,
+        np.zeros_like(solution.controls),
+        solution.feedback_gains,
+        1.0,
+        np.array(problem.control_lower, dtype=np.float64),
+        np.array(problem.control_upper, dtype=np.float64),
+        trial.states,
+        trial.controls,
+        deviations,
+        trial.stage_costs,
+        trial.terminal_cost,
+    )
+    return trial.controls, cost if failing_stage == FINISHED else np.inf
+
+
+def _check_sizes(name: str, solution: Solution, problem: ShootingProblem) -> None:
+    """Raise ValueError if a solution does not fit a problem."""
+    horizon, n_controls = problem.horizon, problem.n_controls
+    check_array(f"{name}.states", solution.states, (horizon + 1, problem.n_states))
+    check_array(f"{name}.controls", solution.controls, (horizon, n_controls))
+    gains = (horizon, n_controls, problem.n_tangent)
+    check_array(f"{name}.feedback_gains", solution.feedback_gains, gains)
+
+
+def _summary(guess: str, solution: Solution) -> dict[str, Any]:
+    """What the metadata tell of an attempt, as JSON values."""
+    return {
+        "guess": guess,
+        "cost": solution.cost,
+        "iterations": solution.iterations,
+        "stop_reason": solution.stop_reason.value,
+    }
