@@ -63,7 +63,7 @@ def host_machine() -> Machine:
 
 
 # Above this many lines of assembly, LLVM's optimizer and its thorough code generator cost seconds and gain a
-# few per cent: # the trace has shared and folded everything already.
+# few per cent: the trace has shared and folded everything already.
 _LARGE_MODULE = 12_000
 
 

@@ -18,7 +18,7 @@ Scalar = Any
 Scalars = Sequence[Scalar]
 
 # Every number of the redundant state is advanced by the classical method; symplectic Euler would need
-# positions # whose rates are velocities.
+# positions whose rates are velocities.
 INTEGRATOR = "rk4"
 
 
