@@ -32,7 +32,7 @@ from experts.models import EXACT_DAMPING, ModelSchedule, SecondOrder
 from experts.problem import FloatArray, ShootingProblem, as_problem
 from experts.regularization import Regularization
 from experts.rollout import FINISHED
-from experts.shooting import ShootingWorkspace
+from experts.shooting import ShootingWorkspace, WorkTime
 from experts.solution import HISTORY_DTYPE, IterationRecord, Solution, StopReason
 
 COST_FLOOR = 1e-9
@@ -169,6 +169,7 @@ class BoxDDP:
         moved = True
         while True:
             started = perf_counter()
+            work.time = WorkTime()
             if moved:
                 work.differentiate()
             if not progress.records:
@@ -285,6 +286,9 @@ class BoxDDP:
             optimality=promised / _scale(cost, progress),
             clamped_share=outcome.clamped / work.current.controls.size,
             seconds=perf_counter() - started,
+            derivative_seconds=work.time.derivatives,
+            sweep_seconds=work.time.sweep,
+            rollout_seconds=work.time.rollout,
         )
         progress.records.append(record)
         progress.schedule.observe(record, cost)

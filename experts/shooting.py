@@ -3,7 +3,11 @@
 Everything here is done for all stages by compiled code; nothing is decided here.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import wraps
+from time import perf_counter
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 
@@ -24,6 +28,9 @@ from experts.derivatives import (
 from experts.native_call import BufferTable, buffer_table, run_kernel
 from experts.problem import KERNEL_NAMES, SECOND_ORDER_KERNEL_NAMES, FloatArray, ShootingProblem
 from experts.rollout import FINISHED, closed_loop_rollout, rollout
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class Trajectory:
@@ -62,6 +69,39 @@ class Trajectory:
         self.terminal_buffers = buffer_table(self.states[-1:], *terminal_inputs, self.terminal_cost)
 
 
+@dataclass
+class WorkTime:
+    """Wall-clock time that went into each kind of work, s.
+
+    Attributes:
+        derivatives: First and second derivatives along trajectories.
+        sweep: Backward sweeps.
+        rollout: Rollouts.
+    """
+
+    derivatives: float = 0.0
+    sweep: float = 0.0
+    rollout: float = 0.0
+
+
+def _timed(work: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Make a method of the workspace add its time to an attribute of `WorkTime`."""
+
+    def decorate(method: Callable[P, R]) -> Callable[P, R]:
+        @wraps(method)
+        def measured(*args: P.args, **kwargs: P.kwargs) -> R:
+            started = perf_counter()
+            try:
+                return method(*args, **kwargs)
+            finally:
+                time = args[0].time  # type: ignore[attr-defined]  # args[0] is the workspace
+                setattr(time, work, getattr(time, work) + perf_counter() - started)
+
+        return measured
+
+    return decorate
+
+
 class ShootingWorkspace:
     """A current trajectory with its derivatives and control update, and a trial trajectory.
 
@@ -71,6 +111,7 @@ class ShootingWorkspace:
         trial: The trajectory of the last step that was tried.
         update: Control update of the last sweep.
         derivatives: Derivatives along the current trajectory, valid after `differentiate`.
+        time: Where the time has gone since somebody last put a new `WorkTime` in its place.
     """
 
     def __init__(
@@ -92,6 +133,7 @@ class ShootingWorkspace:
         """
         sizes = problem.horizon, problem.n_tangent, problem.n_controls
         self.problem = problem
+        self.time = WorkTime()
         self.derivatives = allocate_derivatives(*sizes)
         self.update: Update = allocate_update(*sizes, keep_values=keep_values)
         self._spare_update: Update = allocate_update(*sizes, keep_values=keep_values)
@@ -112,6 +154,7 @@ class ShootingWorkspace:
         self.current = Trajectory(problem, self._time_step, self._terminal_inputs)
         self.trial = Trajectory(problem, self._time_step, self._terminal_inputs)
 
+    @_timed("rollout")
     def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
         """Roll out given controls and make the result the current trajectory.
 
@@ -132,6 +175,7 @@ class ShootingWorkspace:
             trajectory.terminal_cost,
         )
 
+    @_timed("derivatives")
     def differentiate(self) -> None:
         """Compute all derivatives along the current trajectory that Gauss-Newton needs."""
         states, controls, d = self.current.states, self.current.controls, self.derivatives
@@ -142,6 +186,7 @@ class ShootingWorkspace:
         self._run("terminal_cost_derivatives", 1, terminal_buffers)
         self._exact_is_current = False
 
+    @_timed("derivatives")
     def differentiate_twice(self) -> None:
         """Compute exact second derivatives along the current trajectory, unless they are there already."""
         if self._exact_is_current:
@@ -153,6 +198,7 @@ class ShootingWorkspace:
         self._run("terminal_cost_hessian", 1, buffer_table(states[-1:], exact.terminal_xx))
         self._exact_is_current = True
 
+    @_timed("sweep")
     def sweep(self, regularization: float, *, exact: bool = False) -> SweepOutcome:
         """Compute a control update; one that fails leaves the last update as it is.
 
@@ -183,6 +229,7 @@ class ShootingWorkspace:
         """Go back to the update before the last successful sweep."""
         self.update, self._spare_update = self._spare_update, self.update
 
+    @_timed("rollout")
     def try_step(self, alpha: float) -> float:
         """Roll out the control update into the trial trajectory.
 

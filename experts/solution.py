@@ -51,6 +51,9 @@ class IterationRecord(NamedTuple):
         optimality: That decrease relative to the cost; it understates while the damping is strong.
         clamped_share: Share of the inputs, over all stages, that were held at a bound; 0 to 1.
         seconds: Wall-clock time, s.
+        derivative_seconds: Part of it that went into derivatives, s.
+        sweep_seconds: Part of it that went into backward sweeps, s.
+        rollout_seconds: Part of it that went into rollouts, s.
     """
 
     iteration: int
@@ -62,6 +65,9 @@ class IterationRecord(NamedTuple):
     optimality: float
     clamped_share: float
     seconds: float
+    derivative_seconds: float
+    sweep_seconds: float
+    rollout_seconds: float
 
 
 _FIELD_TYPES = {"iteration": np.int64, "exact": np.bool_}
