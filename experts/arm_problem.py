@@ -52,19 +52,16 @@ class ArmProblem:
         success = self.scene.success
         return bool(np.degrees(angle) <= success.attitude_error_deg and distance <= success.position_error)
 
-    def kernel(self, name: str) -> Kernel:
+    def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return one of the kernels that `experts.problem` lists.
-
-        The rollout works through its rows one after another and gets scalar code; all else works on many at
-        once.
 
         Args:
             name: Name of the kernel.
+            batched: Whether it will work on many rows at once: vector code; scalar code otherwise.
 
         Returns:
             The kernel, compiled or loaded from the cache.
         """
-        batched = name in ("linearize", "cost_derivatives", "lagrangian_hessian")
         return self.kernels.kernel(name, lanes=None if batched else 1)
 
 

@@ -68,6 +68,17 @@ class SweepOutcome(NamedTuple):
     quadratic: float
     clamped: int
 
+    def promise(self, alpha: float) -> float:
+        """Decrease of the cost that the model promises for a step.
+
+        Args:
+            alpha: Length of the step, in [0, 1].
+
+        Returns:
+            The decrease, unit of the cost.
+        """
+        return -alpha * (self.linear + alpha * self.quadratic)
+
 
 class SweepWorkspace(NamedTuple):
     """Work arrays of one stage; nt and nu are n_t and n_u rounded up to whole vectors.

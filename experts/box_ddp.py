@@ -94,6 +94,7 @@ class BoxDDP:
         plateau_iterations: int = 50,
         initial_regularization: float = 1000.0,
         second_order: str | None = None,
+        threads: int = 1,
     ) -> None:
         """Prepare the solver.
 
@@ -108,6 +109,7 @@ class BoxDDP:
                 ones let the first steps go so far that the solve may end in a poor minimum.
             second_order: Second derivatives to take: "gauss_newton", "exact" or "hybrid", see
                 `models.SecondOrder`. None takes the hybrid if the problem has exact ones, else Gauss-Newton.
+            threads: Most threads that work on derivatives. More than one pays only where a core is idle.
 
         Raises:
             ValueError: If a setting is out of range, second_order is unknown or asks for derivatives that the
@@ -118,6 +120,7 @@ class BoxDDP:
         check_at_least("plateau_decrease", plateau_decrease, 0.0)
         check_at_least("plateau_iterations", plateau_iterations, 1)
         check_at_least("initial_regularization", initial_regularization, 0.0)
+        check_at_least("threads", threads, 1)
         self.problem: ShootingProblem = as_problem(scene_or_problem)
         self.max_iterations = max_iterations
         self.tolerance = tolerance
@@ -125,7 +128,8 @@ class BoxDDP:
         self.plateau_iterations = plateau_iterations
         self.initial_regularization = initial_regularization
         self.second_order = SecondOrder.of(second_order, self.problem.has_second_order)
-        self._work = ShootingWorkspace(self.problem, self.second_order is not SecondOrder.GAUSS_NEWTON)
+        exact = self.second_order is not SecondOrder.GAUSS_NEWTON
+        self._work = ShootingWorkspace(self.problem, exact, threads=threads)
 
     def solve(
         self,
@@ -268,14 +272,14 @@ class BoxDDP:
 
     def _promise(self, progress: _Progress, outcome: SweepOutcome) -> float:
         """Relate the decrease that the full step promises to the cost."""
-        return -(outcome.linear + outcome.quadratic) / _scale(self._work.current.cost, progress)
+        return outcome.promise(1.0) / _scale(self._work.current.cost, progress)
 
     def _record(
         self, progress: _Progress, proposal: _Proposal, cost: float, alpha: float, started: float
     ) -> IterationRecord:
         """Take the record of an iteration that began at a cost."""
         work, outcome = self._work, proposal.outcome
-        promised = -(outcome.linear + outcome.quadratic)
+        promised = outcome.promise(1.0)
         record = IterationRecord(
             iteration=len(progress.records) + 1,
             cost=work.current.cost,

@@ -101,6 +101,7 @@ def _tile_operation(rows: int, start: str, sign: int) -> Any:
 
 _set_tile = _tile_operation(TILE_ROWS, "zero", +1)
 _add_tile = _tile_operation(TILE_ROWS, "target", +1)
+_add_row_tile = _tile_operation(1, "target", +1)
 _subtract_row_tile = _tile_operation(1, "target", -1)
 
 
@@ -165,6 +166,24 @@ def add_product_upper(target: FloatArray, left: FloatArray, right: FloatArray, d
     for i in range(0, target.shape[0], TILE_ROWS):
         for j in range(i - i % LANES, target.shape[1], LANES):
             _add_tile(target, i, j, left, right, depth)
+
+
+@compiled
+def add_plain_product(target: FloatArray, left: FloatArray, right: FloatArray, depth: int) -> None:
+    """Add the product of two matrices: ``target += left right``.
+
+    Args:
+        target: Shape (n, m), n any number, m a multiple of `LANES`.
+        left: Shape (n, >= depth).
+        right: Shape (>= depth, >= m).
+        depth: Number of columns of `left`, and rows of `right`, that take part.
+    """
+    transposed, rows = left.T, target.shape[0]
+    for j in range(0, target.shape[1], LANES):
+        for i in range(0, rows - rows % TILE_ROWS, TILE_ROWS):
+            _add_tile(target, i, j, transposed, right, depth)
+        for i in range(rows - rows % TILE_ROWS, rows):
+            _add_row_tile(target, i, j, transposed, right, depth)
 
 
 @compiled

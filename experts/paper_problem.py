@@ -58,14 +58,14 @@ class PaperProblem:
         kernel([np.ascontiguousarray(x, dtype=np.float64), result], 1)
         return result
 
-    def kernel(self, name: str) -> Kernel:
+    def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return one of `experts.problem.KERNEL_NAMES`.
 
         Args:
             name: Name of the kernel.
+            batched: Whether it will work on many rows at once: vector code; scalar code otherwise.
 
         Returns:
             The kernel, compiled (half a minute for `linearize`) or loaded from the cache.
         """
-        batched = name in ("linearize", "cost_derivatives")
         return self.kernels.paper_kernel(name, lanes=None if batched else 1)

@@ -90,11 +90,13 @@ class ShootingProblem(Protocol):
     def has_second_order(self) -> bool:
         """Whether there are the kernels of `SECOND_ORDER_KERNEL_NAMES`."""
 
-    def kernel(self, name: str) -> Kernel:
+    def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return one of the kernels.
 
         Args:
             name: One of `KERNEL_NAMES`, or of `SECOND_ORDER_KERNEL_NAMES` if the problem has those.
+            batched: Whether it will work on many rows at once, and not on one after another; which code is
+                best may depend on that, what it computes may not.
 
         Returns:
             The kernel.

@@ -19,7 +19,7 @@ from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.scene.start import PLANAR_POSE
 from experts.arm_problem import ArmProblem
-from experts.backward_sweep import SWEEP_DONE, SweepOutcome
+from experts.backward_sweep import SWEEP_DONE
 from experts.box_ddp import BoxDDP
 from experts.checks import check_array, check_at_least
 from experts.line_search import line_search
@@ -221,16 +221,11 @@ class RecedingHorizonExpert:
         for _ in range(self.iterations):
             work.differentiate()
             outcome = work.sweep(0.0)
-            if outcome.status != SWEEP_DONE or _promise(outcome) <= WORTHWHILE * scale:
+            if outcome.status != SWEEP_DONE or outcome.promise(1.0) <= WORTHWHILE * scale:
                 break
             if line_search(work, outcome) == 0.0:
                 break
         return True
-
-
-def _promise(outcome: SweepOutcome) -> float:
-    """Decrease of the cost that the full step of an update promises."""
-    return -(outcome.linear + outcome.quadratic)
 
 
 def _planned_control(plan: ManeuverPlan, state: FloatArray, stage: int) -> FloatArray:

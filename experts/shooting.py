@@ -11,6 +11,7 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
+from dq_space_arm_env.kernels.threads import share_rows
 from experts.backward_sweep import (
     SWEEP_DONE,
     SweepOutcome,
@@ -26,8 +27,15 @@ from experts.derivatives import (
     gauss_newton_hessians,
 )
 from experts.native_call import BufferTable, buffer_table, run_kernel
+from experts.parallel_rollouts import ParallelRollouts
 from experts.problem import KERNEL_NAMES, SECOND_ORDER_KERNEL_NAMES, FloatArray, ShootingProblem
 from experts.rollout import FINISHED, closed_loop_rollout, rollout
+
+BATCHED_KERNELS = ("linearize", "cost_derivatives", "lagrangian_hessian")
+"""Kernels that work on all stages at once; rollouts go from stage to stage."""
+
+_STAGES_PER_BLOCK = 32
+"""Stages that a thread differentiates at a time: enough work to be worth its while."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -121,6 +129,7 @@ class ShootingWorkspace:
         *,
         keep_values: bool = False,
         terminal_inputs: Sequence[FloatArray] = (),
+        threads: int = 1,
     ) -> None:
         """Allocate all arrays of a solve.
 
@@ -130,10 +139,12 @@ class ShootingWorkspace:
             keep_values: Whether sweeps keep the value function's derivatives at every stage.
             terminal_inputs: Arrays that `terminal_cost` and `terminal_cost_derivatives` read, in their order,
                 between the last state and their outputs; they may change between calls.
+            threads: Most threads that differentiate; sweeps and rollouts go stage by stage.
         """
         sizes = problem.horizon, problem.n_tangent, problem.n_controls
         self.problem = problem
         self.time = WorkTime()
+        self._threads = threads
         self.derivatives = allocate_derivatives(*sizes)
         self.update: Update = allocate_update(*sizes, keep_values=keep_values)
         self._spare_update: Update = allocate_update(*sizes, keep_values=keep_values)
@@ -144,13 +155,14 @@ class ShootingWorkspace:
         self._lower = np.array(problem.control_lower, dtype=np.float64)
         self._upper = np.array(problem.control_upper, dtype=np.float64)
         names = (*KERNEL_NAMES, *SECOND_ORDER_KERNEL_NAMES) if second_order else KERNEL_NAMES
-        self._kernels = {name: problem.kernel(name) for name in names}
+        self._kernels = {name: problem.kernel(name, batched=name in BATCHED_KERNELS) for name in names}
         self._gauss_newton = gauss_newton_hessians(self.derivatives)
         # Without second order there is no stage to store them for.
         stages = problem.horizon if second_order else 0
         self._exact = allocate_hessians(stages, problem.n_tangent, problem.n_controls)
         self._costates = np.zeros((stages, problem.n_tangent))
         self._exact_is_current = False
+        self._parallel = ParallelRollouts(problem, self._time_step, self._terminal_inputs)
         self.current = Trajectory(problem, self._time_step, self._terminal_inputs)
         self.trial = Trajectory(problem, self._time_step, self._terminal_inputs)
 
@@ -261,10 +273,39 @@ class ShootingWorkspace:
         )
         return trial.cost
 
+    @_timed("rollout")
+    def try_steps(self, step_lengths: FloatArray) -> FloatArray:
+        """Roll out the control update with several step lengths at once.
+
+        Args:
+            step_lengths: In [0, 1], at most `LANES` of them.
+
+        Returns:
+            Costs of the trials, inf if not finite; `choose` makes one of them the trial trajectory.
+        """
+        reference = self.current.states, self.current.controls
+        return self._parallel.run(step_lengths, reference, self.update, self._lower, self._upper)
+
+    @_timed("rollout")
+    def choose(self, lane: int, cost: float) -> None:
+        """Take one of the last `try_steps` as the trial trajectory.
+
+        Args:
+            lane: Position of its step length.
+            cost: Its cost.
+        """
+        self.trial.states[:], self.trial.controls[:] = self._parallel.trajectory(lane)
+        self.trial.cost, self.trial.failing_stage = cost, FINISHED
+
     def accept(self) -> None:
         """Make the trial the current trajectory; its derivatives and update are then to be computed."""
         self.current, self.trial = self.trial, self.current
 
     def _run(self, name: str, rows: int, buffers: BufferTable) -> None:
         """Run a kernel over the first rows of its buffers."""
-        run_kernel(self._kernels[name].address, 0, rows, buffers)
+        address = self._kernels[name].address
+
+        def work_on(begin: int, end: int) -> None:
+            run_kernel(address, begin, end, buffers)
+
+        share_rows(work_on, rows, self._threads, _STAGES_PER_BLOCK)

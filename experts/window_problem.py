@@ -40,13 +40,15 @@ class WindowProblem:
         self.control_upper: FloatArray = maneuver.control_upper
         self.initial_state: FloatArray = maneuver.initial_state
 
-    def kernel(self, name: str) -> Kernel:
+    def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return one of the kernels that `experts.problem` lists.
 
         Args:
             name: Name of the kernel.
+            batched: Whether it will work on many rows at once.
 
         Returns:
             The kernel, compiled or loaded from the cache.
         """
-        return self.maneuver.kernel(_QUADRATIC.get(name, name) if self.ends_early else name)
+        name = _QUADRATIC.get(name, name) if self.ends_early else name
+        return self.maneuver.kernel(name, batched=batched)

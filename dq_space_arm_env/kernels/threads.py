@@ -17,8 +17,8 @@ from itertools import count
 # Rows that a thread takes at a time, a multiple of every vector width: some tens of microseconds of work,
 # beside which taking a block is small.
 _BLOCK = 256
-# Rows for each thread below which waking it costs more than it can do.
-_ROWS_PER_THREAD = 1024
+# Blocks for each thread below which waking it costs more than it can do.
+_BLOCKS_PER_THREAD = 4
 
 KernelFunction = Callable[[int, int, int], None]
 
@@ -37,17 +37,32 @@ def run_shared(function: KernelFunction, rows: int, buffers: int, threads: int =
         buffers: Address of the addresses of the kernel's arrays.
         threads: Most threads to use, this one included; small batches use fewer.
     """
-    if threads == 1 or rows < 2 * _ROWS_PER_THREAD:
+    if threads == 1 or rows < 2 * _BLOCKS_PER_THREAD * _BLOCK:
         function(0, rows, buffers)
+    else:
+        share_rows(lambda begin, end: function(begin, end, buffers), rows, threads)
+
+
+def share_rows(work_on: Callable[[int, int], None], rows: int, threads: int, block: int = _BLOCK) -> None:
+    """Have threads work on rows 0 .. rows - 1.
+
+    Args:
+        work_on: Works on rows begin .. end - 1; releases the interpreter meanwhile.
+        rows: Number of rows.
+        threads: Most threads to use, this one included; few rows use fewer.
+        block: Rows that a thread takes at a time; they should take some tens of microseconds.
+    """
+    threads = min(threads, rows // (_BLOCKS_PER_THREAD * block))
+    if threads <= 1:
+        work_on(0, rows)
         return
-    threads = min(threads, rows // _ROWS_PER_THREAD)
-    blocks = math.ceil(rows / _BLOCK)
+    blocks = math.ceil(rows / block)
     tickets = count()
 
     def work() -> None:
         # `next` on a counter is atomic.
-        while (block := next(tickets)) < blocks:
-            function(block * _BLOCK, min(rows, (block + 1) * _BLOCK), buffers)
+        while (ticket := next(tickets)) < blocks:
+            work_on(ticket * block, min(rows, (ticket + 1) * block))
 
     helpers: list[Future[None]] = [_helpers(threads).submit(work) for _ in range(threads - 1)]
     try:

@@ -91,7 +91,7 @@ class PythonProblem:
             )
             self._kernels["terminal_cost_hessian"] = kernel(lambda y: (terminal(y),), [x], [tt])
 
-    def kernel(self, name: str) -> PythonKernel:
+    def kernel(self, name: str, *, batched: bool = False) -> PythonKernel:
         return self._kernels[name]
 
 
