@@ -17,6 +17,7 @@ class ArmProblem:
     """
 
     has_second_order = True
+    has_retraction = True
 
     def __init__(self, scene: Scene | str | Path, integrator: str | None = None) -> None:
         """Take a scene.

@@ -185,6 +185,7 @@ def sweep_workspace(n_tangent: int, n_controls: int) -> SweepWorkspace:
 def backward_sweep(
     derivatives: Derivatives,
     hessians: Hessians,
+    gaps: FloatArray,
     controls: FloatArray,
     control_lower: FloatArray,
     control_upper: FloatArray,
@@ -197,6 +198,8 @@ def backward_sweep(
     Args:
         derivatives: Derivatives along the trajectory.
         hessians: Second derivatives to take; they may be indefinite.
+        gaps: f of x_k+1 (+) f = step(x_k, u_k), shape (N, n_t); no stages at all, shape (0, n_t), if the
+            trajectory has none. The update is then to close them: the model is l(x, u) + V(A x + B u + f).
         controls: Controls u of the trajectory, inside the box, shape (N, n_u).
         control_lower: Lower bounds, -inf allowed, shape (n_u,).
         control_upper: Upper bounds, +inf allowed, shape (n_u,).
@@ -217,6 +220,9 @@ def backward_sweep(
     work.k[:] = 0.0
     linear, quadratic, clamped = 0.0, 0.0, 0
     for stage in range(horizon - 1, -1, -1):
+        if gaps.shape[0] > 0:
+            # From the gradient at x_k+1 to the one where the step lands.
+            add_vector_product(work.Vx, work.Vxx, gaps[stage], n_tangent)
         _expand(derivatives, hessians, stage, work)
         mirror_upper(work.Quu, n_controls)
         _regularize(derivatives.luu[stage], regularization, work)

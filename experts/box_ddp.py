@@ -3,7 +3,8 @@
 Control-limited differential dynamic programming of Tassa, Mansard & Todorov (ICRA 2014), with the
 Gauss-Newton model of the dynamics (iLQR), exact second derivatives (Newton's method), or a hybrid of the two
 (`models`). An iteration differentiates along the trajectory, sweeps backward for a control update and its
-gains, and rolls the update out with shorter and shorter steps until one lowers the cost as promised.
+gains, and rolls the update out with shorter and shorter steps until one lowers the cost as promised. Given a
+guess of the states, a solve begins by multiple shooting (`multiple_shooting`).
 
 **When it has converged.** The measure is the decrease of the cost that a full, undamped step promises,
 relative to the cost. It does not change with the units of states, controls or cost, it accounts for the
@@ -13,8 +14,6 @@ there are exact second derivatives the step is Newton's, which exists only if th
 saddle does not pass, nor does a valley whose floor Gauss-Newton takes for steeper than it is.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -26,19 +25,16 @@ from experts.backward_sweep import (
     SWEEP_NOT_POSITIVE_DEFINITE,
     SweepOutcome,
 )
-from experts.checks import check_array, check_at_least
+from experts.checks import check_array, check_at_least, check_control_weights
 from experts.line_search import line_search
 from experts.models import EXACT_DAMPING, ModelSchedule, SecondOrder
+from experts.multiple_shooting import MultipleShooting
 from experts.problem import FloatArray, ShootingProblem, as_problem
+from experts.progress import Callback, Progress, Stop
 from experts.regularization import Regularization
 from experts.rollout import FINISHED
 from experts.shooting import ShootingWorkspace, WorkTime
 from experts.solution import HISTORY_DTYPE, IterationRecord, Solution, StopReason
-
-COST_FLOOR = 1e-9
-"""Costs below this share of the first one count as zero: relative measures are taken to it."""
-
-Callback = Callable[[IterationRecord], None]
 
 
 class _Proposal(NamedTuple):
@@ -53,32 +49,6 @@ class _Proposal(NamedTuple):
     exact: bool
     damping: float
     outcome: SweepOutcome
-
-
-class _Stop(NamedTuple):
-    """Why a solve ends, and the same in words."""
-
-    reason: StopReason
-    message: str
-
-
-@dataclass
-class _Progress:
-    """What a solve carries from iteration to iteration.
-
-    Attributes:
-        schedule: Which model to take, and its damping.
-        cost_floor: Costs below it count as zero, in the unit of the cost.
-        optimality: Relative decrease that an undamped step promises, inf where unknown.
-        idle_iterations: Iterations in a row that hardly lowered the cost.
-        records: One per iteration.
-    """
-
-    schedule: ModelSchedule
-    cost_floor: float
-    optimality: float = np.inf
-    idle_iterations: int = 0
-    records: list[IterationRecord] = field(default_factory=list)
 
 
 class BoxDDP:
@@ -130,14 +100,17 @@ class BoxDDP:
         self.second_order = SecondOrder.of(second_order, self.problem.has_second_order)
         exact = self.second_order is not SecondOrder.GAUSS_NEWTON
         self._work = ShootingWorkspace(self.problem, exact, threads=threads)
+        self._shooting: MultipleShooting | None = None
 
     def solve(
         self,
         x0: FloatArray | None = None,
         u_init: FloatArray | None = None,
         callback: Callback | None = None,
+        *,
+        x_init: FloatArray | None = None,
     ) -> Solution:
-        """Minimize the cost, starting from a guess of the controls.
+        """Minimize the cost, starting from a guess of the controls, or of controls and states.
 
         Args:
             x0: State at stage 0, shape (n_x,); the problem's initial state if None.
@@ -145,29 +118,48 @@ class BoxDDP:
                 bound next to zero where zero is not allowed.
             callback: Called with the record of every iteration; it may raise KeyboardInterrupt to end the
                 solve.
+            x_init: First guess of the states, shape (N + 1, n_x); the dynamics need not lead from one to the
+                next, nor need it begin at x0. The solve then begins by multiple shooting, see
+                `multiple_shooting`. None takes the rollout of the controls.
 
         Returns:
-            The best trajectory found, whatever the reason to stop.
+            The best trajectory found, whatever the reason to stop; always a rollout of its controls from x0.
 
         Raises:
-            ValueError: If x0 or u_init have the wrong shape, are not finite or out of bounds, or an input
-                has no cost of its own.
+            ValueError: If x0, u_init or x_init have the wrong shape, are not finite or out of bounds, an
+                input has no cost of its own, or states are given and the problem has no retraction.
         """
         initial_state, controls = self._check_start(x0, u_init)
-        work = self._work
-        work.start(initial_state, controls)
+        work, stop = self._work, None
         schedule = ModelSchedule(self.second_order, Regularization(self.initial_regularization))
-        progress = _Progress(schedule, COST_FLOOR * abs(work.current.cost))
+        progress = Progress(schedule)
+        if x_init is None:
+            work.start(initial_state, controls)
+        else:
+            shooting = self._multiple_shooting()
+            start = initial_state, shooting.check(x_init), controls
+            stop = shooting.close_gaps(start, progress, self.max_iterations, callback)
+        progress.first_cost = work.current.cost
         if work.current.failing_stage != FINISHED:
             message = f"the first rollout is not finite from stage {work.current.failing_stage} on"
             return self._collect(progress, StopReason.DIVERGED, message, np.zeros_like(work.update.gains))
         try:
-            stop = self._iterate(progress, callback)
+            stop = stop or self._iterate(progress, callback)
         except KeyboardInterrupt:
-            stop = _Stop(StopReason.INTERRUPTED, "interrupted by the user")
+            stop = Stop(StopReason.INTERRUPTED, "interrupted by the user")
         return self._finish(progress, stop)
 
-    def _iterate(self, progress: _Progress, callback: Callback | None) -> _Stop:
+    def _multiple_shooting(self) -> MultipleShooting:
+        """What closes gaps, made when it is first needed."""
+        if not self.problem.has_retraction:
+            raise ValueError(
+                "x_init is given, but the problem has no retraction to move states with; leave x_init out"
+            )
+        if self._shooting is None:
+            self._shooting = MultipleShooting(self._work)
+        return self._shooting
+
+    def _iterate(self, progress: Progress, callback: Callback | None) -> Stop:
         """Iterate until there is a reason to stop."""
         work = self._work
         moved = True
@@ -177,9 +169,9 @@ class BoxDDP:
             if moved:
                 work.differentiate()
             if not progress.records:
-                self._check_control_weights()
+                check_control_weights(work.derivatives.luu)
             result = self._take_step(progress, started)
-            if isinstance(result, _Stop):
+            if isinstance(result, Stop):
                 return result
             if callback is not None:
                 callback(result)
@@ -188,7 +180,7 @@ class BoxDDP:
             if stop is not None:
                 return stop
 
-    def _take_step(self, progress: _Progress, started: float) -> IterationRecord | _Stop:
+    def _take_step(self, progress: Progress, started: float) -> IterationRecord | Stop:
         """Search along an update, adapt the damping, and take the record; or say why there is no step."""
         schedule, cost = progress.schedule, self._work.current.cost
         if schedule.tries_exact_first:
@@ -233,25 +225,21 @@ class BoxDDP:
             outcome = self._work.sweep(regularization.value, exact=exact)
         return _Proposal(exact, regularization.value, outcome)
 
-    def _stop_before_step(self, progress: _Progress, proposal: _Proposal) -> _Stop | None:
+    def _stop_before_step(self, progress: Progress, proposal: _Proposal) -> Stop | None:
         """Judge a sweep: has it failed, is the trajectory optimal, may another iteration begin?"""
         outcome = proposal.outcome
         if outcome.status == SWEEP_NOT_FINITE:
-            return _Stop(StopReason.DIVERGED, f"the derivatives are not finite at stage {outcome.stage}")
+            return Stop(StopReason.DIVERGED, f"the derivatives are not finite at stage {outcome.stage}")
         if outcome.status != SWEEP_DONE:
-            return _Stop(
+            return Stop(
                 StopReason.REGULARIZATION_LIMIT,
                 f"the model of the cost at stage {outcome.stage} is not convex, however strong the damping",
             )
         if self._promise(progress, outcome) <= self.tolerance and self._is_optimal(progress, proposal):
-            return _Stop(StopReason.CONVERGED, "no step promises to lower the cost")
-        if len(progress.records) == self.max_iterations:
-            return _Stop(
-                StopReason.MAX_ITERATIONS, f"the limit of {self.max_iterations} iterations is reached"
-            )
-        return None
+            return Stop(StopReason.CONVERGED, "no step promises to lower the cost")
+        return progress.iteration_limit(self.max_iterations)
 
-    def _is_optimal(self, progress: _Progress, proposal: _Proposal) -> bool:
+    def _is_optimal(self, progress: Progress, proposal: _Proposal) -> bool:
         """Say whether an undamped step promises as little as the given one; if so, its update is kept.
 
         Exact second derivatives have the last word, where there are any.
@@ -270,12 +258,12 @@ class BoxDDP:
         self._work.restore_update()
         return False
 
-    def _promise(self, progress: _Progress, outcome: SweepOutcome) -> float:
+    def _promise(self, progress: Progress, outcome: SweepOutcome) -> float:
         """Relate the decrease that the full step promises to the cost."""
-        return outcome.promise(1.0) / _scale(self._work.current.cost, progress)
+        return outcome.promise(1.0) / progress.scale(self._work.current.cost)
 
     def _record(
-        self, progress: _Progress, proposal: _Proposal, cost: float, alpha: float, started: float
+        self, progress: Progress, proposal: _Proposal, cost: float, alpha: float, started: float
     ) -> IterationRecord:
         """Take the record of an iteration that began at a cost."""
         work, outcome = self._work, proposal.outcome
@@ -287,12 +275,13 @@ class BoxDDP:
             exact=proposal.exact,
             regularization=proposal.damping,
             expected_decrease=promised,
-            optimality=promised / _scale(cost, progress),
+            optimality=promised / progress.scale(cost),
             clamped_share=outcome.clamped / work.current.controls.size,
             seconds=perf_counter() - started,
             derivative_seconds=work.time.derivatives,
             sweep_seconds=work.time.sweep,
             rollout_seconds=work.time.rollout,
+            gap=0.0,
         )
         progress.records.append(record)
         progress.schedule.observe(record, cost)
@@ -300,21 +289,21 @@ class BoxDDP:
         progress.idle_iterations = progress.idle_iterations + 1 if idle else 0
         return record
 
-    def _stop_after_step(self, progress: _Progress) -> _Stop | None:
+    def _stop_after_step(self, progress: Progress) -> Stop | None:
         """Judge the progress: is there a step left to try, has the cost stayed where it is?"""
         if progress.schedule.regularization.exhausted and progress.records[-1].alpha == 0.0:
-            return _Stop(
+            return Stop(
                 StopReason.REGULARIZATION_LIMIT, "no step lowers the cost, however strong the damping"
             )
         if progress.idle_iterations >= self.plateau_iterations:
-            return _Stop(
+            return Stop(
                 StopReason.PLATEAU,
                 f"{self.plateau_iterations} iterations in a row lowered the cost by less than "
                 f"{self.plateau_decrease:.0e} of its value",
             )
         return None
 
-    def _finish(self, progress: _Progress, stop: _Stop) -> Solution:
+    def _finish(self, progress: Progress, stop: Stop) -> Solution:
         """Compute the gains around the final trajectory, judge it without damping, and collect the result."""
         work, (reason, message) = self._work, stop
         if reason is not StopReason.CONVERGED:
@@ -331,7 +320,7 @@ class BoxDDP:
         message += f"; an undamped step promises a relative decrease of {progress.optimality:.1e}"
         return self._collect(progress, reason, message, work.update.gains.copy())
 
-    def _final_update(self, progress: _Progress) -> _Proposal:
+    def _final_update(self, progress: Progress) -> _Proposal:
         """Sweep without damping, with exact second derivatives if that succeeds."""
         if progress.schedule.has_exact:
             self._work.differentiate_twice()
@@ -340,7 +329,7 @@ class BoxDDP:
                 return _Proposal(True, 0.0, outcome)
         return self._find_update(Regularization(0.0), exact=False)
 
-    def _collect(self, progress: _Progress, reason: StopReason, message: str, gains: FloatArray) -> Solution:
+    def _collect(self, progress: Progress, reason: StopReason, message: str, gains: FloatArray) -> Solution:
         """Copy the current trajectory into a solution."""
         current = self._work.current
         return Solution(
@@ -349,7 +338,7 @@ class BoxDDP:
             feedback_gains=gains,
             cost=current.cost,
             stop_reason=reason,
-            message=message,
+            message=message + progress.note,
             optimality=progress.optimality,
             iterations=len(progress.records),
             history=np.array(progress.records, dtype=HISTORY_DTYPE),
@@ -375,19 +364,3 @@ class BoxDDP:
                 f"input {i}; clip the guess to the bounds first"
             )
         return state, controls
-
-    def _check_control_weights(self) -> None:
-        """Raise ValueError if an input has no cost of its own: the damping is scaled by it."""
-        weights = np.diagonal(self._work.derivatives.luu, axis1=1, axis2=2)
-        free = weights <= 0.0
-        if np.any(free):
-            k, i = (int(index[0]) for index in np.nonzero(free))
-            raise ValueError(
-                f"the cost has the second derivative {weights[k, i]} with respect to input {i} at stage {k}; "
-                "every input needs a positive weight"
-            )
-
-
-def _scale(cost: float, progress: _Progress) -> float:
-    """A cost to relate changes to: positive however small the cost is."""
-    return max(abs(cost), progress.cost_floor, float(np.finfo(np.float64).tiny))

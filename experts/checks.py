@@ -37,3 +37,22 @@ def check_at_least(name: str, value: float, smallest: float) -> None:
     """
     if not value >= smallest:
         raise ValueError(f"{name} is {value}; it must be at least {smallest}")
+
+
+def check_control_weights(luu: FloatArray) -> None:
+    """Refuse a problem in which an input has no cost of its own: the damping is scaled by it.
+
+    Args:
+        luu: Hessian of the stage cost, control block, shape (N, n_u, n_u).
+
+    Raises:
+        ValueError: If it is refused.
+    """
+    weights = np.diagonal(luu, axis1=1, axis2=2)
+    free = weights <= 0.0
+    if np.any(free):
+        k, i = (int(index[0]) for index in np.nonzero(free))
+        raise ValueError(
+            f"the cost has the second derivative {weights[k, i]} with respect to input {i} at stage {k}; "
+            "every input needs a positive weight"
+        )

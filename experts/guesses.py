@@ -12,10 +12,11 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from experts.box_ddp import BoxDDP, Callback
+from experts.box_ddp import BoxDDP
 from experts.checks import check_array, check_at_least
 from experts.native_call import buffer_table
 from experts.problem import FloatArray, ShootingProblem
+from experts.progress import Callback
 from experts.rollout import FINISHED, closed_loop_rollout
 from experts.shooting import Trajectory
 from experts.solution import Solution, StopReason

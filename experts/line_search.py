@@ -9,6 +9,8 @@ from experts.shooting import ShootingWorkspace
 
 SHORTER_STEPS: FloatArray = np.float64(0.5) ** np.arange(1, LANES + 1)
 """Step lengths after the full one, as many as are rolled out at once."""
+STEP_LENGTHS: FloatArray = np.concatenate([[1.0], SHORTER_STEPS])
+"""All step lengths."""
 ACCEPTANCE = 1e-4
 """Share of the promised decrease that a step must achieve."""
 

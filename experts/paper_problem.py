@@ -23,6 +23,7 @@ class PaperProblem:
     """
 
     has_second_order = False
+    has_retraction = False
 
     def __init__(self, scene: Scene | str | Path = "paper") -> None:
         """Take a scene.

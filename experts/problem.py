@@ -14,13 +14,16 @@ kernels. Every kernel works on rows, see `native_call`; its buffers, each with t
 | `terminal_cost_derivatives` | x (n_x); lx (n_t), lxx (n_t, n_t) |
 | `lagrangian_hessian` | x, u, multiplier (n_t), h; Lxx (n_t, n_t), Lux (n_u, n_t), Luu (n_u, n_u) |
 | `terminal_cost_hessian` | x (n_x); Lxx (n_t, n_t) |
+| `retract` | x (n_x), dx (n_t); x_next = x (+) dx (n_x) |
 
 Output arrays of the derivative kernels start as zeros and nobody else writes to them, so that a kernel may
 leave entries out that are always zero. The mixed derivative lux of the stage cost is taken to be zero.
 
-lxx and luu may be approximations, as long as they are convex: Gauss-Newton's. The last two kernels give exact
+lxx and luu may be approximations, as long as they are convex: Gauss-Newton's. The next two kernels give exact
 second derivatives, and only problems with `has_second_order` need to have them: Lxx, Lux and Luu are those of
 the stage cost + multiplier . (step(x (+) z, u) (-) step(x, u)) with respect to tangent state z and control u.
+The last kernel, the inverse of `difference`, takes rounding errors out of a pose; it serves guesses of the
+states, and only problems with `has_retraction` need to have it.
 """
 
 from typing import Any, Protocol, runtime_checkable
@@ -40,6 +43,8 @@ KERNEL_NAMES = (
 )
 
 SECOND_ORDER_KERNEL_NAMES = ("lagrangian_hessian", "terminal_cost_hessian")
+
+RETRACTION_KERNEL_NAME = "retract"
 
 
 class Kernel(Protocol):
@@ -90,11 +95,16 @@ class ShootingProblem(Protocol):
     def has_second_order(self) -> bool:
         """Whether there are the kernels of `SECOND_ORDER_KERNEL_NAMES`."""
 
+    @property
+    def has_retraction(self) -> bool:
+        """Whether there is the kernel `RETRACTION_KERNEL_NAME`."""
+
     def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return one of the kernels.
 
         Args:
-            name: One of `KERNEL_NAMES`, or of `SECOND_ORDER_KERNEL_NAMES` if the problem has those.
+            name: One of `KERNEL_NAMES`, or one of `SECOND_ORDER_KERNEL_NAMES` or `RETRACTION_KERNEL_NAME` if
+                the problem has those.
             batched: Whether it will work on many rows at once, and not on one after another; which code is
                 best may depend on that, what it computes may not.
 

@@ -14,6 +14,7 @@ import numpy as np
 from dq_space_arm_env.kernels.threads import share_rows
 from experts.backward_sweep import (
     SWEEP_DONE,
+    SWEEP_NOT_FINITE,
     SweepOutcome,
     Update,
     allocate_update,
@@ -92,8 +93,15 @@ class WorkTime:
     rollout: float = 0.0
 
 
-def _timed(work: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Make a method of the workspace add its time to an attribute of `WorkTime`."""
+def timed(work: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Make a method add its time to an attribute of `WorkTime`, of which its object has one named `time`.
+
+    Args:
+        work: The attribute.
+
+    Returns:
+        The decorator.
+    """
 
     def decorate(method: Callable[P, R]) -> Callable[P, R]:
         @wraps(method)
@@ -102,7 +110,7 @@ def _timed(work: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
             try:
                 return method(*args, **kwargs)
             finally:
-                time = args[0].time  # type: ignore[attr-defined]  # args[0] is the workspace
+                time = args[0].time  # type: ignore[attr-defined]  # args[0] is the object
                 setattr(time, work, getattr(time, work) + perf_counter() - started)
 
         return measured
@@ -151,6 +159,7 @@ class ShootingWorkspace:
         self._terminal_inputs = tuple(terminal_inputs)
         self._time_step = np.array([problem.time_step])
         self._deviations = np.zeros((problem.horizon, problem.n_tangent))
+        self._no_gaps = np.zeros((0, problem.n_tangent))
         self._sweep_work = sweep_workspace(problem.n_tangent, problem.n_controls)
         self._lower = np.array(problem.control_lower, dtype=np.float64)
         self._upper = np.array(problem.control_upper, dtype=np.float64)
@@ -166,7 +175,7 @@ class ShootingWorkspace:
         self.current = Trajectory(problem, self._time_step, self._terminal_inputs)
         self.trial = Trajectory(problem, self._time_step, self._terminal_inputs)
 
-    @_timed("rollout")
+    @timed("rollout")
     def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
         """Roll out given controls and make the result the current trajectory.
 
@@ -187,7 +196,7 @@ class ShootingWorkspace:
             trajectory.terminal_cost,
         )
 
-    @_timed("derivatives")
+    @timed("derivatives")
     def differentiate(self) -> None:
         """Compute all derivatives along the current trajectory that Gauss-Newton needs."""
         states, controls, d = self.current.states, self.current.controls, self.derivatives
@@ -198,7 +207,7 @@ class ShootingWorkspace:
         self._run("terminal_cost_derivatives", 1, terminal_buffers)
         self._exact_is_current = False
 
-    @_timed("derivatives")
+    @timed("derivatives")
     def differentiate_twice(self) -> None:
         """Compute exact second derivatives along the current trajectory, unless they are there already."""
         if self._exact_is_current:
@@ -210,13 +219,17 @@ class ShootingWorkspace:
         self._run("terminal_cost_hessian", 1, buffer_table(states[-1:], exact.terminal_xx))
         self._exact_is_current = True
 
-    @_timed("sweep")
-    def sweep(self, regularization: float, *, exact: bool = False) -> SweepOutcome:
+    @timed("sweep")
+    def sweep(
+        self, regularization: float, *, exact: bool = False, gaps: FloatArray | None = None
+    ) -> SweepOutcome:
         """Compute a control update; one that fails leaves the last update as it is.
 
         Args:
             regularization: lambda >= 0, in multiples of the control weights.
             exact: Whether to take exact second derivatives; `differentiate_twice` must have been called.
+            gaps: Gaps of the current trajectory for the update to close, shape (N, n_t); None if there are
+                none.
 
         Returns:
             How the sweep ended.
@@ -225,6 +238,7 @@ class ShootingWorkspace:
             *backward_sweep(
                 self.derivatives,
                 self._exact if exact else self._gauss_newton,
+                self._no_gaps if gaps is None else gaps,
                 self.current.controls,
                 self._lower,
                 self._upper,
@@ -233,6 +247,9 @@ class ShootingWorkspace:
                 self._sweep_work,
             )
         )
+        if outcome.status == SWEEP_NOT_FINITE:
+            # Its padding may hold what is not a number, and would spoil all later sweeps.
+            self._sweep_work = sweep_workspace(self.problem.n_tangent, self.problem.n_controls)
         if outcome.status == SWEEP_DONE:
             self.update, self._spare_update = self._spare_update, self.update
         return outcome
@@ -241,7 +258,7 @@ class ShootingWorkspace:
         """Go back to the update before the last successful sweep."""
         self.update, self._spare_update = self._spare_update, self.update
 
-    @_timed("rollout")
+    @timed("rollout")
     def try_step(self, alpha: float) -> float:
         """Roll out the control update into the trial trajectory.
 

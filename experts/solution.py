@@ -43,17 +43,21 @@ class IterationRecord(NamedTuple):
 
     Attributes:
         iteration: Counts from 1.
-        cost: Cost after the iteration.
+        cost: Cost after the iteration; while gaps are open, of a trajectory that the dynamics do not follow.
         alpha: Accepted step length, 0 if every step was refused.
         exact: Whether the update came from exact second derivatives; from Gauss-Newton's otherwise.
         regularization: Weight lambda of the damping, in multiples of the control weights.
-        expected_decrease: Decrease of the cost that the full step promised, in the unit of the cost.
-        optimality: That decrease relative to the cost; it understates while the damping is strong.
+        expected_decrease: Decrease of the cost that the full step promised, in the unit of the cost; negative
+            where closing gaps costs more than the step gains.
+        optimality: That decrease relative to the cost; it understates while the damping is strong. inf for
+            steps from a trajectory with gaps.
         clamped_share: Share of the inputs, over all stages, that were held at a bound; 0 to 1.
         seconds: Wall-clock time, s.
         derivative_seconds: Part of it that went into derivatives, s.
         sweep_seconds: Part of it that went into backward sweeps, s.
         rollout_seconds: Part of it that went into rollouts, s.
+        gap: Largest gap after the iteration, the norm of step(x_k, u_k) (-) x_k+1 in tangent coordinates; 0
+            unless the solve began with a guess of the states.
     """
 
     iteration: int
@@ -68,6 +72,7 @@ class IterationRecord(NamedTuple):
     derivative_seconds: float
     sweep_seconds: float
     rollout_seconds: float
+    gap: float
 
 
 _FIELD_TYPES = {"iteration": np.int64, "exact": np.bool_}

@@ -33,6 +33,7 @@ class WindowProblem:
         """
         self.maneuver, self.horizon, self.ends_early = maneuver, horizon, ends_early
         self.has_second_order = not ends_early
+        self.has_retraction = True
         self.n_states, self.n_tangent = maneuver.n_states, maneuver.n_tangent
         self.n_controls = maneuver.n_controls
         self.time_step = maneuver.time_step

@@ -2,7 +2,7 @@
 
 import ctypes
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,10 +51,15 @@ class PythonProblem:
     terminal_cost_derivatives: Callable[[Array], tuple[Array, Array]]
     lagrangian_hessian: Callable[[Array, Array, Array, float], tuple[Array, Array, Array]] | None = None
     terminal_cost_hessian: Callable[[Array], Array] | None = None
+    retract: Callable[[Array, Array], Array] | None = None
 
     @property
     def has_second_order(self) -> bool:
         return self.lagrangian_hessian is not None
+
+    @property
+    def has_retraction(self) -> bool:
+        return self.retract is not None
 
     def __post_init__(self) -> None:
         x, t, u, one = (self.n_states,), (self.n_tangent,), (self.n_controls,), (1,)
@@ -90,6 +95,9 @@ class PythonProblem:
                 lambda y, v, m, h: exact(y, v, m, h[0]), [x, u, t, one], [tt, u + t, uu], shared=3
             )
             self._kernels["terminal_cost_hessian"] = kernel(lambda y: (terminal(y),), [x], [tt])
+        if self.retract is not None:
+            retract = self.retract
+            self._kernels["retract"] = kernel(lambda y, z: (retract(y, z),), [x, t], [x])
 
     def kernel(self, name: str, *, batched: bool = False) -> PythonKernel:
         return self._kernels[name]
@@ -125,6 +133,7 @@ class LinearQuadratic:
             linearize=lambda x, u, h: (self.A, self.B),
             cost_derivatives=lambda x, u: (self.Q @ x, self.R @ u, self.Q, self.R),
             terminal_cost_derivatives=lambda x: (self.P @ x, self.P),
+            retract=lambda x, dx: x + dx,
         )
 
     def condensed(self, initial_state: Array) -> tuple[Array, Array, float]:
@@ -212,6 +221,7 @@ def pendulum() -> PythonProblem:
         terminal_cost_derivatives=lambda x: (terminal @ x, terminal),
         lagrangian_hessian=lagrangian_hessian,
         terminal_cost_hessian=lambda x: terminal,
+        retract=lambda x, dx: x + dx,
     )
 
 
@@ -224,6 +234,10 @@ def unicycle() -> PythonProblem:
     def difference(reference: Array, x: Array) -> Array:
         sine = reference[0] * x[1] - reference[1] * x[0]
         return np.array([np.arctan2(sine, reference[:2] @ x[:2]), *(x[2:] - reference[2:])])
+
+    def retract(x: Array, dx: Array) -> Array:
+        c, s = np.array([np.cos(dx[0]), np.sin(dx[0])]) / np.hypot(x[0], x[1])
+        return np.array([c * x[0] - s * x[1], s * x[0] + c * x[1], *(x[2:] + dx[1:])])
 
     def step(x: Array, u: Array, h: float) -> Array:
         c, s = np.cos(h * u[1]), np.sin(h * u[1])
@@ -253,4 +267,23 @@ def unicycle() -> PythonProblem:
         linearize=linearize,
         cost_derivatives=lambda x, u: (running @ difference(target, x), weight @ u, running, weight),
         terminal_cost_derivatives=lambda x: (terminal @ difference(target, x), terminal),
+        retract=retract,
     )
+
+
+@pytest.fixture
+def unstable(double_integrator: LinearQuadratic) -> PythonProblem:
+    """A mass that an accelerating force drives away: without control its rate is soon beyond all numbers."""
+    problem = double_integrator.problem()
+    h = 0.1
+
+    def step(x: Array, u: Array, _: float) -> Array:
+        with np.errstate(over="ignore", invalid="ignore"):
+            rate = x[1] + h * (x[0] ** 3 + u[0])
+            return np.array([x[0] + h * rate, rate])
+
+    def linearize(x: Array, u: Array, _: float) -> tuple[Array, Array]:
+        rate = np.array([3.0 * h * x[0] ** 2, 1.0])
+        return np.array([np.array([1.0, 0.0]) + h * rate, rate]), np.array([[h * h], [h]])
+
+    return replace(problem, step=step, linearize=linearize, initial_state=np.array([3.0, 1.0]))

@@ -22,6 +22,8 @@ from experts.derivatives import (
     gauss_newton_hessians,
 )
 
+NO_GAPS = np.zeros((0, 1))
+
 
 def random_derivatives(seed: int, horizon: int, n_tangent: int, n_controls: int) -> Derivatives:
     rng = np.random.default_rng(seed)
@@ -50,7 +52,7 @@ def sweep(
     bound = np.full(n_controls, limit)
     work = sweep_workspace(n_tangent, n_controls)
     hessians = hessians or gauss_newton_hessians(d)
-    outcome = backward_sweep(d, hessians, controls, -bound, bound, regularization, update, work)
+    outcome = backward_sweep(d, hessians, NO_GAPS, controls, -bound, bound, regularization, update, work)
     return SweepOutcome(*outcome), update
 
 
@@ -147,7 +149,7 @@ def test_the_value_function_is_kept_at_every_stage_where_asked_for(limit: float)
     update = allocate_update(9, 6, 4, keep_values=True)
     bound = np.full(4, limit)
     hessians = gauss_newton_hessians(d)
-    backward_sweep(d, hessians, controls, -bound, bound, 2.0, update, sweep_workspace(6, 4))
+    backward_sweep(d, hessians, NO_GAPS, controls, -bound, bound, 2.0, update, sweep_workspace(6, 4))
     for stage in range(9):
         stages = {key: value[stage:] for key, value in d._asdict().items() if not key.startswith("terminal")}
         _, rest = sweep(d._replace(**stages), controls[stage:], limit, 2.0)
@@ -236,3 +238,22 @@ def test_derivatives_that_are_not_finite_are_reported(name: str, stage: int, bad
     for limit in (np.inf, 0.3):
         outcome, _ = sweep(d, np.zeros(d.lu.shape), limit, 1.0)
         assert outcome.status == SWEEP_NOT_FINITE
+
+
+@pytest.mark.parametrize("limit", [np.inf, 0.2])
+def test_gaps_shift_the_value_gradient(limit: float) -> None:
+    """Vx + Vxx f takes the place of Vx: a last gap is the same as a terminal gradient shifted by lxx f."""
+    d = random_derivatives(5, 9, 6, 4)
+    controls = np.random.default_rng(1).uniform(-0.2, 0.2, size=d.lu.shape)
+    gaps = np.zeros((9, 6))
+    plain, bound = sweep(d, controls, limit, 2.0)[1], np.full(4, limit)
+    for last in (np.zeros(6), np.random.default_rng(2).normal(size=6)):
+        gaps[-1] = last
+        update, work = allocate_update(9, 6, 4), sweep_workspace(6, 4)
+        backward_sweep(d, gauss_newton_hessians(d), gaps, controls, -bound, bound, 2.0, update, work)
+        shifted = d._replace(terminal_lx=d.terminal_lx + last @ d.terminal_lxx[0])
+        expected = sweep(shifted, controls, limit, 2.0)[1]
+        np.testing.assert_allclose(update.feedforward, expected.feedforward, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(update.value_gradient, expected.value_gradient, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(update.gains, expected.gains, rtol=1e-10, atol=1e-12)
+    assert np.abs(update.feedforward - plain.feedforward).max() > 1e-3

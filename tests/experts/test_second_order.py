@@ -132,7 +132,7 @@ def test_hybrid_converges_and_says_which_model_led_to_each_step(scene):
 
 
 def record(exact, cost, alpha):
-    return IterationRecord(1, cost, alpha, exact, 0.0, 0.0, 0.0, 0.0, 0.0)
+    return IterationRecord(1, cost, alpha, exact, *np.zeros(9))
 
 
 def test_hybrid_tries_the_exact_model_after_two_slow_steps_and_pauses_when_it_fails():
