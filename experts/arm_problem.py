@@ -6,6 +6,10 @@ import numpy as np
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from experts.problem import FloatArray, Kernel
+from experts.screw_motion import ScrewMotion, screw_motion
+
+SCREW_DURATION = 0.15
+"""Share of the horizon that a guess by screw motion gives the tip: the cost asks for haste."""
 
 
 class ArmProblem:
@@ -52,6 +56,20 @@ class ArmProblem:
         angle, distance = self.kernels.observation(state, [0.0])[1]
         success = self.scene.success
         return bool(np.degrees(angle) <= success.attitude_error_deg and distance <= success.position_error)
+
+    def screw_motion(self, x0: FloatArray) -> ScrewMotion:
+        """Guess the maneuver from a start, from kinematics alone; see `experts.screw_motion`.
+
+        Args:
+            x0: State at stage 0, shape (n_x,), units of `kernels.layout.state`.
+
+        Returns:
+            The guess.
+
+        Raises:
+            ValueError: If x0 has the wrong shape or is not finite.
+        """
+        return screw_motion(self, x0, duration=SCREW_DURATION * self.horizon * self.time_step)
 
     def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return one of the kernels that `experts.problem` lists.

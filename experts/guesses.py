@@ -5,6 +5,9 @@ the controls of a maneuver solved for another start do little better, for their 
 stages. The policy of a solved maneuver u = u_k + K_k (x (-) x_k), rolled out from the new start, does not
 forget where it should be: its trajectory lies in the valley of the minimum that it was made for. So one
 good maneuver per scene is enough, and it is worth some effort, see `START_REGULARIZATIONS`.
+
+Where a policy has been carried too far from its maneuver, kinematics give a guess that knows the start: the
+tip is led to the target by one screw motion, and the arm follows (`screw_motion`).
 """
 
 from collections.abc import Iterable
@@ -18,13 +21,19 @@ from experts.native_call import buffer_table
 from experts.problem import FloatArray, ShootingProblem
 from experts.progress import Callback
 from experts.rollout import FINISHED, closed_loop_rollout
+from experts.screw_motion import ScrewMotion
 from experts.shooting import Trajectory
 from experts.solution import Solution, StopReason
+from experts.tracking import track
 
 START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
 """First dampings with which the initial state is solved from zero controls; the cheapest end is kept."""
 POLICY_REGULARIZATION = 1e2
 """First damping from a policy's trajectory: it is near a minimum, so longer steps than usual are safe."""
+STRAYED = 3.0
+"""A policy whose rollout costs this many times its own maneuver has been carried too far from it."""
+SCREW_REGULARIZATION = 1e2
+"""First damping from a screw motion: the arm is not wound up, and long steps seldom do that."""
 ZERO_REGULARIZATION = 1e4
 """First damping from zero controls: short first steps seldom end in a poor minimum."""
 
@@ -37,26 +46,37 @@ class _HasGoal(Protocol):
         """Judge a final state."""
 
 
+@runtime_checkable
+class _HasScrewMotion(Protocol):
+    """A problem that guesses maneuvers from the kinematics of an arm and its tip."""
+
+    def screw_motion(self, x0: FloatArray) -> ScrewMotion:
+        """Guess the maneuver from a start."""
+
+
 class _Guess(NamedTuple):
     """Controls to start a solve from.
 
     Attributes:
         name: What the solution's metadata call it.
         controls: Shape (N, n_u); None for zeros.
+        cost: Cost of their rollout; inf if it is not finite, or not known.
         regularization: First damping of the solve.
     """
 
     name: str
     controls: FloatArray | None
+    cost: float
     regularization: float
 
 
 class GuidedDDP:
     """Box-DDP that makes its own guesses; give each thread its own.
 
-    Guesses are, the cheapest rollout first, the policies of a library of solved maneuvers, then zero
-    controls. They are solved one after another until one converges to a final state that the task counts as
-    a success, if the problem has `is_success`; the cheapest solution wins.
+    Guesses are, the cheapest rollout first, the policies of a library of solved maneuvers and, where all of
+    them stray, the screw motion of the tip to its target, if the problem has a `screw_motion`; then zero
+    controls. They are solved one after another until one converges to a final state that the task counts as a
+    success, if the problem has `is_success`; the cheapest solution wins.
     """
 
     def __init__(
@@ -64,6 +84,7 @@ class GuidedDDP:
         scene_or_problem: Any,
         *,
         library: Iterable[Solution] | None = None,
+        screw_motion: bool = True,
         remember: int = 0,
         attempts: int = 2,
         max_iterations: int = 200,
@@ -75,7 +96,10 @@ class GuidedDDP:
         Args:
             scene_or_problem: A scene, or a `ShootingProblem`.
             library: Solutions of this problem or of a similar one, such as the scene with another target;
-                None solves the problem's own initial state, once, when a start is first asked for.
+                None solves the problem's own initial state, once, when a start is first asked for. Empty, it
+                leaves the other guesses.
+            screw_motion: Whether the tip's screw motion is a guess where no policy is near, if the problem
+                knows it.
             remember: Number of converged solutions that may join the library. With 0 a solution depends on
                 nothing but its start, with more also on those solved before.
             attempts: Largest number of guesses that are solved for a start.
@@ -94,6 +118,7 @@ class GuidedDDP:
         )
         self.problem: ShootingProblem = self._solver.problem
         self.attempts = attempts
+        self.screw_motion = screw_motion
         self._vacancies = remember
         self._library = None if library is None else list(library)
         for i, solution in enumerate(self._library or ()):
@@ -150,12 +175,23 @@ class GuidedDDP:
 
     def _guesses(self, start: FloatArray) -> list[_Guess]:
         """The guesses to solve, the most promising first; zero controls are the last resort."""
-        rollouts = [(*follow(solution, self.problem, start), i) for i, solution in enumerate(self.library)]
-        finite = sorted((r for r in rollouts if np.isfinite(r[1])), key=lambda r: r[1])
-        policies = [_Guess(f"policy {i}", controls, POLICY_REGULARIZATION) for controls, _, i in finite]
-        zero = _Guess("zero controls", None, ZERO_REGULARIZATION)
+        rollouts = [
+            _Guess(f"policy {i}", *follow(solution, self.problem, start), POLICY_REGULARIZATION)
+            for i, solution in enumerate(self.library)
+        ]
+        strayed = all(
+            guess.cost > STRAYED * solution.cost
+            for guess, solution in zip(rollouts, self.library, strict=True)
+        )
+        if strayed and self.screw_motion and isinstance(self.problem, _HasScrewMotion):
+            motion = self.problem.screw_motion(start)
+            rollouts.append(_Guess("screw motion", *track(self.problem, *motion), SCREW_REGULARIZATION))
+        ranked = sorted(
+            (guess for guess in rollouts if np.isfinite(guess.cost)), key=lambda guess: guess.cost
+        )
+        zero = _Guess("zero controls", None, np.inf, ZERO_REGULARIZATION)
         # Of two attempts or more the last one is left to zero controls.
-        return [*policies[: max(self.attempts - 1, 1)], zero][: self.attempts]
+        return [*ranked[: max(self.attempts - 1, 1)], zero][: self.attempts]
 
     def _solve_from(self, guess: _Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
         self._solver.initial_regularization = guess.regularization
@@ -172,7 +208,7 @@ class GuidedDDP:
         start = np.asarray(self.problem.initial_state, dtype=np.float64)
         solutions: list[Solution] = []
         for regularization in START_REGULARIZATIONS:
-            solution = self._solve_from(_Guess("zero controls", None, regularization), start)
+            solution = self._solve_from(_Guess("zero controls", None, np.inf, regularization), start)
             if solution.stop_reason is StopReason.INTERRUPTED:
                 raise KeyboardInterrupt
             solutions.append(solution)

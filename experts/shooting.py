@@ -290,7 +290,7 @@ class ShootingWorkspace:
         )
         return trial.cost
 
-    @_timed("rollout")
+    @timed("rollout")
     def try_steps(self, step_lengths: FloatArray) -> FloatArray:
         """Roll out the control update with several step lengths at once.
 
@@ -303,7 +303,7 @@ class ShootingWorkspace:
         reference = self.current.states, self.current.controls
         return self._parallel.run(step_lengths, reference, self.update, self._lower, self._upper)
 
-    @_timed("rollout")
+    @timed("rollout")
     def choose(self, lane: int, cost: float) -> None:
         """Take one of the last `try_steps` as the trial trajectory.
 

@@ -15,7 +15,8 @@ from dq_space_arm_env.scene.start import (
     start_from_draws,
 )
 from experts import BoxDDP, GuidedDDP, StopReason
-from experts.guesses import START_REGULARIZATIONS, ZERO_REGULARIZATION, follow
+from experts.guesses import START_REGULARIZATIONS, STRAYED, ZERO_REGULARIZATION, follow
+from experts.screw_motion import ScrewMotion
 
 ELSEWHERE = np.array([0.6, 0.8, -0.2, 0.7])  # another start of the unicycle
 
@@ -81,6 +82,65 @@ def test_an_empty_library_leaves_zero_controls(unicycle):
     expected = BoxDDP(unicycle, initial_regularization=ZERO_REGULARIZATION).solve(ELSEWHERE)
     assert names(solution) == [solution.metadata["guess"]] == ["zero controls"]
     np.testing.assert_array_equal(solution.controls, expected.controls)
+
+
+class WithScrewMotion:
+    """A problem that guesses a given trajectory."""
+
+    def __init__(self, problem, states, controls):
+        self._problem, self._motion = problem, ScrewMotion(states, controls)
+
+    def __getattr__(self, name):
+        return getattr(self._problem, name)
+
+    def screw_motion(self, x0):
+        return self._motion
+
+
+def drifting(unicycle, x0):
+    """The trajectory of a start with no control at all."""
+    states, controls = [x0], np.zeros((unicycle.horizon, 2))
+    for u in controls:
+        states.append(unicycle.step(states[-1], u, unicycle.time_step))
+    return np.array(states), controls
+
+
+def test_a_screw_motion_is_solved_first_if_its_rollout_is_cheaper_than_that_of_a_policy_astray(unicycle):
+    far = BoxDDP(unicycle).solve(np.array([0.0, 1.0, 0.05, 0.05]))
+    good = BoxDDP(unicycle, max_iterations=8).solve(ELSEWHERE)
+    rollout = follow(far, unicycle, ELSEWHERE)[1]
+    assert rollout > max(STRAYED * far.cost, good.cost)
+    problem = WithScrewMotion(unicycle, good.states, good.controls)
+    assert names(GuidedDDP(problem, library=[far]).solve(ELSEWHERE)) == ["screw motion"]
+    assert names(GuidedDDP(problem, library=[far], screw_motion=False).solve(ELSEWHERE)) == ["policy 0"]
+
+
+def test_a_policy_with_the_cheaper_rollout_comes_first_all_the_same(unicycle):
+    far = BoxDDP(unicycle).solve(np.array([0.0, 1.0, 0.05, 0.05]))
+    problem = WithGoal(WithScrewMotion(unicycle, *drifting(unicycle, ELSEWHERE)), False)
+    solution = GuidedDDP(problem, library=[far], attempts=3).solve(ELSEWHERE)
+    assert names(solution) == ["policy 0", "screw motion", "zero controls"]
+    assert names(GuidedDDP(problem, library=[far]).solve(ELSEWHERE)) == ["policy 0", "zero controls"]
+
+
+def test_where_a_policy_is_near_no_screw_motion_is_asked_for(unicycle):
+    near = BoxDDP(unicycle).solve()
+    assert follow(near, unicycle, ELSEWHERE)[1] < STRAYED * near.cost
+    problem = WithGoal(WithScrewMotion(unicycle, *drifting(unicycle, ELSEWHERE)), False)
+    solution = GuidedDDP(problem, library=[near], attempts=3).solve(ELSEWHERE)
+    assert names(solution) == ["policy 0", "zero controls"]
+
+
+def test_an_arm_needs_no_library():
+    """The screw motion alone leads to the minimum, in one solve."""
+    start = random_start("paper", 1)
+    solution = GuidedDDP("paper", library=[]).solve(start)
+    assert names(solution) == ["screw motion"]
+    assert solution.converged
+    np.testing.assert_array_equal(solution.states[0], start)
+    assert names(GuidedDDP("paper", library=[], screw_motion=False, max_iterations=1).solve(start)) == [
+        "zero controls"
+    ]
 
 
 # Which solution wins ---------------------------------------------------------------------------------------
@@ -276,7 +336,8 @@ def test_a_library_serves_the_same_scene_with_another_target(seed):
     scene = load_scene("random-target")
     draws = np.random.default_rng(seed).uniform(-1.0, 1.0, number_of_draws(scene))
     episode, start = episode_scene(scene, draws), start_from_draws(scene, draws)
-    solution = GuidedDDP(episode, library=GuidedDDP(scene).library).solve(start)
+    library = GuidedDDP(scene).library
+    solution = GuidedDDP(episode, library=library, screw_motion=False).solve(start)
     alone = GuidedDDP(episode).solve(start)
     assert solution.converged
     assert solution.metadata["guess"] == "policy 0"
