@@ -10,8 +10,6 @@ Exit status: 0; 2 if the input is unusable; 130 if interrupted.
 """
 
 import argparse
-import importlib.metadata
-import platform
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -113,7 +111,7 @@ def _measure(
         "scene_costs": cost_records(costs, peaks),
         "feature_costs": cost_records(feature_costs, peaks),
         "start_up": {"scene": scenes[0].name, "unit": "s", "durations": start_up},
-        **_provenance(),
+        **provenance("pin", "mujoco"),
     }
     return record, results
 
@@ -135,27 +133,6 @@ def _write(
 
     write_atomically(options.out / "throughput.png", picture(results))
     return ["throughput.json", "throughput.png"]
-
-
-def _provenance() -> dict[str, Any]:
-    """Where the numbers come from, with the peers' versions and the processor's own name."""
-    record = provenance()
-    for package in ("pin", "mujoco"):
-        try:
-            record["versions"][package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            record["versions"][package] = None
-    record["machine"]["processor_name"] = _processor_name()
-    return record
-
-
-def _processor_name() -> str:
-    information = Path("/proc/cpuinfo")
-    if information.exists():
-        for line in information.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ comparison   the paper's numbers beside a scene's, and what is our own choice
 progress, tables   on the terminal
 summary, provenance   for `summary.json`
 figures      Figures 2 to 6 (not imported here: needs the extra `plots`)
-throughput, peak, start_up   the benchmark (not imported here)
+throughput, peak, start_up   the benchmark of the environment (not imported here)
+solvers      the benchmark of the expert (not imported here)
 """
 
 from experts.files import write_atomically

@@ -13,8 +13,11 @@ from dq_space_arm_env.compiler.native import host_machine
 PACKAGES = ("casadi", "gymnasium", "llvmlite", "matplotlib", "numba", "numpy", "pydantic")
 
 
-def provenance() -> dict[str, Any]:
+def provenance(*peers: str) -> dict[str, Any]:
     """Describe this process.
+
+    Args:
+        *peers: Packages whose versions matter besides those of `PACKAGES`.
 
     Returns:
         Date, versions of packages, commit and machine; `None` for what is not installed or not known.
@@ -25,11 +28,12 @@ def provenance() -> dict[str, Any]:
         "versions": {
             "dq-space-arm": dq_space_arm_env.__version__,
             "python": platform.python_version(),
-            **{package: _version(package) for package in PACKAGES},
+            **{package: _version(package) for package in (*PACKAGES, *peers)},
         },
         "machine": {
             "system": platform.platform(),
             "processor": host_machine().cpu,
+            "processor_name": _processor_name(),
             "vector_lanes": host_machine().lanes,
         },
     }
@@ -40,6 +44,15 @@ def _version(package: str) -> str | None:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
+
+
+def _processor_name() -> str:
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        for line in information.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def _commit(checkout: Path) -> dict[str, Any] | None:

@@ -58,7 +58,7 @@ def summarize(run: ManeuverRun) -> dict[str, Any]:
         "resolved_scene": run.scene.model_dump(mode="json"),
         **provenance(),
     }
-    return {key: _json_value(value) for key, value in summary.items()}
+    return {key: json_value(value) for key, value in summary.items()}
 
 
 def to_json(summary: dict[str, Any]) -> str:
@@ -73,6 +73,24 @@ def to_json(summary: dict[str, Any]) -> str:
     return json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
+def json_value(value: Any) -> Any:
+    """Replace what JSON does not have.
+
+    Args:
+        value: Numbers, texts, lists and dictionaries, nested.
+
+    Returns:
+        The same with None for infinity and NaN.
+    """
+    if isinstance(value, dict):
+        return {key: json_value(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_value(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
 def _actuator(actuator: ActuatorHistory) -> dict[str, Any]:
     return {
         "unit": actuator.unit,
@@ -82,14 +100,3 @@ def _actuator(actuator: ActuatorHistory) -> dict[str, Any]:
         "clamped_share": actuator.clamped_share,
         "cost": actuator.effort,
     }
-
-
-def _json_value(value: Any) -> Any:
-    """The same with None for infinity and NaN, which JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _json_value(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json_value(part) for part in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

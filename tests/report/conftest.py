@@ -32,6 +32,12 @@ def short_scene() -> Scene:
 
 
 @pytest.fixture(scope="session")
+def spread_scene(short_scene: Scene) -> Scene:
+    """With random starts; its kernels are the same."""
+    return short_scene.replace(spread={"joint_angles": 0.5, "base_position": 0.1, "base_rotation": 0.1})
+
+
+@pytest.fixture(scope="session")
 def short_run(short_scene: Scene) -> ManeuverRun:
     return run_maneuver(short_scene)
 
