@@ -1,10 +1,13 @@
 """A scene as a shooting problem: its kernels, bounds, horizon and start under the names the solver uses."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
+from experts.native_call import buffer_table, run_kernel
 from experts.problem import FloatArray, Kernel
 from experts.screw_motion import ScrewMotion, screw_motion
 
@@ -18,6 +21,7 @@ class ArmProblem:
     Attributes:
         scene: The scene.
         kernels: Its compiled functions.
+        terminal_inputs: The emphasis on the pose in the terminal cost, shape (1,); see `emphasized`.
     """
 
     has_second_order = True
@@ -43,6 +47,51 @@ class ArmProblem:
         self.control_lower: FloatArray = -layout.control_limit
         self.control_upper: FloatArray = layout.control_limit
         self.initial_state: FloatArray = layout.initial_state
+        self._emphasis: FloatArray = np.ones(1)
+        self.terminal_inputs: tuple[FloatArray, ...] = (self._emphasis,)
+
+    @contextmanager
+    def emphasized(self, emphasis: float) -> Iterator[None]:
+        """Multiply the weights of the tip's final pose for what is solved inside a `with` block.
+
+        Args:
+            emphasis: The factor; 1 is the scene's own cost.
+        """
+        self._emphasis[0] = emphasis
+        try:
+            yield
+        finally:
+            self._emphasis[0] = 1.0
+
+    def end_cost(self, state: FloatArray) -> float:
+        """Terminal cost of a final state, with the emphasis of the moment.
+
+        Args:
+            state: Shape (n_x,), units of `kernels.layout.state`.
+
+        Returns:
+            The cost, dimensionless.
+        """
+        row, cost = np.ascontiguousarray(state, dtype=np.float64), np.zeros(1)
+        buffers = buffer_table(row, *self.terminal_inputs, cost)
+        run_kernel(self.kernel("terminal_cost").address, 0, 1, buffers)
+        return float(cost[0])
+
+    def misses(self, state: FloatArray) -> float:
+        """Compare the tip's final errors with what counts as a success.
+
+        Args:
+            state: Final state, shape (n_x,), units of `kernels.layout.state`.
+
+        Returns:
+            The larger one of the attitude and the position error, each relative to its tolerance in the
+            scene.
+        """
+        angle, distance = self.kernels.observation(state, [0.0])[1]
+        success = self.scene.success
+        return max(
+            float(np.degrees(angle)) / success.attitude_error_deg, float(distance) / success.position_error
+        )
 
     def is_success(self, state: FloatArray) -> bool:
         """Tell whether an episode that ends in a state counts as a success.
@@ -53,9 +102,7 @@ class ArmProblem:
         Returns:
             Whether the tip's errors are within the scene's tolerances.
         """
-        angle, distance = self.kernels.observation(state, [0.0])[1]
-        success = self.scene.success
-        return bool(np.degrees(angle) <= success.attitude_error_deg and distance <= success.position_error)
+        return self.misses(state) <= 1.0
 
     def screw_motion(self, x0: FloatArray) -> ScrewMotion:
         """Guess the maneuver from a start, from kinematics alone; see `experts.screw_motion`.
@@ -81,6 +128,7 @@ class ArmProblem:
         Returns:
             The kernel, compiled or loaded from the cache.
         """
+        name = "emphasized_terminal_cost" if name == "terminal_cost" else name
         return self.kernels.kernel(name, lanes=None if batched else 1)
 
 

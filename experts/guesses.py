@@ -20,6 +20,7 @@ from experts.checks import check_array, check_at_least
 from experts.native_call import buffer_table
 from experts.problem import FloatArray, ShootingProblem
 from experts.progress import Callback
+from experts.reaching import HasTolerances, reach
 from experts.rollout import FINISHED, closed_loop_rollout
 from experts.screw_motion import ScrewMotion
 from experts.shooting import Trajectory
@@ -36,14 +37,8 @@ SCREW_REGULARIZATION = 1e2
 """First damping from a screw motion: the arm is not wound up, and long steps seldom do that."""
 ZERO_REGULARIZATION = 1e4
 """First damping from zero controls: short first steps seldom end in a poor minimum."""
-
-
-@runtime_checkable
-class _HasGoal(Protocol):
-    """A problem that knows whether a final state is what the task asks for."""
-
-    def is_success(self, state: FloatArray) -> bool:
-        """Judge a final state."""
+REACH_REGULARIZATION = 0.0
+"""First damping after the emphasis has been raised: the last minimum is near."""
 
 
 @runtime_checkable
@@ -70,13 +65,29 @@ class _Guess(NamedTuple):
     regularization: float
 
 
+class _Attempt(NamedTuple):
+    """A solve.
+
+    Attributes:
+        guess: Name of the guess.
+        solution: Its result.
+        emphasis: Factor of the final pose's weights.
+    """
+
+    guess: str
+    solution: Solution
+    emphasis: float = 1.0
+
+
 class GuidedDDP:
-    """Box-DDP that makes its own guesses; give each thread its own.
+    """Box-DDP that makes its own guesses, and reaches the target; give each thread its own.
 
     Guesses are, the cheapest rollout first, the policies of a library of solved maneuvers and, where all of
     them stray, the screw motion of the tip to its target, if the problem has a `screw_motion`; then zero
-    controls. They are solved one after another until one converges to a final state that the task counts as a
-    success, if the problem has `is_success`; the cheapest solution wins.
+    controls. They are solved one after another until one converges, and ends within the tolerances if the
+    problem `HasTolerances`. A minimum that ends outside of them is led there: the weights of the final pose
+    are raised as far as that takes (`reaching`). Of several solutions the cheapest wins, first among those
+    that reach the target.
     """
 
     def __init__(
@@ -85,6 +96,7 @@ class GuidedDDP:
         *,
         library: Iterable[Solution] | None = None,
         screw_motion: bool = True,
+        reach_target: bool = True,
         remember: int = 0,
         attempts: int = 2,
         max_iterations: int = 200,
@@ -100,6 +112,8 @@ class GuidedDDP:
                 leaves the other guesses.
             screw_motion: Whether the tip's screw motion is a guess where no policy is near, if the problem
                 knows it.
+            reach_target: Whether to raise the weights of the final pose where the cheapest maneuver ends
+                outside of the tolerances.
             remember: Number of converged solutions that may join the library. With 0 a solution depends on
                 nothing but its start, with more also on those solved before.
             attempts: Largest number of guesses that are solved for a start.
@@ -118,7 +132,7 @@ class GuidedDDP:
         )
         self.problem: ShootingProblem = self._solver.problem
         self.attempts = attempts
-        self.screw_motion = screw_motion
+        self.screw_motion, self.reach_target = screw_motion, reach_target
         self._vacancies = remember
         self._library = None if library is None else list(library)
         for i, solution in enumerate(self._library or ()):
@@ -144,9 +158,10 @@ class GuidedDDP:
                 KeyboardInterrupt to end the solve.
 
         Returns:
-            The cheapest trajectory found. Its `metadata["guess"]` names the guess that it came from, and
-            `metadata["attempts"]` tells for each guess that was solved its name, cost, iterations and stop
-            reason.
+            The best trajectory found; its cost is always the problem's own. Its `metadata["guess"]` names the
+            guess that it came from, `metadata["emphasis"]` is the factor of the final pose's weights at which
+            it is a minimum, and `metadata["attempts"]` tells of each solve the guess, emphasis, cost,
+            iterations and stop reason.
 
         Raises:
             ValueError: If x0 has the wrong shape or is not finite, or an input has no cost of its own.
@@ -154,17 +169,34 @@ class GuidedDDP:
         """
         start = np.asarray(self.problem.initial_state if x0 is None else x0, dtype=np.float64)
         check_array("x0", start, (self.problem.n_states,))
-        attempts: list[tuple[str, Solution]] = []
+        attempts: list[_Attempt] = []
         for guess in self._guesses(start):
-            solution = self._solve_from(guess, start, callback)
-            attempts.append((guess.name, solution))
-            if self._is_good(solution) or solution.stop_reason is StopReason.INTERRUPTED:
+            attempts.append(_Attempt(guess.name, self._solve_from(guess, start, callback)))
+            if attempts[-1].solution.converged and not self._is_good(attempts[-1].solution):
+                attempts += self._reach(attempts[-1], start, callback)
+            last = attempts[-1].solution
+            if self._is_good(last) or last.stop_reason is StopReason.INTERRUPTED:
                 break
-        name, best = min(attempts, key=lambda attempt: attempt[1].cost)
-        best.metadata["guess"] = name
-        best.metadata["attempts"] = [_summary(*attempt) for attempt in attempts]
-        self._remember(best)
-        return best
+        # An emphasis that did not help is given up.
+        good = [attempt for attempt in attempts if self._is_good(attempt.solution)]
+        plain = [attempt for attempt in attempts if attempt.emphasis == 1.0]
+        best = min(good or plain, key=lambda attempt: attempt.solution.cost)
+        solution = best.solution
+        solution.metadata["guess"], solution.metadata["emphasis"] = best.guess, best.emphasis
+        solution.metadata["attempts"] = [_summary(attempt) for attempt in attempts]
+        self._remember(solution)
+        return solution
+
+    def _reach(self, attempt: _Attempt, start: FloatArray, callback: Callback | None) -> list[_Attempt]:
+        """Lead a minimum that ends outside of the tolerances to the target."""
+        if not (self.reach_target and isinstance(self.problem, HasTolerances)):
+            return []
+
+        def solve(controls: FloatArray) -> Solution:
+            return self._solve_from(_Guess("", controls, np.inf, REACH_REGULARIZATION), start, callback)
+
+        steps = reach(self.problem, attempt.solution, solve)
+        return [_Attempt(attempt.guess, step.solution, step.emphasis) for step in steps]
 
     def _remember(self, solution: Solution) -> None:
         """Add a solution to the library, if there is a place left for it and it is worth one."""
@@ -198,10 +230,10 @@ class GuidedDDP:
         return self._solver.solve(start, guess.controls, callback)
 
     def _is_good(self, solution: Solution) -> bool:
-        """Whether a solution is converged, and a success if the problem knows what that is."""
+        """Whether a solution is converged, and within the tolerances if the problem has any."""
         if not solution.converged:
             return False
-        return not isinstance(self.problem, _HasGoal) or self.problem.is_success(solution.states[-1])
+        return not isinstance(self.problem, HasTolerances) or self.problem.misses(solution.states[-1]) <= 1.0
 
     def _solve_initial_state(self) -> list[Solution]:
         """The best solution of the problem's own initial state; none if every rollout diverges."""
@@ -266,10 +298,12 @@ def _check_sizes(name: str, solution: Solution, problem: ShootingProblem) -> Non
     check_array(f"{name}.feedback_gains", solution.feedback_gains, gains)
 
 
-def _summary(guess: str, solution: Solution) -> dict[str, Any]:
+def _summary(attempt: _Attempt) -> dict[str, Any]:
     """What the metadata tell of an attempt, as JSON values."""
+    solution = attempt.solution
     return {
-        "guess": guess,
+        "guess": attempt.guess,
+        "emphasis": attempt.emphasis,
         "cost": solution.cost,
         "iterations": solution.iterations,
         "stop_reason": solution.stop_reason.value,

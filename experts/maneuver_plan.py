@@ -49,7 +49,7 @@ class ManeuverPlan:
         Raises:
             RuntimeError: If the maneuver cannot be simulated, or differentiated, from this state.
         """
-        problem = WindowProblem(maneuver, maneuver.horizon - stage, ends_early=False)
+        problem = WindowProblem(maneuver, maneuver.horizon - stage)
         solution = BoxDDP(problem).solve(x0=state, u_init=guess[stage:])
         work = ShootingWorkspace(problem, second_order=True, keep_values=True)
         work.start(state, solution.controls)

@@ -194,7 +194,8 @@ class MultipleShooting:
         steps = current.states, current.controls, self._time_step, self._landings, current.stage_costs
         self._run("step_with_cost", horizon, *steps)
         self._run("difference", horizon, current.states[1:], self._landings, self.gaps)
-        self._run("terminal_cost", 1, current.states[-1:], current.terminal_cost)
+        end = current.states[-1:], *self.work.problem.terminal_inputs
+        self._run("terminal_cost", 1, *end, current.terminal_cost)
         current.cost = float(current.stage_costs.sum() + current.terminal_cost[0])
         current.failing_stage = FINISHED
         norms = np.linalg.norm(np.vstack([self.initial_gap, self.gaps]), axis=1)

@@ -22,6 +22,7 @@ class PaperProblem:
         kernels: Its compiled functions.
     """
 
+    terminal_inputs = ()
     has_second_order = False
     has_retraction = False
 

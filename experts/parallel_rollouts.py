@@ -5,7 +5,6 @@ several step lengths fill the others: eight rollouts cost little more than one. 
 the full step has been refused.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -68,15 +67,12 @@ class _Kernels(NamedTuple):
 class ParallelRollouts:
     """Rolls a control update out with up to `LANES` step lengths at once."""
 
-    def __init__(
-        self, problem: ShootingProblem, time_step: FloatArray, terminal_inputs: Sequence[FloatArray] = ()
-    ) -> None:
+    def __init__(self, problem: ShootingProblem, time_step: FloatArray) -> None:
         """Allocate the arrays.
 
         Args:
             problem: The problem.
             time_step: The scalar that all rows share, shape (1,), s.
-            terminal_inputs: What `terminal_cost` reads besides the last state.
         """
         horizon, n_x = problem.horizon, problem.n_states
         n_t, n_u = problem.n_tangent, problem.n_controls
@@ -93,7 +89,7 @@ class ParallelRollouts:
             end_cost=np.zeros(1),
         )
         # The kernels' code and the arrays behind the tables stay as long as this object.
-        self._arrays = (time_step, *terminal_inputs)
+        self._arrays = (time_step, *problem.terminal_inputs)
         self._code = difference, step, terminal = (
             problem.kernel("difference", batched=True),
             problem.kernel("step_with_cost", batched=True),
@@ -105,7 +101,7 @@ class ParallelRollouts:
             step.address,
             buffer_table(work.states, work.controls, time_step, work.states[1:], work.stage_costs),
             terminal.address,
-            buffer_table(work.end_state, *terminal_inputs, work.end_cost),
+            buffer_table(work.end_state, *problem.terminal_inputs, work.end_cost),
         )
 
     def run(

@@ -16,6 +16,8 @@ kernels. Every kernel works on rows, see `native_call`; its buffers, each with t
 | `terminal_cost_hessian` | x (n_x); Lxx (n_t, n_t) |
 | `retract` | x (n_x), dx (n_t); x_next = x (+) dx (n_x) |
 
+The three kernels of the terminal cost read the arrays of `terminal_inputs`, a row each, after the state.
+
 Output arrays of the derivative kernels start as zeros and nobody else writes to them, so that a kernel may
 leave entries out that are always zero. The mixed derivative lux of the stage cost is taken to be zero.
 
@@ -90,6 +92,10 @@ class ShootingProblem(Protocol):
     @property
     def initial_state(self) -> FloatArray:
         """State at stage 0 unless `solve` is given another, shape (n_x,)."""
+
+    @property
+    def terminal_inputs(self) -> tuple[FloatArray, ...]:
+        """What the terminal cost reads besides the state: contiguous arrays; their numbers may change."""
 
     @property
     def has_second_order(self) -> bool:

@@ -208,8 +208,7 @@ class RecedingHorizonExpert:
             if (problem.horizon, problem.ends_early) == (horizon, ends_early):
                 return self._work
         model = (self._model_state, self._model_gradient, self._model_hessian) if ends_early else ()
-        window = WindowProblem(self.maneuver, horizon, ends_early=ends_early)
-        return ShootingWorkspace(window, second_order=False, terminal_inputs=model)
+        return ShootingWorkspace(WindowProblem(self.maneuver, horizon, model), second_order=False)
 
     def _optimize(self, work: ShootingWorkspace, state: FloatArray, scale: float) -> bool:
         """Follow the reference from a state, and improve on that; return whether the rollout is finite."""

@@ -3,7 +3,7 @@
 Everything here is done for all stages by compiled code; nothing is decided here.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
 from time import perf_counter
@@ -56,15 +56,12 @@ class Trajectory:
         terminal_buffers: Buffers of `terminal_cost`.
     """
 
-    def __init__(
-        self, problem: ShootingProblem, time_step: FloatArray, terminal_inputs: Sequence[FloatArray] = ()
-    ) -> None:
+    def __init__(self, problem: ShootingProblem, time_step: FloatArray) -> None:
         """Allocate the arrays.
 
         Args:
-            problem: Gives the sizes.
+            problem: Gives the sizes, and what its terminal cost reads; the caller keeps it alive.
             time_step: The scalar that all rows share, shape (1,), s.
-            terminal_inputs: What `terminal_cost` reads besides the last state; the caller keeps it alive.
         """
         self.states = np.zeros((problem.horizon + 1, problem.n_states))
         self.controls = np.zeros((problem.horizon, problem.n_controls))
@@ -75,7 +72,7 @@ class Trajectory:
         self.step_buffers = buffer_table(
             self.states, self.controls, time_step, self.states[1:], self.stage_costs
         )
-        self.terminal_buffers = buffer_table(self.states[-1:], *terminal_inputs, self.terminal_cost)
+        self.terminal_buffers = buffer_table(self.states[-1:], *problem.terminal_inputs, self.terminal_cost)
 
 
 @dataclass
@@ -136,7 +133,6 @@ class ShootingWorkspace:
         second_order: bool,
         *,
         keep_values: bool = False,
-        terminal_inputs: Sequence[FloatArray] = (),
         threads: int = 1,
     ) -> None:
         """Allocate all arrays of a solve.
@@ -145,8 +141,6 @@ class ShootingWorkspace:
             problem: The problem.
             second_order: Whether exact second derivatives will be asked for.
             keep_values: Whether sweeps keep the value function's derivatives at every stage.
-            terminal_inputs: Arrays that `terminal_cost` and `terminal_cost_derivatives` read, in their order,
-                between the last state and their outputs; they may change between calls.
             threads: Most threads that differentiate; sweeps and rollouts go stage by stage.
         """
         sizes = problem.horizon, problem.n_tangent, problem.n_controls
@@ -156,7 +150,6 @@ class ShootingWorkspace:
         self.derivatives = allocate_derivatives(*sizes)
         self.update: Update = allocate_update(*sizes, keep_values=keep_values)
         self._spare_update: Update = allocate_update(*sizes, keep_values=keep_values)
-        self._terminal_inputs = tuple(terminal_inputs)
         self._time_step = np.array([problem.time_step])
         self._deviations = np.zeros((problem.horizon, problem.n_tangent))
         self._no_gaps = np.zeros((0, problem.n_tangent))
@@ -171,9 +164,9 @@ class ShootingWorkspace:
         self._exact = allocate_hessians(stages, problem.n_tangent, problem.n_controls)
         self._costates = np.zeros((stages, problem.n_tangent))
         self._exact_is_current = False
-        self._parallel = ParallelRollouts(problem, self._time_step, self._terminal_inputs)
-        self.current = Trajectory(problem, self._time_step, self._terminal_inputs)
-        self.trial = Trajectory(problem, self._time_step, self._terminal_inputs)
+        self._parallel = ParallelRollouts(problem, self._time_step)
+        self.current = Trajectory(problem, self._time_step)
+        self.trial = Trajectory(problem, self._time_step)
 
     @timed("rollout")
     def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
@@ -203,8 +196,8 @@ class ShootingWorkspace:
         horizon = self.problem.horizon
         self._run("linearize", horizon, buffer_table(states, controls, self._time_step, d.A, d.B))
         self._run("cost_derivatives", horizon, buffer_table(states, controls, d.lx, d.lu, d.lxx, d.luu))
-        terminal_buffers = buffer_table(states[-1:], *self._terminal_inputs, d.terminal_lx, d.terminal_lxx)
-        self._run("terminal_cost_derivatives", 1, terminal_buffers)
+        end = states[-1:], *self.problem.terminal_inputs
+        self._run("terminal_cost_derivatives", 1, buffer_table(*end, d.terminal_lx, d.terminal_lxx))
         self._exact_is_current = False
 
     @timed("derivatives")
@@ -216,7 +209,8 @@ class ShootingWorkspace:
         find_costates(self.derivatives, self._costates)
         buffers = (states, controls, self._costates, self._time_step, exact.xx, exact.ux, exact.uu)
         self._run("lagrangian_hessian", self.problem.horizon, buffer_table(*buffers))
-        self._run("terminal_cost_hessian", 1, buffer_table(states[-1:], exact.terminal_xx))
+        end = states[-1:], *self.problem.terminal_inputs
+        self._run("terminal_cost_hessian", 1, buffer_table(*end, exact.terminal_xx))
         self._exact_is_current = True
 
     @timed("sweep")

@@ -13,26 +13,27 @@ class WindowProblem:
     """Some stages of a maneuver; implements `ShootingProblem`.
 
     A window that ends before the maneuver does has a quadratic model of the remaining cost for its terminal
-    cost. The kernels of that one read three more arrays after the state (`ShootingWorkspace` takes them as
-    `terminal_inputs`): the state around which the model holds (n_x), its gradient (n_t) and its symmetric
-    Hessian (n_t, n_t).
+    cost.
 
     Attributes:
         maneuver: The whole maneuver.
         horizon: Number of stages.
         ends_early: Whether the maneuver goes on after the last stage.
+        terminal_inputs: If it does, the quadratic model: the state around which it holds, shape (1, n_x), its
+            gradient (1, n_t) and its symmetric Hessian (1, n_t, n_t).
     """
 
-    def __init__(self, maneuver: ArmProblem, horizon: int, *, ends_early: bool) -> None:
+    def __init__(self, maneuver: ArmProblem, horizon: int, model: tuple[FloatArray, ...] = ()) -> None:
         """Take a stretch of a maneuver.
 
         Args:
             maneuver: The whole maneuver.
             horizon: Number of stages.
-            ends_early: Whether the maneuver goes on after the last stage.
+            model: `terminal_inputs` of a stretch after which the maneuver goes on; empty if it ends there.
         """
-        self.maneuver, self.horizon, self.ends_early = maneuver, horizon, ends_early
-        self.has_second_order = not ends_early
+        self.maneuver, self.horizon, self.ends_early = maneuver, horizon, bool(model)
+        self.terminal_inputs = model or maneuver.terminal_inputs
+        self.has_second_order = not self.ends_early
         self.has_retraction = True
         self.n_states, self.n_tangent = maneuver.n_states, maneuver.n_tangent
         self.n_controls = maneuver.n_controls

@@ -39,11 +39,13 @@ class DerivativePrograms:
         self.scene, self.layout, self.field = equations.scene, equations.layout, equations.field
         self.chain = equations.chain
 
-    def _state_cost_derivatives(self, x: Scalars, pose: Scalars, velocity: Scalars) -> tuple[Any, Any]:
+    def _state_cost_derivatives(
+        self, x: Scalars, pose: Scalars, velocity: Scalars, emphasis: Scalar = 1.0
+    ) -> tuple[Any, Any]:
         """Gradient and Gauss-Newton Hessian of the state's cost in tangent coordinates, sparse SX.
 
-        The tip's pose moves with the base by q_{e0/I} d q_{G/e0} / 2 for a twist increment d, with the angles
-        by (27).
+        The weights of the pose are multiplied by an emphasis. The tip's pose moves with the base by
+        q_{e0/I} d q_{G/e0} / 2 for a twist increment d, with the angles by (27).
         """
         field = self.field
         motion = field.motion(self.equations.y(x))
@@ -62,7 +64,7 @@ class DerivativePrograms:
         others = zeros(8, field.n_t - len(directions) - self._angle_count())
         by_state = casadi.sparsify(casadi.horzcat(*directions, by_angles, others))
         error = column(*tip) - casadi.DM(self.scene.target.pose.dual_quaternion)
-        weighted = casadi.mtimes(casadi.diag(casadi.DM(pose)), by_state)
+        weighted = emphasis * casadi.mtimes(casadi.diag(casadi.DM(pose)), by_state)
         gradient = 2.0 * casadi.mtimes(weighted.T, error)
         hessian = 2.0 * casadi.mtimes(by_state.T, weighted)
         start = field.n_t - field.n_y
@@ -105,15 +107,17 @@ class DerivativePrograms:
         return program
 
     def terminal_cost(self) -> Program:
-        """Gradient and Gauss-Newton Hessian of the terminal cost."""
+        """Gradient and Gauss-Newton Hessian of the terminal cost, with an emphasis on its pose."""
         field, cost = self.field, self.scene.cost
-        x = symbols("x", field.n_x)
-        gradient, hessian = self._state_cost_derivatives(x, cost.terminal_pose, cost.terminal_base_velocity)
+        x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
+        gradient, hessian = self._state_cost_derivatives(
+            x, cost.terminal_pose, cost.terminal_base_velocity, emphasis
+        )
         outputs = {"lx": casadi.densify(gradient).nonzeros(), "lxx": hessian.nonzeros()}
-        graph = graph_of("terminal_cost_derivatives_graph", {"x": x}, outputs)
+        graph = graph_of("terminal_cost_derivatives_graph", {"x": x, "emphasis": [emphasis]}, outputs)
         program = Program(
             "terminal_cost_derivatives",
-            [Buffer("x", field.n_x)],
+            [Buffer("x", field.n_x), Buffer("emphasis", 1)],
             [Buffer("lx", field.n_t), sparse_buffer("lxx", hessian.sparsity())],
         )
         program.call(graph)
@@ -176,24 +180,29 @@ class DerivativePrograms:
         return program
 
     def terminal_cost_hessian(self) -> Program:
-        """Exact Hessian of the terminal cost."""
+        """Exact Hessian of the terminal cost, with an emphasis on its pose."""
         field, cost = self.field, self.scene.cost
-        x = symbols("x", field.n_x)
-        hessian = self._state_cost_hessian(x, cost.terminal_pose, cost.terminal_base_velocity)
+        x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
+        hessian = self._state_cost_hessian(x, cost.terminal_pose, cost.terminal_base_velocity, emphasis)
         program = Program(
-            "terminal_cost_hessian", [Buffer("x", field.n_x)], [sparse_buffer("Lxx", hessian.sparsity())]
+            "terminal_cost_hessian",
+            [Buffer("x", field.n_x), Buffer("emphasis", 1)],
+            [sparse_buffer("Lxx", hessian.sparsity())],
         )
-        program.call(graph_of("terminal_cost_hessian_graph", {"x": x}, {"Lxx": hessian.nonzeros()}))
+        inputs = {"x": x, "emphasis": [emphasis]}
+        program.call(graph_of("terminal_cost_hessian_graph", inputs, {"Lxx": hessian.nonzeros()}))
         return program
 
-    def _state_cost_hessian(self, x: Scalars, pose: Scalars, velocity: Scalars) -> Matrix:
+    def _state_cost_hessian(
+        self, x: Scalars, pose: Scalars, velocity: Scalars, emphasis: Scalar = 1.0
+    ) -> Matrix:
         """Exact Hessian of the state's cost: Gauss-Newton's, and the residual times the tip's curvature.
 
         A twist increment d moves the tip to q_{e0/I} (1 + d / 2 + d^2 / 8) q_{G/e0} to second order, with
         dual quaternion products.
         """
         field, n = self.field, len(self.field.pose.directions)
-        hessian = self._state_cost_derivatives(x, pose, velocity)[1]
+        hessian = self._state_cost_derivatives(x, pose, velocity, emphasis)[1]
         base = self.equations.base_pose(x)
         increment, angles = symbols("d", n), symbols("angle", self._angle_count())
         n_joints = self.layout.n_joints
@@ -207,7 +216,7 @@ class DerivativePrograms:
         residual = casadi.SX.sym("residual", 8)
         moved = column(*increment, *angles)
         curvature = casadi.hessian(casadi.dot(residual, tip), moved)[0]
-        weighted = casadi.densify(2.0 * casadi.DM(pose) * error)
+        weighted = casadi.densify(2.0 * emphasis * casadi.DM(pose) * error)
         values = column(*[0.0] * n, *self.equations.y(x)[: len(angles)])
         curvature = casadi.substitute(
             [curvature], [casadi.vertcat(residual, moved)], [casadi.densify(casadi.vertcat(weighted, values))]

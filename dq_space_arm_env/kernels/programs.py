@@ -51,6 +51,7 @@ class ScenePrograms:
             "energy": self._energy,
             "cost": self._cost,
             "terminal_cost": self._terminal_cost,
+            "emphasized_terminal_cost": self._emphasized_terminal_cost,
             "cost_derivatives": derivatives.cost,
             "terminal_cost_derivatives": derivatives.terminal_cost,
             "terminal_cost_hessian": derivatives.terminal_cost_hessian,
@@ -177,6 +178,13 @@ class ScenePrograms:
             lambda x: {"cost": [total(self.equations.terminal_cost_terms(x))]},
             x=self.field.n_x,
         )
+
+    def _emphasized_terminal_cost(self) -> Program:
+        def outputs(x: Scalars, emphasis: Scalars) -> Mapping[str, Scalars]:
+            pose, velocity = self.equations.terminal_cost_terms(x)
+            return {"cost": [emphasis[0] * pose + velocity]}
+
+        return self._program("emphasized_terminal_cost", outputs, x=self.field.n_x, emphasis=1)
 
     # Tangent coordinates.
 

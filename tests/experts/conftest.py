@@ -49,6 +49,7 @@ class PythonProblem:
     linearize: Callable[[Array, Array, float], tuple[Array, Array]]
     cost_derivatives: Callable[[Array, Array], tuple[Array, Array, Array, Array]]
     terminal_cost_derivatives: Callable[[Array], tuple[Array, Array]]
+    terminal_inputs: tuple[Array, ...] = ()
     lagrangian_hessian: Callable[[Array, Array, Array, float], tuple[Array, Array, Array]] | None = None
     terminal_cost_hessian: Callable[[Array], Array] | None = None
     retract: Callable[[Array, Array], Array] | None = None

@@ -1,5 +1,6 @@
 """The guessing expert: policies of solved maneuvers as guesses, what wins, and what it says about it."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import gymnasium
@@ -16,6 +17,7 @@ from dq_space_arm_env.scene.start import (
 )
 from experts import BoxDDP, GuidedDDP, StopReason
 from experts.guesses import START_REGULARIZATIONS, STRAYED, ZERO_REGULARIZATION, follow
+from experts.reaching import MOST_SOLVES
 from experts.screw_motion import ScrewMotion
 
 ELSEWHERE = np.array([0.6, 0.8, -0.2, 0.7])  # another start of the unicycle
@@ -26,16 +28,22 @@ def names(solution):
 
 
 class WithGoal:
-    """A problem whose task counts every final state as a success, or none."""
+    """A problem whose task counts every final state as a success, or none, whatever is emphasized."""
 
-    def __init__(self, problem, answer):
-        self._problem, self._answer = problem, answer
+    def __init__(self, problem, success):
+        self._problem, self._success = problem, success
 
     def __getattr__(self, name):
         return getattr(self._problem, name)
 
-    def is_success(self, state):
-        return self._answer
+    def misses(self, state):
+        return 0.5 if self._success else 2.0
+
+    def emphasized(self, emphasis):
+        return nullcontext()
+
+    def end_cost(self, state):
+        return 0.0
 
 
 # The guess -------------------------------------------------------------------------------------------------
@@ -118,16 +126,16 @@ def test_a_screw_motion_is_solved_first_if_its_rollout_is_cheaper_than_that_of_a
 def test_a_policy_with_the_cheaper_rollout_comes_first_all_the_same(unicycle):
     far = BoxDDP(unicycle).solve(np.array([0.0, 1.0, 0.05, 0.05]))
     problem = WithGoal(WithScrewMotion(unicycle, *drifting(unicycle, ELSEWHERE)), False)
-    solution = GuidedDDP(problem, library=[far], attempts=3).solve(ELSEWHERE)
-    assert names(solution) == ["policy 0", "screw motion", "zero controls"]
-    assert names(GuidedDDP(problem, library=[far]).solve(ELSEWHERE)) == ["policy 0", "zero controls"]
+    three, two = (GuidedDDP(problem, library=[far], attempts=n, reach_target=False) for n in (3, 2))
+    assert names(three.solve(ELSEWHERE)) == ["policy 0", "screw motion", "zero controls"]
+    assert names(two.solve(ELSEWHERE)) == ["policy 0", "zero controls"]
 
 
 def test_where_a_policy_is_near_no_screw_motion_is_asked_for(unicycle):
     near = BoxDDP(unicycle).solve()
     assert follow(near, unicycle, ELSEWHERE)[1] < STRAYED * near.cost
     problem = WithGoal(WithScrewMotion(unicycle, *drifting(unicycle, ELSEWHERE)), False)
-    solution = GuidedDDP(problem, library=[near], attempts=3).solve(ELSEWHERE)
+    solution = GuidedDDP(problem, library=[near], attempts=3, reach_target=False).solve(ELSEWHERE)
     assert names(solution) == ["policy 0", "zero controls"]
 
 
@@ -192,9 +200,19 @@ def test_guesses_are_tried_until_one_converges_and_the_cheapest_is_kept(unicycle
 
 @pytest.mark.parametrize(("success", "attempts"), [(True, 1), (False, 2)])
 def test_a_final_state_that_is_no_success_calls_for_another_guess(unicycle, success, attempts):
-    solution = GuidedDDP(WithGoal(unicycle, success)).solve(ELSEWHERE)
+    solution = GuidedDDP(WithGoal(unicycle, success), reach_target=False).solve(ELSEWHERE)
     assert solution.converged
     assert len(names(solution)) == attempts
+
+
+def test_an_emphasis_that_does_not_help_is_given_up(unicycle):
+    solution = GuidedDDP(WithGoal(unicycle, False), attempts=1).solve(ELSEWHERE)
+    emphases = [attempt["emphasis"] for attempt in solution.metadata["attempts"]]
+    assert emphases[0] == 1.0
+    assert emphases[1:] == sorted(emphases[1:])
+    assert 1 < len(emphases) <= 1 + MOST_SOLVES
+    assert solution.metadata["emphasis"] == 1.0
+    assert solution.cost == GuidedDDP(unicycle, attempts=1).solve(ELSEWHERE).cost
 
 
 def test_if_every_rollout_diverges_the_solution_says_so(double_integrator):
@@ -346,10 +364,10 @@ def test_a_library_serves_the_same_scene_with_another_target(seed):
 
 @pytest.mark.slow
 def test_fifty_random_starts(paper):
-    """Convergence, effort, and cost beside the best that either expert finds.
+    """Convergence, success, effort, and cost beside the best that either expert finds.
 
-    Two starts in three can be brought to within 10 cm by a minimum of the cost, in which thrusters are dear:
-    what ends farther away does so from zero controls as well.
+    Of the cheapest maneuvers a third ends farther than 10 cm from the target, for thrusters are dear: these
+    starts need the emphasis.
     """
     starts = [random_start("paper", seed) for seed in range(50)]
     guided = [paper.solve(start) for start in starts]
@@ -361,9 +379,8 @@ def test_fifty_random_starts(paper):
     assert np.mean([solution.converged for solution in guided]) >= 0.98
     assert np.median(iterations) <= 20
     assert np.mean(costs <= 1.01 * np.minimum(costs, others_costs)) >= 0.98
-    assert success.mean() >= 0.65
-    missed = [paper.problem.is_success(s.states[-1]) for s in others]
-    assert not np.any(missed & ~success & (others_costs <= 1.01 * costs))
+    assert success.mean() >= 0.98
+    assert np.mean([paper.problem.is_success(s.states[-1]) for s in others]) <= 0.8
 
 
 @pytest.mark.slow
