@@ -8,7 +8,7 @@ does: fused multiply-adds are chosen here, not by the back end.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from llvmlite import ir
@@ -149,19 +149,28 @@ _LOGICAL = {"not", "and", "or", *_COMPARISONS}
 class _GraphEmitter:
     """Walks a graph's nodes once and emits each of them when a reader asks for it."""
 
-    def __init__(self, graph: Graph, builder: VectorBuilder, inputs: list[ir.Value]) -> None:
+    def __init__(self, graph: Graph, builder: VectorBuilder, pointers: Sequence[ir.Value]) -> None:
         self.graph = graph
         self.builder = builder
-        self.inputs = inputs
+        self.inputs, outputs = pointers[: len(graph.inputs)], pointers[len(graph.inputs) :]
+        self.places: dict[int, list[tuple[ir.Value, int]]] = {}
+        for pointer, indices in zip(outputs, graph.results, strict=True):
+            for position, index in enumerate(indices):
+                self.places.setdefault(index, []).append((pointer, position))
         self.uses = use_counts(graph)
         self.values: list[ir.Value | None] = [None] * len(graph.nodes)
         self.angles: dict[int, tuple[ir.Value, ir.Value]] = {}
 
     def run(self) -> None:
-        """Emit every node except products that the sum reading them absorbs into a fused multiply-add."""
+        """Emit every node except products that the sum reading them absorbs into a fused multiply-add.
+
+        A result is stored as soon as it is there, so that it occupies no register until the end.
+        """
         for index, node in enumerate(self.graph.nodes):
-            if not self._is_fusible(index):
+            if not self._is_fusible(index) or index in self.places:
                 self.values[index] = self._emit(node)
+            for pointer, position in self.places.get(index, ()):
+                self.builder.store(self.value(index), pointer, position)
 
     def value(self, index: int) -> ir.Value:
         """The emitted value of a node, as a number in every lane."""
@@ -289,10 +298,6 @@ def emit_graph(module: ir.Module, graph: Graph, target: Target) -> ir.Function:
     for argument in function.args:
         argument.add_attribute("noalias")
     builder = VectorBuilder(ir.IRBuilder(function.append_basic_block("entry")), target)
-    emitter = _GraphEmitter(graph, builder, list(function.args[: len(graph.inputs)]))
-    emitter.run()
-    for pointer, indices in zip(function.args[len(graph.inputs) :], graph.results, strict=True):
-        for position, index in enumerate(indices):
-            builder.store(emitter.value(index), pointer, position)
+    _GraphEmitter(graph, builder, function.args).run()
     builder.ir.ret_void()
     return function

@@ -27,6 +27,7 @@ from dq_space_arm_env.compiler.emit import (
     emit_graph,
 )
 from dq_space_arm_env.compiler.graph import Graph
+from dq_space_arm_env.compiler.placement import Lifetime, place
 from dq_space_arm_env.compiler.transpose import ArrayAccess
 
 
@@ -127,6 +128,21 @@ class Program:
             known.update(call.bindings.get(name, name) for name, _ in call.graph.outputs)
         return early
 
+    def lifetimes(self) -> dict[str, Lifetime]:
+        """When each buffer is needed: inputs from the start, outputs to the end, initial zeros always."""
+        end = len(self.calls)
+        always = self.read_before_written()
+        used = {buffer.name: [-1] for buffer in self.inputs}
+        for number, call in enumerate(self.calls):
+            for name, _ in (*call.graph.inputs, *call.graph.outputs):
+                used.setdefault(call.bindings.get(name, name), []).append(number)
+        for buffer in self.outputs:
+            used.setdefault(buffer.name, [-1]).append(end)
+        return {
+            name: Lifetime(-1, end) if name in always else Lifetime(min(numbers), max(numbers))
+            for name, numbers in used.items()
+        }
+
 
 def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     """Add a program to a module as an external function of its name, with the graphs that it calls.
@@ -154,15 +170,14 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     head, body, done = (kernel.append_basic_block(name) for name in ("head", "body", "done"))
     builder = ir.IRBuilder(entry)
     vectors = VectorBuilder(builder, target)
-    # Each array's address, and a block of vectors on the stack for every buffer, stay fixed over the loop.
+    # Each array's address, and the place on the stack of every buffer's vectors, stay fixed over the loop.
     arrays = _Arrays(builder, program, addresses)
-    blocks = {}
-    for name, size in sizes.items():
-        block = builder.alloca(vectors.type, size=INDEX(max(size, 1)))
-        block.align = vectors.alignment
-        blocks[name] = block
-        if name in zeroed:
-            _clear(builder, block, vectors.alignment * size)
+    starts, total = place(sizes, program.lifetimes())
+    stack = builder.alloca(vectors.type, size=INDEX(max(total, 1)))
+    stack.align = vectors.alignment
+    blocks = {name: vectors.address(stack, start) for name, start in starts.items()}
+    for name in zeroed:
+        _clear(builder, blocks[name], vectors.alignment * sizes[name])
     builder.branch(head)
 
     builder.position_at_end(head)

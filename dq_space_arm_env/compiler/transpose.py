@@ -70,20 +70,23 @@ class ArrayAccess:
             size: Numbers that are written to a row.
             positions: Where in a row each of them goes; None for one after another.
         """
-        lanes = self.lanes
-        width = 1 if positions else _square_width(size, lanes)
+        for run in _runs(positions or range(size)):
+            width = _square_width(len(run), self.lanes)
+            for start in _square_starts(len(run), width):
+                columns = [self._stored(block, index) for _, index in run[start : start + width]]
+                self._scatter_square(columns, rows, run[start][0])
+
+    def _scatter_square(self, columns: list[ir.Value], rows: Sequence[ir.Value], position: int) -> None:
+        """Write vectors next to each other, in squares of as many lanes."""
+        width = len(columns)
         if width == 1:
-            for index, position in enumerate(positions or range(size)):
-                vector = self._stored(block, index)
-                for lane, row in enumerate(rows):
-                    self._store(self._lane_of(vector, lane), row, position)
+            for lane, row in enumerate(rows):
+                self._store(self._lane_of(columns[0], lane), row, position)
             return
-        for start in _square_starts(size, width):
-            columns = [self._stored(block, start + column) for column in range(width)]
-            for first in range(0, lanes, width):
-                square = self._transposed([self._part(column, first, width) for column in columns])
-                for row, vector in zip(rows[first : first + width], square, strict=True):
-                    self._store(vector, row, start)
+        for first in range(0, self.lanes, width):
+            square = self._transposed([self._part(column, first, width) for column in columns])
+            for row, vector in zip(rows[first : first + width], square, strict=True):
+                self._store(vector, row, position)
 
     def scatter_columns(
         self, block: ir.Value, array: ir.Value, pitch: ir.Value, rows: Sequence[ir.Value], size: int
@@ -216,6 +219,17 @@ class ArrayAccess:
     def _store(self, value: ir.Value, row: ir.Value, index: int) -> None:
         address = self.vectors.ir.gep(row, [INDEX(index)], source_etype=self.element)
         self.vectors.ir.store(value, address, align=BYTES[self.dtype])
+
+
+def _runs(positions: Sequence[int]) -> list[list[tuple[int, int]]]:
+    """Positions next to each other, in ascending order, each with its number in the sequence."""
+    runs: list[list[tuple[int, int]]] = []
+    for position, index in sorted(zip(positions, range(len(positions)), strict=True)):
+        if runs and runs[-1][-1][0] + 1 == position:
+            runs[-1].append((position, index))
+        else:
+            runs.append([(position, index)])
+    return runs
 
 
 def _square_width(size: int, lanes: int) -> int:

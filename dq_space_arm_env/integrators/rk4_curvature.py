@@ -7,13 +7,18 @@ tau_s through the twist of the stage. Then the second derivative is
 
     sum_s Z_s' H_s Z_s + (terms of pairs of twists) + (terms of twists and pose),   H_s = mu_s . f_zz,
 
-because nothing else than f and the pose update is curved. Sums of products that are symmetric only as a whole
-are collected as X and added to their transpose at the end.
+because nothing else than f and the pose update is curved.
+
+It is collected as X, which is added to its transpose at the end, so each mixed derivative may stand on either
+side of the diagonal. It stands in the row of the state that couples with more others: the rows of the inputs
+and of the base's linear velocity stay empty then, and with them half of the work is saved. B_s is H_s in this
+form, and C_s holds what the pairs of twists add to the same rows: X = sum_s Z_s' (B_s Z_s + C_s).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import casadi
@@ -21,15 +26,10 @@ import casadi
 from dq_space_arm_env.compiler.graph import graph_of, trace
 from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.compiler.symbols import column, symbols, zeros
-from dq_space_arm_env.integrators.curvature import pose_curvature, upper_triangle
+from dq_space_arm_env.integrators.curvature import upper_triangle
 from dq_space_arm_env.integrators.field import TwiceDifferentiableField, graph_inputs, split_state
-from dq_space_arm_env.integrators.rk4_stages import (
-    OFFSETS,
-    WEIGHTS,
-    pose_increment,
-    stage_pattern,
-    stage_twists,
-)
+from dq_space_arm_env.integrators.rk4_pose_curvature import TwistCurvature, twist_curvature
+from dq_space_arm_env.integrators.rk4_stages import OFFSETS, WEIGHTS, stage_pattern, stage_twists
 
 Scalar = Any
 Matrix = Any
@@ -41,7 +41,7 @@ class StepCurvature:
     """The graphs of one field; `append` calls them in order."""
 
     def __init__(self, field: TwiceDifferentiableField) -> None:
-        """Find out which entries can be nonzero.
+        """Find out which entries can be nonzero, and on which side of the diagonal they stand.
 
         Args:
             field: The equations of motion.
@@ -55,10 +55,23 @@ class StepCurvature:
         self.change = stage_pattern(field)
         rates, multiplier = symbols("k", n_y), symbols("m", n_y)
         hessian = field.rates_hessian(y, u, rates, by_y, by_u, multiplier)
+        pose = self._pose_derivatives(symbols("x", field.n_x), [y] * 3, casadi.SX.sym("h"), multiplier)
+        blocks = [block.sparsity() for block in pose.twice.values()]
+        twice = _union(blocks + [block.T for block in blocks])
         twists = zeros(n_y + n_u, n_y + n_u)
-        twists[self.twist, self.twist] = casadi.SX.ones(len(self.twist), len(self.twist))
-        self.hessian = casadi.triu((hessian + twists).sparsity())
-        self.sum = self._sum_pattern()
+        twists[self.twist, self.twist] = casadi.SX(twice)
+        coupled = hessian.sparsity().unite(casadi.sparsify(twists).sparsity())
+        # Each of (y, u) ranks before those that couple with fewer.
+        couplings = [end - begin for begin, end in pairwise(coupled.colind())]
+        order = sorted(range(n_y + n_u), key=lambda i: -couplings[i])
+        rank = [order.index(i) for i in range(n_y + n_u)]
+        self.half = _half(coupled, rank)
+        self.twice, self.twist_half = twice, _half(twice, [rank[i] for i in self.twist])
+        self.by_pose = _union(block.sparsity() for block in pose.by_pose.values())
+        moved = self._moved(1.0, casadi.SX.sym("K", self.change))[self.twist, :]
+        self.pairs = casadi.mtimes(casadi.SX(self.twist_half), moved).sparsity()
+        self.pose_sum = casadi.mtimes(casadi.SX(self.by_pose), moved).sparsity()
+        self.sum = self._stage_sum(*self._stage_symbols()).sparsity()
 
     def append(self, program: Program) -> Any:
         """Append all calls.
@@ -99,7 +112,7 @@ class StepCurvature:
                 by_twist=f"tau{s}",
                 twist_hessian=f"W{s}{s}",
                 nu=f"nu{s}",
-                hessian=f"H{s}",
+                half=f"B{s}",
             )
         program.call(self._twist_pairs())
         congruence = self._congruence()
@@ -108,7 +121,7 @@ class StepCurvature:
                 congruence,
                 offset=f"offset{s}",
                 change=f"K{s - 1}",
-                hessian=f"H{s}",
+                half=f"B{s}",
                 pairs=f"C{s}",
                 by_pose=f"D{s}",
                 sum=f"X{s - 1}",
@@ -171,45 +184,36 @@ class StepCurvature:
             {"rate_change": casadi.project(rate_change, self.change).nonzeros()},
         )
 
+    def _pose_derivatives(
+        self, x: Sequence[Scalar], stages: Sequence[Sequence[Scalar]], h: Scalar, multiplier: Sequence[Scalar]
+    ) -> TwistCurvature:
+        """Derivatives of multiplier . (new pose) by the twists, for the rates of the first three stages."""
+        field, n = self.field, len(self.twist)
+        twists = stage_twists(field.pose, split_state(field, x)[1], stages, h)
+        return twist_curvature(field.pose, [column(*twist) for twist in twists], h, multiplier[:n])
+
     def _pose(self) -> Any:
         """Graph of the derivatives of multiplier . (new pose) with respect to the twists of the stages.
 
-        Gradients tau_s; Hessian blocks W_st, upper triangles for s = t; and D_s, with respect to the old pose
-        and the twist of stage s.
+        Gradients tau_s; Hessian blocks W_st, in half for s = t; and D_s, with respect to the old pose and the
+        twist of stage s.
         """
-        field, n = self.field, len(self.twist)
+        field = self.field
         x, h = symbols("x", field.n_x), casadi.SX.sym("h")
         stages = [symbols(f"k{s}", field.n_y) for s in STAGES[:-1]]
-        multiplier = symbols("l", n + field.n_y)
-        free = [symbols(f"w{s}", n) for s in STAGES]
-        names = column(*(entry for twist in free for entry in twist))
-        increment = pose_increment(field.pose, free, h)
-        slope = casadi.jacobian(column(*(increment[i] for i in field.pose.directions)), names)
-        curved = pose_curvature(field.pose, increment, multiplier[:n])
-        weights = symbols("g", n)
-        bracket = casadi.dot(column(*weights), column(*(increment[i] for i in field.pose.directions)))
-        twice = casadi.substitute(
-            casadi.hessian(bracket, names)[0], column(*weights), casadi.densify(curved.by_increment)
-        )
-        twice = twice + casadi.mtimes(slope.T, casadi.mtimes(curved.increment_twice, slope))
-        gradient = casadi.mtimes(slope.T, curved.by_increment)
-        mixed = casadi.mtimes(curved.mixed, slope)
-        twists = stage_twists(field.pose, split_state(field, x)[1], stages, h)
-        values = casadi.densify(column(*(entry for twist in twists for entry in twist)))
-        gradient, twice, mixed = casadi.substitute([gradient, twice, mixed], [names], [values])
-        parts = [list(range(n * s, n * (s + 1))) for s in range(4)]
-        outputs = {f"tau{s}": _entries(gradient[part, 0]) for s, part in zip(STAGES, parts, strict=True)}
-        for s, part in zip(STAGES, parts, strict=True):
-            outputs[f"D{s}"] = _entries(mixed[:, part])
-            for t in range(1, s):
-                outputs[f"W{s}{t}"] = _entries(twice[part, parts[t - 1]])
-            outputs[f"W{s}{s}"] = _entries(twice[part, part])
+        multiplier = symbols("l", len(self.twist) + field.n_y)
+        pose = self._pose_derivatives(x, stages, h, multiplier)
+        outputs = {f"tau{s}": casadi.densify(pose.by_twist[s]).nonzeros() for s in STAGES}
+        for (s, t), block in pose.twice.items():
+            pattern = self.twist_half if s == t else self.twice
+            outputs[f"W{s}{t}"] = casadi.project(block, pattern).nonzeros()
+        outputs |= {f"D{s}": casadi.project(pose.by_pose[s], self.by_pose).nonzeros() for s in STAGES}
         inputs = {"x": x, "h": [h], "multiplier": multiplier}
         inputs |= {f"k{s}": k for s, k in enumerate(stages, start=1)}
         return graph_of(f"{field.name}_rk4_pose_curvature", inputs, outputs)
 
     def _stage(self) -> Any:
-        """Graph of the multipliers of a stage, and of the Hessian of what they weight."""
+        """Graph of the multipliers of a stage, and of half of the Hessian of what they weight."""
         field, n = self.field, len(self.twist)
         n_y, n_u = field.n_y, field.n_u
         x, u, k = symbols("x", field.n_x), symbols("u", n_u), symbols("k", n_y)
@@ -217,10 +221,12 @@ class StepCurvature:
         offset, later_offset, weight = symbols("a", 3)
         multiplier = symbols("l", n + n_y)
         by_y, by_u = casadi.SX.sym("F", self.by_y), casadi.SX.sym("G", self.by_u)
-        twist_hessian = casadi.SX.sym("W", n, n)
+        twist_hessian = casadi.SX.sym("W", self.twist_half)
         mu = [weight * a + later_offset * b for a, b in zip(multiplier[n:], later, strict=True)]
         hessian = field.rates_hessian(self._start(x, k, offset), u, rates, by_y, by_u, mu)
-        hessian[self.twist, self.twist] = hessian[self.twist, self.twist] + twist_hessian
+        half = casadi.project(hessian, self.half)
+        half[self.twist, self.twist] = half[self.twist, self.twist] + twist_hessian
+        half = casadi.project(half - 0.5 * casadi.diag(casadi.diag(half)), self.half)
         nu = casadi.densify(casadi.mtimes(by_y.T, column(*mu)))
         nu[self.twist] = nu[self.twist] + column(*by_twist)
         inputs: dict[str, Sequence[Scalar]] = {"x": x, "u": u, "k": k, "offset": [offset], "rates": rates}
@@ -230,64 +236,57 @@ class StepCurvature:
         return graph_of(
             f"{field.name}_rk4_stage_curvature",
             graph_inputs(field, **inputs),
-            {"nu": nu.nonzeros(), "hessian": casadi.project(casadi.triu(hessian), self.hessian).nonzeros()},
+            {"nu": nu.nonzeros(), "half": half.nonzeros()},
         )
 
     def _twist_pairs(self) -> Any:
-        """Graph of C_s = sum over t < s of W_st (derivative of twist t)."""
+        """Graph of C_s: what second derivatives by two twists add to the rows of stage s."""
         field, n = self.field, len(self.twist)
-        blocks = {(s, t): casadi.SX.sym(f"W{s}{t}", n, n) for s in STAGES for t in range(1, s)}
-        changes = [casadi.SX.sym(f"K{s}", self.change) for s in (1, 2)]
+        blocks = {(s, t): casadi.SX.sym(f"W{s}{t}", self.twice) for s in STAGES for t in range(1, s)}
+        changes = [casadi.SX.sym(f"K{s}", self.change) for s in STAGES[:-1]]
         h = casadi.SX.sym("h")
-        moved = [self._moved(0.0, changes[0])[self.twist, :]]
-        for offset, change in zip(OFFSETS[1:], changes, strict=False):
-            moved.append(self._moved(offset * h, change)[self.twist, :])
-        outputs = {}
-        for s in STAGES[1:]:
-            total = zeros(n, field.n_y + field.n_u)
-            for t in range(1, s):
-                total = total + casadi.mtimes(blocks[s, t], moved[t - 1])
-            outputs[f"C{s}"] = casadi.project(total, self._pair_pattern()).nonzeros()
+        moved = {1: casadi.horzcat(casadi.SX.eye(field.n_y), zeros(field.n_y, field.n_u))[self.twist, :]}
+        for s, change in zip(STAGES[1:], changes, strict=True):
+            moved[s] = self._moved(OFFSETS[s - 1] * h, change)[self.twist, :]
+        totals = {s: zeros(n, field.n_y + field.n_u) for s in STAGES}
+        for (s, t), block in blocks.items():
+            # A mixed derivative that does not stand in a row of stage s stands in one of stage t.
+            own = casadi.project(block, self.twist_half)
+            totals[s] += casadi.mtimes(own, moved[t])
+            totals[t] += casadi.mtimes(casadi.sparsify(block - own).T, moved[s])
         inputs: dict[str, Sequence[Scalar]] = {"h": [h]}
         inputs |= {f"K{s}": change.nonzeros() for s, change in enumerate(changes, start=1)}
         inputs |= {f"W{s}{t}": block.nonzeros() for (s, t), block in blocks.items()}
+        outputs = {f"C{s}": casadi.project(total, self.pairs).nonzeros() for s, total in totals.items()}
         return graph_of(f"{field.name}_rk4_twist_pairs", inputs, outputs)
 
-    def _pair_pattern(self) -> Any:
-        """Sparsity of C_s: the columns that any twist depends on, all of them filled."""
-        twist = self._moved(1.0, casadi.SX.sym("K", self.change))[self.twist, :]
-        return (casadi.SX.ones(len(self.twist), len(self.twist)) @ twist).sparsity()
+    def _stage_symbols(self) -> tuple[Scalar, Matrix, Matrix, Matrix]:
+        """Symbols a_s h, K_{s-1}, B_s, C_s."""
+        named = {"K": self.change, "B": self.half, "C": self.pairs}
+        return (casadi.SX.sym("offset"), *(casadi.SX.sym(name, p) for name, p in named.items()))
 
-    def _sums(self, offset: Scalar, change: Matrix, hessian: Matrix, pairs: Matrix) -> Matrix:
-        """Z' (H Z / 2 + C): with its transpose, what a stage adds to the second derivative."""
+    def _stage_sum(self, offset: Scalar, change: Matrix, half: Matrix, pairs: Matrix) -> Matrix:
+        """Z' (B Z + C): with its transpose, what a stage adds to the second derivative."""
         n_y, n_u = self.field.n_y, self.field.n_u
         inputs = casadi.horzcat(zeros(n_u, n_y), casadi.SX.eye(n_u))
         start = casadi.vertcat(self._moved(offset, change), inputs)
-        half = hessian - 0.5 * casadi.diag(casadi.diag(hessian))
-        both = 0.5 * (half + half.T)
-        product = casadi.mtimes(both, start)
+        product = casadi.mtimes(half, start)
         product[self.twist, :] = product[self.twist, :] + pairs
-        return casadi.sparsify(casadi.mtimes(start.T, product))
-
-    def _sum_pattern(self) -> Any:
-        parts = (casadi.SX.sym("K", self.change), casadi.SX.sym("H", self.hessian))
-        return self._sums(1.0, *parts, casadi.SX.sym("C", self._pair_pattern())).sparsity()
+        return casadi.sparsify(casadi.mtimes(start.T, casadi.sparsify(product)))
 
     def _congruence(self) -> Any:
         """Graph that adds a stage to X, and to the second derivative with respect to pose and (y, u)."""
-        field, n = self.field, len(self.twist)
-        offset, change = casadi.SX.sym("offset"), casadi.SX.sym("K", self.change)
-        hessian, pairs = casadi.SX.sym("H", self.hessian), casadi.SX.sym("C", self._pair_pattern())
-        old, by_pose = casadi.SX.sym("X", self.sum), casadi.SX.sym("D", n, n)
-        pose_old = casadi.SX.sym("P", self._pair_pattern())
-        new = old + self._sums(offset, change, hessian, pairs)
+        offset, change, half, pairs = self._stage_symbols()
+        old, by_pose = casadi.SX.sym("X", self.sum), casadi.SX.sym("D", self.by_pose)
+        pose_old = casadi.SX.sym("P", self.pose_sum)
+        new = old + self._stage_sum(offset, change, half, pairs)
         pose_new = pose_old + casadi.mtimes(by_pose, self._moved(offset, change)[self.twist, :])
         return graph_of(
-            f"{field.name}_rk4_congruence",
+            f"{self.field.name}_rk4_congruence",
             {
                 "offset": [offset],
                 "change": change.nonzeros(),
-                "hessian": hessian.nonzeros(),
+                "half": half.nonzeros(),
                 "pairs": pairs.nonzeros(),
                 "by_pose": by_pose.nonzeros(),
                 "sum": old.nonzeros(),
@@ -295,27 +294,30 @@ class StepCurvature:
             },
             {
                 "new_sum": casadi.project(new, self.sum).nonzeros(),
-                "new_pose_sum": casadi.project(pose_new, self._pair_pattern()).nonzeros(),
+                "new_pose_sum": casadi.project(pose_new, self.pose_sum).nonzeros(),
             },
         )
 
     def _total(self) -> tuple[Any, Any]:
         """Graph that puts everything together, with stage 1, whose start is that of the step."""
         field, n = self.field, len(self.twist)
-        total, pose = casadi.SX.sym("X", self.sum), casadi.SX.sym("P", self._pair_pattern())
-        hessian, by_pose = casadi.SX.sym("H", self.hessian), casadi.SX.sym("D", n, n)
+        later, pose = casadi.SX.sym("X", self.sum), casadi.SX.sym("P", self.pose_sum)
+        _, _, half, pairs = self._stage_symbols()
+        by_pose = casadi.SX.sym("D", self.by_pose)
+        total = later + half
+        total[self.twist, :] = total[self.twist, :] + pairs
         first = zeros(n, field.n_y + field.n_u)
         first[:, self.twist] = by_pose
-        without_pose = hessian + casadi.triu(total + total.T)
         above = casadi.horzcat(zeros(n, n), pose + first)
-        below = casadi.horzcat(zeros(field.n_y + field.n_u, n), without_pose)
+        below = casadi.horzcat(zeros(field.n_y + field.n_u, n), casadi.triu(total + total.T))
         curvature = upper_triangle(casadi.vertcat(above, below))
         graph = graph_of(
             f"{field.name}_rk4_curvature",
             {
-                "X4": total.nonzeros(),
+                "X4": later.nonzeros(),
                 "P4": pose.nonzeros(),
-                "H1": hessian.nonzeros(),
+                "B1": half.nonzeros(),
+                "C1": pairs.nonzeros(),
                 "D1": by_pose.nonzeros(),
             },
             {"curvature": curvature.nonzeros()},
@@ -323,6 +325,15 @@ class StepCurvature:
         return graph, curvature.sparsity()
 
 
-def _entries(block: Matrix) -> list[Scalar]:
-    """All entries of a matrix, column by column, zeros included."""
-    return list(casadi.densify(block).nonzeros())
+def _union(patterns: Iterable[Any]) -> Any:
+    """Entries that any of the patterns has."""
+    first, *others = patterns
+    for pattern in others:
+        first = first.unite(pattern)
+    return first
+
+
+def _half(pattern: Any, rank: Sequence[int]) -> Any:
+    """Half of a symmetric pattern: the entries whose row does not rank after their column."""
+    kept = [(i, j) for i, j in zip(*pattern.get_triplet(), strict=True) if rank[i] <= rank[j]]
+    return casadi.Sparsity.triplet(*pattern.shape, [i for i, _ in kept], [j for _, j in kept])

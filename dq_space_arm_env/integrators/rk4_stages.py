@@ -37,22 +37,23 @@ def stage_twists(
 
 
 def pose_increment(pose: PoseCoordinates, twists: Sequence[Sequence[Scalar]], h: Scalar) -> list[Scalar]:
-    """Omega after one step, 6 numbers.
-
-    Stage i starts from Omega_i = OFFSETS[i] h w_{i-1} and has the slope w_i = dexp^-1(omega_i), where dexp^-1
-    may stop after the second commutator without losing order 4. For twists the commutator is the dual cross
-    product.
-    """
+    """Omega after one step, 6 numbers; stage i starts from Omega_i = OFFSETS[i] h w_{i-1}."""
     slopes: list[Sequence[Scalar]] = []
     for offset, free in zip(OFFSETS, twists, strict=True):
         omega = pose.full_twist(free)
-        if slopes:
-            start = [offset * h * entry for entry in slopes[-1]]
-            once = dual_cross(start, omega)
-            twice = dual_cross(start, once)
-            omega = [w + 0.5 * a + (1 / 12) * b for w, a, b in zip(omega, once, twice, strict=True)]
-        slopes.append(omega)
+        slopes.append(stage_slope([offset * h * entry for entry in slopes[-1]], omega) if slopes else omega)
     return advance([0.0] * 6, slopes, h)
+
+
+def stage_slope(start: Sequence[Scalar], omega: Sequence[Scalar]) -> list[Scalar]:
+    """Omega' = dexp^-1(omega) at Omega = start, 6 numbers.
+
+    The series may stop after the second commutator without losing order 4. For twists the commutator is the
+    dual cross product.
+    """
+    once = dual_cross(start, omega)
+    twice = dual_cross(start, once)
+    return [w + 0.5 * a + (1 / 12) * b for w, a, b in zip(omega, once, twice, strict=True)]
 
 
 def stage_pattern(field: VectorField) -> Any:

@@ -162,6 +162,19 @@ def test_a_shared_input_is_read_by_all_rows_and_scattered_outputs_leave_the_rest
 
 
 @pytest.mark.parametrize("lanes", LANES)
+def test_scattered_outputs_find_their_places_in_runs_of_every_length(lanes):
+    places = [i for first, end in ((1, 2), (4, 7), (9, 17), (20, 31)) for i in range(first, end)]
+    order = np.random.default_rng(3).permutation(places)
+    outputs = [Buffer("y", len(order), positions=tuple(order.tolist()), stride=33)]
+    program = program_of(lambda x: {"y": [2 * entry for entry in x]}, outputs, x=len(order))
+    x, y = np.random.default_rng(4).normal(size=(19, len(order))), np.full((19, 33), 9.0)
+    run(program, lanes, 19, x, y)
+    expected = np.full((19, 33), 9.0)
+    expected[:, order] = 2 * x
+    np.testing.assert_array_equal(y, expected)
+
+
+@pytest.mark.parametrize("lanes", LANES)
 def test_only_the_rows_asked_for_are_written(lanes):
     program = program_of(lambda x: {"y": [2 * x[0]]}, [Buffer("y", 1)], x=1)
     kernel = native.NativeKernel(program.name, *build_program(program, lanes))
