@@ -11,20 +11,23 @@ from typing import NamedTuple
 import numpy as np
 
 from experts.box_qp import NOT_POSITIVE_DEFINITE, BoxQPWorkspace, box_qp, box_qp_workspace
-from experts.compilation import compiled
+from experts.compilation import compiled, inlined
 from experts.derivatives import Derivatives, Hessians
 from experts.padded_algebra import (
     FloatArray,
     add_block,
+    add_product,
     add_product_upper,
     add_vector_product,
-    copy_block,
+    copy_in,
     mirror_upper,
-    padded,
+    padded_zeros,
     prefetch,
+    prefetch_to_write,
     set_product,
     solve_in_place,
 )
+from experts.vector_tiles import copy_row_out, set_row_sum, set_vector_sum
 
 SWEEP_DONE = 0
 SWEEP_NOT_POSITIVE_DEFINITE = 1
@@ -81,25 +84,26 @@ class SweepOutcome(NamedTuple):
 
 
 class SweepWorkspace(NamedTuple):
-    """Work arrays of one stage; nt and nu are n_t and n_u rounded up to whole vectors.
+    """Work arrays of one stage; nt and nu are row lengths, n_t and n_u rounded up to whole vectors.
 
     Attributes:
-        A: Derivative of the next state with respect to the state, shape (nt, nt).
-        B: Derivative of the next state with respect to the control, shape (nt, nu).
-        VA: Vxx A, shape (nt, nt).
-        VB: Vxx B, shape (nt, nu).
-        Vxx: Hessian of the value function; between expansion and update it holds Qxx, upper triangle; (nt,
+        A: Derivative of the next state with respect to the state, shape (n_t, nt).
+        B: Derivative of the next state with respect to the control, shape (n_t, nu).
+        VA: Vxx A, shape (n_t, nt).
+        VB: Vxx B, shape (n_t, nu).
+        Vxx: Hessian of the value function; between expansion and update it holds Qxx, upper triangle; (n_t,
             nt).
         Vx: Gradient of the value function; shape (nt,).
         Qx: State part of the gradient of Q, shape (nt,).
-        Qu: Control part of the gradient of Q, shape (n_u,).
-        Qux: Mixed block of the Hessian of Q, shape (nu, nt).
-        Quu: Control block of the Hessian of Q, shape (nu, nu).
-        Quu_regular: Quu + lambda diag(luu), shape (nu, nu).
-        gains: -K of the free inputs, in their order, shape (nu, nt).
-        coupling: -(Qux - lambda diag(luu) K) of the free inputs, in their order, shape (nu, nt).
+        Qu: Control part of the gradient of Q, shape (nu,).
+        Qux: Mixed block of the Hessian of Q, shape (n_u, nt).
+        Quu: Control block of the Hessian of Q, shape (n_u, nu).
+        Quu_regular: Quu + lambda diag(luu), shape (n_u, nu).
+        gains: K of the free inputs, in their order, shape (n_u, nt).
+        coupling: Qux - lambda diag(luu) K of the free inputs, in their order, shape (n_u, nt).
         k: Control update, shape (n_u,).
-        slope: Quu k + Qu, shape (n_u,).
+        slope: Quu k + Qu, shape (nu,).
+        free_slope: The same of the free inputs, in their order, shape (n_u,).
         room_below: Lower bounds less the control, shape (n_u,).
         room_above: Upper bounds less the control, shape (n_u,).
         box: Work arrays of the quadratic program.
@@ -120,6 +124,7 @@ class SweepWorkspace(NamedTuple):
     coupling: FloatArray
     k: FloatArray
     slope: FloatArray
+    free_slope: FloatArray
     room_below: FloatArray
     room_above: FloatArray
     box: BoxQPWorkspace
@@ -158,23 +163,23 @@ def sweep_workspace(n_tangent: int, n_controls: int) -> SweepWorkspace:
     Returns:
         Arrays of zeros; the sweep relies on the padding being zero and keeps it so.
     """
-    nt, nu = padded(n_tangent), padded(n_controls)
     return SweepWorkspace(
-        A=np.zeros((nt, nt)),
-        B=np.zeros((nt, nu)),
-        VA=np.zeros((nt, nt)),
-        VB=np.zeros((nt, nu)),
-        Vxx=np.zeros((nt, nt)),
-        Vx=np.zeros(nt),
-        Qx=np.zeros(nt),
-        Qu=np.zeros(n_controls),
-        Qux=np.zeros((nu, nt)),
-        Quu=np.zeros((nu, nu)),
-        Quu_regular=np.zeros((nu, nu)),
-        gains=np.zeros((nu, nt)),
-        coupling=np.zeros((nu, nt)),
+        A=padded_zeros(n_tangent, n_tangent),
+        B=padded_zeros(n_tangent, n_controls),
+        VA=padded_zeros(n_tangent, n_tangent),
+        VB=padded_zeros(n_tangent, n_controls),
+        Vxx=padded_zeros(n_tangent, n_tangent),
+        Vx=padded_zeros(n_tangent),
+        Qx=padded_zeros(n_tangent),
+        Qu=padded_zeros(n_controls),
+        Qux=padded_zeros(n_controls, n_tangent),
+        Quu=padded_zeros(n_controls, n_controls),
+        Quu_regular=padded_zeros(n_controls, n_controls),
+        gains=padded_zeros(n_controls, n_tangent),
+        coupling=padded_zeros(n_controls, n_tangent),
         k=np.zeros(n_controls),
-        slope=np.zeros(n_controls),
+        slope=padded_zeros(n_controls),
+        free_slope=np.zeros(n_controls),
         room_below=np.zeros(n_controls),
         room_above=np.zeros(n_controls),
         box=box_qp_workspace(n_controls),
@@ -216,7 +221,7 @@ def backward_sweep(
     n_tangent = derivatives.lx.shape[1]
     for i in range(n_tangent):
         work.Vx[i] = derivatives.terminal_lx[0, i]
-    copy_block(work.Vxx, hessians.terminal_xx[0])
+    copy_in(work.Vxx, hessians.terminal_xx[0])
     work.k[:] = 0.0
     linear, quadratic, clamped = 0.0, 0.0, 0
     for stage in range(horizon - 1, -1, -1):
@@ -224,13 +229,14 @@ def backward_sweep(
             # From the gradient at x_k+1 to the one where the step lands.
             add_vector_product(work.Vx, work.Vxx, gaps[stage], n_tangent)
         _expand(derivatives, hessians, stage, work)
-        mirror_upper(work.Quu, n_controls)
         _regularize(derivatives.luu[stage], regularization, work)
         for i in range(n_controls):
             work.room_below[i] = control_lower[i] - controls[stage, i]
             work.room_above[i] = control_upper[i] - controls[stage, i]
         # work.k still holds the update of the stage after this one: a close first guess.
-        status, n_free = box_qp(work.Quu_regular, work.Qu, work.room_below, work.room_above, work.k, work.box)
+        status, n_free = box_qp(
+            work.Quu_regular, work.Qu[:n_controls], work.room_below, work.room_above, work.k, work.box
+        )
         if status == NOT_POSITIVE_DEFINITE:
             failure = SWEEP_NOT_POSITIVE_DEFINITE if _is_finite(work) else SWEEP_NOT_FINITE
             return failure, stage, linear, quadratic, clamped
@@ -238,6 +244,7 @@ def backward_sweep(
         linear += stage_linear
         quadratic += stage_quadratic
         clamped += n_controls - n_free
+        prefetch_to_write(update.gains[max(stage - 1, 0)])
         _find_gains(derivatives.luu[stage], regularization, n_free, work)
         _update_value(n_tangent, n_free, work)
         _store(stage, n_tangent, n_free, update, work)
@@ -250,81 +257,68 @@ def backward_sweep(
     return SWEEP_DONE, 0, linear, quadratic, clamped
 
 
-@compiled
+@inlined
 def _expand(derivatives: Derivatives, hessians: Hessians, stage: int, work: SweepWorkspace) -> None:
     """Expand Q to second order; Qx and Qxx take the place of Vx and Vxx.
 
     Qx = lx + A' Vx, Qu = lu + B' Vx, Qxx = Hxx + A' Vxx A, Qux = Hux + B' Vxx A, Quu = Huu + B' Vxx B.
     """
     n_tangent = derivatives.lx.shape[1]
-    copy_block(work.A, derivatives.A[stage])
-    copy_block(work.B, derivatives.B[stage])
-    if stage > 0:
-        prefetch(derivatives.A[stage - 1])
-        prefetch(derivatives.B[stage - 1])
+    copy_in(work.A, derivatives.A[stage])
+    copy_in(work.B, derivatives.B[stage])
+    earlier = max(stage - 1, 0)
+    # Between the products: many lines asked for at once would hold the processor up.
+    prefetch(derivatives.A[earlier])
     set_product(work.VA, work.Vxx, work.A, n_tangent)
+    prefetch(derivatives.B[earlier])
     set_product(work.VB, work.Vxx, work.B, n_tangent)
-    copy_block(work.Vxx, hessians.xx[stage])
-    if stage > 0:
-        prefetch(hessians.xx[stage - 1])
-        prefetch(hessians.uu[stage - 1])
+    copy_in(work.Vxx, hessians.xx[stage])
+    prefetch(hessians.xx[earlier])
     add_product_upper(work.Vxx, work.A, work.VA, n_tangent)
     set_product(work.Qux, work.B, work.VA, n_tangent)
     if hessians.ux.shape[0] > 0:
         add_block(work.Qux, hessians.ux[stage])
-        if stage > 0:
-            prefetch(hessians.ux[stage - 1])
-    copy_block(work.Quu, hessians.uu[stage])
-    add_product_upper(work.Quu, work.B, work.VB, n_tangent)
-    for j in range(n_tangent):
-        work.Qx[j] = derivatives.lx[stage, j]
-    add_vector_product(work.Qx, work.A, work.Vx, n_tangent)
-    for i in range(work.Qu.shape[0]):
-        work.Qu[i] = derivatives.lu[stage, i]
-    add_vector_product(work.Qu, work.B, work.Vx, n_tangent)
+        prefetch(hessians.ux[earlier])
+    copy_in(work.Quu, hessians.uu[stage])
+    prefetch(hessians.uu[earlier])
+    add_product(work.Quu, work.B, work.VB, n_tangent)
+    set_vector_sum(work.Qx, derivatives.lx[stage], work.A, work.Vx, n_tangent)
+    set_vector_sum(work.Qu, derivatives.lu[stage], work.B, work.Vx, n_tangent)
 
 
-@compiled
+@inlined
 def _regularize(luu: FloatArray, regularization: float, work: SweepWorkspace) -> None:
     """Build Quu + lambda diag(luu)."""
-    copy_block(work.Quu_regular, work.Quu)
+    copy_in(work.Quu_regular, work.Quu)
     for i in range(luu.shape[0]):
         work.Quu_regular[i, i] += regularization * luu[i, i]
 
 
-@compiled
+@inlined
 def _expected_change(work: SweepWorkspace) -> tuple[float, float]:
     """Compute k' Qu and 1/2 k' Quu k, and keep Quu k + Qu; all with the Quu that is not regularized."""
     linear, quadratic = 0.0, 0.0
     n_controls = work.k.shape[0]
+    set_vector_sum(work.slope, work.Qu, work.Quu, work.k, n_controls)
     for i in range(n_controls):
-        product = 0.0
-        for j in range(n_controls):
-            product += work.Quu[i, j] * work.k[j]
         linear += work.k[i] * work.Qu[i]
-        quadratic += 0.5 * work.k[i] * product
-        work.slope[i] = product + work.Qu[i]
+        quadratic += 0.5 * work.k[i] * (work.slope[i] - work.Qu[i])
     return linear, quadratic
 
 
-@compiled
+@inlined
 def _find_gains(luu: FloatArray, regularization: float, n_free: int, work: SweepWorkspace) -> None:
     """Solve (Quu + lambda diag(luu)) K = -Qux for the free inputs."""
-    n_columns = work.Qux.shape[1]
-    for a in range(n_free):
-        row, source = work.gains[a], work.Qux[work.box.free[a]]
-        for j in range(n_columns):
-            row[j] = source[j]
-    solve_in_place(work.box.factor, work.box.inverse_diagonal, work.gains, n_free)
     for a in range(n_free):
         i = work.box.free[a]
-        weight = regularization * luu[i, i]
-        row, source, gain = work.coupling[a], work.Qux[i], work.gains[a]
-        for j in range(n_columns):
-            row[j] = -source[j] - weight * gain[j]
+        set_row_sum(work.gains, a, work.Qux, i, -2.0, work.Qux, i)  # -Qux
+    solve_in_place(work.box.factor, work.box.inverse_pivots, work.gains, n_free)
+    for a in range(n_free):
+        i = work.box.free[a]
+        set_row_sum(work.coupling, a, work.Qux, i, -regularization * luu[i, i], work.gains, a)
 
 
-@compiled
+@inlined
 def _update_value(n_tangent: int, n_free: int, work: SweepWorkspace) -> None:
     """Propagate the value function under the update that the box allows.
 
@@ -334,28 +328,25 @@ def _update_value(n_tangent: int, n_free: int, work: SweepWorkspace) -> None:
         Vxx = Qxx + K' (Qux - lambda R K),
     one symmetric product instead of three.
     """
-    for j in range(n_tangent):
-        work.Vx[j] = work.Qx[j]
-    add_vector_product(work.Vx, work.Qux, work.k, work.k.shape[0])
+    set_vector_sum(work.Vx, work.Qx, work.Qux, work.k, work.k.shape[0])
     for a in range(n_free):
-        slope, gain = work.slope[work.box.free[a]], work.gains[a]
-        for j in range(n_tangent):
-            work.Vx[j] -= slope * gain[j]
+        work.free_slope[a] = work.slope[work.box.free[a]]
+    set_vector_sum(work.Vx, work.Vx, work.gains, work.free_slope, n_free)
     add_product_upper(work.Vxx, work.gains, work.coupling, n_free)
     mirror_upper(work.Vxx, n_tangent)
 
 
-@compiled
+@inlined
 def _store(stage: int, n_tangent: int, n_free: int, update: Update, work: SweepWorkspace) -> None:
     """Write k and K of a stage, zero rows for clamped inputs, and the value function if it is kept."""
+    gains = update.gains[stage]
     for i in range(work.k.shape[0]):
         update.feedforward[stage, i] = work.k[i]
-        for j in range(n_tangent):
-            update.gains[stage, i, j] = 0.0
+        if work.box.clamped[i]:
+            for j in range(n_tangent):
+                gains[i, j] = 0.0
     for a in range(n_free):
-        row, gain = update.gains[stage, work.box.free[a]], work.gains[a]
-        for j in range(n_tangent):
-            row[j] = -gain[j]
+        copy_row_out(gains, work.box.free[a], work.gains, a)
     if update.stage_gradients.shape[0] > 0:
         for i in range(n_tangent):
             update.stage_gradients[stage, i] = work.Vx[i]
@@ -366,7 +357,7 @@ def _store(stage: int, n_tangent: int, n_free: int, update: Update, work: SweepW
 @compiled
 def _is_finite(work: SweepWorkspace) -> bool:
     """Say whether the expansion of Q at the current stage, or the value function after it, is finite."""
-    n_tangent, n_controls = work.Vx.shape[0], work.k.shape[0]
+    n_tangent, n_controls = work.Vxx.shape[0], work.k.shape[0]
     finite = True
     for i in range(n_tangent):
         finite = finite and np.isfinite(work.Vx[i])

@@ -2,7 +2,7 @@
 
 Projected Newton of Tassa, Mansard & Todorov, "Control-limited differential dynamic programming", ICRA 2014,
 section IV and appendix. The plain Newton step is tried first; when it stays inside the box nothing else is
-needed, and its Cholesky factor serves the feedback gains too.
+needed, and its factorization serves the feedback gains too.
 """
 
 from typing import NamedTuple
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from experts.compilation import compiled
 from experts.padded_algebra import (
     FloatArray,
+    copy_in,
     factorize,
-    padded,
+    padded_zeros,
     solve_vector_in_place,
 )
 
@@ -27,7 +28,7 @@ ITERATION_LIMIT = 2
 STALLED = 3
 """No step along the Newton direction improved the value; the best point is returned."""
 NOT_POSITIVE_DEFINITE = -1
-"""The free block of the Hessian has no Cholesky factor; there is no result."""
+"""The free block of the Hessian is not positive definite; there is no result."""
 
 MAX_ITERATIONS = 100
 GRADIENT_TOLERANCE = 1e-8  # of the free gradient, relative to the norm of g
@@ -41,9 +42,10 @@ class BoxQPWorkspace(NamedTuple):
     """Work arrays of `box_qp`, and the results besides the minimizer.
 
     Attributes:
-        factor: Cholesky factor U of the free block, H_ff = U' U, rows and columns in the order of `free`;
-            shape (n, padded(n)), its leading block and upper triangle count.
-        inverse_diagonal: 1 / U[i, i], shape (n,).
+        factor: Factor U of the free block, H_ff = U' D U, with a diagonal of ones that is not stored; rows
+            and columns in the order of `free`; shape (n, padded(n)), its leading block above the diagonal
+            counts.
+        inverse_pivots: 1 / D[i, i], shape (n,).
         free: Indices of the free components in rising order, the leading n_free count; shape (n,).
         clamped: Whether a component is held at its bound, shape (n,).
         slope: Gradient at the current point, shape (n,).
@@ -52,7 +54,7 @@ class BoxQPWorkspace(NamedTuple):
     """
 
     factor: FloatArray
-    inverse_diagonal: FloatArray
+    inverse_pivots: FloatArray
     free: NDArray[np.int64]
     clamped: NDArray[np.bool_]
     slope: FloatArray
@@ -70,8 +72,8 @@ def box_qp_workspace(size: int) -> BoxQPWorkspace:
         The work arrays.
     """
     return BoxQPWorkspace(
-        factor=np.zeros((size, padded(size))),
-        inverse_diagonal=np.zeros(size),
+        factor=padded_zeros(size, size),
+        inverse_pivots=np.zeros(size),
         free=np.zeros(size, dtype=np.int64),
         clamped=np.zeros(size, dtype=np.bool_),
         slope=np.zeros(size),
@@ -114,7 +116,7 @@ def box_qp(
         return _projected_newton(hessian, gradient, lower, upper, minimizer, NOT_POSITIVE_DEFINITE, work)
     for i in range(size):
         work.search[i] = -gradient[i]
-    solve_vector_in_place(work.factor, work.inverse_diagonal, work.search, size)
+    solve_vector_in_place(work.factor, work.inverse_pivots, work.search, size)
     inside = True
     for i in range(size):
         inside = inside and lower[i] <= work.search[i] <= upper[i]
@@ -157,7 +159,7 @@ def _projected_newton(
             return SOLVED, n_free
         if previous_value - value < RELATIVE_IMPROVEMENT * abs(previous_value):
             return SMALL_IMPROVEMENT, n_free
-        solve_vector_in_place(work.factor, work.inverse_diagonal, work.search, n_free)
+        solve_vector_in_place(work.factor, work.inverse_pivots, work.search, n_free)
         previous_value = value
         value = _projected_step(hessian, gradient, lower, upper, minimizer, n_free, value, work)
         if not value < previous_value:
@@ -175,11 +177,14 @@ def _factorize_free_block(hessian: FloatArray, work: BoxQPWorkspace) -> int:
         if not work.clamped[i]:
             work.free[n_free] = i
             n_free += 1
-    for a in range(n_free):
-        row = hessian[work.free[a]]
-        for b in range(a, n_free):
-            work.factor[a, b] = row[work.free[b]]
-    return n_free if factorize(work.factor, work.inverse_diagonal, n_free) else -1
+    if n_free == work.clamped.shape[0]:
+        copy_in(work.factor, hessian)
+    else:
+        for a in range(n_free):
+            row = hessian[work.free[a]]
+            for b in range(a, n_free):
+                work.factor[a, b] = row[work.free[b]]
+    return n_free if factorize(work.factor, work.inverse_pivots, n_free) else -1
 
 
 @compiled

@@ -21,5 +21,26 @@ def compiled(loop: Loop) -> Loop:
     Returns:
         The compiled function.
     """
+    return _compile(loop, in_place=False)
+
+
+def inlined(loop: Loop) -> Loop:
+    """Compile as `compiled` does, into the place of every call.
+
+    A matrix is nine arguments, and a named tuple of arrays a hundred or more: passing them takes as long as
+    the work of a small function.
+
+    Args:
+        loop: Function in the part of Python that numba compiles.
+
+    Returns:
+        The compiled function.
+    """
+    return _compile(loop, in_place=True)
+
+
+def _compile(loop: Loop, *, in_place: bool) -> Loop:
+    """Compile with the options that all loops share."""
     options: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
+    options["forceinline"] = in_place
     return cast(Loop, njit(cache=True, nogil=True, boundscheck=False, **options)(loop))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from experts.backward_sweep import SweepOutcome
-from experts.padded_algebra import LANES
+from experts.parallel_rollouts import LANES
 from experts.problem import FloatArray
 from experts.shooting import ShootingWorkspace
 

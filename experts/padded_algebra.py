@@ -1,32 +1,29 @@
-"""Small dense matrix operations for the backward sweep, without BLAS: products, Cholesky, substitutions.
+"""Small dense matrix operations for the backward sweep, without BLAS: products, factorization, substitutions.
 
-Every matrix is row-major, and its rows are padded with zeros to whole vectors of `LANES` numbers. All work
-goes through one primitive, written in LLVM IR because numba's arrays may alias and LLVM then keeps no
-accumulator in a register: a tile of the target, a few rows high and one vector wide, gathers ``sum_l
-left[l, row] * right[l, :]``. Padding columns never mix with others, so whatever they hold stays there.
+Every matrix is row-major, and its rows are padded to whole vectors of `LANES` numbers. Padding columns never
+mix with others, so whatever they hold stays there. The work is done in the register tiles of `vector_tiles`.
 """
 
-from typing import Any
-
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from experts.compilation import compiled
+from experts.compilation import compiled, inlined
+from experts.vector_code import LANES, TILE_ROWS
+from experts.vector_tiles import (
+    add_product_rows,
+    copy_row_in,
+    eliminate_rows,
+    prefetch_line,
+    prefetch_line_to_write,
+    set_product_rows,
+    substitute_backward,
+    substitute_forward,
+)
 
 FloatArray = NDArray[np.float64]
 
-LANES = 8
-"""Numbers in one vector: an AVX-512 register; LLVM splits it where registers are narrower."""
-
 CACHE_LINE = 8
 """Numbers in one cache line."""
-
-TILE_ROWS = 4
-"""Rows of a product tile: their accumulators fit in the registers of AVX2 as well."""
 
 SMALLEST_PIVOT = 1e-14
 """A pivot below this share of its diagonal entry is rounding noise: the matrix is not positive definite."""
@@ -44,88 +41,23 @@ def padded(size: int) -> int:
     return -(-size // LANES) * LANES
 
 
-def _tile_operation(rows: int, start: str, sign: int) -> Any:
-    """Build the primitive that computes one tile of a product.
-
-    It sets ``target[i:i+rows, j:j+LANES]`` to ``start + sign * sum_l left[l, i:i+rows] right[l, j:j+LANES]``.
+def padded_zeros(*shape: int) -> FloatArray:
+    """Allocate an array with padded rows, from the beginning of a cache line: no vector straddles two.
 
     Args:
-        rows: Height of the tile.
-        start: "target" to add to what is there, "zero" to overwrite it.
-        sign: +1 or -1.
+        shape: Extents; the last one is rounded up to whole vectors.
 
     Returns:
-        A numba intrinsic (target, i, j, left, right, depth), l running over [0, depth).
+        Zeros, shape (*shape[:-1], padded(shape[-1])).
     """
-
-    def operation(typing_context: Any, target: Any, i: Any, j: Any, left: Any, right: Any, depth: Any) -> Any:
-        signature = types.void(target, types.intp, types.intp, left, right, types.intp)
-
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            double, index = ir.DoubleType(), context.get_value_type(types.intp)
-            vector = ir.VectorType(double, LANES)
-
-            def entry(position: int, row: Any, column: Any) -> Any:
-                array_type = signature.args[position]
-                array = context.make_array(array_type)(context, builder, arguments[position])
-                return cgutils.get_item_pointer(context, builder, array_type, array, [row, column])
-
-            def load_vector(pointer: Any) -> Any:
-                return builder.load(builder.bitcast(pointer, vector.as_pointer()), align=8)
-
-            i, j, depth = arguments[1], arguments[2], arguments[5]
-            targets = [entry(0, builder.add(i, index(r)), j) for r in range(rows)]
-            zero = ir.Constant(vector, [0.0] * LANES)
-            starts = [load_vector(pointer) if start == "target" else zero for pointer in targets]
-            sums = [cgutils.alloca_once_value(builder, value) for value in starts]
-            with cgutils.for_range(builder, depth, intp=index) as loop:
-                row = load_vector(entry(4, loop.index, j))
-                for r, total in enumerate(sums):
-                    factor = builder.load(entry(3, loop.index, builder.add(i, index(r))))
-                    first = builder.insert_element(
-                        ir.Constant(vector, ir.Undefined), factor, ir.Constant(ir.IntType(32), 0)
-                    )
-                    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), None)
-                    spread = builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
-                    product = builder.fmul(spread, row, flags=("contract",))
-                    combine = builder.fadd if sign > 0 else builder.fsub
-                    builder.store(combine(builder.load(total), product, flags=("contract",)), total)
-            for pointer, total in zip(targets, sums, strict=True):
-                builder.store(builder.load(total), builder.bitcast(pointer, vector.as_pointer()), align=8)
-            return context.get_dummy_value()
-
-        return signature, generate
-
-    return intrinsic(operation)
+    extents = (*shape[:-1], padded(shape[-1]))
+    size = int(np.prod(extents))
+    memory = np.zeros(size + CACHE_LINE)
+    start = -(memory.ctypes.data // memory.itemsize) % CACHE_LINE
+    return memory[start : start + size].reshape(extents)
 
 
-_set_tile = _tile_operation(TILE_ROWS, "zero", +1)
-_add_tile = _tile_operation(TILE_ROWS, "target", +1)
-_add_row_tile = _tile_operation(1, "target", +1)
-_subtract_row_tile = _tile_operation(1, "target", -1)
-
-
-def _emit_prefetch(typing_context: Any, array: Any, offset: Any) -> Any:
-    """Emit the code of `_prefetch_line(array, offset)`, offset in numbers from the array's start."""
-    signature = types.void(array, types.intp)
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array = context.make_array(signature.args[0])(context, builder, arguments[0])
-        pointer = builder.gep(array.data, [arguments[1]])
-        byte, int32 = ir.IntType(8).as_pointer(), ir.IntType(32)
-        function_type = ir.FunctionType(ir.VoidType(), [byte, int32, int32, int32])
-        prefetch = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0")
-        read, into_second_level, data = int32(0), int32(2), int32(1)
-        builder.call(prefetch, [builder.bitcast(pointer, byte), read, into_second_level, data])
-        return context.get_dummy_value()
-
-    return signature, generate
-
-
-_prefetch_line: Any = intrinsic(_emit_prefetch)
-
-
-@compiled
+@inlined
 def prefetch(array: FloatArray) -> None:
     """Ask for a contiguous array to be brought near the processor while it works on something else.
 
@@ -133,7 +65,18 @@ def prefetch(array: FloatArray) -> None:
         array: Any shape.
     """
     for offset in range(0, array.size, CACHE_LINE):
-        _prefetch_line(array, offset)
+        prefetch_line(array, offset)
+
+
+@inlined
+def prefetch_to_write(array: FloatArray) -> None:
+    """Ask for a contiguous array as `prefetch` does, in order to write to it.
+
+    Args:
+        array: Any shape.
+    """
+    for offset in range(0, array.size, CACHE_LINE):
+        prefetch_line_to_write(array, offset)
 
 
 @compiled
@@ -141,49 +84,46 @@ def set_product(target: FloatArray, left: FloatArray, right: FloatArray, depth: 
     """Compute the product of a transposed matrix and a matrix: ``target = left' right``.
 
     Args:
-        target: Shape (n, m), n a multiple of `TILE_ROWS`, m of `LANES`.
+        target: Shape (n, m), m a multiple of `LANES`.
         left: Shape (>= depth, >= n).
         right: Shape (>= depth, >= m).
         depth: Number of rows that take part.
     """
-    for i in range(0, target.shape[0], TILE_ROWS):
-        for j in range(0, target.shape[1], LANES):
-            _set_tile(target, i, j, left, right, depth)
+    rows = target.shape[0]
+    for i in range(0, rows, TILE_ROWS):
+        set_product_rows(target, rows, i, 0, left, right, depth)
+
+
+@compiled
+def add_product(target: FloatArray, left: FloatArray, right: FloatArray, depth: int) -> None:
+    """Add the product of a transposed matrix and a matrix: ``target += left' right``.
+
+    Args:
+        target: Shape (n, m), m a multiple of `LANES`.
+        left: Shape (>= depth, >= n).
+        right: Shape (>= depth, >= m).
+        depth: Number of rows that take part.
+    """
+    rows = target.shape[0]
+    for i in range(0, rows, TILE_ROWS):
+        add_product_rows(target, rows, i, 0, left, right, depth)
 
 
 @compiled
 def add_product_upper(target: FloatArray, left: FloatArray, right: FloatArray, depth: int) -> None:
     """Add a product known to be symmetric, on and above the diagonal only: ``target += left' right``.
 
-    Tiles that the diagonal cuts are computed whole; entries below it are left undefined.
+    Vectors that the diagonal cuts are computed whole; entries below it are left undefined.
 
     Args:
-        target: Shape (n, m), n a multiple of `TILE_ROWS`, m of `LANES`.
+        target: Shape (n, m), m a multiple of `LANES`.
         left: Shape (>= depth, >= n).
         right: Shape (>= depth, >= m).
         depth: Number of rows that take part.
     """
-    for i in range(0, target.shape[0], TILE_ROWS):
-        for j in range(i - i % LANES, target.shape[1], LANES):
-            _add_tile(target, i, j, left, right, depth)
-
-
-@compiled
-def add_plain_product(target: FloatArray, left: FloatArray, right: FloatArray, depth: int) -> None:
-    """Add the product of two matrices: ``target += left right``.
-
-    Args:
-        target: Shape (n, m), n any number, m a multiple of `LANES`.
-        left: Shape (n, >= depth).
-        right: Shape (>= depth, >= m).
-        depth: Number of columns of `left`, and rows of `right`, that take part.
-    """
-    transposed, rows = left.T, target.shape[0]
-    for j in range(0, target.shape[1], LANES):
-        for i in range(0, rows - rows % TILE_ROWS, TILE_ROWS):
-            _add_tile(target, i, j, transposed, right, depth)
-        for i in range(rows - rows % TILE_ROWS, rows):
-            _add_row_tile(target, i, j, transposed, right, depth)
+    rows = target.shape[0]
+    for i in range(0, rows, TILE_ROWS):
+        add_product_rows(target, rows, i, i - i % LANES, left, right, depth)
 
 
 @compiled
@@ -202,18 +142,16 @@ def add_vector_product(target: FloatArray, matrix: FloatArray, vector: FloatArra
             target[j] += factor * row[j]
 
 
-@compiled
-def copy_block(target: FloatArray, source: FloatArray) -> None:
-    """Copy a matrix into the leading block of a larger one.
+@inlined
+def copy_in(target: FloatArray, source: FloatArray) -> None:
+    """Copy a matrix into one with padded rows, and set their padding to zero.
 
     Args:
-        target: Shape (>= n, >= m).
+        target: Shape (>= n, >= padded(m)).
         source: Shape (n, m).
     """
     for i in range(source.shape[0]):
-        target_row, source_row = target[i], source[i]
-        for j in range(source.shape[1]):
-            target_row[j] = source_row[j]
+        copy_row_in(target, i, source, i)
 
 
 @compiled
@@ -244,75 +182,68 @@ def mirror_upper(matrix: FloatArray, size: int) -> None:
 
 
 @compiled
-def factorize(matrix: FloatArray, inverse_diagonal: FloatArray, size: int) -> bool:
-    """Overwrite a symmetric matrix by its Cholesky factor U, ``matrix = U' U``.
+def factorize(matrix: FloatArray, inverse_pivots: FloatArray, size: int) -> bool:
+    """Overwrite a symmetric matrix by its factor U, ``matrix = U' D U``, with ones on the diagonal of U.
+
+    The square roots of Cholesky's factor would lengthen the chain from one pivot to the next.
 
     Args:
-        matrix: Upper triangle of the matrix, shape (>= size, padded(size)); undefined below it afterwards.
-        inverse_diagonal: Receives 1 / U[i, i], shape (>= size,).
+        matrix: Upper triangle of the matrix, shape (>= size, padded(size)); receives U above the diagonal,
+            undefined elsewhere.
+        inverse_pivots: Receives 1 / D[i, i], shape (>= size,).
         size: Size of the leading block.
 
     Returns:
         False if the matrix is not positive definite, or not finite.
     """
     for i in range(size):
-        diagonal = matrix[i, i]
-        for j in range(i - i % LANES, matrix.shape[1], LANES):
-            _subtract_row_tile(matrix, i, j, matrix, matrix, i)
+        inverse_pivots[i] = SMALLEST_PIVOT * matrix[i, i]
+    for i in range(size):
         pivot = matrix[i, i]
-        if not (pivot > SMALLEST_PIVOT * diagonal and pivot < np.inf):
+        if not (pivot > inverse_pivots[i] and 0.0 < pivot < np.inf):
             return False
-        inverse_diagonal[i] = 1.0 / np.sqrt(pivot)
-        for j in range(i, size):
-            matrix[i, j] *= inverse_diagonal[i]
+        inverse_pivots[i] = 1.0 / pivot
+        for row in range(i + 1, size, TILE_ROWS):
+            eliminate_rows(matrix, size, row, row - row % LANES, i, inverse_pivots[i])
+    for i in range(size):
+        for j in range(i + 1, size):
+            matrix[i, j] *= inverse_pivots[i]
     return True
 
 
 @compiled
-def solve_in_place(
-    factor: FloatArray, inverse_diagonal: FloatArray, right_side: FloatArray, size: int
-) -> None:
-    """Solve ``U' U X = right_side`` for many right sides at once, overwriting them by X.
+def solve_in_place(factor: FloatArray, inverse_pivots: FloatArray, right_side: FloatArray, size: int) -> None:
+    """Solve ``U' D U X = right_side`` for many right sides at once, overwriting them by X.
 
     Args:
-        factor: U from `factorize`, shape (>= size, padded(size)).
-        inverse_diagonal: 1 / U[i, i], shape (>= size,).
+        factor: U from `factorize`, shape (>= size, >= size).
+        inverse_pivots: 1 / D[i, i], shape (>= size,).
         right_side: Shape (>= size, m), m a multiple of `LANES`.
         size: Number of unknowns.
     """
-    columns = right_side.shape[1]
-    for i in range(size):
-        for j in range(0, columns, LANES):
-            _subtract_row_tile(right_side, i, j, factor, right_side, i)
-        for j in range(columns):
-            right_side[i, j] *= inverse_diagonal[i]
-    transposed = factor.T
-    for i in range(size - 1, -1, -1):
-        below = right_side[i + 1 :]
-        for j in range(0, columns, LANES):
-            _subtract_row_tile(right_side, i, j, transposed[i + 1 :], below, size - 1 - i)
-        for j in range(columns):
-            right_side[i, j] *= inverse_diagonal[i]
+    for i in range(0, size, TILE_ROWS):
+        substitute_forward(right_side, size, i, factor, inverse_pivots)
+    for i in range(size - TILE_ROWS, -TILE_ROWS, -TILE_ROWS):
+        substitute_backward(right_side, size, i, factor, inverse_pivots)
 
 
 @compiled
 def solve_vector_in_place(
-    factor: FloatArray, inverse_diagonal: FloatArray, right_side: FloatArray, size: int
+    factor: FloatArray, inverse_pivots: FloatArray, right_side: FloatArray, size: int
 ) -> None:
-    """Solve ``U' U x = right_side`` for one right side, overwriting it by x.
+    """Solve ``U' D U x = right_side`` for one right side, overwriting it by x.
 
     Args:
         factor: U from `factorize`, shape (>= size, >= size).
-        inverse_diagonal: 1 / U[i, i], shape (>= size,).
+        inverse_pivots: 1 / D[i, i], shape (>= size,).
         right_side: Shape (>= size,).
         size: Number of unknowns.
     """
     for i in range(size):
-        right_side[i] *= inverse_diagonal[i]
         for j in range(i + 1, size):
             right_side[j] -= factor[i, j] * right_side[i]
-    for i in range(size - 1, -1, -1):
-        total = right_side[i]
-        for j in range(i + 1, size):
-            total -= factor[i, j] * right_side[j]
-        right_side[i] = total * inverse_diagonal[i]
+    for i in range(size):
+        right_side[i] *= inverse_pivots[i]
+    for i in range(size - 1, 0, -1):
+        for j in range(i):
+            right_side[j] -= factor[j, i] * right_side[i]

@@ -12,8 +12,11 @@ import numpy as np
 from experts.backward_sweep import Update
 from experts.compilation import compiled
 from experts.native_call import BufferTable, buffer_table, call_kernel
-from experts.padded_algebra import LANES, FloatArray, add_plain_product
+from experts.padded_algebra import FloatArray, add_product
 from experts.problem import ShootingProblem
+
+LANES = 8
+"""Step lengths of a call: a whole number of vectors on any processor."""
 
 
 class _Work(NamedTuple):
@@ -216,7 +219,7 @@ def _apply_update(
             work.control_columns[i, lane] = (
                 reference_controls[stage, i] + alphas[lane] * feedforward[stage, i]
             )
-    add_plain_product(work.control_columns, gains[stage], work.deviation_columns, n_tangent)
+    add_product(work.control_columns, gains[stage].T, work.deviation_columns, n_tangent)
     for i in range(n_controls):
         for lane in range(LANES):
             control = work.control_columns[i, lane]

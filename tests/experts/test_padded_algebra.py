@@ -1,26 +1,32 @@
 import numpy as np
 import pytest
 
+from experts.compilation import compiled
 from experts.padded_algebra import (
-    TILE_ROWS,
+    FloatArray,
+    add_product,
     add_product_upper,
     add_vector_product,
-    copy_block,
+    copy_in,
     factorize,
     mirror_upper,
     padded,
+    padded_zeros,
     set_product,
     solve_in_place,
     solve_vector_in_place,
 )
+from experts.vector_code import LANES
+from experts.vector_tiles import copy_row_out, set_row_sum, set_vector_sum
 
-SIZES = [(1, 1, 1), (3, 5, 4), (8, 8, 8), (21, 12, 21), (12, 21, 9)]
+SIZES = [(1, 1, 1), (3, 5, 4), (8, 8, 8), (21, 12, 21), (12, 21, 9), (7, 60, 5)]
 
 
 def in_padding(matrix: np.ndarray, filler: float = 0.0) -> np.ndarray:
-    """The matrix in the corner of one with padded rows and columns."""
-    result = np.full((padded(matrix.shape[0]), padded(matrix.shape[1])), filler)
-    result[: matrix.shape[0], : matrix.shape[1]] = matrix
+    """The matrix with padded rows."""
+    result = padded_zeros(*matrix.shape)
+    result[:] = filler
+    result[:, : matrix.shape[1]] = matrix
     return result
 
 
@@ -29,27 +35,36 @@ def random_positive(rng: np.random.Generator, n: int, condition: float = 1e3) ->
     return (basis * np.geomspace(1.0, condition, n)) @ basis.T
 
 
-@pytest.mark.parametrize(("size", "expected"), [(1, 8), (8, 8), (9, 16), (21, 24)])
-def test_padded_rounds_up_to_whole_vectors(size: int, expected: int) -> None:
-    assert padded(size) == expected
-    assert padded(size) % TILE_ROWS == 0
+@pytest.mark.parametrize("size", [1, 7, 8, 9, 21])
+def test_padded_rounds_up_to_whole_vectors(size: int) -> None:
+    assert size <= padded(size) < size + LANES
+    assert padded(size) % LANES == 0
+
+
+@pytest.mark.parametrize("shape", [(1,), (12,), (5, 21)])
+def test_padded_zeros_begin_at_a_cache_line(shape: tuple[int, ...]) -> None:
+    arrays = [padded_zeros(*shape) for _ in range(10)]
+    assert all(array.ctypes.data % 64 == 0 for array in arrays)
+    assert all(array.shape == (*shape[:-1], padded(shape[-1])) and not array.any() for array in arrays)
 
 
 @pytest.mark.parametrize(("n", "m", "depth"), SIZES)
 def test_set_product(n: int, m: int, depth: int) -> None:
     rng = np.random.default_rng(n)
     left, right = rng.normal(size=(depth, n)), rng.normal(size=(depth, m))
-    target = np.full((padded(n), padded(m)), np.nan)
+    target = np.full((n, padded(m)), np.nan)
     set_product(target, in_padding(left), in_padding(right), depth)
-    np.testing.assert_allclose(target[:n, :m], left.T @ right, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(target[:, :m], left.T @ right, rtol=1e-13, atol=1e-13)
+    add_product(target, in_padding(left), in_padding(right), depth)
+    np.testing.assert_allclose(target[:, :m], 2.0 * left.T @ right, rtol=1e-13, atol=1e-13)
 
 
 def test_product_is_blind_to_what_padding_and_further_rows_hold() -> None:
     rng = np.random.default_rng(0)
     left, right = rng.normal(size=(5, 3)), rng.normal(size=(5, 11))
-    target = np.zeros((8, 16))
+    target = np.zeros((3, 16))
     set_product(target, in_padding(left, np.nan), in_padding(right, np.nan), 5)
-    np.testing.assert_allclose(target[:3, :11], left.T @ right, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(target[:, :11], left.T @ right, rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.parametrize("n", [1, 4, 12, 21])
@@ -69,30 +84,57 @@ def test_add_vector_product_and_copy() -> None:
     rng = np.random.default_rng(3)
     matrix, vector, target = rng.normal(size=(6, 9)), rng.normal(size=6), rng.normal(size=9)
     expected = target + matrix.T @ vector
-    large = np.zeros((8, 16))
-    copy_block(large, matrix)
+    large = np.full((8, 16), np.nan)
+    copy_in(large, matrix)
     np.testing.assert_array_equal(large[:6, :9], matrix)
+    assert np.all(large[:6, 9 : padded(9)] == 0.0)
     add_vector_product(target, large, vector, 6)
     np.testing.assert_allclose(target, expected, rtol=1e-14, atol=1e-14)
 
 
+@compiled
+def sum_rows(
+    target: FloatArray, source: FloatArray, other: FloatArray, vector: FloatArray, out: FloatArray
+) -> None:
+    """Rows: target[1] = source[2] - 3 other[0], out[1] = source[0]; vector = out[0] + source' vector."""
+    set_row_sum(target, 1, source, 2, -3.0, other, 0)
+    copy_row_out(out, 1, source, 0)
+    set_vector_sum(target[0], out[0], source, vector, 3)
+
+
+@pytest.mark.parametrize("m", [1, 8, 12, 21, 30])
+def test_operations_on_rows_stay_inside_them(m: int) -> None:
+    rng = np.random.default_rng(m)
+    source, other, vector = rng.normal(size=(3, m)), rng.normal(size=(2, m)), rng.normal(size=3)
+    start = rng.normal(size=m)
+    target, out = np.full((3, padded(m)), 7.0), np.full((3, m), 7.0)
+    out[0] = start
+    sum_rows(target, in_padding(source), in_padding(other), vector, out)
+    np.testing.assert_allclose(target[0, :m], start + source.T @ vector, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(target[1, :m], source[2] - 3.0 * other[0], rtol=1e-13, atol=1e-13)
+    np.testing.assert_array_equal(out, [start, source[0], np.full(m, 7.0)])
+    assert np.all(target[2] == 7.0)
+
+
 @pytest.mark.parametrize("n", [1, 2, 7, 8, 12, 17])
-def test_cholesky_factor_and_solutions(n: int) -> None:
+def test_factor_and_solutions(n: int) -> None:
     rng = np.random.default_rng(n)
     matrix = random_positive(rng, n)
-    factor, inverse_diagonal = in_padding(np.triu(matrix)), np.zeros(n)
-    assert factorize(factor, inverse_diagonal, n)
-    upper = np.linalg.cholesky(matrix).T
-    np.testing.assert_allclose(np.triu(factor[:n, :n]), upper, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(inverse_diagonal, 1.0 / np.diag(upper), rtol=1e-10)
+    factor, inverse_pivots = in_padding(np.triu(matrix)), np.zeros(n)
+    assert factorize(factor, inverse_pivots, n)
+    cholesky = np.linalg.cholesky(matrix)
+    np.testing.assert_allclose(inverse_pivots, np.diag(cholesky) ** -2, rtol=1e-10)
+    upper = (cholesky / np.diag(cholesky)).T
+    np.testing.assert_allclose(np.triu(factor[:, :n], 1), np.triu(upper, 1), rtol=1e-10, atol=1e-10)
 
-    right_side = rng.normal(size=(n, 5))
+    right_side = rng.normal(size=(n + 2, 30))
     many, one = in_padding(right_side), right_side[:, 2].copy()
-    solve_in_place(factor, inverse_diagonal, many, n)
-    solve_vector_in_place(factor, inverse_diagonal, one, n)
-    expected = np.linalg.solve(matrix, right_side)
-    np.testing.assert_allclose(many[:n, :5], expected, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(one, expected[:, 2], rtol=1e-10, atol=1e-10)
+    solve_in_place(factor, inverse_pivots, many, n)
+    solve_vector_in_place(factor, inverse_pivots, one, n)
+    expected = np.linalg.solve(matrix, right_side[:n])
+    np.testing.assert_allclose(many[:n, :30], expected, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(one[:n], expected[:, 2], rtol=1e-10, atol=1e-10)
+    np.testing.assert_array_equal(many[n:, :30], right_side[n:])
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from experts import BoxDDP
 from experts.arm_problem import ArmProblem
 from experts.line_search import SHORTER_STEPS, line_search
-from experts.padded_algebra import LANES
+from experts.parallel_rollouts import LANES
 from experts.shooting import ShootingWorkspace
 
 
