@@ -22,9 +22,9 @@ from experts.report.solvers.random_starts import (
     RandomStart,
     StartSolve,
     draw_starts,
+    missing_share,
     solve_random_starts,
     summarize_starts,
-    unreachable_share,
 )
 from experts.report.solvers.receding import Disturbance, disturbances, fly, measure_flights, with_masses
 from experts.report.solvers.runs import SolverRun, median_run, relative_gaps, time_to_gap
@@ -224,7 +224,7 @@ def test_shares_of_random_starts() -> None:
     assert (summary.converged, summary.succeeded, summary.both, summary.best) == (0.75, 0.75, 0.5, 0.5)
     assert summary.iterations == pytest.approx((2.5, 3.7))
     assert summary.seconds == pytest.approx((2.5, 3.7))
-    assert unreachable_share(starts) == 0.25
+    assert missing_share(starts) == 0.25
     assert summarize_starts([]) == []
 
 

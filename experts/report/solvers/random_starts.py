@@ -1,8 +1,8 @@
 """Solves from random starts: how often each solver converges, succeeds, and finds the best minimum known.
 
 The starts are drawn from the scene's spread of states; target and masses are the scene's, also where the
-environment draws them. Whether the best minimum known is a success is up to the weights of the cost and the
-reach of the robot, not to the solver.
+environment draws them. Whether the cheapest maneuver is a success is up to the weights of the cost and the
+reach of the robot; `GuidedDDP` gives up a little of the cost where it is not.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ def is_best(start: RandomStart, solve: StartSolve) -> bool:
     return relative_gap(solve.cost, start.best_cost) <= CLOSE
 
 
-def unreachable_share(starts: Sequence[RandomStart]) -> float:
+def missing_share(starts: Sequence[RandomStart]) -> float:
     """Share of the starts whose best minimum known is no success.
 
     Args:

@@ -8,7 +8,7 @@ from typing import Any
 from experts.report.solvers.accuracy import SolverComparison, SolverResult
 from experts.report.solvers.benchmark import ExpertBenchmark
 from experts.report.solvers.iterations import IterationCosts, Pieces
-from experts.report.solvers.random_starts import RandomStarts, summarize_starts, unreachable_share
+from experts.report.solvers.random_starts import RandomStarts, missing_share, summarize_starts
 from experts.report.solvers.runs import GAPS, time_to_gap
 from experts.report.summary import json_value
 
@@ -86,5 +86,5 @@ def _random_starts(found: RandomStarts) -> dict[str, Any]:
     return {
         **asdict(found),
         "summaries": [asdict(summary) for summary in summarize_starts(found.starts)],
-        "share_whose_best_is_no_success": unreachable_share(found.starts) if found.starts else None,
+        "share_whose_best_is_no_success": missing_share(found.starts) if found.starts else None,
     }

@@ -16,8 +16,8 @@ from experts.report.solvers.ours import TITLES
 from experts.report.solvers.random_starts import (
     RandomStarts,
     StartSummary,
+    missing_share,
     summarize_starts,
-    unreachable_share,
 )
 from experts.report.solvers.receding import Flight
 from experts.report.solvers.runs import GAPS, relative_gap, time_to_gap
@@ -164,8 +164,9 @@ def print_random_starts(console: Console, found: RandomStarts) -> None:
             (_summary_row(summary) for summary in summarize_starts(found.starts)),
             right=1,
         ),
-        f"Of the starts, {unreachable_share(found.starts):.1%} have a best known minimum that is itself no "
-        "success: that is up to the cost's weights.\n"
+        f"From {missing_share(found.starts):.1%} of the starts the cheapest maneuver known ends outside of the "
+        "tolerances:\nso the scene weighs error against effort. GuidedDDP then emphasizes the final pose as "
+        "far as it takes.\n"
         f"The library of GuidedDDP took {found.library_seconds:.2g} s, once.\n",
     )
 
