@@ -101,7 +101,7 @@ def best_gradient_step(scene, solution):
     states, controls, limit = solution.states, solution.controls, kernels.layout.control_limit
     a, b = kernels.linearize(states[:-1], controls)
     lx, lu, _, luu = kernels._call("cost_derivatives", x=states[:-1], u=controls)
-    adjoint = kernels._call("terminal_cost_derivatives", x=states[-1])[0]
+    adjoint = kernels._call("terminal_cost_derivatives", x=states[-1], emphasis=[1.0])[0]
     gradient = np.zeros_like(controls)
     for k in reversed(range(len(controls))):
         gradient[k] = lu[k] + b[k].T @ adjoint

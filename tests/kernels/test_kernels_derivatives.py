@@ -80,9 +80,10 @@ def test_machine_code_agrees_with_the_interpreted_graph(scene, draw):
 def test_cost_derivatives_agree_with_complex_steps(scene, draw):
     kernels, states, inputs = draw(scene, 3)
     programs = ScenePrograms(kernels.scene)
-    cost, terminal = programs.build("cost"), programs.build("terminal_cost")
+    cost, terminal = programs.build("cost"), programs.build("emphasized_terminal_cost")
+    emphasis = [3.0]
     lx, lu, lxx, luu = kernels._call("cost_derivatives", x=states, u=inputs)
-    terminal_lx, terminal_lxx = kernels._call("terminal_cost_derivatives", x=states)
+    terminal_lx, terminal_lxx = kernels._call("terminal_cost_derivatives", x=states, emphasis=emphasis)
     layout = kernels.layout
     for k, (x, u) in enumerate(zip(states, inputs, strict=True)):
 
@@ -95,9 +96,8 @@ def test_cost_derivatives_agree_with_complex_steps(scene, draw):
         scale = np.abs(lx[k]).max()
         np.testing.assert_allclose(lx[k], gradient(cost, along_x, {"u": u}), atol=1e-13 * scale)
         np.testing.assert_allclose(lu[k], gradient(cost, along_u, {"x": x}), rtol=1e-12)
-        np.testing.assert_allclose(
-            terminal_lx[k], gradient(terminal, along_x, {}), atol=1e-13 * np.abs(terminal_lx[k]).max()
-        )
+        expected = gradient(terminal, along_x, {"emphasis": emphasis})
+        np.testing.assert_allclose(terminal_lx[k], expected, atol=1e-13 * np.abs(terminal_lx[k]).max())
     n_u = kernels.n_u
     np.testing.assert_array_equal(luu[0].reshape(n_u, n_u), np.diag(2.0 * layout.control_weight))
     for hessian in (*lxx, *terminal_lxx):

@@ -94,10 +94,12 @@ def test_terminal_cost_hessian_agrees_with_differences_of_the_gradient(scene, dr
 
         def gradient(z, x=x):
             moved = kernels.retract(x, z)
-            return right_jacobian(kernels, z).T @ kernels._call("terminal_cost_derivatives", x=moved)[0]
+            slope = kernels._call("terminal_cost_derivatives", x=moved, emphasis=[3.0])[0]
+            return right_jacobian(kernels, z).T @ slope
 
         expected = differences(gradient, kernels.n_t)
-        hessian = kernels._call("terminal_cost_hessian", x=x)[0].reshape(kernels.n_t, kernels.n_t)
+        hessian = kernels._call("terminal_cost_hessian", x=x, emphasis=[3.0])[0]
+        hessian = hessian.reshape(kernels.n_t, kernels.n_t)
         np.testing.assert_allclose(hessian, expected, atol=1e-8 * np.abs(expected).max())
 
 
