@@ -11,7 +11,7 @@ from experts.compilation import compiled
 from experts.derivatives import Derivatives
 from experts.native_call import BufferTable, call_kernel
 from experts.padded_algebra import FloatArray
-from experts.rollout import FINISHED
+from experts.rollout import add_terminal, is_finite, set_controls
 
 
 @compiled
@@ -62,29 +62,25 @@ def rollout_with_gaps(
         Total cost, and `FINISHED` or the first stage that gave a number that is not finite.
     """
     total = 0.0
-    horizon, n_controls = controls.shape
-    for k in range(horizon):
+    for k in range(controls.shape[0]):
         call_kernel(difference, k, k + 1, difference_buffers)
-        for i in range(n_controls):
-            control = reference_controls[k, i] + alpha * update.feedforward[k, i]
-            for j in range(deviations.shape[1]):
-                control += update.gains[k, i, j] * deviations[k, j]
-            if not np.isfinite(control):
-                return np.inf, k
-            controls[k, i] = min(max(control, control_lower[i]), control_upper[i])
+        if not set_controls(
+            controls[k],
+            reference_controls[k],
+            alpha,
+            update.feedforward[k],
+            update.gains[k],
+            deviations[k],
+            control_lower,
+            control_upper,
+        ):
+            return np.inf, k
         call_kernel(step, k, k + 1, step_buffers)
         call_kernel(retract, k, k + 1, retract_buffers)
         total += stage_costs[k]
-        finite = np.isfinite(total)
-        for j in range(states.shape[1]):
-            finite = finite and np.isfinite(states[k + 1, j])
-        if not finite:
+        if not (np.isfinite(total) and is_finite(states[k + 1])):
             return np.inf, k
-    call_kernel(terminal, 0, 1, terminal_buffers)
-    total += terminal_cost[0]
-    if not np.isfinite(total):
-        return np.inf, horizon
-    return total, FINISHED
+    return add_terminal(total, terminal, terminal_buffers, stage_costs, terminal_cost)
 
 
 @compiled

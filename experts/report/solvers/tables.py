@@ -164,9 +164,9 @@ def print_random_starts(console: Console, found: RandomStarts) -> None:
             (_summary_row(summary) for summary in summarize_starts(found.starts)),
             right=1,
         ),
-        f"From {missing_share(found.starts):.1%} of the starts the cheapest maneuver known ends outside of the "
-        "tolerances:\nso the scene weighs error against effort. GuidedDDP then emphasizes the final pose as "
-        "far as it takes.\n"
+        f"From {missing_share(found.starts):.1%} of the starts the cheapest maneuver known ends outside of "
+        "the tolerances:\nso the scene weighs error against effort. GuidedDDP then emphasizes the final pose "
+        "as far as it takes.\n"
         f"The library of GuidedDDP took {found.library_seconds:.2g} s, once.\n",
     )
 
