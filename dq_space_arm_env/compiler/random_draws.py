@@ -17,8 +17,9 @@ from llvmlite import ir
 from numpy.typing import NDArray
 
 from dq_space_arm_env.compiler import native
-from dq_space_arm_env.compiler.emit import DOUBLE, INDEX, POINTER
 
+# Not from `compiler.emit`, which imports CasADi: with all kernels in the cache nothing else does.
+INDEX, DOUBLE, POINTER = ir.IntType(64), ir.DoubleType(), ir.PointerType()
 _WIDE = ir.IntType(128)
 # M. O'Neill, "PCG: A family of simple fast space-efficient statistically good algorithms for random number
 # generation" (2014): the multiplier of the 128-bit generator with output XSL RR.

@@ -64,15 +64,28 @@ def measure_start_up(scene: Scene, repeats: int) -> dict[str, list[float]]:
 
 
 def _seconds(program: str, scene: Scene, cache: str) -> float:
-    """Run a program in a new process with a cache of its own, and read what it prints."""
+    return float(new_process(program, cache, scene.model_dump_json()))
+
+
+def new_process(program: str, cache: str, text: str = "") -> str:
+    """Run a program in a new process with a cache of its own.
+
+    Args:
+        program: Python code; it finds the package that this process has.
+        cache: Folder of its compiled kernels.
+        text: What it reads from the standard input, a line.
+
+    Returns:
+        What it prints.
+    """
     root = str(Path(dq_space_arm_env.__file__).parent.parent)
     paths = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
     result = subprocess.run(
         [sys.executable, "-P", "-c", program],
-        input=scene.model_dump_json() + "\n",
+        input=text + "\n",
         stdout=subprocess.PIPE,
         text=True,
         check=True,
         env={**os.environ, "DQ_SPACE_ARM_CACHE": cache, "PYTHONPATH": paths},
     )
-    return float(result.stdout)
+    return result.stdout

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -17,6 +18,27 @@ ACTUATOR_TITLES = {
     "joint_torque": "joint torques",
     "wrist_rate": "Euler rates",
 }
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of plain text, for a terminal or a page.
+
+    Attributes:
+        title: What it shows.
+        headings: A heading for each column.
+        rows: The cells.
+        right: First of the columns that are flush right; None for none.
+    """
+
+    title: str
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    right: int | None = None
+
+    def for_terminal(self) -> Table:
+        """The table as `rich` prints it."""
+        return plain_table(self.title, self.headings, self.rows, self.right)
 
 
 def print_tables(console: Console, run: ManeuverRun) -> None:

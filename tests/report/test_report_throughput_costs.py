@@ -14,7 +14,7 @@ from dq_space_arm_env.scene import StateLayout
 from experts.report.peak import Peak
 from experts.report.start_up import EMPTY, IMPORT, LINEARIZE, MAKE, WARM, measure_start_up
 from experts.report.throughput.cost_tables import print_feature_costs, print_scene_costs
-from experts.report.throughput.features import feature_variants, with_links, without_wrist
+from experts.report.throughput.features import feature_variants, in_the_plane, with_links, without_wrist
 from experts.report.throughput.scene_costs import BATCH, measure_costs
 from experts.report.throughput.timing import FLOAT64, Effort, Timing
 
@@ -75,12 +75,18 @@ def test_parts_left_out_take_their_states_and_inputs_along() -> None:
         "without wrist": (20, 9),
         "without base force": (23, 9),
         "without base torque": (23, 9),
+        "without joint torques": (23, 9),
+        "without wrist inputs": (23, 9),
         "without base force and torque": (23, 6),
         "with a tip wrench": (23, 12),
+        "with springs and dampers": (23, 12),
+        "without random starts": (23, 12),
+        "with random target": (23, 12),
+        "with random masses": (23, 12),
         "with 2 links": (21, 11),
         "with 1 link": (19, 10),
         "with 0 links": (17, 9),
-        "scene planar, another robot": (13, 6),
+        "in the plane, without wrist": (13, 6),
     }
 
 
@@ -102,12 +108,55 @@ def test_a_payload_needs_a_link() -> None:
     assert "with 0 links" not in variants
 
 
-def test_a_planar_scene_gets_no_tip_wrench_and_no_other_robot(short_scene: Scene) -> None:
+def test_a_planar_scene_gets_no_tip_wrench_and_stays_in_its_plane(short_scene: Scene) -> None:
     assert list(feature_variants(short_scene)) == [
         "short, as it is",
         "without base torque",
+        "without joint torques",
+        "with springs and dampers",
+        "with random target",
+        "with random masses",
         "with 0 links",
     ]
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_parts_of_every_scene_make_scenes(name: str) -> None:
+    """Each of them is validated; here, that there is something to compare."""
+    variants = feature_variants(load_scene(name))
+    whole = variants.pop(f"{name}, as it is")
+    assert len(variants) >= 10
+    assert len({variant.content_hash() for variant in variants.values()} - {whole.content_hash()}) == len(
+        variants
+    )
+
+
+def test_what_a_scene_draws_is_left_out_and_what_it_does_not_draw_is_added() -> None:
+    drawing = feature_variants(load_scene("random-masses"))
+    assert drawing["without random masses"].spread.payload_mass == 0.0
+    assert drawing["without payload"].spread.link_masses == 0.1
+    assert drawing["without random starts"].spread.joint_angles == 0.0
+    assert drawing["with random target"].spread.target_position > 0.0
+    assert feature_variants(load_scene("paper"))["with random masses"].spread.link_inertias > 0.0
+
+
+def test_springs_that_a_scene_has_are_left_out(short_scene: Scene) -> None:
+    sprung = feature_variants(short_scene)["with springs and dampers"]
+    assert sprung.links[0].stiffness > 0.0
+    rest = feature_variants(sprung)["without springs and dampers"]
+    assert (rest.links[0].stiffness, rest.links[0].damping) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("name", ["paper", "six-joint", "tip-load", "payload"])
+def test_in_the_plane_the_bodies_keep_their_masses_and_the_arm_its_length(name: str) -> None:
+    scene = load_scene(name)
+    flat = in_the_plane(scene)
+    assert flat.base.motion == "planar"
+    assert [link.mass for link in flat.links] == [link.mass for link in scene.links]
+    assert (flat.payload is None) == (scene.payload is None)
+    assert (flat.tip_wrench is None) == (scene.tip_wrench is None)
+    for link, own in zip(flat.links, scene.links, strict=True):
+        assert sum(link.joint.position) == pytest.approx(sum(own.joint.position))
 
 
 def test_without_wrist_the_tip_stays_where_it_is_at_zero_angles() -> None:
