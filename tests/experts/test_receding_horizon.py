@@ -94,7 +94,7 @@ def test_pushes_are_recovered_from(plans, experts):
     assert experts["paper"].fallbacks == 0
 
 
-@pytest.mark.parametrize("factor", [0.8, 1.2])
+@pytest.mark.parametrize("factor", [pytest.param(0.8, marks=pytest.mark.slow), 1.2])
 def test_a_payload_of_another_mass_costs_hardly_more_than_to_who_knows_it(factor, plans, experts):
     """The optimum of this scene itself ends 2.5 to 3 degrees off, so what counts is the cost."""
     scene = load_scene("payload")
