@@ -1,86 +1,13 @@
-"""Trajectories with gaps: a rollout that closes a share of them, and what the model says of its cost.
+"""What the quadratic model says of the cost of a trajectory with gaps, if a step closes them.
 
 Between two stages of such a trajectory there is a gap f_k = step(x_k, u_k) (-) x_k+1, in the tangent
 coordinates of x_k+1; see `multiple_shooting`.
 """
 
-import numpy as np
-
 from experts.backward_sweep import Update
 from experts.compilation import compiled
 from experts.derivatives import Derivatives
-from experts.native_call import BufferTable, call_kernel
 from experts.padded_algebra import FloatArray
-from experts.rollout import add_terminal, is_finite, set_controls
-
-
-@compiled
-def rollout_with_gaps(
-    difference: int,
-    difference_buffers: BufferTable,
-    step: int,
-    step_buffers: BufferTable,
-    retract: int,
-    retract_buffers: BufferTable,
-    terminal: int,
-    terminal_buffers: BufferTable,
-    reference_controls: FloatArray,
-    update: Update,
-    alpha: float,
-    control_lower: FloatArray,
-    control_upper: FloatArray,
-    states: FloatArray,
-    controls: FloatArray,
-    deviations: FloatArray,
-    stage_costs: FloatArray,
-    terminal_cost: FloatArray,
-) -> tuple[float, int]:
-    """Roll out u = clip(u_ref + alpha k + K (x (-) x_ref)), every state moved off where its step lands.
-
-    Args:
-        difference: Address of `difference`.
-        difference_buffers: Its buffers: reference states, states, deviations.
-        step: Address of `step_with_cost`.
-        step_buffers: Its buffers: states, controls, time step, landings, stage costs.
-        retract: Address of `retract`.
-        retract_buffers: Its buffers: landings, offsets, states from stage 1 on. A state is its landing (+)
-            the offset, so that the offset is the negative gap of the result.
-        terminal: Address of `terminal_cost`.
-        terminal_buffers: Its buffers: the last state, the terminal cost.
-        reference_controls: u_ref, shape (N, n_u).
-        update: k and K.
-        alpha: Step length.
-        control_lower: Lower bounds, shape (n_u,).
-        control_upper: Upper bounds, shape (n_u,).
-        states: Row 0 holds the first state; receives the others; shape (N + 1, n_x).
-        controls: Receives the controls, shape (N, n_u).
-        deviations: Receives x (-) x_ref, shape (N, n_t).
-        stage_costs: Receives the cost of every stage, shape (N,).
-        terminal_cost: Receives the terminal cost, shape (1,).
-
-    Returns:
-        Total cost, and `FINISHED` or the first stage that gave a number that is not finite.
-    """
-    total = 0.0
-    for k in range(controls.shape[0]):
-        call_kernel(difference, k, k + 1, difference_buffers)
-        if not set_controls(
-            controls[k],
-            reference_controls[k],
-            alpha,
-            update.feedforward[k],
-            update.gains[k],
-            deviations[k],
-            control_lower,
-            control_upper,
-        ):
-            return np.inf, k
-        call_kernel(step, k, k + 1, step_buffers)
-        call_kernel(retract, k, k + 1, retract_buffers)
-        total += stage_costs[k]
-        if not (np.isfinite(total) and is_finite(states[k + 1])):
-            return np.inf, k
-    return add_terminal(total, terminal, terminal_buffers, stage_costs, terminal_cost)
 
 
 @compiled

@@ -17,15 +17,13 @@ import numpy as np
 
 from experts.box_ddp import BoxDDP
 from experts.checks import check_array, check_at_least
-from experts.native_call import buffer_table
 from experts.problem import FloatArray, ShootingProblem
 from experts.progress import Callback
 from experts.reaching import HasTolerances, reach
-from experts.rollout import FINISHED, closed_loop_rollout
 from experts.screw_motion import ScrewMotion
-from experts.shooting import Trajectory
 from experts.solution import Solution, StopReason
 from experts.tracking import track
+from experts.trajectory import Trajectory
 
 START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
 """First dampings with which the initial state is solved from zero controls; the cheapest end is kept."""
@@ -260,33 +258,13 @@ def follow(solution: Solution, problem: ShootingProblem, x0: FloatArray) -> tupl
         Controls within the bounds, shape (N, n_u), units of the inputs, and the cost of the rollout, inf if
         it is not finite.
     """
-    reference, time_step = np.ascontiguousarray(solution.states), np.array([problem.time_step])
-    trial = Trajectory(problem, time_step)
+    trial = Trajectory(problem)
     trial.states[0] = x0
-    deviations = np.zeros((problem.horizon, problem.n_tangent))
-    difference, step, terminal = (
-        problem.kernel(name) for name in ("difference", "step_with_cost", "terminal_cost")
-    )
-    cost, failing_stage = closed_loop_rollout(
-        difference.address,
-        buffer_table(reference, trial.states, deviations),
-        step.address,
-        trial.step_buffers,
-        terminal.address,
-        trial.terminal_buffers,
-        solution.controls,
-        np.zeros_like(solution.controls),
-        solution.feedback_gains,
-        1.0,
-        np.array(problem.control_lower, dtype=np.float64),
-        np.array(problem.control_upper, dtype=np.float64),
-        trial.states,
-        trial.controls,
-        deviations,
-        trial.stage_costs,
-        trial.terminal_cost,
-    )
-    return trial.controls, cost if failing_stage == FINISHED else np.inf
+    kernels = {name: problem.kernel(name) for name in ("difference", "step_with_cost", "terminal_cost")}
+    reference = np.ascontiguousarray(solution.states), solution.controls
+    policy = np.zeros_like(solution.controls), solution.feedback_gains
+    cost = trial.follow(kernels, reference, policy, alpha=0.0)
+    return trial.controls, cost
 
 
 def _check_sizes(name: str, solution: Solution, problem: ShootingProblem) -> None:

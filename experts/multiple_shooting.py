@@ -36,7 +36,7 @@ import numpy as np
 
 from experts.backward_sweep import SWEEP_DONE
 from experts.checks import check_array, check_control_weights
-from experts.gaps import change_of_cost, rollout_with_gaps
+from experts.gaps import change_of_cost
 from experts.line_search import ACCEPTANCE, STEP_LENGTHS
 from experts.native_call import buffer_table, run_kernel
 from experts.problem import KERNEL_NAMES, RETRACTION_KERNEL_NAME, FloatArray
@@ -86,12 +86,9 @@ class MultipleShooting:
         self.gaps = np.zeros((horizon, n_tangent))
         self.initial_gap = np.zeros((1, n_tangent))
         self._kernels = {name: problem.kernel(name) for name in (*KERNEL_NAMES, RETRACTION_KERNEL_NAME)}
-        self._lower = np.array(problem.control_lower, dtype=np.float64)
-        self._upper = np.array(problem.control_upper, dtype=np.float64)
         self._time_step = np.array([problem.time_step])
         self._initial_state = np.zeros((1, problem.n_states))
         self._landings = np.zeros((horizon, problem.n_states))
-        self._deviations = np.zeros((horizon, n_tangent))
         self._rows = np.zeros(n_tangent), np.zeros(n_tangent), np.zeros(problem.n_controls)
 
     @property
@@ -295,32 +292,11 @@ class MultipleShooting:
     @timed("rollout")
     def _roll_out_with_gaps(self, alpha: float) -> float:
         """Roll out the update into a trial trajectory with gaps."""
-        trial, current, kernels = self.work.trial, self.work.current, self._kernels
-        offsets = (alpha - 1.0) * self.gaps
+        trial, current, update = self.work.trial, self.work.current, self.work.update
         first_offset = (alpha - 1.0) * self.initial_gap
         self._run(RETRACTION_KERNEL_NAME, 1, self._initial_state, first_offset, trial.states)
-        steps = trial.states, trial.controls, self._time_step, self._landings, trial.stage_costs
-        trial.cost, trial.failing_stage = rollout_with_gaps(
-            kernels["difference"].address,
-            buffer_table(current.states, trial.states, self._deviations),
-            kernels["step_with_cost"].address,
-            buffer_table(*steps),
-            kernels[RETRACTION_KERNEL_NAME].address,
-            buffer_table(self._landings, offsets, trial.states[1:]),
-            kernels["terminal_cost"].address,
-            trial.terminal_buffers,
-            current.controls,
-            self.work.update,
-            float(alpha),
-            self._lower,
-            self._upper,
-            trial.states,
-            trial.controls,
-            self._deviations,
-            trial.stage_costs,
-            trial.terminal_cost,
-        )
-        return trial.cost
+        reference, policy = (current.states, current.controls), (update.feedforward, update.gains)
+        return trial.follow(self._kernels, reference, policy, alpha, offsets=(alpha - 1.0) * self.gaps)
 
     def accept(self, alpha: float) -> None:
         """Make the trial the current trajectory.

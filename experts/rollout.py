@@ -8,6 +8,8 @@ from experts.padded_algebra import FloatArray
 
 FINISHED = -1
 """In place of the failing stage, when every state and cost of the rollout is finite."""
+NO_RETRACTION = 0
+"""In place of the address of `retract`, when states are where their steps land."""
 
 
 @compiled
@@ -38,9 +40,9 @@ def rollout(
     for k in range(stage_costs.shape[0]):
         call_kernel(step, k, k + 1, step_buffers)
         total += stage_costs[k]
-        if not (np.isfinite(total) and is_finite(states[k + 1])):
+        if not (np.isfinite(total) and _is_finite(states[k + 1])):
             return np.inf, k
-    return add_terminal(total, terminal, terminal_buffers, stage_costs, terminal_cost)
+    return _add_terminal(total, terminal, terminal_buffers, stage_costs, terminal_cost)
 
 
 @compiled
@@ -49,6 +51,8 @@ def closed_loop_rollout(
     difference_buffers: BufferTable,
     step: int,
     step_buffers: BufferTable,
+    retract: int,
+    retract_buffers: BufferTable,
     terminal: int,
     terminal_buffers: BufferTable,
     reference_controls: FloatArray,
@@ -70,6 +74,9 @@ def closed_loop_rollout(
         difference_buffers: Its buffers: reference states, states, deviations.
         step: Address of `step_with_cost`.
         step_buffers: Its buffers: states, controls, time step, states from stage 1 on, stage costs.
+        retract: Address of `retract`, which moves every state off where its step lands; or `NO_RETRACTION`.
+        retract_buffers: Its buffers: landings, which then take the place of the states that steps write,
+            offsets, states from stage 1 on.
         terminal: Address of `terminal_cost`.
         terminal_buffers: Its buffers: the last state, the terminal cost.
         reference_controls: u_ref, shape (N, n_u).
@@ -88,46 +95,35 @@ def closed_loop_rollout(
         Total cost, and `FINISHED` or the first stage that gave a number that is not finite.
     """
     total = 0.0
-    for k in range(controls.shape[0]):
+    horizon, n_controls = controls.shape
+    n_tangent = deviations.shape[1]
+    for k in range(horizon):
         call_kernel(difference, k, k + 1, difference_buffers)
-        if not set_controls(
-            controls[k],
-            reference_controls[k],
-            alpha,
-            feedforward[k],
-            gains[k],
-            deviations[k],
-            control_lower,
-            control_upper,
-        ):
-            return np.inf, k
+        for i in range(n_controls):
+            control = reference_controls[k, i] + alpha * feedforward[k, i]
+            for j in range(n_tangent):
+                control += gains[k, i, j] * deviations[k, j]
+            if not np.isfinite(control):
+                return np.inf, k
+            controls[k, i] = min(max(control, control_lower[i]), control_upper[i])
         call_kernel(step, k, k + 1, step_buffers)
+        if retract != NO_RETRACTION:
+            call_kernel(retract, k, k + 1, retract_buffers)
         total += stage_costs[k]
-        if not (np.isfinite(total) and is_finite(states[k + 1])):
+        if not (np.isfinite(total) and _is_finite(states[k + 1])):
             return np.inf, k
-    return add_terminal(total, terminal, terminal_buffers, stage_costs, terminal_cost)
+    return _add_terminal(total, terminal, terminal_buffers, stage_costs, terminal_cost)
 
 
 @compiled
-def add_terminal(
+def _add_terminal(
     total: float,
     terminal: int,
     terminal_buffers: BufferTable,
     stage_costs: FloatArray,
     terminal_cost: FloatArray,
 ) -> tuple[float, int]:
-    """Add the terminal cost to the sum over stages.
-
-    Args:
-        total: The sum.
-        terminal: Address of `terminal_cost`.
-        terminal_buffers: Its buffers: the last state, the terminal cost.
-        stage_costs: Costs of the stages, shape (N,).
-        terminal_cost: Receives the terminal cost, shape (1,).
-
-    Returns:
-        Total cost, and `FINISHED`, or N if the terminal cost is not finite.
-    """
+    """Add the terminal cost to the sum over stages."""
     call_kernel(terminal, 0, 1, terminal_buffers)
     total += terminal_cost[0]
     if not np.isfinite(total):
@@ -136,51 +132,8 @@ def add_terminal(
 
 
 @inlined
-def set_controls(
-    controls: FloatArray,
-    reference: FloatArray,
-    alpha: float,
-    feedforward: FloatArray,
-    gains: FloatArray,
-    deviation: FloatArray,
-    lower: FloatArray,
-    upper: FloatArray,
-) -> bool:
-    """Compute u = clip(u_ref + alpha k + K (x (-) x_ref)) of a stage.
-
-    Args:
-        controls: Receives u, shape (n_u,).
-        reference: u_ref, shape (n_u,).
-        alpha: Step length.
-        feedforward: k, shape (n_u,).
-        gains: K, shape (n_u, n_t).
-        deviation: x (-) x_ref, shape (n_t,).
-        lower: Lower bounds, shape (n_u,).
-        upper: Upper bounds, shape (n_u,).
-
-    Returns:
-        Whether it is finite before it is clipped.
-    """
-    finite = True
-    for i in range(controls.shape[0]):
-        control = reference[i] + alpha * feedforward[i]
-        for j in range(deviation.shape[0]):
-            control += gains[i, j] * deviation[j]
-        finite = finite and np.isfinite(control)
-        controls[i] = min(max(control, lower[i]), upper[i])
-    return finite
-
-
-@inlined
-def is_finite(row: FloatArray) -> bool:
-    """Say whether all numbers of a row are finite.
-
-    Args:
-        row: Shape (n,).
-
-    Returns:
-        Whether they are.
-    """
+def _is_finite(row: FloatArray) -> bool:
+    """Say whether all numbers of a row are finite."""
     finite = True
     for i in range(row.shape[0]):
         finite = finite and np.isfinite(row[i])

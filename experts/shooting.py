@@ -30,7 +30,8 @@ from experts.derivatives import (
 from experts.native_call import BufferTable, buffer_table, run_kernel
 from experts.parallel_rollouts import ParallelRollouts
 from experts.problem import KERNEL_NAMES, SECOND_ORDER_KERNEL_NAMES, FloatArray, ShootingProblem
-from experts.rollout import FINISHED, closed_loop_rollout, rollout
+from experts.rollout import FINISHED
+from experts.trajectory import Trajectory
 
 BATCHED_KERNELS = ("linearize", "cost_derivatives", "lagrangian_hessian")
 """Kernels that work on all stages at once; rollouts go from stage to stage."""
@@ -40,39 +41,6 @@ _STAGES_PER_BLOCK = 32
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-
-class Trajectory:
-    """States, controls and costs of one rollout, with the buffer tables of the kernels that fill them.
-
-    Attributes:
-        states: Shape (N + 1, n_x).
-        controls: Shape (N, n_u).
-        stage_costs: Shape (N,).
-        terminal_cost: Shape (1,).
-        cost: Total cost, inf if the rollout is not finite.
-        failing_stage: First stage with a number that is not finite, or `FINISHED`.
-        step_buffers: Buffers of `step_with_cost`.
-        terminal_buffers: Buffers of `terminal_cost`.
-    """
-
-    def __init__(self, problem: ShootingProblem, time_step: FloatArray) -> None:
-        """Allocate the arrays.
-
-        Args:
-            problem: Gives the sizes, and what its terminal cost reads; the caller keeps it alive.
-            time_step: The scalar that all rows share, shape (1,), s.
-        """
-        self.states = np.zeros((problem.horizon + 1, problem.n_states))
-        self.controls = np.zeros((problem.horizon, problem.n_controls))
-        self.stage_costs = np.zeros(problem.horizon)
-        self.terminal_cost = np.zeros(1)
-        self.cost = np.inf
-        self.failing_stage = FINISHED
-        self.step_buffers = buffer_table(
-            self.states, self.controls, time_step, self.states[1:], self.stage_costs
-        )
-        self.terminal_buffers = buffer_table(self.states[-1:], *problem.terminal_inputs, self.terminal_cost)
 
 
 @dataclass
@@ -151,7 +119,6 @@ class ShootingWorkspace:
         self.update: Update = allocate_update(*sizes, keep_values=keep_values)
         self._spare_update: Update = allocate_update(*sizes, keep_values=keep_values)
         self._time_step = np.array([problem.time_step])
-        self._deviations = np.zeros((problem.horizon, problem.n_tangent))
         self._no_gaps = np.zeros((0, problem.n_tangent))
         self._sweep_work = sweep_workspace(problem.n_tangent, problem.n_controls)
         self._lower = np.array(problem.control_lower, dtype=np.float64)
@@ -165,8 +132,8 @@ class ShootingWorkspace:
         self._costates = np.zeros((stages, problem.n_tangent))
         self._exact_is_current = False
         self._parallel = ParallelRollouts(problem, self._time_step)
-        self.current = Trajectory(problem, self._time_step)
-        self.trial = Trajectory(problem, self._time_step)
+        self.current = Trajectory(problem)
+        self.trial = Trajectory(problem)
 
     @timed("rollout")
     def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
@@ -179,15 +146,7 @@ class ShootingWorkspace:
         trajectory = self.current
         trajectory.states[0] = self.trial.states[0] = initial_state
         trajectory.controls[:] = controls
-        trajectory.cost, trajectory.failing_stage = rollout(
-            self._kernels["step_with_cost"].address,
-            trajectory.step_buffers,
-            self._kernels["terminal_cost"].address,
-            trajectory.terminal_buffers,
-            trajectory.states,
-            trajectory.stage_costs,
-            trajectory.terminal_cost,
-        )
+        trajectory.roll_out(self._kernels)
 
     @timed("derivatives")
     def differentiate(self) -> None:
@@ -262,27 +221,9 @@ class ShootingWorkspace:
         Returns:
             Cost of the trial, inf if it is not finite.
         """
-        trial, current = self.trial, self.current
-        trial.cost, trial.failing_stage = closed_loop_rollout(
-            self._kernels["difference"].address,
-            buffer_table(current.states, trial.states, self._deviations),
-            self._kernels["step_with_cost"].address,
-            trial.step_buffers,
-            self._kernels["terminal_cost"].address,
-            trial.terminal_buffers,
-            current.controls,
-            self.update.feedforward,
-            self.update.gains,
-            float(alpha),
-            self._lower,
-            self._upper,
-            trial.states,
-            trial.controls,
-            self._deviations,
-            trial.stage_costs,
-            trial.terminal_cost,
-        )
-        return trial.cost
+        reference = self.current.states, self.current.controls
+        policy = self.update.feedforward, self.update.gains
+        return self.trial.follow(self._kernels, reference, policy, alpha)
 
     @timed("rollout")
     def try_steps(self, step_lengths: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from experts.native_call import buffer_table
-from experts.rollout import FINISHED, closed_loop_rollout, rollout
+from experts.rollout import FINISHED, NO_RETRACTION, closed_loop_rollout, rollout
 
 
 class Arrays:
@@ -41,6 +41,8 @@ class Arrays:
             buffer_table(reference.states, self.states, deviations),
             self.address("step_with_cost"),
             self.step_buffers,
+            NO_RETRACTION,
+            buffer_table(),
             self.address("terminal_cost"),
             self.terminal_buffers,
             reference.controls,

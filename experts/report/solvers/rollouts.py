@@ -8,8 +8,7 @@ import numpy as np
 
 from experts.arm_problem import ArmProblem
 from experts.problem import FloatArray
-from experts.rollout import rollout
-from experts.shooting import Trajectory
+from experts.trajectory import Trajectory
 
 
 def roll_out(problem: ArmProblem, x0: FloatArray, controls: FloatArray) -> Trajectory:
@@ -23,19 +22,9 @@ def roll_out(problem: ArmProblem, x0: FloatArray, controls: FloatArray) -> Traje
     Returns:
         States and cost; the cost is inf if the rollout is not finite.
     """
-    time_step = np.array([problem.time_step])
-    trajectory = Trajectory(problem, time_step)
+    trajectory = Trajectory(problem)
     trajectory.states[0], trajectory.controls[:] = x0, controls
-    step, terminal = problem.kernel("step_with_cost"), problem.kernel("terminal_cost")
-    trajectory.cost, trajectory.failing_stage = rollout(
-        step.address,
-        trajectory.step_buffers,
-        terminal.address,
-        trajectory.terminal_buffers,
-        trajectory.states,
-        trajectory.stage_costs,
-        trajectory.terminal_cost,
-    )
+    trajectory.roll_out({name: problem.kernel(name) for name in ("step_with_cost", "terminal_cost")})
     return trajectory
 
 
