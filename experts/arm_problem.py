@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
+from dq_space_arm_env.scene import CURVED_INTEGRATORS
 from experts.native_call import buffer_table, run_kernel
 from experts.problem import FloatArray, Kernel
 from experts.screw_motion import ScrewMotion, screw_motion
@@ -22,9 +23,10 @@ class ArmProblem:
         scene: The scene.
         kernels: Its compiled functions.
         terminal_inputs: The emphasis on the pose in the terminal cost, shape (1,); see `emphasized`.
+        has_second_order: Whether steps of its integrator have second derivatives; the solver does with
+            Gauss-Newton's model where they have none.
     """
 
-    has_second_order = True
     has_retraction = True
 
     def __init__(self, scene: Scene | str | Path, integrator: str | None = None) -> None:
@@ -40,6 +42,7 @@ class ArmProblem:
         """
         self.scene = in_double_precision(load_scene(scene), integrator)
         self.kernels = compile_scene(self.scene)
+        self.has_second_order = self.scene.simulation.integrator in CURVED_INTEGRATORS
         layout = self.kernels.layout
         self.n_states, self.n_tangent, self.n_controls = layout.n_x, layout.n_t, layout.n_u
         self.horizon = self.scene.simulation.steps

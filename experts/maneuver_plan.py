@@ -51,12 +51,15 @@ class ManeuverPlan:
         """
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         solution = BoxDDP(problem).solve(x0=state, u_init=guess[stage:])
-        work = ShootingWorkspace(problem, second_order=True, keep_values=True)
+        exact = problem.has_second_order
+        work = ShootingWorkspace(problem, second_order=exact, keep_values=True)
         work.start(state, solution.controls)
         work.differentiate()
-        work.differentiate_twice()
+        if exact:
+            work.differentiate_twice()
         # Where the solver ran out of iterations the exact model may have no minimum; Gauss-Newton's has one.
-        found = any(work.sweep(0.0, exact=exact).status == SWEEP_DONE for exact in (True, False))
+        models = (True, False) if exact else (False,)
+        found = any(work.sweep(0.0, exact=model).status == SWEEP_DONE for model in models)
         if solution.stop_reason is StopReason.DIVERGED or not found:
             raise RuntimeError(f"there is no plan from the state at stage {stage}: {solution.message}")
         hessians = _convex_part(work.update.stage_hessians)

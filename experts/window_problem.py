@@ -33,7 +33,7 @@ class WindowProblem:
         """
         self.maneuver, self.horizon, self.ends_early = maneuver, horizon, bool(model)
         self.terminal_inputs = model or maneuver.terminal_inputs
-        self.has_second_order = not self.ends_early
+        self.has_second_order = maneuver.has_second_order and not self.ends_early
         self.has_retraction = True
         self.n_states, self.n_tangent = maneuver.n_states, maneuver.n_tangent
         self.n_controls = maneuver.n_controls

@@ -129,6 +129,14 @@ class VectorBuilder:
         """Emit -a where the condition holds, else a."""
         return self.select(condition, self.negate(a), a)
 
+    def any_nonzero(self, base: ir.Value) -> ir.Value:
+        """Emit whether the first vector of a buffer has a lane that is not zero: a single truth value."""
+        found = self.compare("!=", self.load(base, 0), self.constant(0.0))
+        if self.target.lanes == 1:
+            return found
+        bits = ir.IntType(self.target.lanes)
+        return self.ir.icmp_unsigned("!=", self.ir.bitcast(found, bits), bits(0))
+
     def address(self, base: ir.Value, index: int) -> ir.Value:
         """Address of vector number `index` of a buffer."""
         return self.ir.gep(base, [INDEX(index)], source_etype=self.type)

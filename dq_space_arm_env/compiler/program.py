@@ -13,7 +13,8 @@ index[begin], ..., index[end - 1] instead; the address of `index` (int64) comes 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from llvmlite import ir
@@ -70,6 +71,22 @@ class Call:
     bindings: Mapping[str, str]
 
 
+@dataclass(frozen=True)
+class Loop:
+    """A stretch of a program's calls that is repeated.
+
+    Attributes:
+        begin: Position of its first call.
+        end: Position after its last call.
+        condition: Buffer of one scalar. After each pass the calls are repeated if it is not zero in some
+            lane; lanes in which it is zero must pass through them unchanged.
+    """
+
+    begin: int
+    end: int
+    condition: str
+
+
 @dataclass
 class Program:
     """A sequence of calls.
@@ -80,6 +97,8 @@ class Program:
         outputs: Arrays that are written.
         calls: The calls in order. A buffer that is neither input nor output is scratch; it starts as zero.
         indexed: Whether a list says which rows to work on.
+        loops: Stretches of the calls that are repeated, one after another; what they touch lives through all
+            passes.
     """
 
     name: str
@@ -87,6 +106,7 @@ class Program:
     outputs: Sequence[Buffer]
     calls: list[Call] = field(default_factory=list)
     indexed: bool = False
+    loops: list[Loop] = field(default_factory=list)
 
     def call(self, graph: Graph, **bindings: str) -> None:
         """Append a call.
@@ -97,9 +117,23 @@ class Program:
         """
         self.calls.append(Call(graph, bindings))
 
+    @contextmanager
+    def repeated_while(self, condition: str) -> Iterator[None]:
+        """Repeat the calls that are appended inside, which happens at least once.
+
+        Args:
+            condition: Buffer of one scalar, see `Loop`.
+
+        Yields:
+            Nothing.
+        """
+        begin = len(self.calls)
+        yield
+        self.loops.append(Loop(begin, len(self.calls), condition))
+
     @property
     def operation_count(self) -> int:
-        """Arithmetic operations per row, over all calls."""
+        """Arithmetic operations per row, over all calls; a loop counts once."""
         return sum(call.graph.operation_count for call in self.calls)
 
     def scratch_sizes(self) -> dict[str, int]:
@@ -133,9 +167,12 @@ class Program:
         end = len(self.calls)
         always = self.read_before_written()
         used = {buffer.name: [-1] for buffer in self.inputs}
+        loops = {number: loop for loop in self.loops for number in range(loop.begin, loop.end)}
         for number, call in enumerate(self.calls):
+            # What is written in one pass of a loop may be read in the next one.
+            span = (loops[number].begin, loops[number].end - 1) if number in loops else (number,)
             for name, _ in (*call.graph.inputs, *call.graph.outputs):
-                used.setdefault(call.bindings.get(name, name), []).append(number)
+                used.setdefault(call.bindings.get(name, name), []).extend(span)
         for buffer in self.outputs:
             used.setdefault(buffer.name, [-1]).append(end)
         return {
@@ -193,9 +230,18 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
         lanes = arrays.rows_of(buffer, rows, target)
         element = access[buffer.dtype or target.precision]
         element.gather(lanes, blocks[buffer.name], buffer.size, shared=buffer.shared)
-    for call in program.calls:
+    begins, ends = ({getattr(loop, key): loop for loop in program.loops} for key in ("begin", "end"))
+    for position, call in enumerate(program.calls, start=1):
+        if position - 1 in begins:
+            repeated = kernel.append_basic_block("repeated")
+            builder.branch(repeated)
+            builder.position_at_end(repeated)
         names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
         builder.call(functions[call.graph.name], [blocks[call.bindings.get(name, name)] for name in names])
+        if position in ends:
+            after = kernel.append_basic_block("after")
+            builder.cbranch(vectors.any_nonzero(blocks[ends[position].condition]), repeated, after)
+            builder.position_at_end(after)
     for buffer in program.outputs:
         element, block = access[buffer.dtype or target.precision], blocks[buffer.name]
         if buffer.by_column:

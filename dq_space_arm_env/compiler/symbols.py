@@ -76,3 +76,18 @@ def zeros(rows: int, columns: int) -> Matrix:
         SX matrix.
     """
     return casadi.SX(rows, columns)
+
+
+def dense_entries(vector: Matrix) -> list[Scalar]:
+    """Entries of a column, with the number zero where nothing is stored.
+
+    Args:
+        vector: SX matrix (n, 1).
+
+    Returns:
+        n numbers or expressions.
+    """
+    entries: list[Scalar] = [0.0] * vector.shape[0]
+    for row, value in zip(vector.row(), vector.nonzeros(), strict=True):
+        entries[row] = value
+    return entries

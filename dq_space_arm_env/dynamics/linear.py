@@ -1,4 +1,4 @@
-"""Linear algebra over plain scalars: the LDL' factorization of a small symmetric positive definite matrix."""
+"""Linear algebra over plain scalars: LDL' and LU factorizations of small matrices, without pivoting."""
 
 from __future__ import annotations
 
@@ -69,4 +69,49 @@ def solve_ldl(factor: LDLFactor, right: Sequence[Scalar]) -> list[Scalar]:
     for i in reversed(range(len(solution))):
         for k in range(i):
             solution[k] = solution[k] - factor.lower[i][k] * solution[i]
+    return solution
+
+
+def factorize_lu(matrix: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
+    """Factorize A = L U without pivoting: unit lower triangular L times upper triangular U.
+
+    Meant for matrices I + A E with a positive definite A and a diagonal E >= 0, and for small changes of
+    them: rounding errors are those of the symmetric I + E^1/2 A E^1/2, which needs no pivoting either,
+    because scaling rows and columns by inverse factors scales every number of the elimination alike.
+
+    Args:
+        matrix: n x n.
+
+    Returns:
+        n x n: L below the diagonal, U above it, and the reciprocals of U's diagonal on it.
+    """
+    rows = [list(row) for row in matrix]
+    for k, pivot_row in enumerate(rows):
+        pivot_row[k] = 1.0 / pivot_row[k]
+        for row in rows[k + 1 :]:
+            row[k] = row[k] * pivot_row[k]
+            for j in range(k + 1, len(rows)):
+                row[j] = row[j] - row[k] * pivot_row[j]
+    return rows
+
+
+def solve_lu(factor: Sequence[Sequence[Scalar]], right: Sequence[Scalar]) -> list[Scalar]:
+    """Solve A x = b.
+
+    Args:
+        factor: From `factorize_lu`.
+        right: b, n.
+
+    Returns:
+        x, n.
+    """
+    solution: list[Scalar] = []
+    for row, value in zip(factor, right, strict=True):
+        for entry, known in zip(row, solution, strict=False):
+            value = value - entry * known
+        solution.append(value)
+    for i in reversed(range(len(solution))):
+        for j in range(i + 1, len(solution)):
+            solution[i] = solution[i] - factor[i][j] * solution[j]
+        solution[i] = solution[i] * factor[i][i]
     return solution

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from dq_space_arm_env.algebra import dual_quaternion, quaternion, screw
 from dq_space_arm_env.compiler.program import Program
@@ -96,6 +96,21 @@ class VectorField(Protocol):
         """Time derivative of y, its Jacobians with respect to y (n_y, n_y) and u (n_y, n_u)."""
         ...
 
+    def jacobian_along(
+        self,
+        y: Sequence[Scalar],
+        u: Sequence[Scalar],
+        rates: Sequence[Scalar],
+        by_y: Matrix,
+        by_u: Matrix,
+        direction: Sequence[Scalar],
+    ) -> Matrix:
+        """Derivative of by_y direction with respect to (y, u), SX (n_y, n_y + n_u), the direction held.
+
+        The three arguments after u are what `linearized_rates` gives at (y, u).
+        """
+        ...
+
 
 class TwiceDifferentiableField(VectorField, Protocol):
     """Equations of motion with second derivatives, and with a pose apart from y."""
@@ -121,13 +136,23 @@ class TwiceDifferentiableField(VectorField, Protocol):
 class Integrator(Protocol):
     """A one-step method.
 
-    Attributes:
-        name: Name in the scene file.
-        order: Order of convergence.
+    Those with `has_curvature` are `TwiceDifferentiableIntegrator`s.
     """
 
-    name: str
-    order: int
+    @property
+    def name(self) -> str:
+        """Name in the scene file."""
+        ...
+
+    @property
+    def order(self) -> int:
+        """Order of convergence."""
+        ...
+
+    @property
+    def has_curvature(self) -> bool:
+        """Whether there are second derivatives of a step."""
+        ...
 
     def append_step(self, program: Program, field: VectorField) -> None:
         """Append the calls that turn buffers x, u, h into x_next."""
@@ -141,6 +166,11 @@ class Integrator(Protocol):
             by column.
         """
         ...
+
+
+@runtime_checkable
+class TwiceDifferentiableIntegrator(Integrator, Protocol):
+    """A one-step method with second derivatives."""
 
     def append_curvature(self, program: Program, field: TwiceDifferentiableField) -> Any:
         """Append the calls that turn x, u, h, multiplier into the second derivative of multiplier . step.

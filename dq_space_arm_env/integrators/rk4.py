@@ -42,6 +42,7 @@ class RungeKuttaMuntheKaas4:
 
     name = "rk4"
     order = 4
+    has_curvature = True
 
     def append_step(self, program: Program, field: VectorField) -> None:
         """Append the calls that turn buffers x, u, h into x_next."""

@@ -28,6 +28,7 @@ class SymplecticEuler:
 
     name = "symplectic_euler"
     order = 1
+    has_curvature = True
 
     def append_step(self, program: Program, field: VectorField) -> None:
         """Append the calls that turn buffers x, u, h into x_next."""

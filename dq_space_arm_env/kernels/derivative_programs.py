@@ -18,7 +18,7 @@ from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.compiler.symbols import column, matrix, symbols, zeros
 from dq_space_arm_env.dynamics import kinematics
-from dq_space_arm_env.integrators import INTEGRATORS
+from dq_space_arm_env.integrators import TwiceDifferentiableIntegrator, integrator_of
 from dq_space_arm_env.kernels.equations import SceneEquations
 
 Scalar = Any
@@ -138,7 +138,7 @@ class DerivativePrograms:
             [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)],
             [],
         )
-        a, b = INTEGRATORS[integrator].append_linearization(program, field)
+        a, b = integrator_of(self.scene.simulation, integrator).append_linearization(program, field)
         program.outputs = [sparse_buffer("A", a), sparse_buffer("B", b)]
         return program
 
@@ -150,7 +150,13 @@ class DerivativePrograms:
 
         Returns:
             The program.
+
+        Raises:
+            ValueError: If the integrator has no second derivatives.
         """
+        method = integrator_of(self.scene.simulation, integrator)
+        if not isinstance(method, TwiceDifferentiableIntegrator):
+            raise ValueError(f"integrator: {method.name!r} has no second derivatives, which this asks for")
         field, layout, cost = self.field, self.layout, self.scene.cost
         program = Program(
             "lagrangian_hessian",
@@ -162,7 +168,7 @@ class DerivativePrograms:
             ],
             [],
         )
-        pattern = INTEGRATORS[integrator].append_curvature(program, field)
+        pattern = method.append_curvature(program, field)
         curvature, x = casadi.SX.sym("curvature", pattern), symbols("x", field.n_x)
         state = self._state_cost_hessian(x, cost.pose, cost.base_velocity)
         effort = casadi.SX(casadi.diag(casadi.DM(2.0 * layout.control_weight)))

@@ -17,7 +17,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.compiler.graph import Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.cost import weighted_square
-from dq_space_arm_env.integrators import INTEGRATORS
+from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.kernels.equations import SceneEquations, total
 from dq_space_arm_env.kernels.parameters import EpisodeParameters
 from dq_space_arm_env.kernels.report import MEMORY, REPORT, STATE_LIMIT
@@ -153,7 +153,7 @@ class EnvironmentPrograms:
         )
         program.call(trace("inputs_graph", {"action": n_u}, self._commanded))
         program.call(trace("time_step_graph", {}, lambda: {"h": [dt]}))
-        INTEGRATORS[integrator].append_step(program, field)
+        integrator_of(self.scene.simulation, integrator).append_step(program, field)
         sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": len(MEMORY)}
         report = trace("report_graph", sizes, self._report, parameters=self._parameters)
         program.call(report)

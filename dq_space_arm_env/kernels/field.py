@@ -11,12 +11,13 @@ import casadi
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
-from dq_space_arm_env.compiler.symbols import column, columns, symbols, zeros
+from dq_space_arm_env.compiler.symbols import column, columns, dense_entries, symbols, zeros
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
 from dq_space_arm_env.dynamics.minimal import Accelerations, MassMatrix, Wrenches
 from dq_space_arm_env.integrators.field import PoseCoordinates, spread
+from dq_space_arm_env.kernels.residual import Residual
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
 
@@ -226,11 +227,13 @@ class SpaceArmField:
         free = symbols("v", self.n_y)
         motion, inputs = self.motion(y), self.inputs(u)
         solved, mass_matrix, _ = self._solve(motion, inputs, self.chain.tip_wrench)
-        residual, accelerations = self._residual(free)
-        by_y = casadi.jacobian(residual, column(*free))
+        residual = self._residual(free)
+        by_y = casadi.jacobian(residual.forces, column(*free))
         values = casadi.densify(column(*y, *solved.angular, *solved.linear, *solved.joints))
-        by_y = casadi.substitute(by_y, column(*free, *accelerations), values)
-        responses = [self._response(mass_matrix, [-e for e in _dense(by_y[:, i])]) for i in range(self.n_y)]
+        by_y = casadi.substitute(by_y, column(*free, *residual.accelerations), values)
+        responses = [
+            self._response(mass_matrix, [-e for e in dense_entries(by_y[:, i])]) for i in range(self.n_y)
+        ]
         response = columns(*(column(*entries) for entries in responses), rows=len(self.rate_indices))
         rates = [*motion.joint_rates, *inputs.wrist_rates, *self._dual(motion, solved)]
         angles_by_y, angles_by_u, turning_by_y = self._simple_jacobians(y)
@@ -238,6 +241,68 @@ class SpaceArmField:
         inputs_one_by_one = (self._input_response(mass_matrix, i) for i in range(self.n_u))
         by_u = columns(*inputs_one_by_one, rows=len(self.rate_indices))
         return rates, jacobian_y, casadi.vertcat(angles_by_u, by_u)
+
+    def jacobian_along(
+        self,
+        y: Sequence[Scalar],
+        u: Sequence[Scalar],
+        rates: Sequence[Scalar],
+        by_y: Matrix,
+        by_u: Matrix,
+        direction: Sequence[Scalar],
+    ) -> Matrix:
+        """Derivative of by_y times a fixed direction v, from first derivatives that are there already.
+
+        The residual R = M a + ID(y, 0) - f vanishes, and along v so does T = R_a b + R_y v with b the change
+        of the accelerations along v. Differentiating T = 0 once more gives b_z = -M^-1 (T_y + T_a a_z), with
+        z = (y, u): the factorization of M is not differentiated.
+
+        Args:
+            y: State without the pose, n_y expressions.
+            u: Input, n_u expressions.
+            rates: Time derivative of y at (y, u), n_y.
+            by_y: Its Jacobian with respect to y, SX (n_y, n_y).
+            by_u: Its Jacobian with respect to u, SX (n_y, n_u).
+            direction: v, n_y.
+
+        Returns:
+            Derivative of by_y v with respect to (y, u), SX (n_y, n_y + n_u).
+        """
+        rows, n_y = list(self.rate_indices), self.n_y
+        acceleration, by_state = self._inertial(y, rates, by_y, by_u)
+        along = casadi.densify(casadi.mtimes(by_state[:, :n_y], column(*direction))).nonzeros()
+        n = len(self.pose.directions)
+        change = [*self.pose.full_twist(along[:n]), *along[n:]]
+        by_accelerations, by_motion = self._residual(symbols("v", n_y)).along(
+            y, acceleration, direction, change
+        )
+        total = casadi.horzcat(by_motion, zeros(by_motion.shape[0], self.n_u))
+        total = total + casadi.mtimes(by_accelerations, by_state)
+        mass_matrix = MassMatrix(self.chain, minimal.joint_rotations(self.chain, self.motion(y).joint_angles))
+        sides = ([-entry for entry in dense_entries(total[:, i])] for i in range(total.shape[1]))
+        responses = [self._response(mass_matrix, side) for side in sides]
+        result = zeros(n_y, n_y + self.n_u)
+        result[rows, :] = columns(*(column(*entries) for entries in responses), rows=len(rows))
+        # omega x v is bilinear: its Jacobian changes along a direction like the Jacobian at that direction.
+        result[rows, :n_y] = result[rows, :n_y] + self._simple_jacobians(direction)[2]
+        return casadi.sparsify(result)
+
+    def _inertial(
+        self, y: Sequence[Scalar], rates: Sequence[Scalar], by_y: Matrix, by_u: Matrix
+    ) -> tuple[list[Scalar], Matrix]:
+        """Accelerations as seen by an inertial observer, and their Jacobian with respect to (y, u)."""
+        rows = list(self.rate_indices)
+        motion = self.motion(y)
+        dual = self.pose.full_twist([rates[i] for i in self.pose.twist_indices])
+        turning = cross(motion.angular, motion.linear)
+        joints = [rates[i] for i in rows[len(self.pose.directions) :]]
+        by_state = casadi.horzcat(by_y[rows, :] - self._simple_jacobians(y)[2], by_u[rows, :])
+        # As seen by an inertial observer moving along, the velocity of the base changes no acceleration.
+        linear = [
+            i for i, axis in zip(self.pose.twist_indices, self.pose.directions, strict=True) if axis > 2
+        ]
+        by_state[:, linear] = zeros(len(rows), len(linear))
+        return [*dual[:3], *add(dual[3:], turning), *joints], casadi.sparsify(by_state)
 
     def rates_hessian(
         self,
@@ -265,25 +330,16 @@ class SpaceArmField:
             Hessian with respect to (y, u), symmetric SX (n_y + n_u, n_y + n_u).
         """
         rows = list(self.rate_indices)
-        motion = self.motion(y)
-        dual = self.pose.full_twist([rates[i] for i in self.pose.twist_indices])
-        turning = cross(motion.angular, motion.linear)
-        joints = [rates[i] for i in rows[len(self.pose.directions) :]]
-        acceleration = [*dual[:3], *add(dual[3:], turning), *joints]
+        acceleration, by_state = self._inertial(y, rates, by_y, by_u)
         weights = self.pose.full_twist([multiplier[i] for i in self.pose.twist_indices])
-        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        rotations = minimal.joint_rotations(self.chain, self.motion(y).joint_angles)
         response = MassMatrix(self.chain, rotations).solve(
             weights[3:], weights[:3], [multiplier[i] for i in rows[len(self.pose.directions) :]]
         )
-        by_accelerations, curvature = self._residual_curvature(y, acceleration, response)
-        turning_by_y = self._simple_jacobians(y)[2]
-        by_state = casadi.horzcat(by_y[rows, :] - turning_by_y, by_u[rows, :])
-        # As seen by an inertial observer moving along, the velocity of the base changes no acceleration.
-        linear = [
-            i for i, axis in zip(self.pose.twist_indices, self.pose.directions, strict=True) if axis > 2
-        ]
-        by_state[:, linear] = zeros(len(rows), len(linear))
-        coupling = casadi.mtimes(by_accelerations.T, casadi.sparsify(by_state))
+        by_accelerations, curvature = self._residual(symbols("v", self.n_y)).weighted(
+            y, acceleration, [*response.angular, *response.linear, *response.joints]
+        )
+        coupling = casadi.mtimes(by_accelerations.T, by_state)
         n_y, n_u = self.n_y, self.n_u
         coupling = casadi.vertcat(coupling, zeros(n_u, n_y + n_u))
         free = symbols("v", n_y)
@@ -292,26 +348,6 @@ class SpaceArmField:
         curvature = curvature + casadi.jacobian(casadi.gradient(bilinear, column(*free)), column(*free))
         curvature = casadi.diagcat(curvature, zeros(n_u, n_u))
         return casadi.sparsify(-(curvature + coupling + coupling.T))
-
-    def _residual_curvature(
-        self, y: Sequence[Scalar], acceleration: Sequence[Scalar], response: Accelerations
-    ) -> tuple[Matrix, Matrix]:
-        """Derivatives of w . `_residual`: by (free accelerations, y), and by y twice; w is the response."""
-        free = symbols("v", self.n_y)
-        residual, accelerations = self._residual(free)
-        w = symbols("w", len(accelerations))
-        # The residual lists the force before the torque, an acceleration its angular part first.
-        power = casadi.dot(column(*w[3:6], *w[:3], *w[6:]), residual)
-        kept = [accelerations[i] for i in (*self.pose.directions, *range(6, len(accelerations)))]
-        y_column = column(*free)
-        mixed = (
-            casadi.jacobian(casadi.gradient(power, column(*kept)), y_column) if kept else zeros(0, self.n_y)
-        )
-        twice = casadi.hessian(power, y_column)[0]
-        values = column(*y, *acceleration, *response.angular, *response.linear, *response.joints)
-        names = column(*free, *accelerations, *w)
-        mixed, twice = casadi.substitute([mixed, twice], [names], [casadi.densify(values)])
-        return casadi.sparsify(mixed), casadi.sparsify(twice)
 
     def _simple_jacobians(self, y: Sequence[Scalar]) -> tuple[Matrix, Matrix, Matrix]:
         """Constant Jacobians of the angles' rates by y and u, and the Jacobian of -omega x v by y."""
@@ -326,8 +362,8 @@ class SpaceArmField:
         )
         return casadi.jacobian(angles, column(*free_y)), casadi.jacobian(angles, column(*free_u)), by_y
 
-    def _residual(self, y: Sequence[Scalar]) -> tuple[Matrix, list[Scalar]]:
-        """Forces that given accelerations need, less those that depend on y; and the acceleration symbols."""
+    def _residual(self, y: Sequence[Scalar]) -> Residual:
+        """Forces that given accelerations need, less those that depend on y, over symbols."""
         n = len(self.chain.links)
         acceleration = symbols("a", 6 + n)
         motion = self.motion(y)
@@ -340,7 +376,8 @@ class SpaceArmField:
             bias - other - load for bias, other, load in zip(needed.joints, passive, tip.joints, strict=True)
         ]
         forces = [*subtract(needed.force, tip.force), *subtract(needed.torque, tip.torque), *joints]
-        return column(*forces), acceleration
+        free = (*self.pose.directions, *range(6, 6 + n))
+        return Residual(column(*forces), y, acceleration, free)
 
     def _response(self, mass_matrix: MassMatrix, forces: Sequence[Scalar]) -> list[Scalar]:
         """Accelerations (free directions, joints) caused by generalized forces (force, torque, joints)."""
@@ -354,11 +391,3 @@ class SpaceArmField:
         unit = self.inputs([1.0 if i == index else 0.0 for i in range(self.n_u)])
         response = self._response(mass_matrix, [*unit.force, *unit.torque, *unit.joint_torques])
         return column(*response)
-
-
-def _dense(column: Matrix) -> list[Scalar]:
-    """Entries of a sparse column, with the number zero where nothing is stored."""
-    entries: list[Scalar] = [0.0] * column.shape[0]
-    for row, value in zip(column.row(), column.nonzeros(), strict=True):
-        entries[row] = value
-    return entries

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,9 @@ from dq_space_arm_env.kernels.bound import rows_of
 from dq_space_arm_env.kernels.library import KernelLibrary
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.layout import StateLayout
+
+if TYPE_CHECKING:
+    from dq_space_arm_env.kernels.adaptive import IntegratedMotion
 
 Array = NDArray[Any]
 
@@ -114,6 +117,52 @@ class Kernels(KernelLibrary):
         a, b = self._call("linearize", self._integrator(integrator), x=x, u=u, h=self._time_step(dt))
         lead = a.shape[:-1]
         return a.reshape(*lead, self.n_t, self.n_t), b.reshape(*lead, self.n_t, self.n_u)
+
+    def integrate(
+        self,
+        x: ArrayLike,
+        u: ArrayLike,
+        duration: float,
+        *,
+        rtol: float | None = None,
+        atol: float | None = None,
+        times: ArrayLike | None = None,
+        max_steps: int = 100_000,
+    ) -> IntegratedMotion:
+        """Follow one state over any time, in steps as long as tolerances allow, with a curve between them.
+
+        Args:
+            x: State at time 0, shape (n_x,), units of `layout.state`.
+            u: Input, shape (n_u,), or inputs held for equal parts of the duration, shape (N, n_u); not
+                clipped to the limits.
+            duration: Time to follow it for, s; backward in time if negative.
+            rtol: Relative error tolerated in a step: of velocities; of pose and angles in rad and m, which
+                have no natural zero. The scene's, or 1e-8, by default (1e-5 in single precision).
+            atol: Error tolerated besides, rad, m, rad/s, m/s. The scene's, or 1e-10, by default (1e-6 in
+                single precision).
+            times: Times to return states at, shape (k,), s; the ends of the steps by default.
+            max_steps: Most steps to try.
+
+        Returns:
+            Times, states, numbers of steps, and the states at all times between as a function.
+
+        Raises:
+            ValueError: If an argument has the wrong shape, or is not finite, or out of range.
+            RuntimeError: If the motion cannot be followed to its end within the tolerances or max_steps.
+        """
+        from dq_space_arm_env.kernels.adaptive import integrate
+
+        default_rtol, default_atol = self.scene.simulation.tolerances
+        return integrate(
+            self,
+            x,
+            u,
+            duration,
+            rtol=default_rtol if rtol is None else rtol,
+            atol=default_atol if atol is None else atol,
+            times=times,
+            max_steps=max_steps,
+        )
 
     def forward_dynamics(self, x: ArrayLike, u: ArrayLike, w_tip: ArrayLike | None = None) -> Array:
         """Accelerations, eq. (22) in minimal coordinates.

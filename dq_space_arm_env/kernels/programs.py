@@ -15,7 +15,8 @@ from dq_space_arm_env.algebra.vectors import matrix_vector
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics import kinematics, minimal
-from dq_space_arm_env.integrators import INTEGRATORS
+from dq_space_arm_env.integrators import integrator_of
+from dq_space_arm_env.integrators.dormand_prince import append_measured_step
 from dq_space_arm_env.integrators.field import split_state
 from dq_space_arm_env.kernels.derivative_programs import DerivativePrograms
 from dq_space_arm_env.kernels.equations import SceneEquations, total
@@ -59,6 +60,7 @@ class ScenePrograms:
             "quadratic_cost_derivatives": quadratic.cost_derivatives,
             "difference": self._difference,
             "retract": self._retract,
+            "measured_step": self._measured_step,
             "observation": self._observation,
             "state_from_observation": self._state_from_observation,
         }
@@ -250,11 +252,21 @@ class ScenePrograms:
         field = self.field
         x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
         program = Program(name, [x, u, h], [Buffer("x_next", field.n_x)])
-        INTEGRATORS[integrator].append_step(program, field)
+        integrator_of(self.scene.simulation, integrator).append_step(program, field)
         if name == "step_with_cost":
             sizes = {"x": field.n_x, "u": field.n_u}
             program.call(
                 trace("cost_graph", sizes, lambda x, u: {"cost": [total(self.equations.cost_terms(x, u))]})
             )
             program.outputs = [*program.outputs, Buffer("cost", 1)]
+        return program
+
+    def _measured_step(self) -> Program:
+        """A step of an embedded pair, its error and what it passes on its way."""
+        field = self.field
+        inputs = [Buffer("x", field.n_x), Buffer("u", field.n_u)]
+        inputs += [Buffer(name, size, shared=True) for name, size in (("h", 1), ("tolerances", 2))]
+        outputs = [Buffer("x_next", field.n_x), Buffer("error", 1), Buffer("dense", 4 * field.n_t)]
+        program = Program("measured_step", inputs, outputs)
+        append_measured_step(program, field)
         return program

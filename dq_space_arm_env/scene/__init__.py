@@ -11,6 +11,8 @@ from dq_space_arm_env.scene.layout import (
 )
 from dq_space_arm_env.scene.loading import list_scenes, load_scene, scenes_directory
 from dq_space_arm_env.scene.schema import (
+    ADAPTIVE_INTEGRATORS,
+    CURVED_INTEGRATORS,
     INTEGRATORS,
     Actuators,
     AxisAngle,
@@ -32,6 +34,8 @@ from dq_space_arm_env.scene.schema import (
 )
 
 __all__ = [
+    "ADAPTIVE_INTEGRATORS",
+    "CURVED_INTEGRATORS",
     "INTEGRATORS",
     "Actuators",
     "AxisAngle",

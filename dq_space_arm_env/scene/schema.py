@@ -31,6 +31,8 @@ from dq_space_arm_env.scene.task import (
 )
 
 __all__ = [
+    "ADAPTIVE_INTEGRATORS",
+    "CURVED_INTEGRATORS",
     "INTEGRATORS",
     "Actuators",
     "AxisAngle",
@@ -51,7 +53,16 @@ __all__ = [
     "Wrist",
 ]
 
-INTEGRATORS = ("symplectic_euler", "rk4")
+INTEGRATORS = ("symplectic_euler", "rk4", "rk6", "rk8", "dormand_prince", "rodas4", "rodas5p")
+CURVED_INTEGRATORS = ("symplectic_euler", "rk4")
+"""Those whose steps have second derivatives, which Newton's method for optimal control needs."""
+ADAPTIVE_INTEGRATORS = ("dormand_prince",)
+"""Those that divide a time step as far as tolerances ask for."""
+
+TOLERANCES = {"float64": (1e-8, 1e-10), "float32": (1e-5, 1e-6)}
+"""Relative and absolute tolerance of adaptive integrators where a scene gives none, by precision."""
+SMALLEST_SINGLE_RTOL = 1e-6
+"""Relative tolerance that rounding in single precision leaves within reach."""
 
 
 class Simulation(Model):
@@ -65,6 +76,16 @@ class Simulation(Model):
         description="numbers that the machine code computes with: 'float64', or 'float32', about twice as "
         "fast in batches and right to six digits",
     )
+    rtol: Positive | None = Field(
+        default=None,
+        description="relative tolerance of an adaptive integrator, of velocities and, in rad and m, of pose "
+        "and angles; absent: 1e-8, or 1e-5 in single precision",
+    )
+    atol: Positive | None = Field(
+        default=None,
+        description="absolute tolerance of an adaptive integrator, rad, m, rad/s, m/s; absent: 1e-10, or "
+        "1e-6 in single precision",
+    )
 
     @field_validator("integrator")
     @classmethod
@@ -74,6 +95,24 @@ class Simulation(Model):
                 f"unknown; {did_you_mean(name, INTEGRATORS)}It must be one of {', '.join(INTEGRATORS)}"
             )
         return name
+
+    def _problems(self) -> Iterator[Problem]:
+        """Find tolerances that nothing asks for, or that single precision cannot keep."""
+        for name in ("rtol", "atol"):
+            value = getattr(self, name)
+            if value is not None and self.integrator not in ADAPTIVE_INTEGRATORS:
+                adaptive = " or ".join(ADAPTIVE_INTEGRATORS)
+                sentence = f"{self.integrator} takes fixed steps: remove it, or set integrator to {adaptive}"
+                yield Problem((name,), value, sentence)
+        if self.precision == "float32" and self.rtol is not None and self.rtol < SMALLEST_SINGLE_RTOL:
+            sentence = f"must be at least {SMALLEST_SINGLE_RTOL:g} in single precision"
+            yield Problem(("rtol",), self.rtol, sentence)
+
+    @property
+    def tolerances(self) -> tuple[float, float]:
+        """Relative and absolute tolerance of an adaptive integrator."""
+        rtol, atol = TOLERANCES[self.precision]
+        return (rtol if self.rtol is None else self.rtol, atol if self.atol is None else self.atol)
 
 
 class Scene(Model):

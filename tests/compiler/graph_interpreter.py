@@ -55,17 +55,28 @@ def evaluate_graph(graph: Graph, inputs: list[np.ndarray], dtype) -> list[np.nda
 
 
 def evaluate_program(
-    program: Program, inputs: dict[str, np.ndarray], dtype=np.float64
+    program: Program, inputs: dict[str, np.ndarray], dtype=np.float64, frozen=()
 ) -> dict[str, np.ndarray]:
-    """All buffers of a program after running it on one row (n,), or on many at once (n, lanes), by name."""
+    """All buffers of a program after running it on one row (n,), or on many at once (n, lanes), by name.
+
+    What is written to the buffers in `frozen` loses its imaginary part: to complex steps, it is a constant.
+    """
     arrays = {name: np.asarray(value, dtype=dtype) for name, value in inputs.items()}
     lanes = next((value.shape[1:] for value in arrays.values() if value.ndim == 2), ())
     buffers = {name: np.zeros((size, *lanes), dtype=dtype) for name, size in program.scratch_sizes().items()}
     for name, value in arrays.items():
         buffers[name] = value if value.shape[1:] == lanes else np.repeat(value[:, None], lanes[0], axis=1)
-    for call in program.calls:
+    begins = {loop.end: loop.begin for loop in program.loops}
+    conditions = {loop.end: loop.condition for loop in program.loops}
+    position = 0
+    while position < len(program.calls):
+        call = program.calls[position]
         names = [call.bindings.get(name, name) for name, _ in call.graph.inputs]
         results = evaluate_graph(call.graph, [buffers[name] for name in names], dtype)
         for (name, _), result in zip(call.graph.outputs, results, strict=True):
-            buffers[call.bindings.get(name, name)] = result
+            buffer = call.bindings.get(name, name)
+            buffers[buffer] = result.real.astype(dtype) if buffer in frozen else result
+        position += 1
+        if position in begins and np.any(buffers[conditions[position]]):
+            position = begins[position]
     return buffers

@@ -6,10 +6,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dq_space_arm_env import list_scenes
+from dq_space_arm_env import list_scenes, load_scene
 from experts import BoxDDP, StopReason
 from experts.arm_problem import ArmProblem
 from experts.backward_sweep import SWEEP_DONE
+from experts.maneuver_plan import ManeuverPlan
 from experts.models import LONGEST_PAUSE, ModelSchedule, SecondOrder
 from experts.paper_problem import PaperProblem
 from experts.regularization import Regularization
@@ -176,3 +177,16 @@ def test_exact_derivatives_that_are_not_finite_are_reported(pendulum):
     solution = BoxDDP(broken, second_order="exact").solve()
     assert solution.stop_reason is StopReason.DIVERGED
     assert "derivatives are not finite" in solution.message
+
+
+def test_an_integrator_without_second_derivatives_leaves_gauss_newton():
+    scene = load_scene("planar")
+    problem = ArmProblem(scene.replace(simulation={"dt": 0.1, "steps": 20}), "rk6")
+    assert not problem.has_second_order
+    assert BoxDDP(problem).second_order == "gauss_newton"
+    assert BoxDDP(problem).solve().cost < BoxDDP(problem, max_iterations=1).solve().cost
+    with pytest.raises(ValueError, match="the problem has no exact second derivatives; gauss_newton needs"):
+        BoxDDP(problem, second_order="exact")
+    guess = np.zeros((problem.horizon, problem.n_controls))
+    plan = ManeuverPlan.make(problem, problem.initial_state, 5, guess)
+    assert np.linalg.eigvalsh(plan.value_hessians).min() > -1e-9

@@ -8,13 +8,17 @@ import pytest
 
 from dq_space_arm_env import compile_scene, list_scenes, load_scene
 from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.scene import CURVED_INTEGRATORS
 from dq_space_arm_env.scene import INTEGRATORS as SCENE_INTEGRATORS
 
 
 def test_the_schema_knows_the_integrators_there_are():
-    from dq_space_arm_env.integrators import INTEGRATORS
+    from dq_space_arm_env.integrators import INTEGRATORS, TwiceDifferentiableIntegrator
 
     assert set(SCENE_INTEGRATORS) == set(INTEGRATORS)
+    assert {name for name, method in INTEGRATORS.items() if method.has_curvature} == set(CURVED_INTEGRATORS)
+    for method in INTEGRATORS.values():
+        assert isinstance(method, TwiceDifferentiableIntegrator) == method.has_curvature
 
 
 @pytest.mark.parametrize("scene", list_scenes())

@@ -11,10 +11,10 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
-from dq_space_arm_env.scene import INTEGRATORS
 from experts import BoxDDP
 from experts.arm_problem import ArmProblem
 from experts.problem import FloatArray
+from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.solvers import crocoddyl_maneuver, crocoddyl_peer, ipopt_peer
 from experts.report.solvers.crocoddyl_maneuver import CrocoddylManeuver
 from experts.report.solvers.crocoddyl_peer import solve_with_crocoddyl
@@ -54,7 +54,7 @@ def test_ipopt_comes_with_casadi() -> None:
     assert ipopt_peer.is_available()
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
 def test_ipopt_finds_the_optimum_of_the_expert(short_scene: Scene, integrator: str) -> None:
     problem = ArmProblem(short_scene, integrator)
     run, expected = solve_with_ipopt(problem), BoxDDP(problem).solve()
@@ -88,7 +88,7 @@ def test_ipopt_says_when_iterations_or_time_are_used_up(short_scene: Scene) -> N
     assert (brief.converged, brief.stop_reason) == (False, "Maximum_WallTime_Exceeded")
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
 def test_transcription_has_the_experts_steps_and_costs(integrator: str) -> None:
     problem = shortened("paper", 20, integrator)
     trajectory = roll_out(problem, problem.initial_state, random_controls(problem))
@@ -100,7 +100,7 @@ def test_transcription_has_the_experts_steps_and_costs(integrator: str) -> None:
     assert float(casadi.norm_inf(gaps)) < (1e-9 if integrator == "rk4" else 1e-12)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
 def test_transcription_has_the_derivatives_that_casadi_finds(short_scene: Scene, integrator: str) -> None:
     scene = short_scene.replace(simulation={"dt": 0.05, "steps": 3, "integrator": integrator})
     program = transcribe(scene)
@@ -129,7 +129,7 @@ def crocoddyl() -> Any:
     return pytest.importorskip("crocoddyl")
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
 @pytest.mark.parametrize("name", ["no-wrist", "paper", "payload"])
 def test_crocoddyl_takes_the_same_steps(crocoddyl: Any, name: str, integrator: str) -> None:
     problem = shortened(name, 40, integrator)
@@ -148,7 +148,7 @@ def test_crocoddyl_takes_the_same_steps(crocoddyl: Any, name: str, integrator: s
 @pytest.mark.parametrize("name", ["no-wrist", "paper"])
 def test_crocoddyl_has_the_exact_cost(crocoddyl: Any, name: str) -> None:
     ratios = {}
-    for integrator in INTEGRATORS:
+    for integrator in COMPARED_INTEGRATORS:
         problem = shortened(name, 200, integrator)
         controls = random_controls(problem)
         cost = roll_out(problem, problem.initial_state, controls).cost

@@ -15,8 +15,8 @@ import pytest
 from rich.console import Console
 
 from dq_space_arm_env import Scene, compile_scene
-from dq_space_arm_env.scene import INTEGRATORS
 from experts.report import to_json
+from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.peak import Peak
 from experts.report.throughput import timing as timing_module
 from experts.report.throughput.environments import MAKE, MAKE_VEC, UNWRAPPED, single_case, vector_case
@@ -63,14 +63,14 @@ def timing(what: str, engine: str, integrator: str, batch: int, ns: float, way: 
 def test_every_row_of_ours_is_there(result: SceneThroughput) -> None:
     plain = ((PLAIN, way) for way in (SCALAR, VECTOR))
     kernels = [*plain, *((variant, VECTOR) for variant in VARIANTS[1:])]
-    programs = [(DYNAMICS, ""), *((STEP, name) for name in INTEGRATORS), (ENVIRONMENT, "rk4")]
+    programs = [(DYNAMICS, ""), *((STEP, name) for name in COMPARED_INTEGRATORS), (ENVIRONMENT, "rk4")]
     expected = {
         (what, way, name, size, variant)
         for what, name in programs
         for variant, way in kernels
         for size in (1, 5)
     }
-    for name in INTEGRATORS:
+    for name in COMPARED_INTEGRATORS:
         expected |= {(ENVIRONMENT, MAKE_VEC, name, size, PLAIN) for size in (1, 5)}
         expected |= {(ENVIRONMENT, way, name, 1, PLAIN) for way in (MAKE, UNWRAPPED)}
     expected |= {(ENVIRONMENT, MAKE_VEC, "rk4", size, variant) for size in (1, 5) for variant in VARIANTS}
@@ -107,7 +107,7 @@ def test_scalar_and_vector_kernels_give_the_same_bits(result: SceneThroughput) -
 
 def test_float32_is_off_by_its_rounding(result: SceneThroughput) -> None:
     errors = {(a.unit, a.integrator): a.error for a in result.agreements if a.engine == f"{OURS}, {FLOAT32}"}
-    assert set(errors) == {("1", ""), *(("rad", name) for name in INTEGRATORS)}
+    assert set(errors) == {("1", ""), *(("rad", name) for name in COMPARED_INTEGRATORS)}
     rounding = np.finfo(np.float32).eps
     assert all(0.01 * rounding < error < 1e4 * rounding for error in errors.values())
 
@@ -116,7 +116,7 @@ def test_engines_that_integrate_have_the_same_errors(result: SceneThroughput) ->
     errors = {(a.engine, a.integrator): a.error for a in result.agreements if a.reference.startswith("RK4")}
     assert errors[OURS, "rk4"] < errors[OURS, "symplectic_euler"]
     if ("MuJoCo", "rk4") in errors:
-        for name in INTEGRATORS:
+        for name in COMPARED_INTEGRATORS:
             # Both integrate the joints with the same formulas: the same error but for rounding.
             assert errors["MuJoCo", name] == pytest.approx(errors[OURS, name], rel=1e-6, abs=1e-11)
 

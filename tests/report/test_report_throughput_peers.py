@@ -10,7 +10,7 @@ import pytest
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.dynamics.chain import Chain
-from dq_space_arm_env.scene import INTEGRATORS
+from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.throughput import mujoco_peer
 from experts.report.throughput.kernels import sample_states
 from experts.report.throughput.mujoco_environment import mujoco_spec
@@ -38,7 +38,7 @@ def mujoco_twin(short_scene: Scene) -> MujocoPeer:
     return MujocoPeer(compile_scene(short_scene), Chain.from_scene(short_scene))
 
 
-@pytest.mark.parametrize("name", INTEGRATORS)
+@pytest.mark.parametrize("name", COMPARED_INTEGRATORS)
 def test_mujoco_takes_the_same_steps(mujoco_twin: MujocoPeer, short_scene: Scene, name: str) -> None:
     kernels = compile_scene(short_scene)
     x, _ = sample_states(kernels, 8)
@@ -51,7 +51,7 @@ def test_mujoco_takes_the_same_steps(mujoco_twin: MujocoPeer, short_scene: Scene
 
 def test_mujoco_is_timed_in_batches_and_in_gymnasium(mujoco_twin: MujocoPeer, short_scene: Scene) -> None:
     cases = mujoco_twin.cases(*sample_states(compile_scene(short_scene), 4))
-    for name in INTEGRATORS:
+    for name in COMPARED_INTEGRATORS:
         rows = [case.subject for case in cases if case.subject.integrator == name]
         modules = {row.way.partition(",")[0] for row in rows if row.what == STEP}
         assert modules == {"rollout"} | ({"batch"} if not mujoco_twin.notes else set())

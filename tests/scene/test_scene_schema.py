@@ -141,7 +141,7 @@ REFUSED = [
     ("simulation.steps", 0, "simulation.steps = 0", "whole number, 1 or greater"),
     ("simulation.steps", 10.0, "simulation.steps = 10.0", "whole number, 1 or greater"),
     ("simulation.steps", True, "simulation.steps = True", "whole number, 1 or greater"),
-    ("simulation.integrator", "rk5", "simulation.integrator = 'rk5'", "did you mean 'rk4'?"),
+    ("simulation.integrator", "rk44", "simulation.integrator = 'rk44'", "did you mean 'rk4'?"),
     (
         "simulation.integrator",
         "euler",

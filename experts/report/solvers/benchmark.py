@@ -12,12 +12,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from dq_space_arm_env import Scene
-from dq_space_arm_env.scene import INTEGRATORS
 from experts.arm_problem import ArmProblem
 from experts.box_ddp import BoxDDP
 from experts.guesses import GuidedDDP
 from experts.problem import FloatArray, as_problem
 from experts.receding_horizon import RecedingHorizonExpert
+from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.solvers.accuracy import SolverComparison, compare_solvers
 from experts.report.solvers.best_known import Search
 from experts.report.solvers.contenders import contenders
@@ -103,7 +103,7 @@ class ExpertBenchmark:
 
     def _measure_iterations(self, console: Console, scene: Scene) -> None:
         found = []
-        for integrator in INTEGRATORS:
+        for integrator in COMPARED_INTEGRATORS:
             found.append(measure_iterations(ArmProblem(scene, integrator), self.effort))
             self.iterations.append(found[-1])
         print_iterations(console, found)
@@ -112,7 +112,7 @@ class ExpertBenchmark:
         """Compare on the nominal start with each integrator, on random ones with the scene's."""
         chosen = problem.scene.simulation.integrator
         states = draw_starts(problem, self.effort.compared_starts, self.seed)
-        for integrator in INTEGRATORS:
+        for integrator in COMPARED_INTEGRATORS:
             same = integrator == chosen
             variant = problem if same else _warm_problem(problem.scene, integrator)
             entrants, notes = contenders(variant, guided if same else None, self.effort)

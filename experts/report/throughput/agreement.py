@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dq_space_arm_env import Kernels, Scene
-from dq_space_arm_env.scene import INTEGRATORS
 from experts.problem import FloatArray
+from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.throughput.kernels import SCALAR, VECTOR, sample_states
 from experts.report.throughput.peers import Peer
 from experts.report.throughput.timing import FLOAT32, FLOAT64, OURS
@@ -75,7 +75,7 @@ def _joint_angles(kernels: Kernels, peers: Sequence[Peer], x: FloatArray) -> lis
     reference = _end_angles(kernels, x, "rk4", STEPS * _SUBSTEPS, dt / _SUBSTEPS)
     finer = f"RK4, dt/{_SUBSTEPS}"
     found = []
-    for integrator in INTEGRATORS:
+    for integrator in COMPARED_INTEGRATORS:
         angles: list[tuple[str, FloatArray | None]] = [(OURS, _end_angles(kernels, x, integrator, STEPS, dt))]
         angles += [(peer.name, peer.end_angles(x, integrator, STEPS)) for peer in peers]
         for engine, values in angles:
@@ -92,7 +92,7 @@ def _single_precision(kernels: Kernels, x: FloatArray, u: FloatArray) -> list[Ag
     error = _relative(single.forward_dynamics(x, u).astype(FLOAT64), kernels.forward_dynamics(x, u))
     found = [Agreement(ACCELERATIONS, engine, reference, "", error, "1")]
     dt = kernels.scene.simulation.dt
-    for integrator in INTEGRATORS:
+    for integrator in COMPARED_INTEGRATORS:
         angles = [_end_angles(each, x, integrator, STEPS, dt) for each in (single, kernels)]
         found.append(Agreement(ANGLES, engine, reference, integrator, _largest(angles[0] - angles[1]), "rad"))
     return found

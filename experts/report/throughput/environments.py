@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 
 from dq_space_arm_env import Scene
-from dq_space_arm_env.scene import INTEGRATORS
+from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.throughput.timing import ENVIRONMENT, OURS, Case, Subject
 from experts.report.throughput.variants import PLAIN, VARIANTS
 
@@ -35,13 +35,13 @@ def environment_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
     """
     chosen, steps = scene.simulation.integrator, scene.simulation.steps
     cases = []
-    for integrator in INTEGRATORS:
+    for integrator in COMPARED_INTEGRATORS:
         for way in (UNWRAPPED, MAKE):
             env = gymnasium.make("DQSpaceArm-v0", scene=PLAIN.scene(scene, integrator))
             subject = Subject(what=ENVIRONMENT, engine=OURS, way=way, integrator=integrator)
             cases.append(single_case(subject, env if way == MAKE else env.unwrapped, steps))
     for variant in VARIANTS:
-        for integrator in INTEGRATORS if variant == PLAIN else (chosen,):
+        for integrator in COMPARED_INTEGRATORS if variant == PLAIN else (chosen,):
             for batch in batch_sizes:
                 subject = Subject(
                     what=ENVIRONMENT,

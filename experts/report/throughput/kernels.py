@@ -9,9 +9,9 @@ import numpy as np
 
 from dq_space_arm_env import Kernels, Scene
 from dq_space_arm_env.kernels.bound import KernelCall
-from dq_space_arm_env.scene import INTEGRATORS
 from dq_space_arm_env.scene.start import number_of_draws, start_from_draws
 from experts.problem import FloatArray
+from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.throughput.timing import DYNAMICS, ENVIRONMENT, FLOAT64, OURS, STEP, Case, Subject
 from experts.report.throughput.variants import PLAIN, VARIANTS, Variant
 
@@ -54,7 +54,7 @@ def kernel_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
         The cases; of the environment's step, with the scene's integrator only.
     """
     chosen = scene.simulation.integrator
-    programs = [(DYNAMICS, ""), *((STEP, name) for name in INTEGRATORS), (ENVIRONMENT, chosen)]
+    programs = [(DYNAMICS, ""), *((STEP, name) for name in COMPARED_INTEGRATORS), (ENVIRONMENT, chosen)]
     cases = []
     for what, integrator in programs:
         for variant, way in ((PLAIN, SCALAR), *((variant, VECTOR) for variant in VARIANTS)):

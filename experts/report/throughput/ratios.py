@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from dq_space_arm_env.scene import INTEGRATORS
+from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.throughput.environments import MAKE, MAKE_VEC
 from experts.report.throughput.kernels import SCALAR, VECTOR
 from experts.report.throughput.measurement import TRAINING_COPIES, SceneThroughput
@@ -67,7 +67,7 @@ def _pairs(timings: list[Timing]) -> Iterator[tuple[str, Timing | None, Timing |
         yield "dynamics, one state", single, fastest(theirs, batch=1)
         batches = [timing for timing in theirs if timing.batch > 1]
         yield "dynamics, batch", fastest(ours, what=DYNAMICS, way=VECTOR), fastest(batches)
-    for name in INTEGRATORS:
+    for name in COMPARED_INTEGRATORS:
         theirs = select(timings, engine=MujocoPeer.name, integrator=name)
         own = select(ours, integrator=name)
         in_c = fastest(theirs, what=STEP)

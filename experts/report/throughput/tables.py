@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from rich.console import Console
 from rich.text import Text
 
-from dq_space_arm_env.scene import INTEGRATORS
+from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.peak import Peak
 from experts.report.tables import plain_table
 from experts.report.throughput.agreement import Agreement
@@ -49,7 +49,11 @@ def print_scene(console: Console, result: SceneThroughput, peaks: Mapping[str, P
         result: What is measured.
         peaks: Peak of a core for each precision.
     """
-    programs = [(DYNAMICS, ""), *((STEP, name) for name in INTEGRATORS), (ENVIRONMENT, result.integrator)]
+    programs = [
+        (DYNAMICS, ""),
+        *((STEP, name) for name in COMPARED_INTEGRATORS),
+        (ENVIRONMENT, result.integrator),
+    ]
     for what, integrator in programs:
         _print_kernel(console, result, peaks, what, integrator)
     _print_environments(console, result)
@@ -98,7 +102,7 @@ def _heading(title: str, variant: Variant) -> str:
 
 def _print_environments(console: Console, result: SceneThroughput) -> None:
     timings = select(result.timings, engine=OURS, what=ENVIRONMENT)
-    columns = [(PLAIN, name) for name in INTEGRATORS] + [
+    columns = [(PLAIN, name) for name in COMPARED_INTEGRATORS] + [
         (variant, result.integrator) for variant in VARIANTS if variant != PLAIN
     ]
     rows = []

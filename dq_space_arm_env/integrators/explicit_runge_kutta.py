@@ -1,0 +1,79 @@
+"""Explicit Runge-Kutta methods of higher order on the group: any tableau, Munthe-Kaas for the pose."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi
+
+from dq_space_arm_env.compiler.graph import graph_of, trace
+from dq_space_arm_env.compiler.program import Program
+from dq_space_arm_env.compiler.symbols import zeros
+from dq_space_arm_env.integrators.explicit_stages import ExplicitStages
+from dq_space_arm_env.integrators.field import VectorField, split_state
+from dq_space_arm_env.integrators.munthe_kaas import combined, stage_slopes
+from dq_space_arm_env.integrators.tableaus import ButcherTableau
+
+Scalar = Any
+
+
+class ExplicitRungeKutta:
+    """An explicit Runge-Kutta-Munthe-Kaas method with fixed steps.
+
+    Attributes:
+        name: Name in the scene file.
+        order: Order of convergence.
+        tableau: Its coefficients.
+    """
+
+    has_curvature = False
+
+    def __init__(self, name: str, tableau: ButcherTableau) -> None:
+        """Name a tableau."""
+        self.name, self.tableau, self.order = name, tableau, tableau.order
+
+    def append_step(self, program: Program, field: VectorField) -> None:
+        """Append the calls that turn buffers x, u, h into x_next."""
+        stages, tableau = ExplicitStages(field, self.tableau, self.name), self.tableau
+        stages.append(program)
+
+        def step(x: list[Scalar], h: list[Scalar], **others: list[Scalar]) -> dict[str, Any]:
+            stored, start = split_state(field, x)
+            rates = [others.get(f"k{i}", []) for i in stages.numbers]
+            y = stages.moved(start, tableau.weights, rates, h[0])
+            if field.pose is None:
+                return {"x_next": y}
+            twists = stages.twists([others[f"y{i}"] for i in stages.numbers])
+            increment = combined(tableau.weights, stage_slopes(field.pose, tableau, twists, h[0]), h[0])
+            return {"x_next": [*field.pose.moved(stored, increment), *y]}
+
+        sizes = {"x": field.n_x, "h": 1}
+        sizes |= {f"k{i}": field.n_y for i, w in zip(stages.numbers, tableau.weights, strict=True) if w}
+        if field.pose is not None:
+            sizes |= {f"y{i}": field.n_y for i in stages.numbers}
+        program.call(trace(f"{stages.prefix}_sum", sizes, step))
+
+    def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
+        """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
+        stages = ExplicitStages(field, self.tableau, self.name)
+        stages.append_linearized(program)
+        h = casadi.SX.sym("h")
+        weights = zip(self.tableau.weights, stages.numbers, strict=True)
+        change, inputs = stages.change([term for term in weights if term[0]], h, is_carried=False)
+        bindings = {}
+        if field.pose is None:
+            a, b = change[:, : field.n_y], change[:, field.n_y :]
+        else:
+            bindings["pose_change"], pattern = stages.append_pose_change(program, numbers=stages.numbers)
+            by_pose, moved, pose_inputs = stages.linearized_pose(pattern)
+            moved = casadi.vertcat(moved, change)
+            a = casadi.horzcat(
+                casadi.vertcat(by_pose, zeros(field.n_y, by_pose.shape[1])), moved[:, : field.n_y]
+            )
+            b = moved[:, field.n_y :]
+            inputs |= pose_inputs
+        a, b = casadi.sparsify(a), casadi.sparsify(b)
+        outputs = {"A": a.nonzeros(), "B": b.nonzeros()}
+        graph = graph_of(f"{stages.prefix}_linearized_sum", {"h": [h], **inputs}, outputs)
+        program.call(graph, **bindings)
+        return a.sparsity(), b.sparsity()

@@ -1,0 +1,199 @@
+"""Motion over a long time, with steps as long as tolerances allow and a curve between them.
+
+The steps are those of Dormand and Prince's pair, in machine code; their lengths are chosen here, by the
+controller of Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, section II.4 (2nd ed.,
+1993), with the stabilization of Hairer & Wanner II, section IV.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.kernels.bound import KernelCall
+
+if TYPE_CHECKING:
+    from dq_space_arm_env.kernels.kernels import Kernels
+
+Array = NDArray[Any]
+
+SAFETY = 0.9
+STABILIZATION = 0.04
+EXPONENT = 0.2 - 0.75 * STABILIZATION
+SMALLEST_FACTOR, LARGEST_FACTOR = 0.2, 10.0
+STRETCH = 1.01
+
+
+class MotionCurve:
+    """A motion at any time: a polynomial of degree 4 in tangent coordinates for each step, of order 4."""
+
+    def __init__(self, kernels: Kernels, times: Array, states: Array, coefficients: Array) -> None:
+        """Take the steps.
+
+        Args:
+            kernels: Kernels of the scene.
+            times: Ends of the steps, the start first, shape (m + 1,), s.
+            states: States there, shape (m + 1, n_x).
+            coefficients: Tangent vectors of theta, ..., theta^4 of each step, shape (m, 4, n_t).
+        """
+        self._kernels, self._times, self._states, self._coefficients = kernels, times, states, coefficients
+
+    def __call__(self, t: ArrayLike) -> Array:
+        """States at given times.
+
+        Args:
+            t: Times within the motion, a number or shape (k,), s.
+
+        Returns:
+            States, shape (n_x,) or (k, n_x).
+
+        Raises:
+            ValueError: If a time lies outside of the motion.
+        """
+        times = np.asarray(t, dtype=np.float64)
+        if times.ndim > 1:
+            raise ValueError(f"t: shape {times.shape}, should be a number or (k,)")
+        end = self._times[-1]
+        within = (times >= min(0.0, end)) & (times <= max(0.0, end))
+        if not within.all():
+            raise ValueError(
+                f"t: {times[~within].flat[0]} is not between 0 and {end} s, where the motion is known"
+            )
+        sign = -1.0 if end < 0.0 else 1.0
+        step = np.searchsorted(sign * self._times[1:-1], sign * times, side="right")
+        begin = self._times[step]
+        theta = ((times - begin) / (self._times[step + 1] - begin))[..., None]
+        change = np.zeros(())
+        for power in reversed(range(4)):
+            change = theta * (self._coefficients[step, power] + change)
+        return self._kernels.retract(self._states[step], change)
+
+
+@dataclass(frozen=True, eq=False)
+class IntegratedMotion:
+    """What `Kernels.integrate` returns.
+
+    Attributes:
+        t: Times, shape (k,), s: those asked for, or the ends of the steps, the start first.
+        x: States at these times, shape (k, n_x).
+        steps: Number of steps taken.
+        rejected: Number of steps tried in vain because their error was too large.
+        sol: The state at any time of the motion.
+    """
+
+    t: Array
+    x: Array
+    steps: int
+    rejected: int
+    sol: MotionCurve
+
+
+class _Stepper:
+    """A state on its way, with the length of the next step."""
+
+    def __init__(self, kernels: Kernels, x: Array, tolerances: Array, step: float) -> None:
+        self.x, self.step, self.error = x.copy(), step, 1e-4
+        self.u, self._h = np.zeros(kernels.n_u, kernels.dtype), np.zeros(1, kernels.dtype)
+        self.x_next, self.dense = np.zeros_like(x), np.zeros((4, kernels.n_t), kernels.dtype)
+        self._error = np.zeros(1, kernels.dtype)
+        arrays = {"x": self.x, "u": self.u, "h": self._h, "tolerances": tolerances}
+        arrays |= {"x_next": self.x_next, "error": self._error, "dense": self.dense}
+        self._run = KernelCall(kernels.kernel("measured_step", lanes=1), arrays).of_one_row()
+
+    def attempt(self, h: float) -> bool:
+        """Try a step and choose the length of the next; tell whether its error is tolerable."""
+        self._h[0] = h
+        self._run()
+        error = float(self._error[0])
+        if error <= 1.0 and np.isfinite(self.x_next).all():
+            factor = SAFETY * max(error, 1e-10) ** -EXPONENT * self.error**STABILIZATION
+            self.step = abs(h) * min(max(factor, SMALLEST_FACTOR), LARGEST_FACTOR)
+            self.error = max(error, 1e-4)
+            return True
+        factor = SAFETY * error**-EXPONENT if np.isfinite(error) else SMALLEST_FACTOR
+        self.step = abs(h) * min(max(factor, SMALLEST_FACTOR), SAFETY)
+        return False
+
+
+def integrate(
+    kernels: Kernels,
+    x: ArrayLike,
+    u: ArrayLike,
+    duration: float,
+    *,
+    rtol: float,
+    atol: float,
+    times: ArrayLike | None = None,
+    max_steps: int = 100_000,
+) -> IntegratedMotion:
+    """See `Kernels.integrate`."""
+    start, held = _checked(kernels, x, u)
+    tolerances = np.array([_positive("rtol", rtol), _positive("atol", atol)], kernels.dtype)
+    if not np.isfinite(duration) or duration == 0.0:
+        raise ValueError(f"duration: {duration} should be a finite time in s other than zero")
+    smallest = np.finfo(kernels.dtype).eps
+    if rtol < 4.0 * smallest:
+        raise ValueError(f"rtol: {rtol}, should be at least {4.0 * smallest:.1e} in {kernels.dtype}")
+    if max_steps < 1:
+        raise ValueError(f"max_steps: {max_steps}, should be at least 1")
+    stepper = _Stepper(kernels, start, tolerances, kernels.scene.simulation.dt)
+    ends, states = [0.0], [start]
+    coefficients: list[Array] = []
+    rejected = 0
+    for begin, end, control in _intervals(held, duration):
+        stepper.u[:] = control
+        t = begin
+        while t != end:
+            # A little longer than was chosen, if a sliver would be left otherwise.
+            last = STRETCH * stepper.step >= abs(end - t)
+            h = end - t if last else np.copysign(stepper.step, duration)
+            if abs(h) < 16.0 * np.finfo(float).eps * abs(duration):
+                raise RuntimeError(f"the motion cannot be followed beyond t = {t} s: no step is short enough")
+            if len(coefficients) + rejected >= max_steps:
+                raise RuntimeError(
+                    f"the motion was followed to t = {t} s only: max_steps = {max_steps} were tried"
+                )
+            if not stepper.attempt(h):
+                rejected += 1
+                continue
+            t = end if last else t + h
+            stepper.x[:] = stepper.x_next
+            ends.append(t)
+            states.append(stepper.x_next.copy())
+            coefficients.append(stepper.dense.copy())
+    curve = MotionCurve(kernels, np.array(ends), np.array(states), np.array(coefficients))
+    if times is None:
+        return IntegratedMotion(np.array(ends), np.array(states), len(coefficients), rejected, curve)
+    wanted = np.atleast_1d(np.asarray(times, dtype=np.float64))
+    return IntegratedMotion(wanted, curve(wanted), len(coefficients), rejected, curve)
+
+
+def _intervals(held: Array, duration: float) -> Iterator[tuple[float, float, Array]]:
+    """Begin, end and input of each interval with a constant input."""
+    marks = np.linspace(0.0, duration, len(held) + 1).tolist()
+    yield from zip(marks[:-1], marks[1:], held, strict=True)
+
+
+def _checked(kernels: Kernels, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+    """The start, shape (n_x,), and the inputs of all intervals, shape (N, n_u)."""
+    start, held = np.array(x, dtype=kernels.dtype), np.array(u, dtype=kernels.dtype)
+    if start.shape != (kernels.n_x,):
+        raise ValueError(f"x: shape {start.shape}, should be ({kernels.n_x},)")
+    if held.ndim == 1:
+        held = held[None]
+    if held.ndim != 2 or held.shape[1] != kernels.n_u or not len(held):
+        raise ValueError(f"u: shape {np.shape(u)}, should be ({kernels.n_u},) or (N, {kernels.n_u})")
+    for name, array in (("x", start), ("u", held)):
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name}: {array[~np.isfinite(array)][0]} is not a finite number")
+    return start, held
+
+
+def _positive(name: str, value: float) -> float:
+    if not (np.isfinite(value) and value > 0.0):
+        raise ValueError(f"{name}: {value}, should be a positive number")
+    return value
