@@ -28,7 +28,7 @@ from dq_space_arm_env.algebra.vectors import (
     transposed_matrix_vector,
 )
 from dq_space_arm_env.dynamics.chain import Chain, Matrix, RigidBody
-from dq_space_arm_env.dynamics.linear import factorize_ldl, solve_ldl
+from dq_space_arm_env.dynamics.linear import LDLFactor, factorize_ldl, solve_ldl
 
 Scalar = Any
 Vector3 = Sequence[Scalar]
@@ -165,6 +165,9 @@ class MassMatrix:
     positive definite system for the base's angular and the joints' accelerations. Like every LDL'
     factorization of such a matrix it is backward stable in any order of elimination, so extreme mass ratios
     cost no digits.
+
+    Attributes:
+        center: Center of mass of the system in the base frame, 3, m.
     """
 
     def __init__(self, chain: Chain, rotations: Sequence[Sequence[Vector3]]) -> None:
@@ -177,23 +180,24 @@ class MassMatrix:
         self._axes = (2,) if chain.planar else (0, 1, 2)
         mass, moment, inertia, columns, joint_block = _composite_bodies(chain, rotations)
         self._mass = mass
-        self._center = scale(1.0 / mass, moment)
+        self.center = scale(1.0 / mass, moment)
         # Joint columns of the mass matrix in the base frame: force, and torque about the system's center of
         # mass.
         self._forces = [force for force, _ in columns]
-        torques = [subtract(torque, cross(self._center, force)) for force, torque in columns]
-        about_center = _shifted_inertia(inertia, -mass, self._center, ZERO)
+        self._torques = [subtract(torque, cross(self.center, force)) for force, torque in columns]
+        about_center = self._inertia = _shifted_inertia(inertia, -mass, self.center, ZERO)
         axes, n = self._axes, len(columns)
         reduced: list[list[Scalar]] = [[0.0] * (len(axes) + n) for _ in range(len(axes) + n)]
         for row, axis in enumerate(axes):
             for column, other in enumerate(axes):
                 reduced[row][column] = about_center[axis][other]
             for j in range(n):
-                reduced[row][len(axes) + j] = reduced[len(axes) + j][row] = torques[j][axis]
+                reduced[row][len(axes) + j] = reduced[len(axes) + j][row] = self._torques[j][axis]
         for i in range(n):
             for j in range(i, n):
                 entry = joint_block[i][j] - dot(self._forces[i], self._forces[j]) * (1.0 / mass)
                 reduced[len(axes) + i][len(axes) + j] = reduced[len(axes) + j][len(axes) + i] = entry
+        self._reduced = reduced
         self._factor = factorize_ldl(reduced)
 
     def solve(self, force: Vector3, torque: Vector3, joints: Sequence[Scalar]) -> Accelerations:
@@ -208,7 +212,7 @@ class MassMatrix:
             The accelerations, without any velocity-dependent term.
         """
         inverse_mass = 1.0 / self._mass
-        about_center = subtract(torque, cross(self._center, force))
+        about_center = subtract(torque, cross(self.center, force))
         right = [about_center[axis] for axis in self._axes]
         right += [
             tau - dot(column, force) * inverse_mass for tau, column in zip(joints, self._forces, strict=True)
@@ -218,10 +222,78 @@ class MassMatrix:
         for axis, value in zip(self._axes, solution, strict=False):
             angular[axis] = value
         rates = solution[len(self._axes) :]
-        linear = add(scale(inverse_mass, force), cross(self._center, angular))
+        linear = add(scale(inverse_mass, force), cross(self.center, angular))
         for column, rate in zip(self._forces, rates, strict=True):
             linear = subtract(linear, scale(rate * inverse_mass, column))
         return Accelerations(angular, linear, rates)
+
+    def joint_inertia(self) -> list[list[Scalar]]:
+        """Inertia that the joints feel on the free base, which is eliminated.
+
+        Returns:
+            Symmetric positive definite matrix n x n, kg m^2.
+        """
+        count = len(self._axes)
+        joints = [row[count:] for row in self._reduced[count:]]
+        for j in range(len(joints)):
+            response = solve_ldl(self._locked_factor(), [row[count + j] for row in self._reduced[:count]])
+            for i in range(j, len(joints)):
+                entry = joints[i][j]
+                for k in range(count):
+                    entry = entry - self._reduced[count + i][k] * response[k]
+                joints[i][j] = joints[j][i] = entry
+        return joints
+
+    def _locked_factor(self) -> LDLFactor:
+        """Factors of the inertia with all joints locked, the leading block of the factorized matrix."""
+        n = len(self._axes)
+        return LDLFactor(self._factor.lower[:n], self._factor.inverse_diagonal[:n])
+
+    def momentum(
+        self, angular_velocity: Vector3, velocity: Vector3, joint_rates: Sequence[Scalar]
+    ) -> tuple[Vector3, Vector3]:
+        """Momentum of the system, the inverse of `base_velocity`.
+
+        Args:
+            angular_velocity: Angular velocity of the base, base axes, 3, rad/s.
+            velocity: Velocity of the base's center of mass, base axes, 3, m/s.
+            joint_rates: n, rad/s.
+
+        Returns:
+            Linear momentum [kg m/s] and angular momentum about the system's center of mass [kg m^2/s], base
+            axes, 3 each.
+        """
+        linear = scale(self._mass, add(velocity, cross(angular_velocity, self.center)))
+        angular: Vector3 = matrix_vector(self._inertia, angular_velocity)
+        for force, torque, rate in zip(self._forces, self._torques, joint_rates, strict=True):
+            linear = add(linear, scale(rate, force))
+            angular = add(angular, scale(rate, torque))
+        return linear, angular
+
+    def base_velocity(
+        self, linear: Vector3, angular: Vector3, joint_rates: Sequence[Scalar]
+    ) -> tuple[Vector3, Vector3]:
+        """Velocity of the base with which the system has a given momentum.
+
+        About the center of mass, the angular momentum involves the angular velocity and the joint rates only.
+
+        Args:
+            linear: Linear momentum of the system, base axes, 3, kg m/s.
+            angular: Angular momentum about the system's center of mass, base axes, 3, kg m^2/s.
+            joint_rates: n, rad/s.
+
+        Returns:
+            Angular velocity of the base [rad/s] and velocity of its center of mass [m/s], base axes, 3 each.
+        """
+        for force, torque, rate in zip(self._forces, self._torques, joint_rates, strict=True):
+            linear = subtract(linear, scale(rate, force))
+            angular = subtract(angular, scale(rate, torque))
+        omega: list[Scalar] = [0.0, 0.0, 0.0]
+        solution = solve_ldl(self._locked_factor(), [angular[axis] for axis in self._axes])
+        for axis, value in zip(self._axes, solution, strict=True):
+            omega[axis] = value
+        # Divided: a reciprocal's rounding would be the same at every step.
+        return omega, subtract([entry / self._mass for entry in linear], cross(omega, self.center))
 
 
 def _shifted_inertia(inertia: Sequence[Vector3], mass: Scalar, p: Vector3, d: Vector3) -> list[list[Scalar]]:

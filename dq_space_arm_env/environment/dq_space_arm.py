@@ -13,7 +13,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.environment.start_options import given_start
+from dq_space_arm_env.environment.start_options import check_size, given_start
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.kernels.report import REPORT, STATE_LIMIT
@@ -151,7 +151,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
         Raises:
             SceneError: If the scene cannot be loaded.
-            ValueError: If the scene has no actuator, or one without a finite limit, or the render mode is unknown.
+            ValueError: If the scene has no actuator, or one without a finite limit, or starts too far from the origin, or the
+                render mode is unknown.
         """
         EzPickle.__init__(self, scene, render_mode)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -170,6 +171,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             raise ValueError(
                 f"scene {self.scene.name!r} has no normalized actions: {problem}; give each actuator a finite limit"
             )
+        check_size(f"scene {self.scene.name!r}: initial_state", layout.initial_state)
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.scene.simulation.dt))}
         self.action_space = spaces.Box(-1.0, 1.0, (layout.n_u,), np.float32)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.kernels import Kernels
+from dq_space_arm_env.kernels.report import STATE_LIMIT
 from dq_space_arm_env.scene.start import PLANAR_POSE, target_entries
 
 Array = NDArray[Any]
@@ -85,7 +86,26 @@ def _checked_state(kernels: Kernels, state: Any) -> Array:
     pose = np.zeros(8)
     pose[stored] = x[where]
     x[where] = _unit_pose("initial_state has a base pose", pose)[stored]
+    check_size("options: initial_state", x)
     return x
+
+
+def check_size(name: str, state: Array) -> None:
+    """Refuse a state that an environment would take for one of a simulation that has blown up.
+
+    Args:
+        name: What the message calls it.
+        state: Shape (n_x,), units of `kernels.layout.state`.
+
+    Raises:
+        ValueError: If its norm is beyond `STATE_LIMIT`.
+    """
+    size = math.hypot(*state.tolist())
+    if size > STATE_LIMIT:
+        raise ValueError(
+            f"{name} has a norm of {size:.3g}, should be at most {STATE_LIMIT:g}, beyond which a simulation "
+            "counts as blown up; positions are small if the origin is near the spacecraft"
+        )
 
 
 def _checked_target(kernels: Kernels, target: Any) -> Array:

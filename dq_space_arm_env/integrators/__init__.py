@@ -3,8 +3,10 @@
 from dq_space_arm_env.integrators.dormand_prince import DormandPrince
 from dq_space_arm_env.integrators.explicit_runge_kutta import ExplicitRungeKutta
 from dq_space_arm_env.integrators.field import Integrator, TwiceDifferentiableIntegrator, VectorField
+from dq_space_arm_env.integrators.momentum import MomentumPreserving
 from dq_space_arm_env.integrators.rk4 import RungeKuttaMuntheKaas4
 from dq_space_arm_env.integrators.rosenbrock import RODAS_METHODS, Rosenbrock
+from dq_space_arm_env.integrators.rosenbrock_w import RosenbrockW
 from dq_space_arm_env.integrators.symplectic_euler import SymplecticEuler
 from dq_space_arm_env.integrators.tableaus import CALVO_6, DORMAND_PRINCE_8
 from dq_space_arm_env.scene.schema import Simulation
@@ -18,6 +20,8 @@ INTEGRATORS: dict[str, Integrator] = {
         ExplicitRungeKutta("rk8", DORMAND_PRINCE_8),
         DormandPrince(),
         *RODAS_METHODS,
+        MomentumPreserving(RungeKuttaMuntheKaas4()),
+        MomentumPreserving(RosenbrockW()),
     )
 }
 
@@ -26,7 +30,9 @@ __all__ = [
     "DormandPrince",
     "ExplicitRungeKutta",
     "Integrator",
+    "MomentumPreserving",
     "Rosenbrock",
+    "RosenbrockW",
     "RungeKuttaMuntheKaas4",
     "SymplecticEuler",
     "TwiceDifferentiableIntegrator",

@@ -17,6 +17,7 @@ from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
 from dq_space_arm_env.dynamics.minimal import Accelerations, MassMatrix, Wrenches
 from dq_space_arm_env.integrators.field import PoseCoordinates, spread
+from dq_space_arm_env.kernels.momentum_balance import SpaceArmMomentum
 from dq_space_arm_env.kernels.residual import Residual
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
@@ -91,6 +92,11 @@ class SpaceArmField:
             twist_indices=twist,
         )
 
+    @property
+    def momentum_balance(self) -> SpaceArmMomentum:
+        """The momentum of the whole system, and what changes it."""
+        return SpaceArmMomentum(self)
+
     def _in_y(self, part: slice) -> tuple[int, ...]:
         shift = self.n_x - self.n_y
         return tuple(range(part.start - shift, part.stop - shift))
@@ -128,9 +134,19 @@ class SpaceArmField:
             wrist_rates=wrist,
         )
 
-    def _tip_forces(
+    def tip_forces(
         self, motion: Motion, rotations: Sequence[Any], wrench: Sequence[Scalar] | None
     ) -> Wrenches:
+        """Generalized forces of a wrench at the tip.
+
+        Args:
+            motion: The motion.
+            rotations: From `minimal.joint_rotations`.
+            wrench: Force and torque at the tip in tip axes, 6, or None.
+
+        Returns:
+            The forces; zeros without a wrench.
+        """
         n = len(self.chain.links)
         if wrench is None:
             return Wrenches(ZERO, ZERO, [0.0] * n, [(ZERO, ZERO)] * n)
@@ -147,7 +163,7 @@ class SpaceArmField:
         mass_matrix = MassMatrix(self.chain, rotations)
         rest = Accelerations(ZERO, ZERO, [0.0] * len(self.chain.links))
         needed = minimal.inverse_dynamics(self.chain, rotations, motion.angular, motion.joint_rates, rest)
-        tip = self._tip_forces(motion, rotations, wrench)
+        tip = self.tip_forces(motion, rotations, wrench)
         passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
         accelerations = mass_matrix.solve(
             subtract(add(inputs.force, tip.force), needed.force),
@@ -203,7 +219,7 @@ class SpaceArmField:
         wrench = self.chain.tip_wrench
         solved, _, rotations = self._solve(motion, self.inputs(u), wrench)
         needed = minimal.inverse_dynamics(self.chain, rotations, motion.angular, motion.joint_rates, solved)
-        tip = self._tip_forces(motion, rotations, wrench)
+        tip = self.tip_forces(motion, rotations, wrench)
         result: list[Scalar] = []
         for (force, torque), (tip_force, tip_torque) in zip(needed.reactions, tip.reactions, strict=True):
             result += [*subtract(force, tip_force), *subtract(torque, tip_torque)[:2]]
@@ -370,7 +386,7 @@ class SpaceArmField:
         rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
         given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
         needed = minimal.inverse_dynamics(self.chain, rotations, motion.angular, motion.joint_rates, given)
-        tip = self._tip_forces(motion, rotations, self.chain.tip_wrench)
+        tip = self.tip_forces(motion, rotations, self.chain.tip_wrench)
         passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
         joints = [
             bias - other - load for bias, other, load in zip(needed.joints, passive, tip.joints, strict=True)

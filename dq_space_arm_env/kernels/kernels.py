@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.kernels.bound import rows_of
 from dq_space_arm_env.kernels.library import KernelLibrary
+from dq_space_arm_env.kernels.walk import walk
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.layout import StateLayout
 
@@ -96,6 +97,47 @@ class Kernels(KernelLibrary):
             ValueError: If shapes do not fit, dt is not a finite number, or the integrator is unknown.
         """
         return self._call("step", self._integrator(integrator), x=x, u=u, h=self._time_step(dt))[0]
+
+    def simulate(
+        self,
+        x: ArrayLike,
+        u: ArrayLike,
+        steps: int,
+        dt: float | None = None,
+        integrator: str | None = None,
+        every: int = 1,
+    ) -> Array:
+        """Take many steps in a row, without coming back to Python in between.
+
+        The results are those of `step` called again and again, but for the integrators that keep the
+        momentum (`momentum_...`): they hand it on from step to step besides the state, so that it does not
+        wander by the rounding errors of the states, however many steps there are.
+
+        Args:
+            x: State at the start, shape (n_x,), units of `layout.state`.
+            u: Inputs, shape (n_u,) for constant ones, or (steps, n_u); not clipped to the limits.
+            steps: Number of steps.
+            dt: Time step, s; the scene's by default.
+            integrator: Name of the integrator; the scene's by default.
+            every: The state after every so many steps is returned.
+
+        Returns:
+            States, the start first, shape (steps // every + 1, n_x).
+
+        Raises:
+            ValueError: If shapes do not fit, steps or every is not positive, dt is not a finite number, or
+                the integrator is unknown.
+        """
+        if steps < 1 or every < 1:
+            raise ValueError(f"steps: {steps}, every: {every}, should be at least 1")
+        start, inputs = np.asarray(x, self.dtype), np.asarray(u, self.dtype)
+        if start.shape != (self.n_x,) or inputs.shape not in ((self.n_u,), (steps, self.n_u)):
+            raise ValueError(
+                f"x: shape {start.shape}, u: shape {inputs.shape}, should be ({self.n_x},), and "
+                f"({self.n_u},) or ({steps}, {self.n_u})"
+            )
+        kernel = self.kernel("walk", integrator=self._integrator(integrator), lanes=1)
+        return walk(self, kernel, start, inputs, self._time_step(dt).astype(self.dtype), steps, every)
 
     def linearize(
         self, x: ArrayLike, u: ArrayLike, dt: float | None = None, integrator: str | None = None

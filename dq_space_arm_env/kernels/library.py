@@ -188,6 +188,7 @@ _MODEL_SOURCES = ("algebra", "compiler", "cost.py", "dynamics", "integrators", "
 _STEPS = (
     "step",
     "step_with_cost",
+    "walk",
     "linearize",
     "lagrangian_hessian",
     "environment_step",

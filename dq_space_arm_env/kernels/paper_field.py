@@ -17,13 +17,14 @@ from dq_space_arm_env.compiler.symbols import column, matrix, symbols, zeros
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
 from dq_space_arm_env.dynamics.newton_euler import PaperState, SchurComplement
 from dq_space_arm_env.integrators.field import split_state
+from dq_space_arm_env.integrators.linearization import DifferentiatedJacobian
 from dq_space_arm_env.kernels.field import Inputs, SpaceArmField
 
 Scalar = Any
 Matrix = Any
 
 
-class PaperField:
+class PaperField(DifferentiatedJacobian):
     """Vector field of the paper's state with the tip's pose appended; implements `integrators.VectorField`.
 
     For three links and a wrist: base pose (8), joint angles (3), wrist angles (3), dual velocities of the
@@ -135,33 +136,6 @@ class PaperField:
         )
         rates, jacobian = casadi.substitute([rates, jacobian], [variables], [values])
         return casadi.vertsplit(casadi.densify(rates)), jacobian[:, : self.n_y], jacobian[:, self.n_y :]
-
-    def jacobian_along(
-        self,
-        y: Sequence[Scalar],
-        u: Sequence[Scalar],
-        rates: Sequence[Scalar],
-        by_y: Matrix,
-        by_u: Matrix,
-        direction: Sequence[Scalar],
-    ) -> Matrix:
-        """Derivative of by_y times a fixed direction with respect to (y, u), by differentiating by_y.
-
-        Args:
-            y: State, n_y expressions.
-            u: Input, n_u expressions.
-            rates: Time derivative of y at (y, u), n_y; not used.
-            by_y: Its Jacobian with respect to y, SX (n_y, n_y); not used.
-            by_u: Its Jacobian with respect to u, SX (n_y, n_u); not used.
-            direction: The direction, n_y.
-
-        Returns:
-            SX (n_y, n_y + n_u).
-        """
-        free = symbols("v", self.n_y + self.n_u)
-        _, jacobian, _ = self.linearized_rates(free[: self.n_y], free[self.n_y :])
-        along = casadi.jacobian(casadi.mtimes(jacobian, column(*direction)), column(*free))
-        return casadi.sparsify(casadi.substitute(along, column(*free), casadi.densify(column(*y, *u))))
 
 
 def _residual(system: newton_euler.NewtonEulerSystem) -> tuple[Matrix, Matrix]:

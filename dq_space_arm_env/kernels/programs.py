@@ -18,6 +18,7 @@ from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.integrators.dormand_prince import append_measured_step
 from dq_space_arm_env.integrators.field import split_state
+from dq_space_arm_env.integrators.momentum import MomentumPreserving
 from dq_space_arm_env.kernels.derivative_programs import DerivativePrograms
 from dq_space_arm_env.kernels.equations import SceneEquations, total
 from dq_space_arm_env.kernels.quadratic_programs import QuadraticPrograms
@@ -69,8 +70,8 @@ class ScenePrograms:
         """Trace a program.
 
         Args:
-            name: `step`, `step_with_cost`, `linearize`, `lagrangian_hessian`, or one of the functions of a
-                state.
+            name: `step`, `step_with_cost`, `walk`, `linearize`, `lagrangian_hessian`, or one of the
+                functions of a state.
             integrator: Name of the integrator, for those that take a step.
 
         Returns:
@@ -81,6 +82,8 @@ class ScenePrograms:
         """
         if name in ("step", "step_with_cost"):
             return self._step(name, integrator)
+        if name == "walk":
+            return self._walk(integrator)
         if name == "linearize":
             return self._derivatives.linearize(integrator)
         if name == "lagrangian_hessian":
@@ -269,4 +272,17 @@ class ScenePrograms:
         outputs = [Buffer("x_next", field.n_x), Buffer("error", 1), Buffer("dense", 4 * field.n_t)]
         program = Program("measured_step", inputs, outputs)
         append_measured_step(program, field)
+        return program
+
+    def _walk(self, integrator: str) -> Program:
+        """A step of many in a row; a method that keeps the momentum hands it on besides the state."""
+        field, method = self.field, integrator_of(self.scene.simulation, integrator)
+        x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
+        if not isinstance(method, MomentumPreserving):
+            program = Program("walk", [x, u, h], [Buffer("x_next", field.n_x)])
+            method.append_step(program, field)
+            return program
+        outputs = [Buffer("x_next", field.n_x), Buffer("momentum_next", 6)]
+        program = Program("walk", [x, Buffer("momentum", 6), u, h], outputs)
+        method.append_walk(program, field)
         return program

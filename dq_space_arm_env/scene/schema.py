@@ -53,7 +53,17 @@ __all__ = [
     "Wrist",
 ]
 
-INTEGRATORS = ("symplectic_euler", "rk4", "rk6", "rk8", "dormand_prince", "rodas4", "rodas5p")
+INTEGRATORS = (
+    "symplectic_euler",
+    "rk4",
+    "rk6",
+    "rk8",
+    "dormand_prince",
+    "rodas4",
+    "rodas5p",
+    "momentum_rk4",
+    "momentum_rosenbrock",
+)
 CURVED_INTEGRATORS = ("symplectic_euler", "rk4")
 """Those whose steps have second derivatives, which Newton's method for optimal control needs."""
 ADAPTIVE_INTEGRATORS = ("dormand_prince",)

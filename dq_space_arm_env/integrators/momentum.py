@@ -1,0 +1,265 @@
+"""Methods that keep the momentum of the whole system exactly: any method for vectors, in other coordinates.
+
+A step changes to coordinates in which the momentum is a state (`momentum_coordinates.py`), lets another
+method advance them, and changes back. Where no wrench acts from outside, the momentum after a step is that
+before it up to the rounding of a single evaluation; a base actuator or a wrench at the tip changes it by the
+impulse that the method computes. The order is that of the method.
+
+A state holds the base's velocity, rounded, so that the momentum recomputed from it at every step wanders like
+the square root of the number of steps. Over millions of steps, `append_walk` hands the momentum on besides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import casadi
+
+from dq_space_arm_env.algebra import dual_quaternion, poses, quaternion, rotations, screw
+from dq_space_arm_env.algebra.dual_vectors import transform_matrix
+from dq_space_arm_env.algebra.vectors import (
+    add,
+    matrix_vector,
+    skew_matrix,
+    subtract,
+    transposed_matrix_vector,
+)
+from dq_space_arm_env.compiler.graph import graph_of
+from dq_space_arm_env.compiler.program import Program
+from dq_space_arm_env.compiler.symbols import matrix, symbols, zeros
+from dq_space_arm_env.integrators.field import (
+    Integrator,
+    VectorField,
+    graph_inputs,
+    nearly_unit,
+    split_state,
+)
+from dq_space_arm_env.integrators.momentum_coordinates import (
+    FreeBaseField,
+    LocalState,
+    MomentumCoordinates,
+)
+
+Scalar = Any
+Scalars = Sequence[Scalar]
+Matrix = Any
+
+
+class MomentumPreserving:
+    """A method for vectors, in coordinates that hold the momentum in place of the base's velocity."""
+
+    has_curvature = False
+
+    def __init__(self, method: Integrator) -> None:
+        """Take over a method.
+
+        Args:
+            method: One that works for equations of motion without a pose apart.
+        """
+        self.method = method
+        self.name, self.order = f"momentum_{method.name}", method.order
+
+    def append_step(self, program: Program, field: VectorField) -> None:
+        """Append the calls that turn buffers x, u, h into x_next."""
+        coordinates = _coordinates(field)
+        x, center, local = _symbols(coordinates)
+        start = _start(coordinates, split_state(field, x)[1])
+        program.call(self._graph("enter", coordinates, {"x": x}, start))
+        self._advance(program, coordinates)
+        inputs = {"x": x, "center": center, "local_next": local}
+        outputs = {"x_next": _left(coordinates, x, center, coordinates.parts(local))}
+        program.call(self._graph("leave", coordinates, inputs, outputs))
+
+    def append_walk(self, program: Program, field: VectorField) -> None:
+        """Append the calls that turn buffers x, momentum, u, h into x_next, momentum_next.
+
+        The momentum is that of `Kernels.momentum`, 6 numbers in inertial axes. It is handed on with what the
+        step adds to it, so that rounding errors of the states never enter it.
+        """
+        coordinates = _coordinates(field)
+        x, center, local = _symbols(coordinates)
+        momentum = symbols("momentum", 6)
+        stored, y = split_state(field, x)
+        attitude, _ = poses.to_matrix(coordinates.base.pose.full(stored))
+        entered = _start(coordinates, y)
+        state = coordinates.parts(entered["local"])
+        linear, angular = (transposed_matrix_vector(attitude, part) for part in (momentum[:3], momentum[3:]))
+        before = LocalState(
+            state.rotation, state.shape, state.displacement, linear, angular, state.joint_rates
+        )
+        entered["local"] = coordinates.joined(before)
+        program.call(self._graph("carry_in", coordinates, {"x": x, "momentum": momentum}, entered))
+        self._advance(program, coordinates)
+        begun = symbols("b", coordinates.n_y)
+        before, after = coordinates.parts(begun), coordinates.parts(local)
+        gained = [subtract(after.linear, before.linear), subtract(after.angular, before.angular)]
+        added = [entry for part in gained for entry in matrix_vector(attitude, part)]
+        outputs = {
+            "x_next": _left(coordinates, x, center, after),
+            "momentum_next": [old + new for old, new in zip(momentum, added, strict=True)],
+        }
+        inputs = {"x": x, "momentum": momentum, "center": center, "local": begun, "local_next": local}
+        program.call(self._graph("carry_out", coordinates, inputs, outputs))
+
+    def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
+        """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
+        coordinates = _coordinates(field)
+        x, center, local = _symbols(coordinates)
+        y = split_state(field, x)[1]
+        program.call(self._graph("enter", coordinates, {"x": x}, _start(coordinates, y)))
+        inner = Program("linearization", [], [])
+        patterns = self.method.append_linearization(inner, coordinates)
+        _take_over(program, inner)
+        # One more step, for the state that it leads to.
+        self._advance(program, coordinates)
+        by_start, by_input = (
+            casadi.SX.sym(key, pattern) for key, pattern in zip("AB", patterns, strict=True)
+        )
+        by_y, center_by_y = _linearized_start(coordinates, y)
+        by_pose, by_local, by_center = _linearized_left(coordinates, coordinates.parts(local), center)
+        through = casadi.mtimes(by_local, casadi.mtimes(by_start, by_y))
+        through = through + casadi.mtimes(by_center, center_by_y)
+        a = casadi.sparsify(casadi.horzcat(by_pose, through))
+        b = casadi.sparsify(casadi.mtimes(by_local, by_input))
+        inputs = {"x": x, "center": center, "local_next": local}
+        inputs |= {"local_A": by_start.nonzeros(), "local_B": by_input.nonzeros()}
+        outputs = {"A": a.nonzeros(), "B": b.nonzeros()}
+        program.call(self._graph("linearized", coordinates, inputs, outputs))
+        return a.sparsity(), b.sparsity()
+
+    def _advance(self, program: Program, coordinates: MomentumCoordinates) -> None:
+        inner = Program("step", [], [])
+        self.method.append_step(inner, coordinates)
+        _take_over(program, inner)
+
+    def _graph(
+        self,
+        name: str,
+        coordinates: MomentumCoordinates,
+        inputs: Mapping[str, Scalars],
+        outputs: Mapping[str, Scalars],
+    ) -> Any:
+        return graph_of(f"{coordinates.name}_{name}", graph_inputs(coordinates, **inputs), outputs)
+
+
+_BUFFERS = {"x": "local", "x_next": "local_next", "A": "local_A", "B": "local_B"}
+
+
+def _take_over(program: Program, inner: Program) -> None:
+    """Append the calls of a program that knows the local state as x."""
+    for call in inner.calls:
+        names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
+        buffers = {name: call.bindings.get(name, name) for name in names}
+        program.call(call.graph, **{name: _BUFFERS.get(buffer, buffer) for name, buffer in buffers.items()})
+
+
+def _coordinates(field: VectorField) -> MomentumCoordinates:
+    if not isinstance(field, FreeBaseField):
+        raise TypeError(f"equations {field.name!r} do not tell the momentum of the system")
+    return MomentumCoordinates(field)
+
+
+def _symbols(coordinates: MomentumCoordinates) -> tuple[list[Scalar], list[Scalar], list[Scalar]]:
+    """State and center of mass in the base frame at a step's start, local state at its end."""
+    return symbols("x", coordinates.base.n_x), symbols("c", 3), symbols("z", coordinates.n_y)
+
+
+def _start(coordinates: MomentumCoordinates, y: Scalars) -> dict[str, Scalars]:
+    """The local state at a step's start, and the center of mass in the base frame."""
+    linear, angular, center = coordinates.balance.momentum(y)
+    zero = (0.0, 0.0, 0.0)
+    shape = [y[i] for i in coordinates.shape_indices]
+    joint_rates = [y[i] for i in coordinates.joint_indices]
+    state = LocalState(zero, shape, zero, linear, angular, joint_rates)
+    return {"local": coordinates.joined(state), "center": center}
+
+
+def _linearized_start(coordinates: MomentumCoordinates, y: Scalars) -> tuple[Matrix, Matrix]:
+    """Derivatives of the local state at a step's start, and of the center of mass, by y."""
+    momentum, center = coordinates.momentum_jacobian(y)
+    identity = casadi.SX.eye(coordinates.base.n_y)
+    result = zeros(coordinates.n_y, coordinates.base.n_y)
+    result[coordinates.shape, :] = identity[coordinates.shape_indices, :]
+    result[coordinates.linear, :] = momentum[coordinates.moving, :]
+    result[coordinates.angular, :] = momentum[[3 + axis for axis in coordinates.turning], :]
+    result[coordinates.joint_rates, :] = identity[coordinates.joint_indices, :]
+    return casadi.sparsify(result), center
+
+
+def _ending(coordinates: MomentumCoordinates, state: LocalState) -> tuple[Scalars, Scalars, Scalars]:
+    """Linear and angular momentum and twist of the base in its axes at a step's end.
+
+    Each vector is turned as v + 2 r x (...), not by a matrix: the entries of a matrix near 1 are rounded in
+    the same way at every step of a steady rotation, and the momentum would shrink or grow with them.
+    """
+    back = quaternion.conjugate(rotations.exponential(state.rotation))
+    linear, angular = (rotations.rotate(back, part) for part in (state.linear, state.angular))
+    return linear, angular, coordinates.twist(state.shape, linear, angular, state.joint_rates)
+
+
+def _relative_pose(state: LocalState, before: Scalars, after: Scalars) -> Scalars:
+    """Pose of the base as seen from the step's start.
+
+    Args:
+        state: Local state at the step's end.
+        before: Center of mass in the base frame at the start, 3.
+        after: And at the end.
+    """
+    rotation = rotations.exponential(state.rotation)
+    position = subtract(add(state.displacement, before), rotations.rotate(rotation, after))
+    return poses.from_rotation_and_position(rotation, position)
+
+
+def _left(coordinates: MomentumCoordinates, x: Scalars, before: Scalars, state: LocalState) -> list[Scalar]:
+    """The state after a step that began at x, with the center of mass there."""
+    pose = coordinates.base.pose
+    end = coordinates.y(state.shape, _ending(coordinates, state)[2], state.joint_rates)
+    relative = _relative_pose(state, before, coordinates.balance.momentum(end)[2])
+    moved = dual_quaternion.multiply(pose.full(split_state(coordinates.base, x)[0]), relative)
+    return [*pose.reduced(nearly_unit(moved)), *end]
+
+
+def _linearized_left(
+    coordinates: MomentumCoordinates, state: LocalState, before: Scalars
+) -> tuple[Matrix, Matrix, Matrix]:
+    """Derivatives of the state after a step, in tangent coordinates.
+
+    Args:
+        coordinates: The coordinates.
+        state: Local state at the step's end.
+        before: Center of mass in the base frame at the start, 3.
+
+    Returns:
+        By the pose at the start; by the local state at the end; and by the center of mass at the start.
+    """
+    field, change = coordinates.base, casadi.SX.eye(coordinates.n_y)
+    linear, angular, twist = _ending(coordinates, state)
+    y = coordinates.y(state.shape, twist, state.joint_rates)
+    center = coordinates.balance.momentum(y)[2]
+    jacobian = screw.exponential_right_jacobian((*state.rotation, 0.0, 0.0, 0.0))
+    turned = matrix([[row[i] for i in coordinates.turning] for row in jacobian[:3]])
+    turned = casadi.mtimes(turned, change[coordinates.rotation, :])
+    # A vector v that is constant in start axes changes by v x (rotation) as the base turns.
+    back = matrix(rotations.to_matrix(rotations.exponential(state.rotation))).T
+    momentum = casadi.vertcat(
+        casadi.mtimes(back[:, coordinates.moving], change[coordinates.linear, :])
+        + casadi.mtimes(matrix(skew_matrix(linear)), turned),
+        casadi.mtimes(back[:, coordinates.turning], change[coordinates.angular, :])
+        + casadi.mtimes(matrix(skew_matrix(angular)), turned),
+    )
+    by_shape = coordinates.momentum_jacobian(y)[1][:, coordinates.shape_indices]
+    moved = casadi.mtimes(back[:, coordinates.moving], change[coordinates.displacement, :])
+    moved = moved + casadi.mtimes(matrix(skew_matrix(center)), turned)
+    moved = moved - casadi.mtimes(by_shape, change[coordinates.shape, :])
+    directions = list(field.pose.directions)
+    rest = zeros(field.n_y, coordinates.n_y)
+    rest[coordinates.shape_indices, :] = change[coordinates.shape, :]
+    rest[list(field.pose.twist_indices), :] = coordinates.twist_change(y, momentum, change)[directions, :]
+    rest[coordinates.joint_indices, :] = change[coordinates.joint_rates, :]
+    by_local = casadi.vertcat(casadi.vertcat(turned, moved)[directions, :], rest)
+    by_center = casadi.vertcat(casadi.vertcat(zeros(3, 3), back)[directions, :], zeros(field.n_y, 3))
+    backward = dual_quaternion.conjugate(_relative_pose(state, before, center))
+    adjoint = matrix(transform_matrix(*poses.to_matrix(backward)))[directions, directions]
+    by_pose = casadi.vertcat(adjoint, zeros(field.n_y, len(directions)))
+    return by_pose, casadi.sparsify(by_local), casadi.sparsify(by_center)

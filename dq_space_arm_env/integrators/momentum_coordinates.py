@@ -1,0 +1,354 @@
+"""Coordinates in which the momentum of the whole system is a state, and the base's velocity is not.
+
+They are local to a step, seen from the base's frame at its start ("start axes"):
+
+    rotation of the base (rotation vector), joint and wrist angles, displacement of the system's center of
+    mass, linear momentum, angular momentum about the center of mass, joint rates.
+
+The base's angular velocity follows from the angular momentum, the joint rates and the locked inertia, its
+place from the center of mass. Without an external wrench both momenta have the time derivative zero, so that
+any method that adds multiples of derivatives keeps them exactly, and the center of mass moves on an exact
+straight line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import casadi
+
+from dq_space_arm_env.algebra.vectors import (
+    add,
+    cross,
+    dot,
+    matrix_vector,
+    scale,
+    skew_matrix,
+    subtract,
+    transposed_matrix_vector,
+)
+from dq_space_arm_env.compiler.symbols import column, columns, symbols, zeros
+from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, spread
+from dq_space_arm_env.integrators.linearization import DifferentiatedJacobian
+
+Scalar = Any
+Scalars = Sequence[Scalar]
+Matrix = Any
+
+# Power series in the squared angle, the highest power first: sin(t) / t, (1 - cos(t)) / t^2, and
+# (1 - (t/2) cot(t/2)) / t^2. What is omitted is of order 10 in the rotation within a step, with factors
+# below 3e-8.
+_SINE = tuple((-1.0) ** j / math.factorial(2 * j + 1) for j in reversed(range(5)))
+_COSINE = tuple((-1.0) ** j / math.factorial(2 * j + 2) for j in reversed(range(5)))
+_COTANGENT = (1 / 1209600, 1 / 30240, 1 / 720, 1 / 12)
+
+
+class MomentumBalance(Protocol):
+    """Momentum of a robot, in base axes; y is a state without the pose."""
+
+    @property
+    def mass(self) -> Scalar:
+        """Mass of the whole system, kg."""
+        ...
+
+    @property
+    def springs(self) -> tuple[Sequence[float], Sequence[float]]:
+        """Stiffness [N m/rad] and damping [N m s/rad] of the joints, n each."""
+        ...
+
+    def joint_inertia(self, y: Scalars) -> Sequence[Scalars]:
+        """Inertia that the joints feel while the base floats freely, symmetric (n, n)."""
+        ...
+
+    def momentum(self, y: Scalars) -> tuple[Scalars, Scalars, Scalars]:
+        """Linear momentum, angular momentum about the center of mass, and the center of mass, 3 each."""
+        ...
+
+    def base_twist(self, y: Scalars, linear: Scalars, angular: Scalars) -> list[Scalar]:
+        """The twist of the base, 6, that gives the system a momentum; y's own is not read."""
+        ...
+
+    def external_wrench(self, y: Scalars, u: Scalars) -> tuple[Scalars, Scalars]:
+        """Force, and torque about the base's origin, that act from outside; the number zero where none."""
+        ...
+
+
+@runtime_checkable
+class FreeBaseField(VectorField, Protocol):
+    """Equations of motion of a robot whose base floats freely."""
+
+    @property
+    def pose(self) -> PoseCoordinates:
+        """Coordinates of the pose."""
+        ...
+
+    @property
+    def momentum_balance(self) -> MomentumBalance:
+        """The momentum of the whole system, and what changes it."""
+        ...
+
+
+@dataclass(frozen=True)
+class LocalState:
+    """The parts of a state in these coordinates; vectors have three numbers, in start axes.
+
+    Attributes:
+        rotation: Rotation vector of the base, rad.
+        shape: Joint and wrist angles, rad.
+        displacement: Of the system's center of mass, m.
+        linear: Linear momentum, kg m/s.
+        angular: Angular momentum about the center of mass, kg m^2/s.
+        joint_rates: rad/s.
+    """
+
+    rotation: Scalars
+    shape: Scalars
+    displacement: Scalars
+    linear: Scalars
+    angular: Scalars
+    joint_rates: Scalars
+
+
+class MomentumCoordinates(DifferentiatedJacobian):
+    """Equations of motion in these coordinates: a `VectorField` without a pose apart."""
+
+    pose = None
+
+    def __init__(self, field: FreeBaseField) -> None:
+        """Lay out the coordinates.
+
+        Args:
+            field: Equations of motion with the base's velocity among the states.
+        """
+        self.base, self.balance = field, field.momentum_balance
+        self.name = f"{field.name}_momentum"
+        self.parameters, self.n_u = field.parameters, field.n_u
+        self.turning = [axis for axis in field.pose.directions if axis < 3]
+        self.moving = [axis - 3 for axis in field.pose.directions if axis >= 3]
+        twist = field.pose.twist_indices
+        self.shape_indices = [i for i in range(field.n_y) if i not in field.rate_indices]
+        self.joint_indices = [i for i in field.rate_indices if i not in twist]
+        sizes = [len(self.turning), len(self.shape_indices), len(self.moving), len(self.moving)]
+        sizes += [len(self.turning), len(self.joint_indices)]
+        ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
+        self.rotation, self.shape, self.displacement, self.linear, self.angular, self.joint_rates = (
+            slice(end - size, end) for size, end in zip(sizes, ends, strict=True)
+        )
+        self.n_x = self.n_y = ends[-1]
+        self.rate_indices = tuple(range(self.linear.start, self.n_y))
+        # Joint angles come before wrist angles.
+        self.stiff_angles = range(self.shape.start, self.shape.start + len(self.joint_indices))
+        self.stiff_rates = range(self.joint_rates.start, self.joint_rates.stop)
+        self.stiffness, self.damping = self.balance.springs
+
+    def parts(self, local: Scalars) -> LocalState:
+        """Name the parts of a state."""
+        return LocalState(
+            spread(local[self.rotation], self.turning, 3),
+            local[self.shape],
+            spread(local[self.displacement], self.moving, 3),
+            spread(local[self.linear], self.moving, 3),
+            spread(local[self.angular], self.turning, 3),
+            local[self.joint_rates],
+        )
+
+    def joined(self, state: LocalState) -> list[Scalar]:
+        """Put the parts of a state together; the inverse of `parts`."""
+        return [
+            *(state.rotation[i] for i in self.turning),
+            *state.shape,
+            *(state.displacement[i] for i in self.moving),
+            *(state.linear[i] for i in self.moving),
+            *(state.angular[i] for i in self.turning),
+            *state.joint_rates,
+        ]
+
+    def y(self, shape: Scalars, twist: Scalars, joint_rates: Scalars) -> list[Scalar]:
+        """A state of the given equations of motion, without the pose."""
+        result = spread(shape, self.shape_indices, self.base.n_y)
+        for index, direction in zip(self.base.pose.twist_indices, self.base.pose.directions, strict=True):
+            result[index] = twist[direction]
+        for index, rate in zip(self.joint_indices, joint_rates, strict=True):
+            result[index] = rate
+        return result
+
+    def twist(self, shape: Scalars, linear: Scalars, angular: Scalars, joint_rates: Scalars) -> list[Scalar]:
+        """The base's twist for a momentum in base axes."""
+        return self.balance.base_twist(self.y(shape, [0.0] * 6, joint_rates), linear, angular)
+
+    def joint_inertia(self, y: Scalars) -> Sequence[Scalars]:
+        """Inertia that the joints feel while the base floats freely, symmetric (n, n)."""
+        state = self.parts(y)
+        return self.balance.joint_inertia(self.y(state.shape, [0.0] * 6, state.joint_rates))
+
+    def _moving(self, state: LocalState) -> tuple[list[Scalar], list[Scalar]]:
+        """The base's angular velocity, and y with it; no rate depends on the linear velocity."""
+        angular = transposed_matrix_vector(rotation_matrix(state.rotation), state.angular)
+        omega = self.twist(state.shape, (0.0, 0.0, 0.0), angular, state.joint_rates)[:3]
+        return omega, self.y(state.shape, [*omega, 0.0, 0.0, 0.0], state.joint_rates)
+
+    def _momentum_rates(self, state: LocalState, u: Scalars) -> tuple[Scalars, Scalars]:
+        """What the external wrench changes, in start axes."""
+        y = self.y(state.shape, [0.0] * 6, state.joint_rates)
+        force, torque = self.balance.external_wrench(y, u)
+        about_center = subtract(torque, cross(self.balance.momentum(y)[2], force))
+        attitude = rotation_matrix(state.rotation)
+        return matrix_vector(attitude, force), matrix_vector(attitude, about_center)
+
+    def rates(self, y: Scalars, u: Scalars) -> list[Scalar]:
+        """Time derivative of a state.
+
+        Args:
+            y: State in these coordinates, n_y.
+            u: Input, n_u.
+
+        Returns:
+            n_y rates.
+        """
+        state = self.parts(y)
+        omega, moving = self._moving(state)
+        return self._joined_rates(state, omega, self.base.rates(moving, u), u)
+
+    def _joined_rates(self, state: LocalState, omega: Scalars, rates: Scalars, u: Scalars) -> list[Scalar]:
+        linear, angular = self._momentum_rates(state, u)
+        return self.joined(
+            LocalState(
+                rotation_rate(state.rotation, omega),
+                [rates[i] for i in self.shape_indices],
+                scale(1.0 / self.balance.mass, state.linear),
+                linear,
+                angular,
+                [rates[i] for i in self.joint_indices],
+            )
+        )
+
+    def linearized_rates(self, y: Scalars, u: Scalars) -> tuple[list[Scalar], Matrix, Matrix]:
+        """Time derivative of a state and its Jacobians.
+
+        The Jacobians of the given equations of motion are taken over; the angular velocity changes by what
+        keeps the momentum.
+
+        Args:
+            y: State in these coordinates, n_y expressions.
+            u: Input, n_u expressions.
+
+        Returns:
+            Rates (n_y), Jacobian with respect to y (n_y, n_y), Jacobian with respect to u (n_y, n_u).
+        """
+        free, inputs = symbols("z", self.n_y), symbols("w", self.n_u)
+        both = column(*free, *inputs)
+        state = self.parts(free)
+        omega, moving = self._moving(state)
+        rates, by_y, by_u = self.base.linearized_rates(moving, inputs)
+        change = casadi.horzcat(casadi.SX.eye(self.n_y), zeros(self.n_y, self.n_u))
+        momentum = column(
+            0.0, 0.0, 0.0, *transposed_matrix_vector(rotation_matrix(state.rotation), state.angular)
+        )
+        twist = self.twist_change(moving, casadi.jacobian(momentum, both), change)
+        moved = zeros(self.base.n_y, self.n_y + self.n_u)
+        moved[self.shape_indices, :] = change[self.shape, :]
+        moved[self.joint_indices, :] = change[self.joint_rates, :]
+        for index, direction in zip(self.base.pose.twist_indices, self.base.pose.directions, strict=True):
+            if direction < 3:
+                moved[index, :] = twist[direction, :]
+        moved = casadi.mtimes(by_y, moved) + casadi.horzcat(zeros(self.base.n_y, self.n_y), by_u)
+        # Everything else is explicit; the angular velocity and the given rates stand as they are in it.
+        turning = symbols("omega", 3)
+        explicit = column(*self._joined_rates(state, turning, [0.0] * self.base.n_y, inputs))
+        jacobian = casadi.jacobian(explicit, both)
+        jacobian += casadi.mtimes(casadi.jacobian(explicit, column(*turning)), twist[:3, :])
+        jacobian = casadi.substitute(jacobian, column(*turning), casadi.densify(column(*omega)))
+        jacobian[self.shape, :] = moved[self.shape_indices, :]
+        jacobian[self.joint_rates, :] = moved[self.joint_indices, :]
+        value = column(*self._joined_rates(state, omega, rates, inputs))
+        values = casadi.densify(column(*y, *u))
+        value, jacobian = casadi.substitute([casadi.densify(value), jacobian], [both], [values])
+        jacobian = casadi.sparsify(jacobian)
+        return casadi.vertsplit(value), jacobian[:, : self.n_y], jacobian[:, self.n_y :]
+
+    def momentum_jacobian(self, y: Scalars) -> tuple[Matrix, Matrix]:
+        """Derivatives, by a given y, of the momentum and of the center of mass in base axes.
+
+        Args:
+            y: State of the given equations without the pose, expressions.
+
+        Returns:
+            SX (6, n) of linear and angular momentum, and SX (3, n).
+        """
+        free = symbols("v", self.base.n_y)
+        linear, angular, center = self.balance.momentum(free)
+        jacobians = [
+            casadi.jacobian(column(*entries), column(*free)) for entries in ((*linear, *angular), center)
+        ]
+        momentum, center = casadi.substitute(jacobians, [column(*free)], [casadi.densify(column(*y))])
+        return casadi.sparsify(momentum), casadi.sparsify(center)
+
+    def twist_change(self, y: Scalars, momentum: Matrix, local: Matrix) -> Matrix:
+        """Change of the base's twist.
+
+        Args:
+            y: State of the given equations without the pose.
+            momentum: Changes of linear and angular momentum in base axes, SX (6, m).
+            local: Changes of the state in these coordinates, SX (n_y, m), of which shape and rates count.
+
+        Returns:
+            SX (6, m).
+        """
+        by_y = self.momentum_jacobian(y)[0]
+        right = momentum - casadi.mtimes(by_y[:, self.shape_indices], local[self.shape, :])
+        right = right - casadi.mtimes(by_y[:, self.joint_indices], local[self.joint_rates, :])
+        right = casadi.sparsify(right)
+        shape, still = [y[i] for i in self.shape_indices], [0.0] * len(self.joint_indices)
+        changes = []
+        for k in range(right.shape[1]):
+            entries: list[Scalar] = [0.0] * 6
+            for row, value in zip(right[:, k].row(), right[:, k].nonzeros(), strict=True):
+                entries[row] = value
+            changes.append(column(*self.twist(shape, entries[:3], entries[3:], still)))
+        return columns(*changes, rows=6)
+
+
+def _series(x: Scalar, coefficients: tuple[float, ...]) -> Scalar:
+    value: Scalar = coefficients[0]
+    for coefficient in coefficients[1:]:
+        value = coefficient + x * value
+    return value
+
+
+def rotation_matrix(rotation: Scalars) -> list[list[Scalar]]:
+    """Rotation matrix of a rotation vector, by power series for rotations within a step.
+
+    Args:
+        rotation: Rotation vector, 3, rad.
+
+    Returns:
+        Matrix 3x3, from rotated axes to those from which they were rotated.
+    """
+    square = dot(rotation, rotation)
+    sine = scale(_series(square, _SINE), rotation)
+    cosine = scale(_series(square, _COSINE), rotation)
+    skew = skew_matrix(sine)
+    result = [[cosine[i] * rotation[j] + skew[i][j] for j in range(3)] for i in range(3)]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        result[i][i] = 1.0 - (cosine[j] * rotation[j] + cosine[k] * rotation[k])
+    return result
+
+
+def rotation_rate(rotation: Scalars, angular_velocity: Scalars) -> Scalars:
+    """Time derivative of the rotation vector, dexp^-1, by power series for rotations within a step.
+
+    Args:
+        rotation: Rotation vector, 3, rad.
+        angular_velocity: In the axes of the rotated frame, 3, rad/s.
+
+    Returns:
+        3 numbers, rad/s.
+    """
+    once = cross(rotation, angular_velocity)
+    twice = cross(rotation, once)
+    factor = _series(dot(rotation, rotation), _COTANGENT)
+    return add(angular_velocity, add(scale(0.5, once), scale(factor, twice)))

@@ -1,0 +1,73 @@
+"""States handed over between two scenes that differ in the payload at the tip."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.dynamics.capture import Velocities, capture
+from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.integrators.field import spread
+from dq_space_arm_env.kernels.kernels import Kernels
+from dq_space_arm_env.scene.start import PLANAR_TWIST
+
+Array = NDArray[Any]
+
+
+def catch_payload(free: Kernels, loaded: Kernels, x: ArrayLike, payload_twist: ArrayLike) -> Array:
+    """The state right after the tip has caught a payload, total momentum kept.
+
+    Poses and angles stay; base and joints take the velocities of a plastic impact (`dynamics.capture`). A
+    release needs no function: the state stays, and the payload leaves with the twist of the tip.
+
+    Args:
+        free: Functions of the scene without the payload.
+        loaded: Functions of the same scene with the payload.
+        x: State before, shape (n_x,), units of `layout.state`.
+        payload_twist: Of the payload before, angular [rad/s] then linear [m/s] at the tip's origin, in tip
+            axes, shape (6,).
+
+    Returns:
+        State after, shape (n_x,).
+
+    Raises:
+        ValueError: If the scenes differ in more than the payload, x or the twist have a wrong shape or are
+            not finite, or a planar payload leaves the plane.
+    """
+    payload = loaded.scene.payload
+    if payload is None:
+        raise ValueError(f"loaded: scene {loaded.scene.name!r} has no payload to be caught")
+    names = ("base", "links", "wrist", "tip")
+    differing = [name for name in names if getattr(free.scene, name) != getattr(loaded.scene, name)]
+    if free.scene.payload is not None or differing:
+        which = ", ".join(differing) or "it has a payload already"
+        raise ValueError(
+            f"free: scene {free.scene.name!r} must be the loaded one without its payload: {which}"
+        )
+    state = _finite("x", x, free.n_x)
+    twist = _finite("payload_twist", payload_twist, 6)
+    layout, where = free.layout, free.layout.state
+    directions = PLANAR_TWIST if layout.planar else tuple(range(6))
+    base = spread(state[where.base_velocity].tolist(), directions, 6)
+    after = capture(
+        Chain.from_scene(free.scene),
+        Chain.from_scene(loaded.scene),
+        RigidBody(payload.mass, payload.center_of_mass, payload.inertia),
+        state[where.joint_angles].tolist(),
+        Velocities(base[:3], base[3:], state[where.joint_rates].tolist()),
+        twist.tolist(),
+    )
+    state[where.base_velocity] = np.array([*after.angular, *after.linear])[list(directions)]
+    state[where.joint_rates] = after.joint_rates
+    return state
+
+
+def _finite(name: str, value: ArrayLike, size: int) -> Array:
+    numbers = np.array(value, dtype=np.float64)
+    if numbers.shape != (size,) or not np.isfinite(numbers).all():
+        raise ValueError(
+            f"{name}: {numbers} of shape {numbers.shape}, should be finite numbers of shape {(size,)}"
+        )
+    return numbers

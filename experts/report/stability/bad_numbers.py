@@ -1,0 +1,264 @@
+"""NaN, infinities and denormals in every input: refused in a sentence, or kept to their row and reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from dq_space_arm_env import Kernels, compile_scene
+from dq_space_arm_env.environment import DQSpaceArmEnv
+from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
+from dq_space_arm_env.scene import INTEGRATORS
+from experts.box_ddp import BoxDDP
+from experts.problem import FloatArray
+from experts.report.stability.rows import Case, Effort, Handled, NotClaimed, Outcome, refusal
+from experts.report.stability.time_steps import moving_start
+
+GROUP = "bad numbers"
+
+BAD = {"NaN": np.nan, "inf": np.inf, "-inf": -np.inf}
+DENORMAL = 5e-324
+
+
+def cases() -> Iterator[Case]:
+    """All cases of the group."""
+    for name in INTEGRATORS:
+        yield Case(
+            GROUP,
+            "NaN and infinities in each entry of x and u",
+            f"step, {name}",
+            "other rows of a batch have the bits that they have alone",
+            partial(_confined, name),
+            0.0,
+            "rows",
+        )
+        yield Case(
+            GROUP,
+            "denormals in every entry of x and u",
+            f"step, {name}",
+            "finite, and within 1e-15 of the step from zero",
+            partial(_denormal_step, name),
+            1e-15,
+            "1",
+        )
+    yield Case(
+        GROUP,
+        "NaN and infinities in each entry of x and u",
+        "forward dynamics",
+        "other rows of a batch have the bits that they have alone; the row has no wrong finite numbers",
+        partial(_confined, None),
+        0.0,
+        "rows",
+    )
+    yield Case(
+        GROUP,
+        "denormals in every entry of x and u",
+        "forward dynamics",
+        "finite, and within 1e-15 of those at zero",
+        _denormal_dynamics,
+        1e-15,
+        "1",
+    )
+    for text, number in BAD.items():
+        yield Case(GROUP, f"{text} as dt", "step", "refused, naming dt", partial(_time_step, number))
+        yield Case(
+            GROUP,
+            f"{text} in each entry of the initial state",
+            "environment, reset",
+            "refused, naming the option",
+            partial(_reset, number),
+        )
+        yield Case(GROUP, f"{text} in x0", "expert", "refused, naming x0", partial(_expert, number))
+    yield Case(GROUP, "NaN in each entry of an action", "environment, step", "refused", _nan_action)
+    yield Case(
+        GROUP,
+        "NaN in an action of one copy",
+        "vector environment, step",
+        "refused, naming the copy, or this copy diverged and the others untouched",
+        _nan_action_of_one_copy,
+        0.0,
+        "copies",
+    )
+    yield Case(
+        GROUP,
+        "infinities in each entry of an action",
+        "environment, step",
+        "clipped to the limits: the bits of an action of 1 or -1",
+        _infinite_action,
+        0.0,
+        "entries",
+    )
+    yield Case(
+        GROUP,
+        "denormal action",
+        "environment, step",
+        "finite, and within 1e-15 of no action",
+        _denormal_action,
+        1e-15,
+        "1",
+    )
+    yield Case(
+        GROUP,
+        "velocities of 1e200",
+        "environment",
+        "refused, naming the option",
+        _overflowing_reset,
+    )
+    yield Case(
+        GROUP,
+        "states that overflow during an episode",
+        "environment, step",
+        "terminated and diverged; observation and reward finite",
+        _overflow,
+        0.0,
+        "numbers",
+    )
+
+
+def _rows(kernels: Kernels) -> tuple[FloatArray, FloatArray]:
+    """A batch of sound states and inputs."""
+    count = 2 * kernels.lanes + 1
+    rng = np.random.default_rng(0)
+    return np.tile(moving_start(kernels), (count, 1)), rng.normal(size=(count, kernels.n_u))
+
+
+def _confined(integrator: str | None, effort: Effort) -> Outcome:
+    kernels = compile_scene("paper")
+    states, controls = _rows(kernels)
+
+    def results(x: FloatArray, u: FloatArray) -> Any:
+        if integrator is None:
+            return kernels.forward_dynamics(x, u)
+        return kernels.step(x, u, integrator=integrator)
+
+    sound = results(states, controls)
+    touched, quiet, hit = 0, 0, 2
+    others = [row for row in range(len(states)) if row != hit]
+    with np.errstate(all="ignore"):
+        for array in (states, controls):
+            for entry in range(array.shape[1]):
+                for number in BAD.values():
+                    kept, array[hit, entry] = array[hit, entry], number
+                    found = results(states, controls)
+                    array[hit, entry] = kept
+                    touched += int(not np.array_equal(found[others], sound[others]))
+                    quiet += int(np.isfinite(found[hit]).all())
+    note = f"{quiet} of the bad entries do not enter the result" if quiet else "each shows as NaN or inf"
+    return Handled(float(touched), note)
+
+
+def _denormals(kernels: Kernels) -> tuple[FloatArray, FloatArray]:
+    """The paper's robot at the origin, every zero replaced by the smallest number."""
+    x, u = np.full(kernels.n_x, DENORMAL), np.full(kernels.n_u, DENORMAL)
+    x[0] = 1.0
+    return x, u
+
+
+def _denormal_step(integrator: str, effort: Effort) -> Outcome:
+    kernels = compile_scene("paper")
+    x, u = _denormals(kernels)
+    zero = np.zeros(kernels.n_x)
+    zero[0] = 1.0
+    exact = kernels.step(zero, np.zeros(kernels.n_u), integrator=integrator)
+    return Handled(float(np.abs(kernels.step(x, u, integrator=integrator) - exact).max()))
+
+
+def _denormal_dynamics(effort: Effort) -> Outcome:
+    kernels = compile_scene("paper")
+    return Handled(float(np.abs(kernels.forward_dynamics(*_denormals(kernels))).max()))
+
+
+def _time_step(number: float, effort: Effort) -> Outcome:
+    kernels = compile_scene("paper")
+    x, u = moving_start(kernels), np.zeros(kernels.n_u)
+    return refusal(lambda: kernels.step(x, u, number), naming="dt")
+
+
+def _all_refused(attempts: list[Callable[[], object]], naming: str) -> Outcome:
+    sentences = [refusal(attempt, naming=naming) for attempt in attempts]
+    return sentences[0]
+
+
+def _reset(number: float, effort: Effort) -> Outcome:
+    env = DQSpaceArmEnv("paper")
+    attempts: list[Callable[[], object]] = []
+    for entry in range(env.kernels.n_x):
+        x = env.kernels.layout.initial_state.copy()
+        x[entry] = number
+        attempts.append(partial(env.reset, options={"initial_state": x}))
+    return _all_refused(attempts, "initial_state")
+
+
+def _expert(number: float, effort: Effort) -> Outcome:
+    solver = BoxDDP("planar", max_iterations=1)
+    x = np.array(solver.problem.initial_state)
+    x[-1] = number
+    return refusal(lambda: solver.solve(x), naming="x0")
+
+
+def _begun() -> DQSpaceArmEnv:
+    env = DQSpaceArmEnv("paper")
+    env.reset(options={"nominal": True})
+    return env
+
+
+def _nan_action(effort: Effort) -> Outcome:
+    attempts: list[Callable[[], object]] = []
+    for entry in range(compile_scene("paper").n_u):
+        action = np.zeros(compile_scene("paper").n_u)
+        action[entry] = np.nan
+        attempts.append(partial(_begun().step, action))
+    return _all_refused(attempts, "action")
+
+
+def _nan_action_of_one_copy(effort: Effort) -> Outcome:
+    env = DQSpaceArmVectorEnv(scene="paper", num_envs=5)
+    env.reset(options={"nominal": True})
+    actions = np.zeros(env.action_space.shape or ())
+    actions[2, 3] = np.nan
+    return refusal(lambda: env.step(actions), naming="action")
+
+
+def _infinite_action(effort: Effort) -> Outcome:
+    differing = 0
+    for entry in range(compile_scene("paper").n_u):
+        for number in (np.inf, -np.inf):
+            action = np.zeros(compile_scene("paper").n_u)
+            action[entry] = number
+            found = _begun().step(action)[0]
+            action[entry] = np.sign(number)
+            differing += int(not np.array_equal(found, _begun().step(action)[0]))
+    return Handled(float(differing))
+
+
+def _denormal_action(effort: Effort) -> Outcome:
+    n_u = compile_scene("paper").n_u
+    still, moved = _begun().step(np.zeros(n_u))[0], _begun().step(np.full(n_u, DENORMAL))[0]
+    return Handled(float(np.abs(still - moved).max()))
+
+
+def _overflowing_reset(effort: Effort) -> Outcome:
+    env = DQSpaceArmEnv("paper")
+    x = env.kernels.layout.initial_state.copy()
+    x[env.kernels.layout.state.base_velocity] = 1e200
+    return refusal(lambda: env.reset(options={"initial_state": x}), naming="initial_state")
+
+
+def _overflow(effort: Effort) -> Outcome:
+    env = DQSpaceArmEnv("paper")
+    x = env.kernels.layout.initial_state.copy()
+    x[env.kernels.layout.state.joint_rates] = 1e5
+    env.reset(options={"initial_state": x})
+    for _ in range(env.scene.simulation.steps):
+        observation, reward, terminated, _, info = env.step(np.zeros(env.kernels.n_u))
+        numbers = np.array([*observation, reward, *(float(value) for value in info.values())])
+        if not np.isfinite(numbers).all():
+            return Handled(np.inf, "an observation or a reward is not finite")
+        if terminated:
+            break
+    if not (terminated and info["diverged"]):
+        return NotClaimed("the motion did not overflow")
+    return Handled(0.0, "the episode ends, diverged")

@@ -1,0 +1,162 @@
+"""Extreme problems for the expert: its stop reason must be true, its trajectory a rollout of its inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from dq_space_arm_env import Scene, load_scene
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.integrators.field import PoseCoordinates
+from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
+from experts.arm_problem import ArmProblem
+from experts.box_ddp import BoxDDP
+from experts.problem import FloatArray
+from experts.report.stability.rows import Case, Effort, Handled, Outcome, refusal
+from experts.report.stability.scenes import walk
+from experts.solution import StopReason
+
+GROUP = "expert"
+
+_STEPS = 150
+_MOST_ITERATIONS = 100
+_TRUE = "stop reason true, all finite; states are the rollout of inputs within their limits"
+
+
+def cases() -> Iterator[Case]:
+    """All cases of the group."""
+    problems: dict[str, Callable[[], ArmProblem]] = {
+        "limits of 1e-6": partial(_with_limits, 1e-6),
+        "infinite limits": partial(_with_limits, np.inf),
+        "weights spread over 1e12": _with_spread_weights,
+        "horizon of 1": partial(_short, 1),
+        "target 1 km away, out of reach": _with_far_target,
+        "huge initial momentum": partial(_moving, 3.0, 5.0, 0.01),
+        "a motion that overflows": partial(_moving, 1e3, 100.0, 0.05),
+        "start at the target": _at_target,
+        "springs of 1e8 N m/rad, beyond the integrator's limit": _with_stiff_joints,
+    }
+    for name, make in problems.items():
+        yield Case(GROUP, name, "BoxDDP", _TRUE, partial(_solve, make), 1e-12, "of the states")
+    yield Case(
+        GROUP,
+        "horizon of 20,000; of 2,000 in a quick run",
+        "BoxDDP",
+        _TRUE,
+        _long_horizon,
+        1e-12,
+        "of the states",
+        slow=True,
+    )
+    for limit in (0.0, -1.0, np.nan):
+        name, run = f"limit of {limit:g}", partial(_refused_limit, limit)
+        yield Case(GROUP, name, "scene", "refused, naming the limit", run)
+    yield Case(GROUP, "horizon of 0", "scene", "refused, naming the steps", _refused_horizon)
+
+
+def _scene(**changes: Any) -> Scene:
+    """A planar arm of two joints, and a maneuver of few stages."""
+    planar = load_scene("planar")
+    start = {"joint_angles": [0.5, -1.2]}
+    links = [link.model_dump() for link in planar.links[:2]]
+    simulation = {"steps": _STEPS, "dt": 0.05}
+    fields = {"links": links, "initial_state": start, "simulation": simulation, "name": "two joints"}
+    return planar.replace(**{**fields, **changes})
+
+
+def _short(steps: int = _STEPS) -> ArmProblem:
+    """The maneuver; what is not in the machine code may be changed without compiling anew."""
+    problem = ArmProblem(_scene())
+    problem.horizon = steps
+    return problem
+
+
+def _with_limits(limit: float) -> ArmProblem:
+    problem = _short()
+    problem.control_upper = np.full(problem.n_controls, limit)
+    problem.control_lower = -problem.control_upper
+    return problem
+
+
+def _with_spread_weights() -> ArmProblem:
+    cost = {"pose": 1e6, "terminal_pose": 1e6, "joint_torque": 1e-6, "base_force": 1.0, "base_torque": 1e-3}
+    return ArmProblem(_scene(cost=cost))
+
+
+def _with_far_target() -> ArmProblem:
+    return ArmProblem(_scene(target={"pose": {"position": [1e3, 0.0, 0.0]}}))
+
+
+def _moving(joint_rate: float, velocity: float, time_step: float) -> ArmProblem:
+    problem = _short()
+    where, x = problem.kernels.layout.state, problem.initial_state.copy()
+    x[where.joint_rates] = [joint_rate, -joint_rate]
+    x[where.base_velocity] = [joint_rate, velocity, -velocity]
+    problem.initial_state, problem.time_step = x, time_step
+    return problem
+
+
+def _at_target() -> ArmProblem:
+    """The base moved so that the tip is where it should be."""
+    problem = _short()
+    where, x = problem.kernels.layout.state.pose, problem.initial_state.copy()
+    field = PoseCoordinates(PLANAR_POSE, PLANAR_TWIST, ())
+    base, tip = tuple(field.full(x[where].tolist())), tuple(problem.kernels.tip_pose(x).tolist())
+    base_to_tip = dq.multiply(dq.conjugate(base), tip)
+    target = problem.scene.target.pose.dual_quaternion
+    pose = dq.normalize(dq.multiply(target, dq.conjugate(base_to_tip)))
+    x[where] = field.reduced(pose)
+    problem.initial_state = x
+    return problem
+
+
+def _with_stiff_joints() -> ArmProblem:
+    scene = _scene()
+    return ArmProblem(scene.replace(links=[{**link.model_dump(), "stiffness": 1e8} for link in scene.links]))
+
+
+def _solve(make: Callable[[], ArmProblem], effort: Effort) -> Outcome:
+    problem = make()
+    return _check(problem, BoxDDP(problem, max_iterations=_MOST_ITERATIONS))
+
+
+def _check(problem: ArmProblem, solver: BoxDDP) -> Outcome:
+    solution = solver.solve()
+    outcome = f"{solution.stop_reason.value} after {solution.iterations} iterations: {solution.message}"
+    if solution.stop_reason is StopReason.DIVERGED:
+        # That is the truth only if doing nothing overflows.
+        still = np.zeros((problem.horizon, problem.n_controls))
+        truth = not np.isfinite(_rollout(problem, still)).all()
+        return Handled(0.0 if truth and not np.isfinite(solution.cost) else np.inf, outcome)
+    arrays = (solution.states, solution.controls, solution.feedback_gains, np.array([solution.cost]))
+    if not all(np.isfinite(array).all() for array in arrays):
+        return Handled(np.inf, f"{outcome}; not all of the solution is finite")
+    if solution.converged != (solution.optimality <= solver.tolerance):
+        return Handled(np.inf, f"{outcome}; the measure of convergence is {solution.optimality:.1e}")
+    outside = np.abs(solution.controls) > problem.control_upper
+    if outside.any():
+        return Handled(np.inf, f"{outcome}; {outside.sum()} inputs are beyond their limits")
+    states = _rollout(problem, solution.controls)
+    apart = np.abs(states - solution.states).max() / np.abs(states).max()
+    return Handled(float(apart), outcome)
+
+
+def _rollout(problem: ArmProblem, controls: FloatArray) -> FloatArray:
+    return walk(problem.kernels, problem.initial_state, controls, problem.time_step)
+
+
+def _long_horizon(effort: Effort) -> Outcome:
+    problem = _short(effort.horizon)
+    problem.time_step = 30.0 / effort.horizon
+    return _check(problem, BoxDDP(problem, max_iterations=_MOST_ITERATIONS))
+
+
+def _refused_limit(limit: float, effort: Effort) -> Outcome:
+    return refusal(lambda: _scene(actuators={"base_force": {"limit": limit}}), naming="limit")
+
+
+def _refused_horizon(effort: Effort) -> Outcome:
+    return refusal(lambda: _scene(simulation={"steps": 0}), naming="steps")

@@ -1,0 +1,178 @@
+"""Poses off the unit dual quaternions, and attitude errors of half a turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from dq_space_arm_env import compile_scene, load_scene
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.environment import DQSpaceArmEnv
+from dq_space_arm_env.scene import INTEGRATORS
+from experts.arm_problem import ArmProblem
+from experts.problem import FloatArray
+from experts.report.stability.rows import Case, Effort, Handled, Outcome, refusal
+from experts.report.stability.time_steps import moving_start, unit_error
+
+GROUP = "poses"
+
+DEVIATIONS = tuple(10.0**k for k in range(-16, -1))
+_STEPS = 4
+
+
+def cases() -> Iterator[Case]:
+    """All cases of the group."""
+    for name in INTEGRATORS:
+        yield Case(
+            GROUP,
+            "pose off the unit dual quaternions by 1e-16 to 1e-2",
+            name,
+            f"a unit dual quaternion again after {_STEPS} steps",
+            partial(_return_to_manifold, name),
+            1e-15,
+            "1",
+        )
+    for deviation in (1e-16, 1e-12, 1e-8):
+        yield Case(
+            GROUP,
+            f"initial state off by {deviation:g}",
+            "environment",
+            "accepted, and made a unit dual quaternion",
+            partial(_accepted, deviation),
+            1e-15,
+            "1",
+        )
+    for deviation in (1e-5, 1e-2):
+        yield Case(
+            GROUP,
+            f"initial state off by {deviation:g}",
+            "environment",
+            "refused, naming the norm",
+            partial(_refused, deviation),
+        )
+        yield Case(
+            GROUP,
+            f"target of a scene off by {deviation:g}",
+            "scene",
+            "refused, naming the norm",
+            partial(_refused_target, deviation),
+        )
+    for axis in range(3):
+        yield from _half_turns(axis)
+
+
+def _half_turns(axis: int) -> Iterator[Case]:
+    turn = f"attitude error of exactly 180 deg about {'xyz'[axis]}"
+    yield Case(
+        GROUP,
+        turn,
+        "environment",
+        "observation, reward and costs finite; attitude error is 180 deg",
+        partial(_environment, axis),
+        1e-6,
+        "deg",
+    )
+    yield Case(
+        GROUP,
+        turn,
+        "tangent coordinates",
+        "difference has the length pi, retract undoes it",
+        partial(_difference, axis),
+        1e-14,
+        "1",
+    )
+    yield Case(
+        GROUP,
+        turn,
+        "expert's screw motion",
+        "states and controls of the guess are finite",
+        partial(_guess, axis),
+        0.0,
+        "1",
+    )
+
+
+def _disturbed(x: FloatArray, deviation: float) -> FloatArray:
+    """A state whose pose is off in its norm and in the product of its parts by about a deviation."""
+    y = x.copy()
+    y[:4] *= 1.0 + deviation
+    y[4:8] += deviation * y[:4]
+    return y
+
+
+def _return_to_manifold(integrator: str, effort: Effort) -> Outcome:
+    kernels = compile_scene("paper")
+    curve = []
+    for deviation in DEVIATIONS:
+        x = _disturbed(moving_start(kernels), deviation)
+        for _ in range(_STEPS):
+            x = kernels.step(x, np.zeros(kernels.n_u), integrator=integrator)
+        curve.append((deviation, unit_error(x[None, :])))
+    deviation, error = max(curve, key=lambda point: point[1])
+    return Handled(error, f"most after {deviation:g}", tuple(curve))
+
+
+def _accepted(deviation: float, effort: Effort) -> Outcome:
+    env = DQSpaceArmEnv("paper")
+    env.reset(options={"initial_state": _disturbed(env.kernels.layout.initial_state, deviation)})
+    return Handled(unit_error(env.state[None, :]))
+
+
+def _refused(deviation: float, effort: Effort) -> Outcome:
+    env = DQSpaceArmEnv("paper")
+    x = _disturbed(env.kernels.layout.initial_state, deviation)
+    return refusal(lambda: env.reset(options={"initial_state": x}), naming="q_r")
+
+
+def _refused_target(deviation: float, effort: Effort) -> Outcome:
+    scene = load_scene("paper")
+    pose = _disturbed(np.array(scene.target.pose.dual_quaternion), deviation).tolist()
+    return refusal(lambda: scene.replace(target={"pose": pose}), naming="q_r")
+
+
+def _half_turn_start(axis: int) -> FloatArray:
+    """The paper's start, the base moved so that the tip is half a turn and 1 m off its target."""
+    kernels = compile_scene("paper")
+    x: FloatArray = kernels.layout.initial_state.copy()
+    where = kernels.layout.state.pose
+    rotation = [0.0] * 4
+    rotation[1 + axis] = 1.0
+    offset = poses.from_rotation_and_position(tuple(rotation), (1.0, 0.0, 0.0))
+    wanted = dq.multiply(kernels.scene.target.pose.dual_quaternion, offset)
+    tip = tuple(kernels.tip_pose(x).tolist())
+    base_to_tip = dq.multiply(dq.conjugate(tuple(x[where].tolist())), tip)
+    x[where] = dq.normalize(dq.multiply(wanted, dq.conjugate(base_to_tip)))
+    return x
+
+
+def _environment(axis: int, effort: Effort) -> Outcome:
+    env = DQSpaceArmEnv("paper")
+    observation, info = env.reset(options={"initial_state": _half_turn_start(axis)})
+    numbers = [*observation, *(float(value) for value in info.values())]
+    stepped, reward, _, _, after = env.step(np.zeros(env.kernels.n_u))
+    numbers += [*stepped, reward, *(float(value) for value in after.values())]
+    if not np.isfinite(numbers).all() or after["diverged"]:
+        return Handled(np.inf)
+    return Handled(abs(info["attitude_error"] - 180.0))
+
+
+def _difference(axis: int, effort: Effort) -> Outcome:
+    kernels = compile_scene("paper")
+    x = kernels.layout.initial_state.copy()
+    turn = np.zeros(kernels.n_t)
+    turn[axis] = np.pi
+    half = kernels.retract(x, turn)
+    back = kernels.difference(x, half)
+    again = kernels.retract(x, back)
+    # q and -q are one pose.
+    apart = min(float(np.abs(again - half).max()), float(np.abs(again[:8] + half[:8]).max()))
+    return Handled(max(abs(float(np.linalg.norm(back)) - np.pi), apart))
+
+
+def _guess(axis: int, effort: Effort) -> Outcome:
+    motion = ArmProblem("paper").screw_motion(_half_turn_start(axis))
+    finite = all(np.isfinite(array).all() for array in motion if isinstance(array, np.ndarray))
+    return Handled(0.0 if finite else np.inf)
