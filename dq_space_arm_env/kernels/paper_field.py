@@ -12,6 +12,7 @@ from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import vectors
 from dq_space_arm_env.compiler.symbols import column, matrix, symbols, zeros
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
@@ -79,6 +80,62 @@ class PaperField(DifferentiatedJacobian):
         tip = kinematics.tip_pose(chain, pose, motion.joint_angles, motion.wrist_angles)
         return [*pose, *motion.joint_angles, *motion.wrist_angles, *duals, *tip]
 
+    def minimal_from_state(self, y: Sequence[Scalar]) -> list[Scalar]:
+        """The motion in minimal coordinates: what is left of a redundant state without its redundancy.
+
+        Joint rates follow from the dual velocities by (12); whatever else of these velocities the joints
+        forbid is dropped, and so is what the pose is off the unit dual quaternions.
+
+        Args:
+            y: State of the paper with the tip's pose appended.
+
+        Returns:
+            State in minimal coordinates, n_x.
+        """
+        field, layout = self.minimal, self.minimal.layout.state
+        state = PaperState.from_vector(self.chain, y[: self.tip.start])
+        base = state.velocities[0]
+        twist = (*base[1:4], *base[5:8])
+        x: list[Scalar] = [0.0] * field.n_x
+        x[layout.pose] = field.pose.reduced(dq.normalize(state.base_pose))
+        x[layout.joint_angles] = list(state.joint_angles)
+        x[layout.wrist_angles] = list(state.wrist_angles)
+        x[layout.base_velocity] = [twist[i] for i in field.pose.directions]
+        x[layout.joint_rates] = newton_euler.joint_speeds(self.chain, state)
+        return x
+
+    def system(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> newton_euler.NewtonEulerSystem:
+        """The linear system (20) for dual accelerations and reaction wrenches.
+
+        Args:
+            y: State of the paper with the tip's pose appended.
+            u: Input.
+
+        Returns:
+            The system.
+        """
+        state, inputs = self._parts(y, u)
+        base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
+        return newton_euler.system_of(self.chain, state, base_wrench, inputs.joint_torques)
+
+    def free_accelerations(self, y: Sequence[Scalar], ydot: Sequence[Scalar]) -> list[Scalar]:
+        """Accelerations of base and joints among the dual accelerations of all bodies.
+
+        Args:
+            y: State of the paper with the tip's pose appended.
+            ydot: Dual accelerations of all bodies, 8 (n + 1).
+
+        Returns:
+            What `SpaceArmField.accelerations` gives: base (free directions), then joints.
+        """
+        state = PaperState.from_vector(self.chain, y[: self.tip.start])
+        # The turning of the joint's axes has no component along them: (12) holds for accelerations too.
+        bodies = [ydot[8 * i : 8 * i + 8] for i in range(len(self.chain.links) + 1)]
+        frames = newton_euler.joint_frames(self.chain, state.joint_angles, state.wrist_angles)
+        joints = [newton_euler.joint_velocity(frames, j, bodies)[3] for j in range(len(self.chain.links))]
+        base = (*ydot[1:4], *ydot[5:8])
+        return [*(base[i] for i in self.minimal.pose.directions), *joints]
+
     def _parts(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> tuple[PaperState, Inputs]:
         return PaperState.from_vector(self.chain, y[: self.tip.start]), self.minimal.inputs(u)
 
@@ -107,8 +164,7 @@ class PaperField(DifferentiatedJacobian):
         y, u = symbols("y", self.n_y), symbols("u", self.n_u)
         variables = column(*y, *u)
         state, inputs = self._parts(y, u)
-        base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
-        system = newton_euler.system_of(self.chain, state, base_wrench, inputs.joint_torques)
+        system = self.system(y, u)
         schur = SchurComplement(self.chain, system)
         accelerations, reactions = schur.solve(system.b1, system.b2)
         residual, unknowns = _residual(system)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.cost import weighted_square
+from dq_space_arm_env.dynamics import newton_euler
 from dq_space_arm_env.integrators import INTEGRATORS
 from dq_space_arm_env.kernels.derivative_programs import sparse_buffer
 from dq_space_arm_env.kernels.paper_field import PaperField
@@ -40,9 +41,11 @@ class PaperPrograms:
         """Trace a program.
 
         Args:
-            name: One of `step_with_cost`, `linearize`, `difference`, `cost_derivatives`, `terminal_cost`,
-                `terminal_cost_derivatives`, and `from_minimal`, which gives the redundant state of a minimal
-                one.
+            name: One of `step`, `step_with_cost`, `linearize`, `difference`, `cost_derivatives`,
+                `terminal_cost`, `terminal_cost_derivatives`; `projected_step`, after which the state is
+                exactly that of a motion that the joints allow; `from_minimal` and `to_minimal`, which
+                translate states; `system` (20), its solution `accelerations` (22), and
+                `free_accelerations`, those of base and joints among the bodies' dual ones.
 
         Returns:
             The program.
@@ -51,6 +54,12 @@ class PaperPrograms:
             KeyError: If there is no such program.
         """
         return {
+            "step": self._step,
+            "projected_step": self._projected_step,
+            "to_minimal": self._to_minimal,
+            "system": self._system,
+            "accelerations": self._accelerations,
+            "free_accelerations": self._free_accelerations,
             "step_with_cost": self._step_with_cost,
             "linearize": self._linearize,
             "difference": self._difference,
@@ -59,6 +68,67 @@ class PaperPrograms:
             "terminal_cost_derivatives": self._terminal_cost_derivatives,
             "from_minimal": self._from_minimal,
         }[name]()
+
+    def _step(self) -> Program:
+        n_x, n_u = self.field.n_x, self.field.n_u
+        inputs = [Buffer("x", n_x), Buffer("u", n_u), Buffer("h", 1, shared=True)]
+        program = Program("step", inputs, [Buffer("x_next", n_x)])
+        INTEGRATORS[INTEGRATOR].append_step(program, self.field)
+        return program
+
+    def _projected_step(self) -> Program:
+        """A step, and the redundant state of what it leads to in minimal coordinates."""
+
+        def project(x_next: Scalars) -> dict[str, Scalars]:
+            x = self.field.minimal_from_state(x_next)
+            return {"x_projected": self.field.state_from_minimal(x)}
+
+        program = self._step()
+        program.name, program.outputs = "projected_step", [Buffer("x_projected", self.field.n_x)]
+        program.call(trace("projection_graph", {"x_next": self.field.n_x}, project))
+        return program
+
+    def _to_minimal(self) -> Program:
+        return self._of_state_and("to_minimal", lambda x: {"y": self.field.minimal_from_state(x)})
+
+    def _of_state_and(self, name: str, outputs: Callable[..., dict[str, Scalars]], **sizes: int) -> Program:
+        """A program of a single graph."""
+        graph = trace(name + "_graph", {"x": self.field.n_x, **sizes}, outputs)
+        program = Program(
+            name,
+            [Buffer(key, size) for key, size in graph.inputs],
+            [Buffer(key, size) for key, size in graph.outputs],
+        )
+        program.call(graph)
+        return program
+
+    def _system(self) -> Program:
+        """Matrix (row by row) and right-hand side of (20)."""
+
+        def outputs(x: Scalars, u: Scalars) -> dict[str, Scalars]:
+            system = self.field.system(x, u)
+            upper = [[*left, *right] for left, right in zip(system.s11, system.s12, strict=True)]
+            lower = [[*row, *(0.0 for _ in system.b2)] for row in system.s21]
+            matrix = [entry for row in (*upper, *lower) for entry in row]
+            return {"matrix": matrix, "right": [*system.b1, *system.b2]}
+
+        return self._of_state_and("system", outputs, u=self.field.n_u)
+
+    def _accelerations(self) -> Program:
+        """Accelerations of base and joints by the Schur complement (21), (22)."""
+
+        def outputs(x: Scalars, u: Scalars) -> dict[str, Scalars]:
+            ydot, _ = newton_euler.solve_schur(self.field.chain, self.field.system(x, u))
+            return {"accelerations": self.field.free_accelerations(x, ydot)}
+
+        return self._of_state_and("accelerations", outputs, u=self.field.n_u)
+
+    def _free_accelerations(self) -> Program:
+        return self._of_state_and(
+            "free_accelerations",
+            lambda x, ydot: {"accelerations": self.field.free_accelerations(x, ydot)},
+            ydot=8 * (len(self.field.chain.links) + 1),
+        )
 
     def _state_weights(self, pose: Scalars, velocity: Scalars) -> tuple[list[float], list[float]]:
         """References and weights of every entry of the state."""

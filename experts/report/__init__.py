@@ -9,6 +9,9 @@ summary, provenance   for `summary.json`
 figures      Figures 2 to 6 (not imported here: needs the extra `plots`)
 throughput, peak, start_up   the benchmark of the environment (not imported here)
 solvers      the benchmark of the expert (not imported here)
+scene_cost   what a scene leaves out (not imported here)
+work_precision   error against run time of integrators and formulations (not imported here)
+page         all of these on one page (not imported here)
 """
 
 from experts.files import write_atomically

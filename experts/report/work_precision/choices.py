@@ -1,0 +1,121 @@
+"""What follows from errors and times: observed orders, the cheapest choice for an accuracy, defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from experts.report.work_precision.measurement import CaseResult, Curve, Point
+
+ACCURACIES = (1e-3, 1e-6, 1e-9)
+"""Errors of the tip to be reached, m and rad."""
+DEFAULT_ACCURACY = 1e-6
+"""What a scene's integrator should reach by default."""
+
+_ASYMPTOTIC = 1e-3
+_ROUNDING, _UNCERTAINTIES = 1e-11, 100.0
+_SLOPES = 3
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A method and its step.
+
+    Attributes:
+        method: Name of the method.
+        title: What tables call it.
+        point: The step, its errors and times.
+    """
+
+    method: str
+    title: str
+    point: Point
+
+
+def observed_order(steps: Sequence[float], errors: Sequence[float], uncertainty: float = 0.0) -> float | None:
+    """Order of convergence that errors show.
+
+    Args:
+        steps: Descending lengths, s.
+        errors: Of each, m or rad.
+        uncertainty: Of the reference, m or rad.
+
+    Returns:
+        Median slope of log error over log step among the finest three pairs between 1e-3 and rounding, or a
+        hundred times the uncertainty; None if there is none.
+    """
+    smallest = max(_ROUNDING, _UNCERTAINTIES * uncertainty)
+    slopes = [
+        float(np.log(errors[i] / errors[i + 1]) / np.log(steps[i] / steps[i + 1]))
+        for i in range(len(steps) - 1)
+        if errors[i] < _ASYMPTOTIC and errors[i + 1] > smallest
+    ]
+    return float(np.median(slopes[-_SLOPES:])) if slopes else None
+
+
+def order_of(curve: Curve, uncertainty: float | None) -> float | None:
+    """Order of convergence that a method shows on a motion.
+
+    Args:
+        curve: The method.
+        uncertainty: Of the reference, m or rad; None if not known.
+
+    Returns:
+        The order; None for an adaptive method, or if no steps are in the range where it can be seen.
+    """
+    if curve.is_adaptive or not curve.points:
+        return None
+    steps, errors = zip(*((point.step, point.errors.pose) for point in curve.points), strict=True)
+    return observed_order(steps, errors, uncertainty or 0.0)
+
+
+def cheapest(curves: Iterable[Curve], accuracy: float, *, batch: bool) -> Choice | None:
+    """The fastest method and step that reach an accuracy.
+
+    Args:
+        curves: The methods.
+        accuracy: Largest error of the tip, m and rad.
+        batch: Whether many motions run side by side.
+
+    Returns:
+        The choice; None if nothing measured is that accurate.
+    """
+    found = [
+        Choice(curve.method, curve.title, point)
+        for curve in curves
+        for point in curve.points
+        if point.errors.pose <= accuracy
+    ]
+    key = "batch_ns" if batch else "single_ns"
+    return min(found, key=lambda choice: float(getattr(choice.point, key)), default=None)
+
+
+def integrators_of(result: CaseResult) -> list[Curve]:
+    """Those methods that a scene can name: not the paper's redundant form."""
+    return [curve for curve in result.curves if not curve.method.startswith("paper")]
+
+
+def default_at_step(result: CaseResult, step: float) -> Choice | None:
+    """The integrator that a scene with a given time step should have.
+
+    Args:
+        result: A motion.
+        step: The scene's time step, s.
+
+    Returns:
+        The cheapest fixed-step integrator in a batch that reaches `DEFAULT_ACCURACY` with steps no longer
+        than this and no shorter than half of it; the most accurate one if none does; None if none was
+        measured.
+    """
+    near = [
+        Choice(curve.method, curve.title, point)
+        for curve in integrators_of(result)
+        for point in curve.points
+        if not curve.is_adaptive and 0.5 * step < point.step <= 1.0001 * step
+    ]
+    good = [choice for choice in near if choice.point.errors.pose <= DEFAULT_ACCURACY]
+    if good:
+        return min(good, key=lambda choice: choice.point.batch_ns)
+    return min(near, key=lambda choice: choice.point.errors.pose, default=None)

@@ -1,0 +1,42 @@
+"""How much of the work-precision report is measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from experts.report.throughput.timing import Effort as TimingEffort
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much to measure.
+
+    Attributes:
+        cases: Names of the motions (`cases.CASES`).
+        duration: How long each motion should be, s; see `cases.make_case`.
+        most_steps: Steps that a motion is divided into at most.
+        tolerances: Those that adaptive integrators are given, relative.
+        timing: Of steps and accelerations; its batch sizes are not used.
+        states: States whose accelerations are computed with 50 digits.
+        second_reference: Whether the references are integrated twice, with two codes' dynamics.
+    """
+
+    cases: tuple[str, ...] = ("body", "maneuver", "spin", "stiff", "damped", "chain")
+    duration: float = 15.0
+    most_steps: int = 1_100_000
+    tolerances: tuple[float, ...] = tuple(10.0**-digits for digits in range(3, 14))
+    timing: TimingEffort = field(default=TimingEffort(repeats=25, sample_seconds=0.002))
+    states: int = 20
+    second_reference: bool = True
+
+
+FULL = Effort()
+QUICK = Effort(
+    cases=("body", "maneuver", "stiff"),
+    duration=3.0,
+    most_steps=12_000,
+    tolerances=(1e-8,),
+    timing=TimingEffort(repeats=9, sample_seconds=0.001),
+    states=5,
+    second_reference=False,
+)

@@ -1,0 +1,227 @@
+"""Accelerations of one robot from different formulations, in two precisions: error against time per call.
+
+The errors are relative to the paper's system (20) solved with 50 digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import mpmath
+import numpy as np
+
+from dq_space_arm_env import Kernels, load_scene
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
+from dq_space_arm_env.kernels.paper_programs import PaperPrograms
+from dq_space_arm_env.kernels.programs import ScenePrograms
+from experts.problem import FloatArray
+from experts.report.throughput.kernels import sample_states
+from experts.report.throughput.pinocchio_peer import PinocchioPeer
+from experts.report.throughput.timing import DYNAMICS, FLOAT32, FLOAT64, OURS, Case, Subject, time_cases
+from experts.report.throughput.variants import Variant
+from experts.report.work_precision.effort import Effort
+from experts.report.work_precision.many_digits import evaluate
+
+MINIMAL, SCHUR, DENSE = "minimal coordinates", "Schur complement (21)-(22)", "whole system (20), LU"
+ARTICULATED = "articulated body, Pinocchio"
+DIGITS = 50
+LIMITS = {FLOAT64: 1e-12, FLOAT32: 1e-3}
+"""Largest relative error of our accelerations; beyond it accuracy has regressed."""
+_BATCH = 1024
+
+
+@dataclass(frozen=True)
+class Formulation:
+    """How accelerations are computed, with which error, in which time.
+
+    Attributes:
+        name: What is solved.
+        precision: Name of the floating-point type.
+        largest_error: Over the states, relative to the norm of the accelerations.
+        median_error: The same.
+        single_ns: Time of a call for one state, ns; None where it is only called in batches.
+        batch_ns: Time per state of a batch of 1024 on one core, ns; None where it takes no batches.
+    """
+
+    name: str
+    precision: str
+    largest_error: float
+    median_error: float
+    single_ns: float | None
+    batch_ns: float | None
+
+
+@dataclass(frozen=True)
+class Formulations:
+    """What is measured of one robot.
+
+    Attributes:
+        scene: Name of its scene.
+        states: Number of states whose accelerations are compared.
+        reference_agreement: Largest relative difference of the reference from minimal coordinates with as
+            many digits: both have the same equations.
+        results: Each formulation in each precision.
+        notes: What is left out.
+    """
+
+    scene: str
+    states: int
+    reference_agreement: float
+    results: tuple[Formulation, ...]
+    notes: tuple[str, ...]
+
+
+def measure_formulations(effort: Effort, scene_name: str = "paper") -> Formulations:
+    """Compare the accelerations of a scene's robot.
+
+    Args:
+        effort: How much to measure.
+        scene_name: Name of a scene with a spatial base and an arm.
+
+    Returns:
+        Errors and times.
+    """
+    scene = load_scene(scene_name)
+    kernels = Variant(FLOAT64).compile(scene)
+    x, u = _representable(*sample_states(kernels, effort.states))
+    many = _representable(*sample_states(kernels, _BATCH))
+    right, agreement = _reference(kernels, x, u)
+    results: list[Formulation] = []
+    notes: list[str] = []
+    for precision in (FLOAT64, FLOAT32):
+        variant = Variant(precision).compile(scene)
+        for name, kind in ((MINIMAL, _Minimal), (SCHUR, _Schur), (DENSE, _Dense)):
+            way = kind(variant)
+            values = way.accelerations(*way.arguments(x, u))
+            counts = (1, _BATCH)
+            runs = [way.runner(*way.arguments(*(array[:count] for array in many))) for count in counts]
+            times = _times(runs, counts, effort)
+            results.append(_result(name, precision, values, right, *times))
+    try:
+        peer = PinocchioPeer(kernels, Chain.from_scene(scene))
+    except ImportError:
+        notes.append("Articulated body: left out, Pinocchio is not installed (pip install pin).")
+    else:
+        cases = peer.cases(*many)
+        timings = time_cases(cases, effort.timing)
+        batch = timings[1].best_ns if len(timings) > 1 else None
+        values = peer.accelerations(x, u)
+        results.append(_result(ARTICULATED, FLOAT64, values, right, timings[0].best_ns, batch))
+    return Formulations(scene.name, len(x), agreement, tuple(results), tuple(notes))
+
+
+def _representable(x: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """States and inputs that single precision holds without error."""
+    single = [array.astype(FLOAT32).astype(FLOAT64) for array in (x, u)]
+    return single[0], single[1]
+
+
+def _times(runs: Sequence[Callable[[], object]], counts: Sequence[int], effort: Effort) -> list[float]:
+    subjects = [Subject(what=DYNAMICS, engine=OURS, way="", batch=count) for count in counts]
+    cases = [Case(subject, run) for subject, run in zip(subjects, runs, strict=True)]
+    return [timing.best_ns for timing in time_cases(cases, effort.timing)]
+
+
+def _result(
+    name: str,
+    precision: str,
+    values: FloatArray,
+    right: FloatArray,
+    single_ns: float | None,
+    batch_ns: float | None,
+) -> Formulation:
+    error = np.linalg.norm(values.astype(FLOAT64) - right, axis=1) / np.linalg.norm(right, axis=1)
+    return Formulation(name, precision, float(error.max()), float(np.median(error)), single_ns, batch_ns)
+
+
+class _Minimal:
+    """Minimal coordinates, the default."""
+
+    def __init__(self, kernels: Kernels) -> None:
+        self.kernels, self.dtype = kernels, kernels.dtype
+
+    def arguments(self, x: FloatArray, u: FloatArray) -> tuple[Any, Any]:
+        """States as the formulation has them, and inputs, in its precision."""
+        return x.astype(self.dtype), u.astype(self.dtype)
+
+    def kernel(self, lanes: int | None) -> BoundKernel:
+        """The kernel that is timed."""
+        return self.kernels.kernel("forward_dynamics", lanes=lanes)
+
+    def accelerations(self, x: Any, u: Any) -> Any:
+        """Accelerations of base and joints, a row for each state."""
+        return _outputs(self.kernel(1), x, u)[0]
+
+    def runner(self, x: Any, u: Any) -> Callable[[], object]:
+        """Computes them for rows that stay: a single one or a batch."""
+        kernel = self.kernel(1 if len(x) == 1 else None)
+        results = [np.zeros((len(x), spec.stride), self.dtype) for spec in kernel.outputs]
+        names = [spec.name for spec in (*kernel.inputs, *kernel.outputs)]
+        call = KernelCall(kernel, dict(zip(names, (x, u, *results), strict=True)))
+        return call.of_one_row() if len(x) == 1 else partial(call, len(x))
+
+
+class _Schur(_Minimal):
+    """The reaction wrenches first (21), then the dual accelerations (22)."""
+
+    def arguments(self, x: FloatArray, u: FloatArray) -> tuple[Any, Any]:
+        y = _outputs(self.kernels.paper_kernel("from_minimal", lanes=1), x.astype(self.dtype))[0]
+        return y, u.astype(self.dtype)
+
+    def kernel(self, lanes: int | None) -> BoundKernel:
+        return self.kernels.paper_kernel("accelerations", lanes=lanes)
+
+
+class _Dense(_Schur):
+    """The whole system (20), assembled by a kernel and solved by LAPACK."""
+
+    def kernel(self, lanes: int | None) -> BoundKernel:
+        return self.kernels.paper_kernel("system", lanes=1)
+
+    def accelerations(self, x: Any, u: Any) -> Any:
+        free = self.kernels.paper_kernel("free_accelerations", lanes=1)
+        solution = _solved(*_outputs(self.kernel(1), x, u))
+        return _outputs(free, x, solution[:, : free.inputs[1].stride])[0]
+
+    def runner(self, x: Any, u: Any) -> Callable[[], object]:
+        kernel = self.kernel(1)
+        return lambda: _solved(*_outputs(kernel, x, u))
+
+
+def _outputs(kernel: BoundKernel, *inputs: Any) -> list[Any]:
+    """A kernel applied to rows."""
+    ordered = [np.ascontiguousarray(array) for array in inputs]
+    results = [np.zeros((len(ordered[0]), spec.stride), ordered[0].dtype) for spec in kernel.outputs]
+    kernel([*ordered, *results], len(ordered[0]))
+    return results
+
+
+def _solved(matrix: Any, right: Any) -> Any:
+    n = right.shape[1]
+    return np.linalg.solve(matrix.reshape(-1, n, n), right[..., None])[..., 0]
+
+
+def _reference(kernels: Kernels, x: FloatArray, u: FloatArray) -> tuple[FloatArray, float]:
+    """Accelerations from (20) with 50 digits, and how far minimal coordinates are from them with as many."""
+    paper = PaperPrograms(kernels.scene)
+    names = ("from_minimal", "system", "free_accelerations")
+    redundant, system, free = (paper.build(name).calls[0].graph for name in names)
+    minimal = ScenePrograms(kernels.scene).build("forward_dynamics").calls[0].graph
+    right, differences = [], []
+    with mpmath.workdps(DIGITS):
+        for state, inputs in zip(x.tolist(), u.tolist(), strict=True):
+            (y,) = evaluate(redundant, state)
+            matrix, wrenches = evaluate(system, y, inputs)
+            n = len(wrenches)
+            rows = mpmath.matrix([matrix[n * row : n * row + n] for row in range(n)])
+            solution = list(mpmath.lu_solve(rows, mpmath.matrix(wrenches)))
+            (values,) = evaluate(free, y, solution[: dict(free.inputs)["ydot"]])
+            (others,) = evaluate(minimal, state, inputs)
+            gap = mpmath.norm([a - b for a, b in zip(values, others, strict=True)]) / mpmath.norm(values)
+            right.append([float(entry) for entry in values])
+            differences.append(float(gap))
+    return np.array(right), max(differences)
