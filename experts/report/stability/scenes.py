@@ -139,11 +139,6 @@ def walk(
     Returns:
         States, shape (n + 1, n_x), in the scene's precision.
     """
-    steps = len(controls)
-    states = np.empty((steps + 1, kernels.n_x), kernels.dtype)
-    states[0] = state
-    if steps:
-        # The scalar kernel walks down rows that it has just written.
-        arrays = [states, np.ascontiguousarray(controls, kernels.dtype), np.array([dt], kernels.dtype)]
-        kernels.kernel("step", integrator=integrator, lanes=1)([*arrays, states[1:]], steps)
-    return states
+    if not len(controls):
+        return np.asarray(state, kernels.dtype)[None]
+    return kernels.simulate(state, controls, len(controls), dt, integrator)
