@@ -13,20 +13,14 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.util import find_spec
-from pathlib import Path
 
-from rich.console import Console
-
-from dq_space_arm_env import SceneError, list_scenes, load_scene
+from dq_space_arm_env import list_scenes, load_scene
 from experts.checks import check_at_least
-from experts.report import to_json, write_atomically
+from experts.report.command import INTERRUPTED, SUCCESS, guarded, parser_of, save, table_console
 from experts.report.provenance import provenance
 from experts.report.solvers.benchmark import ExpertBenchmark
 from experts.report.solvers.effort import FULL, PARTS, QUICK, Effort
 from experts.report.solvers.records import benchmark_record
-
-SUCCESS, UNUSABLE, INTERRUPTED = 0, 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,35 +33,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status.
     """
     options = _parse(arguments)
-    # A file or a pipe has no width of its own; the tables are made for this one.
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
+    return guarded(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    console = table_console()
+    names = options.scene or (list_scenes() if options.full else ["paper"])
+    scenes = [load_scene(name) for name in names]
+    found = ExpertBenchmark(_effort(options), options.seed)
+    parts = options.part or PARTS
+    for scene in scenes:
+        found.check(scene, parts)
+    options.out.mkdir(parents=True, exist_ok=True)
+    interrupted = False
     try:
-        names = options.scene or (list_scenes() if options.full else ["paper"])
-        scenes = [load_scene(name) for name in names]
-        found = ExpertBenchmark(_effort(options), options.seed)
-        parts = options.part or PARTS
         for scene in scenes:
-            found.check(scene, parts)
-        options.out.mkdir(parents=True, exist_ok=True)
-        interrupted = False
-        try:
-            for scene in scenes:
-                found.run(console, scene, parts)
-        except KeyboardInterrupt:
-            interrupted = True
-            console.print("Interrupted: what is measured so far is saved.")
-        files = _write(console, options, found, interrupted=interrupted)
-    except (SceneError, ValueError, OSError) as error:
-        Console(stderr=True, highlight=False).print(str(error), style="red", markup=False)
-        return UNUSABLE
-    console.print(f"{options.out}: {', '.join(files)}", markup=False)
+            found.run(console, scene, parts)
+    except KeyboardInterrupt:
+        interrupted = True
+        console.print("Interrupted: what is measured so far is saved.")
+    record = {**benchmark_record(found, interrupted=interrupted), **provenance("crocoddyl", "pin")}
+    solved = [starts for starts in found.random_starts if starts.starts]
+
+    def picture() -> bytes:
+        from experts.report.figures.solvers import picture as draw
+
+        return draw(found.comparisons, solved)
+
+    save(console, options, "expert", record, picture if found.comparisons or solved else None)
     return INTERRUPTED if interrupted else SUCCESS
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__, "expert")
     parser.add_argument(
         "--scene",
         action="append",
@@ -83,8 +81,6 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="of random starts and disturbances (default: 0)")
     parser.add_argument("--slow-peers", action="store_true", help="compare also solvers that take minutes")
     parser.add_argument("--no-peers", dest="peers", action="store_false", help="compare only our solvers")
-    parser.add_argument("--out", type=Path, default=Path("results/expert"), help="output folder")
-    parser.add_argument("--no-picture", dest="picture", action="store_false", help="tables and JSON only")
     return parser.parse_args(arguments)
 
 
@@ -99,27 +95,6 @@ def _effort(options: argparse.Namespace) -> Effort:
         peers=effort.peers and options.peers,
         slow_peers=effort.slow_peers or options.slow_peers,
     )
-
-
-def _write(
-    console: Console, options: argparse.Namespace, found: ExpertBenchmark, *, interrupted: bool
-) -> list[str]:
-    """Write the files; their names."""
-    record = {
-        **benchmark_record(found, interrupted=interrupted),
-        **provenance("crocoddyl", "pin"),
-    }
-    write_atomically(options.out / "expert.json", to_json(record))
-    solved = [starts for starts in found.random_starts if starts.starts]
-    if not options.picture or not (found.comparisons or solved):
-        return ["expert.json"]
-    if find_spec("matplotlib") is None:
-        console.print('No picture: it needs matplotlib (pip install "dq-space-arm[plots]").', markup=False)
-        return ["expert.json"]
-    from experts.report.figures.solvers import picture
-
-    write_atomically(options.out / "expert.png", picture(found.comparisons, solved))
-    return ["expert.json", "expert.png"]
 
 
 if __name__ == "__main__":

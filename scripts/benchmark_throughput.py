@@ -13,14 +13,12 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from dq_space_arm_env import Scene, SceneError, list_scenes, load_scene
-from experts.report import to_json, write_atomically
+from dq_space_arm_env import Scene, list_scenes, load_scene
+from experts.report.command import SUCCESS, guarded, parser_of, save, table_console
 from experts.report.peak import measure_peak
 from experts.report.provenance import provenance
 from experts.report.start_up import measure_start_up
@@ -31,8 +29,6 @@ from experts.report.throughput.records import cost_records, scene_record
 from experts.report.throughput.scene_costs import measure_costs
 from experts.report.throughput.tables import print_peaks, print_scene
 from experts.report.throughput.timing import QUICK, Effort
-
-SUCCESS, UNUSABLE, INTERRUPTED = 0, 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,27 +41,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status.
     """
     options = _parse(arguments)
-    # A file or a pipe has no width of its own; the tables are made for this one.
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
-    try:
-        scenes = [load_scene(name) for name in options.scene or ["paper"]]
-        options.out.mkdir(parents=True, exist_ok=True)
-        record, results = _measure(console, scenes, options)
-        files = _write(console, options, record, results)
-    except (SceneError, ValueError, OSError) as error:
-        Console(stderr=True, highlight=False).print(str(error), style="red", markup=False)
-        return UNUSABLE
-    except KeyboardInterrupt:
-        console.print("Interrupted: nothing is saved.")
-        return INTERRUPTED
-    console.print(f"{options.out}: {', '.join(files)}", markup=False)
+    return guarded(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    console = table_console()
+    scenes = [load_scene(name) for name in options.scene or ["paper"]]
+    options.out.mkdir(parents=True, exist_ok=True)
+    record, results = _measure(console, scenes, options)
+    save(console, options, "throughput", record, lambda: _picture(results))
     return SUCCESS
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__, "throughput")
     parser.add_argument(
         "--scene",
         action="append",
@@ -74,8 +63,6 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--all-scenes", action="store_true", help="what each shipped scene costs")
     parser.add_argument("--features", action="store_true", help="what each part of the first scene costs")
     parser.add_argument("--quick", action="store_true", help="three batch sizes, short samples")
-    parser.add_argument("--out", type=Path, default=Path("results/throughput"), help="output folder")
-    parser.add_argument("--no-picture", dest="picture", action="store_false", help="tables and JSON only")
     return parser.parse_args(arguments)
 
 
@@ -116,23 +103,10 @@ def _measure(
     return record, results
 
 
-def _write(
-    console: Console,
-    options: argparse.Namespace,
-    record: dict[str, Any],
-    results: Sequence[SceneThroughput],
-) -> list[str]:
-    """Write the files; their names."""
-    write_atomically(options.out / "throughput.json", to_json(record))
-    if not options.picture:
-        return ["throughput.json"]
-    if find_spec("matplotlib") is None:
-        console.print('No picture: it needs matplotlib (pip install "dq-space-arm[plots]").', markup=False)
-        return ["throughput.json"]
+def _picture(results: Sequence[SceneThroughput]) -> bytes:
     from experts.report.figures.throughput import picture
 
-    write_atomically(options.out / "throughput.png", picture(results))
-    return ["throughput.json", "throughput.png"]
+    return picture(results)
 
 
 if __name__ == "__main__":

@@ -11,19 +11,13 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.util import find_spec
-from pathlib import Path
 
-from rich.console import Console
-
-from dq_space_arm_env import SceneError, load_scene
-from experts.report import to_json, write_atomically
+from dq_space_arm_env import load_scene
+from experts.report.command import SUCCESS, guarded, parser_of, save, table_console
 from experts.report.provenance import provenance
-from experts.report.scene_cost.measurement import FULL, QUICK, Effort, SceneCostReport, measure
+from experts.report.scene_cost.measurement import FULL, QUICK, SceneCostReport, measure
 from experts.report.scene_cost.records import report_record
 from experts.report.scene_cost.tables import tables
-
-SUCCESS, UNUSABLE, INTERRUPTED = 0, 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -36,31 +30,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status.
     """
     options = _parse(arguments)
-    # A file or a pipe has no width of its own; the tables are made for this one.
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
+    return guarded(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    console = table_console()
     effort = QUICK if options.quick else FULL
-    try:
-        chosen = [load_scene(name) for name in options.scene or ()]
-        options.out.mkdir(parents=True, exist_ok=True)
-        with console.status("Compiling and timing: a minute with --quick, some minutes without"):
-            report = measure(effort, {scene.name: scene for scene in chosen} or None)
-        for table in tables(report):
-            console.print(table.for_terminal())
-        files = _write(console, options, effort, report)
-    except (SceneError, ValueError, OSError) as error:
-        Console(stderr=True, highlight=False).print(str(error), style="red", markup=False)
-        return UNUSABLE
-    except KeyboardInterrupt:
-        console.print("Interrupted: nothing is saved.")
-        return INTERRUPTED
-    console.print(f"{options.out}: {', '.join(files)}", markup=False)
+    chosen = [load_scene(name) for name in options.scene or ()]
+    options.out.mkdir(parents=True, exist_ok=True)
+    with console.status("Compiling and timing: a minute with --quick, some minutes without"):
+        report = measure(effort, {scene.name: scene for scene in chosen} or None)
+    for table in tables(report):
+        console.print(table.for_terminal())
+    record = {"effort": asdict(effort), **report_record(report), **provenance()}
+    save(console, options, "scene_cost", record, lambda: _picture(report))
     return SUCCESS
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__, "scene_cost")
     parser.add_argument(
         "--scene",
         action="append",
@@ -68,26 +56,13 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "the parts of scene paper)",
     )
     parser.add_argument("--quick", action="store_true", help="three scenes, short samples")
-    parser.add_argument("--out", type=Path, default=Path("results/scene_cost"), help="output folder")
-    parser.add_argument("--no-picture", dest="picture", action="store_false", help="tables and JSON only")
     return parser.parse_args(arguments)
 
 
-def _write(
-    console: Console, options: argparse.Namespace, effort: Effort, report: SceneCostReport
-) -> list[str]:
-    """Write the files; their names."""
-    record = {"effort": asdict(effort), **report_record(report), **provenance()}
-    write_atomically(options.out / "scene_cost.json", to_json(record))
-    if not options.picture:
-        return ["scene_cost.json"]
-    if find_spec("matplotlib") is None:
-        console.print('No picture: it needs matplotlib (pip install "dq-space-arm[plots]").', markup=False)
-        return ["scene_cost.json"]
+def _picture(report: SceneCostReport) -> bytes:
     from experts.report.figures.scene_cost import picture
 
-    write_atomically(options.out / "scene_cost.png", picture(report))
-    return ["scene_cost.json", "scene_cost.png"]
+    return picture(report)
 
 
 if __name__ == "__main__":

@@ -14,13 +14,8 @@ missing; 130 if interrupted.
 import argparse
 import sys
 from collections.abc import Sequence
-from importlib.util import find_spec
-from pathlib import Path
 
-from rich.console import Console
-
-from dq_space_arm_env import SceneError
-from experts.report import to_json, write_atomically
+from experts.report.command import guarded, judge, parser_of, save, table_console
 from experts.report.provenance import provenance
 from experts.report.work_precision.benchmark import FORMULATIONS, WorkPrecision, measure, shortcomings
 from experts.report.work_precision.cases import CASES
@@ -28,8 +23,6 @@ from experts.report.work_precision.effort import FULL, QUICK
 from experts.report.work_precision.methods import method_names
 from experts.report.work_precision.records import report_record
 from experts.report.work_precision.tables import notes, tables
-
-SUCCESS, INACCURATE, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,37 +35,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status.
     """
     options = _parse(arguments)
-    # A file or a pipe has no width of its own; the tables are made for this one.
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
-        effort = QUICK if options.quick else FULL
-        with console.status("") as status:
-            found = measure(
-                effort, options.case, options.integrator, lambda name: status.update(f"Measuring: {name}")
-            )
-        for table in tables(found):
-            console.print(table.for_terminal())
-        for sentence in notes(found):
-            console.print(sentence, markup=False)
-        files = _write(console, options, found)
-    except (SceneError, ModuleNotFoundError, ValueError, OSError) as error:
-        Console(stderr=True, highlight=False).print(str(error), style="red", markup=False)
-        return UNUSABLE
-    except KeyboardInterrupt:
-        console.print("Interrupted: nothing is saved.")
-        return INTERRUPTED
-    console.print(f"{options.out}: {', '.join(files)}", markup=False)
-    failures = shortcomings(found)
-    for sentence in failures:
-        Console(stderr=True, highlight=False).print(sentence, style="red", markup=False)
-    return INACCURATE if failures else SUCCESS
+    return guarded(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    console = table_console(width=120)
+    options.out.mkdir(parents=True, exist_ok=True)
+    with console.status("") as status:
+        found = measure(
+            QUICK if options.quick else FULL,
+            options.case,
+            options.integrator,
+            lambda name: status.update(f"Measuring: {name}"),
+        )
+    for table in tables(found):
+        console.print(table.for_terminal())
+    for sentence in notes(found):
+        console.print(sentence, markup=False)
+    record = {**report_record(found), **provenance("mpmath", "pin", "scipy")}
+    save(console, options, "work_precision", record, lambda: _picture(found))
+    return judge(shortcomings(found))
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__, "work_precision")
     parser.add_argument(
         "--case",
         action="append",
@@ -86,24 +72,13 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="method to measure; repeatable (default: all, and the paper's form on the maneuver)",
     )
     parser.add_argument("--quick", action="store_true", help="three short motions, few steps, short samples")
-    parser.add_argument("--out", type=Path, default=Path("results/work_precision"), help="output folder")
-    parser.add_argument("--no-picture", dest="picture", action="store_false", help="tables and JSON only")
     return parser.parse_args(arguments)
 
 
-def _write(console: Console, options: argparse.Namespace, found: WorkPrecision) -> list[str]:
-    """Write the files; their names."""
-    record = {**report_record(found), **provenance("mpmath", "pin", "scipy")}
-    write_atomically(options.out / "work_precision.json", to_json(record))
-    if not options.picture:
-        return ["work_precision.json"]
-    if find_spec("matplotlib") is None:
-        console.print('No picture: it needs matplotlib (pip install "dq-space-arm[plots]").', markup=False)
-        return ["work_precision.json"]
+def _picture(found: WorkPrecision) -> bytes:
     from experts.report.figures.work_precision import picture
 
-    write_atomically(options.out / "work_precision.png", picture(found))
-    return ["work_precision.json", "work_precision.png"]
+    return picture(found)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """The report on one page: what HTML and Markdown hold, and how the script ends."""
 
 import importlib.util
+import json
 import re
 from base64 import b64decode
 from dataclasses import replace
@@ -11,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from experts.report.page.parts import AGREEMENT, PARTS, disagreements
+from experts.report.command import INACCURATE, INTERRUPTED, SUCCESS
+from experts.report.page.parts import AGREEMENT, PARTS, Announce, disagreements
 from experts.report.page.rendering import html_page, markdown_page
 from experts.report.page.sections import Figure, Section, printed
 from experts.report.provenance import provenance
@@ -27,7 +29,16 @@ TABLE = TextTable("A <title>\nexplained", ("", "m | s", "two\nlines"), (("a & b"
 
 def section() -> Section:
     figure = Figure("made_up", "What <is> seen", PNG)
-    return Section("part", "A part", "What it is", [TABLE], "drawn < text", ["A note."], [figure])
+    return Section(
+        "part",
+        "A part",
+        "What it is",
+        [TABLE],
+        "drawn < text",
+        ["A note."],
+        [figure],
+        record={"measured": 1.5},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -142,31 +153,38 @@ def test_script_writes_both_pages_and_fails_on_what_is_inaccurate(
 ) -> None:
     asked = []
 
-    def part(*, quick: bool) -> Section:
+    def part(*, quick: bool, announce: Announce) -> Section:
+        announce("something")
         asked.append(quick)
         return section()
 
     monkeypatch.setattr(script, "PARTS", {"part": part})
     out = tmp_path / "deep" / "out"
-    assert script.main(["--quick", "--out", str(out)]) == script.SUCCESS
-    assert sorted(file.name for file in out.iterdir()) == ["made_up.png", "report.html", "report.md"]
+    assert script.main(["--quick", "--out", str(out)]) == SUCCESS
+    assert sorted(file.name for file in out.iterdir()) == [
+        "made_up.png",
+        "part.json",
+        "report.html",
+        "report.md",
+    ]
     assert (out / "made_up.png").read_bytes() == PNG
     bad = replace(section(), shortcomings=["Something is off."])
-    monkeypatch.setattr(script, "PARTS", {"part": lambda quick: bad})
-    assert script.main(["--out", str(out)]) == script.INACCURATE
+    monkeypatch.setattr(script, "PARTS", {"part": lambda quick, announce: bad})
+    assert script.main(["--out", str(out)]) == INACCURATE
     assert "Something is off." in capsys.readouterr().err
     assert asked == [True]
 
 
-def test_an_interrupt_saves_nothing(
+def test_an_interrupt_keeps_the_parts_before_it(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*, quick: bool) -> Section:
+    def interrupted(*, quick: bool, announce: Announce) -> Section:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(script, "PARTS", {"part": interrupted})
-    assert script.main(["--out", str(tmp_path)]) == script.INTERRUPTED
-    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(script, "PARTS", {"part": lambda quick, announce: section(), "next": interrupted})
+    assert script.main(["--out", str(tmp_path)]) == INTERRUPTED
+    assert "What &lt;is&gt; seen" in (tmp_path / "report.html").read_text()
+    assert json.loads((tmp_path / "part.json").read_text())["measured"] == 1.5
 
 
 def test_every_part_is_an_option(script: ModuleType) -> None:
@@ -177,7 +195,7 @@ def test_every_part_is_an_option(script: ModuleType) -> None:
 @pytest.mark.slow
 def test_the_throughput_part_measures(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
-    part = PARTS["throughput"](quick=True)
+    part = PARTS["throughput"](quick=True, announce=print)
     assert "forward dynamics" in part.printed
     assert part.shortcomings == []
     assert part.figures[0].png.startswith(b"\x89PNG")

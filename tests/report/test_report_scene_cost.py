@@ -20,6 +20,7 @@ from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.kernels.environment_programs import EnvironmentPrograms
 from dq_space_arm_env.kernels.programs import ScenePrograms
 from experts.report import to_json
+from experts.report.command import INTERRUPTED, SUCCESS, UNUSABLE
 from experts.report.scene_cost import measurement
 from experts.report.scene_cost.measurement import OUTPUTS, Effort, SceneCostReport, SceneRow, measure
 from experts.report.scene_cost.processes import IMPORT, MAKE, STEP, WRENCHES, ProcessStage
@@ -278,7 +279,7 @@ def test_script_writes_record_and_picture(
 ) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "deep" / "out"
-    assert script.main(["--quick", "--out", str(out)]) == script.SUCCESS
+    assert script.main(["--quick", "--out", str(out)]) == SUCCESS
     record = json.loads((out / "scene_cost.json").read_text(encoding="utf-8"))
     assert {"scenes", "features", "outputs", "processes", "installation"} <= set(record)
     assert record["machine"]["processor_name"]
@@ -301,8 +302,8 @@ def test_script_measures_the_scenes_that_are_named(
     file.write_text(short_scene.to_yaml())
     out = tmp_path / "out"
     common = ["--no-picture", "--out", str(out)]
-    assert script.main(["--scene", str(file), "--scene", "planar", *common]) == script.SUCCESS
-    assert script.main(common) == script.SUCCESS
+    assert script.main(["--scene", str(file), "--scene", "planar", *common]) == SUCCESS
+    assert script.main(common) == SUCCESS
     assert asked == [
         (measurement.FULL, {"short": short_scene, "planar": load_scene("planar")}),
         (measurement.FULL, None),
@@ -313,7 +314,7 @@ def test_script_measures_the_scenes_that_are_named(
 def test_script_refuses_an_unknown_scene(
     script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert script.main(["--scene", "no such scene", "--out", str(tmp_path / "out")]) == script.UNUSABLE
+    assert script.main(["--scene", "no such scene", "--out", str(tmp_path / "out")]) == UNUSABLE
     assert "no such scene" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -325,5 +326,5 @@ def test_an_interrupt_saves_nothing(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(script, "measure", interrupted)
-    assert script.main(["--out", str(tmp_path)]) == script.INTERRUPTED
+    assert script.main(["--out", str(tmp_path)]) == INTERRUPTED
     assert not list(tmp_path.iterdir())

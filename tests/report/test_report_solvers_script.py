@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from dq_space_arm_env import Scene
+from experts.report.command import INTERRUPTED, UNUSABLE
 from experts.report.solvers import benchmark
 from experts.report.solvers.effort import PARTS, QUICK, Effort
 from experts.report.solvers.ours import GUIDED, TITLES
@@ -100,7 +101,7 @@ def test_an_interrupt_keeps_what_is_done(
 
     monkeypatch.setattr(benchmark, "solve_random_starts", interrupted)
     arguments = ["--quick", "--part", "starts", "--part", "horizon", "--scene", scene_file]
-    assert script.main([*arguments, "--out", str(tmp_path)]) == script.INTERRUPTED
+    assert script.main([*arguments, "--out", str(tmp_path)]) == INTERRUPTED
     record = json.loads((tmp_path / "expert.json").read_text(encoding="utf-8"))
     assert record["interrupted"] is True
     assert len(record["random_starts"][0]["starts"]) == 1
@@ -126,7 +127,7 @@ def test_unusable_input_is_one_sentence(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "out"
-    assert script.main([*arguments, "--out", str(out)]) == script.UNUSABLE
+    assert script.main([*arguments, "--out", str(out)]) == UNUSABLE
     assert sentence in capsys.readouterr().err
     assert not out.exists()
 
@@ -137,7 +138,7 @@ def test_a_scene_without_limits_is_refused_before_anything_is_measured(
     file = tmp_path / "unlimited.yaml"
     actuators = {"base_torque": {"limit": float("inf")}}
     file.write_text(spread_scene.replace(actuators=actuators).to_yaml())
-    assert script.main(["--quick", "--scene", str(file), "--out", str(tmp_path / "out")]) == script.UNUSABLE
+    assert script.main(["--quick", "--scene", str(file), "--out", str(tmp_path / "out")]) == UNUSABLE
     assert "no finite limit" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
 

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from dq_space_arm_env import Scene, compile_scene
 from experts.report import to_json
+from experts.report.command import UNUSABLE
 from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.peak import Peak
 from experts.report.throughput import timing as timing_module
@@ -336,13 +337,13 @@ def test_script_compares_all_shipped_scenes(
     monkeypatch.setattr(script, "measure_scene", lambda scene, effort: empty)
     monkeypatch.setattr(script, "print_scene", lambda *_: None)
     monkeypatch.setattr(script, "measure_costs", measure_costs)
-    assert script.main(["--all-scenes", "--out", str(tmp_path)]) == script.UNUSABLE
+    assert script.main(["--all-scenes", "--out", str(tmp_path)]) == UNUSABLE
     assert asked == [["paper", *(name for name in script.list_scenes() if name != "paper")]]
 
 
 def test_script_refuses_an_unknown_scene(
     script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert script.main(["--scene", "no such scene", "--out", str(tmp_path / "out")]) == script.UNUSABLE
+    assert script.main(["--scene", "no such scene", "--out", str(tmp_path / "out")]) == UNUSABLE
     assert "no such scene" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from dq_space_arm_env.integrators import INTEGRATORS
+from experts.report.command import INACCURATE, INTERRUPTED, UNUSABLE
 from experts.report.work_precision import benchmark
 from experts.report.work_precision.effort import QUICK
 
@@ -81,7 +82,7 @@ def test_what_is_less_accurate_than_declared_fails(
 ) -> None:
     monkeypatch.setattr(benchmark, "LIMITS", {"float64": 1e-30, "float32": 1.0})
     arguments = ["--quick", "--case", "formulations", "--out", str(tmp_path), "--no-picture"]
-    assert script.main(arguments) == script.INACCURATE
+    assert script.main(arguments) == INACCURATE
     assert "minimal coordinates in float64: relative error" in capsys.readouterr().err
     assert len(json.loads((tmp_path / "work_precision.json").read_text())["shortcomings"]) == 3
     assert not (tmp_path / "work_precision.png").exists()
@@ -98,9 +99,9 @@ def test_an_interrupt_and_a_missing_package_end_in_one_sentence(
 
     arguments = ["--quick", "--case", "formulations", "--out", str(tmp_path)]
     monkeypatch.setattr(benchmark, "measure_formulations", interrupted)
-    assert script.main(arguments) == script.INTERRUPTED
+    assert script.main(arguments) == INTERRUPTED
     assert "nothing is saved" in capsys.readouterr().out
     monkeypatch.setattr(benchmark, "find_spec", lambda name: None)
-    assert script.main(arguments) == script.UNUSABLE
+    assert script.main(arguments) == UNUSABLE
     assert "not installed" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 
 from rich.console import Console
 
 from dq_space_arm_env import load_scene
+from experts.report import stability as stability_cases
 from experts.report.page.sections import Section, printed
 from experts.report.peak import measure_peak
 from experts.report.scene_cost import measurement as scene_cost
+from experts.report.scene_cost.records import report_record as scene_cost_record
 from experts.report.scene_cost.tables import tables as scene_cost_tables
 from experts.report.solvers import effort as solver_effort
+from experts.report.solvers import judgement as solver_judgement
 from experts.report.solvers.benchmark import ExpertBenchmark
+from experts.report.solvers.records import benchmark_record
+from experts.report.stability import tables as stability_tables
+from experts.report.stability.records import record as stability_record
 from experts.report.throughput.agreement import ACCELERATIONS, Agreement
 from experts.report.throughput.kernels import VECTOR
 from experts.report.throughput.measurement import measure_scene
+from experts.report.throughput.records import scene_record
 from experts.report.throughput.tables import print_peaks, print_scene
 from experts.report.throughput.timing import OURS
 from experts.report.throughput.timing import QUICK as QUICK_TIMING
@@ -23,22 +31,27 @@ from experts.report.throughput.timing import Effort as TimingEffort
 from experts.report.work_precision import effort as work_effort
 from experts.report.work_precision.benchmark import measure as measure_work_precision
 from experts.report.work_precision.benchmark import shortcomings
+from experts.report.work_precision.records import report_record as work_precision_record
 from experts.report.work_precision.tables import notes, tables
 
 AGREEMENT = 1e-10
 """Largest relative difference of our accelerations, in double precision, from those of other engines."""
 
+Announce = Callable[[str], object]
+"""Told what is being measured."""
 
-def work_precision(*, quick: bool) -> Section:
+
+def work_precision(*, quick: bool, announce: Announce) -> Section:
     """Error against run time of integrators and formulations.
 
     Args:
         quick: Whether to measure little.
+        announce: Told the name of each motion.
 
     Returns:
         The section.
     """
-    found = measure_work_precision(work_effort.QUICK if quick else work_effort.FULL)
+    found = measure_work_precision(work_effort.QUICK if quick else work_effort.FULL, announce=announce)
     section = Section(
         "work_precision",
         "Error against run time",
@@ -49,6 +62,7 @@ def work_precision(*, quick: bool) -> Section:
         tables(found),
         notes=notes(found),
         shortcomings=shortcomings(found),
+        record=work_precision_record(found),
     )
 
     def picture() -> bytes:
@@ -66,11 +80,44 @@ def work_precision(*, quick: bool) -> Section:
     return section
 
 
-def scene_costs(*, quick: bool) -> Section:
+def stability(*, quick: bool, announce: Announce) -> Section:
+    """Stiff and extreme cases.
+
+    Args:
+        quick: Whether to try little.
+        announce: Told the name of each case that is done.
+
+    Returns:
+        The section.
+    """
+    effort = stability_cases.QUICK if quick else stability_cases.FULL
+    rows = stability_cases.run_cases(effort, progress=lambda row: announce(f"{row.group}, {row.name}"))
+    section = Section(
+        "stability",
+        "Stiff and extreme cases",
+        "A case is handled, with an error below its bound; refused, in the sentence that the user is told; "
+        "or beyond what the method claims. Whatever else happens is a failure, and stands at the top.",
+        stability_tables.tables(rows),
+        notes=[stability_tables.summary(rows)],
+        shortcomings=stability_tables.failures(rows),
+        record=stability_record(rows, effort),
+    )
+
+    def picture() -> bytes:
+        from experts.report.figures.stability import picture as draw
+
+        return draw(rows)
+
+    section.draw("stability", "Error over what makes each case extreme; dashed: its bound.", picture)
+    return section
+
+
+def scene_costs(*, quick: bool, announce: Announce) -> Section:
     """What scenes leave out.
 
     Args:
         quick: Whether to measure little.
+        announce: Not called.
 
     Returns:
         The section.
@@ -82,6 +129,7 @@ def scene_costs(*, quick: bool) -> Section:
         "A part that a scene does not have, and an output that nobody asks for, cost nothing: neither "
         "operations nor memory nor time to compile.",
         scene_cost_tables(found),
+        record=scene_cost_record(found),
     )
 
     def picture() -> bytes:
@@ -96,11 +144,12 @@ def scene_costs(*, quick: bool) -> Section:
     return section
 
 
-def expert(*, quick: bool) -> Section:
+def expert(*, quick: bool, announce: Announce) -> Section:
     """The expert beside other solvers: cost gap against seconds.
 
     Args:
         quick: Whether to measure little.
+        announce: Told the name of each part.
 
     Returns:
         The section.
@@ -109,7 +158,9 @@ def expert(*, quick: bool) -> Section:
     scene = load_scene("paper")
 
     def run(console: Console) -> None:
-        found.run(console, scene, solver_effort.PARTS)
+        for part in solver_effort.PARTS:
+            announce(part)
+            found.run(console, scene, (part,))
 
     section = Section(
         "expert",
@@ -118,6 +169,8 @@ def expert(*, quick: bool) -> Section:
         "and from random ones; and the expert that plans anew during flight.",
         printed=printed(run),
     )
+    section.shortcomings = solver_judgement.shortcomings(found)
+    section.record = benchmark_record(found, interrupted=False)
     solved = [starts for starts in found.random_starts if starts.starts]
 
     def picture() -> bytes:
@@ -133,11 +186,12 @@ def expert(*, quick: bool) -> Section:
     return section
 
 
-def throughput(*, quick: bool) -> Section:
+def throughput(*, quick: bool, announce: Announce) -> Section:
     """States and environment steps per second, beside other engines.
 
     Args:
         quick: Whether to measure little.
+        announce: Not called.
 
     Returns:
         The section.
@@ -158,6 +212,10 @@ def throughput(*, quick: bool) -> Section:
         "it.",
         printed=printed(run),
         shortcomings=disagreements(found.agreements),
+        record={
+            "peaks": {name: asdict(peak) for name, peak in peaks.items()},
+            "scenes": [scene_record(found, peaks)],
+        },
     )
 
     def picture() -> bytes:
@@ -191,8 +249,9 @@ def disagreements(agreements: list[Agreement]) -> list[str]:
 
 PARTS: Mapping[str, Callable[..., Section]] = {
     "work_precision": work_precision,
+    "stability": stability,
     "scene_cost": scene_costs,
     "expert": expert,
     "throughput": throughput,
 }
-"""Each part by its name; called with `quick`."""
+"""Each part by its name; called with `quick` and `announce`."""

@@ -22,11 +22,22 @@ th { border-bottom: 1px solid #111; vertical-align: bottom; white-space: pre-lin
 th, td { padding: 0.15rem 0.7rem; text-align: left; }
 tr:nth-child(even) td { background: #f4f4f4; }
 .right { text-align: right; font-variant-numeric: tabular-nums; }
-pre { overflow-x: auto; font-size: 0.75rem; line-height: 1.3; }
+.wide, pre { overflow-x: auto; }
+pre { font-size: 0.75rem; line-height: 1.3; }
 figure { margin: 1.5rem 0; }
 img { max-width: 100%; }
 figcaption { font-size: 0.9rem; color: #333; }
 .bad { color: #b00000; font-weight: bold; }
+:root { color-scheme: light dark; }
+@media (prefers-color-scheme: dark) {
+  body { color: #ddd; background: #161616; }
+  h2 { border-color: #555; }
+  th { border-color: #ddd; }
+  tr:nth-child(even) td { background: #222; }
+  figcaption { color: #bbb; }
+  a { color: #8ab4f8; }
+  .bad { color: #ff6b6b; }
+}
 """
 
 
@@ -128,12 +139,12 @@ def _html_section(section: Section) -> Iterator[str]:
 
 def _html_table(table: TextTable) -> Iterator[str]:
     title, _, explained = table.title.partition("\n")
-    yield f"<table><caption><b>{escape(title)}</b>"
+    yield f'<div class="wide"><table><caption><b>{escape(title)}</b>'
     yield f"<br>{escape(explained)}</caption>" if explained else "</caption>"
     if any(table.headings):
         yield f"<thead><tr>{_html_cells('th', table.headings, table.right)}</tr></thead>"
     rows = (f"<tr>{_html_cells('td', row, table.right)}</tr>" for row in table.rows)
-    yield from ("<tbody>", *rows, "</tbody></table>")
+    yield from ("<tbody>", *rows, "</tbody></table></div>")
 
 
 def _html_cells(tag: str, cells: Sequence[str], right: int | None) -> str:

@@ -6,9 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from io import StringIO
+from typing import Any
 
 from rich.console import Console
 
+from experts.report.command import NO_PICTURE
 from experts.report.tables import TextTable
 
 _WIDTH = 110
@@ -42,6 +44,7 @@ class Section:
         notes: Sentences below the tables.
         figures: Pictures.
         shortcomings: A sentence for each thing that is less accurate than declared.
+        record: What was measured in JSON's types, for programs.
     """
 
     name: str
@@ -52,6 +55,7 @@ class Section:
     notes: list[str] = field(default_factory=list)
     figures: list[Figure] = field(default_factory=list)
     shortcomings: list[str] = field(default_factory=list)
+    record: dict[str, Any] = field(default_factory=dict)
 
     def draw(self, name: str, caption: str, picture: Callable[[], bytes]) -> None:
         """Add a picture, or a note where Matplotlib is missing.
@@ -62,7 +66,7 @@ class Section:
             picture: Draws it, as PNG.
         """
         if find_spec("matplotlib") is None:
-            self.notes.append('No picture: it needs matplotlib (pip install "dq-space-arm[plots]").')
+            self.notes.append(NO_PICTURE)
             return
         self.figures.append(Figure(name, caption, picture()))
 

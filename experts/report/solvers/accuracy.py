@@ -14,6 +14,9 @@ from experts.report.solvers.contenders import OURS, Contender
 from experts.report.solvers.effort import Effort
 from experts.report.solvers.runs import SolverRun, median_run
 
+NOMINAL_START = "nominal start"
+"""What the scene's own initial state is called."""
+
 
 @dataclass(frozen=True)
 class SolverResult:

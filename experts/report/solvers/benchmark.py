@@ -18,7 +18,7 @@ from experts.guesses import GuidedDDP
 from experts.problem import FloatArray, as_problem
 from experts.receding_horizon import RecedingHorizonExpert
 from experts.report.integrators import COMPARED_INTEGRATORS
-from experts.report.solvers.accuracy import SolverComparison, compare_solvers
+from experts.report.solvers.accuracy import NOMINAL_START, SolverComparison, compare_solvers
 from experts.report.solvers.best_known import Search
 from experts.report.solvers.contenders import contenders
 from experts.report.solvers.effort import ACCURACY, HORIZON, ITERATIONS, STARTS, Effort
@@ -118,7 +118,7 @@ class ExpertBenchmark:
             entrants, notes = contenders(variant, guided if same else None, self.effort)
             self._note(console, *notes)
             search = Search(variant, guided.library, self.effort.max_iterations)
-            starts: list[tuple[str, FloatArray | None]] = [("nominal start", None)]
+            starts: list[tuple[str, FloatArray | None]] = [(NOMINAL_START, None)]
             if same:
                 starts += [(f"random start {i}", state) for i, state in enumerate(states)]
             for name, x0 in starts:

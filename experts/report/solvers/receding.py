@@ -28,6 +28,8 @@ NOISE = 0.01
 """Standard deviation of the noise on every tangent coordinate of the state that the policy sees, rad, m,
 rad/s, m/s."""
 MASS_FACTORS = (0.8, 1.2)
+UNDISTURBED = "none"
+"""Name of the disturbance that is none."""
 
 Control = Callable[[FloatArray, int], FloatArray]
 """Function of a state, shape (n_x,), and a stage; it returns a control, shape (n_u,), units of the scene."""
@@ -118,7 +120,7 @@ def disturbances(scene: Scene, other_masses: bool) -> list[Disturbance]:
         None, pushes, noise, and other masses.
     """
     found = [
-        Disturbance("none"),
+        Disturbance(UNDISTURBED),
         Disturbance(f"pushes, {PUSH:g} rad/s, m/s", push=PUSH),
         Disturbance(f"noise, {NOISE:g} rad, m, /s", noise=NOISE),
     ]

@@ -57,7 +57,7 @@ def all_cases(groups: Iterable[str] = GROUPS) -> list[Case]:
 def run_cases(
     effort: Effort = QUICK,
     groups: Iterable[str] = GROUPS,
-    progress: Callable[[Row], None] = lambda row: None,
+    progress: Callable[[Row], object] = lambda row: None,
 ) -> list[Row]:
     """Try everything.
 

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from experts.report.stability.rows import Row, Status
-from experts.report.tables import plain_table
+from experts.report.tables import TextTable
 
 _LONGEST = 240
 
@@ -20,14 +20,43 @@ def print_rows(console: Console, rows: Sequence[Row]) -> None:
         console: Where to print.
         rows: The rows.
     """
-    for group in dict.fromkeys(row.group for row in rows):
-        members = [row for row in rows if row.group == group]
-        headings = ("case", "applied to", "", "error", "bound", "what is to be known")
-        console.print(plain_table(group.capitalize(), headings, map(_cells, members)))
+    for table in tables(rows):
+        console.print(table.for_terminal())
     console.print(Text(summary(rows)))
-    for row in rows:
-        if row.status is Status.FAILED:
-            console.print(Text(f"FAILED: {row.group}: {row.name}, {row.subject}: {row.sentence}"))
+
+
+def tables(rows: Sequence[Row]) -> list[TextTable]:
+    """What became of the cases, a table for each group.
+
+    Args:
+        rows: The rows.
+
+    Returns:
+        The tables.
+    """
+    headings = ("case", "applied to", "", "error", "bound", "what is to be known")
+    return [
+        TextTable(
+            group.capitalize(), headings, tuple(_cells(row) for row in rows if row.group == group), right=None
+        )
+        for group in dict.fromkeys(row.group for row in rows)
+    ]
+
+
+def failures(rows: Sequence[Row]) -> list[str]:
+    """What failed.
+
+    Args:
+        rows: The rows.
+
+    Returns:
+        A sentence for each failed case.
+    """
+    return [
+        f"{row.group}: {row.name}, {row.subject}: {row.sentence}"
+        for row in rows
+        if row.status is Status.FAILED
+    ]
 
 
 def summary(rows: Sequence[Row]) -> str:
