@@ -191,7 +191,7 @@ def test_tables_and_record_show_every_row() -> None:
     page = console.file.getvalue()
     assert "two lines" in page
     assert "the error is above 1 m" in page
-    assert failures(rows) == ["group: name, subject: the error is above 1 m"]
+    assert failures(rows) == ["group: name, subject: the error is above 1 m."]
     found = json.loads(to_json(record(rows, QUICK)))
     assert [row["status"] for row in found["rows"]] == ["handled", "failed", "refused"]
     assert found["counts"] == {"handled": 1, "refused": 1, "not claimed": 0, "failed": 1}
