@@ -12,6 +12,15 @@ from experts.native_call import buffer_table, run_kernel
 from experts.problem import FloatArray, Kernel
 from experts.screw_motion import ScrewMotion, screw_motion
 
+CURVATURE_OF = {
+    **{name: name for name in CURVED_INTEGRATORS},
+    "rk6": "rk4",
+    "rk8": "rk4",
+    "momentum_rk4": "rk4",
+}
+"""Whose second derivatives the solver takes with an integrator. Newton's method needs a few digits of them:
+those of methods of order 4 and above differ by O(dt^5), while the gradients, which decide where the solver
+ends, are always the method's own."""
 SCREW_DURATION = 0.15
 """Share of the horizon that a guess by screw motion gives the tip: the cost asks for haste."""
 
@@ -23,8 +32,8 @@ class ArmProblem:
         scene: The scene.
         kernels: Its compiled functions.
         terminal_inputs: The emphasis on the pose in the terminal cost, shape (1,); see `emphasized`.
-        has_second_order: Whether steps of its integrator have second derivatives; the solver does with
-            Gauss-Newton's model where they have none.
+        has_second_order: Whether there are second derivatives for its integrator, see `CURVATURE_OF`; the
+            solver does with Gauss-Newton's model where there are none.
     """
 
     has_retraction = True
@@ -42,7 +51,7 @@ class ArmProblem:
         """
         self.scene = in_double_precision(load_scene(scene), integrator)
         self.kernels = compile_scene(self.scene)
-        self.has_second_order = self.scene.simulation.integrator in CURVED_INTEGRATORS
+        self.has_second_order = self.scene.simulation.integrator in CURVATURE_OF
         layout = self.kernels.layout
         self.n_states, self.n_tangent, self.n_controls = layout.n_x, layout.n_t, layout.n_u
         self.horizon = self.scene.simulation.steps
@@ -132,7 +141,10 @@ class ArmProblem:
             The kernel, compiled or loaded from the cache.
         """
         name = "emphasized_terminal_cost" if name == "terminal_cost" else name
-        return self.kernels.kernel(name, lanes=None if batched else 1)
+        integrator = None
+        if name == "lagrangian_hessian":
+            integrator = CURVATURE_OF[self.scene.simulation.integrator]
+        return self.kernels.kernel(name, integrator=integrator, lanes=None if batched else 1)
 
 
 def in_double_precision(scene: Scene, integrator: str | None = None) -> Scene:

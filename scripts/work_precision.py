@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 from experts.report.command import guarded, judge, parser_of, save, table_console
 from experts.report.provenance import provenance
-from experts.report.work_precision.benchmark import FORMULATIONS, WorkPrecision, measure, shortcomings
+from experts.report.work_precision.benchmark import FORMULATIONS, SCENES, WorkPrecision, measure, shortcomings
 from experts.report.work_precision.cases import CASES
 from experts.report.work_precision.effort import FULL, QUICK
 from experts.report.work_precision.methods import method_names
@@ -53,7 +53,8 @@ def _run(options: argparse.Namespace) -> int:
     for sentence in notes(found):
         console.print(sentence, markup=False)
     record = {**report_record(found), **provenance("mpmath", "pin", "scipy")}
-    save(console, options, "work_precision", record, lambda: _picture(found))
+    drawn = found.cases or found.formulations is not None
+    save(console, options, "work_precision", record, (lambda: _picture(found)) if drawn else None)
     return judge(shortcomings(found))
 
 
@@ -62,7 +63,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--case",
         action="append",
-        choices=(*CASES, FORMULATIONS),
+        choices=(*CASES, SCENES, FORMULATIONS),
         help="what to measure; repeatable (default: all; with --quick: the first few)",
     )
     parser.add_argument(

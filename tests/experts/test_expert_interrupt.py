@@ -9,7 +9,9 @@ import time
 import pytest
 
 SOLVE = """
+import signal
 from experts import BoxDDP
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job inherits that it is ignored
 solver = BoxDDP("six-joint", max_iterations=1_000_000, tolerance=0.0, plateau_decrease=0.0)
 started = []
 def announce(record):

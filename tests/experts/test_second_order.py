@@ -181,7 +181,7 @@ def test_exact_derivatives_that_are_not_finite_are_reported(pendulum):
 
 def test_an_integrator_without_second_derivatives_leaves_gauss_newton():
     scene = load_scene("planar")
-    problem = ArmProblem(scene.replace(simulation={"dt": 0.1, "steps": 20}), "rk6")
+    problem = ArmProblem(scene.replace(simulation={"dt": 0.1, "steps": 20}), "rodas4")
     assert not problem.has_second_order
     assert BoxDDP(problem).second_order == "gauss_newton"
     assert BoxDDP(problem).solve().cost < BoxDDP(problem, max_iterations=1).solve().cost
@@ -190,3 +190,16 @@ def test_an_integrator_without_second_derivatives_leaves_gauss_newton():
     guess = np.zeros((problem.horizon, problem.n_controls))
     plan = ManeuverPlan.make(problem, problem.initial_state, 5, guess)
     assert np.linalg.eigvalsh(plan.value_hessians).min() > -1e-9
+
+
+@pytest.mark.parametrize("integrator", ["rk6", "momentum_rk4"])
+def test_methods_of_higher_order_do_with_the_second_derivatives_of_rk4(integrator):
+    """Where the solver ends is decided by gradients, which are the method's own."""
+    problem = ArmProblem("planar", integrator)
+    solution, its_rk4 = BoxDDP(problem).solve(), BoxDDP(ArmProblem("planar", "rk4")).solve()
+    assert solution.converged
+    assert abs(solution.iterations - its_rk4.iterations) <= 3
+    assert solution.cost == pytest.approx(its_rk4.cost, rel=1e-5)
+    exact = BoxDDP(problem, second_order="exact").solve(u_init=solution.controls)
+    assert exact.converged
+    assert exact.iterations <= 2

@@ -6,16 +6,24 @@ import mpmath
 import numpy as np
 import pytest
 
-from dq_space_arm_env import compile_scene, load_scene
+from dq_space_arm_env import compile_scene, list_scenes, load_scene
 from dq_space_arm_env.integrators import INTEGRATORS
 from dq_space_arm_env.kernels.paper_programs import PaperPrograms
-from experts.report.work_precision.benchmark import WorkPrecision, measure, shortcomings
-from experts.report.work_precision.cases import CASES, chain_scene, make_case, stiff_scene
+from experts.report.work_precision.benchmark import SCENES, WorkPrecision, measure, shortcomings
+from experts.report.work_precision.cases import (
+    CASES,
+    DEFAULT_ACCURACY,
+    chain_scene,
+    make_case,
+    scene_case,
+    stiff_scene,
+)
 from experts.report.work_precision.choices import (
     cheapest,
     default_at_step,
     observed_order,
     order_of,
+    own_choice,
 )
 from experts.report.work_precision.effort import QUICK
 from experts.report.work_precision.formulations import (
@@ -40,7 +48,9 @@ from experts.report.work_precision.references import reference_of
 from experts.report.work_precision.rigid_body import torque_free_motion
 from experts.report.work_precision.tables import notes, tables
 
-SHORT = replace(QUICK, duration=1.0, most_steps=600, timing=replace(QUICK.timing, repeats=1), states=2)
+SHORT = replace(
+    QUICK, scenes=(), duration=1.0, most_steps=600, timing=replace(QUICK.timing, repeats=1), states=2
+)
 
 
 def point(step: float, error: float, time: float, tolerance: float | None = None) -> Point:
@@ -54,7 +64,8 @@ def curve(name: str, order: int, *points: Point, adaptive: bool = False) -> Curv
 
 
 def result(*curves: Curve, limit: float = 1e-8, uncertainty: float | None = None) -> CaseResult:
-    return CaseResult("made up", "Made up", "none", 1.0, 0.1, limit, True, "nobody", uncertainty, curves)
+    origin = ("made up", "Made up", "none", 1.0, 0.1, "low")
+    return CaseResult(*origin, limit, True, "nobody", uncertainty, curves)
 
 
 LOW = curve("low", 1, *(point(0.1 / 2**k, 1e-2 / 2**k, 1.0 * 2**k) for k in range(6)))
@@ -84,12 +95,13 @@ def test_a_default_is_cheap_at_the_step_of_the_scene_and_no_method_of_the_papers
     adaptive = curve("free", 5, point(1.0, 1e-9, 0.1, 1e-9), adaptive=True)
     good = curve("good", 6, point(0.1, 1e-8, 7.0))
     better = curve("better", 8, point(0.1, 1e-12, 9.0))
-    choice = default_at_step(result(LOW, HIGH, paper, adaptive, good, better), 0.1)
+    coarse = curve("coarse", 4, point(0.1, 2.0 * DEFAULT_ACCURACY, 5.0))
+    choice = default_at_step(result(LOW, coarse, paper, adaptive, good, better), 0.1)
     assert choice is not None
     assert choice.method == "good"
-    choice = default_at_step(result(LOW, HIGH, paper), 0.1)
+    choice = default_at_step(result(LOW, coarse, paper), 0.1)
     assert choice is not None
-    assert choice.method == "high"  # not good enough, but the most accurate one
+    assert choice.method == "coarse"  # not good enough, but the most accurate one
     assert default_at_step(result(LOW), 0.9) is None
 
 
@@ -329,6 +341,40 @@ def test_tables_show_choices_and_what_is_not_reached() -> None:
     assert notes(found)[1:] == [
         "Made up: reference nobody; on our own accelerations it ends 2e-13 from there."
     ]
+
+
+def test_a_scene_is_told_from_its_own_integrator_and_the_cheapest_that_is_right() -> None:
+    coarse = result(LOW, HIGH)
+    found = WorkPrecision(SHORT, None, (), None, (coarse,))
+    *_, choices = tables(found)
+    assert choices.rows == (("none", "low", "1e-02", "high", "1e-04"),)
+    (sentence,) = shortcomings(found)
+    assert sentence.startswith("scene none: low, its own integrator, ends the expert's maneuver 1e-02 off")
+    good = replace(coarse, integrator="high")
+    assert shortcomings(replace(found, scenes=(good,))) == []
+    unmeasured = replace(coarse, integrator="other")
+    assert own_choice(unmeasured) is None
+    assert shortcomings(replace(found, scenes=(unmeasured,))) == []
+
+
+def test_the_maneuver_of_a_scene_is_followed() -> None:
+    effort = replace(SHORT, scenes=("planar",), scene_steps=2000)
+    found = measure(effort, [SCENES], ["rk4", "rk6", "dormand_prince"])
+    (planar,) = found.scenes
+    assert [(curve.method, len(curve.points)) for curve in planar.curves][:2] == [("rk4", 2), ("rk6", 2)]
+    assert planar.uncertainty is not None
+    assert planar.uncertainty < 1e-11
+    assert shortcomings(found) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list_scenes())
+def test_the_integrator_of_each_scene_follows_from_the_errors(name: str) -> None:
+    case = scene_case(name)
+    own = Method(case.scene.simulation.integrator, 4)
+    walk = Walk(own, own.kernels(case.scene), case)
+    walk.run(1)
+    assert errors_of(own.kernels(case.scene), walk.state, reference_of(case).state).pose < DEFAULT_ACCURACY
 
 
 def test_missing_packages_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 
-from experts.report.work_precision.cases import make_case
-from experts.report.work_precision.choices import integrators_of, order_of
+from experts.report.work_precision.cases import DEFAULT_ACCURACY, make_case, scene_case
+from experts.report.work_precision.choices import integrators_of, order_of, own_choice
 from experts.report.work_precision.effort import Effort
 from experts.report.work_precision.formulations import (
     ARTICULATED,
@@ -17,8 +17,10 @@ from experts.report.work_precision.formulations import (
 )
 from experts.report.work_precision.measurement import CaseResult, measure_case
 
-FORMULATIONS = "formulations"
-"""Name of the comparison of accelerations, beside those of the motions."""
+FORMULATIONS, SCENES = "formulations", "scenes"
+"""Names of the comparison of accelerations and of the maneuvers of scenes, beside those of the motions."""
+SCENE_TOLERANCES = (1e-3, 1e-6, 1e-9)
+"""Those of adaptive integrators in the maneuvers of scenes."""
 ORDER_TOLERANCE = 0.3
 """How far an observed order may be below the claimed one."""
 
@@ -32,12 +34,14 @@ class WorkPrecision:
         methods: Names of the methods that were asked for; None for all.
         cases: The motions.
         formulations: The accelerations; None if not asked for.
+        scenes: The expert's maneuvers in shipped scenes.
     """
 
     effort: Effort
     methods: tuple[str, ...] | None
     cases: tuple[CaseResult, ...]
     formulations: Formulations | None
+    scenes: tuple[CaseResult, ...] = ()
 
 
 def measure(
@@ -50,7 +54,7 @@ def measure(
 
     Args:
         effort: How much to measure.
-        names: Names of motions, and FORMULATIONS; those of the effort and FORMULATIONS if None.
+        names: Names of motions, SCENES and FORMULATIONS; those of the effort, and both, if None.
         methods: Names of methods; all if None.
         announce: Told the name of each part before it is measured.
 
@@ -61,15 +65,21 @@ def measure(
         ModuleNotFoundError: If SciPy or mpmath is not installed.
     """
     check_packages()
-    wanted = (*effort.cases, FORMULATIONS) if names is None else tuple(names)
-    cases, formulations = [], None
+    wanted = (*effort.cases, SCENES, FORMULATIONS) if names is None else tuple(names)
+    cases, scenes, formulations = [], [], None
     for name in wanted:
         announce(name)
         if name == FORMULATIONS:
             formulations = measure_formulations(effort)
+        elif name == SCENES:
+            brief = replace(effort, most_steps=effort.scene_steps, tolerances=SCENE_TOLERANCES)
+            for scene in effort.scenes:
+                announce(f"scene {scene}")
+                scenes.append(measure_case(scene_case(scene), brief, methods))
         else:
             cases.append(measure_case(make_case(name, effort.duration), effort, methods))
-    return WorkPrecision(effort, None if methods is None else tuple(methods), tuple(cases), formulations)
+    chosen = None if methods is None else tuple(methods)
+    return WorkPrecision(effort, chosen, tuple(cases), formulations, tuple(scenes))
 
 
 def check_packages() -> None:
@@ -97,6 +107,8 @@ def shortcomings(found: WorkPrecision) -> list[str]:
     sentences = []
     for case in found.cases:
         sentences += _case_shortcomings(case, all_methods=found.methods is None)
+    for scene in found.scenes:
+        sentences += _scene_shortcomings(scene)
     if found.formulations is not None:
         for result in found.formulations.results:
             limit = LIMITS[result.precision]
@@ -106,6 +118,17 @@ def shortcomings(found: WorkPrecision) -> list[str]:
                     f"accelerations; it should be below {limit:g}."
                 )
     return sentences
+
+
+def _scene_shortcomings(scene: CaseResult) -> list[str]:
+    """A scene's own integrator must follow the expert's maneuver."""
+    own = own_choice(scene)
+    if own is None or own.point.errors.pose <= DEFAULT_ACCURACY:
+        return []
+    return [
+        f"scene {scene.scene}: {own.title}, its own integrator, ends the expert's maneuver "
+        f"{own.point.errors.pose:.0e} off; it should be within {DEFAULT_ACCURACY:g}."
+    ]
 
 
 def _case_shortcomings(case: CaseResult, *, all_methods: bool) -> list[str]:

@@ -1,4 +1,7 @@
-"""Motions that every integrator follows: a free body, the maneuver, a spin, stiff joints, a long chain."""
+"""Motions that every integrator follows: a free body, the maneuver, a spin, stiff joints, a long chain.
+
+And the expert's maneuver in each scene, from which the scene's own integrator follows.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,9 @@ from dq_space_arm_env import Scene, compile_scene, load_scene
 from experts import BoxDDP
 from experts.problem import FloatArray
 
+DEFAULT_ACCURACY = 1e-4
+"""Error of the tip [m, rad] that a scene's own integrator stays below: a thousandth of the 10 cm that count
+as a success."""
 STIFFNESS = 1e4
 """Spring of the stiff joint, N m/rad."""
 STIFF_JOINT = 1
@@ -35,6 +41,7 @@ class MotionCase:
         limit: Error [m, rad] that some method must stay below, or accuracy has regressed.
         is_smooth: Whether methods show their order: nothing is faster than the steps.
         with_paper_form: Whether the paper's redundant formulation follows it too.
+        has_other_code: Whether other codes tell where it ends; our own method of order 8 does otherwise.
     """
 
     name: str
@@ -47,6 +54,7 @@ class MotionCase:
     limit: float
     is_smooth: bool = True
     with_paper_form: bool = False
+    has_other_code: bool = True
 
     @property
     def duration(self) -> float:
@@ -132,6 +140,30 @@ def _maneuver(duration: float) -> MotionCase:
         1,
         limit=1e-11,
         with_paper_form=True,
+    )
+
+
+def scene_case(name: str) -> MotionCase:
+    """The expert's maneuver in a scene.
+
+    Args:
+        name: Name of a shipped scene.
+
+    Returns:
+        The motion.
+    """
+    scene = load_scene(name)
+    solution = BoxDDP(scene).solve()
+    return MotionCase(
+        name,
+        name,
+        scene,
+        np.array(solution.states[0], dtype=np.float64),
+        np.array(solution.controls, dtype=np.float64),
+        scene.simulation.dt,
+        1,
+        limit=DEFAULT_ACCURACY,
+        has_other_code=False,
     )
 
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from experts.report.work_precision.cases import DEFAULT_ACCURACY
 from experts.report.work_precision.measurement import CaseResult, Curve, Point
 
 ACCURACIES = (1e-3, 1e-6, 1e-9)
 """Errors of the tip to be reached, m and rad."""
-DEFAULT_ACCURACY = 1e-6
-"""What a scene's integrator should reach by default."""
 
 _ASYMPTOTIC = 1e-3
 _ROUNDING, _UNCERTAINTIES = 1e-11, 100.0
@@ -95,6 +94,23 @@ def cheapest(curves: Iterable[Curve], accuracy: float, *, batch: bool) -> Choice
 def integrators_of(result: CaseResult) -> list[Curve]:
     """Those methods that a scene can name: not the paper's redundant form."""
     return [curve for curve in result.curves if not curve.method.startswith("paper")]
+
+
+def own_choice(result: CaseResult) -> Choice | None:
+    """A scene's own integrator, at its own step.
+
+    Args:
+        result: The scene's maneuver.
+
+    Returns:
+        Its error and times; None if it was not measured, or got lost.
+    """
+    for curve in result.curves:
+        if curve.method == result.integrator:
+            for point in curve.points:
+                if curve.is_adaptive or abs(point.step - result.dt) < 1e-9:
+                    return Choice(curve.method, curve.title, point)
+    return None
 
 
 def default_at_step(result: CaseResult, step: float) -> Choice | None:

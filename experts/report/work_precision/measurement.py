@@ -122,6 +122,7 @@ class CaseResult:
         scene: Name of its scene.
         duration: How long it is, s.
         dt: Time step of the scene, s.
+        integrator: The scene's own.
         limit: Error that some method must stay below.
         is_smooth: Whether methods must show their order.
         reference: Who says where it ends.
@@ -135,6 +136,7 @@ class CaseResult:
     scene: str
     duration: float
     dt: float
+    integrator: str
     limit: float
     is_smooth: bool
     reference: str
@@ -167,6 +169,7 @@ def measure_case(case: MotionCase, effort: Effort, names: Sequence[str] | None =
         scene=case.scene.name,
         duration=case.duration,
         dt=case.scene.simulation.dt,
+        integrator=case.scene.simulation.integrator,
         limit=case.limit,
         is_smooth=case.is_smooth,
         reference=reference.source,

@@ -23,6 +23,7 @@ def report_record(found: WorkPrecision) -> dict[str, Any]:
     record = {
         "effort": asdict(found.effort),
         "cases": [_case(case) for case in found.cases],
+        "scenes": [_case(scene) for scene in found.scenes],
         "formulations": None if found.formulations is None else asdict(found.formulations),
         "shortcomings": shortcomings(found),
     }
@@ -36,6 +37,7 @@ def _case(case: CaseResult) -> dict[str, Any]:
         "scene": case.scene,
         "duration_s": case.duration,
         "scene_step_s": case.dt,
+        "scene_integrator": case.integrator,
         "error_limit": case.limit,
         "reference": case.reference,
         "reference_uncertainty": case.uncertainty,

@@ -1,7 +1,8 @@
 """Where a motion ends, from codes that share no dynamics with ours.
 
 A body alone has its solution in 30 digits. Arms are followed by SciPy's DOP853, hold by hold, on the
-articulated-body algorithm of Pinocchio; where Pinocchio is missing, on our own accelerations.
+articulated-body algorithm of Pinocchio; where Pinocchio is missing, on our own accelerations. The maneuvers
+of all scenes are followed by our own method of order 8: the codes have been compared by then.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ from dq_space_arm_env import Kernels, compile_scene
 from dq_space_arm_env.algebra import poses, quaternion, rotations
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.integrators import INTEGRATORS
 from experts.problem import FloatArray
 from experts.report.throughput.pinocchio_peer import PinocchioPeer
 from experts.report.throughput.robot import Robot
 from experts.report.work_precision.cases import MotionCase
+from experts.report.work_precision.methods import Method, Walk
 from experts.report.work_precision.rigid_body import torque_free_motion
 
 TOLERANCE = 1e-13
@@ -51,6 +54,8 @@ def reference_of(case: MotionCase, *, second: bool = False) -> Reference:
         The reference.
     """
     kernels = compile_scene(case.scene)
+    if not case.has_other_code:
+        return _fine_end(case)
     if case.is_single_body:
         return Reference(_body_end(case, kernels), "power series with 30 digits")
     arm = _Arm(case, kernels)
@@ -63,6 +68,17 @@ def reference_of(case: MotionCase, *, second: bool = False) -> Reference:
         f"DOP853 at {TOLERANCE:g} on Pinocchio's dynamics",
         arm.end(arm.own_rates()) if second else None,
     )
+
+
+def _fine_end(case: MotionCase) -> Reference:
+    """The end by our own method of order 8, with fine steps; that of order 6 says how far to trust it."""
+    ends = []
+    for name, per_hold in (("rk8", 4), ("rk6", 8)):
+        method = Method(name, INTEGRATORS[name].order)
+        walk = Walk(method, method.kernels(case.scene), case)
+        walk.run(per_hold)
+        ends.append(walk.state)
+    return Reference(ends[0], "rk8 with a quarter of the step", ends[1])
 
 
 def _body_end(case: MotionCase, kernels: Kernels) -> FloatArray:

@@ -7,13 +7,14 @@ from collections.abc import Iterable, Iterator
 from experts.report.tables import TextTable
 from experts.report.throughput.formats import three_digits
 from experts.report.work_precision.benchmark import WorkPrecision
+from experts.report.work_precision.cases import DEFAULT_ACCURACY
 from experts.report.work_precision.choices import (
     ACCURACIES,
-    DEFAULT_ACCURACY,
     Choice,
     cheapest,
     default_at_step,
     order_of,
+    own_choice,
 )
 from experts.report.work_precision.formulations import Formulations
 from experts.report.work_precision.measurement import CaseResult, Curve, Point
@@ -23,6 +24,8 @@ _EXPLAINED = (
     "the longest step that does not lose the motion, with its error of the tip; the least error, with those "
     "of angular momentum [kg m^2/s] and of energy [relative] at that step."
 )
+
+CHEAPEST = "The cheapest method and step that reach an accuracy"
 
 
 def tables(found: WorkPrecision) -> list[TextTable]:
@@ -36,7 +39,9 @@ def tables(found: WorkPrecision) -> list[TextTable]:
     """
     made = [_case_table(case) for case in found.cases]
     if found.cases:
-        made += [_choices_table(found.cases), _defaults_table(found.cases)]
+        made += [_choices_table(CHEAPEST, found.cases), _defaults_table(found.cases)]
+    if found.scenes:
+        made += [_choices_table(f"{CHEAPEST}, in each scene", found.scenes), _scenes_table(found.scenes)]
     if found.formulations is not None:
         made.append(_formulations_table(found.formulations))
     return made
@@ -112,9 +117,9 @@ def _step(point: Point) -> str:
     return f"{point.step:.3g}"
 
 
-def _choices_table(cases: Iterable[CaseResult]) -> TextTable:
+def _choices_table(title: str, cases: Iterable[CaseResult]) -> TextTable:
     return TextTable(
-        "The cheapest method and step that reach an accuracy; µs per simulated second",
+        f"{title}; µs per simulated second",
         ("", "error", "of 1024 on one core", "µs", "a single motion", "µs"),
         tuple(row for case in cases for row in _choice_rows(case)),
     )
@@ -154,6 +159,27 @@ def _defaults_table(cases: Iterable[CaseResult]) -> TextTable:
         ("", "step of the scene [s]", "integrator", "step", "error [m, rad]"),
         tuple(rows),
         right=4,
+    )
+
+
+def _scenes_table(scenes: Iterable[CaseResult]) -> TextTable:
+    rows = []
+    for scene in scenes:
+        own, best = own_choice(scene), default_at_step(scene, scene.dt)
+        rows.append(
+            (
+                scene.scene,
+                scene.integrator,
+                "lost" if own is None else f"{own.point.errors.pose:.0e}",
+                "-" if best is None else best.title,
+                "-" if best is None else f"{best.point.errors.pose:.0e}",
+            )
+        )
+    return TextTable(
+        f"The integrator of each scene, and the cheapest one that follows the expert's maneuver to "
+        f"{DEFAULT_ACCURACY:g} m and rad at the scene's step, a thousandth of what counts as a success",
+        ("", "its own", "error", "cheapest", "error"),
+        tuple(rows),
     )
 
 
