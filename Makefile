@@ -1,6 +1,6 @@
 # make paper   solve and replay the paper's maneuver: figures and table in results/paper
-# make test    lint, type check, tests (with CI set: the slow tests too, and those of the extra agents, whose
-#              PyTorch is a download of gigabytes; without it they are skipped)
+# make test    lint, type check, tests (with CI set also the slow tests, the quick numerical report, and the
+#              tests of the extra agents, whose PyTorch is a download of gigabytes; they are skipped without it)
 # make clean   remove the virtual environment and the results
 
 PYTHON ?= python3
@@ -15,7 +15,8 @@ paper: $(VENV)/installed-plots
 	$(BIN)/python scripts/reproduce_paper.py
 
 test: $(VENV)/installed-$(TEST) lint
-	$(BIN)/python -m pytest $(if $(CI),-m "")
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal $(if $(CI),-m "")
+	$(if $(CI),$(BIN)/python scripts/report.py --quick)
 
 lint: $(VENV)/installed-$(TEST)
 	$(BIN)/ruff check .
