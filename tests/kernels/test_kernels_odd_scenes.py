@@ -44,7 +44,7 @@ def odd_scenes_and_integrators():
     """All pairs; methods that share their code with others are fast for small scenes only."""
     for name in ("base", "wrist", "one link", "no actuator", "wrist without motor"):
         for integrator in INTEGRATORS:
-            is_slow = integrator not in CURVED_INTEGRATORS and name in ("no actuator", "wrist without motor")
+            is_slow = integrator not in CURVED_INTEGRATORS and name != "one link"
             yield pytest.param(name, integrator, marks=[pytest.mark.slow] if is_slow else [])
 
 

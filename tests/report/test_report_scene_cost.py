@@ -106,7 +106,7 @@ def test_sizes_of_parts(title: str) -> None:
     assert size.state_bytes == 8 * size.states
 
 
-@pytest.mark.parametrize("name", ["planar", "six-joint"])
+@pytest.mark.parametrize("name", ["planar", "tip-load"])
 def test_sizes_of_scenes_are_those_of_kernels_and_environment(name: str) -> None:
     scene = load_scene(name)
     size, kernels, env = measure_size(scene), compile_scene(scene), DQSpaceArmEnv(scene)
