@@ -1,1 +1,1 @@
-"""Equations of motion over plain scalars: the paper's Newton-Euler system, and minimal coordinates."""
+"""Equations of motion over plain scalars: the paper's system, articulated bodies, the mass matrix."""

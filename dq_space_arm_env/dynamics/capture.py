@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 
 from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale
 from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 from dq_space_arm_env.dynamics.minimal import (
     ZERO,
     Accelerations,
-    MassMatrix,
     inverse_dynamics,
     joint_rotations,
     tip_wrench_forces,

@@ -91,6 +91,7 @@ class Chain:
         tip: Tip frame G in the wrist frame, or in the last link's frame without one.
         tip_wrench: Force [N] and torque [N m] acting at G, in G axes (16); None where nothing acts.
         planar: Whether the base moves in its x-y plane only.
+        heaviest: Which body has the greatest mass by the scene, whatever is drawn: 0 is the base, i link i.
     """
 
     base: RigidBody
@@ -99,6 +100,7 @@ class Chain:
     tip: Placement
     tip_wrench: tuple[float, ...] | None
     planar: bool
+    heaviest: int = 0
 
     @classmethod
     def from_scene(cls, scene: Scene, masses: MassFactors | None = None) -> Chain:
@@ -126,7 +128,16 @@ class Chain:
             tip=_placement(scene.tip),
             tip_wrench=None if wrench is None else (*wrench.force, *wrench.torque),
             planar=scene.base.motion == "planar",
+            heaviest=_heaviest(scene),
         )
+
+
+def _heaviest(scene: Scene) -> int:
+    """Index of the heaviest body, the base's being 0."""
+    masses = [scene.base.mass, *(link.mass for link in scene.links)]
+    if scene.payload is not None:
+        masses[-1] += scene.payload.mass
+    return masses.index(max(masses))
 
 
 def _base_factors(masses: MassFactors | None) -> tuple[Scalar, Scalar]:

@@ -1,9 +1,8 @@
 """Dynamics in minimal coordinates: joint angles, base twist and joint rates, and nothing redundant.
 
-The recursive Newton-Euler algorithm gives the wrenches that a motion needs (inverse dynamics), the
-composite-rigid-body algorithm the mass matrix, and an LDL' factorization the accelerations (Featherstone,
-Rigid Body Dynamics Algorithms, 2008, chapters 5, 6 and 9). Everything is written over plain scalars: numbers,
-arrays, or symbols.
+The recursive Newton-Euler algorithm gives the wrenches that a motion needs, which is inverse dynamics
+(Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 5); `forward` has its inverse. Everything is
+written over plain scalars: numbers, arrays, or symbols.
 
 Two facts keep it small. The base pose never enters, because space has no preferred place or direction; and
 neither does the base's linear velocity, because it has no preferred velocity: the acceleration of the base is
@@ -21,14 +20,11 @@ from dq_space_arm_env.algebra.scalars import cos, sin
 from dq_space_arm_env.algebra.vectors import (
     add,
     cross,
-    dot,
     matrix_vector,
     scale,
-    subtract,
     transposed_matrix_vector,
 )
-from dq_space_arm_env.dynamics.chain import Chain, Matrix, RigidBody
-from dq_space_arm_env.dynamics.linear import LDLFactor, factorize_ldl, solve_ldl
+from dq_space_arm_env.dynamics.chain import Chain, RigidBody
 
 Scalar = Any
 Vector3 = Sequence[Scalar]
@@ -87,6 +83,42 @@ def joint_rotations(chain: Chain, joint_angles: Sequence[Scalar]) -> list[Sequen
     return rotations
 
 
+def body_wrenches(
+    chain: Chain,
+    rotations: Sequence[Sequence[Vector3]],
+    angular_velocity: Vector3,
+    joint_rates: Sequence[Scalar],
+    acceleration: Accelerations,
+) -> list[tuple[Vector3, Vector3]]:
+    """Wrenches that each body needs for given accelerations, whatever brings them about.
+
+    Args:
+        chain: The robot.
+        rotations: From `joint_rotations`.
+        angular_velocity: Angular velocity of the base, base axes, 3, rad/s.
+        joint_rates: Joint rates, n, rad/s.
+        acceleration: The accelerations.
+
+    Returns:
+        Force [N] and torque [N m] on base and links about the origins of their frames, in their axes, n + 1
+        pairs.
+    """
+    omega, alpha, a = angular_velocity, acceleration.angular, acceleration.linear
+    wrenches = [_newton_euler(chain.base, omega, alpha, a)]
+    for link, rotation, rate, rate_change in zip(
+        chain.links, rotations, joint_rates, acceleration.joints, strict=True
+    ):
+        p = link.joint.position
+        a = transposed_matrix_vector(rotation, add(a, add(cross(alpha, p), cross(omega, cross(omega, p)))))
+        omega = transposed_matrix_vector(rotation, omega)
+        # omega x (rate z), the part of the angular acceleration that the turning axes cause.
+        turning = (omega[1] * rate, -omega[0] * rate, 0.0)
+        alpha = add(transposed_matrix_vector(rotation, alpha), (turning[0], turning[1], rate_change))
+        omega = (omega[0], omega[1], omega[2] + rate)
+        wrenches.append(_newton_euler(link.body, omega, alpha, a))
+    return wrenches
+
+
 def inverse_dynamics(
     chain: Chain,
     rotations: Sequence[Sequence[Vector3]],
@@ -106,29 +138,34 @@ def inverse_dynamics(
     Returns:
         The wrenches, without springs, dampers and tip wrench.
     """
-    omega, alpha, a = angular_velocity, acceleration.angular, acceleration.linear
-    wrenches = [_newton_euler(chain.base, omega, alpha, a)]
-    for link, rotation, rate, rate_change in zip(
-        chain.links, rotations, joint_rates, acceleration.joints, strict=True
-    ):
-        p = link.joint.position
-        a = transposed_matrix_vector(rotation, add(a, add(cross(alpha, p), cross(omega, cross(omega, p)))))
-        omega = transposed_matrix_vector(rotation, omega)
-        # omega x (rate z), the part of the angular acceleration that the turning axes cause.
-        turning = (omega[1] * rate, -omega[0] * rate, 0.0)
-        alpha = add(transposed_matrix_vector(rotation, alpha), (turning[0], turning[1], rate_change))
-        omega = (omega[0], omega[1], omega[2] + rate)
-        wrenches.append(_newton_euler(link.body, omega, alpha, a))
+    wrenches = body_wrenches(chain, rotations, angular_velocity, joint_rates, acceleration)
+    return passed_to_base(chain, rotations, wrenches)
+
+
+def passed_to_base(
+    chain: Chain, rotations: Sequence[Sequence[Vector3]], wrenches: Sequence[tuple[Vector3, Vector3]]
+) -> Wrenches:
+    """Generalized forces of wrenches on the bodies, added up from the tip to the base.
+
+    Args:
+        chain: The robot.
+        rotations: From `joint_rotations`.
+        wrenches: Force [N] and torque [N m] on base and links, as `body_wrenches` gives them.
+
+    Returns:
+        The generalized forces.
+    """
+    acting = list(wrenches)
     reactions: list[tuple[Vector3, Vector3]] = []
     for i in reversed(range(len(chain.links))):
-        force, torque = wrenches[i + 1]
+        force, torque = acting[i + 1]
         reactions.insert(0, (force, torque))
         force_at_parent, torque_at_parent = shift_wrench(
             rotations[i], chain.links[i].joint.position, force, torque
         )
-        wrenches[i] = (add(wrenches[i][0], force_at_parent), add(wrenches[i][1], torque_at_parent))
+        acting[i] = (add(acting[i][0], force_at_parent), add(acting[i][1], torque_at_parent))
     joints = [torque[2] for _, torque in reactions]
-    return Wrenches(wrenches[0][0], wrenches[0][1], joints, reactions)
+    return Wrenches(acting[0][0], acting[0][1], joints, reactions)
 
 
 def _newton_euler(body: RigidBody, omega: Vector3, alpha: Vector3, a: Vector3) -> tuple[Vector3, Vector3]:
@@ -156,202 +193,6 @@ def shift_wrench(
     """
     rotated = matrix_vector(rotation, force)
     return rotated, add(matrix_vector(rotation, torque), cross(position, rotated))
-
-
-class MassMatrix:
-    """The mass matrix of the robot at given joint angles, factorized.
-
-    The base's linear acceleration is eliminated first (its block is the total mass), which leaves a symmetric
-    positive definite system for the base's angular and the joints' accelerations. Like every LDL'
-    factorization of such a matrix it is backward stable in any order of elimination, so extreme mass ratios
-    cost no digits.
-
-    Attributes:
-        center: Center of mass of the system in the base frame, 3, m.
-    """
-
-    def __init__(self, chain: Chain, rotations: Sequence[Sequence[Vector3]]) -> None:
-        """Assemble and factorize (composite-rigid-body algorithm, Featherstone table 6.2 and 9.6).
-
-        Args:
-            chain: The robot.
-            rotations: From `joint_rotations`.
-        """
-        self._axes = (2,) if chain.planar else (0, 1, 2)
-        mass, moment, inertia, columns, joint_block = _composite_bodies(chain, rotations)
-        self._mass = mass
-        self.center = scale(1.0 / mass, moment)
-        # Joint columns of the mass matrix in the base frame: force, and torque about the system's center of
-        # mass.
-        self._forces = [force for force, _ in columns]
-        self._torques = [subtract(torque, cross(self.center, force)) for force, torque in columns]
-        about_center = self._inertia = _shifted_inertia(inertia, -mass, self.center, ZERO)
-        axes, n = self._axes, len(columns)
-        reduced: list[list[Scalar]] = [[0.0] * (len(axes) + n) for _ in range(len(axes) + n)]
-        for row, axis in enumerate(axes):
-            for column, other in enumerate(axes):
-                reduced[row][column] = about_center[axis][other]
-            for j in range(n):
-                reduced[row][len(axes) + j] = reduced[len(axes) + j][row] = self._torques[j][axis]
-        for i in range(n):
-            for j in range(i, n):
-                entry = joint_block[i][j] - dot(self._forces[i], self._forces[j]) * (1.0 / mass)
-                reduced[len(axes) + i][len(axes) + j] = reduced[len(axes) + j][len(axes) + i] = entry
-        self._reduced = reduced
-        self._factor = factorize_ldl(reduced)
-
-    def solve(self, force: Vector3, torque: Vector3, joints: Sequence[Scalar]) -> Accelerations:
-        """Accelerations that generalized forces produce.
-
-        Args:
-            force: Force on the base, base axes, 3, N.
-            torque: Torque on the base about its center of mass, 3, N m.
-            joints: Joint torques, n, N m.
-
-        Returns:
-            The accelerations, without any velocity-dependent term.
-        """
-        inverse_mass = 1.0 / self._mass
-        about_center = subtract(torque, cross(self.center, force))
-        right = [about_center[axis] for axis in self._axes]
-        right += [
-            tau - dot(column, force) * inverse_mass for tau, column in zip(joints, self._forces, strict=True)
-        ]
-        solution = solve_ldl(self._factor, right)
-        angular: list[Scalar] = [0.0, 0.0, 0.0]
-        for axis, value in zip(self._axes, solution, strict=False):
-            angular[axis] = value
-        rates = solution[len(self._axes) :]
-        linear = add(scale(inverse_mass, force), cross(self.center, angular))
-        for column, rate in zip(self._forces, rates, strict=True):
-            linear = subtract(linear, scale(rate * inverse_mass, column))
-        return Accelerations(angular, linear, rates)
-
-    def joint_inertia(self) -> list[list[Scalar]]:
-        """Inertia that the joints feel on the free base, which is eliminated.
-
-        Returns:
-            Symmetric positive definite matrix n x n, kg m^2.
-        """
-        count = len(self._axes)
-        joints = [row[count:] for row in self._reduced[count:]]
-        for j in range(len(joints)):
-            response = solve_ldl(self._locked_factor(), [row[count + j] for row in self._reduced[:count]])
-            for i in range(j, len(joints)):
-                entry = joints[i][j]
-                for k in range(count):
-                    entry = entry - self._reduced[count + i][k] * response[k]
-                joints[i][j] = joints[j][i] = entry
-        return joints
-
-    def _locked_factor(self) -> LDLFactor:
-        """Factors of the inertia with all joints locked, the leading block of the factorized matrix."""
-        n = len(self._axes)
-        return LDLFactor(self._factor.lower[:n], self._factor.inverse_diagonal[:n])
-
-    def momentum(
-        self, angular_velocity: Vector3, velocity: Vector3, joint_rates: Sequence[Scalar]
-    ) -> tuple[Vector3, Vector3]:
-        """Momentum of the system, the inverse of `base_velocity`.
-
-        Args:
-            angular_velocity: Angular velocity of the base, base axes, 3, rad/s.
-            velocity: Velocity of the base's center of mass, base axes, 3, m/s.
-            joint_rates: n, rad/s.
-
-        Returns:
-            Linear momentum [kg m/s] and angular momentum about the system's center of mass [kg m^2/s], base
-            axes, 3 each.
-        """
-        linear = scale(self._mass, add(velocity, cross(angular_velocity, self.center)))
-        angular: Vector3 = matrix_vector(self._inertia, angular_velocity)
-        for force, torque, rate in zip(self._forces, self._torques, joint_rates, strict=True):
-            linear = add(linear, scale(rate, force))
-            angular = add(angular, scale(rate, torque))
-        return linear, angular
-
-    def base_velocity(
-        self, linear: Vector3, angular: Vector3, joint_rates: Sequence[Scalar]
-    ) -> tuple[Vector3, Vector3]:
-        """Velocity of the base with which the system has a given momentum.
-
-        About the center of mass, the angular momentum involves the angular velocity and the joint rates only.
-
-        Args:
-            linear: Linear momentum of the system, base axes, 3, kg m/s.
-            angular: Angular momentum about the system's center of mass, base axes, 3, kg m^2/s.
-            joint_rates: n, rad/s.
-
-        Returns:
-            Angular velocity of the base [rad/s] and velocity of its center of mass [m/s], base axes, 3 each.
-        """
-        for force, torque, rate in zip(self._forces, self._torques, joint_rates, strict=True):
-            linear = subtract(linear, scale(rate, force))
-            angular = subtract(angular, scale(rate, torque))
-        omega: list[Scalar] = [0.0, 0.0, 0.0]
-        solution = solve_ldl(self._locked_factor(), [angular[axis] for axis in self._axes])
-        for axis, value in zip(self._axes, solution, strict=True):
-            omega[axis] = value
-        # Divided: a reciprocal's rounding would be the same at every step.
-        return omega, subtract([entry / self._mass for entry in linear], cross(omega, self.center))
-
-
-def _shifted_inertia(inertia: Sequence[Vector3], mass: Scalar, p: Vector3, d: Vector3) -> list[list[Scalar]]:
-    """Add mass (p.p E - p p') + 2 p.d E - p d' - d p': parallel axes for a shift p and first moment d."""
-    trace = mass * dot(p, p) + 2.0 * dot(p, d)
-    result: list[list[Scalar]] = [[0.0] * 3 for _ in range(3)]
-    for i in range(3):
-        for j in range(i, 3):
-            entry = inertia[i][j] - (mass * (p[i] * p[j]) + p[i] * d[j] + d[i] * p[j])
-            result[i][j] = result[j][i] = entry + trace if i == j else entry
-    return result
-
-
-def _rotated_inertia(rotation: Sequence[Vector3], inertia: Sequence[Vector3]) -> list[list[Scalar]]:
-    """R I R', computed once above the diagonal."""
-    half = [matrix_vector(inertia, row) for row in rotation]
-    result: list[list[Scalar]] = [[0.0] * 3 for _ in range(3)]
-    for i in range(3):
-        for j in range(i, 3):
-            result[i][j] = result[j][i] = dot(rotation[i], half[j])
-    return result
-
-
-def _composite_bodies(
-    chain: Chain, rotations: Sequence[Sequence[Vector3]]
-) -> tuple[Scalar, Vector3, Sequence[Vector3], list[tuple[Vector3, Vector3]], list[list[Scalar]]]:
-    """Composite mass, first moment, inertia at the base; each joint's column (force, torque); joint block."""
-
-    def about_origin(body: RigidBody) -> tuple[float, Vector3, Sequence[Vector3]]:
-        c = body.center_of_mass
-        inertia: Matrix | list[list[Scalar]] = _shifted_inertia(body.inertia, body.mass, c, ZERO)
-        return body.mass, scale(body.mass, c), inertia
-
-    n = len(chain.links)
-    mass, moment, inertia = about_origin(chain.links[-1].body) if n else about_origin(chain.base)
-    columns: list[tuple[Vector3, Vector3]] = []
-    block: list[list[Scalar]] = [[0.0] * n for _ in range(n)]
-    for i in reversed(range(n)):
-        # A unit acceleration of joint i needs this wrench on the composite body beyond it.
-        column: tuple[Vector3, Vector3] = (
-            (-moment[1], moment[0], 0.0),
-            (inertia[0][2], inertia[1][2], inertia[2][2]),
-        )
-        block[i][i] = column[1][2]
-        for ancestor in reversed(range(i)):
-            column = shift_wrench(rotations[ancestor + 1], chain.links[ancestor + 1].joint.position, *column)
-            block[ancestor][i] = block[i][ancestor] = column[1][2]
-        columns.insert(0, shift_wrench(rotations[0], chain.links[0].joint.position, *column))
-        rotation, p = rotations[i], chain.links[i].joint.position
-        rotated_moment = matrix_vector(rotation, moment)
-        shifted = _shifted_inertia(_rotated_inertia(rotation, inertia), mass, p, rotated_moment)
-        parent_mass, parent_moment, parent_inertia = about_origin(
-            chain.links[i - 1].body if i else chain.base
-        )
-        moment = add(parent_moment, add(rotated_moment, scale(mass, p)))
-        inertia = [list(add(row, other)) for row, other in zip(parent_inertia, shifted, strict=True)]
-        mass = parent_mass + mass
-    return mass, moment, inertia, columns, block
 
 
 def passive_torques(
@@ -393,8 +234,4 @@ def tip_wrench_forces(
         Force and torque on the base, joint torques, and what each joint passes on to the body before it.
     """
     force, torque = shift_wrench(tip_rotation, tip_position, wrench[:3], wrench[3:])
-    passed: list[tuple[Vector3, Vector3]] = []
-    for link, rotation in zip(reversed(chain.links), reversed(rotations), strict=True):
-        passed.insert(0, (force, torque))
-        force, torque = shift_wrench(rotation, link.joint.position, force, torque)
-    return Wrenches(force, torque, [moment[2] for _, moment in passed], passed)
+    return passed_to_base(chain, rotations, [*[(ZERO, ZERO)] * len(chain.links), (force, torque)])

@@ -6,8 +6,8 @@ corrected equations: reaction wrench i is what body i exerts on body i+1, in the
 about its origin. A dual vector occupies 8 slots: scalar, vector of the real part, scalar, vector of the dual
 part; velocities carry the angular part in the real slots, wrenches the force.
 
-This formulation is the reference for `minimal`, which simulations use: 8 numbers per body against one per
-joint.
+This formulation is the reference for those in minimal coordinates (`forward`), which simulations use: 8
+numbers per body against one per joint.
 """
 
 from __future__ import annotations
@@ -177,6 +177,7 @@ class SchurComplement:
             chain: The robot; the inverse of S11 is known in closed form from its mass properties.
             system: From `assemble`; its right-hand side is not read.
         """
+        self._system = system
         self._bodies = [chain.base, *(link.body for link in chain.links)]
         count = len(system.s21)
         # A force enforces a linear velocity, a torque an angular one: (vx, vy, vz, wx, wy) within each joint.
@@ -210,18 +211,55 @@ class SchurComplement:
             accelerations = [a - reaction * c for a, c in zip(accelerations, column, strict=True)]
         return accelerations, reactions
 
+    def refine(
+        self, b1: Sequence[Scalar], b2: Sequence[Scalar], solution: tuple[list[Scalar], list[Scalar]]
+    ) -> tuple[list[Scalar], list[Scalar]]:
+        """Solve once more, for what a solution leaves of the right-hand side (iterative refinement).
 
-def solve_schur(chain: Chain, system: NewtonEulerSystem) -> tuple[list[Scalar], list[Scalar]]:
+        Entries of the Schur complement are as large as the greatest mobility of any body: about the axis of a
+        needle, 1 over its moment of inertia. What else they add up is rounded accordingly; the system itself
+        is not, and its residual tells.
+
+        Args:
+            b1: Wrenches on the bodies, 8 (n+1), N and N m.
+            b2: Right-hand side of the constraints, 5 n.
+            solution: From `solve`, for the same right-hand side.
+
+        Returns:
+            As `solve`.
+        """
+        accelerations, reactions = solution
+        left = self._system
+        unbalanced = [
+            value - _product(own, accelerations) - _product(others, reactions)
+            for value, own, others in zip(b1, left.s11, left.s12, strict=True)
+        ]
+        violated = [value - _product(row, accelerations) for value, row in zip(b2, left.s21, strict=True)]
+        corrections = self.solve(unbalanced, violated)
+        return (
+            [a + b for a, b in zip(accelerations, corrections[0], strict=True)],
+            [a + b for a, b in zip(reactions, corrections[1], strict=True)],
+        )
+
+
+def solve_schur(
+    chain: Chain, system: NewtonEulerSystem, refinements: int = 0
+) -> tuple[list[Scalar], list[Scalar]]:
     """Dual accelerations (22) and reaction wrenches (21) of a system.
 
     Args:
         chain: The robot.
         system: From `assemble`.
+        refinements: How often to solve once more for the residual.
 
     Returns:
         As `SchurComplement.solve`.
     """
-    return SchurComplement(chain, system).solve(system.b1, system.b2)
+    complement = SchurComplement(chain, system)
+    solution = complement.solve(system.b1, system.b2)
+    for _ in range(refinements):
+        solution = complement.refine(system.b1, system.b2, solution)
+    return solution
 
 
 def _solve_inertia(bodies: Sequence[Any], wrenches: Sequence[Scalar]) -> list[Scalar]:

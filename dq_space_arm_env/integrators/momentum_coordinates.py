@@ -90,6 +90,11 @@ class FreeBaseField(VectorField, Protocol):
         """The momentum of the whole system, and what changes it."""
         ...
 
+    @property
+    def beside_momentum(self) -> FreeBaseField:
+        """The same equations as they are cheapest where the momentum is computed too."""
+        ...
+
 
 @dataclass(frozen=True)
 class LocalState:
@@ -123,7 +128,7 @@ class MomentumCoordinates(DifferentiatedJacobian):
         Args:
             field: Equations of motion with the base's velocity among the states.
         """
-        self.base, self.balance = field, field.momentum_balance
+        self.base, self.balance = field.beside_momentum, field.momentum_balance
         self.name = f"{field.name}_momentum"
         self.parameters, self.n_u = field.parameters, field.n_u
         self.turning = [axis for axis in field.pose.directions if axis < 3]

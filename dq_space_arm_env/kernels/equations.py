@@ -43,13 +43,19 @@ class SceneEquations:
         """Equations with the scene's own target, masses and inertias."""
         chain, layout = Chain.from_scene(scene), StateLayout.of(scene)
         target = scene.target.pose.dual_quaternion
-        return cls(scene, chain, target, layout, SpaceArmField(chain, layout))
+        return cls(
+            scene,
+            chain,
+            target,
+            layout,
+            SpaceArmField(chain, layout, formulation=scene.simulation.formulation),
+        )
 
     @classmethod
     def parametric(cls, scene: Scene) -> SceneEquations:
         """Equations with symbols, `field.parameters`, for what the scene draws for each episode."""
         parameters, layout = EpisodeParameters.of(scene), StateLayout.of(scene)
-        field = SpaceArmField(parameters.chain, layout, parameters.symbols)
+        field = SpaceArmField(parameters.chain, layout, parameters.symbols, scene.simulation.formulation)
         return cls(scene, parameters.chain, parameters.target, layout, field)
 
     def y(self, x: Scalars) -> Scalars:

@@ -207,7 +207,7 @@ class Kernels(KernelLibrary):
         )
 
     def forward_dynamics(self, x: ArrayLike, u: ArrayLike, w_tip: ArrayLike | None = None) -> Array:
-        """Accelerations, eq. (22) in minimal coordinates.
+        """Accelerations, those of eq. (20), by the scene's formulation.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).

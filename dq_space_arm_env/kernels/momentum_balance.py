@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from dq_space_arm_env.algebra.vectors import add
 from dq_space_arm_env.dynamics import minimal
+from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 
 if TYPE_CHECKING:
-    from dq_space_arm_env.kernels.field import Motion, SpaceArmField
+    from dq_space_arm_env.kernels.field import SpaceArmField
+    from dq_space_arm_env.kernels.motion import Motion
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -99,8 +101,6 @@ class SpaceArmMomentum:
         """
         return self._mass_matrix(y)[1].joint_inertia()
 
-    def _mass_matrix(self, y: Scalars) -> tuple[Motion, minimal.MassMatrix]:
+    def _mass_matrix(self, y: Scalars) -> tuple[Motion, MassMatrix]:
         motion = self._field.motion(y)
-        return motion, minimal.MassMatrix(
-            self._chain, minimal.joint_rotations(self._chain, motion.joint_angles)
-        )
+        return motion, MassMatrix(self._chain, minimal.joint_rotations(self._chain, motion.joint_angles))

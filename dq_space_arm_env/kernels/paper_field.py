@@ -19,7 +19,8 @@ from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
 from dq_space_arm_env.dynamics.newton_euler import PaperState, SchurComplement
 from dq_space_arm_env.integrators.field import split_state
 from dq_space_arm_env.integrators.linearization import DifferentiatedJacobian
-from dq_space_arm_env.kernels.field import Inputs, SpaceArmField
+from dq_space_arm_env.kernels.field import SpaceArmField
+from dq_space_arm_env.kernels.motion import Inputs
 
 Scalar = Any
 Matrix = Any

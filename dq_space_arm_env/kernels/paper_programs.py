@@ -44,8 +44,9 @@ class PaperPrograms:
             name: One of `step`, `step_with_cost`, `linearize`, `difference`, `cost_derivatives`,
                 `terminal_cost`, `terminal_cost_derivatives`; `projected_step`, after which the state is
                 exactly that of a motion that the joints allow; `from_minimal` and `to_minimal`, which
-                translate states; `system` (20), its solution `accelerations` (22), and
-                `free_accelerations`, those of base and joints among the bodies' dual ones.
+                translate states; `system` (20), its solution `accelerations` (22) and, solved once
+                more for the residual, `refined_accelerations`; and `free_accelerations`, those of base and
+                joints among the bodies' dual ones.
 
         Returns:
             The program.
@@ -59,6 +60,7 @@ class PaperPrograms:
             "to_minimal": self._to_minimal,
             "system": self._system,
             "accelerations": self._accelerations,
+            "refined_accelerations": self._refined_accelerations,
             "free_accelerations": self._free_accelerations,
             "step_with_cost": self._step_with_cost,
             "linearize": self._linearize,
@@ -116,12 +118,18 @@ class PaperPrograms:
 
     def _accelerations(self) -> Program:
         """Accelerations of base and joints by the Schur complement (21), (22)."""
+        return self._schur("accelerations", 0)
 
+    def _refined_accelerations(self) -> Program:
+        """The same, with the digits that the Schur complement has lost."""
+        return self._schur("refined_accelerations", 1)
+
+    def _schur(self, name: str, refinements: int) -> Program:
         def outputs(x: Scalars, u: Scalars) -> dict[str, Scalars]:
-            ydot, _ = newton_euler.solve_schur(self.field.chain, self.field.system(x, u))
+            ydot, _ = newton_euler.solve_schur(self.field.chain, self.field.system(x, u), refinements)
             return {"accelerations": self.field.free_accelerations(x, ydot)}
 
-        return self._of_state_and("accelerations", outputs, u=self.field.n_u)
+        return self._of_state_and(name, outputs, u=self.field.n_u)
 
     def _free_accelerations(self) -> Program:
         return self._of_state_and(

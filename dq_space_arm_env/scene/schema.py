@@ -86,6 +86,12 @@ class Simulation(Model):
         description="numbers that the machine code computes with: 'float64', or 'float32', about twice as "
         "fast in batches and right to six digits",
     )
+    formulation: Literal["articulated_body", "minimal_coordinates"] | None = Field(
+        default=None,
+        description="how accelerations are solved for: 'articulated_body', joint by joint, or "
+        "'minimal_coordinates', with the mass matrix, where a base lighter than its arm loses digits; "
+        "absent: the faster one, which is articulated_body unless the integrator keeps the momentum",
+    )
     rtol: Positive | None = Field(
         default=None,
         description="relative tolerance of an adaptive integrator, of velocities and, in rad and m, of pose "

@@ -1,6 +1,7 @@
 """Both formulations against Pinocchio on random chains: accelerations, reactions, kinematics, invariants."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,10 @@ import pytest
 
 from dq_space_arm_env.algebra import poses, vectors
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
-from dq_space_arm_env.dynamics.minimal import Accelerations, MassMatrix
+from dq_space_arm_env.dynamics.articulated_body import ArticulatedBodies
+from dq_space_arm_env.dynamics.forward import forward_dynamics
+from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
+from dq_space_arm_env.dynamics.minimal import Accelerations
 
 pin = pytest.importorskip("pinocchio")
 
@@ -64,25 +68,22 @@ def pinocchio_accelerations(case):
     return np.array([*a[3:6], *a[:3], *a[6:]])
 
 
-def minimal_accelerations(case):
+def accelerations(case, inertia_at):
+    """Dual accelerations of base and joints, given how a formulation's inertia is made of rotations."""
     chain = case.chain
     rotations = minimal.joint_rotations(chain, case.angles)
-    rest = Accelerations(ZERO, ZERO, [0.0] * len(chain.links))
-    bias = minimal.inverse_dynamics(chain, rotations, case.angular, case.rates, rest)
-    force, torque, joints = case.force, case.torque, case.motors
+    acting = [(case.force, case.torque), *[(ZERO, ZERO)] * len(chain.links)]
     if chain.tip_wrench is not None:
-        tip = minimal.tip_wrench_forces(
-            chain, rotations, *twin.tip_in_last_link(chain, case.wrist), chain.tip_wrench
-        )
-        force, torque = vectors.add(force, tip.force), vectors.add(torque, tip.torque)
-        joints = [a + b for a, b in zip(joints, tip.joints, strict=True)]
-    solved = MassMatrix(chain, rotations).solve(
-        vectors.subtract(force, bias.force),
-        vectors.subtract(torque, bias.torque),
-        [a - b for a, b in zip(joints, bias.joints, strict=True)],
-    )
+        tip, wrench = twin.tip_in_last_link(chain, case.wrist), chain.tip_wrench
+        acting[-1] = minimal.shift_wrench(*tip, wrench[:3], wrench[3:])
+    inertia = inertia_at(chain, rotations)
+    solved = forward_dynamics(chain, inertia, rotations, case.angular, case.rates, acting, case.motors)
     linear = vectors.subtract(solved.linear, vectors.cross(case.angular, case.linear))
     return np.array([*solved.angular, *linear, *solved.joints], dtype=float)
+
+
+def minimal_accelerations(case):
+    return accelerations(case, MassMatrix)
 
 
 def paper_state(case):
@@ -121,6 +122,17 @@ def test_minimal_coordinates_agree_with_pinocchio(joints, wrench):
         case = random_case(joints, seed, wrench and joints > 0)
         errors.append(relative_error(minimal_accelerations(case), pinocchio_accelerations(case)))
     assert max(errors) < 1e-12
+
+
+@pytest.mark.parametrize("wrench", [False, True])
+@pytest.mark.parametrize("joints", range(8))
+def test_articulated_bodies_agree_with_pinocchio_from_every_root(joints, wrench):
+    for seed in range(SAMPLES):
+        case = random_case(joints, seed, wrench and joints > 0)
+        expected = pinocchio_accelerations(case)
+        for root in range(joints + 1):
+            found = accelerations(case, partial(ArticulatedBodies, root=root))
+            assert relative_error(found, expected) < 1e-12
 
 
 @pytest.mark.parametrize("wrench", [False, True])

@@ -147,7 +147,8 @@ def test_derivatives_cost_more_than_the_step_and_the_step_does_not_pay(report: S
     by_name = {program.name: program.operations for program in report.outputs}
     assert step < by_name["linearize"] < by_name["lagrangian_hessian"]
     assert by_name["tip_pose"] < step
-    assert by_name["forward_dynamics"] <= by_name["reaction_wrenches"]
+    # Reactions need the accelerations, all but the turning of the base's axes: omega x v in the plane.
+    assert by_name["forward_dynamics"] - 4 <= by_name["reaction_wrenches"]
 
 
 def test_the_default_scenes_are_those_of_the_effort(monkeypatch: pytest.MonkeyPatch) -> None:

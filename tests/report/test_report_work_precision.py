@@ -27,8 +27,8 @@ from experts.report.work_precision.choices import (
 )
 from experts.report.work_precision.effort import QUICK
 from experts.report.work_precision.formulations import (
-    ARTICULATED,
     LIMITS,
+    PINOCCHIO,
     Formulation,
     Formulations,
     measure_formulations,
@@ -301,10 +301,11 @@ def test_the_whole_system_20_and_its_schur_complement_give_the_accelerations(sce
 def test_formulations_agree_within_their_precision() -> None:
     found = measure_formulations(SHORT)
     assert found.reference_agreement < 1e-14
-    ours = [each for each in found.results if each.name != ARTICULATED]
-    assert [each.precision for each in ours] == ["float64"] * 3 + ["float32"] * 3
+    ours = [each for each in found.results if each.name != PINOCCHIO]
+    assert [each.precision for each in ours] == ["float64"] * 5 + ["float32"] * 5
     for each in found.results:
         assert 0.0 < each.median_error <= each.largest_error < LIMITS[each.precision]
+        assert 0.0 < each.backward_error <= each.largest_error
         assert each.single_ns is not None
         assert each.single_ns > 0.0
     assert min(each.largest_error for each in ours if each.precision == "float32") > 1e-9
@@ -314,7 +315,7 @@ def test_formulations_agree_within_their_precision() -> None:
 def test_shortcomings_name_what_is_inaccurate() -> None:
     slow = curve("slow", 4, *(point(0.1 / 2**k, 1e-4 / 4**k, 1.0) for k in range(6)))
     lost = replace(result(curve("lost", 4)), case="hopeless")
-    bad = Formulation("minimal coordinates", "float64", 1e-9, 1e-10, 1.0, 1.0)
+    bad = Formulation("minimal coordinates", "float64", 1e-9, 1e-10, 1e-11, 1.0, 1.0)
     formulations = Formulations("paper", 2, 0.0, (bad, replace(bad, largest_error=float("nan"))), ())
     found = WorkPrecision(SHORT, None, (result(slow), lost), formulations)
     assert [sentence.split(" ", 1)[1] for sentence in shortcomings(found)] == [
@@ -391,7 +392,7 @@ def test_without_pinocchio_the_references_say_so(monkeypatch: pytest.MonkeyPatch
     case = make_case("spin", 0.05)
     assert "our own" in reference_of(case).source
     found = measure_formulations(SHORT)
-    assert found.notes == ("Articulated body: left out, Pinocchio is not installed (pip install pin).",)
+    assert found.notes == ("Pinocchio's articulated body: left out, it is not installed (pip install pin).",)
 
 
 def test_a_lost_state_has_no_finite_error() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
 from dq_space_arm_env.dynamics.chain import Chain
 from experts.problem import FloatArray
 from experts.report.stability.references import Motion
+from experts.report.throughput.pinocchio_peer import PinocchioPeer
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +56,10 @@ class Sample:
         )
 
 
-def _compiled(sample: Sample) -> FloatArray:
-    return np.asarray(sample.kernels.forward_dynamics(sample.state, sample.control), dtype=np.float64)
-
-
-def _single_precision(sample: Sample) -> FloatArray:
-    simulation = {**sample.scene.simulation.model_dump(), "precision": "float32"}
-    kernels = compile_scene(sample.scene.replace(simulation=simulation))
-    return np.asarray(kernels.forward_dynamics(sample.state, sample.control), dtype=np.float64)
+def _compiled(sample: Sample, **simulation: str) -> FloatArray:
+    changed = sample.scene.replace(simulation={**sample.scene.simulation.model_dump(), **simulation})
+    found = compile_scene(changed).forward_dynamics(sample.state, sample.control)
+    return np.asarray(found, dtype=np.float64)
 
 
 def _system(sample: Sample) -> tuple[newton_euler.NewtonEulerSystem, newton_euler.JointFrames]:
@@ -87,9 +86,9 @@ def _from_duals(sample: Sample, frames: newton_euler.JointFrames, duals: FloatAr
     return np.array([*bodies[0][1:4], *bodies[0][5:8], *joints])
 
 
-def _schur(sample: Sample) -> FloatArray:
+def _schur(sample: Sample, refinements: int = 0) -> FloatArray:
     system, frames = _system(sample)
-    accelerations, _ = newton_euler.solve_schur(sample.chain, system)
+    accelerations, _ = newton_euler.solve_schur(sample.chain, system, refinements)
     return _from_duals(sample, frames, np.array(accelerations))
 
 
@@ -102,15 +101,30 @@ def _dense(sample: Sample) -> FloatArray:
     return _from_duals(sample, frames, solution[:count])
 
 
+def _pinocchio(sample: Sample) -> FloatArray:
+    peer = PinocchioPeer(sample.kernels, sample.chain)
+    return np.asarray(peer.accelerations(sample.state[None], sample.control[None])[0])
+
+
+ARTICULATED = "articulated body"
+SINGLE = "articulated body, float32"
 MINIMAL = "minimal coordinates"
-SINGLE = "minimal coordinates, float32"
+MINIMAL_SINGLE = "minimal coordinates, float32"
 SCHUR = "Schur complement (21)-(22)"
+REFINED = "Schur complement, refined"
 DENSE = "47x47 system (20)"
+PINOCCHIO = "articulated body, Pinocchio"
 
 FORMULATIONS: dict[str, Callable[[Sample], FloatArray]] = {
-    MINIMAL: _compiled,
-    SINGLE: _single_precision,
+    ARTICULATED: partial(_compiled, formulation="articulated_body"),
+    SINGLE: partial(_compiled, formulation="articulated_body", precision="float32"),
+    MINIMAL: partial(_compiled, formulation="minimal_coordinates"),
+    MINIMAL_SINGLE: partial(_compiled, formulation="minimal_coordinates", precision="float32"),
     SCHUR: _schur,
+    REFINED: partial(_schur, refinements=1),
     DENSE: _dense,
 }
 """Accelerations by each formulation: base angular [rad/s^2], linear [m/s^2], joints [rad/s^2], (6 + n,)."""
+
+if find_spec("pinocchio") is not None:
+    FORMULATIONS[PINOCCHIO] = _pinocchio

@@ -8,7 +8,15 @@ from functools import partial
 import numpy as np
 
 from dq_space_arm_env import Scene, load_scene
-from experts.report.stability.formulations import FORMULATIONS, MINIMAL, SCHUR, SINGLE, Sample
+from experts.report.stability.formulations import (
+    FORMULATIONS,
+    MINIMAL,
+    MINIMAL_SINGLE,
+    PINOCCHIO,
+    SCHUR,
+    SINGLE,
+    Sample,
+)
 from experts.report.stability.references import Errors, errors, linear_system
 from experts.report.stability.rows import Case, Effort, Handled, NotClaimed, Outcome, Refused, refusal
 from experts.report.stability.scenes import random_state, with_base, with_links, with_mass_ratio
@@ -17,9 +25,10 @@ GROUP = "masses"
 BACKWARD, FORWARD = "backward error", "forward error"
 
 BACKWARD_BOUND = 1e-12
-ROUNDING = {SINGLE: float(np.finfo(np.float32).eps / np.finfo(np.float64).eps)}
+_COARSER = float(np.finfo(np.float32).eps / np.finfo(np.float64).eps)
+ROUNDING = {SINGLE: _COARSER, MINIMAL_SINGLE: _COARSER}
 """How much coarser a formulation rounds than double precision does."""
-SMALLEST_RATIO = {SINGLE: 1e-2}
+SMALLEST_RATIO = {MINIMAL_SINGLE: 1e-2}
 """Lightest base, in arm masses, whose accelerations a formulation claims to give with three digits."""
 BY_ROW_BOUNDS = {SCHUR: 1e-10}
 """Bounds of the row-wise backward error over mass ratios, where they are not 1e-11, in double precision.
@@ -31,14 +40,22 @@ NEEDLE_BOUNDS = {SCHUR: 1e-7}
 """Bounds for needles, where they are not 1e-12.
 
 The entries of the Schur complement are as large as 1 over the smallest moment, and cancel in the
-accelerations: as many digits are lost as the ratio has.
+accelerations: as many digits are lost as the ratio has. The system itself does not cancel: solved once more
+for its residual, it gives all of them back.
 """
-FORWARD_BOUNDS = {MINIMAL: 1e-8, SINGLE: 1e-3}
+FORWARD_BOUNDS = {MINIMAL: 1e-8, MINIMAL_SINGLE: 1e-3, PINOCCHIO: 1e-8, SINGLE: 1e-5}
 """Bounds of the forward error, where they are not 1e-12.
 
 In minimal coordinates the entries of the mass matrix are sums over all bodies, in which a light base is lost
-in the rounding of a heavy arm: eps over the mass ratio. Redundant coordinates never add up the bodies.
+in the rounding of a heavy arm: eps over the mass ratio. An articulated-body algorithm that ends at the base,
+like Pinocchio's, adds the arm to the base and loses as much. Ours ends at the heaviest body: light ones are
+added to heavy ones, after the joint between them has been eliminated, never the other way round. Redundant
+coordinates never add up the bodies.
 """
+PAYLOAD_BOUNDS = {**FORWARD_BOUNDS, SCHUR: 1e-11}
+"""The same for a payload that outweighs the robot."""
+HEAVY = 1e6
+"""How many times heavier the heavy payload is than the one of its scene."""
 
 
 def cases() -> Iterator[Case]:
@@ -54,11 +71,13 @@ def cases() -> Iterator[Case]:
         for what, scene in (("links", _with_needles(needle)), ("base", _with_needle_base(needle))):
             title, run = f"needle {what}, inertia ratio 1e-8", partial(_inertias, scene, name)
             yield Case(GROUP, title, name, criterion, run, bound, "1")
-    smallest = SMALLEST_RATIO[SINGLE]
+        if name not in SMALLEST_RATIO:
+            yield _heavy_payload(name)
+    smallest = SMALLEST_RATIO[MINIMAL_SINGLE]
     yield Case(
         GROUP,
         f"base to arm mass below {smallest:g}, {FORWARD}",
-        SINGLE,
+        MINIMAL_SINGLE,
         "not claimed: the mass matrix has no digits left; finite",
         _light_base,
     )
@@ -66,11 +85,14 @@ def cases() -> Iterator[Case]:
 
 
 def _light_base(effort: Effort) -> Outcome:
-    light = [ratio for ratio in effort.mass_ratios if ratio < SMALLEST_RATIO[SINGLE]]
+    light = [ratio for ratio in effort.mass_ratios if ratio < SMALLEST_RATIO[MINIMAL_SINGLE]]
     found = [
         (
             ratio,
-            max(judge(sample, SINGLE).forward for sample in samples(with_mass_ratio(ratio), effort.samples)),
+            max(
+                judge(sample, MINIMAL_SINGLE).forward
+                for sample in samples(with_mass_ratio(ratio), effort.samples)
+            ),
         )
         for ratio in light
     ]
@@ -106,6 +128,27 @@ def _mass_ratios(formulation: str, measure: str) -> Case:
     name = f"base to arm mass 1e-6 to 1e6, {measure}"
     run = partial(_ratios, formulation, measure)
     return Case(GROUP, name, formulation, criterion, run, bound, "1")
+
+
+def _heavy_payload(formulation: str) -> Case:
+    bound = PAYLOAD_BOUNDS.get(formulation, 1e-12)
+    criterion = f"error of the accelerations against 50 digits below {bound:g}"
+    run = partial(_forward, _with_heavy_payload, formulation)
+    return Case(GROUP, f"payload of {HEAVY:g} times its mass", formulation, criterion, run, bound, "1")
+
+
+def _with_heavy_payload() -> Scene:
+    scene = load_scene("payload")
+    if scene.payload is None:
+        raise ValueError("scene payload: its payload is missing")
+    inertia = (HEAVY * np.array(scene.payload.inertia)).tolist()
+    fields = {**scene.payload.model_dump(), "mass": HEAVY * scene.payload.mass, "inertia": inertia}
+    return scene.replace(payload=fields)
+
+
+def _forward(scene: Callable[[], Scene], formulation: str, effort: Effort) -> Outcome:
+    found = [judge(sample, formulation) for sample in samples(scene(), effort.samples)]
+    return Handled(max(e.forward for e in found), f"backward error {max(e.backward for e in found):.1e}")
 
 
 def samples(scene: Scene, count: int, scale: float = 1.0) -> list[Sample]:

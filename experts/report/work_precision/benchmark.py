@@ -10,8 +10,8 @@ from experts.report.work_precision.cases import DEFAULT_ACCURACY, make_case, sce
 from experts.report.work_precision.choices import integrators_of, order_of, own_choice
 from experts.report.work_precision.effort import Effort
 from experts.report.work_precision.formulations import (
-    ARTICULATED,
     LIMITS,
+    PINOCCHIO,
     Formulations,
     measure_formulations,
 )
@@ -112,7 +112,7 @@ def shortcomings(found: WorkPrecision) -> list[str]:
     if found.formulations is not None:
         for result in found.formulations.results:
             limit = LIMITS[result.precision]
-            if result.name != ARTICULATED and not result.largest_error <= limit:
+            if result.name != PINOCCHIO and not result.largest_error <= limit:
                 sentences.append(
                     f"{result.name} in {result.precision}: relative error {result.largest_error:.1e} of "
                     f"accelerations; it should be below {limit:g}."

@@ -8,17 +8,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import mpmath
 import numpy as np
 
-from dq_space_arm_env import Kernels, load_scene
+from dq_space_arm_env import Kernels, Scene, load_scene
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
 from dq_space_arm_env.kernels.paper_programs import PaperPrograms
 from dq_space_arm_env.kernels.programs import ScenePrograms
 from experts.problem import FloatArray
+from experts.report.stability.formulations import Sample
+from experts.report.stability.references import errors, linear_system
 from experts.report.throughput.kernels import sample_states
 from experts.report.throughput.pinocchio_peer import PinocchioPeer
 from experts.report.throughput.timing import DYNAMICS, FLOAT32, FLOAT64, OURS, Case, Subject, time_cases
@@ -26,8 +28,10 @@ from experts.report.throughput.variants import Variant
 from experts.report.work_precision.effort import Effort
 from experts.report.work_precision.many_digits import evaluate
 
-MINIMAL, SCHUR, DENSE = "minimal coordinates", "Schur complement (21)-(22)", "whole system (20), LU"
-ARTICULATED = "articulated body, Pinocchio"
+ARTICULATED, MINIMAL = "articulated body", "minimal coordinates"
+SCHUR, REFINED = "Schur complement (21)-(22)", "Schur complement, refined"
+DENSE = "whole system (20), LU"
+PINOCCHIO = "articulated body, Pinocchio"
 DIGITS = 50
 LIMITS = {FLOAT64: 1e-12, FLOAT32: 1e-3}
 """Largest relative error of our accelerations; beyond it accuracy has regressed."""
@@ -43,6 +47,7 @@ class Formulation:
         precision: Name of the floating-point type.
         largest_error: Over the states, relative to the norm of the accelerations.
         median_error: The same.
+        backward_error: Largest over the states of |M a - f| / (|M| |a| + |f|), in infinity norms.
         single_ns: Time of a call for one state, ns; None where it is only called in batches.
         batch_ns: Time per state of a batch of 1024 on one core, ns; None where it takes no batches.
     """
@@ -51,6 +56,7 @@ class Formulation:
     precision: str
     largest_error: float
     median_error: float
+    backward_error: float
     single_ns: float | None
     batch_ns: float | None
 
@@ -62,7 +68,7 @@ class Formulations:
     Attributes:
         scene: Name of its scene.
         states: Number of states whose accelerations are compared.
-        reference_agreement: Largest relative difference of the reference from minimal coordinates with as
+        reference_agreement: Largest relative difference of the reference from the articulated body with as
             many digits: both have the same equations.
         results: Each formulation in each precision.
         notes: What is left out.
@@ -90,27 +96,27 @@ def measure_formulations(effort: Effort, scene_name: str = "paper") -> Formulati
     x, u = _representable(*sample_states(kernels, effort.states))
     many = _representable(*sample_states(kernels, _BATCH))
     right, agreement = _reference(kernels, x, u)
+    judge = _Judge(kernels, x, u, right)
     results: list[Formulation] = []
     notes: list[str] = []
     for precision in (FLOAT64, FLOAT32):
-        variant = Variant(precision).compile(scene)
-        for name, kind in ((MINIMAL, _Minimal), (SCHUR, _Schur), (DENSE, _Dense)):
-            way = kind(variant)
+        for name, kind in _KINDS.items():
+            way = kind(_compiled(scene, precision, kind.formulation))
             values = way.accelerations(*way.arguments(x, u))
             counts = (1, _BATCH)
             runs = [way.runner(*way.arguments(*(array[:count] for array in many))) for count in counts]
             times = _times(runs, counts, effort)
-            results.append(_result(name, precision, values, right, *times))
+            results.append(judge.result(name, precision, values, *times))
     try:
         peer = PinocchioPeer(kernels, Chain.from_scene(scene))
     except ImportError:
-        notes.append("Articulated body: left out, Pinocchio is not installed (pip install pin).")
+        notes.append("Pinocchio's articulated body: left out, it is not installed (pip install pin).")
     else:
         cases = peer.cases(*many)
         timings = time_cases(cases, effort.timing)
         batch = timings[1].best_ns if len(timings) > 1 else None
         values = peer.accelerations(x, u)
-        results.append(_result(ARTICULATED, FLOAT64, values, right, timings[0].best_ns, batch))
+        results.append(judge.result(PINOCCHIO, FLOAT64, values, timings[0].best_ns, batch))
     return Formulations(scene.name, len(x), agreement, tuple(results), tuple(notes))
 
 
@@ -126,20 +132,39 @@ def _times(runs: Sequence[Callable[[], object]], counts: Sequence[int], effort: 
     return [timing.best_ns for timing in time_cases(cases, effort.timing)]
 
 
-def _result(
-    name: str,
-    precision: str,
-    values: FloatArray,
-    right: FloatArray,
-    single_ns: float | None,
-    batch_ns: float | None,
-) -> Formulation:
-    error = np.linalg.norm(values.astype(FLOAT64) - right, axis=1) / np.linalg.norm(right, axis=1)
-    return Formulation(name, precision, float(error.max()), float(np.median(error)), single_ns, batch_ns)
+def _compiled(scene: Scene, precision: str, formulation: str) -> Kernels:
+    simulation = {**scene.simulation.model_dump(), "formulation": formulation}
+    return Variant(precision).compile(scene.replace(simulation=simulation))
 
 
-class _Minimal:
-    """Minimal coordinates, the default."""
+class _Judge:
+    """The accelerations of some states with 50 digits, by which those of all formulations are judged."""
+
+    def __init__(self, kernels: Kernels, x: FloatArray, u: FloatArray, right: FloatArray) -> None:
+        chain = Chain.from_scene(kernels.scene)
+        samples = [Sample(kernels.scene, kernels, chain, *row) for row in zip(x, u, strict=True)]
+        self._right, self._motions = right, [sample.motion for sample in samples]
+        self._systems = [linear_system(chain, motion) for motion in self._motions]
+
+    def result(
+        self, name: str, precision: str, values: FloatArray, single_ns: float | None, batch_ns: float | None
+    ) -> Formulation:
+        """A formulation with its errors and times."""
+        values = values.astype(FLOAT64)
+        error = np.linalg.norm(values - self._right, axis=1) / np.linalg.norm(self._right, axis=1)
+        backward = max(
+            errors(system, motion, row).backward
+            for system, motion, row in zip(self._systems, self._motions, values, strict=True)
+        )
+        return Formulation(
+            name, precision, float(error.max()), float(np.median(error)), backward, single_ns, batch_ns
+        )
+
+
+class _Articulated:
+    """The articulated-body algorithm, the default."""
+
+    formulation: ClassVar[str] = "articulated_body"
 
     def __init__(self, kernels: Kernels) -> None:
         self.kernels, self.dtype = kernels, kernels.dtype
@@ -165,7 +190,13 @@ class _Minimal:
         return call.of_one_row() if len(x) == 1 else partial(call, len(x))
 
 
-class _Schur(_Minimal):
+class _Minimal(_Articulated):
+    """The mass matrix in minimal coordinates."""
+
+    formulation = "minimal_coordinates"
+
+
+class _Schur(_Articulated):
     """The reaction wrenches first (21), then the dual accelerations (22)."""
 
     def arguments(self, x: FloatArray, u: FloatArray) -> tuple[Any, Any]:
@@ -174,6 +205,13 @@ class _Schur(_Minimal):
 
     def kernel(self, lanes: int | None) -> BoundKernel:
         return self.kernels.paper_kernel("accelerations", lanes=lanes)
+
+
+class _Refined(_Schur):
+    """The same, solved once more for the residual."""
+
+    def kernel(self, lanes: int | None) -> BoundKernel:
+        return self.kernels.paper_kernel("refined_accelerations", lanes=lanes)
 
 
 class _Dense(_Schur):
@@ -192,6 +230,15 @@ class _Dense(_Schur):
         return lambda: _solved(*_outputs(kernel, x, u))
 
 
+_KINDS: dict[str, type[_Articulated]] = {
+    ARTICULATED: _Articulated,
+    MINIMAL: _Minimal,
+    SCHUR: _Schur,
+    REFINED: _Refined,
+    DENSE: _Dense,
+}
+
+
 def _outputs(kernel: BoundKernel, *inputs: Any) -> list[Any]:
     """A kernel applied to rows."""
     ordered = [np.ascontiguousarray(array) for array in inputs]
@@ -206,11 +253,11 @@ def _solved(matrix: Any, right: Any) -> Any:
 
 
 def _reference(kernels: Kernels, x: FloatArray, u: FloatArray) -> tuple[FloatArray, float]:
-    """Accelerations from (20) with 50 digits, and how far minimal coordinates are from them with as many."""
+    """Accelerations from (20) with 50 digits, and how far the articulated body is from them with as many."""
     paper = PaperPrograms(kernels.scene)
     names = ("from_minimal", "system", "free_accelerations")
     redundant, system, free = (paper.build(name).calls[0].graph for name in names)
-    minimal = ScenePrograms(kernels.scene).build("forward_dynamics").calls[0].graph
+    articulated = ScenePrograms(kernels.scene).build("forward_dynamics").calls[0].graph
     right, differences = [], []
     with mpmath.workdps(DIGITS):
         for state, inputs in zip(x.tolist(), u.tolist(), strict=True):
@@ -220,7 +267,7 @@ def _reference(kernels: Kernels, x: FloatArray, u: FloatArray) -> tuple[FloatArr
             rows = mpmath.matrix([matrix[n * row : n * row + n] for row in range(n)])
             solution = list(mpmath.lu_solve(rows, mpmath.matrix(wrenches)))
             (values,) = evaluate(free, y, solution[: dict(free.inputs)["ydot"]])
-            (others,) = evaluate(minimal, state, inputs)
+            (others,) = evaluate(articulated, state, inputs)
             gap = mpmath.norm([a - b for a, b in zip(values, others, strict=True)]) / mpmath.norm(values)
             right.append([float(entry) for entry in values])
             differences.append(float(gap))

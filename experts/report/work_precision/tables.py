@@ -64,7 +64,7 @@ def notes(found: WorkPrecision) -> list[str]:
         sentences.append(f"{case.title}: reference {case.reference}{trust}.")
     if found.formulations is not None:
         sentences.append(
-            f"Accelerations: reference, (20) with 50 digits; minimal coordinates with as many digits are "
+            f"Accelerations: reference, (20) with 50 digits; the articulated body with as many is "
             f"{found.formulations.reference_agreement:.0e} from it, for constants are rounded."
         )
         sentences += found.formulations.notes
@@ -186,13 +186,14 @@ def _scenes_table(scenes: Iterable[CaseResult]) -> TextTable:
 def _formulations_table(found: Formulations) -> TextTable:
     return TextTable(
         f"Accelerations in scene {found.scene}: relative error in {found.states} states, and time",
-        ("", "precision", "largest\nerror", "median\nerror", "ns,\none", "ns,\nof 1024"),
+        ("", "precision", "largest\nerror", "median\nerror", "backward\nerror", "ns,\none", "ns,\nof 1024"),
         tuple(
             (
                 result.name,
                 result.precision,
                 f"{result.largest_error:.1e}",
                 f"{result.median_error:.1e}",
+                f"{result.backward_error:.1e}",
                 "-" if result.single_ns is None else three_digits(result.single_ns),
                 "-" if result.batch_ns is None else three_digits(result.batch_ns),
             )

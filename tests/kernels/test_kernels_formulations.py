@@ -1,0 +1,114 @@
+"""Every kernel by one formulation of the dynamics and by the other."""
+
+import numpy as np
+import pytest
+from test_kernels_odd_scenes import ODD
+
+from dq_space_arm_env import compile_scene, list_scenes, load_scene
+from dq_space_arm_env.environment import DQSpaceArmEnv
+from dq_space_arm_env.kernels.programs import ScenePrograms
+from dq_space_arm_env.scene.schema import Simulation
+
+BOTH = ("articulated_body", "minimal_coordinates")
+DEFAULT = None  # the articulated body, unless the integrator keeps the momentum
+DIFFERENTIATED = ("paper", "planar")
+
+
+def by(scene, formulation, **changes):
+    simulation = {**scene.simulation.model_dump(), "formulation": formulation, **changes}
+    return scene.replace(simulation=simulation)
+
+
+def assert_close(found, expected, bound=1e-12):
+    assert np.linalg.norm(found - expected) <= bound * np.linalg.norm(expected)
+
+
+def both(draw, scene, count):
+    """Kernels of the default and of the mass matrix, states and inputs."""
+    kernels, states, inputs = draw(scene, count)
+    return [kernels, compile_scene(by(scene, "minimal_coordinates"))], states, inputs
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_accelerations_and_reactions_agree_to_1e_12(name, draw):
+    kernels, states, inputs = both(draw, load_scene(name), 10)
+    for function in ("forward_dynamics", "reaction_wrenches"):
+        found, expected = (getattr(each, function)(states, inputs) for each in kernels)
+        for row, right in zip(found, expected, strict=True):
+            assert_close(row, right)
+
+
+@pytest.mark.parametrize("name", list(ODD))
+def test_odd_scenes_agree_to_1e_12(name, draw):
+    kernels, states, inputs = both(draw, ODD[name], 5)
+    found, expected = (each.forward_dynamics(states, inputs) for each in kernels)
+    assert_close(found, expected)
+
+
+@pytest.mark.parametrize(
+    "name", [s if s in DIFFERENTIATED else pytest.param(s, marks=pytest.mark.slow) for s in list_scenes()]
+)
+def test_derivatives_of_a_step_agree_to_1e_12(name, draw):
+    kernels, states, inputs = both(draw, load_scene(name), 3)
+    found, expected = (each.linearize(states, inputs) for each in kernels)
+    for ours, right in zip(found, expected, strict=True):
+        assert_close(ours, right)
+
+
+def test_second_derivatives_agree(draw):
+    kernels, states, inputs = both(draw, load_scene("planar"), 1)
+    multiplier, h = np.ones(kernels[0].n_t), np.array([0.1])
+    arguments = {"x": states[0], "u": inputs[0], "multiplier": multiplier, "h": h}
+    found, expected = (each._call("lagrangian_hessian", "rk4", **arguments) for each in kernels)
+    for ours, right in zip(found, expected, strict=True):
+        assert_close(ours, right, 1e-11)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "other"),
+    [
+        ("dormand_prince", "minimal_coordinates"),
+        ("momentum_rk4", "articulated_body"),
+        pytest.param("rodas4", "minimal_coordinates", marks=pytest.mark.slow),
+        pytest.param("momentum_rosenbrock", "articulated_body", marks=pytest.mark.slow),
+    ],
+)
+def test_steps_of_other_methods_agree_to_1e_12(integrator, other, draw):
+    """The default is compared with the formulation that it is not."""
+    scene = load_scene("paper")
+    kernels, states, inputs = draw(scene, 3)
+    found = kernels.step(states, inputs, integrator=integrator)
+    expected = compile_scene(by(scene, other)).step(states, inputs, integrator=integrator)
+    assert_close(found, expected)
+
+
+def test_environments_that_draw_masses_agree():
+    scenes = [by(load_scene("random-masses"), each) for each in (DEFAULT, "minimal_coordinates")]
+    environments = [DQSpaceArmEnv(scene) for scene in scenes]
+    observations = [env.reset(seed=5)[0] for env in environments]
+    for _ in range(3):
+        np.testing.assert_allclose(*observations, rtol=1e-11, atol=1e-11)
+        action = 0.5 * np.ones(environments[0].action_space.shape)
+        observations = [env.step(action)[0] for env in environments]
+
+
+def operations(scene, program, integrator="", **changes):
+    return (
+        ScenePrograms(scene.replace(simulation={**scene.simulation.model_dump(), **changes}))
+        .build(program, integrator)
+        .operation_count
+    )
+
+
+@pytest.mark.parametrize("name", ["paper", "planar", "six-joint"])
+def test_without_a_choice_it_is_the_one_with_fewer_operations(name):
+    scene = load_scene(name)
+    for program, integrator in (("forward_dynamics", ""), ("step", "rk4"), ("step", "momentum_rk4")):
+        counts = [operations(scene, program, integrator, formulation=each) for each in BOTH]
+        assert operations(scene, program, integrator) == min(counts)
+        assert counts[0] != counts[1]
+
+
+def test_an_unknown_formulation_is_refused_by_the_scene():
+    with pytest.raises(ValueError, match="articulated_body"):
+        Simulation(formulation="articulated")
