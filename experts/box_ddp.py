@@ -8,10 +8,12 @@ guess of the states, a solve begins by multiple shooting (`multiple_shooting`).
 
 **When it has converged.** The measure is the decrease of the cost that a full, undamped step promises,
 relative to the cost. It does not change with the units of states, controls or cost, it accounts for the
-bounds, and it is zero exactly at a point that satisfies the first-order conditions. A small decrease of the
-cost is no such sign: damping or a plateau of a curved problem make steps small far from any minimum. Where
-there are exact second derivatives the step is Newton's, which exists only if they are positive definite: a
-saddle does not pass, nor does a valley whose floor Gauss-Newton takes for steeper than it is.
+bounds, and it is zero exactly at a point that satisfies the first-order conditions. A promise below what a
+rounding of the states is worth counts as zero: at the target, cost and gradient are nothing but rounding
+errors. A small decrease of the cost is no such sign: damping or a plateau of a curved problem make steps
+small far from any minimum. Where there are exact second derivatives the step is Newton's, which exists only
+if they are positive definite: a saddle does not pass, nor does a valley whose floor Gauss-Newton takes for
+steeper than it is.
 """
 
 from time import perf_counter
@@ -259,8 +261,11 @@ class BoxDDP:
         return False
 
     def _promise(self, progress: Progress, outcome: SweepOutcome) -> float:
-        """Relate the decrease that the full step promises to the cost."""
-        return outcome.promise(1.0) / progress.scale(self._work.current.cost)
+        """Relate the decrease that the full step promises to the cost; one that rounding hides is none."""
+        promised = outcome.promise(1.0)
+        if promised <= self._work.cost_rounding():
+            return 0.0
+        return promised / progress.scale(self._work.current.cost)
 
     def _record(
         self, progress: Progress, proposal: _Proposal, cost: float, alpha: float, started: float

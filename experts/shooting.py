@@ -207,6 +207,21 @@ class ShootingWorkspace:
             self.update, self._spare_update = self._spare_update, self.update
         return outcome
 
+    def cost_rounding(self) -> float:
+        """What the last digit of the states is worth: changes of the cost below it cannot be told from none.
+
+        The largest entry of a state stands for all, and half the trace of lxx for what random errors cost.
+
+        Returns:
+            Change of the cost if every tangent coordinate is off by a rounding, to second order, unit of the
+            cost; of the current trajectory, whose derivatives must be there.
+        """
+        d, states = self.derivatives, self.current.states
+        digits = np.finfo(np.float64).eps * np.abs(states).max(axis=1)
+        slopes = np.append(np.abs(d.lx).sum(axis=1), np.abs(d.terminal_lx).sum())
+        bends = np.append(np.einsum("kii->k", d.lxx), np.trace(d.terminal_lxx[0]))
+        return float(digits @ slopes + 0.5 * (digits * digits) @ bends)
+
     def restore_update(self) -> None:
         """Go back to the update before the last successful sweep."""
         self.update, self._spare_update = self._spare_update, self.update

@@ -15,6 +15,7 @@ __all__ = [
     "dexp_inverse",
     "exponential",
     "exponential_left_jacobian",
+    "exponential_minus_identity",
     "exponential_right_jacobian",
     "from_screw_parameters",
     "interpolate",
@@ -36,14 +37,34 @@ def exponential(twist: Components) -> DualQuaternion:
     Returns:
         Unit dual quaternion, shape (8,), dimensionless and m.
     """
+    scalar, _, rest = _exponential_parts(twist)
+    return (scalar, *rest)
+
+
+def exponential_minus_identity(twist: Components) -> DualQuaternion:
+    """Return exp(1/2 (xi_r + eps xi_d)) - 1, to all digits however small the twist.
+
+    Args:
+        twist: xi, rotation vector then translation-like vector, shape (6,), rad and m.
+
+    Returns:
+        Dual quaternion, shape (8,), dimensionless and m.
+    """
+    _, scalar_minus_one, rest = _exponential_parts(twist)
+    return (scalar_minus_one, *rest)
+
+
+def _exponential_parts(twist: Components) -> tuple[Scalar, Scalar, tuple[Scalar, ...]]:
+    """Return the first number of the exponential, the same less 1, and the seven others."""
     u = vectors.scale(0.5, dual_vectors.real_part(twist))
     w = vectors.scale(0.5, dual_vectors.dual_part(twist))
     # The half angle squared is the dual number u.u + 2 eps u.w; c0' = -c1 / 2, c1' = -(c2 - c3) / 2.
-    c0, c1, c2, c3, _, _ = stumpff(vectors.dot(u, u))
+    square = vectors.dot(u, u)
+    c0, c1, c2, c3, _, _ = stumpff(square)
     along = vectors.dot(u, w)
     real = vectors.scale(c1, u)
     dual = vectors.subtract(vectors.scale(c1, w), vectors.scale((c2 - c3) * along, u))
-    return (c0, real[0], real[1], real[2], -c1 * along, dual[0], dual[1], dual[2])
+    return c0, -square * c2, (*real, -c1 * along, *dual)
 
 
 def logarithm(q: Components) -> DualVector:

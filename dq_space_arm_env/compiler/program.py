@@ -126,9 +126,14 @@ class Program:
 
         Yields:
             Nothing.
+
+        Raises:
+            ValueError: If there is a loop inside.
         """
         begin = len(self.calls)
         yield
+        if any(loop.begin >= begin for loop in self.loops):
+            raise ValueError(f"program {self.name!r}: a loop inside a loop")
         self.loops.append(Loop(begin, len(self.calls), condition))
 
     @property
@@ -180,6 +185,40 @@ class Program:
             for name, numbers in used.items()
         }
 
+    def check_memory(self, starts: Mapping[str, int]) -> None:
+        """Make sure that the compiled calls find in memory what they should.
+
+        The functions of graphs promise LLVM that what they write lies apart from all else that they are given
+        (`noalias`): a call that breaks the promise gives wrong numbers without a word.
+
+        Args:
+            starts: Where each buffer begins, see `place`.
+
+        Raises:
+            ValueError: If a graph would write to memory that it also reads, or writes twice; or if a buffer
+                that starts as zero is written, so that the next rows would not find it zero.
+        """
+        sizes, zeroed = self.scratch_sizes(), self.read_before_written()
+        for number, call in enumerate(self.calls):
+            where = f"program {self.name!r}: call {number} of graph {call.graph.name!r}"
+            inputs, outputs = (
+                [call.bindings.get(name, name) for name, size in arrays if size]
+                for arrays in (call.graph.inputs, call.graph.outputs)
+            )
+            for position, written in enumerate(outputs):
+                if written in zeroed:
+                    raise ValueError(f"{where} writes buffer {written!r}, which starts as zero for all rows")
+                for other in (*inputs, *outputs[:position]):
+                    apart = (
+                        starts[written] + sizes[written] <= starts[other]
+                        or starts[other] + sizes[other] <= starts[written]
+                    )
+                    if not apart:
+                        raise ValueError(
+                            f"{where} writes buffer {written!r}, which shares memory with {other!r}, another "
+                            "of its arguments"
+                        )
+
 
 def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     """Add a program to a module as an external function of its name, with the graphs that it calls.
@@ -193,7 +232,7 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
         target: Lanes and instructions to use.
 
     Raises:
-        ValueError: If two calls disagree on the size of a buffer.
+        ValueError: If two calls disagree on the size of a buffer, or arguments of one share memory.
     """
     sizes, zeroed = program.scratch_sizes(), program.read_before_written()
     functions: dict[str, ir.Function] = {}
@@ -210,6 +249,7 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     # Each array's address, and the place on the stack of every buffer's vectors, stay fixed over the loop.
     arrays = _Arrays(builder, program, addresses)
     starts, total = place(sizes, program.lifetimes())
+    program.check_memory(starts)
     stack = builder.alloca(vectors.type, size=INDEX(max(total, 1)))
     stack.align = vectors.alignment
     blocks = {name: vectors.address(stack, start) for name, start in starts.items()}

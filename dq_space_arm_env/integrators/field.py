@@ -45,7 +45,7 @@ class PoseCoordinates:
         return spread(free, self.directions, 6)
 
     def moved(self, stored: Sequence[Scalar], increment: Sequence[Scalar]) -> list[Scalar]:
-        """Compose a pose with the exponential of a twist increment; rounding errors of the norm are removed.
+        """Compose a pose with the exponential of a twist increment, see `composed`.
 
         Args:
             stored: Stored numbers of the pose.
@@ -54,8 +54,7 @@ class PoseCoordinates:
         Returns:
             Stored numbers of q exp(increment / 2).
         """
-        pose = dual_quaternion.multiply(self.full(stored), screw.exponential(increment))
-        return self.reduced(nearly_unit(pose))
+        return self.reduced(composed(self.full(stored), screw.exponential_minus_identity(increment)))
 
 
 class VectorField(Protocol):
@@ -228,20 +227,31 @@ def spread(values: Sequence[Scalar], positions: Sequence[int], size: int) -> lis
     return result
 
 
-def nearly_unit(pose: Sequence[Scalar]) -> tuple[Scalar, ...]:
-    """Project a pose that is unit up to rounding errors back onto the unit dual quaternions, to first order.
+def composed(pose: Sequence[Scalar], change: Sequence[Scalar]) -> tuple[Scalar, ...]:
+    """Multiply a pose by another, and project the product onto the unit dual quaternions.
 
-    Without it, rounding errors of the products accumulate; one step of Newton's method for 1/sqrt(|q|^2)
-    removes them.
+    The projection is one step of Newton's method for 1/sqrt(|q|^2), a dual number near 1: errors of the
+    pose's norm are squared, those of rounding do not accumulate. It joins the change, which is added at the
+    end, so that each number is rounded once. Rounding the product, and then its projection, which is a matter
+    of the last digit, would err in the same direction step after step: by 4e-18 rad each, 4e-12 rad in a
+    million.
 
     Args:
         pose: Dual quaternion, 8 numbers, |q_r| = 1 and q_r . q_d = 0 up to small errors.
+        change: The other pose less 1, 8 numbers.
 
     Returns:
-        The projected dual quaternion, 8 numbers.
+        Unit dual quaternion pose (1 + change), 8 numbers.
     """
     real, dual = pose[:4], pose[4:]
-    scaling = 1.5 - 0.5 * quaternion.dot(real, real)[0]
+    # The product has the norm of the pose: the other one is a unit dual quaternion.
+    lengthening = 0.5 - 0.5 * quaternion.dot(real, real)[0]
     overlap = quaternion.dot(real, dual)[0]
-    unit = [scaling * entry for entry in real]
-    return (*unit, *(scaling * (d - overlap * r) for r, d in zip(real, dual, strict=True)))
+    # (1 + lengthening - eps overlap)(1 + change) - 1
+    factor = 1.0 + lengthening
+    first, *rest = (factor * entry for entry in change[:4])
+    shift = [
+        factor * d - overlap * r for r, d in zip((1.0 + change[0], *change[1:4]), change[4:], strict=True)
+    ]
+    step = dual_quaternion.multiply(pose, (first + lengthening, *rest, *shift))
+    return tuple(old + new for old, new in zip(pose, step, strict=True))

@@ -31,8 +31,8 @@ from dq_space_arm_env.compiler.symbols import matrix, symbols, zeros
 from dq_space_arm_env.integrators.field import (
     Integrator,
     VectorField,
+    composed,
     graph_inputs,
-    nearly_unit,
     split_state,
 )
 from dq_space_arm_env.integrators.momentum_coordinates import (
@@ -216,8 +216,9 @@ def _left(coordinates: MomentumCoordinates, x: Scalars, before: Scalars, state: 
     pose = coordinates.base.pose
     end = coordinates.y(state.shape, _ending(coordinates, state)[2], state.joint_rates)
     relative = _relative_pose(state, before, coordinates.balance.momentum(end)[2])
-    moved = dual_quaternion.multiply(pose.full(split_state(coordinates.base, x)[0]), relative)
-    return [*pose.reduced(nearly_unit(moved)), *end]
+    less_one = screw.exponential_minus_identity((*state.rotation, 0.0, 0.0, 0.0))[0]
+    moved = composed(pose.full(split_state(coordinates.base, x)[0]), (less_one, *relative[1:]))
+    return [*pose.reduced(moved), *end]
 
 
 def _linearized_left(

@@ -110,6 +110,19 @@ def test_exponential():
             assert error(q[4:], expected[4:], length(exact(twist[3:])) / 2) <= 4.0, twist
 
 
+def test_exponential_minus_identity():
+    """The scalar to 4 units of itself, however close cos to 1; the rest is that of the exponential."""
+    for twist in twists(ANGLES):
+        q = screw.exponential_minus_identity(twist)
+        assert q[1:] == screw.exponential(twist)[1:], twist
+        if any(twist[:3]):
+            scalar = -2 * mpmath.sin(length(exact(twist[:3])) / 4) ** 2
+            size = max(abs(scalar), mpmath.mpf(10) ** -300)  # below, doubles have fewer digits
+            assert error(q[:1], [scalar], size) <= 4.0, twist
+        else:
+            assert q[0] == 0.0
+
+
 def test_logarithm():
     """Rotation and translation each relative to itself, from 1e-307 rad up to and including pi."""
     for twist in twists(SHORT_ANGLES):

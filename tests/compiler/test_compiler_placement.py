@@ -4,7 +4,10 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from graph_interpreter import evaluate_program
 
+from dq_space_arm_env.compiler import native
+from dq_space_arm_env.compiler.build import assembly, build_program
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.placement import Lifetime, place
 from dq_space_arm_env.compiler.program import Buffer, Program
@@ -38,3 +41,124 @@ def test_what_starts_as_zero_keeps_its_memory():
     program.call(step, old="b", new="sum")
     lifetimes = program.lifetimes()
     assert all(lifetimes["zero"].overlaps(lifetimes[name]) for name in ("a", "b", "sum"))
+
+
+# What a call must not find --------------------------------------------------------------------------------
+
+
+def doubled(name="doubled"):
+    return trace(name, {"a": 3}, lambda a: {"b": [2.0 * entry for entry in a]})
+
+
+def build(program):
+    return assembly(program, 4)
+
+
+def test_a_call_must_not_write_what_it_reads():
+    """Arguments are noalias: LLVM may store before it loads."""
+    program = Program("in_place", [Buffer("x", 3)], [Buffer("x_next", 3)])
+    program.call(doubled(), a="x", b="x_next")
+    program.call(doubled(), a="x_next", b="x_next")
+    with pytest.raises(
+        ValueError, match=r"'in_place': call 1 of graph 'doubled' writes buffer 'x_next', whi"
+    ):
+        build(program)
+
+
+def test_a_call_must_not_write_a_buffer_twice():
+    both = trace("both", {"a": 3}, lambda a: {"b": a, "c": a})
+    program = Program("twice", [Buffer("x", 3)], [Buffer("y", 3)])
+    program.call(both, a="x", b="y", c="y")
+    with pytest.raises(ValueError, match="shares memory with 'y', another of its arguments"):
+        build(program)
+
+
+def test_a_call_may_read_a_buffer_twice():
+    product = trace(
+        "product", {"a": 3, "b": 3}, lambda a, b: {"c": [p * q for p, q in zip(a, b, strict=True)]}
+    )
+    program = Program("squares", [Buffer("x", 3)], [Buffer("y", 3)])
+    program.call(product, a="x", b="x", c="y")
+    assert "noalias" in build(program)
+
+
+def test_buffers_of_different_names_must_lie_apart_too():
+    """A wrong lifetime would be found out, whatever became of the names."""
+    program = Program("chain", [Buffer("x", 3)], [Buffer("z", 3)])
+    program.call(doubled(), a="x", b="y")
+    program.call(doubled(), a="y", b="z")
+    program.check_memory({"x": 0, "y": 3, "z": 0})
+    with pytest.raises(
+        ValueError, match="call 1 of graph 'doubled' writes buffer 'z', which shares memory w"
+    ):
+        program.check_memory({"x": 0, "y": 3, "z": 5})
+
+
+def test_what_starts_as_zero_must_stay_zero():
+    """Memory is cleared once, not for every block of rows."""
+    step = trace(
+        "step", {"a": 3, "old": 3}, lambda a, old: {"new": [p + q for p, q in zip(a, old, strict=True)]}
+    )
+    program = Program("sum", [Buffer("a", 3)], [Buffer("sum", 3)])
+    program.call(step, old="zero", new="sum")
+    program.call(doubled(), a="sum", b="zero")
+    with pytest.raises(ValueError, match="writes buffer 'zero', which starts as zero for all rows"):
+        build(program)
+
+
+def test_a_loop_inside_a_loop_is_refused():
+    program = Program("nested", [Buffer("x", 3)], [Buffer("y", 3)])
+
+    def nest():
+        with program.repeated_while("outer"):
+            program.call(doubled(), a="x", b="y")
+            with program.repeated_while("inner"):
+                program.call(doubled(), a="y", b="z")
+
+    with pytest.raises(ValueError, match="'nested': a loop inside a loop"):
+        nest()
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_random_programs_with_loops_compute_what_their_calls_say(seed, tmp_path, monkeypatch):
+    """Memory is reused wherever lifetimes allow; a buffer given up too early would change the numbers."""
+    monkeypatch.setenv("DQ_SPACE_ARM_CACHE", str(tmp_path))
+    rng = np.random.default_rng(seed)
+    program = random_program(rng)
+    x = rng.normal(size=(11, 3))
+    wanted = evaluate_program(program, {"x": x.T})["result"]
+    kernel = native.load_or_build(program.name, f"{program.name}-{seed}", lambda: build_program(program, 4))
+    result = np.zeros_like(x)
+    buffers = np.array([array.ctypes.data for array in (x, result)], dtype=np.int64)
+    kernel.function(0, len(x), buffers.ctypes.data)
+    np.testing.assert_allclose(result, np.array(wanted).T, rtol=1e-12)
+
+
+def random_program(rng):
+    """Some ten sums of two of the buffers before, some of them in a loop of three passes."""
+    program = Program("random_calls", [Buffer("x", 3)], [Buffer("result", 3)])
+
+    def mean(a, b):
+        return {"c": [0.6 * p - 0.5 * q + 0.1 for p, q in zip(a, b, strict=True)]}
+
+    def hand_on(last, left):
+        return {"carried": [0.5 * entry for entry in last], "fewer": [left[0] - 1.0]}
+
+    known = ["x"]
+
+    def append(count):
+        for _ in range(count):
+            a, b = map(str, rng.choice(known, 2))
+            known.append(f"b{len(known)}")
+            program.call(trace("mean", {"a": 3, "b": 3}, mean), a=a, b=b, c=known[-1])
+
+    append(rng.integers(1, 5))
+    program.call(trace("begin", {"x": 3}, lambda x: {"left": [3.0], "carried": x}))
+    known.append("carried")
+    with program.repeated_while("left"):
+        append(rng.integers(1, 5))
+        program.call(trace("hand_on", {"last": 3, "left": 1}, hand_on), last=known[-1])
+        program.call(trace("count", {"fewer": 1}, lambda fewer: {"left": fewer}))
+    append(rng.integers(1, 5))
+    program.call(trace("end", {"last": 3}, lambda last: {"result": last}), last=known[-1])
+    return program

@@ -220,6 +220,68 @@ def test_no_step_lowers_the_cost_of_a_wrong_model(double_integrator):
     assert solution.optimality > 1e-3
 
 
+@pytest.mark.parametrize("size", [1.0, 1e-12])
+def test_a_small_cost_does_not_make_a_wrong_model_converge(double_integrator, size):
+    """What counts as rounding goes with the states, so that a cost of 1e-24 has its digits too."""
+    problem = replace(double_integrator.problem(), initial_state=size * double_integrator.initial_state)
+    wrong = replace(problem, linearize=lambda x, u, h: (double_integrator.A, -double_integrator.B))
+    assert BoxDDP(problem).solve().converged
+    solution = BoxDDP(wrong).solve()
+    assert solution.stop_reason is StopReason.REGULARIZATION_LIMIT
+    assert solution.optimality > 1e-3
+
+
+# Nothing to do --------------------------------------------------------------------------------------------
+
+
+def test_a_cost_of_zero_is_a_minimum(system):
+    solution = BoxDDP(replace(system.problem(), initial_state=np.zeros(len(system.initial_state)))).solve()
+    assert solution.converged
+    assert solution.iterations == 0
+    assert solution.cost == solution.optimality == 0.0
+    np.testing.assert_allclose(solution.feedback_gains, riccati_gains(system)[0], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("offset", [1e-16, -3e-16])
+@pytest.mark.parametrize("initial_regularization", [0.0, 1000.0])
+def test_a_start_at_the_target_up_to_rounding_has_converged(unicycle, offset, initial_regularization):
+    """Cost and promise are rounding errors of equal size, 1e-30: their ratio says nothing."""
+    at_target = replace(unicycle, initial_state=np.array([1.0, 2.0 * offset, offset, -offset]))
+    solution = BoxDDP(at_target, initial_regularization=initial_regularization).solve()
+    assert 0.0 < solution.cost < 1e-28
+    assert solution.converged
+    assert solution.iterations == 0
+    assert np.all(solution.controls == 0.0)
+
+
+@pytest.mark.parametrize("offset", [1e-10, 1e-6])
+def test_a_start_near_the_target_is_still_solved(unicycle, offset):
+    near = replace(unicycle, initial_state=np.array([1.0, 0.0, offset, 0.0]))
+    before = BoxDDP(near, max_iterations=0).solve()
+    assert not before.converged
+    solution = BoxDDP(near).solve()
+    assert solution.converged
+    assert solution.iterations > 0
+    assert solution.cost < 0.5 * before.cost
+
+
+def test_a_promise_below_the_rounding_of_a_large_state_is_none(double_integrator):
+    """With x of 1e9 the cost of x - 1e9 is exact to (1e9 eps)^2 only."""
+    origin, Q, P = np.array([1e9, 0.0]), double_integrator.Q, double_integrator.P
+    shifted = replace(
+        double_integrator.problem(),
+        initial_state=origin + np.array([2e-7, 0.0]),
+        step=lambda x, u, h: origin + double_integrator.A @ (x - origin) + double_integrator.B @ u,
+        cost=lambda x, u: 0.5 * ((x - origin) @ Q @ (x - origin) + u @ double_integrator.R @ u),
+        terminal_cost=lambda x: 0.5 * (x - origin) @ P @ (x - origin),
+        cost_derivatives=lambda x, u: (Q @ (x - origin), double_integrator.R @ u, Q, double_integrator.R),
+        terminal_cost_derivatives=lambda x: (P @ (x - origin), P),
+    )
+    solution = BoxDDP(shifted).solve()
+    assert solution.converged
+    assert solution.cost > 0.0
+
+
 def test_cost_that_no_damping_makes_convex(double_integrator):
     problem = double_integrator.problem()
     concave = replace(

@@ -6,9 +6,10 @@ import pytest
 
 import dq_space_arm_env  # noqa: F401 - registers the environment
 from dq_space_arm_env import compile_scene, list_scenes, load_scene
-from experts import BoxDDP, StopReason
+from experts import BoxDDP, GuidedDDP, StopReason
 from experts.arm_problem import ArmProblem
 from experts.paper_problem import PaperProblem
+from experts.report.stability.expert import at_target
 
 COMPILED_ANYWAY = ("no-wrist", "paper", "planar")
 EVERY_SCENE = [
@@ -51,6 +52,20 @@ def test_the_papers_maneuver_is_solved_from_zero_controls(paper_solution):
     assert (np.diff(paper_solution.history["cost"]) <= 0.0).all()
     # Thrusters are dear: base forces stay at a few millinewtons.
     assert np.abs(paper_solution.controls[:, :3]).max() < 0.01
+
+
+AT_REST = [case for case in EVERY_SCENE if case.values[0] != "tumbling"]
+
+
+@pytest.mark.parametrize("solver", [BoxDDP, GuidedDDP])
+@pytest.mark.parametrize("scene", AT_REST)
+def test_a_start_at_the_target_has_converged(scene, solver):
+    """Cost and gradient are rounding errors there: nothing is left to do, and the result says so."""
+    solution = solver(at_target(ArmProblem(scene))).solve()
+    assert solution.converged, solution.message
+    assert solution.iterations == 0
+    assert solution.cost < 1e-20
+    assert np.abs(solution.controls).max() < 1e-12
 
 
 def test_the_return_of_the_plan_is_minus_its_cost(paper_solution):

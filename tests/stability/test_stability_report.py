@@ -17,6 +17,14 @@ from dq_space_arm_env.algebra import rotations
 from dq_space_arm_env.dynamics.capture import Velocities, capture
 from dq_space_arm_env.dynamics.chain import Chain, RigidBody
 from dq_space_arm_env.environment import DQSpaceArmEnv
+from dq_space_arm_env.integrators import INTEGRATORS
+from dq_space_arm_env.integrators.rk4_stages import OFFSETS, WEIGHTS
+from dq_space_arm_env.integrators.tableaus import (
+    CALVO_6,
+    DORMAND_PRINCE_5,
+    DORMAND_PRINCE_8,
+    ButcherTableau,
+)
 from dq_space_arm_env.kernels.capture import catch_payload
 
 pytest.importorskip("mpmath")
@@ -30,7 +38,7 @@ from experts.report.stability.records import record
 from experts.report.stability.references import accelerations, errors, linear_system
 from experts.report.stability.rows import Handled, NotClaimed, Refused, refusal
 from experts.report.stability.scenes import sprung_inertia, sprung_joint
-from experts.report.stability.stiff_joints import swing
+from experts.report.stability.stiff_joints import LIMITS, STIFF_METHODS, rate_left, stiff_arm, swing
 from experts.report.stability.tables import failures, print_rows, summary
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "stability.py"
@@ -122,12 +130,77 @@ def test_inertia_of_the_sprung_joint_is_torque_over_acceleration() -> None:
     assert sprung_inertia(scene) == pytest.approx(-1e3 * 1e-6 / acceleration, rel=1e-9)
 
 
-def test_rk4_blows_up_beyond_its_limit_and_not_before() -> None:
-    """The limit on the imaginary axis is 2 sqrt(2) (Hairer & Wanner II, IV.2)."""
-    assert swing("rk4", 1e4, 2.80).growth <= 0.0
-    assert swing("rk4", 1e4, 2.86).growth > 1.0
-    assert swing("symplectic_euler", 1e4, 1.99).growth < 1.0
-    assert swing("symplectic_euler", 1e4, 2.01).growth > 1.0
+TABLEAUS = {
+    "rk4": ButcherTableau(
+        4, tuple((0.0,) * (i - 1) + (a,) * (i > 0) for i, a in enumerate(OFFSETS)), WEIGHTS
+    ),
+    "rk6": CALVO_6,
+    "rk8": DORMAND_PRINCE_8,
+}
+
+
+def stability_polynomial(tableau: ButcherTableau) -> np.polynomial.Polynomial:
+    """R(z) = 1 + z b'(1 - z A)^-1 1 (Hairer & Wanner II, IV.2), by powers of the nilpotent A."""
+    count = len(tableau.weights)
+    a, b, powers, coefficients = np.zeros((count, count)), np.array(tableau.weights), np.ones(count), [1.0]
+    for i, row in enumerate(tableau.stages):
+        a[i, : len(row)] = row
+    for _ in range(count):
+        coefficients.append(b @ powers)
+        powers = a @ powers
+    return np.polynomial.Polynomial(coefficients)
+
+
+def first_above_one(growth: np.ndarray, at: np.ndarray) -> float:
+    return float(at[np.argmax(growth > 1.0 + 1e-9)])
+
+
+@pytest.mark.parametrize("name", TABLEAUS)
+def test_limits_are_those_of_the_stability_polynomials(name: str) -> None:
+    """|R| <= 1 on the imaginary axis for springs, on the negative real one for dampers."""
+    polynomial, at = stability_polynomial(TABLEAUS[name]), np.linspace(1e-3, 10.0, 1_000_000)
+    assert first_above_one(np.abs(polynomial(1j * at)), at) == pytest.approx(LIMITS[name].spring, abs=1e-3)
+    assert first_above_one(np.abs(polynomial(-at)), at) == pytest.approx(LIMITS[name].damper, abs=1e-3)
+
+
+def test_limits_of_rk4_are_those_of_the_literature() -> None:
+    """2 sqrt(2) and 2.785 (Hairer & Wanner II, IV.2)."""
+    assert LIMITS["rk4"] == LIMITS["momentum_rk4"] == pytest.approx((2.0 * np.sqrt(2.0), 2.785), abs=1e-3)
+
+
+def test_dormand_princes_own_limit_is_why_it_takes_shares_of_a_step() -> None:
+    at = np.linspace(0.5, 10.0, 1_000_000)  # below, R is above 1 by rounding-like 1e-6 only
+    polynomial = stability_polynomial(DORMAND_PRINCE_5)
+    assert first_above_one(np.abs(polynomial(1j * at)) - 1e-5, at) < 1.1
+    assert swing("dormand_prince", 1e4, 100.0).change < 0.01
+
+
+def test_every_integrator_has_its_limits() -> None:
+    assert set(LIMITS) == set(INTEGRATORS)
+    assert set(STIFF_METHODS) == {"dormand_prince", "rodas4", "rodas5p", "momentum_rosenbrock"}
+
+
+@pytest.mark.parametrize("name", [name for name in LIMITS if name not in STIFF_METHODS])
+def test_a_method_is_stable_just_below_its_limits_and_not_above(name: str) -> None:
+    """Each product stands for all: neither the spring's nor the damper's size matters."""
+    limits = LIMITS[name]
+    assert swing(name, 1e4, 0.995 * limits.spring).growth <= 1.0
+    assert swing(name, 1e4, 1.01 * limits.spring).growth > 1.0
+    assert rate_left(name, 1e4, 0.995 * limits.damper) < 1e-2
+    assert rate_left(name, 1e4, 1.01 * limits.damper) > 1e2
+
+
+@pytest.mark.parametrize("name", STIFF_METHODS)
+def test_a_stiff_method_bounds_the_energy_at_100(name: str) -> None:
+    """A free arm with a joint at dt times frequency = 100, and the vibration of that joint itself."""
+    assert np.abs(stiff_arm(name, 100.0)).max() < 1e-6
+    energy = swing(name, 1e5, 100.0)
+    assert energy.growth <= 0.0
+    assert energy.change <= 1.0 + 1e-9
+
+
+def test_an_explicit_method_does_not() -> None:
+    assert not np.abs(stiff_arm("rk4", 100.0)).max() < 1e3
 
 
 def test_a_caught_payload_at_rest_relative_to_the_tip_changes_nothing() -> None:

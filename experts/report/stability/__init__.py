@@ -4,7 +4,8 @@ rows         what a case is, and the row that says what became of it
 cases        all groups, and `run_cases`, which tries them
 references   accelerations with 50 digits, and how far others are from them
 formulations, scenes   what the cases are applied to, and made of
-mass_properties, motions, stiff_joints, time_steps   groups of cases, of the physics
+mass_properties, motions, extreme_motions, stiff_joints, time_steps, paper_form   groups of cases, of the
+             physics
 far_away, odd_poses, bad_numbers, payloads, expert   groups of cases, of what is asked
 tables       on the terminal
 records      for the file

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
 
-from dq_space_arm_env import Kernels, compile_scene
+from dq_space_arm_env import Kernels, Scene, compile_scene, load_scene
 from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
 from dq_space_arm_env.scene import INTEGRATORS
 from experts.box_ddp import BoxDDP
 from experts.problem import FloatArray
-from experts.report.stability.rows import Case, Effort, Handled, NotClaimed, Outcome, refusal
+from experts.report.stability.rows import Case, Effort, Handled, NotClaimed, Outcome, Refused, refusal
+from experts.report.stability.scenes import PRECISIONS, applied, paper
 from experts.report.stability.time_steps import moving_start
 
 GROUP = "bad numbers"
@@ -25,23 +27,24 @@ DENORMAL = 5e-324
 
 def cases() -> Iterator[Case]:
     """All cases of the group."""
-    for name in INTEGRATORS:
+    for name, precision in product(INTEGRATORS, PRECISIONS):
         yield Case(
             GROUP,
             "NaN and infinities in each entry of x and u",
-            f"step, {name}",
+            f"step, {applied(name, precision)}",
             "other rows of a batch have the bits that they have alone",
-            partial(_confined, name),
+            partial(_confined, name, precision),
             0.0,
             "rows",
         )
+        few = 5.0 * float(np.finfo(precision).eps)
         yield Case(
             GROUP,
             "denormals in every entry of x and u",
-            f"step, {name}",
-            "finite, and within 1e-15 of the step from zero",
-            partial(_denormal_step, name),
-            1e-15,
+            f"step, {applied(name, precision)}",
+            f"finite, and within {few:.0e} of the step from zero",
+            partial(_denormal_step, name, precision),
+            few,
             "1",
         )
     yield Case(
@@ -49,7 +52,7 @@ def cases() -> Iterator[Case]:
         "NaN and infinities in each entry of x and u",
         "forward dynamics",
         "other rows of a batch have the bits that they have alone; the row has no wrong finite numbers",
-        partial(_confined, None),
+        partial(_confined, None, "float64"),
         0.0,
         "rows",
     )
@@ -63,7 +66,23 @@ def cases() -> Iterator[Case]:
         "1",
     )
     for text, number in BAD.items():
-        yield Case(GROUP, f"{text} as dt", "step", "refused, naming dt", partial(_time_step, number))
+        yield Case(
+            GROUP,
+            f"{text} as dt",
+            "step, simulate, linearize",
+            "refused, naming dt",
+            partial(_time_step, number),
+        )
+        yield Case(
+            GROUP, f"{text} as duration", "integrate", "refused, naming it", partial(_duration, number)
+        )
+        yield Case(
+            GROUP,
+            f"{text} in each number of a scene",
+            "scene",
+            "refused, naming the field; but limits may be infinite",
+            partial(_scene, number),
+        )
         yield Case(
             GROUP,
             f"{text} in each entry of the initial state",
@@ -72,6 +91,9 @@ def cases() -> Iterator[Case]:
             partial(_reset, number),
         )
         yield Case(GROUP, f"{text} in x0", "expert", "refused, naming x0", partial(_expert, number))
+        yield Case(
+            GROUP, f"{text} in u_init", "expert", "refused, naming u_init", partial(_expert_controls, number)
+        )
     yield Case(GROUP, "NaN in each entry of an action", "environment, step", "refused", _nan_action)
     yield Case(
         GROUP,
@@ -125,8 +147,8 @@ def _rows(kernels: Kernels) -> tuple[FloatArray, FloatArray]:
     return np.tile(moving_start(kernels), (count, 1)), rng.normal(size=(count, kernels.n_u))
 
 
-def _confined(integrator: str | None, effort: Effort) -> Outcome:
-    kernels = compile_scene("paper")
+def _confined(integrator: str | None, precision: str, effort: Effort) -> Outcome:
+    kernels = paper(precision)
     states, controls = _rows(kernels)
 
     def results(x: FloatArray, u: FloatArray) -> Any:
@@ -152,13 +174,14 @@ def _confined(integrator: str | None, effort: Effort) -> Outcome:
 
 def _denormals(kernels: Kernels) -> tuple[FloatArray, FloatArray]:
     """The paper's robot at the origin, every zero replaced by the smallest number."""
-    x, u = np.full(kernels.n_x, DENORMAL), np.full(kernels.n_u, DENORMAL)
+    smallest = float(np.finfo(kernels.dtype).smallest_subnormal)
+    x, u = np.full(kernels.n_x, smallest), np.full(kernels.n_u, smallest)
     x[0] = 1.0
     return x, u
 
 
-def _denormal_step(integrator: str, effort: Effort) -> Outcome:
-    kernels = compile_scene("paper")
+def _denormal_step(integrator: str, precision: str, effort: Effort) -> Outcome:
+    kernels = paper(precision)
     x, u = _denormals(kernels)
     zero = np.zeros(kernels.n_x)
     zero[0] = 1.0
@@ -174,10 +197,51 @@ def _denormal_dynamics(effort: Effort) -> Outcome:
 def _time_step(number: float, effort: Effort) -> Outcome:
     kernels = compile_scene("paper")
     x, u = moving_start(kernels), np.zeros(kernels.n_u)
-    return refusal(lambda: kernels.step(x, u, number), naming="dt")
+    calls = (
+        partial(kernels.step, x, u, number),
+        partial(kernels.simulate, x, u, 10, number),
+        partial(kernels.linearize, x, u, number),
+    )
+    return _all_refused(calls, "dt")
 
 
-def _all_refused(attempts: list[Callable[[], object]], naming: str) -> Outcome:
+def _duration(number: float, effort: Effort) -> Outcome:
+    kernels = compile_scene("paper")
+    x, u = moving_start(kernels), np.zeros(kernels.n_u)
+    return refusal(lambda: kernels.integrate(x, u, number), naming="duration")
+
+
+def _scene(number: float, effort: Effort) -> Outcome:
+    data = load_scene("paper").model_dump()
+    sentences = []
+    for path in _numbers(data):
+        if number == np.inf and "limit" in path[-2:]:
+            continue
+        attempt = partial(Scene.model_validate, _replaced(data, path, number))
+        field = next(key for key in reversed(path) if isinstance(key, str))
+        sentences.append(refusal(attempt, naming=field).sentence)
+    return Refused(sentences[0])
+
+
+def _numbers(data: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Where the numbers are in nested dictionaries and lists."""
+    if isinstance(data, dict | list | tuple):
+        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+            yield from _numbers(value, (*path, key))
+    elif isinstance(data, int | float) and not isinstance(data, bool):
+        yield path
+
+
+def _replaced(data: Any, path: tuple[str | int, ...], number: float) -> Any:
+    """The same with another number in one place."""
+    if not path:
+        return number
+    entries = dict(data.items() if isinstance(data, dict) else enumerate(data))
+    entries[path[0]] = _replaced(entries[path[0]], path[1:], number)
+    return entries if isinstance(data, dict) else list(entries.values())
+
+
+def _all_refused(attempts: Iterable[Callable[[], object]], naming: str) -> Outcome:
     sentences = [refusal(attempt, naming=naming) for attempt in attempts]
     return sentences[0]
 
@@ -190,6 +254,13 @@ def _reset(number: float, effort: Effort) -> Outcome:
         x[entry] = number
         attempts.append(partial(env.reset, options={"initial_state": x}))
     return _all_refused(attempts, "initial_state")
+
+
+def _expert_controls(number: float, effort: Effort) -> Outcome:
+    solver = BoxDDP("planar", max_iterations=1)
+    controls = np.zeros((solver.problem.horizon, solver.problem.n_controls))
+    controls[-1, -1] = number
+    return refusal(lambda: solver.solve(u_init=controls), naming="u_init")
 
 
 def _expert(number: float, effort: Effort) -> Outcome:

@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from experts.report.stability import (
     bad_numbers,
     expert,
+    extreme_motions,
     far_away,
     mass_properties,
     motions,
     odd_poses,
+    paper_form,
     payloads,
     stiff_joints,
     time_steps,
@@ -22,8 +24,10 @@ GROUPS: Mapping[str, Callable[[], Iterator[Case]]] = {
     for module in (
         mass_properties,
         motions,
+        extreme_motions,
         stiff_joints,
         time_steps,
+        paper_form,
         far_away,
         odd_poses,
         bad_numbers,

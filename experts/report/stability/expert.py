@@ -14,6 +14,7 @@ from dq_space_arm_env.integrators.field import PoseCoordinates
 from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
 from experts.arm_problem import ArmProblem
 from experts.box_ddp import BoxDDP
+from experts.guesses import GuidedDDP
 from experts.problem import FloatArray
 from experts.report.stability.rows import Case, Effort, Handled, Outcome, refusal
 from experts.report.stability.scenes import walk
@@ -23,6 +24,8 @@ GROUP = "expert"
 
 _STEPS = 150
 _MOST_ITERATIONS = 100
+_TWO_JOINTS = "two joints"
+_AT_TARGET = (_TWO_JOINTS, "paper")
 _TRUE = "stop reason true, all finite; states are the rollout of inputs within their limits"
 
 
@@ -36,11 +39,22 @@ def cases() -> Iterator[Case]:
         "target 1 km away, out of reach": _with_far_target,
         "huge initial momentum": partial(_moving, 3.0, 5.0, 0.01),
         "a motion that overflows": partial(_moving, 1e3, 100.0, 0.05),
-        "start at the target": _at_target,
         "springs of 1e8 N m/rad, beyond the integrator's limit": _with_stiff_joints,
     }
     for name, make in problems.items():
         yield Case(GROUP, name, "BoxDDP", _TRUE, partial(_solve, make), 1e-12, "of the states")
+    solvers: tuple[Callable[[ArmProblem], BoxDDP | GuidedDDP], ...] = (BoxDDP, GuidedDDP)
+    for scene in _AT_TARGET:
+        for solver in solvers:
+            yield Case(
+                GROUP,
+                f"start at the target, {scene}",
+                solver.__name__,
+                "converged without an iteration, all finite; the tip stays where it is",
+                partial(_solve_at_target, scene, solver),
+                1e-12,
+                "rad, m",
+            )
     yield Case(
         GROUP,
         "horizon of 20,000; of 2,000 in a quick run",
@@ -49,7 +63,6 @@ def cases() -> Iterator[Case]:
         _long_horizon,
         1e-12,
         "of the states",
-        slow=True,
     )
     for limit in (0.0, -1.0, np.nan):
         name, run = f"limit of {limit:g}", partial(_refused_limit, limit)
@@ -63,7 +76,7 @@ def _scene(**changes: Any) -> Scene:
     start = {"joint_angles": [0.5, -1.2]}
     links = [link.model_dump() for link in planar.links[:2]]
     simulation = {"steps": _STEPS, "dt": 0.05}
-    fields = {"links": links, "initial_state": start, "simulation": simulation, "name": "two joints"}
+    fields = {"links": links, "initial_state": start, "simulation": simulation, "name": _TWO_JOINTS}
     return planar.replace(**{**fields, **changes})
 
 
@@ -99,16 +112,23 @@ def _moving(joint_rate: float, velocity: float, time_step: float) -> ArmProblem:
     return problem
 
 
-def _at_target() -> ArmProblem:
-    """The base moved so that the tip is where it should be."""
-    problem = _short()
-    where, x = problem.kernels.layout.state.pose, problem.initial_state.copy()
-    field = PoseCoordinates(PLANAR_POSE, PLANAR_TWIST, ())
+def at_target(problem: ArmProblem) -> ArmProblem:
+    """A maneuver that is over when it begins: the base moved so that the tip is where it should be.
+
+    Args:
+        problem: Of a scene that starts at rest; it is changed.
+
+    Returns:
+        The problem.
+    """
+    layout, x = problem.kernels.layout, problem.initial_state.copy()
+    where = layout.state.pose
+    directions = PLANAR_TWIST if layout.planar else tuple(range(6))
+    field = PoseCoordinates(PLANAR_POSE if layout.planar else tuple(range(8)), directions, ())
     base, tip = tuple(field.full(x[where].tolist())), tuple(problem.kernels.tip_pose(x).tolist())
     base_to_tip = dq.multiply(dq.conjugate(base), tip)
     target = problem.scene.target.pose.dual_quaternion
-    pose = dq.normalize(dq.multiply(target, dq.conjugate(base_to_tip)))
-    x[where] = field.reduced(pose)
+    x[where] = field.reduced(dq.normalize(dq.multiply(target, dq.conjugate(base_to_tip))))
     problem.initial_state = x
     return problem
 
@@ -121,6 +141,19 @@ def _with_stiff_joints() -> ArmProblem:
 def _solve(make: Callable[[], ArmProblem], effort: Effort) -> Outcome:
     problem = make()
     return _check(problem, BoxDDP(problem, max_iterations=_MOST_ITERATIONS))
+
+
+def _solve_at_target(
+    scene: str, solver: Callable[[ArmProblem], BoxDDP | GuidedDDP], effort: Effort
+) -> Outcome:
+    problem = at_target(_short() if scene == _TWO_JOINTS else ArmProblem(scene))
+    solution = solver(problem).solve()
+    outcome = f"{solution.stop_reason.value} after {solution.iterations} iterations: {solution.message}"
+    finite = all(np.isfinite(array).all() for array in (solution.states, solution.feedback_gains))
+    if not (solution.converged and solution.iterations == 0 and finite):
+        return Handled(np.inf, outcome)
+    angle, distance = problem.kernels.observation(solution.states[-1], [0.0])[1]
+    return Handled(max(float(angle), float(distance)), outcome)
 
 
 def _check(problem: ArmProblem, solver: BoxDDP) -> Outcome:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -15,24 +16,26 @@ from dq_space_arm_env.scene import INTEGRATORS
 from experts.arm_problem import ArmProblem
 from experts.problem import FloatArray
 from experts.report.stability.rows import Case, Effort, Handled, Outcome, refusal
+from experts.report.stability.scenes import PRECISIONS, applied, paper, walk
 from experts.report.stability.time_steps import moving_start, unit_error
 
 GROUP = "poses"
 
 DEVIATIONS = tuple(10.0**k for k in range(-16, -1))
 _STEPS = 4
+_UNIT = {"float64": 1e-15, "float32": 5e-7}
 
 
 def cases() -> Iterator[Case]:
     """All cases of the group."""
-    for name in INTEGRATORS:
+    for name, precision in product(INTEGRATORS, PRECISIONS):
         yield Case(
             GROUP,
             "pose off the unit dual quaternions by 1e-16 to 1e-2",
-            name,
+            applied(name, precision),
             f"a unit dual quaternion again after {_STEPS} steps",
-            partial(_return_to_manifold, name),
-            1e-15,
+            partial(_return_to_manifold, name, precision),
+            _UNIT[precision],
             "1",
         )
     for deviation in (1e-16, 1e-12, 1e-8):
@@ -103,14 +106,12 @@ def _disturbed(x: FloatArray, deviation: float) -> FloatArray:
     return y
 
 
-def _return_to_manifold(integrator: str, effort: Effort) -> Outcome:
-    kernels = compile_scene("paper")
-    curve = []
+def _return_to_manifold(integrator: str, precision: str, effort: Effort) -> Outcome:
+    kernels = paper(precision)
+    curve, still, dt = [], np.zeros((_STEPS, kernels.n_u)), kernels.scene.simulation.dt
     for deviation in DEVIATIONS:
         x = _disturbed(moving_start(kernels), deviation)
-        for _ in range(_STEPS):
-            x = kernels.step(x, np.zeros(kernels.n_u), integrator=integrator)
-        curve.append((deviation, unit_error(x[None, :])))
+        curve.append((deviation, unit_error(walk(kernels, x, still, dt, integrator)[-1:])))
     deviation, error = max(curve, key=lambda point: point[1])
     return Handled(error, f"most after {deviation:g}", tuple(curve))
 

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from dq_space_arm_env import Kernels, Scene, load_scene
+from dq_space_arm_env import Kernels, Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import screw
 from experts.problem import FloatArray
 
+PRECISIONS = ("float64", "float32")
 INERTIA = [[0.02, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.5]]
 
 
@@ -24,6 +25,45 @@ def with_simulation(scene: Scene, **changes: Any) -> Scene:
         The new scene.
     """
     return scene.replace(simulation={**scene.simulation.model_dump(), **changes})
+
+
+def paper(precision: str = "float64", scene: str = "paper") -> Kernels:
+    """Functions of a shipped scene in a precision.
+
+    Args:
+        precision: "float64" or "float32".
+        scene: Its name; that of the paper by default.
+
+    Returns:
+        The functions.
+    """
+    return compile_scene(with_simulation(load_scene(scene), precision=precision))
+
+
+def applied(integrator: str, precision: str) -> str:
+    """What a case is applied to, in words.
+
+    Args:
+        integrator: Name of the integrator.
+        precision: "float64", which goes without saying, or "float32".
+
+    Returns:
+        The words.
+    """
+    return integrator if precision == "float64" else f"{integrator}, {precision}"
+
+
+def rounded(array: FloatArray, kernels: Kernels) -> FloatArray:
+    """Numbers as a scene's precision holds them.
+
+    Args:
+        array: Numbers.
+        kernels: Functions of the scene.
+
+    Returns:
+        The same, rounded, in double precision.
+    """
+    return array.astype(kernels.dtype).astype(np.float64)
 
 
 def with_mass_ratio(ratio: float) -> Scene:

@@ -2,116 +2,136 @@
 
 The joint swings about its spring, or comes to rest in its damper, from a deflection so small that the motion
 is linear. What a method makes of it depends on a single number: the time step times the frequency of the
-spring, or the rate of the damper. Explicit methods are bounded below a limit of theirs and must blow up
-beyond; the limit that each claims is in `CLAIMS`.
+spring, or the rate of the damper. Explicit methods are bounded up to a limit of theirs and must blow up
+beyond; the limits are in `LIMITS`, and the tests find them in the stability polynomials of the tableaus.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
-from dq_space_arm_env import Kernels, compile_scene
+from dq_space_arm_env import Kernels, compile_scene, load_scene
 from dq_space_arm_env.scene import INTEGRATORS
+from experts.problem import FloatArray
 from experts.report.stability.rows import Case, Effort, Handled, NotClaimed, Outcome
-from experts.report.stability.scenes import sprung_inertia, sprung_joint, walk
+from experts.report.stability.scenes import applied, sprung_inertia, sprung_joint, walk, with_simulation
 
 GROUP = "stiff joints"
 
-CLAIMS = {"symplectic_euler": 1.9, "rk4": 2.7, "momentum_rk4": 2.7}
-"""Largest dt times frequency at which a method claims a bounded energy, s * rad/s.
 
-Theory gives 2 for symplectic Euler, 2.83 for RK4.
-"""
-OTHERS_CLAIM = 1.0
-"""What every other method claims at least."""
-STIFF_METHODS = ("rodas", "rosenbrock")
-"""Parts of the names of methods that claim any dt times frequency."""
-DAMPED_CLAIM = 1.9
-"""Largest dt times rate of decay at which every method claims that a damper brings the joint to rest."""
+class Limits(NamedTuple):
+    """How stiff a joint may be for a method; infinite where the method is L-stable or adapts its steps.
 
-PRODUCTS = (0.01, 0.03, 0.1, 0.3, 1.0, 1.9, 2.7, 3.0, 10.0, 30.0, 100.0)
+    Attributes:
+        spring: Largest dt times frequency at which the energy of a swinging joint is bounded, dimensionless.
+        damper: Largest dt times rate of decay at which a joint comes to rest, dimensionless.
+    """
+
+    spring: float
+    damper: float
+
+
+ANY = Limits(np.inf, np.inf)
+LIMITS = {
+    "symplectic_euler": Limits(2.0, 2.0),
+    "rk4": Limits(2.828, 2.785),
+    "rk6": Limits(2.609, 4.463),
+    "rk8": Limits(5.960, 6.393),
+    "dormand_prince": ANY,
+    "rodas4": ANY,
+    "rodas5p": ANY,
+    "momentum_rk4": Limits(2.828, 2.785),
+    "momentum_rosenbrock": ANY,
+}
+"""Where the stability polynomial leaves the unit circle, on the imaginary and on the negative real axis."""
+STIFF_METHODS = tuple(name for name, limits in LIMITS.items() if limits == ANY)
+"""Methods that claim any dt times frequency."""
+WITHIN, BEYOND = 0.99, 1.02
+"""Shares of a limit at which a method must be stable, and at which it must not be."""
+STIFFEST = 100.0
+"""Product that is tried with methods that have no limit."""
+
+PRODUCTS = (0.01, 0.03, 0.1, 0.3, 1.0, 1.9, 2.5, 2.7, 3.0, 5.8, 10.0, 30.0, 100.0)
 """dt times frequency of the curve."""
 STEPS = 2000
 DEFLECTION = 1e-4  # rad
+RATE = 1e-3  # rad/s
 BOUNDED = 1.0
 """Largest energy of the second half of the steps relative to that of the first half, less 1.
 
-The energy may swing within that: near its limit, that of symplectic Euler does so by a factor of 20.
+The energy may swing within that: near its limit, that of symplectic Euler does so by a factor of 100.
+"""
+AT_REST, AT_REST_SINGLE = 1e-6, 1e-3
+"""Largest rate in a damper after all steps, relative to the first, by precision.
+
+In single precision, methods that adapt their steps have an absolute tolerance of 1e-6 rad/s.
 """
 LARGEST_CHANGE = 1e6
-"""Larger changes of the energy count as this one: the motion has blown up."""
+"""A larger change of the energy counts as this one: the motion has blown up, even if it stays finite."""
 CURVE_STIFFNESS = 1e5  # N m/rad
 DAMPINGS = (1e2, 1e4, 1e6)  # N m s/rad
-
-
-def is_stiff_method(integrator: str) -> bool:
-    """Whether a method claims to be stable however stiff the joint.
-
-    Args:
-        integrator: Its name.
-
-    Returns:
-        The answer.
-    """
-    return any(part in integrator for part in STIFF_METHODS)
-
-
-def claim(integrator: str) -> float:
-    """Largest dt times frequency at which a method claims a bounded energy.
-
-    Args:
-        integrator: Its name.
-
-    Returns:
-        The product, dimensionless.
-    """
-    return np.inf if is_stiff_method(integrator) else CLAIMS.get(integrator, OTHERS_CLAIM)
+TIME_STEP = 0.015  # s
+_ARM_STIFFNESS = 1e8  # N m/rad
+_ARM_ENERGY = 1e-2  # of the energy
 
 
 def cases() -> Iterator[Case]:
     """All cases of the group."""
     half = STEPS // 2
-    criterion = f"largest energy of the last {half} of {STEPS} steps at most twice that before"
+    springs, dampers = "joint springs 1e2 to 1e8 N m/rad", "dampers 1e2 to 1e6 N m s/rad"
+    bounded = f"largest energy of the last {half} of {STEPS} steps at most twice that before"
+
+    def energy(name: str, integrator: str, criterion: str, run: Callable[[Effort], Outcome]) -> Case:
+        return Case(GROUP, name, integrator, f"{bounded}; {criterion}", run, BOUNDED, "of the energy")
+
+    def rate(
+        name: str, integrator: str, criterion: str, run: Callable[[Effort], Outcome], bound: float = AT_REST
+    ) -> Case:
+        rests = f"rate after {STEPS} steps below {bound:g} of the first"
+        return Case(GROUP, name, integrator, f"{rests}; {criterion}", run, bound, "of the rate")
+
     for name in INTEGRATORS:
-        limit = claim(name)
-        within = "100" if np.isinf(limit) else f"{limit:g}, its limit"
+        limits = LIMITS[name]
+        at = "dt times frequency = " + _product_in_words(limits.spring)
+        yield energy(springs, name, at, partial(_springs, name))
+        yield energy(f"{springs}, dt = 15 ms", name, "where claimed", partial(_springs_at_15_ms, name))
+        products = "dt times frequency from 0.01 to 100"
+        yield energy(products, name, "where claimed", partial(_products, name))
+        at = "dt times decay = " + _product_in_words(limits.damper)
+        yield rate(dampers, name, at, partial(_dampers, name))
+        yield rate(f"{dampers}, dt = 15 ms", name, "where claimed", partial(_dampers_at_15_ms, name))
+        if limits != ANY:
+            yield energy("springs beyond the limit", name, "not claimed", partial(_spring_beyond, name))
+            yield rate("dampers beyond the limit", name, "not claimed", partial(_damper_beyond, name))
+        single = applied(name, "float32")
+        within = "dt times frequency = " + _product_in_words(limits.spring)
+        yield energy(springs, single, within, partial(_springs, name, precision="float32"))
+        within = "dt times decay = " + _product_in_words(limits.damper)
+        yield rate(dampers, single, within, partial(_dampers, name, precision="float32"), AT_REST_SINGLE)
+    for name in STIFF_METHODS:
         yield Case(
             GROUP,
-            "joint springs 1e2 to 1e8 N m/rad",
+            "arm with a joint at dt times frequency = 100",
             name,
-            f"{criterion}; dt times frequency = {within}",
-            partial(_springs, name),
-            BOUNDED,
+            f"energy of the free arm kept to {_ARM_ENERGY:g} over {STEPS} steps",
+            partial(_stiff_arm, name),
+            _ARM_ENERGY,
             "of the energy",
         )
-        yield Case(
-            GROUP,
-            "dt times frequency from 0.01 to 100",
-            name,
-            f"{criterion}, where claimed",
-            partial(_products, name),
-            BOUNDED,
-            "of the energy",
-        )
-        yield Case(
-            GROUP,
-            "dampers 1e2 to 1e6 N m s/rad",
-            name,
-            f"the joint comes to rest at dt times decay = {100 if is_stiff_method(name) else DAMPED_CLAIM:g}",
-            partial(_dampers, name),
-            1e-6,
-            "of the rate",
-        )
+
+
+def _product_in_words(limit: float) -> str:
+    return f"{STIFFEST:g}" if np.isinf(limit) else f"{WITHIN * limit:.3g}, {WITHIN:g} of the limit"
 
 
 @cache
-def _sprung(stiffness: float, damping: float) -> tuple[Kernels, float]:
+def _sprung(stiffness: float, damping: float, precision: str = "float64") -> tuple[Kernels, float]:
     """Kernels of a sprung joint, and the inertia that it turns."""
-    scene = sprung_joint(stiffness, damping)
+    scene = with_simulation(sprung_joint(stiffness, damping), precision=precision)
     return compile_scene(scene), sprung_inertia(scene)
 
 
@@ -120,7 +140,7 @@ class Energy(NamedTuple):
 
     Attributes:
         growth: Largest one of the second half of the steps relative to that of the first half, less 1;
-            infinite where the motion overflows.
+            infinite where the motion blows up.
         change: Largest difference from the first, relative to it, at most `LARGEST_CHANGE`.
     """
 
@@ -128,64 +148,168 @@ class Energy(NamedTuple):
     change: float
 
 
-def swing(integrator: str, stiffness: float, product: float) -> Energy:
+def _frequency(stiffness: float) -> float:
+    """Angular frequency of the sprung joint, rad/s."""
+    return float(np.sqrt(stiffness / _sprung(stiffness, 0.0)[1]))
+
+
+def swing(integrator: str, stiffness: float, product: float, precision: str = "float64") -> Energy:
     """Let a joint swing.
 
     Args:
         integrator: Name of the method.
         stiffness: Of the spring, N m/rad.
         product: dt times frequency, dimensionless.
+        precision: "float64" or "float32".
 
     Returns:
         What becomes of its energy.
     """
-    kernels, inertia = _sprung(stiffness, 0.0)
+    kernels, exact = _sprung(stiffness, 0.0, precision)[0], _sprung(stiffness, 0.0)[0]
     x = kernels.layout.initial_state.copy()
     x[kernels.layout.state.joint_angles] = DEFLECTION
-    dt = product / float(np.sqrt(stiffness / inertia))
+    dt = product / _frequency(stiffness)
     states = walk(kernels, x, np.zeros((STEPS, kernels.n_u)), dt, integrator)
     with np.errstate(all="ignore"):
-        energies = np.asarray(kernels.energy(states)) / kernels.energy(x)
-        if not np.isfinite(energies).all():
+        energies = np.asarray(exact.energy(states)) / exact.energy(x)
+        change = float(np.abs(energies - 1.0).max())
+        if not change < LARGEST_CHANGE:
             return Energy(np.inf, LARGEST_CHANGE)
         early, late = energies[: STEPS // 2].max(), energies[STEPS // 2 :].max()
-    change = float(np.abs(energies - 1.0).max())
-    return Energy(float(late / early) - 1.0, min(change, LARGEST_CHANGE))
+    return Energy(float(late / early) - 1.0, change)
 
 
-def _springs(integrator: str, effort: Effort) -> Outcome:
-    product = min(claim(integrator), 100.0)
-    found = [(k, swing(integrator, k, product)) for k in effort.stiffness]
+def rate_left(integrator: str, damping: float, product: float, precision: str = "float64") -> float:
+    """Let a joint come to rest in its damper.
+
+    Args:
+        integrator: Name of the method.
+        damping: Of the damper, N m s/rad.
+        product: dt times rate of decay, dimensionless.
+        precision: "float64" or "float32".
+
+    Returns:
+        The joint's rate after all steps relative to the first; infinite where it overflows.
+    """
+    kernels, inertia = _sprung(0.0, damping, precision)
+    x = kernels.layout.initial_state.copy()
+    x[kernels.layout.state.joint_rates] = RATE
+    final = walk(kernels, x, np.zeros((STEPS, kernels.n_u)), product * inertia / damping, integrator)[-1]
+    left = abs(float(final[kernels.layout.state.joint_rates][0])) / RATE
+    return left if np.isfinite(left) else np.inf
+
+
+def _springs(integrator: str, effort: Effort, precision: str = "float64") -> Outcome:
+    product = min(WITHIN * LIMITS[integrator].spring, STIFFEST)
+    found = [(k, swing(integrator, k, product, precision)) for k in effort.stiffness]
     worst, energy = max(found, key=lambda point: point[1].growth)
     return Handled(
         max(energy.growth, 0.0), f"most at {worst:g} N m/rad; energy changes by {energy.change:.1e}"
     )
 
 
+def _dampers(integrator: str, effort: Effort, precision: str = "float64") -> Outcome:
+    product = min(WITHIN * LIMITS[integrator].damper, STIFFEST)
+    return Handled(max(rate_left(integrator, damping, product, precision) for damping in DAMPINGS))
+
+
+def _springs_at_15_ms(integrator: str, effort: Effort) -> Outcome:
+    products = [TIME_STEP * _frequency(k) for k in effort.stiffness]
+    found = [swing(integrator, k, p).growth for k, p in zip(effort.stiffness, products, strict=True)]
+    limit = LIMITS[integrator].spring
+    return _where_claimed("frequency", limit, effort.stiffness, products, found, BOUNDED)
+
+
+def _dampers_at_15_ms(integrator: str, effort: Effort) -> Outcome:
+    products = [TIME_STEP * damping / _sprung(0.0, damping)[1] for damping in DAMPINGS]
+    found = [rate_left(integrator, d, p) for d, p in zip(DAMPINGS, products, strict=True)]
+    return _where_claimed("decay", LIMITS[integrator].damper, DAMPINGS, products, found, AT_REST)
+
+
+def _where_claimed(
+    quantity: str,
+    limit: float,
+    sizes: Sequence[float],
+    products: Sequence[float],
+    found: Sequence[float],
+    bound: float,
+) -> Outcome:
+    """Judge what a method makes of springs or dampers of several sizes in its own time step."""
+    claimed = [error for error, product in zip(found, products, strict=True) if product <= limit]
+    worst = max((0.0, *claimed))
+    if len(claimed) == len(sizes):
+        return Handled(worst, f"dt times {quantity} from {products[0]:.2g} to {products[-1]:.2g}")
+    softest = sizes[len(claimed)]
+    sentence = (
+        f"claimed up to dt times {quantity} = {limit:g}; it is {products[len(claimed)]:.2g} at "
+        f"{softest:g}: take shorter steps or a stiff method"
+    )
+    return NotClaimed(sentence) if worst <= bound else Handled(worst, sentence)
+
+
 def _products(integrator: str, effort: Effort) -> Outcome:
     found = [(product, swing(integrator, CURVE_STIFFNESS, product)) for product in PRODUCTS]
-    limit = claim(integrator)
+    limit = LIMITS[integrator].spring
     worst = max(energy.growth for product, energy in found if product <= limit)
     curve = tuple((product, energy.change) for product, energy in found)
     lost = [product for product, energy in found if not energy.growth <= BOUNDED]
     if worst > BOUNDED or not lost:
-        return Handled(max(worst, 0.0), "" if lost else "bounded up to 100", curve)
-    largest = max(product for product in PRODUCTS if product < min(lost))
+        largest, energy = max(found, key=lambda point: point[0])
+        note = f"at {largest:g} the energy changes by {energy.change:.1e}, and never grows beyond its first"
+        return Handled(max(worst, 0.0), "" if lost else note, curve)
+    within = max(product for product in PRODUCTS if product < min(lost))
     return NotClaimed(
-        f"bounded up to {largest:g}, as claimed up to {limit:g}; the motion grows without bound from "
+        f"bounded up to {within:g}, as claimed up to {limit:g}; the motion grows without bound from "
         f"{min(lost):g} on",
         curve,
     )
 
 
-def _dampers(integrator: str, effort: Effort) -> Outcome:
-    product = 100.0 if is_stiff_method(integrator) else DAMPED_CLAIM
-    left = []
-    for damping in DAMPINGS:
-        kernels, inertia = _sprung(0.0, damping)
-        x = kernels.layout.initial_state.copy()
-        x[kernels.layout.state.joint_rates] = 1e-3
-        dt = product * inertia / damping
-        final = walk(kernels, x, np.zeros((STEPS, kernels.n_u)), dt, integrator)[-1]
-        left.append(abs(float(final[kernels.layout.state.joint_rates][0])) / 1e-3)
-    return Handled(max(left) if np.isfinite(left).all() else np.inf)
+def _spring_beyond(integrator: str, effort: Effort) -> Outcome:
+    limit = LIMITS[integrator].spring
+    growth = swing(integrator, CURVE_STIFFNESS, BEYOND * limit).growth
+    return _unbounded(growth > BOUNDED, f"dt times frequency = {limit:g}")
+
+
+def _damper_beyond(integrator: str, effort: Effort) -> Outcome:
+    limit = LIMITS[integrator].damper
+    left = rate_left(integrator, DAMPINGS[0], BEYOND * limit)
+    return _unbounded(left > 1.0, f"dt times rate of decay = {limit:g}")
+
+
+def _unbounded(grows: bool, limit: str) -> Outcome:
+    """Beyond a limit the motion must grow: a limit that is too low would be a claim too small."""
+    if grows:
+        return NotClaimed(f"stable up to {limit}; {BEYOND - 1.0:.0%} beyond, the motion grows without bound")
+    return Handled(np.inf, f"bounded beyond {limit}: the limit is wrong")
+
+
+def stiff_arm(integrator: str, product: float) -> FloatArray:
+    """Energy of a free arm that moves slowly, one of its joints on a stiff spring at rest.
+
+    Args:
+        integrator: Name of the method.
+        product: dt times frequency of that joint, dimensionless.
+
+    Returns:
+        The energy after every step relative to the first, less 1, shape (STEPS,).
+    """
+    scene = load_scene("free-floating")
+    links = [link.model_dump() for link in scene.links]
+    links[1] |= {"stiffness": _ARM_STIFFNESS, "rest_angle": scene.initial_state.joint_angles[1]}
+    kernels = compile_scene(scene.replace(name="stiff joint", links=links))
+    where, x = kernels.layout.state, kernels.layout.initial_state.copy()
+    still = np.zeros(kernels.n_u)
+    x[where.joint_angles.start + 1] += DEFLECTION
+    stiff = kernels.forward_dynamics(x, still)[-2]
+    dt = product / float(np.sqrt(-stiff / DEFLECTION))
+    x[where.joint_angles.start + 1] -= DEFLECTION
+    x[where.base_velocity] = [0.02, -0.01, 0.015, 0.01, 0.0, -0.01]
+    x[where.joint_rates] = [0.05, 0.0, -0.04]
+    energies = np.asarray(kernels.energy(walk(kernels, x, np.tile(still, (STEPS, 1)), dt, integrator)))
+    return np.asarray(energies[1:] / energies[0] - 1.0)
+
+
+def _stiff_arm(integrator: str, effort: Effort) -> Outcome:
+    error = float(np.abs(stiff_arm(integrator, STIFFEST)).max())
+    return Handled(error if np.isfinite(error) else np.inf)
