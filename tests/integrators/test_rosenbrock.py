@@ -16,7 +16,7 @@ from dq_space_arm_env.kernels.paper_programs import PaperPrograms
 
 interpreter = pytest.importorskip("graph_interpreter")
 
-NAMES = ("rodas4", "rodas5p")
+NAMES = ("rodas4", pytest.param("rodas5p", marks=pytest.mark.slow))  # they share all but numbers
 TABLEAUS = {"rodas4": RODAS4, "rodas5p": RODAS5P}
 STEPS = 10_000
 DT = 0.015

@@ -6,10 +6,20 @@ import pytest
 
 pytest.importorskip("mpmath")
 
+from dq_space_arm_env.integrators import INTEGRATORS
 from experts.report.stability import GROUPS, QUICK, Case, Status, all_cases, run_case
 
+FAST_INTEGRATORS = ("rk4", "momentum_rosenbrock")
+
+
+def is_slow(case: Case) -> bool:
+    """Fast tests do with two integrators and double precision: the others' machine code takes minutes."""
+    others = [name for name in INTEGRATORS if name not in FAST_INTEGRATORS]
+    return case.slow or any(name in case.subject for name in ("float32", *others))
+
+
 CASES = [
-    pytest.param(case, id=f"{case.group}: {case.title}", marks=[pytest.mark.slow] if case.slow else [])
+    pytest.param(case, id=f"{case.group}: {case.title}", marks=[pytest.mark.slow] if is_slow(case) else [])
     for case in all_cases()
 ]
 
