@@ -1,6 +1,7 @@
 """Experts: optimal control of a scene, by control-limited differential dynamic programming."""
 
 from experts.box_ddp import BoxDDP
+from experts.demonstrations import generate_demonstrations, load_demonstrations
 from experts.guesses import GuidedDDP
 from experts.problem import ShootingProblem
 from experts.receding_horizon import RecedingHorizonExpert
@@ -13,4 +14,6 @@ __all__ = [
     "ShootingProblem",
     "Solution",
     "StopReason",
+    "generate_demonstrations",
+    "load_demonstrations",
 ]

@@ -1,0 +1,25 @@
+"""Demonstrations: optimal maneuvers from many starts, in files that agents learn from.
+
+A folder of demonstrations is made of shards, files with some dozens of problems each, `settings.json` with
+all that they follow from, and `manifest.json`, written last, with what became of every problem. Given the
+processor, its bytes follow from the settings alone: whatever interrupts the work, whoever goes on with it,
+ends with the same files.
+"""
+
+from experts.demonstrations.errors import DemonstrationsError
+from experts.demonstrations.executors import Executor, ProcessExecutor, SerialExecutor
+from experts.demonstrations.generation import Advance, generate_demonstrations
+from experts.demonstrations.reading import Batch, Demonstration, Demonstrations, load_demonstrations
+
+__all__ = [
+    "Advance",
+    "Batch",
+    "Demonstration",
+    "Demonstrations",
+    "DemonstrationsError",
+    "Executor",
+    "ProcessExecutor",
+    "SerialExecutor",
+    "generate_demonstrations",
+    "load_demonstrations",
+]

@@ -1,0 +1,353 @@
+"""Reading demonstrations: views of mapped files, batches of time steps, splits by problem.
+
+Nothing is read before it is looked at, and nothing is kept: a data set may be far larger than the memory.
+"""
+
+import json
+import os
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Any, Self, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env import Scene, compile_scene
+from dq_space_arm_env.kernels import Kernels
+from experts.demonstrations.columns import FAILURES, SUMMARIES, TRAJECTORIES
+from experts.demonstrations.errors import DemonstrationsError
+from experts.demonstrations.folder import MANIFEST, SETTINGS, SHARDS, sha256_of
+from experts.demonstrations.outcomes import GUESSES, REASONS
+from experts.demonstrations.settings import FORMAT
+from experts.demonstrations.tensors import Tensors, map_tensors
+from experts.problem import FloatArray
+
+OPEN_SHARDS = 64
+"""Files that are mapped at a time, each for as long as it is among those used last."""
+MIXED = 64
+"""Demonstrations whose time steps are shuffled together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration:
+    """One optimal maneuver of N stages; arrays are read-only views of the file.
+
+    Attributes:
+        index: Number of its problem.
+        seed: `env.reset(seed=seed)` starts where it does.
+        cost: J; the sum of the rewards is -J.
+        states: Shape (N + 1, n_x), units of the state.
+        observations: Shape (N + 1, n_obs), as the environment gives them.
+        actions: Inputs as fractions of their limits, shape (N, n_u).
+        rewards: Shape (N,).
+        feedback_gains: G of a = clip(a_k + G_k (x (-) x_k)) for actions a, float32, shape (N, n_u, n_t); zero
+            in the rows of inputs at a limit.
+        facts: The other numbers about it, by the names of `columns.SUMMARIES`; the guess and the stop reason
+            in words.
+    """
+
+    index: int
+    seed: int
+    cost: float
+    states: FloatArray
+    observations: FloatArray
+    actions: FloatArray
+    rewards: FloatArray
+    feedback_gains: NDArray[np.float32]
+    facts: Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Time steps of several demonstrations, B of them.
+
+    Attributes:
+        demonstration: Place of each one's demonstration in the data set, shape (B,).
+        stage: Stage of each, in [0, N), shape (B,).
+        arrays: What was asked for, by name, each of shape (B, ...).
+    """
+
+    demonstration: NDArray[np.int64]
+    stage: NDArray[np.int64]
+    arrays: Mapping[str, NDArray[Any]]
+
+
+class _Files:
+    """The shards of a folder, some of them mapped."""
+
+    def __init__(self, folder: Path, shards: Sequence[Mapping[str, Any]]) -> None:
+        self.paths = [folder / SHARDS / shard["file"] for shard in shards]
+        self.ends = list(accumulate(int(shard["demonstrations"]) for shard in shards))
+        self.mapped = lru_cache(maxsize=OPEN_SHARDS)(self._map)
+
+    def _map(self, shard: int) -> Tensors:
+        return map_tensors(self.paths[shard])
+
+    def locate(self, place: int) -> tuple[Tensors, int]:
+        """The shard of a demonstration, and its row there."""
+        shard = bisect_right(self.ends, place)
+        return self.mapped(shard), place - (self.ends[shard - 1] if shard else 0)
+
+    def column(self, name: str) -> NDArray[Any]:
+        """An array of all shards, joined and in memory."""
+        # Past the cache: in one pass over all shards it would only drop what is in use.
+        return np.concatenate([self._map(shard).arrays[name] for shard in range(len(self.paths))])
+
+
+class Demonstrations(Sequence[Demonstration]):
+    """The demonstrations of a folder, or some of them.
+
+    Attributes:
+        path: The folder.
+        settings: What they follow from, as in `settings.json`.
+        manifest: What became of every problem, as in `manifest.json`.
+        scene: The scene, in double precision.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        settings: Mapping[str, Any],
+        manifest: Mapping[str, Any],
+        *,
+        selection: tuple[_Files, NDArray[np.int64]] | None = None,
+    ) -> None:
+        """Take a folder's descriptions; `load_demonstrations` reads and checks them.
+
+        Args:
+            path: The folder.
+            settings: Content of its `settings.json`.
+            manifest: Content of its `manifest.json`.
+            selection: The files, and places of demonstrations among all of the folder; None for all.
+        """
+        self.path, self.settings, self.manifest = path, settings, manifest
+        self.scene = Scene.model_validate(settings["scene"])
+        if selection is None:
+            files = _Files(path, manifest["shards"])
+            selection = files, np.arange(manifest["demonstrations"], dtype=np.int64)
+        self._files, self._places = selection
+
+    @property
+    def kernels(self) -> Kernels:
+        """The compiled functions of the scene: layout of states, difference, retraction, observation."""
+        return compile_scene(self.scene)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, position: int) -> Demonstration: ...
+
+    @overload
+    def __getitem__(self, position: slice) -> Self: ...
+
+    def __getitem__(self, position: int | slice) -> Demonstration | Self:
+        if isinstance(position, slice):
+            return self.select(np.arange(len(self))[position])
+        (arrays, _), row = self._files.locate(int(self._places[position]))
+        facts: dict[str, Any] = {name: arrays[name][row].tolist() for name in SUMMARIES}
+        facts["stop_reason"], facts["guess"] = REASONS[facts["stop_reason"]], GUESSES[facts["guess"]]
+        named = {name: facts.pop(name) for name in ("index", "seed", "cost")}
+        return Demonstration(**named, **{name: arrays[name][row] for name in TRAJECTORIES}, facts=facts)
+
+    def select(self, positions: ArrayLike) -> Self:
+        """Choose some demonstrations.
+
+        Args:
+            positions: Their positions in this sequence, shape (M,).
+
+        Returns:
+            Those, in this order.
+
+        Raises:
+            IndexError: If there is no such position.
+        """
+        chosen = self._places[np.asarray(positions, dtype=np.int64)]
+        return type(self)(self.path, self.settings, self.manifest, selection=(self._files, chosen))
+
+    def column(self, name: str) -> NDArray[Any]:
+        """Numbers about every demonstration, read into memory.
+
+        Args:
+            name: One of `columns.SUMMARIES`, for example "cost" or "seed".
+
+        Returns:
+            Shape (len(self),), or (len(self), 2) for the tip's errors.
+
+        Raises:
+            ValueError: If there is no such column.
+        """
+        _check_names((name,), SUMMARIES)
+        return self._files.column(name)[self._places]
+
+    def failures(self) -> dict[str, NDArray[Any]]:
+        """The problems of the folder that led to no demonstration, F of them.
+
+        Returns:
+            `index`, `seed`, `cost`, each of shape (F,); `reason`, words, shape (F,); `start`, states at stage
+            0, shape (F, n_x); `final_errors` of the tip, attitude [deg] and position [m], shape (F, 2).
+        """
+        columns = {name: self._files.column(f"failures.{name}") for name in FAILURES}
+        reasons = columns.pop("stop_reason")
+        return {**columns, "reason": np.array(REASONS)[reasons]}
+
+    def split(self, *fractions: float, seed: int = 0) -> tuple[Self, ...]:
+        """Split by problem: no two parts share a demonstration, so none knows another's time steps.
+
+        Args:
+            *fractions: Share of each part; together at most 1.
+            seed: Seed of the shuffle.
+
+        Returns:
+            The parts, each in the order of the problems.
+
+        Raises:
+            ValueError: If the fractions are none.
+        """
+        ends = np.cumsum(fractions)
+        if not fractions or min(fractions) < 0.0 or ends[-1] > 1.0 + 1e-9:
+            raise ValueError(f"fractions: {fractions}, should be positive and at most 1 together")
+        shuffled = np.random.default_rng(seed).permutation(len(self))
+        bounds = [0, *np.rint(ends * len(self)).astype(np.int64).tolist()]
+        return tuple(self.select(np.sort(shuffled[a:b])) for a, b in pairwise(bounds))
+
+    def batches(
+        self,
+        size: int,
+        names: Sequence[str] = ("observations", "actions"),
+        *,
+        seed: int | None = None,
+        drop_last: bool = False,
+    ) -> Iterator[Batch]:
+        """Go through all time steps once.
+
+        With a seed they come shuffled: demonstrations in a random order, and the time steps of some dozens of
+        them mixed with each other, so that memory holds no more than those.
+
+        Args:
+            size: Time steps of a batch.
+            names: What to read, of `columns.TRAJECTORIES`; of states and observations those at which an
+                action is taken, without the last.
+            seed: Seed of the order; None for that of the problems and stages.
+            drop_last: Whether to leave out the last batch if it is smaller.
+
+        Yields:
+            Batches, copies in memory.
+
+        Raises:
+            ValueError: If the size is not positive, or a name is unknown.
+        """
+        if size < 1:
+            raise ValueError(f"size: {size}, should be at least 1")
+        _check_names(names, TRAJECTORIES)
+        return self._batches(size, tuple(names), seed, drop_last)
+
+    def _batches(
+        self, size: int, names: tuple[str, ...], seed: int | None, drop_last: bool
+    ) -> Iterator[Batch]:
+        rng = None if seed is None else np.random.default_rng(seed)
+        order = np.arange(len(self)) if rng is None else rng.permutation(len(self))
+        horizon, rest = self.scene.simulation.steps, np.zeros((0, 2), dtype=np.int64)
+        for begin in range(0, len(order), MIXED):
+            group = order[begin : begin + MIXED]
+            steps = np.stack([np.repeat(group, horizon), np.tile(np.arange(horizon), len(group))], axis=1)
+            steps = np.concatenate([rest, steps if rng is None else rng.permutation(steps)])
+            whole = len(steps) - len(steps) % size
+            for first in range(0, whole, size):
+                yield self._gather(steps[first : first + size], names)
+            rest = steps[whole:]
+        if len(rest) and not drop_last:
+            yield self._gather(rest, names)
+
+    def _gather(self, steps: NDArray[np.int64], names: tuple[str, ...]) -> Batch:
+        """Copy time steps, given as demonstration and stage, out of the files."""
+        positions, stages = steps[:, 0].copy(), steps[:, 1].copy()
+        arrays: dict[str, NDArray[Any]] = {}
+        for position in np.unique(positions):
+            tensors, row = self._files.locate(int(self._places[position]))
+            mine = positions == position
+            for name in names:
+                source = tensors.arrays[name][row]
+                if name not in arrays:
+                    arrays[name] = np.empty((len(steps), *source.shape[1:]), source.dtype)
+                arrays[name][mine] = source[stages[mine]]
+        return Batch(positions, stages, arrays)
+
+    def tangent(self, reference: ArrayLike, states: ArrayLike) -> FloatArray:
+        """Deviations from reference states in tangent coordinates, where feedback gains act.
+
+        Args:
+            reference: States of a demonstration, shape (..., n_x), units of the state.
+            states: States to be compared with them, shape (..., n_x); the two are broadcast.
+
+        Returns:
+            x (-) x_reference, shape (..., n_t), units of `kernels.layout.tangent`. The optimal action there
+            is, to first order, clip(action + feedback_gains @ deviation, -1, 1).
+
+        Raises:
+            ValueError: If the shapes do not fit.
+        """
+        first, second = np.broadcast_arrays(np.asarray(reference), np.asarray(states))
+        n_x = first.shape[-1]
+        rows = self.kernels.difference(first.reshape(-1, n_x), second.reshape(-1, n_x))
+        return np.asarray(rows.reshape(*first.shape[:-1], -1))
+
+
+def load_demonstrations(path: str | os.PathLike[str], *, verify: bool = False) -> Demonstrations:
+    """Open a folder that `generate_demonstrations` has completed.
+
+    Args:
+        path: The folder.
+        verify: Whether to read every file and compare its hash with the manifest's; without, their sizes are
+            compared.
+
+    Returns:
+        The demonstrations; their files are mapped when they are looked at.
+
+    Raises:
+        DemonstrationsError: If there is no such folder, it is not complete, or a file is damaged.
+    """
+    folder = Path(path)
+    if not (folder / SETTINGS).is_file():
+        raise DemonstrationsError(f"{folder} holds no demonstrations: it has no {SETTINGS}")
+    if not (folder / MANIFEST).is_file():
+        raise DemonstrationsError(
+            f"{folder} is not complete: it has no {MANIFEST}; the command that began it goes on with it"
+        )
+    settings, manifest = (_read_json(folder / name) for name in (SETTINGS, MANIFEST))
+    if settings.get("format") != FORMAT:
+        raise DemonstrationsError(
+            f"{folder} has format {settings.get('format')}, this version reads {FORMAT}: generate it again"
+        )
+    for shard in manifest["shards"]:
+        _check_file(folder / SHARDS / shard["file"], shard, verify)
+    return Demonstrations(folder, settings, manifest)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DemonstrationsError(f"{path} cannot be read ({error}); generate it again") from error
+    return dict(content)
+
+
+def _check_file(path: Path, shard: Mapping[str, Any], verify: bool) -> None:
+    remedy = "the command that made the folder makes it anew"
+    if not path.is_file():
+        raise DemonstrationsError(f"{path} is missing; {remedy}")
+    size = path.stat().st_size
+    if size != shard["bytes"]:
+        raise DemonstrationsError(f"{path} has {size} bytes instead of {shard['bytes']}; {remedy}")
+    if verify and sha256_of(path) != shard["sha256"]:
+        raise DemonstrationsError(f"{path} is damaged: its hash is not that of the manifest; {remedy}")
+
+
+def _check_names(names: Sequence[str], known: Sequence[str]) -> None:
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(f"{', '.join(unknown)}: unknown; there are {', '.join(known)}")
