@@ -1,7 +1,8 @@
 """Generate demonstrations: optimal maneuvers from random starts, with feedback gains, to learn from.
 
-The output folder gets settings.json, shards with the demonstrations, and manifest.json once all are there. A
-run that was interrupted or killed is resumed by the same command. On a cluster, jobs of an array share a
+The output folder gets settings.json, shards with the demonstrations, and manifest.json once all are there;
+then README.md, a data card, and summary/ with a page of their distributions, failures and some trajectories.
+A run that was interrupted or killed is resumed by the same command. On a cluster, jobs of an array share a
 folder: --shard 1/8 to --shard 8/8, at once or not.
 Exit status: 0; 1 if the run had to stop, for example because the disk is full; 2 if the input is unusable;
 130 if interrupted. What is complete by then remains, and the same command goes on with it.
@@ -19,6 +20,7 @@ from dq_space_arm_env import SceneError, load_scene
 from experts.demonstrations import Demonstrations, DemonstrationsError, generate_demonstrations
 from experts.demonstrations.progress import GenerationProgress
 from experts.demonstrations.settings import SHARD_SIZE
+from experts.report.demonstrations import write_summary
 
 SUCCESS, FAILURE, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
 
@@ -48,10 +50,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 workers=options.workers,
                 progress=progress.update,
             )
+        if demonstrations is not None and options.summary:
+            write_summary(demonstrations)
     except (SceneError, ValueError) as error:
         errors.print(str(error), style="red", markup=False, soft_wrap=True)
         return UNUSABLE
-    except DemonstrationsError as error:
+    except (DemonstrationsError, OSError) as error:
         errors.print(str(error), style="red", markup=False, soft_wrap=True)
         return FAILURE
     except KeyboardInterrupt:
@@ -80,6 +84,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         default=(1, 1),
         metavar="I/K",
         help="do part I of K only, for jobs that share a folder",
+    )
+    parser.add_argument(
+        "--no-summary", dest="summary", action="store_false", help="no data card and no page of pictures"
     )
     parser.add_argument("--workers", type=int, help="number of processes (default: one per processor)")
     return parser.parse_args(arguments)

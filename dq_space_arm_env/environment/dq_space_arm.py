@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,7 +109,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
     | Parameter     | Type                     | Default   | Description                                            |
     |---------------|--------------------------|-----------|--------------------------------------------------------|
-    | `scene`       | **str, Path or Scene**   | `"paper"` | name of a shipped scene, path of a YAML file, a `Scene` |
+    | `scene`       | **str, Path or Scene**   | `"paper"` | name of a shipped scene, path of a YAML file, a mapping like one, a `Scene` |
     | `render_mode` | **str or None**          | `None`    | `"rgb_array"` or `"human"`; needs the extra `render`   |
 
     ```python
@@ -142,11 +143,13 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         "render_fps": 60,
     }
 
-    def __init__(self, scene: Scene | str | Path = "paper", render_mode: str | None = None) -> None:
+    def __init__(
+        self, scene: Scene | Mapping[str, Any] | str | Path = "paper", render_mode: str | None = None
+    ) -> None:
         """Load a scene and compile what a step needs (or take it from the cache).
 
         Args:
-            scene: Name of a shipped scene, path of a YAML file, or a scene.
+            scene: Name of a shipped scene, path of a YAML file, what such a file holds as a mapping, or a scene.
             render_mode: None, "rgb_array" or "human".
 
         Raises:

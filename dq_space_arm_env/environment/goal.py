@@ -101,7 +101,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
 
     | Parameter     | Type                     | Default           | Description                                             |
     |---------------|--------------------------|-------------------|---------------------------------------------------------|
-    | `scene`       | **str, Path or Scene**   | `"random-target"` | name of a shipped scene, path of a YAML file, a `Scene` |
+    | `scene`       | **str, Path or Scene**   | `"random-target"` | name of a shipped scene, path of a YAML file, a mapping like one, a `Scene` |
     | `reward_type` | **str**                  | `"sparse"`        | `"sparse"` or `"dense"`                                 |
     | `render_mode` | **str or None**          | `None`            | `"rgb_array"` or `"human"`; needs the extra `render`    |
 
@@ -135,14 +135,14 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
 
     def __init__(
         self,
-        scene: Scene | str | Path = "random-target",
+        scene: Scene | Mapping[str, Any] | str | Path = "random-target",
         reward_type: RewardType = "sparse",
         render_mode: str | None = None,
     ) -> None:
         """Load a scene and compile what a step needs (or take it from the cache).
 
         Args:
-            scene: Name of a shipped scene, path of a YAML file, or a scene.
+            scene: Name of a shipped scene, path of a YAML file, what such a file holds as a mapping, or a scene.
             reward_type: "sparse" or "dense".
             render_mode: None, "rgb_array" or "human".
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +51,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
     def __init__(
         self,
         num_envs: int = 1,
-        scene: Scene | str | Path = "paper",
+        scene: Scene | Mapping[str, Any] | str | Path = "paper",
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: None = None,
         threads: int = 1,
@@ -60,7 +60,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
 
         Args:
             num_envs: Number of copies.
-            scene: Name of a shipped scene, path of a YAML file, or a scene.
+            scene: Name of a shipped scene, path of a YAML file, what such a file holds as a mapping, or a
+                scene.
             autoreset_mode: What happens after the end of an episode.
             render_mode: None; a single environment draws pictures.
             threads: Most threads that a step is shared among. More than one pays for some thousand copies on

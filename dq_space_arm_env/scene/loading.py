@@ -1,8 +1,10 @@
 """From a name or a file to a validated scene; finds the scenes that ship with the package."""
 
 import importlib.resources
+from collections.abc import Mapping
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 import yaml
 from pydantic import ValidationError
@@ -43,12 +45,12 @@ def list_scenes() -> list[str]:
     return sorted(file.stem for file in files if file.suffix == ".yaml")
 
 
-def load_scene(source: str | Path | Scene) -> Scene:
+def load_scene(source: str | Path | Mapping[str, Any] | Scene) -> Scene:
     """Load and validate a scene.
 
     Args:
-        source: Name of a shipped scene ("paper"), path of a YAML file (with a slash or ending in .yaml), or a
-            scene, which is validated again.
+        source: Name of a shipped scene ("paper"), path of a YAML file (with a slash or ending in .yaml), what
+            such a file holds as a mapping, or a scene, which is validated again.
 
     Returns:
         The validated scene.
@@ -60,10 +62,11 @@ def load_scene(source: str | Path | Scene) -> Scene:
         return _validated(source, f"scene {source.name!r}")
     if isinstance(source, Path) or (isinstance(source, str) and _is_path(source)):
         return _read(Path(source))
+    if isinstance(source, Mapping):
+        return _validated(dict(source), f"scene {source.get('name')!r}")
     if not isinstance(source, str):
         raise SceneError(
-            f"{source!r} is no scene: give the name of a scene, the path of a YAML file or a Scene; "
-            "Scene.model_validate makes a scene from a mapping"
+            f"{source!r} is no scene: give the name of a scene, the path of a YAML file, a mapping or a Scene"
         )
     names = list_scenes()
     if source not in names:

@@ -9,6 +9,7 @@ ends with the same files.
 from experts.demonstrations.errors import DemonstrationsError
 from experts.demonstrations.executors import Executor, ProcessExecutor, SerialExecutor
 from experts.demonstrations.generation import Advance, generate_demonstrations
+from experts.demonstrations.minari_export import export_to_minari
 from experts.demonstrations.reading import Batch, Demonstration, Demonstrations, load_demonstrations
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "Executor",
     "ProcessExecutor",
     "SerialExecutor",
+    "export_to_minari",
     "generate_demonstrations",
     "load_demonstrations",
 ]

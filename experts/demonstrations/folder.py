@@ -5,7 +5,8 @@
 | `settings.json` | all that the data follow from; written first |
 | `shards/<number>-<sha256>.safetensors` | a shard, under the name of its content: what differs is damaged |
 | `manifest.json` | what became of every problem, and the shards with their hashes; written last |
-| `log/` | locks, and who took how long for what: all that may differ from run to run |
+| `log/` | locks, and who took how long for what: this may differ from run to run |
+| `README.md`, `summary/` | a data card, and a page with times, from `experts.report.demonstrations` |
 
 A shard is written under another name, and renamed once the disk has it. So at any moment every file with its
 proper name is whole, and the rest is rubbish to be removed.

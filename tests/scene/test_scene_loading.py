@@ -1,5 +1,6 @@
 """Loading: names, paths and scenes; every failure is one SceneError that says what would be right."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -79,10 +80,26 @@ def test_unknown_name() -> None:
         load_scene("zzz")
 
 
-@pytest.mark.parametrize("source", [None, 3, {"name": "box"}])
+@pytest.mark.parametrize("source", [None, 3, [("name", "box")]])
 def test_other_types_are_no_source(source: Any) -> None:
-    with pytest.raises(SceneError, match="give the name of a scene, the path of a YAML file or a Scene"):
+    with pytest.raises(
+        SceneError, match="the name of a scene, the path of a YAML file, a mapping or a Scene"
+    ):
         load_scene(source)
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_a_mapping_of_json_values_is_a_scene(name: str) -> None:
+    scene = load_scene(name)
+    values = json.loads(json.dumps(scene.model_dump(mode="json", exclude_none=True)))
+    assert load_scene(values) == scene
+
+
+def test_a_wrong_mapping_is_refused_with_all_that_is_wrong() -> None:
+    with pytest.raises(SceneError, match="scene 'box': 2 problems") as caught:
+        load_scene({"name": "box"})
+    assert "base" in str(caught.value)
+    assert "target" in str(caught.value)
 
 
 def test_missing_file(tmp_path: Path) -> None:

@@ -104,12 +104,13 @@ class SnapshotPainter:
         width, height = self._high - self._low
         self.aspect = float(width / height)
 
-    def draw(self, axes: Axes, stage: int) -> None:
+    def draw(self, axes: Axes, stage: int, *, timed: bool = True) -> None:
         """Draw a stage.
 
         Args:
             axes: Where to draw; its frame is taken away.
             stage: One of the stages given before.
+            timed: Whether to write its time above.
         """
         axes.set_axis_off()
         axes.set_aspect("equal")
@@ -125,8 +126,9 @@ class SnapshotPainter:
             self._name_tip(axes, stage)
             if self._numbered:
                 draw_scales(axes, self._grid, self.view, self._ceiling, self._spacing)
-        time = self._maneuver.time[stage]
-        axes.text(0.5, 0.985, f"$t$ = {time:.1f} s", transform=axes.transAxes, ha="center", va="top")
+        if timed:
+            time = self._maneuver.time[stage]
+            axes.text(0.5, 0.985, f"$t$ = {time:.1f} s", transform=axes.transAxes, ha="center", va="top")
 
     def _name_target(self, axes: Axes) -> None:
         """Name its axes, and dot them where something hides them."""

@@ -5,12 +5,31 @@ from __future__ import annotations
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 from experts.report.page.sections import Section
 from experts.report.tables import TextTable
 
-TITLE = "DQ Space Arm: the numerical report"
+
+class Heading(NamedTuple):
+    """What stands at the top of a page.
+
+    Attributes:
+        title: Its title.
+        all_well: Sentence where nothing falls short.
+        complaint: What comes before the shortcomings.
+    """
+
+    title: str
+    all_well: str
+    complaint: str
+
+
+REPORT = Heading(
+    "DQ Space Arm: the numerical report",
+    "Everything is as accurate as declared. Times are shown, never judged.",
+    "Less accurate than declared",
+)
 
 _STYLE = """
 body { font: 16px/1.5 Georgia, serif; color: #111; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }
@@ -41,21 +60,22 @@ figcaption { font-size: 0.9rem; color: #333; }
 """
 
 
-def html_page(sections: Sequence[Section], origin: Mapping[str, Any]) -> str:
+def html_page(sections: Sequence[Section], origin: Mapping[str, Any], heading: Heading = REPORT) -> str:
     """Write a page that needs no other file.
 
     Args:
         sections: What was measured.
         origin: Machine, versions and commit, from `provenance`.
+        heading: What stands at its top.
 
     Returns:
         HTML text.
     """
     lines = ["<!DOCTYPE html>", '<html lang="en">', "<head>", '<meta charset="utf-8">']
-    lines += [f"<title>{escape(TITLE)}</title>", f"<style>{_STYLE}</style>", "</head>", "<body>"]
-    lines.append(f"<h1>{escape(TITLE)}</h1>")
+    lines += [f"<title>{escape(heading.title)}</title>", f"<style>{_STYLE}</style>", "</head>", "<body>"]
+    lines.append(f"<h1>{escape(heading.title)}</h1>")
     lines += _html_table(origin_table(origin))
-    lines += [f'<p class="{style}">{escape(text)}</p>' for style, text in _verdict(sections)]
+    lines += [f'<p class="{style}">{escape(text)}</p>' for style, text in _verdict(sections, heading)]
     links = (f'<li><a href="#{part.name}">{escape(part.title)}</a></li>' for part in sections)
     lines += ["<ul>", *links, "</ul>"]
     for section in sections:
@@ -63,25 +83,26 @@ def html_page(sections: Sequence[Section], origin: Mapping[str, Any]) -> str:
     return "\n".join([*lines, "</body>", "</html>", ""])
 
 
-def markdown_page(sections: Sequence[Section], origin: Mapping[str, Any]) -> str:
+def markdown_page(sections: Sequence[Section], origin: Mapping[str, Any], heading: Heading = REPORT) -> str:
     """Write the same as Markdown; each figure is a file of its name beside it.
 
     Args:
         sections: What was measured.
         origin: Machine, versions and commit, from `provenance`.
+        heading: What stands at its top.
 
     Returns:
         Markdown text.
     """
-    blocks = [f"# {TITLE}", *_markdown_table(origin_table(origin))]
-    blocks += [f"**{text}**" if style else text for style, text in _verdict(sections)]
+    blocks = [f"# {heading.title}", *markdown_table(origin_table(origin))]
+    blocks += [f"**{text}**" if style else text for style, text in _verdict(sections, heading)]
     for section in sections:
         blocks += [f"## {section.title}", section.caption]
         blocks += [f"**{sentence}**" for sentence in section.shortcomings]
         for figure in section.figures:
             blocks += [f"![{_cell(figure.caption)}]({figure.name}.png)", f"*{figure.caption}*"]
         for table in section.tables:
-            blocks += _markdown_table(table)
+            blocks += markdown_table(table)
         if section.printed:
             blocks.append(f"```text\n{section.printed}\n```")
         blocks += section.notes
@@ -111,13 +132,13 @@ def origin_table(origin: Mapping[str, Any]) -> TextTable:
     return TextTable("Where this comes from", ("", ""), rows)
 
 
-def _verdict(sections: Sequence[Section]) -> Iterator[tuple[str, str]]:
+def _verdict(sections: Sequence[Section], heading: Heading) -> Iterator[tuple[str, str]]:
     """Style and sentence."""
     failures = [sentence for section in sections for sentence in section.shortcomings]
     if failures:
-        yield "bad", f"Less accurate than declared: {' '.join(failures)}"
+        yield "bad", f"{heading.complaint}: {' '.join(failures)}"
     else:
-        yield "", "Everything is as accurate as declared. Times are shown, never judged."
+        yield "", heading.all_well
 
 
 def _html_section(section: Section) -> Iterator[str]:
@@ -155,7 +176,15 @@ def _html_cells(tag: str, cells: Sequence[str], right: int | None) -> str:
     return "".join(written)
 
 
-def _markdown_table(table: TextTable) -> Iterator[str]:
+def markdown_table(table: TextTable) -> Iterator[str]:
+    """Write a table as Markdown.
+
+    Args:
+        table: The table.
+
+    Yields:
+        Its title, and its lines.
+    """
     title, _, explained = table.title.partition("\n")
     yield f"**{_cell(title)}**" + (f": {_cell(explained)}" if explained else "")
     rules = (

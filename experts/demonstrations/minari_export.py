@@ -1,0 +1,306 @@
+"""Demonstrations as a data set of Minari, the format in which offline reinforcement learning shares episodes.
+
+An episode holds observations, actions, rewards and terminations. Its `infos` have a row for each observation:
+what the environment's `info` says about the tip, the state, and the feedback gain, which is zero at the end,
+where no action is taken. Its metadata have the seed, with which `env.reset(seed=seed)` starts where it does,
+the cost, and other numbers about it. `recover_environment()` makes the environment with the whole scene,
+wherever that came from.
+
+Actions are float64, and so is the data set's action space, though the environment's own is float32: it reads
+float64 at full precision, and only so an episode's actions give its rewards bit for bit.
+
+The data set is written under a hidden name and renamed, so that nobody sees half of one.
+"""
+
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import dq_space_arm_env
+from experts.demonstrations.errors import DemonstrationsError
+from experts.demonstrations.reading import Demonstration, Demonstrations
+
+ALGORITHM = "Control-limited differential dynamic programming (box-DDP)"
+CARD = "README.md"
+"""Name of the data card beside the data."""
+PIECE = 16
+"""Episodes that are handed over at a time: some ten megabytes."""
+PADDING, MARGIN = 1.3, 2**25
+"""What HDF5 adds to the size of the arrays: a factor, and bytes."""
+_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")
+_FOLDER_VARIABLE = "MINARI_DATASETS_PATH"
+_DESCRIPTION = """\
+{count} optimal maneuvers of scene {name!r} in DQSpaceArm-v0, from random starts: converged, successful, \
+and replayed in the environment. The environment reset with an episode's seed, and given its actions \
+(float64), repeats its rewards. infos has a row for each observation: attitude_error [deg] and \
+position_error [m] of the tip, is_success, state{gains}."""
+_GAINS = """, and feedback_gains G of the optimal policy clip(action + G @ deviation, -1, 1), where the \
+deviation from the state is env.unwrapped.kernels.difference(state, other_state); zero in rows of inputs \
+at a limit"""
+
+
+def export_to_minari(
+    demonstrations: Demonstrations,
+    dataset_id: str,
+    *,
+    feedback_gains: bool = True,
+    author: str | None = None,
+    author_email: str | None = None,
+    code_permalink: str | None = None,
+    card: str | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> Any:
+    """Write demonstrations as a data set of Minari (HDF5), in `MINARI_DATASETS_PATH` or ~/.minari/datasets.
+
+    Memory holds a few episodes at a time.
+
+    Args:
+        demonstrations: What to write, M of them.
+        dataset_id: Name with a version, for example "space-arm/paper/expert-v0".
+        feedback_gains: Whether to write the gains, two thirds of the size.
+        author: Who made the data.
+        author_email: How to reach them.
+        code_permalink: Address of the code that made the data.
+        card: Text of a README.md beside the data.
+        overwrite: Whether a data set of this name is replaced, once the new one is complete.
+        progress: Called with the number of episodes that are written.
+
+    Returns:
+        The `minari.MinariDataset`.
+
+    Raises:
+        DemonstrationsError: If Minari is not installed; if there are no demonstrations; if a data set of this
+            name exists, or another process writes it; if the disk is full. Nothing is changed then.
+        ValueError: If the name is none of Minari's.
+    """
+    try:
+        # Minari asks for these two after it has begun to write.
+        import h5py  # noqa: F401
+        import minari
+        import PIL  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise DemonstrationsError(
+            f'this needs Minari: pip install "dq-space-arm[minari]" ({error.name} is missing)'
+        ) from error
+    if not _ID.fullmatch(dataset_id):
+        raise ValueError(
+            f"dataset_id: {dataset_id!r}, should be a name with a version, such as space-arm/paper/expert-v0"
+        )
+    if not len(demonstrations):
+        raise DemonstrationsError(f"{demonstrations.path}: there is no demonstration to export")
+    origin = {"author": author, "author_email": author_email, "code_permalink": code_permalink}
+    try:
+        with _staging(dataset_id, overwrite) as folder:
+            dataset = _create(demonstrations, dataset_id, folder, feedback_gains, origin)
+            _fill(dataset, demonstrations, feedback_gains, progress or (lambda done: None))
+            if card is not None:
+                (folder / dataset_id / CARD).write_text(card, encoding="utf-8")
+    except OSError as error:
+        raise DemonstrationsError(
+            f"the data set cannot be written: {error.strerror or error}; nothing of it remains"
+        ) from error
+    return minari.load_dataset(dataset_id)
+
+
+@contextmanager
+def _staging(dataset_id: str, overwrite: bool) -> Iterator[Path]:
+    """A hidden folder to write a data set into, which gets its place at the end of a `with` block.
+
+    Its name follows from that of the data set, so that what a killed process leaves there is removed by the
+    next one; the lock vanishes with the process.
+    """
+    import fcntl  # not on Windows
+
+    from minari.namespace import create_namespace, list_local_namespaces
+    from minari.storage import get_dataset_path
+
+    place = get_dataset_path(dataset_id)
+    # A folder without data is a namespace, with other data sets in it.
+    if place.exists() and not (overwrite and (place / "data").is_dir()):
+        raise DemonstrationsError(
+            f"there is a Minari data set {dataset_id} already: take another name or version, or have it "
+            "overwritten"
+        )
+    folder = get_dataset_path() / f".{dataset_id.replace('/', '-')}.part"
+    folder.mkdir(exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise DemonstrationsError(
+                f"another process is writing the Minari data set {dataset_id}"
+            ) from error
+        replaced = folder / "replaced"
+        try:
+            _put_back(replaced, place)
+            for leftover in folder.iterdir():
+                shutil.rmtree(leftover)
+            yield folder
+            namespace = dataset_id.rpartition("/")[0]
+            if namespace and namespace not in list_local_namespaces():
+                create_namespace(namespace)
+            if overwrite and place.exists():
+                place.rename(replaced)
+            (folder / dataset_id).rename(place)
+        finally:
+            _put_back(replaced, place)
+            shutil.rmtree(folder)
+    finally:
+        os.close(descriptor)
+
+
+def _put_back(replaced: Path, place: Path) -> None:
+    """Undo the first of the two renames if the second has not been."""
+    if replaced.exists() and not place.exists():
+        replaced.rename(place)
+
+
+def _create(
+    demonstrations: Demonstrations,
+    dataset_id: str,
+    folder: Path,
+    feedback_gains: bool,
+    origin: dict[str, str | None],
+) -> Any:
+    """An empty data set."""
+    import minari
+
+    # By its content, not by its name: a scene's name may mean something else elsewhere, or nothing.
+    environment = gymnasium.make("DQSpaceArm-v0", scene=demonstrations.settings["scene"])
+    name, version = demonstrations.scene.name, dq_space_arm_env.__version__
+    description = _DESCRIPTION.format(
+        count=len(demonstrations), name=name, gains=_GAINS if feedback_gains else ""
+    )
+    with _datasets_in(folder), warnings.catch_warnings():
+        # Minari recommends all of them; whoever wants them named names them.
+        warnings.filterwarnings("ignore", f"`({'|'.join(origin)})` is set to None", UserWarning)
+        dataset = minari.create_dataset_from_buffers(
+            dataset_id,
+            [],
+            env=environment,
+            eval_env=environment,
+            action_space=gymnasium.spaces.Box(-1.0, 1.0, environment.action_space.shape, np.float64),
+            algorithm_name=ALGORITHM,
+            description=description,
+            requirements=[f"dq-space-arm>={version}"],
+            data_format="hdf5",
+            **origin,
+        )
+    # The scene is in the environment's specification.
+    settings = {key: value for key, value in demonstrations.settings.items() if key != "scene"}
+    dataset.storage.update_metadata({"demonstrations": settings})
+    environment.close()
+    return dataset
+
+
+@contextmanager
+def _datasets_in(folder: Path) -> Iterator[None]:
+    """Have Minari make data sets in a folder; it asks nobody but this variable."""
+    before = os.environ.get(_FOLDER_VARIABLE)
+    os.environ[_FOLDER_VARIABLE] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_FOLDER_VARIABLE]
+        else:
+            os.environ[_FOLDER_VARIABLE] = before
+
+
+def _fill(
+    dataset: Any, demonstrations: Demonstrations, feedback_gains: bool, progress: Callable[[int], None]
+) -> None:
+    """Write all episodes, a few at a time."""
+    for begin in range(0, len(demonstrations), PIECE):
+        piece = list(demonstrations[begin : begin + PIECE])
+        end = begin + len(piece)
+        episodes = [_episode(demonstrations, demonstration, feedback_gains) for demonstration in piece]
+        # At the beginning for all, then only in case that others write there too.
+        remaining = len(demonstrations) if begin == 0 else len(piece)
+        _check_space(dataset.storage.data_path, remaining * _size(episodes[0]))
+        dataset.update_dataset_from_buffer(episodes)
+        metadata = [_metadata(demonstration) for demonstration in piece]
+        dataset.storage.update_episode_metadata(metadata, range(begin, end))
+        progress(end)
+
+
+def _episode(demonstrations: Demonstrations, demonstration: Demonstration, feedback_gains: bool) -> Any:
+    from minari.data_collector import EpisodeBuffer
+
+    stages = len(demonstration.rewards)
+    terminations = np.zeros(stages, dtype=np.bool_)
+    terminations[-1] = True
+    return EpisodeBuffer(
+        seed=demonstration.seed,
+        observations=demonstration.observations,
+        actions=demonstration.actions,
+        rewards=demonstration.rewards,
+        terminations=terminations,
+        truncations=np.zeros(stages, dtype=np.bool_),
+        infos=_infos(demonstrations, demonstration, feedback_gains),
+    )
+
+
+def _size(episode: Any) -> int:
+    """Size of an episode's arrays, bytes."""
+    arrays = (episode.observations, episode.actions, episode.rewards, *episode.infos.values())
+    return sum(int(array.nbytes) for array in arrays)
+
+
+def _check_space(folder: Path, size: int) -> None:
+    """Refuse what the disk has no room for: on a full disk the library of HDF5 ends the process."""
+    needed, free = PADDING * size + MARGIN, shutil.disk_usage(folder).free
+    if free < needed:
+        raise OSError(f"the disk has {free / 1e9:.1f} GB left, and {needed / 1e9:.1f} GB are needed")
+
+
+def _infos(
+    demonstrations: Demonstrations, demonstration: Demonstration, feedback_gains: bool
+) -> dict[str, Any]:
+    """Arrays with N + 1 rows."""
+    states, success = demonstration.states, demonstrations.scene.success
+    _, errors = demonstrations.kernels.observation(states, np.zeros((len(states), 1)))
+    attitude, position = np.degrees(errors[:, 0]), errors[:, 1]
+    infos = {
+        "state": states,
+        "attitude_error": attitude,
+        "position_error": position,
+        "is_success": (attitude <= success.attitude_error_deg) & (position <= success.position_error),
+    }
+    if feedback_gains:
+        gains = demonstration.feedback_gains
+        infos["feedback_gains"] = np.concatenate([gains, np.zeros_like(gains[:1])])
+    return infos
+
+
+def _metadata(demonstration: Demonstration) -> dict[str, Any]:
+    """Numbers about an episode: those that Minari's own collector writes, and ours."""
+    rewards, facts = demonstration.rewards, demonstration.facts
+    errors = {
+        f"{when}_{what}_error": value
+        for when in ("start", "final")
+        for what, value in zip(("attitude", "position"), facts[f"{when}_errors"], strict=True)
+    }
+    return {
+        "rewards_sum": float(rewards.sum()),
+        "rewards_mean": float(rewards.mean()),
+        "rewards_std": float(rewards.std()),
+        "rewards_max": float(rewards.max()),
+        "rewards_min": float(rewards.min()),
+        "problem": demonstration.index,
+        "cost": demonstration.cost,
+        "iterations": facts["iterations"],
+        "guess": facts["guess"],
+        "clamped_share": facts["clamped_share"],
+        **errors,
+    }
