@@ -1,13 +1,14 @@
 # make paper   solve and replay the paper's maneuver: figures and table in results/paper
 # make test    lint, type check, tests (with CI set also the slow tests, the quick numerical report, and the
-#              tests of the extra agents, whose PyTorch is a download of gigabytes; they are skipped without it)
+#              tests of the extras agents and ray, whose PyTorch is a download of gigabytes; they are skipped
+#              without them)
 # make clean   remove the virtual environment and the results
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 COMMA := ,
-TEST := test$(if $(CI),$(COMMA)agents)
+TEST := test$(if $(CI),$(COMMA)agents$(COMMA)ray)
 
 .PHONY: paper test lint lock clean
 

@@ -3,7 +3,8 @@
 The output folder gets settings.json, shards with the demonstrations, and manifest.json once all are there;
 then README.md, a data card, and summary/ with a page of their distributions, failures and some trajectories.
 A run that was interrupted or killed is resumed by the same command. On a cluster, jobs of an array share a
-folder: --shard 1/8 to --shard 8/8, at once or not.
+folder: --shard 1/8 to --shard 8/8, at once or not. With --ray, the machines of a Ray cluster do the work, and
+need not share a disk.
 Exit status: 0; 1 if the run had to stop, for example because the disk is full; 2 if the input is unusable;
 130 if interrupted. What is complete by then remains, and the same command goes on with it.
 """
@@ -17,7 +18,12 @@ from pathlib import Path
 from rich.console import Console
 
 from dq_space_arm_env import SceneError, load_scene
-from experts.demonstrations import Demonstrations, DemonstrationsError, generate_demonstrations
+from experts.demonstrations import (
+    Demonstrations,
+    DemonstrationsError,
+    RayExecutor,
+    generate_demonstrations,
+)
 from experts.demonstrations.progress import GenerationProgress
 from experts.demonstrations.settings import SHARD_SIZE
 from experts.report.demonstrations import write_summary
@@ -48,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 shard_size=options.shard_size,
                 part=options.shard,
                 workers=options.workers,
+                executor=None if options.ray is None else RayExecutor(options.ray or None),
                 progress=progress.update,
             )
         if demonstrations is not None and options.summary:
@@ -88,7 +95,16 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--no-summary", dest="summary", action="store_false", help="no data card and no page of pictures"
     )
-    parser.add_argument("--workers", type=int, help="number of processes (default: one per processor)")
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument("--workers", type=int, help="number of processes (default: one per processor)")
+    who.add_argument(
+        "--ray",
+        nargs="?",
+        const="",
+        metavar="ADDRESS",
+        help="let a Ray cluster do the work: host:port of its head, or local for a new one of this machine "
+        "(default: what RAY_ADDRESS names, else the one that this machine is part of, else a new one)",
+    )
     return parser.parse_args(arguments)
 
 

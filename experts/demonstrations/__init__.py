@@ -10,6 +10,7 @@ from experts.demonstrations.errors import DemonstrationsError
 from experts.demonstrations.executors import Executor, ProcessExecutor, SerialExecutor
 from experts.demonstrations.generation import Advance, generate_demonstrations
 from experts.demonstrations.minari_export import export_to_minari
+from experts.demonstrations.ray_executor import RayExecutor
 from experts.demonstrations.reading import Batch, Demonstration, Demonstrations, load_demonstrations
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "DemonstrationsError",
     "Executor",
     "ProcessExecutor",
+    "RayExecutor",
     "SerialExecutor",
     "export_to_minari",
     "generate_demonstrations",

@@ -140,6 +140,7 @@ def _fill(folder: Folder, executor: Executor, progress: Callable[[Advance], None
 def _log_entry(result: ShardResult) -> dict[str, object]:
     return {
         "shard": result.shard,
+        "host": result.host,
         "demonstrations": result.demonstrations,
         "failures": result.failures,
         "seconds": result.seconds,

@@ -115,16 +115,27 @@ class Settings:
             "problems": self.n,
             "seed": self.seed,
             "shard_size": self.shard_size,
-            "source": _source_hash(),
-            "versions": {
-                "dq-space-arm": dq_space_arm_env.__version__,
-                **{package: version(package) for package in PACKAGES},
-            },
+            **software(),
         }
 
     def to_json(self) -> str:
         """The record as text."""
         return json.dumps(self.record(), indent=2) + "\n"
+
+
+def software() -> dict[str, Any]:
+    """Name the code that turns settings into demonstrations.
+
+    Returns:
+        JSON values: a hash of the source, and versions of packages.
+    """
+    return {
+        "source": _source_hash(),
+        "versions": {
+            "dq-space-arm": dq_space_arm_env.__version__,
+            **{package: version(package) for package in PACKAGES},
+        },
+    }
 
 
 def differences(there: dict[str, Any], here: dict[str, Any], prefix: str = "") -> list[str]:

@@ -1,6 +1,7 @@
 """One shard: some dozens of problems drawn, solved, checked against each other, replayed, and packed."""
 
 import hashlib
+import platform
 from time import perf_counter
 from typing import NamedTuple
 
@@ -42,6 +43,7 @@ class ShardResult(NamedTuple):
         shard: Its number.
         content: Bytes of the file.
         sha256: Their SHA-256, 64 hexadecimal digits.
+        host: Name of the machine that made it.
         demonstrations: Number of demonstrations in it.
         failures: Number of problems that led to none.
         solve_seconds: Wall-clock time of the first solve of each problem, s.
@@ -51,6 +53,7 @@ class ShardResult(NamedTuple):
     shard: int
     content: bytes
     sha256: str
+    host: str
     demonstrations: int
     failures: int
     solve_seconds: list[float]
@@ -106,7 +109,8 @@ def make_shard(task: Task) -> ShardResult:
     content = pack(arrays | failure_arrays(expert.problem, failed), NOTES)
     digest = hashlib.sha256(content).hexdigest()
     clock.lap("packing")
-    return ShardResult(task.shard, content, digest, len(good), len(failed), solve_seconds, clock.seconds)
+    counts = len(good), len(failed)
+    return ShardResult(task.shard, content, digest, platform.node(), *counts, solve_seconds, clock.seconds)
 
 
 def _replay(expert: Expert, outcomes: list[Outcome]) -> tuple[FloatArray, Episodes]:

@@ -63,7 +63,8 @@ def test_the_log_counts_each_shard_once(folder: Path):
     log = next((folder / "log").glob("*.jsonl"))
     first, *lines = log.read_text().splitlines()
     run = {**json.loads(first), "host": "another"}
-    again = {**json.loads(lines[0]), "solve_seconds": [2.0] * 4, "seconds": {"solves": 8.0}}
+    again = {**json.loads(lines[0]), "host": "another", "solve_seconds": [2.0] * 4}
+    again["seconds"] = {"solves": 8.0}
     log.write_text("\n".join([first, *lines, json.dumps(run), json.dumps(again), lines[1][:30]]))
     found = gather(load_demonstrations(folder)).log
     assert found.shards == 5

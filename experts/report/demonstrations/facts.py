@@ -135,15 +135,16 @@ def read_log(demonstrations: Demonstrations) -> Log:
     """
     entries: dict[int, dict[str, Any]] = {}
     for path in sorted((demonstrations.path / LOG).glob("*.jsonl")):
-        machine = ""
+        processors: dict[str, str] = {}  # of machines that a run was started on
         for line in path.read_text(encoding="utf-8").splitlines():
             try:
                 entry = json.loads(line)
             except ValueError:
                 continue  # what a killed run has begun to write
             if "run" in entry:
-                machine = f"{entry['host']} ({entry['run']['machine']['processor_name']})"
+                processors[entry["host"]] = f" ({entry['run']['machine']['processor_name']})"
             else:
+                machine = entry["host"] + processors.get(entry["host"], "")
                 entries[entry["shard"]] = {**entry, "machine": machine}  # one made anew counts once
     seconds: dict[str, float] = {}
     for entry in entries.values():
