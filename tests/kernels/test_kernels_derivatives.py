@@ -51,7 +51,7 @@ def complex_step_jacobians(kernels, x, u, integrator):
     u_lanes = [u] * kernels.n_t + [u + 1j * H * row for row in np.eye(kernels.n_u)]
     inputs = {"x": np.array(x_lanes).T, "u": np.array(u_lanes).T, "h": h}
     # Derivatives of adaptive methods are those of the steps taken, with their lengths held fixed.
-    buffers = interpreter.evaluate_program(program, inputs, np.complex128, frozen=("taken",))
+    buffers = interpreter.evaluate_program(program, inputs, np.complex128, frozen=("taken", "share_time"))
     x_next = buffers["x_next"].T
     columns = np.array([tangent_of(layout, row.real, row.imag / H) for row in x_next])
     return columns[: kernels.n_t].T, columns[kernels.n_t :].T

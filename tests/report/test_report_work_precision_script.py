@@ -84,7 +84,7 @@ def test_what_is_less_accurate_than_declared_fails(
     arguments = ["--quick", "--case", "formulations", "--out", str(tmp_path), "--no-picture"]
     assert script.main(arguments) == INACCURATE
     assert "minimal coordinates in float64: relative error" in capsys.readouterr().err
-    assert len(json.loads((tmp_path / "work_precision.json").read_text())["shortcomings"]) == 3
+    assert len(json.loads((tmp_path / "work_precision.json").read_text())["shortcomings"]) == 5
     assert not (tmp_path / "work_precision.png").exists()
 
 
