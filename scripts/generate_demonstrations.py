@@ -26,9 +26,10 @@ from experts.demonstrations import (
 )
 from experts.demonstrations.progress import GenerationProgress
 from experts.demonstrations.settings import SHARD_SIZE
+from experts.report.command import INTERRUPTED, SUCCESS, UNUSABLE, complain
 from experts.report.demonstrations import write_summary
 
-SUCCESS, FAILURE, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
+FAILURE = 1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status.
     """
     options = _parse(arguments)
-    console, errors = Console(highlight=False), Console(stderr=True, highlight=False)
+    console = Console(highlight=False)
     try:
         scene = load_scene(options.scene)
         folder = options.out or Path("results/demonstrations") / re.sub(r"[^\w.-]+", "-", scene.name)
@@ -60,10 +61,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if demonstrations is not None and options.summary:
             write_summary(demonstrations)
     except (SceneError, ValueError) as error:
-        errors.print(str(error), style="red", markup=False, soft_wrap=True)
+        complain([str(error)])
         return UNUSABLE
     except (DemonstrationsError, OSError) as error:
-        errors.print(str(error), style="red", markup=False, soft_wrap=True)
+        complain([str(error)])
         return FAILURE
     except KeyboardInterrupt:
         console.print("Interrupted. The shards that are complete remain; the same command goes on with them.")

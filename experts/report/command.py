@@ -77,7 +77,7 @@ def complain(sentences: Sequence[str]) -> None:
     """
     console = Console(stderr=True, highlight=False)
     for sentence in sentences:
-        console.print(sentence, style="red", markup=False)
+        console.print(sentence, style="red", markup=False, soft_wrap=True)
 
 
 def judge(shortcomings: Sequence[str]) -> int:
