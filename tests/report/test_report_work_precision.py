@@ -112,6 +112,10 @@ def test_the_observed_order_leaves_out_coarse_steps_and_rounding() -> None:
     assert observed_order(steps, [0.5] * 8) is None
     floor = [max(error, 1e-9) for error in errors]
     assert observed_order(steps, floor, uncertainty=1e-10) == pytest.approx(6.0)
+    growing = [max(error, 1e-10 * 2.0**k) for k, error in enumerate(errors)]
+    assert observed_order(steps, growing) == pytest.approx(6.0)
+    crossing = [error * (40.0 if k == 1 else 1.0) for k, error in enumerate(errors)]
+    assert observed_order(steps, crossing) == pytest.approx(6.0)
     assert order_of(HIGH, None) == pytest.approx(4.0)
     assert order_of(replace(HIGH, is_adaptive=True), None) is None
     assert order_of(curve("lost", 4), None) is None

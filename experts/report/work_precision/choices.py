@@ -14,7 +14,9 @@ ACCURACIES = (1e-3, 1e-6, 1e-9)
 """Errors of the tip to be reached, m and rad."""
 
 _ASYMPTOTIC = 1e-3
-_ROUNDING, _UNCERTAINTIES = 1e-11, 100.0
+_ROUNDING = 1e-11
+_CLEAR = 6.0
+"""Errors so many times those of rounding, or of the reference, show slopes that are right to a quarter."""
 _SLOPES = 3
 
 
@@ -42,16 +44,18 @@ def observed_order(steps: Sequence[float], errors: Sequence[float], uncertainty:
         uncertainty: Of the reference, m or rad.
 
     Returns:
-        Median slope of log error over log step among the finest three pairs between 1e-3 and rounding, or a
-        hundred times the uncertainty; None if there is none.
+        Slope of log error over log step among the finest three pairs between 1e-3 and what rounding and the
+        uncertainty blur: the median, or the finest one if that is larger, for a leading term that changes its
+        sign spoils one or two; None if there is none.
     """
-    smallest = max(_ROUNDING, _UNCERTAINTIES * uncertainty)
+    floor = min(errors) if errors[-1] > 0.5 * errors[-2] else 0.0  # it falls no more
+    smallest = max(_ROUNDING, _CLEAR * uncertainty, _CLEAR * floor)
     slopes = [
         float(np.log(errors[i] / errors[i + 1]) / np.log(steps[i] / steps[i + 1]))
         for i in range(len(steps) - 1)
         if errors[i] < _ASYMPTOTIC and errors[i + 1] > smallest
     ]
-    return float(np.median(slopes[-_SLOPES:])) if slopes else None
+    return max(float(np.median(slopes[-_SLOPES:])), slopes[-1]) if slopes else None
 
 
 def order_of(curve: Curve, uncertainty: float | None) -> float | None:
@@ -64,7 +68,7 @@ def order_of(curve: Curve, uncertainty: float | None) -> float | None:
     Returns:
         The order; None for an adaptive method, or if no steps are in the range where it can be seen.
     """
-    if curve.is_adaptive or not curve.points:
+    if curve.is_adaptive or len(curve.points) < 2:
         return None
     steps, errors = zip(*((point.step, point.errors.pose) for point in curve.points), strict=True)
     return observed_order(steps, errors, uncertainty or 0.0)
