@@ -15,8 +15,8 @@ ACCURACIES = (1e-3, 1e-6, 1e-9)
 
 _ASYMPTOTIC = 1e-3
 _ROUNDING = 1e-11
-_CLEAR = 6.0
-"""Errors so many times those of rounding, or of the reference, show slopes that are right to a quarter."""
+_FLOORS, _UNCERTAINTIES = 6.0, 30.0
+"""How many times the error at which a curve ends, and that of the reference, errors are that show a slope."""
 _SLOPES = 3
 
 
@@ -49,7 +49,7 @@ def observed_order(steps: Sequence[float], errors: Sequence[float], uncertainty:
         sign spoils one or two; None if there is none.
     """
     floor = min(errors) if errors[-1] > 0.5 * errors[-2] else 0.0  # it falls no more
-    smallest = max(_ROUNDING, _CLEAR * uncertainty, _CLEAR * floor)
+    smallest = max(_ROUNDING, _UNCERTAINTIES * uncertainty, _FLOORS * floor)
     slopes = [
         float(np.log(errors[i] / errors[i + 1]) / np.log(steps[i] / steps[i + 1]))
         for i in range(len(steps) - 1)
