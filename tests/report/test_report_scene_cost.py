@@ -22,7 +22,14 @@ from dq_space_arm_env.kernels.programs import ScenePrograms
 from experts.report import to_json
 from experts.report.command import INTERRUPTED, SUCCESS, UNUSABLE
 from experts.report.scene_cost import measurement
-from experts.report.scene_cost.measurement import OUTPUTS, Effort, SceneCostReport, SceneRow, measure
+from experts.report.scene_cost.measurement import (
+    OUTPUTS,
+    Effort,
+    SceneCostReport,
+    SceneRow,
+    measure,
+    programs_and_integrators,
+)
 from experts.report.scene_cost.processes import IMPORT, MAKE, STEP, WRENCHES, ProcessStage
 from experts.report.scene_cost.programs import compile_cold
 from experts.report.scene_cost.records import ratios, report_record
@@ -238,6 +245,17 @@ def test_tables_fit_a_terminal_of_110_columns(report: SceneCostReport) -> None:
         lines = [line.rstrip() for line in console.file.getvalue().splitlines()]
         pages.append([line for line in lines if line.startswith("  ")])
     assert pages[0] == pages[1]
+
+
+def test_a_scene_may_name_any_integrator(report: SceneCostReport) -> None:
+    first = report.scenes[0]
+    other = dataclasses.replace(first, cost=dataclasses.replace(first.cost, integrator="rodas4"))
+    assert len(tables(dataclasses.replace(report, scenes=(first, other)))[0].rows) == 2
+    curved = programs_and_integrators(load_scene("six-joint"))
+    assert curved == {"step": "rk6", "linearize": "rk6", "lagrangian_hessian": "rk4"}
+    settings = {**load_scene("planar").simulation.model_dump(), "integrator": "rodas4"}
+    stiff = programs_and_integrators(load_scene("planar").replace(simulation=settings))
+    assert stiff == {"step": "rodas4", "linearize": "rodas4"}
 
 
 def test_every_row_of_a_table_has_a_cell_for_each_heading(report: SceneCostReport) -> None:

@@ -22,7 +22,7 @@ from experts.report.figures.style import (
 from experts.report.solvers.accuracy import SolverComparison
 from experts.report.solvers.random_starts import CLOSE, RandomStarts, is_best
 from experts.report.solvers.runs import GAPS, relative_gaps
-from experts.report.throughput.formats import TITLES
+from experts.report.throughput.formats import integrator_title
 
 SMALLEST_GAP = 1e-8
 """Smaller gaps are drawn here: the solvers' tolerance is not far above."""
@@ -124,7 +124,7 @@ def _draw_gaps(axes: Any, comparison: SolverComparison, looks: _Looks) -> None:
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.5 * SMALLEST_GAP)
     axes.margins(x=0.04)
-    title = f"Scene {comparison.scene}, {TITLES[comparison.integrator]}, {comparison.start}"
+    title = f"Scene {comparison.scene}, {integrator_title(comparison.integrator)}, {comparison.start}"
     axes.set_title(title, loc="left", fontsize=9.5)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("cost above the best known [$-$]")

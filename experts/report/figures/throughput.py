@@ -20,7 +20,7 @@ from experts.report.figures.style import (
     house_style,
 )
 from experts.report.throughput.environments import MAKE, MAKE_VEC
-from experts.report.throughput.formats import TITLES
+from experts.report.throughput.formats import integrator_title
 from experts.report.throughput.kernels import VECTOR
 from experts.report.throughput.measurement import SceneThroughput
 from experts.report.throughput.mujoco_peer import SYNCHRONOUS, SYNCHRONOUS_COPIES, WRAPPED
@@ -100,7 +100,7 @@ def _draw_environments(axes: Any, result: SceneThroughput) -> dict[str, Timing]:
     for single in select(ours, way=MAKE):
         place = (1, single.states_per_second)
         axes.plot(*place, "*", color=BLACK, markersize=8, label=MAKE)
-    axes.set_title(f"environment steps, {TITLES[result.integrator]}", loc="left", fontsize=9.5)
+    axes.set_title(f"environment steps, {integrator_title(result.integrator)}", loc="left", fontsize=9.5)
     found = {}
     for engine in dict.fromkeys(timing.engine for timing in timings if timing.engine != OURS):
         theirs = select(timings, engine=engine)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dq_space_arm_env import Scene, list_scenes, load_scene
+from experts.arm_problem import CURVATURE_OF
 from experts.report.scene_cost.installation import InstalledSize, measure_installation
 from experts.report.scene_cost.processes import ProcessStage, measure_processes
 from experts.report.scene_cost.programs import ProgramCost, compile_cold
@@ -31,7 +32,8 @@ OUTPUTS: Mapping[str, str] = {
 }
 """Programs that only their callers pay for, and what they give; the step first, to compare with."""
 
-_OF_A_STEP = ("step", "linearize", "lagrangian_hessian")
+_SECOND = "lagrangian_hessian"
+_OF_A_STEP = ("step", "linearize", _SECOND)
 
 
 @dataclass(frozen=True)
@@ -113,10 +115,11 @@ def measure(effort: Effort, scenes: Mapping[str, Scene] | None = None) -> SceneC
     compile_cold(paper, "tip_pose")
     compared, parts = {REFERENCE: paper, **scenes}, feature_variants(first)
     rows = _measure_rows([*compared.items(), *parts.items()], effort)
-    integrator = first.simulation.integrator
+    integrators = programs_and_integrators(first)
     outputs = tuple(
-        compile_cold(first, name, integrator if name in _OF_A_STEP else "", effort.compilations)
+        compile_cold(first, name, integrators.get(name, ""), effort.compilations)
         for name in OUTPUTS
+        if name in integrators or name not in _OF_A_STEP
     )
     return SceneCostReport(
         scenes=tuple(rows[: len(compared)]),
@@ -126,6 +129,23 @@ def measure(effort: Effort, scenes: Mapping[str, Scene] | None = None) -> SceneC
         processes=tuple(measure_processes(effort.processes)),
         installation=tuple(measure_installation()),
     )
+
+
+def programs_and_integrators(scene: Scene) -> dict[str, str]:
+    """Programs about a step, and whose step it is.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        Names of integrators by names of programs; without second derivatives where there are none.
+    """
+    own = scene.simulation.integrator
+    found = dict.fromkeys(_OF_A_STEP, own)
+    if own in CURVATURE_OF:
+        return found | {_SECOND: CURVATURE_OF[own]}
+    del found[_SECOND]
+    return found
 
 
 def _measure_rows(scenes: list[tuple[str, Scene]], effort: Effort) -> list[SceneRow]:

@@ -12,7 +12,7 @@ from experts.report.scene_cost.programs import ProgramCost
 from experts.report.scene_cost.records import ratios
 from experts.report.scene_cost.sizes import COMPARED_INTEGRATORS
 from experts.report.tables import TextTable
-from experts.report.throughput.formats import TITLES, three_digits
+from experts.report.throughput.formats import integrator_title, three_digits
 from experts.report.throughput.scene_costs import BATCH
 
 
@@ -58,7 +58,7 @@ def _compiled(program: ProgramCost) -> tuple[str, str, str]:
 
 
 def _work(title: str, rows: Sequence[SceneRow]) -> TextTable:
-    steps = [f"{TITLES[name]}\nops" for name in COMPARED_INTEGRATORS]
+    steps = [f"{integrator_title(name)}\nops" for name in COMPARED_INTEGRATORS]
     first = rows[0].title
     headings = ("", "dynamics\nops", *steps, "step\nns", "ratio", "env. step\nops", "ratio", "ns", "ratio")
     cells = []
@@ -78,7 +78,7 @@ def _work(title: str, rows: Sequence[SceneRow]) -> TextTable:
             )
         )
     explained = f"ns per state, best, vector kernels on {BATCH:,} states; ratios to “{first}”"
-    integrators = {TITLES[row.cost.integrator] for row in rows}
+    integrators = {integrator_title(row.cost.integrator) for row in rows}
     if len(integrators) == 1:
         explained += f"; times with {integrators.pop()}"
     return TextTable(f"{title}\n{explained}", headings, tuple(cells), right=1)

@@ -109,10 +109,10 @@ class ExpertBenchmark:
         print_iterations(console, found)
 
     def _compare_solvers(self, console: Console, problem: ArmProblem, guided: GuidedDDP) -> None:
-        """Compare on the nominal start with each integrator, on random ones with the scene's."""
+        """Compare on the nominal start with each integrator, on random ones with the scene's own."""
         chosen = problem.scene.simulation.integrator
         states = draw_starts(problem, self.effort.compared_starts, self.seed)
-        for integrator in COMPARED_INTEGRATORS:
+        for integrator in dict.fromkeys((*COMPARED_INTEGRATORS, chosen)):
             same = integrator == chosen
             variant = problem if same else _warm_problem(problem.scene, integrator)
             entrants, notes = contenders(variant, guided if same else None, self.effort)

@@ -72,7 +72,7 @@ def contenders(
     if not effort.papers_states:
         notes.append("The paper's formulation is left out.")
     elif problem.scene.simulation.integrator != "rk4":
-        notes.append("The paper's formulation is left out with symplectic Euler: it is stepped by RK4.")
+        notes.append("The paper's formulation is compared with RK4 only, which it is stepped by.")
     else:
         found.append(Contender(PAPERS_STATES, papers_states(problem, limit)))
     if not effort.peers:

@@ -22,8 +22,7 @@ from experts.report.solvers.random_starts import (
 from experts.report.solvers.receding import Flight
 from experts.report.solvers.runs import GAPS, relative_gap, time_to_gap
 from experts.report.tables import plain_table
-from experts.report.throughput.formats import TITLES as INTEGRATOR_TITLES
-from experts.report.throughput.formats import three_digits
+from experts.report.throughput.formats import integrator_title, three_digits
 
 
 def print_iterations(console: Console, found: Sequence[IterationCosts]) -> None:
@@ -37,7 +36,7 @@ def print_iterations(console: Console, found: Sequence[IterationCosts]) -> None:
     headings = ("itera-\ntions", "cost J", "end", "solve [s]")
     parts = ("itera-\ntion", "deriva-\ntives", "sweep", "roll-\nout", "rest")
     for costs in found:
-        integrator = INTEGRATOR_TITLES[costs.variants[0].integrator]
+        integrator = integrator_title(costs.variants[0].integrator)
         title = (
             f"Scene {scene}, {integrator}, from zero controls: solves, best (median); iterations, median, ms"
         )
@@ -69,7 +68,7 @@ def _variant_row(variant: VariantCost) -> tuple[str, ...]:
 
 
 def _pieces_rows(costs: IterationCosts) -> Iterator[tuple[str, ...]]:
-    integrator = INTEGRATOR_TITLES[costs.variants[0].integrator]
+    integrator = integrator_title(costs.variants[0].integrator)
     yield _pieces_row(f"{integrator}, best", costs.best)
     yield _pieces_row(f"{integrator}, median", costs.median)
 
@@ -97,7 +96,7 @@ def print_comparison(console: Console, comparison: SolverComparison) -> None:
     """
     gaps = (f"s to\n{100 * gap:g} %" for gap in GAPS)
     best = comparison.best[OURS]
-    integrator = INTEGRATOR_TITLES[comparison.integrator]
+    integrator = integrator_title(comparison.integrator)
     console.print(
         plain_table(
             f"Scene {comparison.scene}, {integrator}, {comparison.start}: best known J {best:.7g}",
@@ -148,7 +147,7 @@ def print_random_starts(console: Console, found: RandomStarts) -> None:
     """
     if not found.starts:
         return
-    integrator = INTEGRATOR_TITLES[found.integrator]
+    integrator = integrator_title(found.integrator)
     console.print(
         plain_table(
             f"Scene {found.scene}, {integrator}: {len(found.starts)} random starts, seed {found.seed}",

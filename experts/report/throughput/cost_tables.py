@@ -9,7 +9,7 @@ from rich.console import Console
 
 from experts.report.peak import Peak
 from experts.report.tables import plain_table
-from experts.report.throughput.formats import TITLES, per_second, three_digits
+from experts.report.throughput.formats import integrator_title, per_second, three_digits
 from experts.report.throughput.records import share_of_peak
 from experts.report.throughput.scene_costs import BATCH, SceneCost
 
@@ -29,7 +29,7 @@ def print_scene_costs(console: Console, costs: Sequence[SceneCost], peaks: Mappi
     rows = (
         (
             cost.title,
-            TITLES[cost.integrator],
+            integrator_title(cost.integrator),
             f"{cost.states}, {cost.inputs}",
             *(text for pair in _sizes(cost) for text in pair),
             f"{share_of_peak(cost.environment_step, peaks):.0%}",
@@ -67,9 +67,8 @@ def print_feature_costs(console: Console, costs: Sequence[SceneCost]) -> None:
             share = timing.best_ns / reference.best_ns
             row += [f"{timing.operations:,}", three_digits(timing.best_ns), f"{share:.2f}"]
         rows.append(row)
-    title = (
-        f"What parts cost: vector kernels on {BATCH:,} states, {TITLES[whole.integrator]}, ns per state, best"
-    )
+    integrator = integrator_title(whole.integrator)
+    title = f"What parts cost: vector kernels on {BATCH:,} states, {integrator}, ns per state, best"
     console.print(plain_table(title, headings, rows, right=1))
 
 

@@ -8,7 +8,7 @@ from experts.report.peak import Peak
 from experts.report.throughput.records import share_of_peak
 from experts.report.throughput.timing import Timing
 
-TITLES = {"symplectic_euler": "Euler", "rk4": "RK4", "": ""}
+_TITLES = {"symplectic_euler": "Euler", "rk4": "RK4"}
 """Short names of the integrators."""
 
 
@@ -37,3 +37,15 @@ def utilization(timing: Timing, peaks: Mapping[str, Peak]) -> str:
     """Operations per ns and their share of the peak; empty if the operations are not known."""
     rate, share = timing.operations_per_ns, share_of_peak(timing, peaks)
     return "" if rate is None or share is None else f"{rate:.1f}, {share:.0%}"
+
+
+def integrator_title(name: str) -> str:
+    """What tables call an integrator.
+
+    Args:
+        name: Its name in the scene file; empty for none.
+
+    Returns:
+        A title.
+    """
+    return _TITLES.get(name, name)

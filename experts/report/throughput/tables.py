@@ -13,7 +13,7 @@ from experts.report.tables import plain_table
 from experts.report.throughput.agreement import Agreement
 from experts.report.throughput.environments import MAKE, MAKE_VEC, UNWRAPPED
 from experts.report.throughput.formats import (
-    TITLES,
+    integrator_title,
     nanoseconds,
     per_second,
     rates,
@@ -76,7 +76,7 @@ def _print_kernel(
     """A row for each batch size; time for every variant, use of the core for the vector code."""
     timings = select(result.timings, engine=OURS, what=what, integrator=integrator)
     scalar, vector = select(timings, way=SCALAR), select(timings, way=VECTOR)
-    title = f"{TITLES[integrator]} {what}".strip()
+    title = f"{integrator_title(integrator)} {what}".strip()
     if what == ENVIRONMENT:
         title += ", compiled part"
     headings = ["states", "scalar"]
@@ -116,7 +116,7 @@ def _print_environments(console: Console, result: SceneThroughput) -> None:
     console.print(
         plain_table(
             f"Scene {result.scene}: environment steps per second, best (median)",
-            ("made by", "copies", *(_heading(TITLES[name], variant) for variant, name in columns)),
+            ("made by", "copies", *(_heading(integrator_title(name), variant) for variant, name in columns)),
             rows,
             right=1,
         ),
@@ -130,7 +130,7 @@ def _print_threads(console: Console, result: SceneThroughput) -> None:
     for busy in select(result.busy_timings, threads=1):
         same = {name: getattr(busy, name) for name in ("what", "way", "integrator", "batch", "precision")}
         way = "kernel" if busy.way == VECTOR else busy.way.removeprefix(_MODULE)
-        row = [f"{TITLES[busy.integrator]} {busy.what}, {way}", f"{busy.batch:,}"]
+        row = [f"{integrator_title(busy.integrator)} {busy.what}, {way}", f"{busy.batch:,}"]
         for timings in (result.timings, result.busy_timings):
             one, two = (select(timings, engine=OURS, threads=count, **same)[0] for count in (1, 2))
             row += [three_digits(timing.median_ns) for timing in (one, two)]
@@ -156,7 +156,7 @@ def _print_peers(console: Console, result: SceneThroughput) -> None:
             ("", "engine", "way", "time", "per s"),
             (
                 (
-                    f"{TITLES[timing.integrator]} {timing.what}".strip(),
+                    f"{integrator_title(timing.integrator)} {timing.what}".strip(),
                     timing.engine,
                     timing.way,
                     nanoseconds(timing),
@@ -183,7 +183,7 @@ def _ratio_rows(result: SceneThroughput) -> Iterator[tuple[str, ...]]:
         ours, theirs = ratio.ours, ratio.theirs
         way = ours.way.removeprefix(_MODULE)
         yield (
-            f"{TITLES[theirs.integrator]} {ratio.what}".strip(),
+            f"{integrator_title(theirs.integrator)} {ratio.what}".strip(),
             f"{way}, {ours.batch:,}" if ours.batch > 1 else way,
             three_digits(ours.best_ns),
             f"{theirs.engine}: {theirs.way}",
@@ -198,6 +198,6 @@ def _agreement_row(agreement: Agreement) -> tuple[str, ...]:
         agreement.quantity,
         agreement.engine,
         agreement.reference,
-        TITLES[agreement.integrator],
+        integrator_title(agreement.integrator),
         f"{agreement.error:.1e}{unit}",
     )
