@@ -68,7 +68,7 @@ def test_without_installation_the_sources_say_what_is_required(folder: Path) -> 
     base, *extras = measure_installation()
     assert base.distributions == {NAME: 7, "numpy": 11}
     assert "gymnasium" in base.missing
-    assert [size.extra for size in extras] == ["agents", "plots", "render", "test"]
+    assert [size.extra for size in extras] == ["agents", "minari", "plots", "ray", "render", "test"]
     assert "stable-baselines3" in extras[0].missing
 
 
