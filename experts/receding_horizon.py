@@ -7,7 +7,8 @@ feedback, is so close to the new optimum that one iteration is enough.
 
 The iterations are Gauss-Newton's. Their model is convex wherever noise and pushes take the state, also where
 exact second derivatives have no minimum; near the plan the curvature that they leave out is in the model of
-what the rest will cost.
+what the rest will cost. Where the cheapest maneuver would end outside of the tolerances, plan and steps
+emphasize the final pose as much as reaching the target takes.
 """
 
 from pathlib import Path
@@ -26,6 +27,7 @@ from experts.line_search import line_search
 from experts.maneuver_plan import ManeuverPlan
 from experts.problem import FloatArray, as_problem
 from experts.shooting import ShootingWorkspace
+from experts.solution import Solution
 from experts.window_problem import WindowProblem
 
 WORTHWHILE = 1e-12
@@ -80,7 +82,7 @@ class RecedingHorizonExpert:
         self.control: FloatArray = np.zeros(self.maneuver.n_controls)
         self.fallbacks = 0
         self._next_stage = 0
-        self._nominal_controls: FloatArray | None = None
+        self._nominal: Solution | None = None
         self._work: ShootingWorkspace | None = None
         self._model_state = np.zeros((1, self.maneuver.n_states))
         self._model_gradient = np.zeros((1, self.maneuver.n_tangent))
@@ -119,7 +121,9 @@ class RecedingHorizonExpert:
             self._begin(state, stage)
         assert self.plan is not None
         work = self._window(self.plan, stage)
-        if self._optimize(work, state, self.plan.solution.cost):
+        with self.maneuver.emphasized(self.plan.emphasis):
+            is_finite = self._optimize(work, state, self.plan.solution.cost)
+        if is_finite:
             self._work, self.control = work, work.current.controls[0].copy()
         else:
             self._work, self.control = None, _planned_control(self.plan, state, stage)
@@ -168,10 +172,10 @@ class RecedingHorizonExpert:
         return result
 
     def _begin(self, state: FloatArray, stage: int) -> None:
-        """Plan an episode; the nominal maneuver is a better first guess than doing nothing."""
-        if self._nominal_controls is None:
-            self._nominal_controls = BoxDDP(self.maneuver).solve().controls
-        self.plan = ManeuverPlan.make(self.maneuver, state, stage, self._nominal_controls)
+        """Plan an episode; the policy of the nominal maneuver is a better first guess than doing nothing."""
+        if self._nominal is None:
+            self._nominal = BoxDDP(self.maneuver).solve()
+        self.plan = ManeuverPlan.make(self.maneuver, state, stage, self._nominal)
         self._work, self._next_stage, self.fallbacks = None, stage, 0
 
     def _window(self, plan: ManeuverPlan, stage: int) -> ShootingWorkspace:

@@ -1,5 +1,7 @@
 """A stretch of a scene's maneuver as a shooting problem: from any state, over as many stages as one likes."""
 
+from contextlib import AbstractContextManager
+
 from experts.arm_problem import ArmProblem
 from experts.problem import FloatArray, Kernel
 
@@ -10,7 +12,7 @@ _QUADRATIC = {
 
 
 class WindowProblem:
-    """Some stages of a maneuver; implements `ShootingProblem`.
+    """Some stages of a maneuver; implements `ShootingProblem` and `HasTolerances`.
 
     A window that ends before the maneuver does has a quadratic model of the remaining cost for its terminal
     cost.
@@ -54,3 +56,36 @@ class WindowProblem:
         """
         name = _QUADRATIC.get(name, name) if self.ends_early else name
         return self.maneuver.kernel(name, batched=batched)
+
+    def misses(self, state: FloatArray) -> float:
+        """Compare the tip's final errors with what counts as a success; see `ArmProblem.misses`.
+
+        Args:
+            state: Last state, shape (n_x,), units of the state.
+
+        Returns:
+            The larger error relative to its tolerance; 0 for a window after which the maneuver goes on.
+        """
+        return 0.0 if self.ends_early else self.maneuver.misses(state)
+
+    def emphasized(self, emphasis: float) -> AbstractContextManager[None]:
+        """Multiply the weights of the maneuver's final pose inside a `with` block.
+
+        Args:
+            emphasis: The factor; 1 is the scene's own cost.
+
+        Returns:
+            The context.
+        """
+        return self.maneuver.emphasized(emphasis)
+
+    def end_cost(self, state: FloatArray) -> float:
+        """Terminal cost of the maneuver, with the emphasis of the moment.
+
+        Args:
+            state: Final state, shape (n_x,), units of the state.
+
+        Returns:
+            The cost, dimensionless.
+        """
+        return self.maneuver.end_cost(state)

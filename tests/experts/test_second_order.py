@@ -187,8 +187,7 @@ def test_an_integrator_without_second_derivatives_leaves_gauss_newton():
     assert BoxDDP(problem).solve().cost < BoxDDP(problem, max_iterations=1).solve().cost
     with pytest.raises(ValueError, match="the problem has no exact second derivatives; gauss_newton needs"):
         BoxDDP(problem, second_order="exact")
-    guess = np.zeros((problem.horizon, problem.n_controls))
-    plan = ManeuverPlan.make(problem, problem.initial_state, 5, guess)
+    plan = ManeuverPlan.make(problem, problem.initial_state, 5, BoxDDP(problem).solve())
     assert np.linalg.eigvalsh(plan.value_hessians).min() > -1e-9
 
 
