@@ -21,6 +21,7 @@ from dq_space_arm_env.environment.start_options import GivenStart, given_start
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.report import REPORT
 from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.scene.start import target_entries
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
@@ -110,6 +111,15 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         See `DQSpaceArmEnv.parameters`.
         """
         return self._copies.parameters.copy()
+
+    @property
+    def targets(self) -> Array:
+        """Poses q_{D/I} of the targets, shape (num_envs, 8), real part dimensionless, dual part m; a copy."""
+        target = np.array(self.scene.target.pose.dual_quaternion, dtype=self.kernels.dtype)
+        targets = np.tile(target, (self.num_envs, 1))
+        entries = list(target_entries(self.scene))
+        targets[:, entries] = self._copies.parameters[:, : len(entries)]
+        return targets
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

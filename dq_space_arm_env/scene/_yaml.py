@@ -79,14 +79,15 @@ def parse_yaml(text: str) -> Any:
     return yaml.load(text, Loader=_Loader)
 
 
-def dump_yaml(data: dict[str, Any]) -> str:
+def dump_yaml(data: dict[str, Any], header: str = _HEADER) -> str:
     """Write plain data as YAML, lists of numbers on one line.
 
     Args:
         data: Dicts, lists, tuples, text, numbers, booleans.
+        header: Comment lines to begin with; on the units by default.
 
     Returns:
-        The YAML text with a comment on the units; `parse_yaml` gives the data back, tuples as lists.
+        The YAML text with its comment; `parse_yaml` gives the data back, tuples as lists.
     """
     # default_flow_style=None: only lists without lists inside go on one line.
-    return _HEADER + yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
+    return header + yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)

@@ -1,5 +1,6 @@
 """Who makes the shards: this process, some processes of this machine, or whatever else runs tasks."""
 
+import os
 import selectors
 from collections.abc import Generator, Iterable, Iterator
 from itertools import islice
@@ -125,3 +126,21 @@ def _dismiss(selector: selectors.BaseSelector, worker: object) -> None:
     assert isinstance(worker, Worker)
     selector.unregister(worker)
     worker.end()
+
+
+def local_executor(workers: int | None = None) -> Executor:
+    """Choose processes of this machine, or this one alone where one is enough.
+
+    Args:
+        workers: Number of processes; None for one for each processor.
+
+    Returns:
+        The executor.
+
+    Raises:
+        ValueError: If there are none.
+    """
+    if workers is None:
+        affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
+        workers = len(affinity(0)) if affinity else os.cpu_count() or 1
+    return SerialExecutor() if workers == 1 else ProcessExecutor(workers)

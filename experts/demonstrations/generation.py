@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from dq_space_arm_env import Scene
 from experts.demonstrations.errors import DemonstrationsError
-from experts.demonstrations.executors import Executor, ProcessExecutor, SerialExecutor
+from experts.demonstrations.executors import Executor, local_executor
 from experts.demonstrations.folder import Folder, Part
 from experts.demonstrations.reading import Demonstrations, load_demonstrations
 from experts.demonstrations.settings import SHARD_SIZE, Settings
@@ -99,7 +99,7 @@ def generate_demonstrations(
     if not 1 <= part[0] <= part[1]:
         raise ValueError(f"part: {part}, should be (i, k) with 1 <= i <= k")
     folder = Folder(Path(out), settings, Part(*part))
-    chosen = executor or _local_executor(workers)
+    chosen = executor or local_executor(workers)
     try:
         with folder.opened():
             _fill(folder, chosen, progress or (lambda advance: None))
@@ -146,11 +146,3 @@ def _log_entry(result: ShardResult) -> dict[str, object]:
         "seconds": result.seconds,
         "solve_seconds": result.solve_seconds,
     }
-
-
-def _local_executor(workers: int | None) -> Executor:
-    """Processes of this machine; this one alone where one is enough."""
-    if workers is None:
-        affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
-        workers = len(affinity(0)) if affinity else os.cpu_count() or 1
-    return SerialExecutor() if workers == 1 else ProcessExecutor(workers)
