@@ -1,0 +1,302 @@
+"""A trained policy as arrays in one file, evaluated with NumPy alone.
+
+One observation takes a few microseconds: its arrays are allocated once, and the normalization is part of the
+first layer. Weights are kept in single precision, like those of the training; the arithmetic is in double
+precision, which for networks of this size takes hardly longer: in single precision the sums over some hundred
+terms would be wrong by more than 1e-6.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agents.policies.activations import ACTIVATIONS, SQUASHES
+from experts.files import write_atomically
+
+FORMAT = 1
+"""Version of the files; to be raised when they change."""
+
+FloatArray = NDArray[np.float64]
+SingleArray = NDArray[np.float32]
+
+
+class PolicyFileError(Exception):
+    """A file holds no policy that this version can read."""
+
+
+class _Work(NamedTuple):
+    """What an evaluation needs besides the observation, for one of them or a batch.
+
+    Attributes:
+        normalized: Shape (..., n_obs).
+        layers: Matrix and bias of each inner layer, its result and a spare array of the same shape.
+        activate: Function between layers, of values and a spare array.
+        squash: The same of the last layer's outputs.
+    """
+
+    normalized: FloatArray
+    layers: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]
+    activate: Callable[[FloatArray, FloatArray], None]
+    squash: Callable[[FloatArray, FloatArray], None]
+
+    @classmethod
+    def of(cls, policy: ExportedPolicy, lead: tuple[int, ...]) -> Self:
+        """Allocate arrays for one observation, lead (), or a batch, lead (B,)."""
+        layers = [
+            (matrix, bias, *np.empty((2, *lead, len(bias))))
+            for matrix, bias in zip(policy._matrices[:-1], policy._offsets[:-1], strict=True)
+        ]
+        normalized = np.empty((*lead, policy.n_observation))
+        return cls(normalized, layers, ACTIVATIONS[policy.activation], SQUASHES[policy.squash])
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedPolicy:
+    """A network of L layers from observations to actions: `action = policy(observation)`.
+
+    It owns its work arrays, so give each thread its own.
+
+    Attributes:
+        weights: Of each layer, float32, shapes (n_obs, h_1), (h_1, h_2), ..., (h_{L-1}, n_u).
+        biases: Of each layer, float32, shapes (h_1,), ..., (n_u,).
+        activation: Function between layers: "tanh", "silu" or "relu".
+        squash: What brings the last layer's outputs into [-1, 1]: "clip" or "tanh".
+        action_scale: What they are then multiplied by, shape (n_u,), fractions of limits; None for ones.
+        mean: Subtracted from observations, shape (n_obs,), units of the observation.
+        scale: What the difference is then multiplied by, shape (n_obs,), one over those units; 0 for entries
+            to ignore, those that were constant in training.
+        normalized_limit: Normalized observations are clipped to this size, dimensionless; inf for none.
+        metadata: JSON values: for which scene, how trained.
+    """
+
+    weights: tuple[SingleArray, ...]
+    biases: tuple[SingleArray, ...]
+    activation: str
+    mean: FloatArray
+    scale: FloatArray
+    squash: str = "clip"
+    action_scale: FloatArray | None = None
+    normalized_limit: float = math.inf
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    # What a call reads and writes, made once; matrices and offsets are weights and biases in double
+    # precision, the first matrix with the scale in it.
+    _matrices: tuple[FloatArray, ...] = field(init=False, repr=False)
+    _offsets: tuple[FloatArray, ...] = field(init=False, repr=False)
+    _work: _Work = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit each other, and allocate what a call needs.
+
+        Raises:
+            ValueError: If a shape does not fit, a number is not finite, or a function is unknown.
+        """
+        self._adopt("weights", tuple(np.ascontiguousarray(array, np.float32) for array in self.weights))
+        self._adopt("biases", tuple(np.ascontiguousarray(array, np.float32) for array in self.biases))
+        self._adopt("mean", np.array(self.mean, np.float64))
+        self._adopt("scale", np.array(self.scale, np.float64))
+        if self.action_scale is not None:
+            self._adopt("action_scale", np.array(self.action_scale, np.float64))
+        _check(self)
+        first, *others = (array.astype(np.float64) for array in self.weights)
+        if math.isinf(self.normalized_limit):
+            # Part of the first layer, it costs nothing.
+            first *= self.scale[:, None]
+        self._adopt("_matrices", (first, *others))
+        self._adopt("_offsets", tuple(array.astype(np.float64) for array in self.biases))
+        self._adopt("_work", _Work.of(self, ()))
+
+    def _adopt(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    @property
+    def n_observation(self) -> int:
+        """Entries of an observation."""
+        return len(self.mean)
+
+    @property
+    def n_action(self) -> int:
+        """Entries of an action."""
+        return len(self.biases[-1])
+
+    def __call__(self, observation: ArrayLike) -> SingleArray:
+        """Choose actions.
+
+        Args:
+            observation: As the environment gives it, shape (n_obs,) or (B, n_obs).
+
+        Returns:
+            Inputs as fractions of their limits, in [-1, 1], float32, shape (n_u,) or (B, n_u).
+
+        Raises:
+            ValueError: If the shape does not fit.
+        """
+        observation = np.asarray(observation)
+        shape = observation.shape
+        if shape == self.mean.shape:
+            return self._evaluate(observation, self._work)
+        if len(shape) == 2 and shape[1:] == self.mean.shape:
+            return self._evaluate(observation, _Work.of(self, shape[:1]))
+        raise ValueError(
+            f"observation: shape {shape}, should be ({self.n_observation},) or (B, {self.n_observation})"
+        )
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[SingleArray, None]:
+        """Choose actions, as the policies of Stable-Baselines3 do.
+
+        Args:
+            observation: Shape (n_obs,) or (B, n_obs).
+            state: None; the policy remembers nothing.
+            episode_start: Which episodes have just begun, shape (B,); of no effect.
+            deterministic: True; the policy draws nothing.
+
+        Returns:
+            Actions, shape (n_u,) or (B, n_u), and None.
+
+        Raises:
+            ValueError: If the shape does not fit.
+        """
+        return self(observation), None
+
+    def _evaluate(self, observation: NDArray[Any], work: _Work) -> SingleArray:
+        values = work.normalized
+        np.subtract(observation, self.mean, out=values)
+        if self.normalized_limit < math.inf:
+            values *= self.scale
+            np.clip(values, -self.normalized_limit, self.normalized_limit, out=values)
+        for matrix, bias, result, spare in work.layers:
+            np.dot(values, matrix, result)
+            result += bias
+            work.activate(result, spare)
+            values = result
+        action: FloatArray = np.dot(values, self._matrices[-1])
+        action += self._offsets[-1]
+        work.squash(action, action)
+        if self.action_scale is not None:
+            action *= self.action_scale
+        return action.astype(np.float32)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the policy into a file, complete or not at all.
+
+        Args:
+            path: The file, `.npz` by custom.
+        """
+        arrays: dict[str, NDArray[Any]] = {
+            "format": np.array(FORMAT),
+            "activation": np.array(self.activation),
+            "squash": np.array(self.squash),
+            "mean": self.mean,
+            "scale": self.scale,
+            "normalized_limit": np.array(self.normalized_limit),
+            "metadata": np.array(json.dumps(dict(self.metadata), sort_keys=True)),
+        }
+        if self.action_scale is not None:
+            arrays["action_scale"] = self.action_scale
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            arrays[f"weight_{i}"], arrays[f"bias_{i}"] = weight, bias
+        content = io.BytesIO()
+        np.savez_compressed(content, allow_pickle=False, **arrays)
+        write_atomically(Path(path), content.getvalue())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a policy that `save` has written; nothing in the file is executed.
+
+        Args:
+            path: The file.
+
+        Returns:
+            The policy.
+
+        Raises:
+            PolicyFileError: If there is no such file, it is of another format, or its parts do not fit.
+        """
+        try:
+            # Read first: of a file that is no archive, NumPy would leave the descriptor open.
+            with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as content:
+                arrays = {name: content[name] for name in content.files}
+        except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+            raise PolicyFileError(f"{path} cannot be read as a policy ({error})") from error
+        found = arrays.get("format")
+        if found is None or found.shape != () or found != FORMAT:
+            raise PolicyFileError(
+                f"{path} has format {found}, this version reads {FORMAT}: export the policy again"
+            )
+        try:
+            return cls(**_fields(arrays))
+        except KeyError as error:
+            raise PolicyFileError(f"{path} is no policy: it has no {error.args[0]}") from error
+        except (ValueError, TypeError) as error:
+            raise PolicyFileError(f"{path} is no policy: {error}") from error
+
+
+def _fields(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    layers = range(sum(name.startswith("weight_") for name in arrays))
+    metadata = json.loads(str(arrays["metadata"]))
+    if not isinstance(metadata, dict):
+        raise ValueError("metadata: should be names with values")
+    return {
+        "weights": tuple(arrays[f"weight_{i}"] for i in layers),
+        "biases": tuple(arrays[f"bias_{i}"] for i in layers),
+        "activation": str(arrays["activation"]),
+        "squash": str(arrays["squash"]),
+        "action_scale": arrays.get("action_scale"),
+        "mean": arrays["mean"],
+        "scale": arrays["scale"],
+        "normalized_limit": float(arrays["normalized_limit"]),
+        "metadata": metadata,
+    }
+
+
+def _check(policy: ExportedPolicy) -> None:
+    for name, value, known in (
+        ("activation", policy.activation, ACTIVATIONS),
+        ("squash", policy.squash, SQUASHES),
+    ):
+        if value not in known:
+            raise ValueError(f"{name}: {value!r} is unknown; there are {', '.join(known)}")
+    if not policy.weights or len(policy.weights) != len(policy.biases):
+        raise ValueError(
+            f"{len(policy.weights)} weights and {len(policy.biases)} biases, should be one of each per layer"
+        )
+    if not policy.normalized_limit > 0.0:
+        raise ValueError(f"normalized_limit: {policy.normalized_limit}, should be positive")
+    if policy.mean.ndim != 1:
+        raise ValueError(f"mean: shape {policy.mean.shape}, should be (n_obs,)")
+    inputs = len(policy.mean)
+    arrays: dict[str, tuple[NDArray[Any], tuple[int, ...]]] = {
+        "mean": (policy.mean, (inputs,)),
+        "scale": (policy.scale, (inputs,)),
+    }
+    for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        outputs = bias.size
+        arrays[f"weight_{i}"] = weight, (inputs, outputs)
+        arrays[f"bias_{i}"] = bias, (outputs,)
+        inputs = outputs
+    if policy.action_scale is not None:
+        arrays["action_scale"] = policy.action_scale, (inputs,)
+    for name, (array, shape) in arrays.items():
+        if array.shape != shape:
+            raise ValueError(f"{name}: shape {array.shape}, should be {shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name}: has entries that are not finite")
+    scale = policy.action_scale
+    if scale is not None and not ((scale >= 0.0) & (scale <= 1.0)).all():
+        raise ValueError(f"action_scale: {scale}, should be in [0, 1]")

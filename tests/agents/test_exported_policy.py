@@ -1,0 +1,244 @@
+"""An exported policy: what it computes, what its file holds, and that it needs NumPy alone."""
+
+import io
+import pickle
+import subprocess
+import sys
+import zipfile
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agents.policies import ExportedPolicy, PolicyFileError
+
+N_OBS, N_U, HIDDEN = 7, 3, (16, 8)
+
+FUNCTIONS = {
+    "tanh": np.tanh,
+    "silu": lambda z: z / (1.0 + np.exp(-z)),
+    "relu": lambda z: np.where(z > 0.0, z, 0.0),
+    "clip": lambda z: np.clip(z, -1.0, 1.0),
+}
+
+
+def parts(seed=0, **changes):
+    rng = np.random.default_rng(seed)
+    sizes = [N_OBS, *HIDDEN, N_U]
+    shapes = list(pairwise(sizes))
+    return {
+        "weights": tuple(rng.normal(size=shape).astype(np.float32) for shape in shapes),
+        "biases": tuple(rng.normal(size=shape[1]).astype(np.float32) for shape in shapes),
+        "activation": "tanh",
+        "mean": rng.normal(size=N_OBS),
+        "scale": rng.uniform(0.5, 2.0, size=N_OBS),
+        "metadata": {"scene": "paper", "training": {"updates": 3}},
+    } | changes
+
+
+def expected(policy, observation):
+    """The same in double precision, in the plainest words."""
+    values = (observation - policy.mean) * policy.scale
+    values = np.clip(values, -policy.normalized_limit, policy.normalized_limit)
+    for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        values = values @ weight.astype(np.float64) + bias
+        last = i == len(policy.weights) - 1
+        values = FUNCTIONS[policy.squash if last else policy.activation](values)
+    return values
+
+
+def observations(count=50):
+    return np.random.default_rng(1).normal(size=(count, N_OBS))
+
+
+@pytest.mark.parametrize("limit", [np.inf, 0.7])
+@pytest.mark.parametrize("squash", ["clip", "tanh"])
+@pytest.mark.parametrize("activation", ["tanh", "silu", "relu"])
+def test_actions_are_those_of_the_formula(activation, squash, limit):
+    # Small last weights, so that not all actions are at the limit.
+    given = parts(activation=activation, squash=squash, normalized_limit=limit)
+    given["weights"] = (*given["weights"][:-1], 0.1 * given["weights"][-1])
+    policy = ExportedPolicy(**given)
+    batch = observations()
+    actions = policy(batch)
+    assert actions.shape == (50, N_U)
+    assert actions.dtype == np.float32
+    np.testing.assert_allclose(actions, expected(policy, batch), atol=1e-7)
+    assert np.mean(np.abs(actions) < 0.99) > 0.05
+    for observation, action in zip(batch, actions, strict=True):
+        np.testing.assert_allclose(policy(observation), action, atol=1e-7)
+
+
+def test_large_inputs_do_not_overflow():
+    policy = ExportedPolicy(**parts(activation="silu"))
+    assert np.isfinite(policy(np.full(N_OBS, 1e6))).all()
+    assert np.isfinite(policy(np.full(N_OBS, -1e6))).all()
+
+
+def test_an_action_stays_what_it_was_when_another_is_asked_for():
+    policy = ExportedPolicy(**parts())
+    first, second = observations(2)
+    action = policy(first)
+    before = action.copy()
+    assert not np.array_equal(policy(second), before)
+    np.testing.assert_array_equal(action, before)
+
+
+def test_entries_without_scale_are_ignored():
+    scale = parts()["scale"]
+    scale[2] = 0.0
+    policy = ExportedPolicy(**parts(scale=scale))
+    observation = observations(1)[0]
+    changed = observation.copy()
+    changed[2] += 100.0
+    np.testing.assert_array_equal(policy(changed), policy(observation))
+    changed[3] += 1.0
+    assert not np.array_equal(policy(changed), policy(observation))
+
+
+def test_it_predicts_as_stable_baselines_does():
+    policy = ExportedPolicy(**parts())
+    batch = observations()
+    actions, state = policy.predict(batch, deterministic=True)
+    assert state is None
+    np.testing.assert_array_equal(actions, policy(batch))
+
+
+def test_saved_and_loaded_it_is_the_same(tmp_path):
+    policy = ExportedPolicy(**parts(squash="tanh", activation="silu", normalized_limit=5.0))
+    policy.save(tmp_path / "policy.npz")
+    loaded = ExportedPolicy.load(tmp_path / "policy.npz")
+    assert (loaded.activation, loaded.squash, loaded.normalized_limit) == ("silu", "tanh", 5.0)
+    assert loaded.metadata == policy.metadata
+    np.testing.assert_array_equal(loaded(observations()), policy(observations()))
+    np.testing.assert_array_equal(loaded.mean, policy.mean)
+
+
+def test_pickled_it_is_the_same():
+    policy = ExportedPolicy(**parts())
+    copied = pickle.loads(pickle.dumps(policy))
+    np.testing.assert_array_equal(copied(observations()), policy(observations()))
+    np.testing.assert_array_equal(copied(observations()[0]), policy(observations()[0]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"activation": "sine"}, "activation: 'sine' is unknown; there are tanh, silu, relu"),
+        ({"squash": "none"}, "squash: 'none' is unknown; there are clip, tanh"),
+        ({"mean": np.zeros(N_OBS + 1)}, r"scale: shape \(7,\), should be \(8,\)"),
+        ({"mean": np.zeros((N_OBS, 1))}, r"mean: shape \(7, 1\), should be \(n_obs,\)"),
+        ({"scale": np.full(N_OBS, np.nan)}, "scale: has entries that are not finite"),
+        ({"weights": parts()["weights"][:2]}, "2 weights and 3 biases, should be one of each per layer"),
+        (
+            {"weights": (*parts()["weights"][:1], np.zeros((9, 8)), parts()["weights"][2])},
+            r"weight_1: shape \(9, 8\), should be \(16, 8\)",
+        ),
+        ({"normalized_limit": 0.0}, "normalized_limit: 0.0, should be positive"),
+    ],
+)
+def test_parts_that_do_not_fit_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        ExportedPolicy(**parts(**changes))
+
+
+@pytest.mark.parametrize("shape", [(N_OBS + 1,), (4, N_OBS - 1), (), (2, 3, N_OBS)])
+def test_observations_of_another_shape_are_refused(shape):
+    with pytest.raises(ValueError, match=r"should be \(7,\) or \(B, 7\)"):
+        ExportedPolicy(**parts())(np.zeros(shape))
+
+
+def rewritten(path, **changes):
+    """Change arrays of a saved policy; None removes one."""
+    ExportedPolicy(**parts()).save(path)
+    with np.load(path) as content:
+        arrays = {**{name: content[name] for name in content.files}, **changes}
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": np.array(99)}, "has format 99, this version reads 1: export the policy again"),
+        ({"format": None}, "has format None"),
+        ({"bias_1": None}, "is no policy: it has no bias_1"),
+        ({"weight_2": np.zeros((8, 4))}, r"is no policy: weight_2: shape \(8, 4\), should be \(8, 3\)"),
+        ({"metadata": np.array("[1]")}, "is no policy: metadata: should be names with values"),
+        ({"metadata": np.array("{")}, "is no policy: "),
+        ({"mean": np.array(["a"] * N_OBS)}, "is no policy: "),
+    ],
+)
+def test_files_that_hold_no_policy_are_refused(tmp_path, changes, message):
+    path = rewritten(tmp_path / "policy.npz", **changes)
+    with pytest.raises(PolicyFileError, match=message):
+        ExportedPolicy.load(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"nothing", b"PK\x03\x04 broken"])
+def test_other_files_are_refused(tmp_path, content):
+    path = tmp_path / "policy.npz"
+    path.write_bytes(content)
+    with pytest.raises(PolicyFileError, match=r"policy.npz cannot be read as a policy"):
+        ExportedPolicy.load(path)
+    with pytest.raises(PolicyFileError, match=r"missing\.npz cannot be read"):
+        ExportedPolicy.load(tmp_path / "missing.npz")
+
+
+class Malicious:
+    def __reduce__(self):
+        return exec, ("raise SystemExit('executed')",)
+
+
+def test_nothing_in_a_file_is_executed(tmp_path):
+    path = rewritten(tmp_path / "policy.npz")
+    array = np.empty((), dtype=object)
+    array[()] = Malicious()
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, array, allow_pickle=True)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("weight_3.npy", stream.getvalue())
+    with pytest.raises(PolicyFileError, match="pickle"):
+        ExportedPolicy.load(path)
+
+
+def test_a_truncated_file_is_refused(tmp_path):
+    path = tmp_path / "policy.npz"
+    ExportedPolicy(**parts()).save(path)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(PolicyFileError, match="cannot be read as a policy"):
+        ExportedPolicy.load(path)
+
+
+WITHOUT_TORCH = """
+import sys
+import numpy as np
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("stable_baselines3", "torch"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing())
+from agents.policies import ExportedPolicy
+policy = ExportedPolicy.load(sys.argv[1])
+print(policy(np.zeros(7)).tolist())
+from agents.policies import PolicyNetwork
+"""
+
+
+def test_it_runs_without_pytorch(tmp_path):
+    policy = ExportedPolicy(**parts())
+    policy.save(tmp_path / "policy.npz")
+    root = Path(__file__).parents[2]
+    run = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TORCH, tmp_path / "policy.npz"],
+        capture_output=True,
+        text=True,
+        cwd=root,
+    )
+    assert run.stdout.strip() == str(policy(np.zeros(N_OBS)).tolist())
+    assert run.stderr.splitlines()[-1] == (
+        'ImportError: PolicyNetwork needs torch: pip install "dq-space-arm[agents]"'
+    )
