@@ -1,7 +1,9 @@
-"""Agents: what learns on the environment.
+"""Agents: what learns on the environment, and how far it is from the optimal controller.
 
+`train` makes an agent from a configuration, `evaluate` flies it from fixed starts beside the expert,
+`compare` sets agents beside the expert's controllers, `zoo` has those that ship with the package, and
 `DQSpaceArmVecEnv` is the native vector environment as Stable-Baselines3 wants it. Importing this package
-loads neither that library nor PyTorch; using the name does.
+loads neither that library nor PyTorch; what needs them loads them, and an exported policy needs neither.
 """
 
 from __future__ import annotations
@@ -10,11 +12,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from agents.comparison import compare
+    from agents.evaluation import evaluate
+    from agents.policies import ExportedPolicy
+    from agents.training import train
     from agents.vec_env import DQSpaceArmVecEnv
 
-__all__ = ["DQSpaceArmVecEnv"]
+__all__ = ["DQSpaceArmVecEnv", "ExportedPolicy", "compare", "evaluate", "train"]
 
-_HOMES = {"DQSpaceArmVecEnv": "vec_env"}
+_HOMES = {
+    "DQSpaceArmVecEnv": "vec_env",
+    "ExportedPolicy": "policies",
+    "compare": "comparison",
+    "evaluate": "evaluation",
+    "train": "training",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,0 +1,38 @@
+"""Configurations of agents: validated YAML files that say what is trained, on what, and for how long."""
+
+from agents.configuration.algorithms import PPO, SAC, TD3, TQC, Algorithm, Demonstrated, Hindsight, OffPolicy
+from agents.configuration.demonstrations import DemonstrationSource
+from agents.configuration.imitation import Cloning, Dagger, ImitationConfiguration
+from agents.configuration.loading import ConfigurationError, list_configurations, load_configuration
+from agents.configuration.schema import (
+    ActionScale,
+    AgentConfiguration,
+    Configuration,
+    Network,
+    Practice,
+    Schedule,
+)
+
+__all__ = [
+    "PPO",
+    "SAC",
+    "TD3",
+    "TQC",
+    "ActionScale",
+    "AgentConfiguration",
+    "Algorithm",
+    "Cloning",
+    "Configuration",
+    "ConfigurationError",
+    "Dagger",
+    "Demonstrated",
+    "DemonstrationSource",
+    "Hindsight",
+    "ImitationConfiguration",
+    "Network",
+    "OffPolicy",
+    "Practice",
+    "Schedule",
+    "list_configurations",
+    "load_configuration",
+]

@@ -1,0 +1,173 @@
+"""The algorithms of reinforcement learning that can be asked for, with the names of Stable-Baselines3."""
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field, StrictBool
+
+from agents.configuration.demonstrations import DemonstrationSource
+from dq_space_arm_env.validation import Count, Finite, Fraction, Model, NonNegative, Positive, Problem
+
+
+class _Common(Model):
+    learning_rate: Positive = Field(default=3e-4, description="step size of Adam at the beginning")
+    final_learning_rate: NonNegative | None = Field(
+        default=None, description="step size at the end, reached linearly; absent: that of the beginning"
+    )
+    batch_size: Count = Field(default=256, description="decisions of a minibatch")
+    gamma: Fraction = Field(default=0.98, description="discount of a decision")
+
+
+class PPO(_Common):
+    """Proximal policy optimization (Schulman et al., 2017)."""
+
+    name: Literal["PPO"]
+    batch_size: Count = Field(default=4096, description="decisions of a minibatch")
+    n_steps: Count = Field(default=50, description="decisions of each copy between updates")
+    n_epochs: Count = Field(default=10, description="passes over these decisions in an update")
+    gae_lambda: Fraction = Field(default=0.95, description="decay of the advantage estimate")
+    clip_range: Positive = Field(default=0.2, description="largest change of a probability ratio")
+    ent_coef: NonNegative = Field(default=0.0, description="weight of the entropy")
+    vf_coef: Positive = Field(default=0.5, description="weight of the value function's loss")
+    max_grad_norm: Positive = Field(default=0.5, description="largest norm of a gradient")
+    target_kl: Positive | None = Field(
+        default=None, description="divergence of the policy at which an update ends early; absent: none"
+    )
+    desired_kl: Positive | None = Field(
+        default=None,
+        description="divergence of the policy that an update is to cause: below learning_rate, the actor's "
+        "steps are as large as that; absent: they are learning_rate",
+    )
+    first_step_factor: Positive = Field(
+        default=1.0,
+        description="size of the actor's first steps with desired_kl, relative to learning_rate, at most 1",
+    )
+    critic_warm_up: Annotated[int, Field(strict=True, ge=0)] = Field(
+        default=0, description="first updates, in which the critic learns alone"
+    )
+    log_std_init: Finite = Field(
+        default=-0.7, description="logarithm of the first standard deviation of actions, in action scales"
+    )
+
+    def _problems(self) -> Iterator[Problem]:
+        if self.first_step_factor > 1.0:
+            yield Problem(
+                ("first_step_factor",), self.first_step_factor, "must be at most 1, for learning_rate itself"
+            )
+
+
+class Hindsight(Model):
+    """Hindsight experience replay (Andrychowicz et al., NeurIPS 2017), on the goal environment."""
+
+    n_sampled_goal: Count = Field(default=4, description="relabeled decisions for each real one")
+    goal_selection_strategy: Literal["future", "final", "episode"] = Field(
+        default="future", description="which achieved goals take the place of desired ones"
+    )
+    reward_type: Literal["sparse", "dense"] = Field(
+        default="sparse", description="reward of the goal environment"
+    )
+
+
+class OffPolicy(_Common):
+    """What the algorithms with a replay buffer have in common."""
+
+    buffer_size: Count = Field(default=1_000_000, description="decisions that are remembered")
+    learning_starts: Count = Field(default=10_000, description="random decisions before learning")
+    tau: Positive = Field(default=0.005, description="share by which target networks follow")
+    train_freq: Count = Field(default=1, description="decisions of each copy between updates")
+    gradient_steps: Count = Field(default=1, description="gradient steps of an update")
+    n_critics: Count = Field(default=2, description="critics; the lowest, or lowest quantiles, are believed")
+    hindsight: Hindsight | None = Field(
+        default=None, description="learn on the goal environment, with hindsight; absent: neither"
+    )
+
+    def _problems(self) -> Iterator[Problem]:
+        if self.learning_starts > self.buffer_size:
+            yield Problem(
+                ("learning_starts",),
+                self.learning_starts,
+                f"must be at most buffer_size, which is {self.buffer_size}",
+            )
+
+
+class _MaximumEntropy(OffPolicy):
+    ent_coef: Positive | Literal["auto"] = Field(
+        default="auto", description="weight of the entropy, or 'auto' to learn it"
+    )
+    ent_coef_init: Positive = Field(default=0.1, description="first weight of the entropy if it is learned")
+    target_entropy: Finite | Literal["auto"] = Field(
+        default="auto", description="entropy to learn it for; 'auto': minus the number of actions"
+    )
+
+
+class Demonstrated(Model):
+    """Demonstrations in the replay buffer (Ball et al., ICML 2023)."""
+
+    source: DemonstrationSource = Field(
+        default_factory=DemonstrationSource, description="where they come from"
+    )
+    share: Positive = Field(default=0.5, description="of demonstrated decisions in a batch, less than 1")
+    cloning_weight: NonNegative = Field(
+        default=0.0,
+        description="weight of the mean squared difference from demonstrated actions, in action scales, in "
+        "the actor's loss, relative to the mean size of values",
+    )
+
+    def _problems(self) -> Iterator[Problem]:
+        if self.share >= 1.0:
+            yield Problem(
+                ("share",), self.share, "must be less than 1: the agent's own decisions are the rest"
+            )
+
+
+class SAC(_MaximumEntropy):
+    """Soft actor-critic (Haarnoja et al., 2018)."""
+
+    name: Literal["SAC"]
+    layer_norm: StrictBool = Field(default=False, description="whether critics are layer-normalized")
+    demonstrations: Demonstrated | None = Field(
+        default=None, description="decisions of the expert to learn from as well; absent: none"
+    )
+
+    def _problems(self) -> Iterator[Problem]:
+        yield from super()._problems()
+        if self.demonstrations is not None and self.hindsight is not None:
+            yield Problem(
+                ("demonstrations",), "given", "must be absent with hindsight, whose replay buffer is another"
+            )
+
+
+class TQC(_MaximumEntropy):
+    """Truncated quantile critics (Kuznetsov et al., ICML 2020)."""
+
+    name: Literal["TQC"]
+    n_quantiles: Count = Field(default=25, description="quantiles of a critic")
+    top_quantiles_to_drop_per_net: Count = Field(
+        default=2, description="highest quantiles of each critic that are not believed"
+    )
+
+    def _problems(self) -> Iterator[Problem]:
+        yield from super()._problems()
+        if self.top_quantiles_to_drop_per_net >= self.n_quantiles:
+            yield Problem(
+                ("top_quantiles_to_drop_per_net",),
+                self.top_quantiles_to_drop_per_net,
+                f"must be less than n_quantiles, which is {self.n_quantiles}",
+            )
+
+
+class TD3(OffPolicy):
+    """Twin delayed deep deterministic policy gradient (Fujimoto et al., ICML 2018)."""
+
+    name: Literal["TD3"]
+    policy_delay: Count = Field(default=2, description="critic updates for each actor update")
+    target_policy_noise: NonNegative = Field(
+        default=0.2, description="noise of target actions, in action scales"
+    )
+    target_noise_clip: Positive = Field(default=0.5, description="its largest size, in action scales")
+    action_noise: NonNegative = Field(
+        default=0.1, description="standard deviation of exploration, in action scales"
+    )
+
+
+Algorithm = Annotated[PPO | SAC | TQC | TD3, Field(discriminator="name")]

@@ -1,0 +1,124 @@
+"""From a name or a file to a validated configuration; finds those that ship with the package."""
+
+import importlib.resources
+from collections.abc import Mapping
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+from pydantic import ValidationError
+
+from agents.configuration.algorithms import Algorithm
+from agents.configuration.imitation import Cloning, Dagger, ImitationConfiguration
+from agents.configuration.residual import ResidualConfiguration, ResidualPPO, ResidualSAC
+from agents.configuration.schema import AgentConfiguration, Configuration
+from dq_space_arm_env.validation import did_you_mean, parse_yaml
+
+_SUFFIXES = (".yaml", ".yml")
+
+
+def _names(algorithm: Any) -> tuple[str, ...]:
+    return get_args(algorithm.model_fields["name"].annotation)
+
+
+_CLASSES: dict[str, type[AgentConfiguration]] = {
+    name: kind
+    for kind, algorithms in (
+        (Configuration, get_args(get_args(Algorithm)[0])),
+        (ImitationConfiguration, (Cloning, Dagger)),
+        (ResidualConfiguration, (ResidualPPO, ResidualSAC)),
+    )
+    for algorithm in algorithms
+    for name in _names(algorithm)
+}
+"""Class of configuration for each name of an algorithm."""
+
+
+class ConfigurationError(ValueError):
+    """A configuration cannot be used; the message gives field, value, and what would be right."""
+
+
+def list_configurations() -> list[str]:
+    """List the configurations that ship with the package.
+
+    Returns:
+        Their names, sorted.
+
+    Raises:
+        ConfigurationError: If the package has lost them.
+    """
+    names = (Path(entry.name) for entry in _directory().iterdir())
+    return sorted(name.stem for name in names if name.suffix == ".yaml")
+
+
+def load_configuration(source: str | Path | Mapping[str, Any] | AgentConfiguration) -> AgentConfiguration:
+    """Load and validate a configuration; the name of its algorithm decides about its class.
+
+    Args:
+        source: Name of a shipped configuration ("ppo"), path of a YAML file (with a slash or ending in
+            .yaml), what such a file holds as a mapping, or a configuration.
+
+    Returns:
+        The validated configuration, of the class that its algorithm belongs to.
+
+    Raises:
+        ConfigurationError: If it cannot be found, read or validated; the message lists every problem.
+    """
+    if isinstance(source, AgentConfiguration):
+        return _validated(type(source), source, f"configuration {source.name!r}")
+    if isinstance(source, Mapping):
+        return _of_its_class(source, f"configuration {source.get('name')!r}")
+    if isinstance(source, Path) or "/" in source or "\\" in source or source.endswith(_SUFFIXES):
+        return _read(Path(source))
+    names = list_configurations()
+    if source not in names:
+        raise ConfigurationError(
+            f"no configuration is named {source!r}; {did_you_mean(source, names)}They are "
+            f"{', '.join(names)}; a file of your own is given by its path, ending in .yaml"
+        )
+    return _read(_directory() / f"{source}.yaml")
+
+
+def _directory() -> Traversable:
+    installed = importlib.resources.files("agents") / "configs"
+    checkout = Path(__file__).resolve().parents[2] / "configs" / "agents"
+    for directory in (installed, checkout):
+        if directory.is_dir():
+            return directory
+    raise ConfigurationError(
+        f"the configurations that ship with the package are missing: neither {installed} nor {checkout} is a "
+        "folder"
+    )
+
+
+def _read(file: Traversable) -> AgentConfiguration:
+    try:
+        data = parse_yaml(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigurationError(f"{file}: there is no such file") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigurationError(f"{file}: cannot be read: {error}") from error
+    if not isinstance(data, dict):
+        raise ConfigurationError(f"{file}: must be a mapping (key: value) at the top")
+    return _of_its_class(data, str(file))
+
+
+def _of_its_class(data: Mapping[str, Any], origin: str) -> AgentConfiguration:
+    algorithm = data.get("algorithm")
+    name = algorithm.get("name") if isinstance(algorithm, Mapping) else None
+    if name not in _CLASSES:
+        hint = did_you_mean(name, _CLASSES) if isinstance(name, str) else ""
+        raise ConfigurationError(
+            f"{origin}: algorithm.name = {name!r}: {hint}it must be one of {', '.join(_CLASSES)}"
+        )
+    return _validated(_CLASSES[name], dict(data), origin)
+
+
+def _validated(kind: type[AgentConfiguration], data: object, origin: str) -> AgentConfiguration:
+    try:
+        return kind.model_validate(data)
+    except ValidationError as error:
+        problems = [detail["msg"] for detail in error.errors(include_url=False)]
+        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        raise ConfigurationError("\n  - ".join([f"{origin}: {count}", *problems])) from error
