@@ -1,0 +1,41 @@
+"""Imitation: networks that learn the expert's maneuvers from demonstrations.
+
+`clone` trains a network on what the expert does (behavior cloning), on how the expert would change it
+(cloning with gains: the derivative of the policy is matched to the feedback gains), and on what the gains say
+about states around the demonstrations (augmentation), each as the settings weigh it. `aggregate` lets the
+network fly, has the expert label the states that it visits, and trains on (DAgger). Importing this package
+loads no PyTorch; training does.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from agents.imitation.aggregation import Aggregated, aggregate
+    from agents.imitation.cloning import Cloned, Making, clone
+    from agents.imitation.training import train_by_imitation
+
+__all__ = ["Aggregated", "Cloned", "Making", "aggregate", "clone", "train_by_imitation"]
+
+_HOMES = {
+    "Aggregated": "aggregation",
+    "aggregate": "aggregation",
+    "Cloned": "cloning",
+    "Making": "cloning",
+    "clone": "cloning",
+    "train_by_imitation": "training",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        module = import_module(f"{__name__}.{_HOMES[name]}")
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise ImportError(f'{name} needs torch: pip install "dq-space-arm[agents]"') from error
+    return getattr(module, name)

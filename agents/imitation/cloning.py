@@ -1,0 +1,189 @@
+"""Training of a network on demonstrations."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from agents.configuration.imitation import Cloning
+from agents.configuration.schema import Network
+from agents.demonstrations import check_scene
+from agents.imitation.objective import Objective
+from agents.imitation.samples import Statistics
+from agents.imitation.trainer import Progress, Record, Trainer, Watch, torch_threads
+from agents.policies.exported import ExportedPolicy
+from agents.policies.network import PolicyNetwork
+from dq_space_arm_env import Scene
+from experts.demonstrations import Demonstrations
+
+
+@dataclass(frozen=True)
+class Making:
+    """What a training follows from besides demonstrations and hyperparameters.
+
+    Attributes:
+        network: Sizes and activation of the network.
+        seed: Of everything that is drawn.
+        threads: Of PyTorch; another number changes the last digits.
+    """
+
+    network: Network = field(default_factory=Network)
+    seed: int = 0
+    threads: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Cloned:
+    """A trained network.
+
+    Attributes:
+        network: With the weights of the best validation.
+        history: Losses at every validation, see `Trainer`.
+        facts: JSON values: scene and training, for the exported policy.
+    """
+
+    network: PolicyNetwork
+    history: list[Record]
+    facts: dict[str, Any]
+
+    def export(self) -> ExportedPolicy:
+        """Make the policy that needs NumPy alone.
+
+        Returns:
+            The policy; its metadata says for which scene and how it was trained.
+        """
+        return self.network.export(self.facts)
+
+
+def clone(
+    demonstrations: Demonstrations,
+    settings: Cloning | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    *,
+    making: Making | None = None,
+    scene: Scene | None = None,
+    progress: Progress | None = None,
+    watch: Watch | None = None,
+) -> Cloned:
+    """Train a network on demonstrations.
+
+    A run that was interrupted is resumed by the same call, and ends with the weights of an uninterrupted one.
+
+    Args:
+        demonstrations: At least two; some are set aside for the validation.
+        settings: How to train; cloning with gains by default.
+        folder: Where to keep a checkpoint; None for none.
+        making: Network, seed and threads; `Making()` by default.
+        scene: The scene that the policy is for; that of the demonstrations by default. Theirs may have
+            stricter tolerances: where the cheapest way to succeed ends just within the tolerances, a policy
+            that is a little less exact than the expert needs a margin.
+        progress: Called now and then.
+        watch: Called with the network at every validation; what it returns is added to the history.
+
+    Returns:
+        The network.
+
+    Raises:
+        ValueError: If there are too few demonstrations, or gains are asked for and they have none.
+        DemonstrationsError: If the scene differs from theirs in more than tolerances.
+        CheckpointError: If the folder holds the checkpoint of another training, or a damaged one.
+    """
+    settings, making = settings or Cloning(), making or Making()
+    intended = scene or demonstrations.scene
+    check_scene(demonstrations, intended)
+    training, validation = _divide(demonstrations, settings, making.seed)
+    facts = _facts(demonstrations, settings, making, intended)
+    with torch_threads(making.threads):
+        statistics = Statistics.of(training)
+        network = new_network(statistics, making)
+        trainer = Trainer(
+            network,
+            Objective(demonstrations.kernels, statistics, settings.objective),
+            settings.optimization,
+            validate_every=settings.validate_every,
+            seed=making.seed,
+            part="cloning",
+        )
+        place = None if folder is None else Path(folder)
+        trainer.train(training, validation, place, facts["training"], progress=progress, watch=watch)
+    return Cloned(network, trainer.history, facts)
+
+
+def new_network(statistics: Statistics, making: Making) -> PolicyNetwork:
+    """Make a network that has learned nothing but the units.
+
+    Args:
+        statistics: Of the demonstrations.
+        making: Sizes, and the seed of its weights.
+
+    Returns:
+        The network; PyTorch's generator is as before.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(making.seed)
+        sizes = len(statistics.observation_mean), len(statistics.action_mean)
+        network = PolicyNetwork(*sizes, making.network.hidden, making.network.activation)
+    network.normalize(
+        statistics.observation_mean,
+        statistics.observation_deviation,
+        statistics.action_mean,
+        statistics.action_deviation,
+    )
+    return network
+
+
+def _facts(demonstrations: Demonstrations, settings: Cloning, making: Making, scene: Scene) -> dict[str, Any]:
+    """What a training follows from, JSON values."""
+    return {
+        "scene": scene.name,
+        "scene_hash": scene.content_hash(),
+        "training": {
+            "demonstrations": len(demonstrations),
+            "tolerances": demonstrations.scene.success.model_dump(mode="json"),
+            "data": demonstrations.manifest["settings_sha256"],
+            "problems": fingerprint(demonstrations),
+            "network": making.network.model_dump(mode="json"),
+            "seed": making.seed,
+            "threads": making.threads,
+            **settings.model_dump(mode="json"),
+        },
+    }
+
+
+def fingerprint(demonstrations: Demonstrations) -> str:
+    """Name a choice among the demonstrations of a folder.
+
+    Args:
+        demonstrations: The choice.
+
+    Returns:
+        16 hexadecimal digits.
+    """
+    return hashlib.sha256(demonstrations.column("index").tobytes()).hexdigest()[:16]
+
+
+def _divide(
+    demonstrations: Demonstrations, settings: Cloning, seed: int
+) -> tuple[Demonstrations, Demonstrations | None]:
+    """Split by problem into what to train and what to validate on."""
+    count, share, gains = len(demonstrations), settings.validation_share, settings.objective.needs_gains
+    aside = max(1, round(share * count)) if share else 0
+    if count - aside < 1 or (gains and count - aside < 2):
+        raise ValueError(
+            f"{count} demonstrations, {aside} of them for the validation, are too few: training needs one, "
+            "with gains two, whose spread is the unit of deviations"
+        )
+    if gains and not demonstrations[0].feedback_gains.any():
+        raise ValueError(
+            f"{demonstrations.path}: these demonstrations have no feedback gains, which gain_weight and "
+            "augmentation_weight ask for: set both to 0, or export them with gains"
+        )
+    if not aside:
+        return demonstrations, None
+    training, validation = demonstrations.split(1.0 - aside / count, aside / count, seed=seed)
+    return training, validation

@@ -1,0 +1,155 @@
+"""What training by imitation minimizes: errors of actions, of their derivatives, and around demonstrations.
+
+With x (+) d the state moved along tangent coordinates, the expert does a(x (+) d) = clip(a + G d) to first
+order, so a policy pi that sees o(x) should have
+
+    d/de pi(o(x (+) e d)) = G d
+
+in every direction d, at e = 0. Each update asks that of one random direction per time step: of a whole
+Jacobian that is right only if it is right in all of them. Inputs at a limit are left out: their rows of G are
+zero because the limit holds them, and clipping does so for the policy too, which may want more than it gets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from agents.configuration.imitation import ObjectiveWeights
+from agents.imitation.samples import Statistics
+from agents.policies.network import PolicyNetwork
+from dq_space_arm_env.kernels import Kernels
+from experts.demonstrations.reading import Batch
+from experts.problem import FloatArray
+
+STEP = 1e-5
+"""Length of a central difference, relative to the direction: errors of 1e-10 both ways."""
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Mean squares of errors, in units of the demonstrations' variation.
+
+    Attributes:
+        total: What is minimized, the weighted sum.
+        action: Of actions.
+        gain: Of derivatives relative to the size of the gains; 0 if they have no weight.
+        augmentation: Of actions at states around the demonstrations; 0 if they have no weight.
+    """
+
+    total: Tensor
+    action: Tensor
+    gain: Tensor
+    augmentation: Tensor
+
+
+class Objective:
+    """Evaluates a network on batches."""
+
+    def __init__(self, kernels: Kernels, statistics: Statistics, weights: ObjectiveWeights) -> None:
+        """Prepare.
+
+        Args:
+            kernels: Of the scene, in double precision.
+            statistics: Of the demonstrations.
+            weights: Of the parts.
+        """
+        self._kernels, self._weights, self._spread = kernels, weights, statistics.spread
+        self._action_deviation = statistics.action_deviation
+        self._gain_size = torch.from_numpy(statistics.gain_size.astype(np.float32))
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the arrays that a batch must have."""
+        if self._weights.needs_gains:
+            return ("states", "observations", "actions", "feedback_gains")
+        return ("observations", "actions")
+
+    def __call__(self, network: PolicyNetwork, batch: Batch, rng: np.random.Generator) -> Losses:
+        """Evaluate a network.
+
+        Args:
+            network: The network.
+            batch: B time steps with the arrays that `needs` names.
+            rng: Draws the directions.
+
+        Returns:
+            The losses, with gradients.
+        """
+        weights, arrays = self._weights, batch.arrays
+        normalized = network.normalized(arrays["observations"])
+        none = torch.zeros(())
+        gain, augmentation = none, none
+        if weights.gain_weight:
+            directions = self._directions(arrays["states"], rng)
+            change = observation_change(self._kernels, arrays["states"], arrays["observations"], directions)
+            tangent = torch.from_numpy((change * network.observation_scale.numpy()).astype(np.float32))
+            outputs, slopes = network.forward_with_tangent(normalized, tangent)
+            gain = self._gain_error(network, slopes, batch, directions)
+        else:
+            outputs = network(normalized)
+        action = _action_error(network, outputs, arrays["actions"])
+        if weights.augmentation_weight:
+            augmentation = self._augmentation_error(network, batch, rng)
+        total = action + weights.gain_weight * gain + weights.augmentation_weight * augmentation
+        return Losses(total, action, gain, augmentation)
+
+    def _directions(self, states: FloatArray, rng: np.random.Generator) -> FloatArray:
+        return rng.standard_normal((len(states), len(self._spread))) * self._spread
+
+    def _gain_error(
+        self, network: PolicyNetwork, slopes: Tensor, batch: Batch, directions: FloatArray
+    ) -> Tensor:
+        """Error of the policy's derivative, each action relative to the size of its gains."""
+        wanted = torch.from_numpy(_times(batch.arrays["feedback_gains"], directions).astype(np.float32))
+        free = torch.from_numpy(np.abs(batch.arrays["actions"]) < 1.0)
+        errors = (slopes * network.action_scale.float() - wanted) / self._gain_size
+        return torch.where(free, errors, 0.0).square().mean()
+
+    def _augmentation_error(self, network: PolicyNetwork, batch: Batch, rng: np.random.Generator) -> Tensor:
+        """Error of actions at states around the demonstrations, where their gains say what to do."""
+        arrays = batch.arrays
+        directions = self._weights.augmentation_scale * self._directions(arrays["states"], rng)
+        states = self._kernels.retract(arrays["states"], directions)
+        observations = self._kernels.observation(states, arrays["observations"][:, -1:])[0]
+        wanted = np.clip(arrays["actions"] + _times(arrays["feedback_gains"], directions), -1.0, 1.0)
+        return _action_error(network, network(network.normalized(observations)), wanted)
+
+
+def observation_change(
+    kernels: Kernels, states: FloatArray, observations: FloatArray, directions: FloatArray
+) -> FloatArray:
+    """Derivative of the observation along tangent coordinates, in a direction for each state.
+
+    Args:
+        kernels: Of the scene, in double precision.
+        states: Shape (B, n_x), units of the state.
+        observations: Of these states; only the time left is read, which does not change, shape (B, n_obs).
+        directions: Shape (B, n_t), units of the tangent coordinates.
+
+    Returns:
+        d/de o(x (+) e d) at e = 0, shape (B, n_obs), units of the observation.
+    """
+    time_left = observations[:, -1:]
+    ahead, behind = (
+        kernels.observation(kernels.retract(states, sign * STEP * directions), time_left)[0]
+        for sign in (1.0, -1.0)
+    )
+    return np.asarray((ahead - behind) / (2.0 * STEP))
+
+
+def _times(gains: NDArray[np.float32], directions: FloatArray) -> FloatArray:
+    """G d, shape (B, n_u)."""
+    return np.asarray(np.matmul(gains, directions[:, :, None].astype(np.float32))[:, :, 0])
+
+
+def _action_error(network: PolicyNetwork, outputs: Tensor, actions: FloatArray) -> Tensor:
+    """Error of actions; one that is at a limit may be wanted beyond it, which clipping undoes."""
+    wanted = torch.from_numpy(actions)
+    errors = network.action_mean + network.action_scale * outputs - wanted
+    beyond = ((wanted >= 1.0) & (errors > 0.0)) | ((wanted <= -1.0) & (errors < 0.0))
+    return (torch.where(beyond, 0.0, errors) / network.action_scale).float().square().mean()
