@@ -1,0 +1,222 @@
+"""Soft actor-critic that learns from demonstrations too, and the critic and the replay buffer for that.
+
+Half of each batch is demonstrated, and critics are layer-normalized, so that they believe no action that
+nobody tried to be wonderful: both after Ball et al., "Efficient online reinforcement learning with offline
+data" (ICML 2023). The actor may be drawn to what was demonstrated, as Fujimoto and Gu's is ("A minimalist
+approach to offline reinforcement learning", NeurIPS 2021).
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.sac.policies import SACPolicy
+from torch import Tensor, nn
+from torch.nn.functional import mse_loss
+
+from agents.reinforcement.demonstrating import Flown
+
+
+class LayerNormalizedCritic(ContinuousCritic):
+    """Critics with a layer normalization before each activation."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        """Make the critics.
+
+        Args:
+            *arguments: As for `ContinuousCritic`.
+            **options: As for `ContinuousCritic`.
+        """
+        super().__init__(*arguments, **options)
+        for number, plain in enumerate(self.q_networks):
+            assert isinstance(plain, nn.Sequential)
+            linear = [module for module in plain if isinstance(module, nn.Linear)]
+            layers = create_mlp(
+                linear[0].in_features,
+                1,
+                [layer.out_features for layer in linear[:-1]],
+                type(plain[1]),
+                post_linear_modules=[nn.LayerNorm],
+            )
+            self.q_networks[number] = nn.Sequential(*layers)
+            setattr(self, f"qf{number}", self.q_networks[number])
+
+
+class LayerNormalizedPolicy(SACPolicy):
+    """The policy of SAC, with layer-normalized critics."""
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
+        """Make the critics.
+
+        Args:
+            features_extractor: What they see observations through; one of their own by default.
+
+        Returns:
+            The critics.
+        """
+        options = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return LayerNormalizedCritic(**options).to(self.device)
+
+
+class DemonstrationBuffer(ReplayBuffer):
+    """A replay buffer whose batches end with demonstrated decisions, a share of them.
+
+    Attributes:
+        share: Of demonstrated decisions in a batch; 0 before there are any.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        """Make a buffer without demonstrations.
+
+        Args:
+            *arguments: As for `ReplayBuffer`.
+            **options: As for `ReplayBuffer`.
+        """
+        super().__init__(*arguments, **options)
+        self.share = 0.0
+        self._demonstrated: tuple[NDArray[np.float32], ...] = ()
+
+    def demonstrate(self, flown: Flown, unit: NDArray[np.float32], share: float) -> None:
+        """Take demonstrations.
+
+        Args:
+            flown: Their decisions.
+            unit: Largest actions, shape (n_u,), fractions of limits; the buffer keeps actions relative to it.
+            share: Of demonstrated decisions in a batch.
+        """
+        self.share = share
+        columns = (
+            flown.observations,
+            flown.actions / unit,
+            flown.next_observations,
+            flown.done[:, None],
+            flown.rewards[:, None],
+        )
+        self._demonstrated = tuple(np.asarray(column, dtype=np.float32) for column in columns)
+
+    def demonstrated(self, batch_size: int) -> int:
+        """Count the demonstrated decisions in a batch.
+
+        Args:
+            batch_size: Decisions in all.
+
+        Returns:
+            Those at its end that are demonstrated.
+        """
+        return round(self.share * batch_size)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """Draw a batch.
+
+        Args:
+            batch_size: Decisions in all.
+            env: None; observations are not normalized here.
+
+        Returns:
+            The batch, demonstrated decisions last.
+        """
+        count = self.demonstrated(batch_size)
+        own = super().sample(batch_size - count, env)
+        if not count:
+            return own
+        # The generator that SB3's buffers draw from, and that its seed is for.
+        rows = np.random.randint(len(self._demonstrated[0]), size=count)  # noqa: NPY002
+        others = (self.to_torch(column[rows]) for column in self._demonstrated)
+        parts = (own.observations, own.actions, own.next_observations, own.dones, own.rewards)
+        return ReplayBufferSamples(*(torch.cat(pair) for pair in zip(parts, others, strict=True)))
+
+
+class SoftActorCritic(SAC):
+    """SAC of Stable-Baselines3, whose actor may be drawn to demonstrated actions.
+
+    Attributes:
+        cloning_weight: Of the mean squared difference from demonstrated actions, relative to the mean size of
+            values.
+    """
+
+    def __init__(self, *arguments: Any, cloning_weight: float = 0.0, **options: Any) -> None:
+        """Make a learner.
+
+        Args:
+            *arguments: As for SAC.
+            cloning_weight: See the class; 0 for SAC's own loss.
+            **options: As for SAC.
+        """
+        self.cloning_weight = cloning_weight
+        super().__init__(*arguments, **options)
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Learn from batches of the replay buffer.
+
+        Args:
+            gradient_steps: Batches.
+            batch_size: Decisions of each.
+        """
+        if not self.cloning_weight:
+            super().train(gradient_steps, batch_size)
+            return
+        self.policy.set_training_mode(True)
+        entropy_optimizers = [] if self.ent_coef_optimizer is None else [self.ent_coef_optimizer]
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer, *entropy_optimizers])
+        losses = []
+        for _ in range(gradient_steps):
+            losses.append(self._step(batch_size))
+            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+        self._n_updates += gradient_steps
+        names = ("critic_loss", "actor_loss", "cloning_loss", "ent_coef")
+        for name, values in zip(names, zip(*losses, strict=True), strict=True):
+            self.logger.record(f"train/{name}", np.mean(values))
+
+    def _step(self, batch_size: int) -> tuple[float, ...]:
+        """One step of temperature, critics and actor, as in SAC but for the last term."""
+        buffer = self.replay_buffer
+        assert isinstance(buffer, DemonstrationBuffer)
+        data = buffer.sample(batch_size)
+        actions, log_probability = self.actor.action_log_prob(data.observations)
+        temperature = self._temperature(log_probability)
+        with torch.no_grad():
+            following, following_log = self.actor.action_log_prob(data.next_observations)
+            values = self._lowest(self.critic_target(data.next_observations, following))
+            values = values - temperature * following_log.reshape(-1, 1)
+            target = data.rewards + (1.0 - data.dones) * self.gamma * values
+        critics = self.critic(data.observations, data.actions)
+        critic_loss = 0.5 * torch.stack([mse_loss(values, target) for values in critics]).sum()
+        self.critic.optimizer.zero_grad()
+        critic_loss.backward()
+        self.critic.optimizer.step()
+
+        values = self._lowest(self.critic(data.observations, actions))
+        count = buffer.demonstrated(batch_size)
+        shown, wanted = data.observations[-count:], data.actions[-count:]
+        cloning_loss = mse_loss(self.actor(shown, deterministic=True), wanted)
+        weight = self.cloning_weight * values.abs().mean().detach()
+        actor_loss = (temperature * log_probability.reshape(-1, 1) - values).mean() + weight * cloning_loss
+        self.actor.optimizer.zero_grad()
+        actor_loss.backward()
+        self.actor.optimizer.step()
+        return critic_loss.item(), actor_loss.item(), cloning_loss.item(), temperature.item()
+
+    def _temperature(self, log_probability: Tensor) -> Tensor:
+        """The weight of the entropy, before it makes a step of its own."""
+        if self.ent_coef_optimizer is None or self.log_ent_coef is None:
+            return self.ent_coef_tensor
+        temperature = torch.exp(self.log_ent_coef.detach())
+        assert isinstance(self.target_entropy, float)
+        loss = -(self.log_ent_coef * (log_probability + self.target_entropy).detach()).mean()
+        self.ent_coef_optimizer.zero_grad()
+        loss.backward()
+        self.ent_coef_optimizer.step()
+        return temperature
+
+    @staticmethod
+    def _lowest(values: tuple[Tensor, ...]) -> Tensor:
+        """The least that critics expect, shape (B, 1)."""
+        return torch.cat(values, dim=1).min(dim=1, keepdim=True).values

@@ -1,0 +1,185 @@
+"""SAC with demonstrations: flown again by the agent's own actions, mixed into batches, and resumed."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+
+import torch
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from agents import DQSpaceArmVecEnv, ExportedPolicy
+from agents.configuration import ConfigurationError, load_configuration
+from agents.reinforcement.building import load_to_act, make_environment, make_learner
+from agents.reinforcement.checkpoints import read_checkpoint
+from agents.reinforcement.demonstrating import fly_again
+from agents.reinforcement.sac import DemonstrationBuffer, LayerNormalizedCritic
+from agents.run_folder import RunFolder
+from agents.training import train
+from experts.demonstrations import DemonstrationsError
+
+pytestmark = pytest.mark.agents
+
+COPIES, REPEAT, DECISIONS = 2, 2, 75  # of 150 steps
+BATCH, SHARE = 32, 0.25
+
+
+@pytest.fixture(scope="module")
+def scene_file(small_scene, tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "small.yaml"
+    small_scene.to_yaml(path)
+    return path
+
+
+def configuration(demonstrations, scene_file, total_steps=1200, cloning_weight=0.5, **practice):
+    return load_configuration(
+        {
+            "name": "demonstrated",
+            "scene": str(scene_file),
+            "environment": {"copies": COPIES, "action_repeat": REPEAT, "reward_scale": 0.01, **practice},
+            "network": {"hidden": [32, 32], "activation": "relu"},
+            "algorithm": {
+                "name": "SAC",
+                "batch_size": BATCH,
+                "learning_starts": 40,
+                "buffer_size": 1000,
+                "layer_norm": True,
+                "demonstrations": {
+                    "source": {"folder": str(demonstrations.path)},
+                    "share": SHARE,
+                    "cloning_weight": cloning_weight,
+                },
+            },
+            "schedule": {"total_steps": total_steps, "evaluation_episodes": 4, "checkpoint_every": 600},
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(demonstrations, scene_file, tmp_path_factory):
+    return train(configuration(demonstrations, scene_file), tmp_path_factory.mktemp("run"))
+
+
+def test_a_demonstration_flown_again_is_what_the_environment_does(demonstrations, small_scene, scene_file):
+    environment = make_environment(configuration(demonstrations, scene_file), small_scene)
+    flown = fly_again(demonstrations[:4], small_scene, environment)
+    assert len(flown.actions) == 4 * DECISIONS
+    np.testing.assert_array_equal(np.flatnonzero(flown.done) % DECISIONS, DECISIONS - 1)
+    # The same actions in the agent's environment, one flight after the other.
+    alone = environment.around(DQSpaceArmVecEnv(1, small_scene))
+    for flight in range(4):
+        alone.venv.set_options({"initial_state": demonstrations[flight].states[0]})
+        observation = alone.reset()
+        for row in range(flight * DECISIONS, (flight + 1) * DECISIONS):
+            np.testing.assert_array_equal(flown.observations[row], observation[0])
+            observation, reward, done, infos = alone.step(flown.actions[row : row + 1])
+            assert flown.rewards[row] == reward[0]
+            assert flown.done[row] == done[0]
+            after = infos[0]["terminal_observation"] if done[0] else observation[0]
+            np.testing.assert_array_equal(flown.next_observations[row], after)
+        assert infos[0]["is_success"]
+        # Held for two steps, it costs little more than the optimum.
+        assert demonstrations[flight].cost < -infos[0]["episode"]["r"] < 1.1 * demonstrations[flight].cost
+
+
+def test_actions_too_small_to_succeed_are_named(demonstrations, small_scene, scene_file):
+    weak = {"base_torque": 0.001, "joint_torque": 0.001, "base_force": 0.001}
+    settings = configuration(demonstrations, scene_file, action_scale=weak)
+    with pytest.raises(DemonstrationsError, match=r"none of the 2 demonstrations .*action_scale larger"):
+        fly_again(demonstrations[:2], small_scene, make_environment(settings, small_scene))
+
+
+def test_batches_end_with_demonstrated_decisions(trained, demonstrations, small_scene, scene_file):
+    buffer = trained.model.replay_buffer
+    assert buffer.demonstrated(BATCH) == SHARE * BATCH == 8
+    settings = configuration(demonstrations, scene_file)
+    flown = fly_again(demonstrations, small_scene, make_environment(settings, small_scene))
+    batch = buffer.sample(BATCH)
+    known = {row.tobytes() for row in flown.observations}
+    shown = [row.tobytes() in known for row in batch.observations.numpy()]
+    assert shown == [False] * 24 + [True] * 8
+    assert batch.rewards.shape == batch.dones.shape == (BATCH, 1)
+
+
+def test_networks_see_in_units_of_the_demonstrations(trained, demonstrations, small_scene, scene_file):
+    settings = configuration(demonstrations, scene_file)
+    flown = fly_again(demonstrations, small_scene, make_environment(settings, small_scene))
+    deviation = flown.observations.astype(np.float64).std(axis=0)
+    policy = trained.model.policy
+    for network in (policy.actor, policy.critic, policy.critic_target):
+        scale = network.features_extractor.scale.numpy()
+        varies = scale > 0.0
+        assert varies.sum() > 8
+        np.testing.assert_allclose(scale[varies], 1.0 / deviation[varies], rtol=1e-12)
+
+
+def test_critics_are_layer_normalized_and_optimized(trained):
+    critic = trained.model.critic
+    assert isinstance(critic, LayerNormalizedCritic)
+    norms = [module for module in critic.modules() if isinstance(module, torch.nn.LayerNorm)]
+    assert len(norms) == 2 * 2  # critics, hidden layers
+    assert all(np.abs(norm.weight.detach().numpy() - 1.0).max() > 1e-5 for norm in norms)
+    assert len(list(critic.parameters())) == 2 * (3 * 2 + 2 * 2)
+
+
+def test_the_actor_is_drawn_to_what_was_demonstrated(demonstrations, scene_file, small_scene, tmp_path):
+    settings = configuration(demonstrations, scene_file)
+    flown = fly_again(demonstrations, small_scene, make_environment(settings, small_scene))
+    errors = []
+    for weight in (0.0, 100.0):
+        run = train(configuration(demonstrations, scene_file, 2000, weight), tmp_path / str(weight))
+        actions = run.model.predict(flown.observations, deterministic=True)[0]
+        errors.append(np.mean((actions - flown.actions) ** 2))
+    assert errors[1] < 0.8 * errors[0]
+
+
+def test_saved_and_exported_policies_act_like_the_model(trained):
+    policy = ExportedPolicy.load(trained.folder / "policy.npz")
+    noise = np.random.default_rng(0).normal(0.0, 1.5, (50, policy.n_observation))
+    unit = np.where(policy.scale > 0.0, 1.0 / np.maximum(policy.scale, 1e-9), 0.0)
+    observations = (policy.mean + unit * noise).astype(np.float32)
+    expected = trained.model.predict(observations, deterministic=True)[0]
+    assert np.ptp(expected, axis=0).min() > 0.0
+    np.testing.assert_allclose(policy(observations), expected, rtol=0.0, atol=1e-6)
+    loaded = load_to_act(trained.folder / "model.zip", type(trained.model.policy).__module__)
+    np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], expected)
+
+
+def test_a_run_resumes_with_both_buffers(trained, demonstrations, small_scene, scene_file):
+    settings = configuration(demonstrations, scene_file)
+    checkpoint = RunFolder(trained.folder, settings).checkpoint()
+    model, progress = read_checkpoint(checkpoint, settings, make_environment(settings, small_scene))
+    before, after = trained.model.replay_buffer, model.replay_buffer
+    assert isinstance(after, DemonstrationBuffer)
+    assert after.pos == before.pos > 0
+    np.testing.assert_array_equal(after.actions, before.actions)
+    np.random.seed(0)  # noqa: NPY002
+    first = before.sample(BATCH)
+    np.random.seed(0)  # noqa: NPY002
+    for one, other in zip(first, after.sample(BATCH), strict=True):
+        assert one is other is None or torch.equal(one, other)
+    assert progress.expert_solves == len(demonstrations)
+    assert trained.policy.metadata["training"]["expert_solves"] == len(demonstrations)
+    more = train(configuration(demonstrations, scene_file, total_steps=1800), trained.folder)
+    assert more.model.num_timesteps * REPEAT == 1800
+    assert isinstance(more.model.replay_buffer, DemonstrationBuffer)
+
+
+def test_without_demonstrations_it_is_plain(scene_file, small_scene, demonstrations):
+    content = json.loads(configuration(demonstrations, scene_file).model_dump_json(exclude_none=True))
+    del content["algorithm"]["demonstrations"]
+    content["algorithm"]["layer_norm"] = False
+    settings = load_configuration(content)
+    model = make_learner(settings, make_environment(settings, small_scene))
+    assert type(model.replay_buffer) is ReplayBuffer
+    assert not any(isinstance(module, torch.nn.LayerNorm) for module in model.critic.modules())
+
+
+def test_demonstrations_and_hindsight_exclude_each_other(demonstrations, scene_file):
+    content = json.loads(configuration(demonstrations, scene_file).model_dump_json(exclude_none=True))
+    content["algorithm"]["hindsight"] = {}
+    with pytest.raises(ConfigurationError, match="must be absent with hindsight"):
+        load_configuration(content)

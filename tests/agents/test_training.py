@@ -1,0 +1,344 @@
+"""Every algorithm trains, saves, resumes and exports, and acts the same way each time."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+import agents
+from agents import DQSpaceArmVecEnv, ExportedPolicy, evaluate
+from agents.configuration import load_configuration
+from agents.evaluation.policies import as_policy
+from agents.reinforcement.building import load_to_act, make_environment, make_learner
+from agents.reinforcement.checkpoints import read_checkpoint
+from agents.reinforcement.export import export_policy
+from agents.reinforcement.held_actions import HeldActions
+from agents.run_folder import RunFolder, RunFolderError
+from agents.training import main, train
+from dq_space_arm_env import load_scene
+
+pytestmark = pytest.mark.agents
+
+PAPER = load_scene("paper")
+STEPS, REPEAT, COPIES = 40, 4, 4
+OFF_POLICY = {"batch_size": 32, "learning_starts": 200, "buffer_size": 2000, "gradient_steps": 2}
+ALGORITHMS = {
+    "PPO": {"name": "PPO", "n_steps": 10, "batch_size": 40, "n_epochs": 2},
+    "SAC": {"name": "SAC", **OFF_POLICY},
+    "TQC": {"name": "TQC", **OFF_POLICY},
+    "TD3": {"name": "TD3", **OFF_POLICY},
+    "HER": {"name": "SAC", **OFF_POLICY, "hindsight": {"n_sampled_goal": 2}},
+}
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "short.yaml"
+    PAPER.replace(name="short", simulation={"dt": 0.015, "steps": STEPS}).to_yaml(path)
+    return path
+
+
+def configuration(algorithm, scene_file, total_steps=3200, **changes):
+    return load_configuration(
+        {
+            "name": algorithm.lower(),
+            "scene": str(scene_file),
+            "environment": {
+                "copies": COPIES,
+                "action_repeat": REPEAT,
+                "action_scale": {"base_force": 0.001, "base_torque": 0.2},
+                "reward_scale": 0.01,
+            },
+            "network": {"hidden": [16, 16], "activation": "tanh" if algorithm == "PPO" else "relu"},
+            "algorithm": ALGORITHMS[algorithm],
+            "schedule": {
+                "total_steps": total_steps,
+                "evaluate_every": 1600,
+                "evaluation_episodes": 4,
+                "checkpoint_every": 1600,
+            },
+            **changes,
+        }
+    )
+
+
+def observations(model, count=50):
+    """As far apart as those of the environment, or twice as far; as the model takes them, and joined."""
+    policy = export_policy(model, {})
+    deviation = np.where(policy.scale > 0.0, 1.0 / np.maximum(policy.scale, 1e-9), 0.0)
+    noise = np.random.default_rng(0).normal(0.0, 1.5, (count, policy.n_observation))
+    joined = (policy.mean + deviation * noise).astype(np.float32)
+    spaces = getattr(model.observation_space, "spaces", None)
+    if spaces is None:
+        return joined, joined
+    ends = np.cumsum([spaces[name].shape[0] for name in sorted(spaces)])[:-1]
+    return dict(zip(sorted(spaces), np.split(joined, ends, axis=1), strict=True)), joined
+
+
+def state_of(model):
+    """Parameters and the state of every optimizer, as a flat list of arrays."""
+    tensors = []
+
+    def collect(value):
+        if isinstance(value, dict):
+            for key in sorted(value, key=str):
+                collect(value[key])
+        elif isinstance(value, (list, tuple)):
+            for item in value:
+                collect(item)
+        elif isinstance(value, torch.Tensor):
+            tensors.append(value.detach().numpy())
+        elif isinstance(value, float):
+            tensors.append(np.array(value))
+
+    collect(model.get_parameters())
+    return tensors
+
+
+@pytest.fixture(scope="module")
+def trained(scene_file, tmp_path_factory):
+    """Each algorithm, trained for some thousand steps."""
+    folder = tmp_path_factory.mktemp("runs")
+    runs = {}
+
+    def get(algorithm):
+        if algorithm not in runs:
+            runs[algorithm] = train(configuration(algorithm, scene_file), folder / algorithm)
+        return runs[algorithm]
+
+    return get
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_training_learns_for_as_many_steps_as_it_was_asked_for(algorithm, trained, scene_file):
+    run = trained(algorithm)
+    assert run.model.num_timesteps * REPEAT == 3200
+    settings = configuration(algorithm, scene_file)
+    untrained = make_learner(settings, make_environment(settings, load_scene(scene_file)))
+    weights = zip(export_policy(untrained, {}).weights, run.policy.weights, strict=True)
+    assert all(np.abs(after - before).max() > 1e-4 for before, after in weights)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_saved_and_exported_policies_act_like_the_model(algorithm, trained):
+    run = trained(algorithm)
+    seen, joined = observations(run.model)
+    expected, _ = run.model.predict(seen, deterministic=True)
+    expected = np.clip(expected, -1.0, 1.0)  # what the environment does
+    loaded = load_to_act(run.folder / "model.zip", type(run.model.policy).__module__)
+    assert type(loaded) is type(run.model)
+    np.testing.assert_array_equal(np.clip(loaded.predict(seen, deterministic=True)[0], -1.0, 1.0), expected)
+    exported = ExportedPolicy.load(run.folder / "policy.npz")
+    np.testing.assert_allclose(exported(joined), expected, rtol=0.0, atol=1e-6)
+    single = np.array([exported(observation) for observation in joined])
+    np.testing.assert_allclose(single, expected, rtol=0.0, atol=1e-6)
+    assert np.ptp(expected, axis=0).min() > 0.0
+    assert exported.metadata["training"]["environment_steps"] == 3200
+    assert exported.metadata["observation"] == ("goal" if algorithm == "HER" else "plain")
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_run_resumes_with_optimizer_and_buffer(algorithm, scene_file, tmp_path):
+    """Killed after its first checkpoint: what a new process reads there is what was written."""
+    settings = configuration(algorithm, scene_file)
+    kept = {}
+
+    def kill(advance):
+        if advance.environment_steps > 1600:
+            raise KeyboardInterrupt
+
+    def remember(path, model, progress):
+        kept.update(state=[array.copy() for array in state_of(model)], steps=model.num_timesteps)
+        if hasattr(model, "replay_buffer"):
+            kept.update(actions=model.replay_buffer.actions.copy(), position=model.replay_buffer.pos)
+        write(path, model, progress)
+
+    from agents.reinforcement import watching
+
+    write = watching.write_checkpoint
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(watching, "write_checkpoint", remember)
+        with pytest.raises(KeyboardInterrupt):
+            train(settings, tmp_path / "run", report=kill)
+    checkpoint = RunFolder(tmp_path / "run", settings).checkpoint()
+    environment = make_environment(settings, load_scene(scene_file))
+    model, progress = read_checkpoint(checkpoint, settings, environment)
+    assert progress.environment_steps == kept["steps"] * REPEAT == 1600
+    for actual, expected in zip(state_of(model), kept["state"], strict=True):
+        np.testing.assert_array_equal(actual, expected)
+    if "actions" in kept:
+        np.testing.assert_array_equal(model.replay_buffer.actions, kept["actions"])
+        assert model.replay_buffer.pos == kept["position"]
+    run = train(settings, tmp_path / "run")
+    assert run.model.num_timesteps * REPEAT == 3200
+    curve = [json.loads(line) for line in (tmp_path / "run" / "evaluations.jsonl").read_text().splitlines()]
+    assert [line["environment_steps"] for line in curve] == [1600, 3200]
+    assert len(json.loads((tmp_path / "run" / "provenance.json").read_text())) == 3
+    again = train(settings, tmp_path / "run")  # nothing is left to do
+    for actual, expected in zip(state_of(again.model), state_of(run.model), strict=True):
+        np.testing.assert_array_equal(actual, expected)
+
+
+def test_networks_see_the_goals_of_hindsight_although_the_target_never_varies(trained):
+    """Goals are in units of what is achieved."""
+    extractor = trained("HER").model.actor.features_extractor
+    achieved, desired = slice(0, 8), slice(8, 16)
+    assert (extractor.scale[desired] > 0.0).any()
+    assert torch.equal(extractor.scale[desired], extractor.scale[achieved])
+    assert torch.equal(extractor.mean[desired], extractor.mean[achieved])
+
+
+def test_an_unfinished_checkpoint_is_none(scene_file, tmp_path):
+    folder = RunFolder(tmp_path, configuration("PPO", scene_file))
+
+    def fail(path):
+        (path / "model.zip").write_bytes(b"half of it")
+        raise OSError("the disk is full")
+
+    folder.add_checkpoint(10, lambda path: (path / "model.zip").touch())
+    with pytest.raises(OSError, match="full"):
+        folder.add_checkpoint(20, fail)
+    assert folder.checkpoint().name == f"{10:012d}"
+    folder.add_checkpoint(30, lambda path: (path / "model.zip").touch())
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [f"{30:012d}"]
+
+
+def test_a_folder_is_for_one_configuration_but_may_get_more_time(scene_file, tmp_path):
+    RunFolder(tmp_path, configuration("PPO", scene_file))
+    RunFolder(tmp_path, configuration("PPO", scene_file, total_steps=6400))
+    with pytest.raises(RunFolderError, match="seed is 0 there and 1 here"):
+        RunFolder(tmp_path, configuration("PPO", scene_file, seed=1))
+
+
+def test_the_same_seed_gives_the_same_agent(scene_file, tmp_path):
+    runs = [train(configuration("PPO", scene_file, total_steps=800), tmp_path / name) for name in "ab"]
+    other = train(configuration("PPO", scene_file, total_steps=800, seed=1), tmp_path / "c")
+    first, second, third = (run.policy.weights[0] for run in (*runs, other))
+    np.testing.assert_array_equal(first, second)
+    assert np.abs(first - third).max() > 1e-3
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "HER"])
+def test_models_folders_and_exports_fly_alike(algorithm, trained, scene_file):
+    run = trained(algorithm)
+    ways = [run.model, run.folder / "model.zip", run.policy, run.folder]
+    costs = [evaluate(way, scene_file, 6, expert=False).flights.cost for way in ways]
+    np.testing.assert_array_equal(costs[0], costs[1])
+    np.testing.assert_allclose(costs[2], costs[0], rtol=1e-5)
+    np.testing.assert_array_equal(costs[2], costs[3])
+
+
+def test_held_actions_add_rewards_up_and_end_with_the_episode():
+    scene = PAPER.replace(simulation={"dt": 0.015, "steps": 10})
+    scale = np.full(12, 0.5, dtype=np.float32)
+    held = HeldActions(DQSpaceArmVecEnv(3, scene), repeat=4, action_scale=scale, reward_scale=0.1)
+    plain = DQSpaceArmVecEnv(3, scene)
+    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (3, 12)).astype(np.float32)
+    for env in (held, plain):
+        env.seed(4)
+        env.reset()
+    np.testing.assert_array_equal(held.action_space.high, scale)
+    for block in range(3):
+        observation, reward, done, infos = held.step(actions)
+        total = np.zeros(3)
+        for step in range(4):
+            expected, rewards, _, _ = plain.step(actions)
+            if 4 * block + step < 10:  # what follows belongs to the next episode
+                total += rewards
+        np.testing.assert_array_equal(observation, expected)
+        np.testing.assert_allclose(reward, 0.1 * total, rtol=1e-6)
+        assert done.all() == (block == 2)
+    assert all(info["episode"]["l"] == 10 for info in infos)
+
+
+def test_a_power_of_the_cost_is_that_of_its_mean():
+    scene = PAPER.replace(simulation={"dt": 0.015, "steps": 8})
+    scale = np.ones(12, dtype=np.float32)
+    plain, root = (
+        HeldActions(DQSpaceArmVecEnv(2, scene, seed=1), repeat=4, action_scale=scale, cost_power=power)
+        for power in (1.0, 0.5)
+    )
+    rewards = []
+    for env in (plain, root):
+        env.reset()
+        rewards.append(env.step(np.zeros((2, 12), dtype=np.float32))[1])
+    np.testing.assert_allclose(rewards[1], -4.0 * np.sqrt(-rewards[0] / 4.0), rtol=1e-6)
+
+
+def test_success_is_rewarded_once_at_the_end():
+    """Everything is a success in one scene, nothing in the other."""
+    rewards = []
+    for degrees in (180.0, 1e-6):
+        success = {"attitude_error_deg": degrees, "position_error": 100.0}
+        scene = PAPER.replace(simulation={"dt": 0.015, "steps": 8}, success=success)
+        scale = np.ones(12, dtype=np.float32)
+        env = HeldActions(
+            DQSpaceArmVecEnv(2, scene, seed=1), repeat=4, action_scale=scale, success_reward=0.5
+        )
+        env.reset()
+        rewards.append([env.step(np.zeros((2, 12), dtype=np.float32))[1] for _ in range(4)])
+    expected = np.tile([[0.0], [0.5]], (2, 2))  # two episodes, each of two decisions
+    np.testing.assert_allclose(np.subtract(*rewards), expected, rtol=0.0, atol=1e-6)
+
+
+def test_errors_at_the_end_cost_the_more_the_larger_they_are_but_not_without_bound():
+    scene = PAPER.replace(simulation={"dt": 0.015, "steps": 8})
+    scale = np.ones(12, dtype=np.float32)
+    rewards, infos = [], []
+    for cost in (0.0, 2.0):
+        plain = DQSpaceArmVecEnv(2, scene, seed=1)
+        env = HeldActions(plain, repeat=4, action_scale=scale, end_error_cost=cost, tolerances=(3.0, 0.1))
+        env.reset()
+        steps = [env.step(np.zeros((2, 12), dtype=np.float32)) for _ in range(2)]
+        rewards.append([step[1] for step in steps])
+        infos = steps[1][3]
+    errors = [(info["attitude_error"] / 3.0) ** 2 + (info["position_error"] / 0.1) ** 2 for info in infos]
+    charged = [2.0 * error / (1.0 + error) for error in errors]
+    assert all(1.0 < cost < 2.0 for cost in charged)
+    np.testing.assert_allclose(np.subtract(*rewards), [[0.0, 0.0], charged], rtol=1e-4)
+
+
+def test_what_the_arrays_cannot_hold_is_not_exported():
+    env = DQSpaceArmVecEnv(2, PAPER)
+    normalized = PPO("MlpPolicy", VecNormalize(env), device="cpu")
+    with pytest.raises(ValueError, match="VecNormalize cannot be exported"):
+        export_policy(normalized, {})
+    odd = PPO("MlpPolicy", env, device="cpu", policy_kwargs={"activation_fn": torch.nn.ELU})
+    with pytest.raises(ValueError, match="activations ELU"):
+        export_policy(odd, {})
+
+
+def test_a_plain_model_of_stable_baselines3_is_exported_and_evaluated(tmp_path):
+    model = PPO("MlpPolicy", DQSpaceArmVecEnv(2, PAPER), device="cpu", seed=0)
+    seen, joined = observations(model)
+    expected = np.clip(model.predict(seen, deterministic=True)[0], -1.0, 1.0)
+    np.testing.assert_allclose(export_policy(model, {})(joined), expected, rtol=0.0, atol=1e-6)
+    model.save(tmp_path / "model.zip")
+    np.testing.assert_array_equal(as_policy(tmp_path / "model.zip").act(joined), expected)
+
+
+def test_the_command_trains_and_names_what_is_wrong(scene_file, tmp_path, capsys):
+    path, out = tmp_path / "ppo.yaml", str(tmp_path / "run")
+    content = configuration("PPO", scene_file).model_dump(mode="json", exclude_none=True)
+    path.write_text(json.dumps(content))  # JSON is YAML
+    assert main(["--config", str(path), "--out", out, "--total-steps", "800"]) == 0
+    assert "800 of 800 steps" in capsys.readouterr().out
+    assert main(["--config", str(path), "--out", out, "--seed", "5"]) == 1
+    assert "seed is 0 there and 5 here" in capsys.readouterr().err
+    assert main(["--config", "pppo", "--out", out]) == 2
+    assert "did you mean 'ppo'" in capsys.readouterr().err
+
+
+def test_commands_are_not_imported_in_place_of_functions():
+    for name in ("agents.train", "agents.evaluate"):
+        with pytest.raises(ImportError, match="is a command"):
+            __import__(name)
+    assert callable(agents.train)
+    assert callable(agents.evaluate)
