@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 from agents.comparison.comparing import Comparison, Row
-from agents.comparison.controllers import RECEDING
 from agents.evaluation.statistics import Interval
 from experts.report.page.rendering import markdown_table
 from experts.report.tables import TextTable
@@ -26,12 +25,6 @@ _HEADINGS = (
     "training\nsteps",
     "training\ntime",
     "expert\nsolves",
-)
-_RECEDING_NOTE = (
-    "The receding-horizon expert minimizes the cost alone. The plans of the other two are led into the "
-    "tolerances where the cheapest maneuver ends outside of them; it is not, so it may miss the target, and "
-    "pay less than the expert. Each of its plans begins with the nominal maneuver, and may end in a poor "
-    "minimum far from there."
 )
 
 
@@ -74,8 +67,6 @@ def notes(comparison: Comparison) -> list[str]:
     if comparison.groups:
         sentences.append("*: interquartile mean over runs and starts.")
     names = {row.evaluation.policy for row in comparison.rows if not row.is_agent}
-    if RECEDING in names:
-        sentences.append(_RECEDING_NOTE)
     if names and any(condition.endswith("payload") for condition in comparison.conditions):
         sentences.append(
             "Controllers plan with the payload of the unchanged scene: they do not know the new one."
