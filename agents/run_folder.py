@@ -3,26 +3,30 @@
 | file | content |
 |---|---|
 | `config.yaml` | the resolved configuration; written first |
-| `provenance.json` | commit, versions and machine of each start of the run, a list |
+| `provenance.json` | commit, versions, machine and hash of the scene of each start of the run, a list |
 | `evaluations.jsonl` | the learning curve: a line for each evaluation on validation seeds |
 | `checkpoints/<steps>/` | all that the run needs to go on: model and optimizer, replay buffer, progress; \
 of imitation, a folder for each part |
 | `demonstrations/` | what was generated to learn from, if anything was |
 | `tensorboard/` | curves for TensorBoard |
-| `best.npz` | the policy that was best in these evaluations, exported |
+| `best.npz` | of reinforcement: the policy that was best in these evaluations, exported |
 | `policy.npz`, `model.zip` | the policy at the end, exported, and the model; written last |
+| `.lock` | empty; locked while a process trains here |
 
 Files and checkpoints are written under another name and renamed: what has its proper name is whole.
 """
 
+import fcntl
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from agents.configuration import AgentConfiguration, load_configuration
+from dq_space_arm_env import load_scene
 from dq_space_arm_env.validation import dump_yaml
 from experts.demonstrations.settings import differences
 from experts.files import write_atomically
@@ -32,12 +36,40 @@ CONFIGURATION, PROVENANCE, EVALUATIONS = "config.yaml", "provenance.json", "eval
 CHECKPOINTS, TENSORBOARD, DEMONSTRATIONS = "checkpoints", "tensorboard", "demonstrations"
 BEST, POLICY, MODEL = "best.npz", "policy.npz", "model.zip"
 
+LOCK = ".lock"
+
 _HEADER = "# The resolved configuration of this run.\n"
 _DIGITS = 12
+_PART = ".part"
 
 
 class RunFolderError(RuntimeError):
     """A folder is for another run, or damaged."""
+
+
+@contextmanager
+def reserved(path: Path) -> Iterator[None]:
+    """Keep other processes from training in a folder inside a `with` block.
+
+    The system releases the lock when the process ends, however it does.
+
+    Args:
+        path: The folder; made if it does not exist.
+
+    Raises:
+        RunFolderError: If another process trains there.
+        OSError: If it cannot be written.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    with (path / LOCK).open("w") as file:
+        try:
+            # Not flock, whose lock would live on in the forked workers of a killed process.
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError) as error:
+            raise RunFolderError(
+                f"another process trains in {path}: wait for it, or take another folder"
+            ) from error
+        yield
 
 
 class RunFolder:
@@ -55,7 +87,9 @@ class RunFolder:
             configuration: What it is for.
 
         Raises:
-            RunFolderError: If it is for another configuration.
+            RunFolderError: If it is for another configuration, its scene was another one, or a file of it is
+                damaged.
+            SceneError: If the scene cannot be loaded.
             OSError: If it cannot be written.
         """
         self.path = path
@@ -65,26 +99,32 @@ class RunFolder:
         if file.exists():
             there = load_configuration(file).model_dump(mode="json", exclude_none=True)
             # A run may be given more time than it was begun with; all else would make it another one.
-            found = differences(_without_budget(there), _without_budget(here))
+            found = differences(_deciding(there), _deciding(here))
             if found:
                 raise RunFolderError(
                     f"{path} was begun with another configuration: {'; '.join(found)}. Repeat it, or take "
                     "another folder"
                 )
+        # A configuration names its scene, and what lies in a file of that name may have changed.
+        scene = load_scene(configuration.scene).content_hash()
+        starts = self._starts()
+        if any(start.get("scene_hash", scene) != scene for start in starts):
+            raise RunFolderError(
+                f"{path} was begun with another version of scene {configuration.scene!r}: take another folder"
+            )
         write_atomically(file, dump_yaml(here, _HEADER), durable=True)
-        self._add_provenance()
+        origin = provenance("pyyaml", "sb3-contrib", "stable-baselines3", "torch")
+        starts.append({**origin, "scene_hash": scene})
+        write_atomically(path / PROVENANCE, json.dumps(starts, indent=2) + "\n")
 
-    def _add_provenance(self) -> None:
+    def _starts(self) -> list[dict[str, Any]]:
         file = self.path / PROVENANCE
-        starts = json.loads(file.read_text(encoding="utf-8")) if file.exists() else []
-        starts.append(provenance("pyyaml", "sb3-contrib", "stable-baselines3", "torch"))
-        write_atomically(file, json.dumps(starts, indent=2) + "\n")
+        return list(_parsed(file, file.read_text(encoding="utf-8"))) if file.exists() else []
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """Commit, versions and machine of the present start."""
-        starts = json.loads((self.path / PROVENANCE).read_text(encoding="utf-8"))
-        return dict(starts[-1])
+        """Commit, versions, machine and hash of the scene of the present start."""
+        return self._starts()[-1]
 
     def checkpoint(self) -> Path | None:
         """Find the last whole checkpoint.
@@ -106,7 +146,7 @@ class RunFolder:
             OSError: If that is impossible; the last checkpoint is still there.
         """
         folder = self.path / CHECKPOINTS
-        temporary = folder / f".{os.getpid()}.part"
+        temporary = folder / f".{os.getpid()}{_PART}"
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir()
         write(temporary)
@@ -114,7 +154,7 @@ class RunFolder:
         shutil.rmtree(final, ignore_errors=True)
         temporary.rename(final)
         for other in folder.iterdir():
-            if other != final:
+            if other != final and (other.name.isdigit() or other.suffix == _PART):
                 shutil.rmtree(other, ignore_errors=True)
 
     def evaluations(self, until: int | None = None) -> list[dict[str, Any]]:
@@ -125,11 +165,14 @@ class RunFolder:
 
         Returns:
             The lines.
+
+        Raises:
+            RunFolderError: If the file is damaged.
         """
         file = self.path / EVALUATIONS
         if not file.exists():
             return []
-        lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+        lines = [_parsed(file, line) for line in file.read_text(encoding="utf-8").splitlines()]
         return [line for line in lines if until is None or line["environment_steps"] <= until]
 
     def write_evaluations(self, lines: list[dict[str, Any]]) -> None:
@@ -142,8 +185,16 @@ class RunFolder:
         write_atomically(self.path / EVALUATIONS, text)
 
 
-def _without_budget(configuration: dict[str, Any]) -> dict[str, Any]:
-    """All but how long the training is; of imitation, whose learning rates follow from that, all."""
+def _parsed(file: Path, text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise RunFolderError(f"{file} is damaged ({error}): mend it, or take another folder") from error
+
+
+def _deciding(configuration: dict[str, Any]) -> dict[str, Any]:
+    """All but the description, and how long the training is; imitation's learning rates follow from that."""
+    configuration = {name: value for name, value in configuration.items() if name != "description"}
     if "schedule" not in configuration:
         return configuration
     schedule = {

@@ -3,6 +3,7 @@
 import argparse
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,8 @@ _DESCRIPTION = """Train an agent as a configuration says.
 The folder of the run gets the resolved configuration, commit and versions, checkpoints, curves for
 TensorBoard, the learning curve, and the policy, exported. A run that was interrupted or killed goes on at its
 last checkpoint when the same command is given again.
-Exit status: 0; 1 if the folder is for another run; 2 if the input is unusable; 130 if interrupted."""
+Exit status: 0; 1 if the folder is for another run, or in use; 2 if the input is unusable; 130 if
+interrupted."""
 
 
 def train(
@@ -55,29 +57,40 @@ def train(
     Raises:
         ConfigurationError: If the configuration cannot be used.
         SceneError: If its scene cannot be loaded.
-        RunFolderError: If the folder is for another configuration.
+        RunFolderError: If the folder is for another configuration, or another process trains there.
         ImportError: If the extra `agents` is not installed.
         KeyboardInterrupt: If the user interrupts it; the last checkpoint remains.
     """
     checked = load_configuration(configuration)
     folder = Path(out) if out is not None else default_folder(checked)
-    tell = report or (lambda advance: None)
     try:
-        if isinstance(checked, ImitationConfiguration):
-            from agents.imitation.training import train_by_imitation
-
-            return train_by_imitation(checked, folder, tell)
-        if isinstance(checked, ResidualConfiguration):
-            from agents.residual.training import train_residual
-
-            return train_residual(checked, folder, tell)
-        from agents.reinforcement.training import train_by_reinforcement
+        run = _run(checked, folder, report or (lambda advance: None))
     except ModuleNotFoundError as error:
         if error.name not in ("stable_baselines3", "sb3_contrib", "torch", "tensorboard"):
             raise
         raise ImportError(f'training needs {error.name}: pip install "dq-space-arm[agents]"') from error
+    from agents.run_folder import reserved
+
+    with reserved(folder):
+        return run()
+
+
+def _run(
+    checked: AgentConfiguration, folder: Path, tell: Callable[[Advance], None]
+) -> "Callable[[], Trained | Imitated]":
+    """What trains such an agent; finding it loads what it needs."""
+    if isinstance(checked, ImitationConfiguration):
+        from agents.imitation.training import train_by_imitation
+
+        return partial(train_by_imitation, checked, folder, tell)
+    if isinstance(checked, ResidualConfiguration):
+        from agents.residual.training import train_residual
+
+        return partial(train_residual, checked, folder, tell)
+    from agents.reinforcement.training import train_by_reinforcement
+
     assert isinstance(checked, Configuration)
-    return train_by_reinforcement(checked, folder, tell)
+    return partial(train_by_reinforcement, checked, folder, tell)
 
 
 def default_folder(configuration: AgentConfiguration) -> Path:
@@ -135,7 +148,8 @@ def _train(console: Console, options: argparse.Namespace) -> int:
         complain([str(error)])
         return FAILURE
     except KeyboardInterrupt:
-        console.print(f"Interrupted: the same command goes on at the last checkpoint in {folder}.")
+        sentence = f"Interrupted: the same command goes on at the last checkpoint in {folder}."
+        console.print(sentence, markup=False)
         return INTERRUPTED
     console.print(f"{folder}: the policy is in policy.npz", markup=False)
     return 0

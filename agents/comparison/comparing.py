@@ -325,7 +325,7 @@ class _Work:
 
 def _distinct_names(files: Sequence[Path]) -> list[str]:
     """Names for policies, by their files: a run's folder, or the file's own where that is no `policy`."""
-    names = [file.parent.name if file.stem == "policy" else file.stem for file in files]
+    names = [file.resolve().parent.name if file.stem == "policy" else file.stem for file in files]
     return [
         name if names.count(name) == 1 else f"{name} ({names[: i + 1].count(name)})"
         for i, name in enumerate(names)

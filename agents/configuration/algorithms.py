@@ -54,6 +54,12 @@ class PPO(_Common):
             yield Problem(
                 ("first_step_factor",), self.first_step_factor, "must be at most 1, for learning_rate itself"
             )
+        if self.batch_size < 2:
+            yield Problem(
+                ("batch_size",),
+                self.batch_size,
+                "must be at least 2: advantages are normalized in a minibatch",
+            )
 
 
 class Hindsight(Model):
@@ -134,6 +140,13 @@ class SAC(_MaximumEntropy):
         if self.demonstrations is not None and self.hindsight is not None:
             yield Problem(
                 ("demonstrations",), "given", "must be absent with hindsight, whose replay buffer is another"
+            )
+        share = 0.5 if self.demonstrations is None else self.demonstrations.share
+        if self.demonstrations is not None and not 1 <= round(share * self.batch_size) < self.batch_size:
+            yield Problem(
+                ("demonstrations", "share"),
+                share,
+                f"must leave room for decisions of both kinds in a batch, which has {self.batch_size}",
             )
 
 

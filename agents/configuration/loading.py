@@ -73,8 +73,9 @@ def load_configuration(source: str | Path | Mapping[str, Any] | AgentConfigurati
         return _read(Path(source))
     names = list_configurations()
     if source not in names:
+        close = did_you_mean(source, names)
         raise ConfigurationError(
-            f"no configuration is named {source!r}; {did_you_mean(source, names)}They are "
+            f"no configuration is named {source!r}{f'; {close}' if close else '. '}They are "
             f"{', '.join(names)}; a file of your own is given by its path, ending in .yaml"
         )
     return _read(_directory() / f"{source}.yaml")
@@ -107,7 +108,7 @@ def _read(file: Traversable) -> AgentConfiguration:
 def _of_its_class(data: Mapping[str, Any], origin: str) -> AgentConfiguration:
     algorithm = data.get("algorithm")
     name = algorithm.get("name") if isinstance(algorithm, Mapping) else None
-    if name not in _CLASSES:
+    if not isinstance(name, str) or name not in _CLASSES:
         hint = did_you_mean(name, _CLASSES) if isinstance(name, str) else ""
         raise ConfigurationError(
             f"{origin}: algorithm.name = {name!r}: {hint}it must be one of {', '.join(_CLASSES)}"

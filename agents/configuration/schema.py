@@ -6,8 +6,11 @@ from typing import Literal
 
 from pydantic import Field, StrictBool, StrictInt, StrictStr
 
-from agents.configuration.algorithms import PPO, Algorithm
+from agents.configuration.algorithms import PPO, SAC, Algorithm, OffPolicy
 from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
+
+_REWARDS = ("reward_scale", "cost_power", "success_reward", "end_error_cost")
+"""What the practice changes in rewards."""
 
 
 class ActionScale(Model):
@@ -83,7 +86,7 @@ class AgentConfiguration(Model):
     name: StrictStr = Field(min_length=1, pattern=r"^[\w.-]+$", description="name of the agent")
     description: StrictStr = Field(default="", description="what it is, and what to expect")
     scene: StrictStr = Field(default="paper", description="name of a shipped scene, or path of a YAML file")
-    seed: StrictInt = Field(default=0, ge=0, description="seed of everything random")
+    seed: StrictInt = Field(default=0, ge=0, lt=2**31, description="seed of everything random")
     threads: Count = Field(default=1, description="threads of PyTorch")
     network: Network = Field(default_factory=Network, description="the networks")
 
@@ -106,6 +109,19 @@ class Configuration(AgentConfiguration):
             yield Problem(
                 ("start_from",), self.start_from, f"is for PPO, not for {self.algorithm.name}: leave it out"
             )
+        if isinstance(self.algorithm, SAC) and self.algorithm.layer_norm and not self.network.hidden:
+            yield Problem(
+                ("network", "hidden"), [], "must have a layer for algorithm.layer_norm to normalize"
+            )
+        if isinstance(self.algorithm, OffPolicy) and self.algorithm.hindsight is not None:
+            for name in _REWARDS:
+                value, plain = getattr(self.environment, name), Practice.model_fields[name].default
+                if value != plain:
+                    yield Problem(
+                        ("environment", name),
+                        value,
+                        f"must be {plain:g} with hindsight, which recomputes rewards from goals alone",
+                    )
 
     def decisions(self, steps: int) -> int:
         """Convert environment steps into decisions, each of which is held for several steps.

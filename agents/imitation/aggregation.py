@@ -125,6 +125,7 @@ def aggregate(
     network = copy.deepcopy(cloned.network)
     statistics = Statistics.of(demonstrations)
     expert = _Expert(starts, settings, making.seed, progress)
+    flown = expert.episodes * starts.scene.simulation.steps  # in a round
     rounds: list[Round] = []
     corrections: list[Corrections] = []
     history = list(cloned.history)
@@ -143,7 +144,7 @@ def aggregate(
                 validate_every=settings.cloning.validate_every,
                 seed=making.seed + 1 + number,
                 part=_part(number),
-                before=_spent(history[-1], done, settings.episodes * starts.scene.simulation.steps),
+                before=_spent(history[-1], done, flown),
             )
             trainer.train(mixture, None, place, identity, progress=progress, watch=watch)
         history += trainer.history
@@ -170,10 +171,15 @@ class _Expert:
         self._starts, self._settings, self._seed, self._progress = starts, settings, seed, progress
         self._solver = Solver(starts.scene) if settings.labels == "solve" else None
 
+    @property
+    def episodes(self) -> int:
+        """Of a round: there are no more than starts."""
+        return min(self._settings.episodes, len(self._starts))
+
     def correct(self, network: PolicyNetwork, number: int) -> tuple[Round, Corrections]:
         settings, started = self._settings, perf_counter()
         rng = np.random.default_rng([self._seed, number])
-        count = min(settings.episodes, len(self._starts))
+        count = self.episodes
         starts = self._starts.select(np.sort(rng.permutation(len(self._starts))[:count]))
         visits = record(network.export({}), starts.scene, starts.column("seed").tolist())
         gap = float(np.median(visits.flights.cost / starts.column("cost") - 1.0))

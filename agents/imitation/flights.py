@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluation.flights import Flights, fly
-from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
+from agents.evaluation.flights import Flights, Recording, fly
+from dq_space_arm_env import Scene
 from experts.problem import FloatArray
 
 
@@ -41,27 +41,6 @@ def record(
     Returns:
         The flights.
     """
-    recorder = _Recorder(policy)
-    flights = fly(recorder, scene, [int(seed) for seed in seeds])
-    states, observations = (np.stack(rows, axis=1) for rows in (recorder.states, recorder.observations))
-    # An episode that diverges begins anew, with all of its time left.
-    begins_anew = np.diff(observations[:, :, -1], axis=1) > 0.0
-    length = np.where(begins_anew.any(axis=1), 1 + begins_anew.argmax(axis=1), scene.simulation.steps)
-    return Visits(states, observations, length, flights)
-
-
-class _Recorder:
-    """A policy that writes down what it sees, and the state behind it."""
-
-    def __init__(self, policy: Callable[[FloatArray], NDArray[np.floating]]) -> None:
-        self._policy = policy
-        self.states: list[FloatArray] = []
-        self.observations: list[FloatArray] = []
-
-    def begin(self, environment: DQSpaceArmVectorEnv) -> None:
-        self._environment = environment
-
-    def __call__(self, observation: FloatArray) -> NDArray[np.floating]:
-        self.states.append(self._environment.states.copy())
-        self.observations.append(observation.copy())
-        return self._policy(observation)
+    recording = Recording()
+    flights = fly(policy, scene, [int(seed) for seed in seeds], recording=recording)
+    return Visits(recording.states, recording.observations, flights.length, flights)

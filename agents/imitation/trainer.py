@@ -123,6 +123,10 @@ class Trainer:
             identity: What the training follows from.
             progress: Called now and then.
             watch: Called at every validation.
+
+        Raises:
+            ValueError: If the training diverges.
+            CheckpointError: If the folder holds the checkpoint of another training, or a damaged one.
         """
         if folder is not None:
             self._resume(load_checkpoint(folder, identity))
@@ -188,9 +192,14 @@ class Trainer:
         }
         if validation is not None:
             record |= {f"validation_{name}": value for name, value in self._validate(validation).items()}
-            if record["validation_total"] < self._best:
-                self._best = record["validation_total"]
-                self._best_weights = copy.deepcopy(self._network.state_dict())
+        if not all(map(math.isfinite, record.values())):
+            raise ValueError(
+                f"after {self._updates} updates the losses are no numbers any more: let "
+                "optimization.learning_rate be smaller"
+            )
+        if validation is not None and record["validation_total"] < self._best:
+            self._best = record["validation_total"]
+            self._best_weights = copy.deepcopy(self._network.state_dict())
         if watch is not None:
             record |= watch(self._network, record, self._is_done)
         self.history.append(record)

@@ -16,13 +16,10 @@ from agents.imitation.trainer import Record
 from agents.policies import ExportedPolicy
 from agents.policies.network import PolicyNetwork
 from agents.progress import Advance
-from agents.run_folder import CHECKPOINTS, POLICY, TENSORBOARD, RunFolder
+from agents.run_folder import CHECKPOINTS, DEMONSTRATIONS, POLICY, TENSORBOARD, RunFolder
 from agents.validation import validate, validation_seeds
 from dq_space_arm_env import Scene, load_scene
 from experts.demonstrations import Demonstrations
-
-DEMONSTRATIONS = "demonstrations"
-"""Folder in that of the run where demonstrations are generated."""
 
 
 class Imitated(NamedTuple):

@@ -13,6 +13,7 @@ import json
 import math
 import os
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,19 @@ from experts.files import write_atomically
 
 FORMAT = 1
 """Version of the files; to be raised when they change."""
+
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    EOFError,
+    AttributeError,
+    TypeError,
+    NotImplementedError,  # of a compression that zipfile does not know
+    RuntimeError,  # of an encrypted archive
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What reading an archive of arrays raises, depending on which of its bytes are damaged."""
 
 FloatArray = NDArray[np.float64]
 SingleArray = NDArray[np.float32]
@@ -232,7 +246,7 @@ class ExportedPolicy:
             # Read first: of a file that is no archive, NumPy would leave the descriptor open.
             with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as content:
                 arrays = {name: content[name] for name in content.files}
-        except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        except _UNREADABLE as error:
             raise PolicyFileError(f"{path} cannot be read as a policy ({error})") from error
         found = arrays.get("format")
         if found is None or found.shape != () or found != FORMAT:

@@ -61,8 +61,11 @@ def make_environment(configuration: c.Configuration, scene: Scene) -> HeldAction
         The environment.
 
     Raises:
+        ConfigurationError: If actions are held for longer than an episode, or hindsight begins before one
+            has ended.
         ValueError: If the scene has no normalized actions.
     """
+    _check_lengths(configuration, scene)
     practice, hindsight = configuration.environment, hindsight_of(configuration)
     environment: VecEnv
     if hindsight is None:
@@ -87,6 +90,24 @@ def make_environment(configuration: c.Configuration, scene: Scene) -> HeldAction
         tolerances=(scene.success.attitude_error_deg, scene.success.position_error),
         add_rewards=hindsight is None,
     )
+
+
+def _check_lengths(configuration: c.Configuration, scene: Scene) -> None:
+    practice, steps = configuration.environment, scene.simulation.steps
+    if practice.action_repeat > steps:
+        raise c.ConfigurationError(
+            f"environment.action_repeat = {practice.action_repeat}: must be at most {steps}, the steps of an "
+            f"episode of scene {scene.name!r}"
+        )
+    algorithm = configuration.algorithm
+    if not isinstance(algorithm, c.OffPolicy) or algorithm.hindsight is None:
+        return
+    episodes = practice.copies * configuration.decisions(steps)
+    if algorithm.learning_starts < episodes:
+        raise c.ConfigurationError(
+            f"algorithm.learning_starts = {algorithm.learning_starts}: must be at least {episodes}, an "
+            "episode of each copy, for there is no hindsight before"
+        )
 
 
 def action_scale(scale: c.ActionScale, scene: Scene) -> NDArray[np.float32]:
@@ -159,7 +180,8 @@ def load_to_act(path: Path, policy_home: str) -> BaseAlgorithm:
     """Load a model that is to act, not to learn: without a replay buffer, and without an environment.
 
     Args:
-        path: Model of Stable-Baselines3 or sb3-contrib.
+        path: Model of Stable-Baselines3 or sb3-contrib. Only load files that you trust: it holds pickled
+            objects.
         policy_home: Module of its policy's class, which tells the algorithm.
 
     Returns:

@@ -21,11 +21,13 @@ class Progress(NamedTuple):
         environment_steps: Of all copies together.
         seconds: Time spent on it, in all of its starts, s.
         expert_solves: Problems that the expert solved for what it learns from, or for what it began with.
+        seconds_before: Time that these, and the training of what it began with, have taken, s.
     """
 
     environment_steps: int
     seconds: float
     expert_solves: int = 0
+    seconds_before: float = 0.0
 
 
 def write_checkpoint(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:

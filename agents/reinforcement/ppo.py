@@ -22,7 +22,11 @@ class ProximalPolicyOptimization(PPO):
 
     The deviation of actions falls by an order of magnitude in training, and with it the size of a step that
     leaves the policy close to what it was: so the actor's step size may follow the divergence that it
-    causes, within what the schedule allows, as Rudin et al. do ("Learning to walk in minutes", CoRL 2021).
+    causes, within what the schedule allows. The idea is that of Rudin et al. ("Learning to walk in minutes",
+    CoRL 2021); what is done is not quite theirs. They change the step size of actor and critic from minibatch
+    to minibatch by a factor of 1.5 where the exact divergence leaves a band. Here it changes between updates,
+    for the actor alone, by the root of desired over estimated divergence, which grows with the square of the
+    step; the estimate is that of Stable-Baselines3, the mean over the minibatches of the last pass.
 
     Attributes:
         critic_warm_up: Updates in which the critic learns alone.
@@ -43,8 +47,8 @@ class ProximalPolicyOptimization(PPO):
         Args:
             *arguments: As for PPO.
             critic_warm_up: Updates in which the critic learns alone.
-            desired_kl: Divergence of the policy that an update is to cause, mean over its minibatches; None
-                for steps by the schedule.
+            desired_kl: Divergence of the policy that an update is to cause, mean over the minibatches of its
+                last pass; None for steps by the schedule.
             first_step_factor: See `step_factor`.
             **options: As for PPO.
         """

@@ -1,6 +1,6 @@
 """A policy to begin with: an exported one, cloned from the expert for instance, becomes PPO's actor."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +12,18 @@ from agents.configuration import Configuration, ConfigurationError
 from agents.evaluation.policies import PolicyError, policy_path
 from agents.policies import ExportedPolicy, PolicyFileError
 from agents.reinforcement.held_actions import action_limits
+
+
+class Before(NamedTuple):
+    """What was spent on an agent before it learns by itself.
+
+    Attributes:
+        expert_solves: Problems that the expert solved.
+        seconds: Time of that, and of training, s.
+    """
+
+    expert_solves: int = 0
+    seconds: float = 0.0
 
 
 def load_start(configuration: Configuration, n_observation: int, n_action: int) -> ExportedPolicy | None:
@@ -53,22 +65,22 @@ def load_start(configuration: Configuration, n_observation: int, n_action: int) 
     return policy
 
 
-def solves_before(configuration: Configuration) -> int:
-    """Count what the expert did for the policy that a configuration begins with.
+def spent_before(configuration: Configuration) -> Before:
+    """Look up what the policy has cost that a configuration begins with.
 
     Args:
         configuration: Of the agent.
 
     Returns:
-        Problems that the expert solved; 0 if the agent begins with a random policy.
+        What it has cost; nothing if the agent begins with a random policy.
 
     Raises:
         ConfigurationError: If there is no such policy.
     """
     if configuration.start_from is None:
-        return 0
+        return Before()
     training = _read(configuration.start_from).metadata.get("training", {})
-    return int(training.get("expert_solves") or 0)
+    return Before(int(training.get("expert_solves") or 0), float(training.get("seconds") or 0.0))
 
 
 def _read(source: str) -> ExportedPolicy:

@@ -12,7 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
 
 from agents.configuration import SAC, Configuration
-from agents.demonstrations import prepare_demonstrations
+from agents.demonstrations import expert_seconds, prepare_demonstrations
 from agents.policies import ExportedPolicy
 from agents.reinforcement.building import make_environment, make_learner, units_of
 from agents.reinforcement.checkpoints import Progress, read_checkpoint
@@ -21,7 +21,7 @@ from agents.reinforcement.export import export_policy
 from agents.reinforcement.held_actions import HeldActions, action_limits
 from agents.reinforcement.networks import ScaledObservations
 from agents.reinforcement.sac import DemonstrationBuffer, SoftActorCritic
-from agents.reinforcement.starting import solves_before
+from agents.reinforcement.starting import Before, spent_before
 from agents.reinforcement.watching import Advance, Watcher
 from agents.run_folder import DEMONSTRATIONS, MODEL, POLICY, TENSORBOARD, RunFolder
 from dq_space_arm_env import Scene, load_scene
@@ -91,7 +91,7 @@ def _begin(
     configuration: Configuration, scene: Scene, folder: RunFolder, environment: HeldActions
 ) -> tuple[BaseAlgorithm, Progress]:
     """Make a learner, with what it is given to begin with."""
-    model, solves = make_learner(configuration, environment), solves_before(configuration)
+    model, spent = make_learner(configuration, environment), spent_before(configuration)
     algorithm = configuration.algorithm
     if isinstance(algorithm, SAC) and algorithm.demonstrations is not None:
         given = algorithm.demonstrations
@@ -103,8 +103,11 @@ def _begin(
         if configuration.environment.normalize_observations:
             # What good flights see varies less than what random ones do.
             _see_in_units_of(model, flown.observations)
-        solves += len(demonstrations)
-    return model, Progress(0, 0.0, solves)
+        spent = Before(
+            spent.expert_solves + demonstrations.settings["problems"],
+            spent.seconds + expert_seconds(demonstrations),
+        )
+    return model, Progress(0, 0.0, spent.expert_solves, spent.seconds)
 
 
 def _see_in_units_of(model: SoftActorCritic, observations: NDArray[np.float32]) -> None:
@@ -116,8 +119,8 @@ def _see_in_units_of(model: SoftActorCritic, observations: NDArray[np.float32]) 
 def _learn(model: BaseAlgorithm, watcher: Watcher, configuration: Configuration) -> None:
     schedule = configuration.schedule
     left = configuration.decisions(schedule.total_steps) - model.num_timesteps
-    if left <= 0:
-        watcher.init_callback(model)
+    watcher.init_callback(model)
+    if left <= 0 or watcher.is_time_up:
         return
     # Stable-Baselines3 adds what it is asked for to what was done before, and counts schedules by the sum.
     model.learn(left, callback=watcher, reset_num_timesteps=model.num_timesteps == 0)

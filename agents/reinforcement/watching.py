@@ -116,14 +116,19 @@ class Watcher(BaseCallback):
             "training": {
                 "environment_steps": progress.environment_steps,
                 "updates": gradient_steps(self.model),
-                "seconds": progress.seconds,
+                "seconds": progress.seconds_before + progress.seconds,
                 "expert_solves": progress.expert_solves,
             },
         }
 
     def _on_step(self) -> bool:
+        return not self.is_time_up
+
+    @property
+    def is_time_up(self) -> bool:
+        """Whether the run has had the time that it may take; without a limit it never has."""
         minutes = self._configuration.schedule.minutes
-        return minutes is None or self.progress.seconds < 60.0 * minutes
+        return minutes is not None and self.progress.seconds >= 60.0 * minutes
 
     def _on_rollout_start(self) -> None:
         """Here, and only here, all that was seen has been learned from."""
@@ -149,7 +154,7 @@ class Watcher(BaseCallback):
         progress = self.progress
         line = {
             "environment_steps": progress.environment_steps,
-            "seconds": round(progress.seconds, 3),
+            "seconds": round(progress.seconds_before + progress.seconds, 3),
             **found,
         }
         self._curve.append(line)

@@ -80,7 +80,7 @@ def add_to_zoo(
         OSError: If the folder cannot be written.
     """
     file = policy_path(run)
-    policy = ExportedPolicy.load(file)
+    policy, content = ExportedPolicy.load(file), file.read_bytes()
     chosen = name or str(policy.metadata.get("agent", ""))
     command = training or training_command(policy.metadata)
     scene = _checked(policy, file, chosen, command, shelf)
@@ -103,7 +103,7 @@ def add_to_zoo(
     ]
     shelf.mkdir(parents=True, exist_ok=True)
     weights = shelf / f"{chosen}.npz"
-    write_atomically(weights, file.read_bytes())
+    write_atomically(weights, content)  # what was evaluated, whatever is in the file by now
     record = _record(scene, weights, command, evaluations)
     write_atomically(weights.with_suffix(".json"), json.dumps(record, indent=1, allow_nan=False) + "\n")
     write_atomically(weights.with_suffix(".md"), card(chosen, policy, record))

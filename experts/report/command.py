@@ -61,7 +61,7 @@ def guarded(run: Callable[[], int]) -> int:
     """
     try:
         return run()
-    except (SceneError, ModuleNotFoundError, ValueError, OSError) as error:
+    except (SceneError, ImportError, ValueError, OSError) as error:
         complain([str(error)])
         return UNUSABLE
     except KeyboardInterrupt:

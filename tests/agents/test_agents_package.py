@@ -1,5 +1,6 @@
 """The package of agents is there without its extra, and says what to install where it is used."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -23,15 +24,30 @@ from agents import DQSpaceArmVecEnv
 """
 
 
-def run(code):
+TRAINING = """
+from agents.training import main
+sys.exit(main(["--config", "ppo", "--out", sys.argv[1]]))
+"""
+
+
+def run(code, *arguments):
     root = Path(agents.__file__).parents[1]
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root)
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=root)
 
 
 def test_what_is_missing_is_named_with_the_extra():
     assert run(WITHOUT_THE_EXTRA).stderr.splitlines()[-1] == (
         'ImportError: DQSpaceArmVecEnv needs stable_baselines3: pip install "dq-space-arm[agents]"'
     )
+
+
+def test_the_command_names_what_is_missing_in_a_sentence(tmp_path):
+    code = WITHOUT_THE_EXTRA.partition("import agents")[0] + TRAINING
+    done = run(code, str(tmp_path / "run"))
+    assert done.returncode == 2
+    assert re.fullmatch(r'training needs \w+: pip install "dq-space-arm\[agents\]"\n', done.stderr)
+    assert not (tmp_path / "run").exists()
 
 
 def test_importing_loads_no_learning_library():

@@ -178,6 +178,13 @@ def test_an_interrupted_run_ends_with_the_same_weights(demonstrations, cloned, t
         aggregate(cloned, demonstrations, dagger(61, labels=labels), tmp_path, making=MAKING)
 
 
+def test_a_round_has_no_more_flights_than_starts(demonstrations, cloned):
+    settings = dagger(20, rounds=1, episodes=1000, labels="gains")
+    corrected = aggregate(cloned, demonstrations, settings, making=MAKING, starts=demonstrations[:5])
+    steps = demonstrations.scene.simulation.steps
+    assert corrected.history[-1]["environment_steps"] == 5 * steps
+
+
 @pytest.mark.slow
 def test_correction_brings_flights_closer_to_the_expert(demonstrations, cloned):
     def gap(network):

@@ -62,6 +62,11 @@ def test_it_learns(quick):
     assert last["validation_gain"] < 0.7
 
 
+def test_a_training_that_diverges_gives_no_policy(demonstrations):
+    with pytest.raises(ValueError, match=r"losses are no numbers any more: let optimization.learning_rate"):
+        learn(demonstrations, cloning(learning_rate=1e30))
+
+
 def test_the_exported_policy_acts_like_the_network(quick, demonstrations):
     policy = quick.export()
     observations = demonstrations[0].observations

@@ -79,6 +79,28 @@ def test_unknown_keys_are_refused_with_a_suggestion():
         ({"schedule": {}}, "schedule.total_steps: missing"),
         ({"name": "a/b"}, "name = 'a/b'"),
         ({"seed": -1}, "seed = -1"),
+        ({"seed": 2**31}, "seed = 2147483648"),
+        ({"algorithm": {"name": "PPO", "batch_size": 1}}, "batch_size = 1: must be at least 2"),
+        (
+            {"algorithm": {"name": "SAC", "layer_norm": True}, "network": {"hidden": []}},
+            "network.hidden = []: must have a layer for algorithm.layer_norm",
+        ),
+        ({"environment": {"reward_scale": float("nan")}}, "environment.reward_scale = nan"),
+        ({"algorithm": {"name": "PPO", "learning_rate": float("inf")}}, "learning_rate = inf"),
+        ({"environment": {"copies": 1.5}}, "environment.copies = 1.5"),
+        ({"network": {"hidden": 64}}, "network.hidden = 64"),
+        (
+            {"algorithm": {"name": "SAC", "hindsight": {}}, "environment": {"reward_scale": 0.01}},
+            "environment.reward_scale = 0.01: must be 1 with hindsight",
+        ),
+        (
+            {"algorithm": {"name": "TD3", "hindsight": {}}, "environment": {"success_reward": 0.5}},
+            "environment.success_reward = 0.5: must be 0 with hindsight",
+        ),
+        (
+            {"algorithm": {"name": "SAC", "batch_size": 4, "demonstrations": {"share": 0.1}}},
+            "demonstrations.share = 0.1: must leave room for decisions of both kinds in a batch",
+        ),
     ],
 )
 def test_wrong_values_are_named_with_what_would_be_right(changes, sentence):
@@ -107,6 +129,7 @@ def test_the_algorithm_decides_about_the_class():
         ({"network": {"activation": "relu"}}, "network.activation = 'relu': must be one of tanh, silu"),
         ({"algorithm": {"name": "clonin"}}, "algorithm.name = 'clonin': did you mean 'cloning'"),
         ({"algorithm": None}, "algorithm.name = None: it must be one of PPO"),
+        ({"algorithm": {"name": ["cloning"]}}, "algorithm.name = ['cloning']: it must be one of PPO"),
         (
             {"algorithm": {"name": "cloning", "validation_share": 1.0}},
             "validation_share = 1.0: must be less than 1",

@@ -211,6 +211,23 @@ def test_a_truncated_file_is_refused(tmp_path):
         ExportedPolicy.load(path)
 
 
+def test_a_damaged_file_is_refused_whichever_byte_it_is(tmp_path):
+    path = tmp_path / "policy.npz"
+    policy = ExportedPolicy(**parts())
+    policy.save(path)
+    content, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    for _ in range(300):
+        damaged = bytearray(content)
+        for place in rng.integers(len(content), size=4):
+            damaged[place] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        try:
+            ExportedPolicy.load(path)  # what the archive does not check, such as dates, may be damaged
+        except PolicyFileError:
+            refused += 1
+    assert refused > 200
+
+
 WITHOUT_TORCH = """
 import sys
 import numpy as np

@@ -1,5 +1,6 @@
 """PPO that begins with an exported policy: it acts like that one, and its critic may learn first."""
 
+import json
 from itertools import pairwise
 
 import numpy as np
@@ -45,7 +46,7 @@ def start(tmp_path_factory):
         activation="tanh",
         mean=np.r_[1.0, np.zeros(7), np.zeros(6), np.full(9, 0.5), 7.5],
         scale=np.r_[1.0 / deviation[:-2], 0.0, 1.0 / deviation[-1]],  # one entry is ignored
-        metadata={"training": {"expert_solves": 7}},
+        metadata={"training": {"expert_solves": 7, "seconds": 1000.0}},
     )
     path = tmp_path_factory.mktemp("start") / "policy.npz"
     policy.save(path)
@@ -118,6 +119,9 @@ def test_the_critic_learns_alone_before_the_actor_does(start, scene_file, tmp_pa
     assert changes[2] > 1e-4
     assert np.abs(critics[1] - critics[0]).max() > 1e-4
     assert run.policy.metadata["training"]["expert_solves"] == 7
+    assert run.policy.metadata["training"]["seconds"] > 1000.0
+    curve = [json.loads(line) for line in (tmp_path / "evaluations.jsonl").read_text().splitlines()]
+    assert all(line["seconds"] > 1000.0 for line in curve)
 
 
 def test_steps_follow_the_divergence_that_they_cause(start, scene_file, tmp_path):

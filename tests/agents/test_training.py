@@ -1,6 +1,9 @@
 """Every algorithm trains, saves, resumes and exports, and acts the same way each time."""
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,13 +17,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import agents
 from agents import DQSpaceArmVecEnv, ExportedPolicy, evaluate
-from agents.configuration import load_configuration
+from agents.configuration import ConfigurationError, load_configuration
 from agents.evaluation.policies import as_policy
 from agents.reinforcement.building import load_to_act, make_environment, make_learner
 from agents.reinforcement.checkpoints import read_checkpoint
 from agents.reinforcement.export import export_policy
 from agents.reinforcement.held_actions import HeldActions
-from agents.run_folder import RunFolder, RunFolderError
+from agents.run_folder import RunFolder, RunFolderError, reserved
 from agents.training import main, train
 from dq_space_arm_env import load_scene
 
@@ -54,7 +57,7 @@ def configuration(algorithm, scene_file, total_steps=3200, **changes):
                 "copies": COPIES,
                 "action_repeat": REPEAT,
                 "action_scale": {"base_force": 0.001, "base_torque": 0.2},
-                "reward_scale": 0.01,
+                "reward_scale": 1.0 if algorithm == "HER" else 0.01,
             },
             "network": {"hidden": [16, 16], "activation": "tanh" if algorithm == "PPO" else "relu"},
             "algorithm": ALGORITHMS[algorithm],
@@ -213,8 +216,83 @@ def test_an_unfinished_checkpoint_is_none(scene_file, tmp_path):
 def test_a_folder_is_for_one_configuration_but_may_get_more_time(scene_file, tmp_path):
     RunFolder(tmp_path, configuration("PPO", scene_file))
     RunFolder(tmp_path, configuration("PPO", scene_file, total_steps=6400))
+    RunFolder(tmp_path, configuration("PPO", scene_file, description="the same in other words"))
     with pytest.raises(RunFolderError, match="seed is 0 there and 1 here"):
         RunFolder(tmp_path, configuration("PPO", scene_file, seed=1))
+
+
+def test_a_folder_is_for_one_version_of_a_scene(scene_file, tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_bytes(scene_file.read_bytes())
+    RunFolder(tmp_path / "run", configuration("PPO", path))
+    RunFolder(tmp_path / "run", configuration("PPO", path))
+    PAPER.replace(name="short", simulation={"dt": 0.01, "steps": STEPS}).to_yaml(path)
+    with pytest.raises(RunFolderError, match="begun with another version of scene"):
+        RunFolder(tmp_path / "run", configuration("PPO", path))
+
+
+@pytest.mark.parametrize("name", ["provenance.json", "evaluations.jsonl"])
+def test_a_damaged_file_of_a_folder_is_named(name, scene_file, tmp_path):
+    settings = configuration("PPO", scene_file)
+    RunFolder(tmp_path, settings)
+    (tmp_path / name).write_text('{"half')
+    with pytest.raises(RunFolderError, match=f"{name} is damaged"):
+        RunFolder(tmp_path, settings).evaluations()
+
+
+def test_a_checkpoint_takes_the_place_of_older_ones_and_of_nothing_else(scene_file, tmp_path):
+    folder = RunFolder(tmp_path, configuration("PPO", scene_file))
+    for name in ("somebody's", "000000000005", ".1.part"):
+        (tmp_path / "checkpoints" / name).mkdir()
+    folder.add_checkpoint(10, lambda path: (path / "model.zip").touch())
+    left = {path.name for path in (tmp_path / "checkpoints").iterdir()}
+    assert left == {"somebody's", f"{10:012d}"}
+
+
+RESERVE = "import sys, pathlib; from agents.run_folder import reserved\n"
+RESERVE += "with reserved(pathlib.Path(sys.argv[1])): print('reserved', flush=True); sys.stdin.read()"
+
+
+def test_two_processes_do_not_train_in_one_folder(scene_file, tmp_path):
+    command = [sys.executable, "-c", RESERVE, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=Path(__file__).parents[2], **pipes) as other:
+        assert other.stdout.readline() == "reserved\n"
+        with pytest.raises(RunFolderError, match="another process trains in"):
+            train(configuration("PPO", scene_file), tmp_path)
+        assert {path.name for path in tmp_path.iterdir()} == {".lock"}
+        other.kill()
+    with reserved(tmp_path):  # a killed process keeps nothing
+        pass
+
+
+def test_a_run_whose_time_is_up_is_left_as_it_is(scene_file, tmp_path):
+    settings = configuration("PPO", scene_file, total_steps=10**6).model_dump(exclude_none=True)
+    settings["schedule"]["minutes"] = 1e-6
+    first = train(settings, tmp_path)
+    curve = (tmp_path / "evaluations.jsonl").read_text()
+    assert first.model.num_timesteps * REPEAT < 10**6
+    again = train(settings, tmp_path)
+    assert again.model.num_timesteps == first.model.num_timesteps
+    assert (tmp_path / "evaluations.jsonl").read_text() == curve
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "practice", "learning_starts", "sentence"),
+    [
+        ("PPO", {"action_repeat": STEPS + 1}, None, "environment.action_repeat = 41: must be at most 40"),
+        ("HER", {}, 39, "algorithm.learning_starts = 39: must be at least 40"),
+    ],
+)
+def test_lengths_that_do_not_fit_the_scene_are_named(
+    algorithm, practice, learning_starts, sentence, scene_file
+):
+    content = configuration(algorithm, scene_file).model_dump(exclude_none=True)
+    content["environment"] |= practice
+    if learning_starts is not None:
+        content["algorithm"]["learning_starts"] = learning_starts
+    with pytest.raises(ConfigurationError, match=sentence):
+        make_environment(load_configuration(content), load_scene(scene_file))
 
 
 def test_the_same_seed_gives_the_same_agent(scene_file, tmp_path):
