@@ -13,7 +13,8 @@ BLOCKS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
 @pytest.mark.parametrize("number", range(len(BLOCKS)))
-def test_code_runs(number, capsys):
+def test_code_runs(number, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # results of older code would be refused
     if "stable_baselines3" in BLOCKS[number]:
         pytest.importorskip("stable_baselines3")
     exec(compile(BLOCKS[number], f"README block {number}", "exec"), {})
