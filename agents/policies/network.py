@@ -62,9 +62,10 @@ class PolicyNetwork(nn.Module):
             raise ValueError(f"activation: {activation!r}, should be one of {', '.join(SMOOTH)}")
         self.activation, self.hidden = activation, tuple(hidden)
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+        last = self._linear[-1]
         with torch.no_grad():
-            self.layers[-1].weight.mul_(FIRST_OUTPUTS)
-            self.layers[-1].bias.zero_()
+            last.weight.mul_(FIRST_OUTPUTS)
+            last.bias.zero_()
         for name, value, size in (
             ("observation_mean", 0.0, n_observation),
             ("observation_scale", 1.0, n_observation),
@@ -72,6 +73,11 @@ class PolicyNetwork(nn.Module):
             ("action_scale", 1.0, n_action),
         ):
             self.register_buffer(name, torch.full((size,), value, dtype=torch.float64))
+
+    @property
+    def _linear(self) -> list[nn.Linear]:
+        """The layers by their type."""
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def normalize(
         self,
@@ -122,10 +128,10 @@ class PolicyNetwork(nn.Module):
             Actions in units of the network, (a - action_mean) / action_scale, not clipped, shape (B, n_u).
         """
         values = normalized
-        for layer in self.layers[:-1]:
+        for layer in self._linear[:-1]:
             values = layer(values)
             values = torch.tanh(values) if self.activation == "tanh" else nn.functional.silu(values)
-        result: Tensor = self.layers[-1](values)
+        result: Tensor = self._linear[-1](values)
         return result
 
     def forward_with_tangent(self, normalized: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor]:
@@ -141,7 +147,7 @@ class PolicyNetwork(nn.Module):
             What `forward` returns, and its change in the direction, both of shape (B, n_u).
         """
         values = normalized
-        for layer in self.layers[:-1]:
+        for layer in self._linear[:-1]:
             values, tangent = layer(values), tangent @ layer.weight.T
             if self.activation == "tanh":
                 values = torch.tanh(values)
@@ -151,7 +157,7 @@ class PolicyNetwork(nn.Module):
                 slope = gate * (1.0 + values * (1.0 - gate))
                 values = values * gate
             tangent = slope * tangent
-        last = self.layers[-1]
+        last = self._linear[-1]
         return last(values), tangent @ last.weight.T
 
     def act(self, observation: ArrayLike) -> FloatArray:
@@ -179,8 +185,8 @@ class PolicyNetwork(nn.Module):
         Returns:
             The policy; its actions are those of `act` but for the rounding of its last weights.
         """
-        weights = [layer.weight.detach().double().numpy().T for layer in self.layers]
-        biases = [layer.bias.detach().double().numpy() for layer in self.layers]
+        weights = [layer.weight.detach().double().numpy().T for layer in self._linear]
+        biases = [layer.bias.detach().double().numpy() for layer in self._linear]
         scale = self.action_scale.numpy()
         weights[-1] = weights[-1] * scale
         biases[-1] = biases[-1] * scale + self.action_mean.numpy()

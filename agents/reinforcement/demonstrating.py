@@ -89,7 +89,7 @@ def _flights(
         after = np.array(
             [info.get("terminal_observation", row) for info, row in zip(infos, following, strict=True)]
         )
-        columns.append((observation, actions, reward, after, done))
+        columns.append((np.asarray(observation), actions, reward, after, done))
         observation = following
     environment.close()
     # By flight, then by decision.

@@ -107,7 +107,9 @@ def take_over(model: BaseAlgorithm, policy: ExportedPolicy) -> None:
     layers = [module for module in actor.mlp_extractor.policy_net if isinstance(module, nn.Linear)]
     weights: list[NDArray[Any]] = list(policy.weights)
     biases: list[NDArray[Any]] = list(policy.biases)
-    unit = action_limits(model.get_env())  # of the actor's outputs, which are scaled to the box afterwards
+    environment = model.get_env()
+    assert environment is not None
+    unit = action_limits(environment)  # of the actor's outputs, which are scaled to the box afterwards
     scale = (1.0 if policy.action_scale is None else policy.action_scale) / unit
     weights[-1], biases[-1] = weights[-1] * scale, biases[-1] * scale
     with torch.no_grad():
