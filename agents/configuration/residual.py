@@ -104,6 +104,11 @@ class ResidualConfiguration(AgentConfiguration):
                 copies,
                 f"must be at least {len(factors)}, one for each mass factor",
             )
+        for name in ("hindsight", "demonstrations"):
+            if getattr(self.algorithm, name, None) is not None:
+                yield Problem(
+                    ("algorithm", name), "given", "must be left out: corrections are learned without"
+                )
 
     def learner(self) -> Configuration:
         """Describe the learner alone, to which the plan is a part of the environment.

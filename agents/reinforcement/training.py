@@ -17,7 +17,6 @@ from agents.policies import ExportedPolicy
 from agents.reinforcement.building import make_environment, make_learner, units_of
 from agents.reinforcement.checkpoints import Progress, read_checkpoint
 from agents.reinforcement.demonstrating import fly_again
-from agents.reinforcement.export import export_policy
 from agents.reinforcement.held_actions import HeldActions, action_limits
 from agents.reinforcement.networks import ScaledObservations
 from agents.reinforcement.sac import DemonstrationBuffer, SoftActorCritic
@@ -67,18 +66,49 @@ def train_by_reinforcement(
     scene = load_scene(configuration.scene)
     folder = RunFolder(Path(out), configuration)
     environment = make_environment(configuration, scene)
+    return train_learner(
+        configuration,
+        folder,
+        environment,
+        lambda: _begin(configuration, scene, folder, environment),
+        lambda before: Watcher(configuration, scene, folder, before, report),
+    )
+
+
+def train_learner(
+    configuration: Configuration,
+    folder: RunFolder,
+    environment: HeldActions,
+    begin: Callable[[], tuple[BaseAlgorithm, Progress]],
+    watch: Callable[[Progress], Watcher],
+) -> Trained:
+    """Let a learner practice to the end of its schedule, from its last checkpoint on if there is one.
+
+    Args:
+        configuration: Of the agent.
+        folder: Of the run.
+        environment: What it practices in; it is closed.
+        begin: Makes a learner that has learned nothing yet, and says what was spent on it before.
+        watch: Makes what evaluates it and writes checkpoints, given how far the run has come.
+
+    Returns:
+        The trained agent.
+
+    Raises:
+        KeyboardInterrupt: If the user interrupts it; the last checkpoint remains.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(configuration.threads)
     try:
         checkpoint = folder.checkpoint()
         if checkpoint is None:
-            model, before = _begin(configuration, scene, folder, environment)
+            model, before = begin()
         else:
             model, before = read_checkpoint(checkpoint, configuration, environment)
         model.set_logger(configure(str(folder.path / TENSORBOARD), ["tensorboard"]))
-        watcher = Watcher(configuration, scene, folder, before, report)
+        watcher = watch(before)
         _learn(model, watcher, configuration)
-        policy = export_policy(model, watcher.metadata())
+        policy = watcher.export()
     finally:
         torch.set_num_threads(threads)
         environment.close()

@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.configuration import Configuration
 from agents.evaluation.policies import as_policy
+from agents.policies import ExportedPolicy
 from agents.reinforcement.checkpoints import Progress, write_checkpoint
 from agents.reinforcement.export import export_policy
 from agents.run_folder import BEST, RunFolder
@@ -121,6 +122,14 @@ class Watcher(BaseCallback):
             },
         }
 
+    def export(self) -> ExportedPolicy:
+        """Write the policy, as it is at the moment, as arrays.
+
+        Returns:
+            The policy.
+        """
+        return export_policy(self.model, self.metadata())
+
     def _on_step(self) -> bool:
         return not self.is_time_up
 
@@ -164,7 +173,7 @@ class Watcher(BaseCallback):
         self.logger.dump(self.model.num_timesteps)
         if self._best is None or _score(line) > self._best:
             self._best = _score(line)
-            export_policy(self.model, self.metadata()).save(self._folder.path / BEST)
+            self.export().save(self._folder.path / BEST)
         self._report(self._advance())
 
     def _advance(self) -> Advance:

@@ -7,29 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import configure
 from torch import nn
 
 from agents.configuration.residual import ResidualConfiguration
-from agents.demonstrations import prepare_demonstrations
+from agents.demonstrations import expert_seconds, prepare_demonstrations
 from agents.policies import ExportedPolicy
 from agents.reinforcement.building import action_scale, make_learner
-from agents.reinforcement.checkpoints import Progress, read_checkpoint
+from agents.reinforcement.checkpoints import Progress
 from agents.reinforcement.export import export_policy
 from agents.reinforcement.held_actions import HeldActions
-from agents.reinforcement.training import Trained
+from agents.reinforcement.training import Trained, train_learner
 from agents.reinforcement.watching import Advance, Watcher
 from agents.residual.controllers import Corrected, GainScheduled
 from agents.residual.environment import ResidualVecEnv
 from agents.residual.flights import Adversity, fly
 from agents.residual.plans import Plans
-from agents.run_folder import BEST, MODEL, POLICY, TENSORBOARD, RunFolder
+from agents.run_folder import BEST, DEMONSTRATIONS, RunFolder
 from dq_space_arm_env import Scene, load_scene
 from experts.demonstrations import Demonstrations
 
-DEMONSTRATIONS = "demonstrations"
 VALIDATION_SEED = 1
 """Of the worlds of evaluations during training."""
 VALIDATION_SHARE = 0.2
@@ -64,25 +61,19 @@ def train_residual(
     practiced, kept = split(demonstrations, configuration.schedule.evaluation_episodes)
     environment = make_residual_environment(configuration, scene, practiced)
     learner = configuration.learner()
-    threads = torch.get_num_threads()
-    torch.set_num_threads(configuration.threads)
-    try:
-        checkpoint = folder.checkpoint()
-        if checkpoint is None:
-            model, before = make_learner(learner, environment), Progress(0, 0.0)
-            silence(model)
-        else:
-            model, before = read_checkpoint(checkpoint, learner, environment)
-        model.set_logger(configure(str(folder.path / TENSORBOARD), ["tensorboard"]))
-        watcher = ResidualWatcher(configuration, scene, folder, before, report, kept)
-        _learn(model, watcher, configuration)
-        policy = watcher.export()
-    finally:
-        torch.set_num_threads(threads)
-        environment.close()
-    policy.save(folder.path / POLICY)
-    model.save(folder.path / MODEL)
-    return Trained(folder.path, model, policy)
+
+    def begin() -> tuple[BaseAlgorithm, Progress]:
+        model = make_learner(learner, environment)
+        silence(model)
+        return model, Progress(0, 0.0, demonstrations.settings["problems"], expert_seconds(demonstrations))
+
+    return train_learner(
+        learner,
+        folder,
+        environment,
+        begin,
+        lambda before: ResidualWatcher(configuration, scene, folder, before, report, kept),
+    )
 
 
 def split(demonstrations: Demonstrations, episodes: int) -> tuple[Demonstrations, Demonstrations]:
@@ -183,9 +174,8 @@ class ResidualWatcher(Watcher):
         Returns:
             JSON values.
         """
-        practice, content = self._residual.environment, super().metadata()
-        content["training"]["expert_solves"] = self._residual.demonstrations.problems
-        return content | {
+        practice = self._residual.environment
+        return super().metadata() | {
             "configuration": self._residual.model_dump(mode="json", exclude_none=True),
             "residual": {
                 "action_scale": action_scale(practice.action_scale, self._scene).tolist(),
@@ -213,7 +203,7 @@ class ResidualWatcher(Watcher):
         saved = 1.0 - float(np.exp(np.mean(np.log(ratio))))
         line = {
             "environment_steps": progress.environment_steps,
-            "seconds": round(progress.seconds, 3),
+            "seconds": round(progress.seconds_before + progress.seconds, 3),
             "success_rate": float(np.mean(flown.is_success)),
             "median_cost": float(np.median(flown.cost)),
             "attitude_error": float(np.median(flown.attitude_error)),
@@ -233,14 +223,3 @@ class ResidualWatcher(Watcher):
             self._best_saving = saved
             policy.save(self._folder.path / BEST)
         self._report(self._advance())
-
-
-def _learn(model: BaseAlgorithm, watcher: ResidualWatcher, configuration: ResidualConfiguration) -> None:
-    left = configuration.learner().decisions(configuration.schedule.total_steps) - model.num_timesteps
-    if left <= 0:
-        watcher.init_callback(model)
-        return
-    # Stable-Baselines3 adds what it is asked for to what was done before, and counts schedules by the sum.
-    model.learn(left, callback=watcher, reset_num_timesteps=model.num_timesteps == 0)
-    watcher.evaluate()
-    watcher.write_checkpoint()

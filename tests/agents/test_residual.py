@@ -247,6 +247,7 @@ def test_configurations_tell_the_class_by_the_algorithm(tmp_path):
         ({"environment": {"copies": 2}}, "must be at least 5, one for each mass factor"),
         ({"environment": {"cost_power": 1.5}}, "must be at most 1"),
         ({"algorithm": {"name": "residual-TD3"}}, "TD3, cloning, dagger, residual-PPO, residual-SAC"),
+        ({"algorithm": {"name": "residual-SAC", "hindsight": {}}}, "must be left out"),
     ],
 )
 def test_what_is_wrong_in_a_configuration_is_named(changes, sentence):
