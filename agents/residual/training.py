@@ -14,6 +14,7 @@ from torch import nn
 
 from agents.configuration.residual import ResidualConfiguration
 from agents.demonstrations import prepare_demonstrations
+from agents.plans import Plans
 from agents.policies import ExportedPolicy
 from agents.reinforcement.building import action_scale, make_learner
 from agents.reinforcement.checkpoints import Progress, read_checkpoint
@@ -24,7 +25,6 @@ from agents.reinforcement.watching import Advance, Watcher
 from agents.residual.controllers import Corrected, GainScheduled
 from agents.residual.environment import ResidualVecEnv
 from agents.residual.flights import Adversity, fly
-from agents.residual.plans import Plans
 from agents.run_folder import BEST, MODEL, POLICY, TENSORBOARD, RunFolder
 from dq_space_arm_env import Scene, load_scene
 from experts.demonstrations import Demonstrations
