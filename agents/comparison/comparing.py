@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import re
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,6 +18,7 @@ from agents.comparison.controllers import (
     RecedingHorizon,
     SingleFollower,
 )
+from agents.comparison.kept_rows import KeptRows
 from agents.comparison.planned_flights import PlannedFlights, agents_source, fly_plans, fly_receding
 from agents.evaluation.conditions import CONDITIONS, as_known, scene_under
 from agents.evaluation.evaluating import Advance, Evaluation, evaluate
@@ -40,12 +38,9 @@ from agents.zoo.shelf import file_hash
 from dq_space_arm_env import Scene, load_scene
 from experts.demonstrations.executors import Executor, local_executor
 from experts.demonstrations.settings import software
-from experts.files import write_atomically
 
 RECEDING_STARTS = 100
 """Starts of the receding-horizon expert by default: it takes a second for each flight."""
-ROWS = "rows"
-"""Folder of finished rows, with each episode; an interrupted comparison goes on with them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,14 +160,14 @@ def compare(
         given.name if isinstance(scene, Scene) else str(scene),
         n,
         min(receding_starts, n),
-        None if out is None else out / ROWS,
+        KeptRows(out),
         executor or local_executor(workers),
         progress,
     )
     files = [policy_path(policy) for policy in policies]
     for file in files:
         check_fit(as_policy(file), given)  # what cannot be used is refused before hours of work
-    names = _distinct_names(files)
+    names = distinct_names(files)
     rows: list[Row] = []
     for condition in conditions:
         rows += [work.controller(short, condition, conditions, controllers) for short in controllers]
@@ -189,7 +184,7 @@ class _Work:
     scene_name: str
     n: int
     receding_starts: int
-    folder: Path | None
+    kept: KeptRows
     executor: Executor
     progress: Callable[[Advance], None]
 
@@ -295,45 +290,33 @@ class _Work:
             **software(),
         }
 
-    def _file(self, name: str, condition: str) -> Path:
-        assert self.folder is not None
-        return self.folder / (re.sub(r"[^\w.-]+", "-", f"{name}-{condition}") + ".json")
-
     def _kept(self, name: str, condition: str, content: dict[str, Any]) -> tuple[Evaluation, float] | None:
         """A row that is there and follows from the same things."""
-        if self.folder is None:
-            return None
+        record = self.kept.read(f"{name}-{condition}", content)
         try:
-            record = json.loads(self._file(name, condition).read_text(encoding="utf-8"))
-            if record["key"] != _key(content):
-                return None
-            return evaluation_of(record), float(record["planning_seconds"])
-        except (OSError, ValueError, KeyError, TypeError):
+            return None if record is None else (evaluation_of(record), float(record["planning_seconds"]))
+        except (ValueError, KeyError, TypeError):
             return None
 
     def _keep(self, content: dict[str, Any], evaluation: Evaluation, planning_seconds: float) -> None:
-        if self.folder is None:
-            return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        record = {
-            "key": _key(content),
-            "planning_seconds": planning_seconds,
-            **evaluation_record(evaluation),
-        }
-        write_atomically(self._file(evaluation.policy, evaluation.condition), json.dumps(record) + "\n")
+        record = {"planning_seconds": planning_seconds, **evaluation_record(evaluation)}
+        self.kept.write(f"{evaluation.policy}-{evaluation.condition}", content, record)
 
 
-def _distinct_names(files: Sequence[Path]) -> list[str]:
-    """Names for policies, by their files: a run's folder, or the file's own where that is no `policy`."""
+def distinct_names(files: Sequence[Path]) -> list[str]:
+    """Name policies by their files: a run's folder, or the file's own where that is no `policy`.
+
+    Args:
+        files: The files.
+
+    Returns:
+        A name for each, no two alike.
+    """
     names = [file.resolve().parent.name if file.stem == "policy" else file.stem for file in files]
     return [
         name if names.count(name) == 1 else f"{name} ({names[: i + 1].count(name)})"
         for i, name in enumerate(names)
     ]
-
-
-def _key(content: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _check(name: str, given: Sequence[str], known: Sequence[str]) -> None:

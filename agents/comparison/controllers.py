@@ -5,11 +5,12 @@ Where the scene that they fly in is another one, nobody tells them.
 """
 
 from time import perf_counter
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.plans import Plans
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, compile_scene
 from experts import RecedingHorizonExpert
 from experts.arm_problem import ArmProblem
@@ -24,53 +25,37 @@ CONTROLLERS = {"open-loop": OPEN_LOOP, "gains": FEEDBACK, "receding": RECEDING}
 """The controllers that follow a plan: names by what users ask for."""
 
 
-class Plans(NamedTuple):
-    """Plans for flights, B of them with N stages.
+def plans_of(settings: Settings, result: ShardResult) -> tuple[Plans, FloatArray]:
+    """Take the plans out of a shard of demonstrations.
 
-    Attributes:
-        states: Where each is at the beginning of a stage, shape (B, N, n_x), units of the state.
-        actions: Inputs as fractions of their limits, shape (B, N, n_u).
-        gains: Change of the actions per deviation in tangent coordinates, float32, shape (B, N, n_u, n_t).
-        seconds: Time that planning took, shape (B,), s.
+    Where the expert gave none, the best trajectory of another solve is flown for what it is worth.
+
+    Args:
+        settings: What the shard follows from.
+        result: The shard.
+
+    Returns:
+        A plan for each problem, in their order, and the time that planning took, shape (B,), s.
+
+    Raises:
+        KeyboardInterrupt: If the user interrupts it.
     """
+    from safetensors.numpy import load
 
-    states: FloatArray
-    actions: FloatArray
-    gains: NDArray[np.float32]
-    seconds: FloatArray
-
-    @classmethod
-    def of(cls, settings: Settings, result: ShardResult) -> Self:
-        """Take the plans out of a shard of demonstrations.
-
-        Where the expert gave none, the best trajectory of another solve is flown for what it is worth.
-
-        Args:
-            settings: What the shard follows from.
-            result: The shard.
-
-        Returns:
-            The plans, in the order of the problems.
-
-        Raises:
-            KeyboardInterrupt: If the user interrupts it.
-        """
-        from safetensors.numpy import load
-
-        arrays = load(result.content)
-        kernels = compile_scene(settings.scene)
-        count, first = len(settings.problems(result.shard)), settings.problems(result.shard).start
-        layout, steps = kernels.layout, settings.scene.simulation.steps
-        states = np.zeros((count, steps, layout.n_x))
-        actions = np.zeros((count, steps, layout.n_u))
-        gains = np.zeros((count, steps, layout.n_u, layout.n_t), dtype=np.float32)
-        rows = arrays["index"] - first
-        states[rows], actions[rows] = arrays["states"][:, :-1], arrays["actions"]
-        gains[rows] = arrays["feedback_gains"]
-        for row, start in zip(arrays["failures.index"] - first, arrays["failures.start"], strict=True):
-            solution = expert_of(settings.scene).solver.solve(start)
-            states[row], actions[row], gains[row] = _parts(solution, layout.control_limit)
-        return cls(states, actions, gains, np.array(result.solve_seconds))
+    arrays = load(result.content)
+    kernels = compile_scene(settings.scene)
+    count, first = len(settings.problems(result.shard)), settings.problems(result.shard).start
+    layout, steps = kernels.layout, settings.scene.simulation.steps
+    states = np.zeros((count, steps + 1, layout.n_x))
+    actions = np.zeros((count, steps, layout.n_u))
+    gains = np.zeros((count, steps, layout.n_u, layout.n_t), dtype=np.float32)
+    rows = arrays["index"] - first
+    states[rows], actions[rows] = arrays["states"], arrays["actions"]
+    gains[rows] = arrays["feedback_gains"]
+    for row, start in zip(arrays["failures.index"] - first, arrays["failures.start"], strict=True):
+        solution = expert_of(settings.scene).solver.solve(start)
+        states[row], actions[row], gains[row] = _parts(solution, layout.control_limit)
+    return Plans(states, actions, gains, np.arange(count)), np.array(result.solve_seconds)
 
 
 class PlanFollower:
@@ -105,13 +90,10 @@ class PlanFollower:
             Actions, shape (B, n_u).
         """
         stage, self._stage = self._stage, self._stage + 1
-        actions = self._plans.actions[:, stage]
         if not self._feedback:
-            return actions
+            return self._plans.planned(stage)
         states = self._kernels.state_from_observation(observations)
-        deviations = self._kernels.difference(self._plans.states[:, stage], states)
-        correction = np.matmul(self._plans.gains[:, stage], deviations[:, :, None])[:, :, 0]
-        return np.asarray(np.clip(actions + correction, -1.0, 1.0))
+        return self._plans.follow(self._kernels, stage, states).action
 
 
 class SingleFollower:
@@ -212,7 +194,7 @@ class RecedingHorizon:
 def _parts(solution: Solution, limit: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """States, actions and gains of a solution; zeros where it is not finite."""
     parts = (
-        solution.states[:-1],
+        solution.states,
         solution.controls / limit,
         solution.feedback_gains / limit[:, None],
     )

@@ -21,8 +21,8 @@ FLOOR = 0.01
 """Cost gap that smaller ones are drawn at, %."""
 
 _PANEL_HEIGHT, _LEGEND_ROW = 2.7, 0.2  # inches
-_MARKERS = ("o", "s", "^", "D", "P", "X", "*", "<", ">", "h", "p")
-_PALETTE = (*COLORS, BLACK, GRAY)
+MARKERS = ("o", "s", "^", "D", "P", "X", "*", "<", ">", "h", "p")
+PALETTE = (*COLORS, BLACK, GRAY)
 _LEGEND_COLUMNS = 3
 _ROUND_TIMES = {1.0: "1 s", 10.0: "10 s", 60.0: "1 min", 600.0: "10 min", 3600.0: "1 h", 36000.0: "10 h"}
 
@@ -79,7 +79,7 @@ def comparison_figure(comparison: Comparison) -> Any:
         _draw_conditions(
             right, comparison, looks, "median cost gap [%]", lambda row: row.evaluation.median_cost_gap
         )
-        _logarithmic_gaps(right)
+        logarithmic_gaps(right)
     handles = [_handle(name, rows, look) for name, look in looks.items()]
     figure.legend(
         handles=handles,
@@ -106,8 +106,8 @@ def _looks(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     for index, row in enumerate(rows):
         color = agents.setdefault(agent_of(row.evaluation.metadata) or row.evaluation.policy, len(agents))
         looks[row.evaluation.policy] = {
-            "color": _PALETTE[color % len(_PALETTE)],
-            "marker": _MARKERS[index % len(_MARKERS)],
+            "color": PALETTE[color % len(PALETTE)],
+            "marker": MARKERS[index % len(MARKERS)],
             "markersize": 5.0,
         }
     return looks
@@ -118,14 +118,14 @@ def _draw_action_times(axes: Any, rows: Sequence[Row], looks: dict[str, dict[str
     axes.set_xscale("log")
     for row in rows:
         look = looks[row.evaluation.policy]
-        _draw_gap(axes, 1e6 * row.evaluation.action_seconds, row.evaluation.median_cost_gap, look)
+        draw_gap(axes, 1e6 * row.evaluation.action_seconds, row.evaluation.median_cost_gap, look)
         # The tail as a short dash, without its interval.
         tail = 100.0 * row.evaluation.tail_cost_gap.value
         if np.isfinite(tail) and tail > FLOOR:
             x = 1e6 * row.evaluation.action_seconds
             axes.plot([x], [tail], marker="_", markersize=8.0, color=look["color"])
     axes.margins(x=0.12)
-    _logarithmic_gaps(axes)
+    logarithmic_gaps(axes)
     axes.set_xlabel("time per action [µs]", fontsize=8.5)
     axes.set_title("Marker: median, dash: 95th percentile", loc="left", fontsize=8.5)
 
@@ -141,8 +141,8 @@ def _draw_training_times(axes: Any, rows: Sequence[Row], looks: dict[str, dict[s
         if known:
             axes.plot(*zip(*known, strict=True), color=look["color"], linewidth=0.9)
         if seconds is not None:
-            _draw_gap(axes, seconds, row.evaluation.median_cost_gap, look)
-    _logarithmic_gaps(axes)
+            draw_gap(axes, seconds, row.evaluation.median_cost_gap, look)
+    logarithmic_gaps(axes)
     _times(axes, rows)
     axes.set_title("Line: validation starts", loc="left", fontsize=8.5)
 
@@ -158,7 +158,7 @@ def _draw_learning_curves(axes: Any, rows: Sequence[Row], looks: dict[str, dict[
             rates = [100.0 * point.success_rate for point in row.curve]
             axes.plot(times, rates, color=look["color"], linewidth=0.9)
         if seconds is not None:
-            _draw_bar(axes, seconds, row.evaluation.success_rate, look)
+            draw_bar(axes, seconds, row.evaluation.success_rate, look)
     axes.set_ylim(-3.0, 103.0)
     _times(axes, rows)
     axes.set_ylabel("success rate [%]", fontsize=8.5)
@@ -172,12 +172,12 @@ def _draw_conditions(
     conditions = comparison.conditions
     for position, condition in enumerate(conditions):
         rows = comparison.under(condition)
-        for row, offset in zip(rows, _spread(len(rows)), strict=True):
+        for row, offset in zip(rows, spread(len(rows)), strict=True):
             interval, look = value(row), looks[row.evaluation.policy]
             if label.startswith("success"):
-                _draw_bar(axes, position + offset, interval, look)
+                draw_bar(axes, position + offset, interval, look)
             else:
-                _draw_gap(axes, position + offset, interval, look)
+                draw_gap(axes, position + offset, interval, look)
         if position:
             axes.axvline(position - 0.5, **LIMIT_STYLE)
     axes.set_xlim(-0.5, len(conditions) - 0.5)
@@ -188,8 +188,15 @@ def _draw_conditions(
         axes.set_ylim(-3.0, 103.0)
 
 
-def _draw_gap(axes: Any, x: float, gap: Interval, look: dict[str, Any]) -> None:
-    """Draw a gap with its interval, in per cent; on the floor as an empty triangle."""
+def draw_gap(axes: Any, x: float, gap: Interval, look: dict[str, Any]) -> None:
+    """Draw a gap with its interval, in per cent; on the floor as an empty triangle.
+
+    Args:
+        axes: Where.
+        x: Place on the horizontal axis.
+        gap: The gap, dimensionless; nothing is drawn if it is NaN.
+        look: Color and marker.
+    """
     value, low, high = (100.0 * bound for bound in gap)
     if not np.isfinite(value):
         return
@@ -202,14 +209,25 @@ def _draw_gap(axes: Any, x: float, gap: Interval, look: dict[str, Any]) -> None:
         axes.plot([x], [FLOOR], linestyle="", clip_on=False, **on_floor)
 
 
-def _draw_bar(axes: Any, x: float, rate: Interval, look: dict[str, Any]) -> None:
-    """Draw a rate with its interval, in per cent."""
+def draw_bar(axes: Any, x: float, rate: Interval, look: dict[str, Any]) -> None:
+    """Draw a rate with its interval, in per cent.
+
+    Args:
+        axes: Where.
+        x: Place on the horizontal axis.
+        rate: The rate, in [0, 1].
+        look: Color and marker.
+    """
     axes.plot([x, x], [100.0 * rate.low, 100.0 * rate.high], color=look["color"], linewidth=1.0)
     axes.plot([x], [100.0 * rate.value], linestyle="", **look)
 
 
-def _logarithmic_gaps(axes: Any) -> None:
-    """Make the vertical axis that of cost gaps."""
+def logarithmic_gaps(axes: Any) -> None:
+    """Make the vertical axis that of cost gaps.
+
+    Args:
+        axes: Where they are drawn.
+    """
     from matplotlib.ticker import FuncFormatter
 
     axes.set_yscale("log")
@@ -251,6 +269,13 @@ def _training_seconds(row: Row) -> float | None:
     return float(seconds) if seconds else None
 
 
-def _spread(count: int) -> list[float]:
-    """Places side by side within a column of width 1."""
+def spread(count: int) -> list[float]:
+    """Give places side by side within a column of width 1.
+
+    Args:
+        count: How many.
+
+    Returns:
+        Distances from its middle.
+    """
     return [0.8 * ((i + 0.5) / count - 0.5) for i in range(count)]

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import agents
-from agents.comparison.controllers import FEEDBACK, RECEDING, PlanFollower, Plans, RecedingHorizon
+from agents.comparison.controllers import FEEDBACK, RECEDING, PlanFollower, RecedingHorizon, plans_of
 from agents.evaluation.cached_groups import CachedGroups, Row, known_groups
 from agents.evaluation.conditions import as_known, scene_under
 from agents.evaluation.evaluating import Advance
@@ -36,7 +36,13 @@ from experts.demonstrations.settings import Settings, software
 from experts.demonstrations.shard import Task
 from experts.problem import FloatArray
 
-_SOURCES = ("comparison/controllers.py", "comparison/planned_flights.py", "evaluation", "policies")
+_SOURCES = (
+    "comparison/controllers.py",
+    "comparison/planned_flights.py",
+    "evaluation",
+    "plans.py",
+    "policies",
+)
 _FEW = 5
 """Flights of a group of the receding-horizon expert, a second or so each."""
 _COLUMNS = ("seed", "planning_seconds", *Flights._fields)
@@ -134,12 +140,12 @@ def _planned(
     with closing(executor.run(tasks)) as results:
         for done, result in enumerate(results, 1 + len(groups) - len(missing)):
             keep_costs(settings, result)
-            plans, seeds = Plans.of(settings, result), group_seeds(settings, result.shard)
+            (plans, seconds), seeds = plans_of(settings, result), group_seeds(settings, result.shard)
             for plane, (_, absent), found in zip(planes, known, rows, strict=True):
                 if result.shard in absent:
                     follower = PlanFollower(settings.scene, plans, feedback=plane.controller == FEEDBACK)
                     flights = fly(follower, plane.flown, seeds)
-                    found[result.shard] = _rows(seeds, flights, plans.seconds)
+                    found[result.shard] = _rows(seeds, flights, seconds)
                     plane.files.write(result.shard, found[result.shard])
             progress(Advance(stage, done, len(groups)))
     return rows
@@ -226,14 +232,17 @@ def _files(controller: str, planned_in: Scene, flown: Scene) -> CachedGroups:
 
 
 @cache
-def agents_source() -> str:
+def agents_source(names: tuple[str, ...] = _SOURCES) -> str:
     """Hash of the code that flights follow from, besides the expert's and the environment's.
+
+    Args:
+        names: Files and folders of the package `agents`.
 
     Returns:
         SHA-256, 64 hexadecimal digits.
     """
     folder, digest = Path(str(agents.__file__)).parent, hashlib.sha256()
-    for name in _SOURCES:
+    for name in names:
         path = folder / name
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             digest.update(file.read_bytes())

@@ -119,11 +119,13 @@ def check_fit(policy: ActingPolicy, scene: Scene) -> None:
         PolicyError: If it does not fit.
     """
     kind = policy.metadata.get("observation", "plain")
-    if kind not in _KINDS:
+    if kind == "residual":
         raise PolicyError(
-            f"{policy.label} sees {kind!r} observations, which no environment shows; it cannot fly alone, "
-            "only as part of what it was trained in"
+            f"{policy.label} chooses corrections of a plan rather than actions, so it cannot fly alone: "
+            "compare it by scripts/compare_residual.py"
         )
+    if kind not in _KINDS:
+        raise PolicyError(f"{policy.label} sees {kind!r} observations, which no environment shows")
     if policy.sizes is None:
         return
     environment = DQSpaceArmVectorEnv(1, scene)

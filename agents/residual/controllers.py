@@ -8,8 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from agents.plans import FloatArray, Followed, Plans
 from agents.policies import ExportedPolicy
-from agents.residual.plans import FloatArray, Followed, Plans
 from dq_space_arm_env import Kernels, Scene, compile_scene
 from experts import RecedingHorizonExpert
 
@@ -205,7 +205,8 @@ class Corrected:
         settings = policy.metadata.get("residual")
         if settings is None:
             raise ValueError(
-                "policy: chooses actions rather than corrections of a plan; evaluate it by agents.evaluate"
+                "policy: chooses actions rather than corrections of a plan; evaluate it by "
+                "python -m agents.evaluate"
             )
         kernels = compile_scene(scene)
         expected, actual = (Sight.size(kernels), kernels.n_u), (policy.n_observation, policy.n_action)

@@ -12,8 +12,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from agents.configuration.residual import Mismatch
+from agents.plans import FloatArray, Followed, Plans
 from agents.residual.controllers import Sight, corrected
-from agents.residual.plans import FloatArray, Followed, Plans
 from agents.residual.worlds import Disturbance, Disturbances, Worlds
 from dq_space_arm_env import Scene
 from experts.demonstrations import Demonstrations

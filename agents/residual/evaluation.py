@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
 
-from agents.demonstrations import check_scene
+from agents.comparison.comparing import distinct_names
+from agents.comparison.controllers import FEEDBACK, OPEN_LOOP, RECEDING
+from agents.comparison.kept_rows import KeptRows
+from agents.comparison.planned_flights import agents_source
+from agents.demonstrations import check_scene, stricter
 from agents.evaluation import (
     EVALUATION_SEEDS,
     Interval,
@@ -19,294 +23,339 @@ from agents.evaluation import (
     evaluation_seeds,
     wilson_interval,
 )
-from agents.evaluation.conditions import PAYLOAD_CHANGE
+from agents.evaluation.evaluating import Advance
 from agents.evaluation.expert_costs import SEED_OF_SEEDS
+from agents.evaluation.policies import PolicyError, policy_path
+from agents.plans import FloatArray, Plans
 from agents.policies import ExportedPolicy
+from agents.residual.conditions import CONDITIONS, Condition
 from agents.residual.controllers import Controller, Corrected, GainScheduled, OpenLoop, RecedingHorizon
 from agents.residual.flights import Adversity, Flown, fly
-from agents.residual.plans import FloatArray, Plans
-from dq_space_arm_env import Scene, compile_scene
-from experts import BoxDDP
+from agents.residual.informed import SOURCES, informed_costs
+from agents.zoo.shelf import file_hash
+from dq_space_arm_env import Scene
 from experts.demonstrations import Demonstrations, generate_demonstrations
-from experts.report.solvers.receding import NOISE, PUSH, PUSHES, with_masses
+from experts.report.solvers.receding import PUSHES, with_masses
 
-OPEN_LOOP, GAINS, CORRECTED, RECEDING = (
-    "plan, open loop",
-    "plan, gains",
-    "plan, gains, residual",
-    "receding horizon",
-)
-"""Names of the controllers."""
-
-
-class Condition(NamedTuple):
-    """How worlds differ from the plan's.
-
-    Attributes:
-        name: What tables call it.
-        mass_factor: Factor of mass and inertia of the payload, or of the last link without one.
-        noise: Standard deviation of what is measured, rad, m, rad/s, m/s.
-        push: Standard deviation of the jumps of the base's velocities, rad/s, m/s.
-    """
-
-    name: str
-    mass_factor: float = 1.0
-    noise: float = 0.0
-    push: float = 0.0
-
-
-LIGHT, HEAVY = 1.0 - PAYLOAD_CHANGE, 1.0 + PAYLOAD_CHANGE
-CONDITIONS = (
-    Condition("as planned"),
-    Condition("light", mass_factor=LIGHT),
-    Condition("heavy", mass_factor=HEAVY),
-    Condition("noise", noise=NOISE),
-    Condition("small pushes", push=PUSH / 4.0),
-    Condition("pushes", push=PUSH),
-    Condition("light, noise, pushes", LIGHT, NOISE, PUSH),
-    Condition("heavy, noise, pushes", HEAVY, NOISE, PUSH),
-)
-"""As for the benchmark of the receding-horizon expert, with the masses of the evaluation protocol."""
+RECEDING_HORIZON = 50
+"""Stages that the receding-horizon expert looks ahead."""
+TOLERANCE_SCALE = 0.7
+"""Of the tolerances that plans meet by default, relative to the scene's; as in training."""
+_BLOCK = 40
+"""Actions of a block; the configuration that ships holds a correction for half of it."""
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
-    """What controllers pay under one condition, from the same starts.
+class Row:
+    """A controller under a condition.
 
     Attributes:
         condition: The condition.
+        controller: Its name.
+        flown: What became of its flights, from the first B starts.
         informed_cost: Of the expert that knows the masses, and meets neither noise nor pushes, shape (B,);
             NaN where it found no optimum.
-        flown: What became of the flights of each controller, by its name.
+        action_seconds: Mean time for an action of one flight, s; see `_Timed`.
     """
 
     condition: Condition
+    controller: str
+    flown: Flown
     informed_cost: FloatArray
-    flown: Mapping[str, Flown]
+    action_seconds: float
 
-    def success_rate(self, name: str) -> Interval:
-        """Estimate how often a controller arrives.
-
-        Args:
-            name: Of the controller.
-
-        Returns:
-            The rate, with a 95 % interval.
-        """
-        success = self.flown[name].is_success
+    @property
+    def success_rate(self) -> Interval:
+        """How often it arrives, with a 95 % interval."""
+        success = self.flown.is_success
         return wilson_interval(int(success.sum()), len(success))
 
-    def cost_gap(self, name: str) -> Interval:
-        """Estimate what a controller pays beyond the informed expert.
-
-        Args:
-            name: Of the controller.
-
-        Returns:
-            Median of J / J_informed - 1, with a 95 % interval.
-        """
-        gaps = self.flown[name].cost / self.informed_cost - 1.0
+    @property
+    def cost_gap(self) -> Interval:
+        """Median of J / J_informed - 1, with a 95 % interval."""
+        gaps = self.flown.cost / self.informed_cost - 1.0
         return bootstrap_interval(gaps[~np.isnan(gaps)], _median)
 
-    def saving(self, name: str = CORRECTED, base: str = GAINS) -> Interval:
-        """Estimate what a controller saves, flight by flight.
+    def saving(self, base: Row) -> Interval:
+        """Estimate what it saves, flight by flight, from the starts that both have flown.
 
         Args:
-            name: Of the controller.
-            base: Of the one that it is compared with.
+            base: What it is compared with.
 
         Returns:
             One minus the geometric mean of J / J_base, with a 95 % interval.
         """
-        ratios = np.log(self.flown[name].cost / self.flown[base].cost)
+        both = min(len(self.flown.cost), len(base.flown.cost))
+        ratios = np.log(self.flown.cost[:both] / base.flown.cost[:both])
         return bootstrap_interval(ratios, lambda values: 1.0 - float(np.exp(np.mean(values))))
 
-    def summary(self) -> list[dict[str, Any]]:
-        """Write the comparison down.
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Controllers under several conditions.
+
+    Attributes:
+        scene: Name of the scene.
+        rows: In the order of conditions, then of controllers.
+        policies: Those that correct, with their files, by the names of their controllers.
+    """
+
+    scene: str
+    rows: tuple[Row, ...]
+    policies: Mapping[str, tuple[ExportedPolicy, Path]] = field(default_factory=dict)
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names of the conditions that there are rows for."""
+        return tuple(dict.fromkeys(row.condition.name for row in self.rows))
+
+    def under(self, condition: str) -> tuple[Row, ...]:
+        """Rows of a condition.
+
+        Args:
+            condition: Its name.
 
         Returns:
-            JSON values, a dictionary for each controller.
+            The rows.
         """
-        return [
-            {
-                "condition": self.condition._asdict(),
-                "controller": name,
-                "episodes": len(flown.cost),
-                "success_rate": list(self.success_rate(name)),
-                "median_cost": float(np.median(flown.cost)),
-                "mean_cost": float(np.mean(flown.cost)),
-                "median_cost_gap": list(self.cost_gap(name)),
-                "saving": list(self.saving(name)) if GAINS in self.flown else None,
-                "attitude_error": float(np.median(flown.attitude_error)),
-                "position_error": float(np.median(flown.position_error)),
-            }
-            for name, flown in self.flown.items()
-        ]
+        return tuple(row for row in self.rows if row.condition.name == condition)
+
+    def saving(self, row: Row) -> Interval | None:
+        """Estimate what a controller saves of what the plan with its gains pays, see `Row.saving`.
+
+        Args:
+            row: Of the controller.
+
+        Returns:
+            The saving; None for the plan with its gains itself.
+        """
+        (base,) = (other for other in self.under(row.condition.name) if other.controller == FEEDBACK)
+        return None if row is base else row.saving(base)
 
 
 def compare_under_mismatch(
-    policy: ExportedPolicy | str | Path | None,
+    policies: Sequence[str | Path],
     demonstrations: Demonstrations,
     scene: Scene | None = None,
     *,
-    conditions: Sequence[Condition] = CONDITIONS,
-    receding_horizon: int = 50,
-    receding_flights: int = 0,
+    conditions: Sequence[Condition] = tuple(CONDITIONS.values()),
+    receding_starts: int = 0,
+    receding_horizon: int = RECEDING_HORIZON,
     seed: int = 0,
-    progress: Callable[[str], None] = lambda what: None,
-) -> list[Comparison]:
+    out: Path | None = None,
+    progress: Callable[[Advance], None] = lambda advance: None,
+) -> Comparison:
     """Fly all controllers from where demonstrations begin.
 
+    What a flight meets depends on the number of its start alone: not on who flies, nor on how many fly.
+
     Args:
-        policy: Correction that was exported, its file, or the folder of its run; None to fly without one.
-        demonstrations: Plans of the flights, B of them.
+        policies: Exported corrections, or folders of their training runs.
+        demonstrations: Plans of the flights.
         scene: What they are for, whose tolerances tell success; that of the demonstrations by default, which
             may have stricter ones.
         conditions: How the worlds differ.
-        receding_horizon: Stages that the receding-horizon expert looks ahead.
-        receding_flights: Flights of the receding-horizon expert, a second each: the first ones. If there are
-            fewer than B, all controllers are compared on these flights only; 0 leaves it out.
-        seed: Of noise and pushes; the same for all controllers.
-        progress: Called with what comes next.
+        receding_starts: Number of starts of the receding-horizon expert, the first ones, some seconds each;
+            0 leaves it out.
+        receding_horizon: Stages that it looks ahead.
+        seed: Of noise and pushes.
+        out: Folder that keeps finished rows, in its folder `rows`; what is there is not done again. None
+            keeps nothing but the costs of the informed expert, in the cache.
+        progress: Called now and then.
 
     Returns:
-        A comparison for each condition.
+        The comparison.
 
     Raises:
-        PolicyFileError: If the policy's file cannot be read.
-        ValueError: If it is no correction, or the scene does not fit it.
+        PolicyError, PolicyFileError: If a policy is none, or its file cannot be read.
+        ValueError: If it is no correction or does not fit the scene, or a number is out of range.
         DemonstrationsError: If the demonstrations are of another scene.
+        KeyboardInterrupt: If the user interrupts it. Rows that are finished remain.
     """
+    if receding_starts < 0:
+        raise ValueError(f"receding_starts: {receding_starts}, should be at least 0, which leaves it out")
     scene = scene or demonstrations.scene
     check_scene(demonstrations, scene)
-    if receding_flights:
-        demonstrations = demonstrations[:receding_flights]
-    controllers: dict[str, Controller] = {OPEN_LOOP: OpenLoop(), GAINS: GainScheduled(scene)}
-    if policy is not None:
-        controllers[CORRECTED] = Corrected.by(_read(policy), scene)
-    if receding_flights:
+    controllers: dict[str, Controller] = {OPEN_LOOP: OpenLoop(), FEEDBACK: GainScheduled(scene)}
+    found = read_corrections(policies, scene)
+    controllers |= {name: Corrected.by(policy, scene) for name, (policy, _) in found.items()}
+    if receding_starts:
         controllers[RECEDING] = RecedingHorizon(scene, receding_horizon)
-    plans = Plans.of(demonstrations)
-    costs = _InformedCosts(scene, plans, demonstrations.column("cost").astype(np.float64))
-    comparisons = []
+    work = _Work(
+        demonstrations, Plans.of(demonstrations), scene, seed, receding_horizon, KeptRows(out), progress
+    )
+    rows = []
     for condition in conditions:
-        progress(f"{condition.name}: what the informed expert pays")
-        informed = costs.under(condition.mass_factor)
-        adversity = Adversity(condition.mass_factor, condition.noise, condition.push, PUSHES, seed)
-        flown = {}
+        informed = informed_costs(
+            scene,
+            demonstrations,
+            work.plans,
+            condition.mass_factor,
+            work.announced(f"{condition.name}: informed expert"),
+        )
         for name, controller in controllers.items():
-            progress(f"{condition.name}: {name}")
-            flown[name] = fly(controller, scene, plans, adversity)
-        comparisons.append(Comparison(condition, informed, flown))
-    return comparisons
+            starts = min(receding_starts, len(work.plans)) if name == RECEDING else len(work.plans)
+            file_of = found[name][1] if name in found else None
+            flown, seconds = work.row(condition, name, controller, starts, file_of)
+            rows.append(Row(condition, name, flown, informed[:starts], seconds))
+    return Comparison(scene.name, tuple(rows), found)
+
+
+def read_corrections(policies: Sequence[str | Path], scene: Scene) -> dict[str, tuple[ExportedPolicy, Path]]:
+    """Read policies that correct plans.
+
+    Args:
+        policies: Exported policies, or folders of training runs.
+        scene: What they are to fly in.
+
+    Returns:
+        Each with its file, by the name of its run.
+
+    Raises:
+        PolicyError, PolicyFileError: If a policy is none, or its file cannot be read.
+        ValueError: If it is no correction, or does not fit the scene.
+    """
+    files = [policy_path(policy) for policy in policies]
+    found = {}
+    for name, file in zip(distinct_names(files), files, strict=True):
+        if not file.exists():
+            raise PolicyError(f"{file}: there is no such file or folder")
+        policy = ExportedPolicy.load(file)
+        Corrected.by(policy, scene)  # what cannot be used is refused before hours of work
+        found[name] = policy, file
+    return found
 
 
 def evaluation_plans(
-    scene: Scene, folder: Path, n: int = EVALUATION_SEEDS, *, workers: int | None = None
+    scene: Scene,
+    out: Path,
+    n: int = EVALUATION_SEEDS,
+    *,
+    tolerance_scale: float = TOLERANCE_SCALE,
+    workers: int | None = None,
+    progress: Callable[[Advance], None] = lambda advance: None,
 ) -> Demonstrations:
     """Plan the maneuvers from the evaluation starts of a scene, for evaluations only.
 
     Args:
         scene: The scene.
-        folder: Where to write the plans; those that are there remain.
+        out: Where to make a folder for the plans; those that are there remain.
         n: Number of starts, the first ones. The few that the expert fails at are left out.
+        tolerance_scale: Tolerances that plans meet, relative to the scene's, in (0, 1].
         workers: Processes that plan; one for each processor by default.
+        progress: Called now and then.
 
     Returns:
         The plans.
 
     Raises:
         DemonstrationsError: If they cannot be written.
-        ValueError: If demonstrations of the scene are impossible, or n is out of range.
+        ValueError: If demonstrations of the scene are impossible, or a number is out of range.
+        KeyboardInterrupt: If the user interrupts it. What is planned remains.
     """
     evaluation_seeds(scene, n)  # these are the seeds that follow from the seed of the data set, if n is one
-    plans = generate_demonstrations(scene, n, folder, SEED_OF_SEEDS, workers=workers)
+    if not 0.0 < tolerance_scale <= 1.0:
+        raise ValueError(f"tolerance_scale: {tolerance_scale}, should be above 0, and 1 at most")
+    plans = generate_demonstrations(
+        stricter(scene, tolerance_scale),
+        n,
+        out / f"plans-{scene.name}-{n}-{tolerance_scale:g}",
+        SEED_OF_SEEDS,
+        workers=workers,
+        progress=lambda advance: progress(Advance("plans", advance.done, advance.problems)),
+    )
     assert plans is not None  # one part is all of it
     return plans
 
 
-def comparison_table(comparisons: Sequence[Comparison]) -> Table:
-    """Lay comparisons out.
+@dataclass(frozen=True)
+class _Work:
+    """What all rows have in common."""
 
-    Args:
-        comparisons: One for each condition.
+    demonstrations: Demonstrations
+    plans: Plans
+    scene: Scene
+    seed: int
+    horizon: int
+    kept: KeptRows
+    progress: Callable[[Advance], None]
 
-    Returns:
-        A table for the terminal.
-    """
-    table = Table(title="Controllers under model mismatch")
-    for name in ("condition", "controller", "success", "gap to informed expert", "saves", "deg", "m"):
-        table.add_column(name, justify="left" if name in ("condition", "controller") else "right")
-    for comparison in comparisons:
-        for name, flown in comparison.flown.items():
-            gap, saving = comparison.cost_gap(name), comparison.saving(name)
-            table.add_row(
-                comparison.condition.name,
-                name,
-                _percent(comparison.success_rate(name)),
-                _percent(gap, 1),
-                "" if name == GAINS else _percent(saving, 1),
-                f"{np.median(flown.attitude_error):.1f}",
-                f"{np.median(flown.position_error):.3f}",
-            )
-        table.add_section()
-    return table
+    def row(
+        self, condition: Condition, name: str, controller: Controller, starts: int, policy: Path | None
+    ) -> tuple[Flown, float]:
+        """Fly a controller from the first starts, or take up what is there; with its time per action, s."""
+        content = {
+            "controller": name,
+            "policy": None if policy is None else file_hash(policy),
+            "condition": condition._asdict(),
+            "flown in": with_masses(self.scene, condition.mass_factor).content_hash()
+            if condition.mass_factor != 1.0
+            else self.scene.content_hash(),
+            "plans": dict(self.demonstrations.settings),  # tolerances, seeds, and the experts' code
+            "starts": self.demonstrations.column("seed")[:starts].tolist(),
+            "pushes": PUSHES,
+            "seed": self.seed,
+            "horizon": self.horizon if name == RECEDING else None,
+            "agents": agents_source(SOURCES),
+        }
+        label = f"{name}-{condition.name}"
+        known = _row_of(self.kept.read(label, content), starts)
+        if known is not None:
+            return known
+        worlds = max(EVALUATION_SEEDS, len(self.plans))
+        factors = np.full(worlds, condition.mass_factor)
+        adversity = Adversity(factors, condition.noise, condition.push, PUSHES, self.seed)
+        chosen = self.plans.choose(self.plans.chosen[:starts])
+        flown = fly(controller, self.scene, chosen, adversity, self.announced(f"{condition.name}: {name}"))
+        timed = _Timed(controller)
+        fly(timed, self.scene, chosen.choose(chosen.chosen[:1]), adversity)
+        seconds = timed.action_seconds()
+        columns = {column: values.tolist() for column, values in flown._asdict().items()}
+        self.kept.write(label, content, {"action_seconds": seconds, **columns})
+        return flown, seconds
+
+    def announced(self, stage: str) -> Callable[[int, int], None]:
+        """What to call with how much is done of a stage, and with how much there is."""
+        return lambda done, total: self.progress(Advance(stage, done, total))
 
 
-class _InformedCosts:
-    """What the expert pays who knows the masses, solved once for each of them."""
-
-    def __init__(self, scene: Scene, plans: Plans, planned: FloatArray) -> None:
-        self._scene, self._plans = scene, plans
-        self._known: dict[float, FloatArray] = {1.0: planned}
-
-    def under(self, factor: float) -> FloatArray:
-        """Costs, shape (B,); the solver begins with what the feedback of the plans does there."""
-        if factor not in self._known:
-            recorder = _Recorder(GainScheduled(self._scene))
-            fly(recorder, self._scene, self._plans, Adversity(factor, 0.0, 0.0, 0.0, seed=0))
-            solver = BoxDDP(with_masses(self._scene, factor))
-            guesses = np.stack(recorder.actions, axis=1) * compile_scene(self._scene).layout.control_limit
-            self._known[factor] = np.array(
-                [
-                    _cost(solver, start, guess)
-                    for start, guess in zip(self._plans.starts, guesses, strict=True)
-                ]
-            )
-        return self._known[factor]
-
-
-class _Recorder:
-    """A controller that remembers its actions."""
+class _Timed:
+    """A controller whose actions are timed."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
-        self.actions: list[NDArray[Any]] = []
+        self._seconds: list[float] = []
 
     def begin(self, plans: Plans) -> None:
         self._controller.begin(plans)
 
     def __call__(self, stage: int, measured: FloatArray) -> NDArray[Any]:
-        self.actions.append(self._controller(stage, measured))
-        return self.actions[-1]
+        started = perf_counter()
+        action = self._controller(stage, measured)
+        self._seconds.append(perf_counter() - started)
+        return action
+
+    def action_seconds(self) -> float:
+        """Mean time of an action, s: of the medians of those that are at the same place of a block.
+
+        So a correction that is held counts as often as it is chosen, and an interruption of the process not.
+        """
+        blocks = max(1, len(self._seconds) // _BLOCK)
+        times = np.reshape(self._seconds[: blocks * _BLOCK], (blocks, -1))
+        return float(np.mean(np.median(times, axis=0)))
 
 
-def _cost(solver: BoxDDP, start: FloatArray, guess: FloatArray) -> float:
-    solution = solver.solve(x0=start, u_init=guess)
-    return solution.cost if solution.converged else np.nan
-
-
-def _read(policy: ExportedPolicy | str | Path) -> ExportedPolicy:
-    if isinstance(policy, ExportedPolicy):
-        return policy
-    path = Path(policy)
-    return ExportedPolicy.load(path / "policy.npz" if path.is_dir() else path)
+def _row_of(record: Mapping[str, Any] | None, starts: int) -> tuple[Flown, float] | None:
+    """Flights and time per action out of a file; None if it is damaged."""
+    if record is None:
+        return None
+    try:
+        flown = Flown(*(np.array(record[column]) for column in Flown._fields))
+        seconds = float(record["action_seconds"])
+    except (KeyError, ValueError, TypeError):
+        return None
+    return (flown, seconds) if all(column.shape == (starts,) for column in flown) else None
 
 
 def _median(values: NDArray[np.float64]) -> float:
     return float(np.median(values))
-
-
-def _percent(interval: Interval, digits: int = 0) -> str:
-    value, low, high = (100.0 * each for each in interval)
-    return f"{value:.{digits}f} % [{low:.{digits}f}, {high:.{digits}f}]"

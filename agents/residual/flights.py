@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agents.configuration.residual import Mismatch
+from agents.plans import FloatArray, Plans
 from agents.residual.controllers import Controller
-from agents.residual.plans import FloatArray, Plans
-from agents.residual.worlds import Disturbances, Worlds
+from agents.residual.worlds import Disturbance, Disturbances, Worlds
 from dq_space_arm_env import Scene
 
 
@@ -83,7 +83,7 @@ def fly(
         controller: Who flies.
         scene: The scene of the plans.
         plans: Of B flights.
-        adversity: What they meet.
+        adversity: What they meet. If it is of more than B flights, they meet what the first B of them do.
         progress: Called after each step with its number and the number of all.
 
     Returns:
@@ -93,15 +93,16 @@ def fly(
         ValueError: If the scene has no masses that could be others.
     """
     count, steps = len(plans), scene.simulation.steps
+    drawn = max(count, *(np.size(value) for value in adversity[:3]))
     factors, noise, push = (
-        np.broadcast_to(np.asarray(value, np.float64), (count,)) for value in adversity[:3]
+        np.broadcast_to(np.asarray(value, np.float64), (drawn,)) for value in adversity[:3]
     )
     rng = np.random.default_rng([adversity.seed, 1])
     disturbances = Disturbances(scene, noise, push, adversity.pushes, rng)
-    flight = Worlds(scene, factors.tolist()).begin(plans.starts)
+    flight = Worlds(scene, factors[:count].tolist()).begin(plans.starts)
     controller.begin(plans)
     for stage in range(steps):
-        measured = flight.measure(disturbances.draw())
+        measured = flight.measure(Disturbance(*(part[:count] for part in disturbances.draw())))
         flight.act(np.asarray(controller(stage, measured), dtype=np.float64))
         progress(stage + 1, steps)
     return Flown(flight.cost, flight.is_success(), *flight.errors())

@@ -12,6 +12,7 @@ from torch import nn
 
 from agents.configuration.residual import ResidualConfiguration
 from agents.demonstrations import expert_seconds, prepare_demonstrations
+from agents.plans import Plans
 from agents.policies import ExportedPolicy
 from agents.reinforcement.building import action_scale, make_learner
 from agents.reinforcement.checkpoints import Progress
@@ -22,7 +23,6 @@ from agents.reinforcement.watching import Advance, Watcher
 from agents.residual.controllers import Corrected, GainScheduled
 from agents.residual.environment import ResidualVecEnv
 from agents.residual.flights import Adversity, fly
-from agents.residual.plans import Plans
 from agents.run_folder import BEST, DEMONSTRATIONS, RunFolder
 from dq_space_arm_env import Scene, load_scene
 from experts.demonstrations import Demonstrations

@@ -339,7 +339,7 @@ def test_a_policy_of_another_scene_is_refused_in_a_sentence(tmp_path):
     policy = exported(agent="stub", scene="paper")
     with pytest.raises(PolicyError, match="stub turns 24 numbers into 12 inputs, as it was trained"):
         evaluate(policy, QUICK, 3, expert=False)
-    with pytest.raises(PolicyError, match="stub sees 'residual' observations, which no environment shows"):
+    with pytest.raises(PolicyError, match=r"cannot fly alone: compare it by scripts/compare_residual\.py"):
         evaluate(exported(agent="stub", observation="residual"), SHORT, 3, expert=False)
     with pytest.raises(PolicyError, match="scene 'short' shows 24 and has 12"):
         evaluate(exported(n_observation=31), SHORT, 3, expert=False)

@@ -1,13 +1,19 @@
 """Corrections of plans: without one the plan flies, with one it is bounded, and what is learned is kept."""
 
+import importlib.util
 import json
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from agents.comparison.controllers import FEEDBACK, OPEN_LOOP, RECEDING
 from agents.configuration import ConfigurationError, load_configuration
 from agents.configuration.residual import Mismatch, ResidualConfiguration
+from agents.plans import Plans
 from agents.policies import ExportedPolicy
+from agents.residual.conditions import CONDITIONS, Condition
 from agents.residual.controllers import (
     SMALL,
     Corrected,
@@ -17,9 +23,9 @@ from agents.residual.controllers import (
     Sight,
     corrected,
 )
-from agents.residual.evaluation import CORRECTED, GAINS, RECEDING, Condition, compare_under_mismatch
+from agents.residual.evaluation import compare_under_mismatch, read_corrections
 from agents.residual.flights import Adversity, fly
-from agents.residual.plans import Plans
+from agents.residual.tables import commands, markdown, notes, record, table
 from agents.residual.worlds import Disturbances, Worlds
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from experts.demonstrations import DemonstrationsError
@@ -182,20 +188,186 @@ def test_what_blows_up_stays_and_is_charged(small_scene, plans):
     assert first[0] != second[0]
 
 
-def test_controllers_are_compared_start_by_start(small_scene, demonstrations):
-    conditions = [Condition("as planned"), Condition("heavy", mass_factor=HEAVY)]
-    planned, heavy = compare_under_mismatch(
-        correction(small_scene, 0.02), demonstrations, conditions=conditions, receding_flights=3
-    )
-    assert planned.cost_gap(GAINS).value == pytest.approx(0.0, abs=1e-9)
-    assert planned.saving().value < 0.0  # nothing can be saved there
-    assert planned.success_rate(GAINS).value == 1.0
-    assert planned.cost_gap(RECEDING).value < 1e-3
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """A place for the informed expert's costs alone: compiled kernels stay where they are."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("agents.evaluation.cached_groups.cache_directory", lambda: folder)
+        yield folder
+
+
+def write_correction(folder, scene, value=0.02):
+    """A run that never was."""
+    folder.mkdir(parents=True)
+    correction(scene, value).save(folder / "policy.npz")
+    return folder
+
+
+PLANNED, TESTED = Condition("as-planned"), Condition("heavy-noise-pushes", HEAVY, 0.01, 0.02)
+RUN, FEW = "stub-0", 3
+
+
+@pytest.fixture(scope="module")
+def comparison(small_scene, demonstrations, tmp_path_factory):
+    run = write_correction(tmp_path_factory.mktemp("runs") / RUN, small_scene)
+    conditions = [PLANNED, Condition("heavy", HEAVY), TESTED]
+    return compare_under_mismatch([run], demonstrations, conditions=conditions, receding_starts=FEW)
+
+
+def row_of(comparison, condition, name):
+    (row,) = (row for row in comparison.under(condition) if row.controller == name)
+    return row
+
+
+def test_controllers_are_compared_start_by_start(comparison, demonstrations):
+    gains = row_of(comparison, "as-planned", FEEDBACK)
+    assert gains.cost_gap.value == pytest.approx(0.0, abs=1e-9)
+    assert gains.success_rate.value == 1.0
+    # There is nothing to correct.
+    assert comparison.saving(row_of(comparison, "as-planned", RUN)).value == pytest.approx(0.0, abs=1e-9)
+    assert row_of(comparison, "as-planned", RECEDING).cost_gap.value < 1e-3
     # No controller beats the one that knows; a bound as long as it has found the best maneuver.
-    for name in (GAINS, CORRECTED, RECEDING):
-        assert (heavy.flown[name].cost > heavy.informed_cost * (1.0 - 1e-6)).all()
-    assert heavy.cost_gap(GAINS).value < 0.1
-    json.dumps([*planned.summary(), *heavy.summary()])
+    for name in (FEEDBACK, RUN, RECEDING):
+        row = row_of(comparison, "heavy", name)
+        assert (row.flown.cost > row.informed_cost * (1.0 - 1e-6)).all()
+    assert row_of(comparison, "heavy", FEEDBACK).cost_gap.value < 0.1
+    assert all(row.action_seconds > 0.0 for row in comparison.rows)
+
+
+def test_savings_are_of_the_starts_that_both_have_flown(comparison, demonstrations):
+    base, receding = (row_of(comparison, TESTED.name, name) for name in (FEEDBACK, RECEDING))
+    assert (len(base.flown.cost), len(receding.flown.cost)) == (len(demonstrations), FEW)
+    expected = 1.0 - np.prod(receding.flown.cost / base.flown.cost[:FEW]) ** (1.0 / FEW)
+    assert comparison.saving(receding).value == pytest.approx(expected)
+    assert comparison.saving(base) is None
+
+
+def test_what_a_flight_meets_does_not_depend_on_how_many_fly(small_scene, plans):
+    all_worlds = Adversity(np.full(len(plans), 1.0), 0.01, 0.02, 6.0, seed=3)
+    everyone = fly(GainScheduled(small_scene), small_scene, plans, all_worlds)
+    few = fly(GainScheduled(small_scene), small_scene, plans.choose(np.arange(FEW)), all_worlds)
+    np.testing.assert_allclose(few.cost, everyone.cost[:FEW], rtol=1e-12)
+
+
+def test_finished_rows_are_taken_up(small_scene, demonstrations, tmp_path, monkeypatch):
+    run = write_correction(tmp_path / RUN, small_scene)
+    arguments = {"conditions": [PLANNED, TESTED], "out": tmp_path / "out"}
+    few = demonstrations[:4]
+    first = compare_under_mismatch([run], few, **arguments)
+    names = sorted(path.name for path in (tmp_path / "out" / "rows").iterdir())
+    assert len(names) == 6
+    assert "stub-0-as-planned.json" in names
+
+    def refuse(*arguments, **options):
+        raise AssertionError("flown again")
+
+    monkeypatch.setattr("agents.residual.evaluation.fly", refuse)
+    monkeypatch.setattr("agents.residual.informed.BoxDDP", refuse)
+    again = compare_under_mismatch([run], few, **arguments)
+    assert json.dumps(record(again, [])) == json.dumps(record(first, []))
+    for changes in ({"seed": 1}, {"conditions": [PLANNED._replace(noise=0.001)]}):
+        with pytest.raises(AssertionError, match="flown again"):
+            compare_under_mismatch([run], few, **arguments | changes)
+    with pytest.raises(AssertionError, match="flown again"):
+        compare_under_mismatch([run], demonstrations[:3], **arguments)
+    other = write_correction(tmp_path / "other" / RUN, small_scene, 0.01)
+    with pytest.raises(AssertionError, match="flown again"):
+        compare_under_mismatch([other], few, **arguments)
+    (tmp_path / "out" / "rows" / "stub-0-as-planned.json").write_text("{")
+    with pytest.raises(AssertionError, match="flown again"):
+        compare_under_mismatch([run], few, **arguments)
+
+
+def test_rows_that_were_interrupted_go_on(small_scene, demonstrations, tmp_path):
+    def interrupt(advance):
+        if advance.stage == f"as-planned: {FEEDBACK}":
+            raise KeyboardInterrupt
+
+    arguments = {"conditions": [PLANNED], "out": tmp_path}
+    with pytest.raises(KeyboardInterrupt):
+        compare_under_mismatch([], demonstrations[:4], progress=interrupt, **arguments)
+    stages = []
+    compare_under_mismatch([], demonstrations[:4], progress=lambda a: stages.append(a.stage), **arguments)
+    assert set(stages) == {f"as-planned: {FEEDBACK}"}
+
+
+def test_conditions_need_no_quotes():
+    assert list(CONDITIONS) == shlex.split(shlex.join(CONDITIONS)) == shlex.join(CONDITIONS).split()
+
+
+def test_the_table_says_what_it_shows(comparison):
+    made = table(comparison)
+    assert [row[1] for row in made.rows[:4]] == [OPEN_LOOP, FEEDBACK, RUN, RECEDING]
+    assert {len(row) for row in made.rows} == {len(made.headings)}
+    assert [row[2] for row in made.rows[:4]] == ["24", "24", "24", "3"]
+    again = commands(comparison, ["-n", "24"])
+    text = markdown(comparison, again)
+    for sentence in [*notes(comparison), "python scripts/compare_residual.py -n 24"]:
+        assert sentence in text
+    assert any("flies the first 3 starts" in sentence for sentence in notes(comparison))
+    json.dumps(record(comparison, again), allow_nan=False)
+
+
+def test_the_figure_has_a_mark_for_each_row(comparison):
+    pytest.importorskip("matplotlib")
+    from agents.residual.figure import mismatch_figure
+
+    panels = mismatch_figure(comparison).axes
+    assert len(panels) == 2
+    for axes in panels:
+        marks = [line for line in axes.lines if line.get_marker() not in ("None", None, "")]
+        assert len(marks) == len(comparison.rows)
+
+
+def load_script():
+    path = Path(__file__).parents[2] / "scripts" / "compare_residual.py"
+    spec = importlib.util.spec_from_file_location("compare_residual", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_script_writes_table_record_and_picture(small_scene, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("matplotlib")
+    small_scene.to_yaml(tmp_path / "small.yaml")
+    run, out = write_correction(tmp_path / RUN, small_scene), tmp_path / "out"
+    arguments = ["--policy", str(run), "--scene", str(tmp_path / "small.yaml"), "-n", "3", "--workers", "1"]
+    arguments += ["--condition", "as-planned", "small-pushes", "--tolerance-scale", "1", "--out", str(out)]
+    assert load_script().main(arguments) == 0
+    (command,) = [line for line in capsys.readouterr().out.splitlines() if "compare_residual.py" in line]
+    again = load_script()._parse(shlex.split(command)[2:])
+    assert (again.policy, again.n, again.condition) == ([str(run)], 3, ["as-planned", "small-pushes"])
+    assert {path.name for path in out.iterdir()} == {
+        "plans-small-3-1",
+        "rows",
+        "table.md",
+        "comparison.json",
+        "comparison.png",
+    }
+    assert (out / "comparison.png").read_bytes()[:4] == b"\x89PNG"
+    content = json.loads((out / "comparison.json").read_text())
+    assert [row["controller"] for row in content["rows"][:3]] == [OPEN_LOOP, FEEDBACK, RUN]
+    assert "versions" in content
+
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    script = load_script()
+    monkeypatch.setattr(script, "compare_under_mismatch", interrupt)
+    assert script.main(arguments) == 130
+    assert "what is finished is kept" in capsys.readouterr().err
+
+
+def test_the_script_refuses_before_it_plans(small_scene, tmp_path, capsys):
+    out = ["--out", str(tmp_path / "out")]
+    assert load_script().main(["--policy", str(tmp_path / "nothing.npz"), *out]) == 2
+    assert "there is no such file or folder" in capsys.readouterr().err
+    run = write_correction(tmp_path / RUN, small_scene)
+    assert load_script().main(["--policy", str(run), *out]) == 2
+    assert "corrects scene 'small'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert list(read_corrections([run, run / "policy.npz"], small_scene)) == [f"{RUN} (1)", f"{RUN} (2)"]
 
 
 def test_the_receding_horizon_plans_every_flight_and_pays_no_more_than_the_plan(small_scene, plans):

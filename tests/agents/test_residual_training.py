@@ -9,13 +9,13 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
 from agents.configuration import load_configuration
+from agents.plans import Plans
 from agents.policies import ExportedPolicy
 from agents.reinforcement.building import make_learner
 from agents.reinforcement.checkpoints import read_checkpoint
 from agents.reinforcement.export import export_policy
 from agents.residual.controllers import Corrected, GainScheduled, Sight
 from agents.residual.flights import Adversity, fly
-from agents.residual.plans import Plans
 from agents.residual.training import make_residual_environment, silence, train_residual
 from agents.run_folder import RunFolder, RunFolderError
 from dq_space_arm_env import compile_scene
