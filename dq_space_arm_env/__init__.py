@@ -13,33 +13,61 @@ from dq_space_arm_env.registration import register_environments
 
 if TYPE_CHECKING:
     from dq_space_arm_env.environment import DQSpaceArmEnv, DQSpaceArmGoalEnv, DQSpaceArmVectorEnv
+    from dq_space_arm_env.interoperability.casadi_dynamics import CasadiDynamics, casadi_dynamics
+    from dq_space_arm_env.interoperability.mjcf_export import scene_to_mjcf
+    from dq_space_arm_env.interoperability.pinocchio_twin import (
+        from_pinocchio,
+        generalized_forces,
+        pinocchio_model,
+        to_pinocchio,
+    )
+    from dq_space_arm_env.interoperability.urdf_export import scene_to_urdf
+    from dq_space_arm_env.interoperability.urdf_import import scene_from_urdf
     from dq_space_arm_env.kernels import Kernels, compile_scene
     from dq_space_arm_env.scene import Scene, SceneError, list_scenes, load_scene
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "CasadiDynamics",
     "DQSpaceArmEnv",
     "DQSpaceArmGoalEnv",
     "DQSpaceArmVectorEnv",
     "Kernels",
     "Scene",
     "SceneError",
+    "casadi_dynamics",
     "compile_scene",
+    "from_pinocchio",
+    "generalized_forces",
     "list_scenes",
     "load_scene",
+    "pinocchio_model",
+    "scene_from_urdf",
+    "scene_to_mjcf",
+    "scene_to_urdf",
+    "to_pinocchio",
 ]
 
 _HOMES = {
+    "CasadiDynamics": "interoperability.casadi_dynamics",
     "DQSpaceArmEnv": "environment",
     "DQSpaceArmGoalEnv": "environment",
     "DQSpaceArmVectorEnv": "environment",
     "Kernels": "kernels",
     "Scene": "scene",
     "SceneError": "scene",
+    "casadi_dynamics": "interoperability.casadi_dynamics",
     "compile_scene": "kernels",
+    "from_pinocchio": "interoperability.pinocchio_twin",
+    "generalized_forces": "interoperability.pinocchio_twin",
     "list_scenes": "scene",
     "load_scene": "scene",
+    "pinocchio_model": "interoperability.pinocchio_twin",
+    "scene_from_urdf": "interoperability.urdf_import",
+    "scene_to_mjcf": "interoperability.mjcf_export",
+    "scene_to_urdf": "interoperability.urdf_export",
+    "to_pinocchio": "interoperability.pinocchio_twin",
 }
 
 register_environments()

@@ -1,6 +1,6 @@
 """What validated YAML files have in common, scenes and configurations of agents: models, numbers, text."""
 
-from dq_space_arm_env.scene._fields import Count, Finite, Fraction, NonNegative, Positive
+from dq_space_arm_env.scene._fields import Count, Finite, Fraction, NonNegative, Positive, Vector3
 from dq_space_arm_env.scene._problems import Model, Problem, did_you_mean, problem
 from dq_space_arm_env.scene._yaml import dump_yaml, parse_yaml
 
@@ -12,6 +12,7 @@ __all__ = [
     "NonNegative",
     "Positive",
     "Problem",
+    "Vector3",
     "did_you_mean",
     "dump_yaml",
     "parse_yaml",

@@ -1,0 +1,164 @@
+"""A scene's dynamics as CasADi functions, for optimal control and estimation of one's own.
+
+They are the graphs that the compiler turns into machine code, turned back into CasADi expressions: the same
+operations on the same constants. CasADi differentiates them, and they go wherever its functions go: `Opti`,
+`nlpsol`, generated C.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+
+from dq_space_arm_env.algebra import dual_quaternion
+from dq_space_arm_env.compiler.graph import Graph, trace
+from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.integrators import INTEGRATORS
+from dq_space_arm_env.integrators.field import split_state
+from dq_space_arm_env.kernels.programs import ScenePrograms
+from dq_space_arm_env.scene import ADAPTIVE_INTEGRATORS, Scene, StateLayout
+from dq_space_arm_env.validation import did_you_mean
+
+Scalar = Any
+
+
+@dataclass(frozen=True, eq=False)
+class CasadiDynamics:
+    """A scene's equations as `casadi.Function`s of dense columns, in double precision.
+
+    States, inputs and units are those of `layout`. The inputs are not clipped to their limits,
+    `layout.control_limit`. Nothing normalizes the pose q_{e0/I}: a state that a solver is free to choose has
+    to be held at |q_r| = 1, q_r . q_d = 0, which `step` and the flow of `xdot` keep.
+
+    Attributes:
+        scene: The scene.
+        layout: Names, units and places of the entries of states and inputs.
+        forward_dynamics: (x, u) to accelerations: those of the base, in base axes, angular then linear, the
+            time derivatives of its twist, 6 (planar: 3), rad/s^2 and m/s^2, then the joints', rad/s^2.
+        xdot: (x, u) to the time derivative of the state, (n_x,); that of the pose is q_{e0/I} omega / 2.
+        step: (x, u, h) to the state after h seconds under constant inputs, (n_x,), by the integrator.
+        tip_pose: (x) to the pose q_{G/I} of the tip, 8 numbers, m.
+        cost: (x, u) to the stage cost, without a factor dt, dimensionless.
+        terminal_cost: (x) to the terminal cost, dimensionless.
+    """
+
+    scene: Scene
+    layout: StateLayout
+    forward_dynamics: casadi.Function
+    xdot: casadi.Function
+    step: casadi.Function
+    tip_pose: casadi.Function
+    cost: casadi.Function
+    terminal_cost: casadi.Function
+
+
+def casadi_dynamics(scene: Scene, integrator: str | None = None) -> CasadiDynamics:
+    """Write a scene's dynamics as CasADi functions.
+
+    Args:
+        scene: A validated scene; its nominal target, masses and inertias are constants of the functions.
+        integrator: Name of the integrator of `step`; the scene's by default. One that takes a fixed number
+            of stages: CasADi cannot differentiate a loop that ends when tolerances are met.
+
+    Returns:
+        The functions.
+
+    Raises:
+        ValueError: If the integrator is unknown or adaptive.
+    """
+    name = scene.simulation.integrator if integrator is None else integrator
+    if name not in INTEGRATORS:
+        raise ValueError(
+            f"integrator: {name!r} is unknown; {did_you_mean(name, INTEGRATORS)}It must be one of "
+            f"{', '.join(INTEGRATORS)}"
+        )
+    if name in ADAPTIVE_INTEGRATORS:
+        raise ValueError(
+            f"integrator: {name!r} divides a step as far as its tolerances ask, which CasADi cannot "
+            "differentiate; give one with a fixed number of stages, for example integrator='rk8'"
+        )
+    programs = ScenePrograms(scene)
+    return CasadiDynamics(
+        scene=scene,
+        layout=programs.layout,
+        forward_dynamics=_function(programs.build("forward_dynamics")),
+        xdot=_function(_state_derivative(programs)),
+        step=_function(programs.build("step", name)),
+        tip_pose=_function(programs.build("tip_pose")),
+        cost=_function(programs.build("cost")),
+        terminal_cost=_function(programs.build("terminal_cost")),
+    )
+
+
+def _state_derivative(programs: ScenePrograms) -> Program:
+    equations, field = programs.equations, programs.field
+
+    def outputs(x: Sequence[Scalar], u: Sequence[Scalar]) -> Mapping[str, Sequence[Scalar]]:
+        y = split_state(field, x)[1]
+        motion = field.motion(y)
+        twist = (*motion.angular, *motion.linear)
+        pose = field.pose.reduced(dual_quaternion.derivative(equations.base_pose(x), twist))
+        return {"xdot": [*pose, *field.rates(y, u)]}
+
+    program = Program("xdot", [Buffer("x", field.n_x), Buffer("u", field.n_u)], [Buffer("xdot", field.n_x)])
+    program.call(trace("xdot_graph", {"x": field.n_x, "u": field.n_u}, outputs))
+    return program
+
+
+def _function(program: Program) -> casadi.Function:
+    """A program without loops as a function of columns."""
+    buffers = {name: [casadi.SX(0.0)] * size for name, size in program.scratch_sizes().items()}
+    inputs = {buffer.name: casadi.SX.sym(buffer.name, buffer.size) for buffer in program.inputs}
+    for name, column in inputs.items():
+        buffers[name] = [column[i] for i in range(column.shape[0])]
+    for call in program.calls:
+        arguments = [buffers[call.bindings.get(name, name)] for name, _ in call.graph.inputs]
+        for (name, _), values in zip(call.graph.outputs, _evaluated(call.graph, arguments), strict=True):
+            buffers[call.bindings.get(name, name)] = values
+    outputs = [casadi.densify(casadi.vertcat(*buffers[buffer.name])) for buffer in program.outputs]
+    return casadi.Function(
+        program.name, [*inputs.values()], outputs, [*inputs], [buffer.name for buffer in program.outputs]
+    )
+
+
+def _evaluated(graph: Graph, arguments: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
+    """Outputs of a graph, expression by expression."""
+    values: list[Scalar] = []
+    for node in graph.nodes:
+        if node.operation == "constant":
+            values.append(casadi.SX(node.constant))
+        elif node.operation == "input":
+            values.append(arguments[node.slot[0]][node.slot[1]])
+        else:
+            values.append(_OPERATIONS[node.operation](*(values[i] for i in node.arguments)))
+    return [[values[i] for i in indices] for indices in graph.results]
+
+
+_OPERATIONS: dict[str, Callable[..., Scalar]] = {
+    "add": lambda a, b: a + b,
+    "subtract": lambda a, b: a - b,
+    "multiply": lambda a, b: a * b,
+    "divide": lambda a, b: a / b,
+    "negate": lambda a: -a,
+    "square": lambda a: a * a,
+    "twice": lambda a: a + a,
+    "invert": lambda a: 1.0 / a,
+    "sqrt": casadi.sqrt,
+    "sin": casadi.sin,
+    "cos": casadi.cos,
+    "arctan2": casadi.atan2,
+    "absolute": casadi.fabs,
+    "minimum": casadi.fmin,
+    "maximum": casadi.fmax,
+    "less": lambda a, b: a < b,
+    "less_equal": lambda a, b: a <= b,
+    "equal": lambda a, b: a == b,
+    "not_equal": lambda a, b: a != b,
+    "not": casadi.logic_not,
+    "and": casadi.logic_and,
+    "or": casadi.logic_or,
+    "if_else_zero": lambda condition, a: casadi.if_else(condition, a, 0.0),
+}

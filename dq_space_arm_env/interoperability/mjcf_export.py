@@ -1,0 +1,162 @@
+"""A scene's robot as MJCF, the language of MuJoCo."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from dq_space_arm_env.algebra import poses, rotations
+from dq_space_arm_env.interoperability.exporting import free_name, refuse, tip_from_last_link, words
+from dq_space_arm_env.scene import Base, Link, Payload, Scene, StateLayout
+
+_FORCE_GEARS = ("1 0 0 0 0 0", "0 1 0 0 0 0", "0 0 1 0 0 0")
+_TORQUE_GEARS = ("0 0 0 1 0 0", "0 0 0 0 1 0", "0 0 0 0 0 1")
+
+
+def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
+    """Write a scene's robot as MJCF.
+
+    There is no gravity and no shape, so nothing collides and nothing but frames and inertias can be seen.
+    Body `base` has the frame e0 and a free joint, called `base joint`; in a planar scene it slides along x
+    and y and turns about z. Each link is a body with the frame of its joint, a hinge about z called by the
+    link's name and " joint", with the scene's damping and spring and no armature. Site `tip` has the frame G,
+    body `payload` is what the tip holds.
+
+    Actuators are motors with the names, limits and order of the scene's inputs, without the wrist's rates;
+    forces and torques act in base axes at e0. MuJoCo clips controls at the limits, the scene's kernels do
+    not. Key frame `start` holds the nominal start. The time step is the scene's; the integrator is MuJoCo's
+    RK4, which on rotations is not the scene's to the last digit.
+
+    State: with (w, v) the base twist in base axes, R from base to inertial axes, MuJoCo's free joint has
+    qpos = (position, quaternion scalar first) and qvel = (R v, w), and qacc = (R (dv + w x v), dw).
+
+    The massless wrist as three joints would have infinite accelerations; fixed at the start's angles it
+    changes no acceleration, but the tip cannot turn.
+
+    Args:
+        scene: A validated scene.
+        wrist: What happens to a wrist: "refuse" makes it an error, "fixed" writes it at its initial angles.
+
+    Returns:
+        The MJCF text, all numbers with 17 digits, in m, kg, s, rad.
+
+    Raises:
+        SceneError: If the scene has a wrist that is not to be fixed, or a constant wrench at the tip.
+    """
+    refuse(scene, "MJCF", wrist)
+    root = Element("mujoco", model=scene.name)
+    SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
+    SubElement(root, "option", gravity="0 0 0", timestep=words([scene.simulation.dt]), integrator="RK4")
+    names = [link.name for link in scene.links]
+    base = SubElement(SubElement(root, "worldbody"), "body", name=free_name("base", names))
+    _add_base_joint(base, scene)
+    _add_inertial(base, scene.base, (0.0, 0.0, 0.0))
+    SubElement(base, "site", name="e0")
+    body = base
+    for link in scene.links:
+        body = _add_body(body, link.name, link.joint.dual_quaternion)
+        _add_hinge(body, link)
+        _add_inertial(body, link, link.center_of_mass)
+    tip = tip_from_last_link(scene)
+    SubElement(body, "site", {"name": "tip", **_placed(tip)})
+    if scene.payload is not None:
+        payload = _add_body(body, free_name("payload", names), tip)
+        _add_inertial(payload, scene.payload, scene.payload.center_of_mass)
+    _add_actuators(root, scene)
+    _add_start(root, scene)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_base_joint(base: Element, scene: Scene) -> None:
+    if scene.base.motion == "spatial":
+        SubElement(base, "freejoint", name="base joint")
+        return
+    for name, kind, axis in (("x", "slide", "1 0 0"), ("y", "slide", "0 1 0"), ("z", "hinge", "0 0 1")):
+        SubElement(base, "joint", name=f"base {kind} {name}", type=kind, axis=axis)
+
+
+def _add_body(parent: Element, name: str, pose: Sequence[float]) -> Element:
+    return SubElement(parent, "body", {"name": name, **_placed(pose)})
+
+
+def _placed(pose: Sequence[float]) -> dict[str, str]:
+    rotation, position = poses.to_rotation_and_position(tuple(pose))
+    return {"pos": words(position), "quat": words(rotation)}
+
+
+def _add_inertial(parent: Element, body: Base | Link | Payload, center_of_mass: Sequence[float]) -> None:
+    """Mass properties, with the principal axes found here: MuJoCo's own search stops at 1e-12 kg m^2."""
+    inertia = np.array(body.inertia)
+    moments, axes = np.diag(inertia), np.eye(3)
+    if np.any(inertia != np.diag(moments)):
+        moments, axes = np.linalg.eigh(inertia)
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+    # Rounding may leave the largest moment of a flat body above the sum of the others; MuJoCo refuses that.
+    largest = int(np.argmax(moments))
+    moments = np.where(
+        np.arange(3) == largest, min(moments[largest], np.delete(moments, largest).sum()), moments
+    )
+    quaternion = rotations.from_matrix(axes.tolist())
+    SubElement(
+        parent,
+        "inertial",
+        pos=words(center_of_mass),
+        quat=words(quaternion),
+        mass=words([body.mass]),
+        diaginertia=words(moments),
+    )
+
+
+def _add_hinge(body: Element, link: Link) -> None:
+    joint = SubElement(body, "joint", name=f"{link.name} joint", type="hinge", axis="0 0 1")
+    if link.damping:
+        joint.set("damping", words([link.damping]))
+    if link.stiffness:
+        joint.set("stiffness", words([link.stiffness]))
+        joint.set("springref", words([link.rest_angle]))
+
+
+def _add_actuators(root: Element, scene: Scene) -> None:
+    layout = StateLayout.of(scene)
+    control = layout.control
+    planar = layout.planar
+    at: dict[int, dict[str, str]] = {}
+    for part, gears in (
+        (control.base_force, _FORCE_GEARS[:2] if planar else _FORCE_GEARS),
+        (control.base_torque, _TORQUE_GEARS[2:] if planar else _TORQUE_GEARS),
+    ):
+        for index, gear in zip(range(part.start, part.stop), gears, strict=False):
+            at[index] = {"site": "e0", "gear": gear}
+    torques = range(control.joint_torque.start, control.joint_torque.stop)
+    for index, joint in zip(torques, layout.actuated_joints, strict=True):
+        at[index] = {"joint": f"{scene.links[joint].name} joint"}
+    actuators = SubElement(root, "actuator")
+    for index, transmission in sorted(at.items()):
+        motor = SubElement(actuators, "motor", {"name": control.names[index], **transmission})
+        limit = layout.control_limit[index]
+        if math.isfinite(limit):
+            motor.set("ctrlrange", words([-limit, limit]))
+
+
+def _add_start(root: Element, scene: Scene) -> None:
+    start = scene.initial_state
+    rotation, position = poses.to_rotation_and_position(start.base_pose.dual_quaternion)
+    angular, linear = start.base_velocity[:3], rotations.rotate(rotation, start.base_velocity[3:])
+    if scene.base.motion == "planar":
+        yaw, _, _ = rotations.to_euler_321(rotation)
+        base, velocity = [*position[:2], yaw], [*linear[:2], angular[2]]
+    else:
+        base, velocity = [*position, *rotation], [*linear, *angular]
+    SubElement(
+        SubElement(root, "keyframe"),
+        "key",
+        name="start",
+        qpos=words([*base, *start.joint_angles]),
+        qvel=words([*velocity, *start.joint_rates]),
+    )

@@ -1,0 +1,178 @@
+"""A scene's robot as a Pinocchio model, and what turns states and inputs into Pinocchio's and back.
+
+Pinocchio is optional, `pip install pin`; it is imported when a model is asked for.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics import minimal
+from dq_space_arm_env.dynamics.chain import Chain, Placement, RigidBody
+from dq_space_arm_env.interoperability.exporting import tip_from_last_link
+from dq_space_arm_env.kernels.motion import EquationsOfMotion
+from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.start import PLANAR_POSE
+
+Array = NDArray[np.float64]
+
+
+def pinocchio_model(scene: Scene) -> Any:
+    """Build a scene's robot as a `pinocchio.Model`, for cross-checks and for what Pinocchio computes.
+
+    Joint `base` is a free flyer (planar scenes: a planar joint) with the frame e0, at the center of mass;
+    each link has a joint about z, called by its name. There is no gravity; limits are not set. Frame `tip` is
+    G, a wrist being at its initial angles. `to_pinocchio` and `generalized_forces` give the arguments of
+    Pinocchio's algorithms: `pinocchio.aba(model, data, q, v, tau)` is (dv, dw, joint accelerations), where
+    (dw, dv) are the scene's base accelerations.
+
+    Args:
+        scene: A validated scene; its nominal masses and inertias, the payload merged into the last link.
+
+    Returns:
+        The model; nv = 6 + n for n joints, 3 + n in a planar scene.
+
+    Raises:
+        ImportError: If Pinocchio is not installed.
+    """
+    pin = _pinocchio()
+    chain = Chain.from_scene(scene)
+    model = pin.Model()
+    model.name = scene.name
+    model.gravity = pin.Motion.Zero()
+    free = pin.JointModelPlanar() if chain.planar else pin.JointModelFreeFlyer()
+    joint = model.addJoint(0, free, pin.SE3.Identity(), "base")
+    model.appendBodyToJoint(joint, _inertia(pin, chain.base), pin.SE3.Identity())
+    for link, name in zip(chain.links, [link.name for link in scene.links], strict=True):
+        joint = model.addJoint(joint, pin.JointModelRZ(), _placement(pin, link.joint), name)
+        model.appendBodyToJoint(joint, _inertia(pin, link.body), pin.SE3.Identity())
+    rotation, position = poses.to_matrix(tip_from_last_link(scene))
+    tip = pin.SE3(np.array(rotation), np.array(position))
+    model.addFrame(pin.Frame("tip", joint, tip, pin.FrameType.OP_FRAME))
+    return model
+
+
+def to_pinocchio(scene: Scene, x: ArrayLike) -> tuple[Array, Array]:
+    """Write a state as Pinocchio's configuration and velocity.
+
+    Args:
+        scene: A validated scene.
+        x: State, shape (n_x,), units of the state; the wrist's angles are not part of the model.
+
+    Returns:
+        q: position of e0 in inertial axes, m, quaternion with the scalar last, joint angles, rad, shape
+        (7 + n,) (planar: x, y, cosine and sine of the angle, joint angles, (4 + n,)); v: linear velocity of
+        e0, m/s, angular velocity, rad/s, both in base axes, joint rates, rad/s, shape (6 + n,) (planar:
+        v_x, v_y, omega_z, joint rates, (3 + n,)).
+
+    Raises:
+        ValueError: If x has another shape.
+    """
+    equations, entries = _equations(scene), StateLayout.of(scene).state
+    values = _checked("x", x, equations.n_x)
+    pose = tuple(equations.pose.full(values[entries.pose].tolist()))
+    position, (w, i, j, k) = poses.position(pose), pose[:4]
+    motion = equations.motion(values[entries.pose.stop :].tolist())
+    if equations.chain.planar:
+        base = [*position[:2], w * w - k * k, 2.0 * w * k]
+        velocity = [*motion.linear[:2], motion.angular[2]]
+    else:
+        base, velocity = [*position, i, j, k, w], [*motion.linear, *motion.angular]
+    return np.array([*base, *motion.joint_angles]), np.array([*velocity, *motion.joint_rates])
+
+
+def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: ArrayLike = ()) -> Array:
+    """Write Pinocchio's configuration and velocity as a state, the inverse of `to_pinocchio`.
+
+    Args:
+        scene: A validated scene.
+        q: Configuration, shape (7 + n,), or (4 + n,) in a planar scene, m and rad.
+        v: Velocity, shape (6 + n,), or (3 + n,) in a planar scene, m/s and rad/s.
+        wrist_angles: psi, theta, phi, shape (3,), rad; shape (0,) without a wrist.
+
+    Returns:
+        State, shape (n_x,), units of the state; the sign of q_{e0/I} is that of q, in a planar scene the one
+        with a scalar part of at least 0.
+
+    Raises:
+        ValueError: If a shape is wrong.
+    """
+    layout = StateLayout.of(scene)
+    n, planar = layout.n_joints, layout.planar
+    configuration = _checked("q", q, n + (4 if planar else 7))
+    velocity = _checked("v", v, n + (3 if planar else 6))
+    wrist = _checked("wrist_angles", wrist_angles, 3 if layout.has_wrist else 0)
+    if planar:
+        (x, y, cosine, sine), angles = configuration[:4], configuration[4:]
+        half = 0.5 * np.arctan2(sine, cosine)
+        pose = poses.from_rotation_and_position((np.cos(half), 0.0, 0.0, np.sin(half)), (x, y, 0.0))
+        base = [pose[i] for i in PLANAR_POSE]
+        twist, rates = [velocity[2], *velocity[:2]], velocity[3:]
+    else:
+        position, (i, j, k, w), angles = configuration[:3], configuration[3:7], configuration[7:]
+        base = list(poses.from_rotation_and_position((w, i, j, k), tuple(position)))
+        twist, rates = [*velocity[3:6], *velocity[:3]], velocity[6:]
+    return np.array([*base, *angles, *wrist, *twist, *rates], dtype=np.float64)
+
+
+def generalized_forces(scene: Scene, x: ArrayLike, u: ArrayLike) -> Array:
+    """Write what acts on a scene's robot as Pinocchio's generalized forces tau.
+
+    They hold the inputs, the joints' springs and dampers, and the constant wrench at the tip.
+
+    Args:
+        scene: A validated scene.
+        x: State, shape (n_x,), units of the state.
+        u: Inputs, shape (n_u,), units of the inputs; the wrist's rates do no work.
+
+    Returns:
+        Force at e0, N, torque, N m, both in base axes, joint torques, N m, shape (6 + n,) (planar: f_x, f_y,
+        tau_z, joint torques, (3 + n,)).
+
+    Raises:
+        ValueError: If x or u has another shape.
+    """
+    equations, entries = _equations(scene), StateLayout.of(scene).state
+    values = _checked("x", x, equations.n_x)
+    motion = equations.motion(values[entries.pose.stop :].tolist())
+    inputs = equations.inputs(_checked("u", u, equations.n_u).tolist())
+    rotations = minimal.joint_rotations(equations.chain, motion.joint_angles)
+    tip = equations.tip_forces(motion, rotations, equations.chain.tip_wrench)
+    passive = minimal.passive_torques(equations.chain, motion.joint_angles, motion.joint_rates)
+    base = [*map(sum, zip(inputs.force, tip.force, strict=True))]
+    base += map(sum, zip(inputs.torque, tip.torque, strict=True))
+    if equations.chain.planar:
+        base = [*base[:2], base[5]]
+    joints = map(sum, zip(inputs.joint_torques, passive, tip.joints, strict=True))
+    return np.array([*base, *joints], dtype=np.float64)
+
+
+def _pinocchio() -> Any:
+    try:
+        return import_module("pinocchio")
+    except ImportError as error:
+        raise ImportError("pinocchio_model needs Pinocchio: pip install pin") from error
+
+
+def _equations(scene: Scene) -> EquationsOfMotion:
+    return EquationsOfMotion(Chain.from_scene(scene), StateLayout.of(scene))
+
+
+def _checked(name: str, values: ArrayLike, size: int) -> Array:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (size,):
+        raise ValueError(f"{name}: shape {array.shape}, it must be ({size},)")
+    return array
+
+
+def _inertia(pin: Any, body: RigidBody) -> Any:
+    return pin.Inertia(body.mass, np.array(body.center_of_mass), np.array(body.inertia))
+
+
+def _placement(pin: Any, placement: Placement) -> Any:
+    return pin.SE3(np.array(placement.rotation), np.array(placement.position))

@@ -1,0 +1,311 @@
+"""What stands in a URDF file, as checked plain data: links with their masses, joints with their frames.
+
+The file is read with Python's own expat. The URDF parsers on PyPI either bring a mesh library along
+(yourdfpy, urchin) or have had no release for years (urdf-parser-py), and all are lenient where a wrong robot
+would come out. Namespaces are not resolved: a prefix that nobody declared, such as `drake:acceleration`, is
+an error to a stricter reader, but it is what robots ship with. Document type declarations are refused, and
+with them everything that makes foreign XML dangerous.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+import numpy as np
+
+from dq_space_arm_env.algebra import poses, rotations
+from dq_space_arm_env.interoperability.rigid_body import Array, Body
+from dq_space_arm_env.scene import SceneError
+
+MOVABLE = ("revolute", "continuous")
+TYPES = (*MOVABLE, "fixed", "prismatic", "planar", "floating")
+
+Pose = tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfLink:
+    """A link.
+
+    Attributes:
+        name: Its name.
+        body: Mass properties in the link's frame; None for a link without mass.
+    """
+
+    name: str
+    body: Body | None
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfJoint:
+    """A joint; at zero angle the child's frame coincides with the joint's.
+
+    Attributes:
+        name: Its name.
+        type: One of `TYPES`.
+        parent: Name of the parent link.
+        child: Name of the child link.
+        origin: Pose of the joint's frame in the parent's, 8 numbers, m.
+        axis: Unit vector along the axis in the joint's frame, shape (3,).
+        effort: Largest torque, N m; None where the file gives none, or zero, which is what many files write
+            for an unknown one.
+        limits: Smallest and largest angle, rad; None for a joint without.
+        damping: Viscous friction, N m s/rad.
+        friction: Coulomb friction, N m.
+        mimics: Name of the joint that it follows; None for a free one.
+    """
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    origin: Pose
+    axis: Array
+    effort: float | None
+    limits: tuple[float, float] | None
+    damping: float
+    friction: float
+    mimics: str | None
+
+
+@dataclass(frozen=True)
+class UrdfRobot:
+    """A robot.
+
+    Attributes:
+        name: Its name; "robot" for one without.
+        links: Links by name.
+        joints: Joints by name.
+    """
+
+    name: str
+    links: dict[str, UrdfLink]
+    joints: dict[str, UrdfJoint]
+
+
+def read_robot(source: str | Path) -> UrdfRobot:
+    """Read a URDF file.
+
+    Args:
+        source: Path of the file, or its text, which begins with "<".
+
+    Returns:
+        Links and joints; what else the file holds (shapes, transmissions, simulator settings) is left out.
+
+    Raises:
+        SceneError: If the file cannot be read, is no URDF, or says something that no robot can be.
+    """
+    root = _parse(_content(source))
+    if root.tag != "robot":
+        raise SceneError(f"URDF: the outermost element is <{root.tag}>, it must be <robot>")
+    links = [_read_link(element) for element in root.iterfind("link")]
+    joints = [_read_joint(element) for element in root.iterfind("joint")]
+    if not links:
+        raise SceneError("URDF: there is no <link> in <robot>; a robot needs at least two, and a joint")
+    for kind, names in (("link", [link.name for link in links]), ("joint", [joint.name for joint in joints])):
+        name, count = Counter(names).most_common(1)[0] if names else ("", 0)
+        if count > 1:
+            raise SceneError(f"URDF: two {kind}s are named {name!r}: each needs its own name")
+    return UrdfRobot(
+        name=root.get("name", "").strip() or "robot",
+        links={link.name: link for link in links},
+        joints={joint.name: joint for joint in joints},
+    )
+
+
+def _content(source: str | Path) -> str | bytes:
+    """The text itself, or the bytes of the file, whose encoding is the XML parser's to find."""
+    if not isinstance(source, str | Path):
+        raise SceneError(f"URDF: {shorten(repr(source), 40)} is neither a file's path nor the text of a URDF")
+    if isinstance(source, str):
+        text = source.removeprefix("\ufeff").lstrip()
+        if text.startswith("<"):
+            return text
+        if not text or "\n" in text:
+            raise SceneError(f"URDF: the text {shorten(text, 40)!r} must begin with '<', or be a file's path")
+    try:
+        content = Path(source).read_bytes()
+    except (OSError, ValueError) as error:
+        reason = (isinstance(error, OSError) and error.strerror) or str(error)
+        raise SceneError(f"URDF: {shorten(str(source), 200)} cannot be read: {reason}") from error
+    if not content.strip():
+        raise SceneError(f"URDF: {source} is empty")
+    if b"<" not in content:
+        raise SceneError(f"URDF: {source} is no XML: it must be a text file that begins with '<'")
+    return content
+
+
+def shorten(text: str, width: int) -> str:
+    """Cut a text that would fill the screen.
+
+    Args:
+        text: Any text.
+        width: Largest number of characters to keep.
+
+    Returns:
+        The text, or its beginning and "...".
+    """
+    return text if len(text) <= width else f"{text[:width]}..."
+
+
+def _parse(content: str | bytes) -> Element:
+    builder = TreeBuilder()
+    # Text is text already, whatever encoding it declares.
+    parser = expat.ParserCreate("utf-8" if isinstance(content, str) else None)
+    parser.StartElementHandler = _start_into(builder)
+    parser.EndElementHandler = builder.end
+    parser.StartDoctypeDeclHandler = _refuse_doctype
+    try:
+        parser.Parse(content.encode("utf-8") if isinstance(content, str) else content, True)
+    except SceneError:
+        raise
+    except (expat.ExpatError, LookupError, ValueError) as error:
+        raise SceneError(f"URDF: not valid XML: {error}") from error
+    return builder.close()
+
+
+def _start_into(builder: TreeBuilder) -> Callable[[str, dict[str, str]], None]:
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag.startswith("xacro:") or any("${" in value or "$(" in value for value in attributes.values()):
+            raise SceneError(
+                f"URDF: <{tag}> belongs to xacro, a language that writes URDF; expand the file first, with "
+                "ROS's command: xacro robot.urdf.xacro > robot.urdf"
+            )
+        builder.start(tag, attributes)
+
+    return start
+
+
+def _refuse_doctype(*declaration: object) -> None:
+    raise SceneError("URDF: a document type declaration (<!DOCTYPE ...>) has no place in it: remove it")
+
+
+def _read_link(element: Element) -> UrdfLink:
+    name = _name(element)
+    inertial = _only(element, "inertial", f"link {name!r}")
+    if inertial is None:
+        return UrdfLink(name, None)
+    where = f"link {name!r}, <inertial>"
+    mass = _number(_child(inertial, "mass", where), "value", f"{where}, <mass>")
+    tensor = _child(inertial, "inertia", where)
+    xx, xy, xz, yy, yz, zz = (
+        _number(tensor, key, f"{where}, <inertia>") for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    )
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if mass < 0:
+        raise SceneError(f"URDF: {where}: mass = {mass:g} kg, it must be 0 or greater")
+    if mass == 0:
+        if inertia.any():
+            raise SceneError(f"URDF: {where}: a mass of 0 with an inertia that is not: give it a mass, too")
+        return UrdfLink(name, None)
+    return UrdfLink(name, Body(mass, np.zeros(3), inertia).seen_from(_origin(inertial, where)))
+
+
+def _read_joint(element: Element) -> UrdfJoint:
+    name = _name(element)
+    where = f"joint {name!r}"
+    kind = element.get("type", "")
+    if kind not in TYPES:
+        raise SceneError(f"URDF: {where}: type = {kind!r}, it must be one of {', '.join(TYPES)}")
+    limit, dynamics, mimic = (_only(element, tag, where) for tag in ("limit", "dynamics", "mimic"))
+    effort = _optional(limit, "effort", f"{where}, <limit>")
+    damping, friction = (_optional(dynamics, key, f"{where}, <dynamics>") for key in ("damping", "friction"))
+    for key, value in (("effort", effort), ("damping", damping), ("friction", friction)):
+        if value < 0:
+            raise SceneError(f"URDF: {where}: {key} = {value:g}, it must be 0 or greater")
+    return UrdfJoint(
+        name=name,
+        type=kind,
+        parent=_required(_child(element, "parent", where), "link", f"{where}, <parent>"),
+        child=_required(_child(element, "child", where), "link", f"{where}, <child>"),
+        origin=_origin(element, where),
+        axis=_axis(element, where) if kind in MOVABLE else np.array([0.0, 0.0, 1.0]),
+        effort=effort or None,
+        limits=_limits(limit, where) if kind == "revolute" else None,
+        damping=damping,
+        friction=friction,
+        mimics=None if mimic is None else _required(mimic, "joint", f"{where}, <mimic>"),
+    )
+
+
+def _limits(limit: Element | None, where: str) -> tuple[float, float]:
+    lower, upper = (_optional(limit, key, f"{where}, <limit>") for key in ("lower", "upper"))
+    if lower > upper:
+        raise SceneError(f"URDF: {where}: lower = {lower:g} rad is greater than upper = {upper:g} rad")
+    return lower, upper
+
+
+def _axis(element: Element, where: str) -> Array:
+    axis = _only(element, "axis", where)
+    vector = np.array((1.0, 0.0, 0.0) if axis is None else _vector(axis, "xyz", f"{where}, <axis>"))
+    largest = float(np.abs(vector).max())
+    if largest == 0:
+        raise SceneError(f"URDF: {where}: the axis has zero length; it must give a direction")
+    # In two steps: squares of large numbers, and of small ones, would not be finite, or be zero.
+    direction: Array = vector / largest
+    return direction / np.linalg.norm(direction)
+
+
+def _origin(element: Element, where: str) -> Pose:
+    origin = _only(element, "origin", where)
+    if origin is None:
+        return poses.from_rotation_and_position((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    position, (roll, pitch, yaw) = (
+        _vector(origin, key, f"{where}, <origin>") if key in origin.attrib else (0.0, 0.0, 0.0)
+        for key in ("xyz", "rpy")
+    )
+    return poses.from_rotation_and_position(rotations.from_euler_321(yaw, pitch, roll), position)
+
+
+def _name(element: Element) -> str:
+    return _required(element, "name", f"a <{element.tag}>")
+
+
+def _only(element: Element, tag: str, where: str) -> Element | None:
+    children = element.findall(tag)
+    if len(children) > 1:
+        raise SceneError(f"URDF: {where}: <{tag}> stands {len(children)} times in it, and may only once")
+    return children[0] if children else None
+
+
+def _child(element: Element, tag: str, where: str) -> Element:
+    child = _only(element, tag, where)
+    if child is None:
+        raise SceneError(f"URDF: {where}: <{tag}> is missing")
+    return child
+
+
+def _required(element: Element, key: str, where: str) -> str:
+    value = element.get(key)
+    if not value or value.isspace():
+        raise SceneError(f"URDF: {where}: the attribute {key!r} is missing")
+    return value
+
+
+def _number(element: Element, key: str, where: str) -> float:
+    return _numbers(_required(element, key, where), 1, key, where)[0]
+
+
+def _optional(element: Element | None, key: str, where: str) -> float:
+    return 0.0 if element is None or key not in element.attrib else _number(element, key, where)
+
+
+def _vector(element: Element, key: str, where: str) -> tuple[float, ...]:
+    return _numbers(_required(element, key, where), 3, key, where)
+
+
+def _numbers(text: str, count: int, key: str, where: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(word) for word in text.split())
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
+        wanted = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise SceneError(f"URDF: {where}: {key} = {text!r}, it must be {wanted}")
+    return numbers

@@ -1,0 +1,98 @@
+"""A scene's robot as URDF: what other tools can build, show and check."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+from dq_space_arm_env.algebra import dual_quaternion, poses
+from dq_space_arm_env.interoperability.exporting import free_name, refuse, tip_from_last_link, words
+from dq_space_arm_env.scene import Base, Link, Payload, Scene
+
+# URDF asks for a limit of the rate wherever there is one of the torque; this one limits nothing.
+_ANY_RATE = "1e+06"
+
+
+def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
+    """Write a scene's robot as URDF.
+
+    The root link `base` has the frame e0, at the center of mass; nothing holds it, so a simulator has to be
+    told that the base floats (Pinocchio: `JointModelFreeFlyer`). Each further link has the frame of its joint
+    and carries the scene's name; its joint is continuous, turns about z, and is called by the link's name and
+    " joint". A link `tip` without mass, or with that of the payload, has the frame G. Torque limits become
+    efforts, 0 for a joint without motor; thrusters, wheels, start and task have no place in URDF.
+
+    What URDF cannot say and what would change the motion is refused: joint springs, a wrench at the tip, a
+    base that moves in a plane. The massless wrist as three joints would have infinite accelerations; fixed at
+    the start's angles it changes no acceleration, but the tip cannot turn.
+
+    Args:
+        scene: A validated scene.
+        wrist: What happens to a wrist: "refuse" makes it an error, "fixed" writes it at its initial angles.
+
+    Returns:
+        The URDF text, all numbers with 17 digits; `scene_from_urdf` reads it.
+
+    Raises:
+        SceneError: If the scene has what URDF cannot say.
+    """
+    refuse(scene, "URDF", wrist, springs=True, planar=True)
+    root = Element("robot", name=scene.name)
+    names = [link.name for link in scene.links]
+    parent = free_name("base", names)
+    _add_link(root, parent, scene.base, (0.0, 0.0, 0.0))
+    for link, limit in zip(scene.links, _efforts(scene), strict=True):
+        _add_link(root, link.name, link, link.center_of_mass)
+        _add_joint(root, link, parent, limit)
+        parent = link.name
+    tip = free_name("tip", names)
+    payload = scene.payload
+    _add_link(root, tip, payload, (0.0, 0.0, 0.0) if payload is None else payload.center_of_mass)
+    joint = SubElement(root, "joint", name=f"{tip} joint", type="fixed")
+    _connect(joint, parent, tip, tip_from_last_link(scene))
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _efforts(scene: Scene) -> list[float]:
+    """Largest motor torques of the joints; 0 for those without motor, inf for unlimited ones."""
+    motors = scene.actuators.joint_torque
+    return [
+        0.0
+        if motors is None or not link.actuated
+        else (motors.limit if link.torque_limit is None else link.torque_limit)
+        for link in scene.links
+    ]
+
+
+def _add_link(
+    root: Element, name: str, body: Base | Link | Payload | None, center_of_mass: Sequence[float]
+) -> None:
+    link = SubElement(root, "link", name=name)
+    if body is None:
+        return
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "origin", xyz=words(center_of_mass), rpy="0 0 0")
+    SubElement(inertial, "mass", value=words([body.mass]))
+    entries = {f"i{'xyz'[i]}{'xyz'[j]}": words([body.inertia[i][j]]) for i in range(3) for j in range(i, 3)}
+    SubElement(inertial, "inertia", entries)
+
+
+def _add_joint(root: Element, link: Link, parent: str, effort: float) -> None:
+    joint = SubElement(root, "joint", name=f"{link.name} joint", type="continuous")
+    _connect(joint, parent, link.name, link.joint.dual_quaternion)
+    SubElement(joint, "axis", xyz="0 0 1")
+    if math.isfinite(effort):
+        SubElement(joint, "limit", effort=words([effort]), velocity=_ANY_RATE)
+    if link.damping:
+        SubElement(joint, "dynamics", damping=words([link.damping]))
+
+
+def _connect(joint: Element, parent: str, child: str, pose: Sequence[float]) -> None:
+    yaw, pitch, roll, position = poses.to_euler_321(dual_quaternion.normalize(tuple(pose)))
+    SubElement(joint, "origin", xyz=words(position), rpy=words([roll, pitch, yaw]))
+    SubElement(joint, "parent", link=parent)
+    SubElement(joint, "child", link=child)

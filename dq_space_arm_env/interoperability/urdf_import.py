@@ -1,0 +1,253 @@
+"""A scene from a URDF file: its arm on a free spacecraft, with actuators and a target to begin with."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from dq_space_arm_env.algebra import dual_quaternion, poses
+from dq_space_arm_env.dynamics import kinematics
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.interoperability.rigid_body import Body, lumped, tidied
+from dq_space_arm_env.interoperability.urdf_arm import Arm, ArmJoint, arm_of
+from dq_space_arm_env.interoperability.urdf_elements import Pose, UrdfJoint, read_robot
+from dq_space_arm_env.scene import Cost, Scene, SceneError
+from dq_space_arm_env.scene.bodies import Inertia
+from dq_space_arm_env.validation import Model, Positive, Vector3
+
+# How far the joints are from the start, rad, when the tip is at a target that nobody gave.
+_TARGET_OFFSET = 0.3
+# How fast the joint that moves the largest inertia would close an error by itself, rad/s.
+_FREQUENCY = 0.7
+
+
+def scene_from_urdf(
+    source: str | Path,
+    tip: str,
+    base: str | None = None,
+    *,
+    name: str | None = None,
+    spacecraft: Mapping[str, Any] | None = None,
+    base_force: float | Sequence[float] | None = 10.0,
+    base_torque: float | Sequence[float] | None = 5.0,
+    joint_torque: float | None = None,
+    passive: Collection[str] = (),
+    lock_branches: bool = False,
+    target: Mapping[str, Any] | None = None,
+) -> Scene:
+    """Make a scene of a robot's URDF: the arm from the base link to the tip link, free in space.
+
+    Revolute, continuous and fixed joints are understood. What hangs on the chain by fixed joints is lumped
+    into the body that carries it, masses, centers of mass and turned inertias included; links without mass
+    are frames and nothing else. The links of the scene have the names of the links that the joints carry.
+
+    Frames: the scene's base frame e0 has the axes of the base link and its origin at the center of mass of
+    the base and of all that is fixed to it; the scene's description says where that is in the base link. The
+    frame of a scene's joint has its z axis along the joint's axis; where the URDF has another axis, it is the
+    child link's frame turned. The tip frame G is the tip link's. Joint angles are the URDF's.
+
+    Joint torques are limited to the efforts of the URDF. Not in a scene, and left out: limits of joint angles
+    and rates, shapes and meshes, transmissions and settings of simulators. Coulomb friction is left out with
+    a warning. Start: at rest, the base link's axes along the inertial ones, joints at zero, or, where their
+    limits exclude zero, in the middle between the limits. Cost: a scene's own, but the weight of the joint
+    torques is such that the arm moves within seconds, whatever its size. Further changes:
+    `scene.replace(...)`.
+
+    Args:
+        source: Path of a URDF file, or its text, which begins with "<"; xacro has to be expanded before.
+        tip: Name of the link whose frame is to reach the target.
+        base: Name of the link that is the spacecraft; the root of the URDF by default.
+        name: Name of the scene; the robot's by default.
+        spacecraft: A body that is fixed to the base link, besides the link's own mass: `mass` in kg,
+            `inertia` about its center of mass in kg m^2, 3 numbers (diagonal) or 3x3, and `center_of_mass` in
+            m, by default (0, 0, 0); axes and origin are the base link's. None for no such body.
+        base_force: Limit of the thrusters' force on the base, N, for each axis or one for all; None for no
+            thrusters.
+        base_torque: Limit of the wheels' torque on the base, N m, for each axis or one for all; None for no
+            wheels.
+        joint_torque: Limit of the joints for which the URDF gives no effort, or zero, N m.
+        passive: Names of the joints that have no motor.
+        lock_branches: Whether movable joints beside the chain, as those of a gripper, are held at zero;
+            otherwise they are an error if they move a mass.
+        target: Pose of the target as in a scene, {"position": ..., "rotation": ...} in m; by default the pose
+            of the tip at the start but with every joint 0.3 rad further.
+
+    Returns:
+        The scene.
+
+    Raises:
+        SceneError: If the file cannot be read, the robot is nothing that a scene can hold, or an argument is
+            wrong; the message names link or joint and says what would be right.
+    """
+    robot = read_robot(source)
+    extra = None if spacecraft is None else _spacecraft(spacecraft)
+    if joint_torque is not None and not (isinstance(joint_torque, int | float) and joint_torque > 0):
+        raise SceneError(f"joint_torque = {joint_torque!r}: must be a number greater than 0, N m")
+    arm = arm_of(robot, tip, base, lock_branches, extra)
+    _check_passive(arm, passive)
+    _warn(arm)
+    center = ", ".join(f"{number:.9g}" for number in arm.base_center)
+    data: dict[str, Any] = {
+        "name": robot.name if name is None else name,
+        "description": f"From the URDF of {robot.name}: base frame at ({center}) m in link {arm.base_link}.",
+        "base": {"mass": arm.base.mass, "inertia": tidied(arm.base.inertia).tolist()},
+        "links": [_link(part, joint_torque, passive) for part in arm.joints],
+        "tip": _pose(arm.tip),
+        "actuators": {
+            "base_force": None if base_force is None else {"limit": base_force},
+            "base_torque": None if base_torque is None else {"limit": base_torque},
+            "joint_torque": _motors(arm, joint_torque, passive),
+        },
+        "cost": {"joint_torque": _torque_weight(arm)},
+        "initial_state": {"joint_angles": [_start(part.joint) for part in arm.joints]},
+        "target": {"pose": {} if target is None else target},
+    }
+    scene = _validated(data, robot.name)
+    return scene if target is not None else scene.replace(target={"pose": _default_target(scene)})
+
+
+class _Spacecraft(Model):
+    """What carries the arm, and is no part of the robot's file."""
+
+    mass: Positive = Field(description="mass of the spacecraft, kg")
+    inertia: Inertia = Field(
+        description="inertia of the spacecraft about its center of mass, axes of the base link, kg m^2: 3 "
+        "numbers (diagonal) or 3x3"
+    )
+    center_of_mass: Vector3 = Field(
+        default=(0.0, 0.0, 0.0), description="center of mass of the spacecraft in the base link's frame, m"
+    )
+
+
+def _spacecraft(fields: Mapping[str, Any]) -> Body:
+    if not isinstance(fields, Mapping):
+        raise SceneError(f"spacecraft = {fields!r}: must be a mapping, {{'mass': ..., 'inertia': ...}}")
+    try:
+        body = _Spacecraft.model_validate(dict(fields))
+    except ValidationError as error:
+        raise SceneError("\n  - ".join(["spacecraft:", *_messages(error)])) from error
+    return Body(body.mass, np.array(body.center_of_mass), np.array(body.inertia))
+
+
+def _check_passive(arm: Arm, passive: Collection[str]) -> None:
+    if isinstance(passive, str):
+        raise SceneError(f"passive = {passive!r}: must be a list of names of joints")
+    joints = [part.joint.name for part in arm.joints]
+    unknown = [name for name in passive if name not in joints]
+    if unknown:
+        raise SceneError(
+            f"passive: {unknown[0]!r} is no joint between base and tip, which are {', '.join(joints)}"
+        )
+
+
+def _validated(data: dict[str, Any], robot: str) -> Scene:
+    try:
+        return Scene.model_validate(data)
+    except ValidationError as error:
+        names = [f"links[{index}] is {link['name']!r}" for index, link in enumerate(data["links"])]
+        problems = [*_messages(error), *(text for text in names if text.split()[0] in str(error))]
+        raise SceneError("\n  - ".join([f"URDF of {robot!r}:", *problems])) from error
+
+
+def _messages(error: ValidationError) -> list[str]:
+    return [detail["msg"] for detail in error.errors(include_url=False)]
+
+
+def _warn(arm: Arm) -> None:
+    """Say what a scene cannot hold, and what only looks like a robot."""
+    rubbing = [part.joint.name for part in arm.joints if part.joint.friction]
+    if rubbing:
+        warnings.warn(
+            f"URDF: Coulomb friction of {', '.join(rubbing)} is left out: a scene has viscous damping only",
+            stacklevel=3,
+        )
+    for flaw in arm.flaws:
+        warnings.warn(
+            f"URDF: {flaw}; it is used as it is, because what the link is fixed to makes up for it",
+            stacklevel=3,
+        )
+
+
+def _torque_weight(arm: Arm) -> float:
+    """Weight of the joint torques with which the arm needs seconds, as a spacecraft's does.
+
+    The optimal regulator of an inertia I with the cost a theta^2 + b tau^2 has the natural frequency
+    (a / (b I^2))^(1/4). Turned by theta, a tip at distance d costs a = w (1 + d^2) / 4, w the pose's weight.
+    """
+    bodies: list[Body] = []
+    tip, largest = arm.tip, (0.0, 0.0)
+    for part in reversed(arm.joints):
+        bodies.append(part.body)
+        moved = lumped(bodies)
+        assert moved is not None
+        x, y, _ = moved.center_of_mass
+        distance = math.dist(poses.to_rotation_and_position(tip)[1], (0.0, 0.0, 0.0))
+        about_axis = float(moved.inertia[2, 2] + moved.mass * (x * x + y * y))
+        largest = max(largest, (about_axis, distance))
+        # On to the frame before, the joint at its start.
+        bodies = [moved.seen_from(pose := _at_start(part))]
+        tip = tuple(dual_quaternion.multiply(pose, tip))
+    inertia, distance = largest
+    pose_weight = Cost().pose[0]
+    return float(f"{0.25 * pose_weight * (1.0 + distance**2) / (inertia**2 * _FREQUENCY**4):.2g}")
+
+
+def _at_start(part: ArmJoint) -> Pose:
+    half = 0.5 * _start(part.joint)
+    turned = poses.from_rotation_and_position((math.cos(half), 0.0, 0.0, math.sin(half)), (0.0, 0.0, 0.0))
+    return tuple(dual_quaternion.multiply(part.pose, turned))
+
+
+def _motors(arm: Arm, joint_torque: float | None, passive: Collection[str]) -> dict[str, Any] | None:
+    """The scene's joint motors; every link has a limit of its own."""
+    driven = [part.joint for part in arm.joints if part.joint.name not in passive]
+    unlimited = [joint.name for joint in driven if joint.effort is None]
+    if unlimited and joint_torque is None:
+        raise SceneError(
+            f"URDF: no effort limit for joint {', '.join(unlimited)}: give joint_torque, N m, for all joints "
+            "without one, or name those without a motor in passive"
+        )
+    if not driven:
+        return None
+    limits = [limit for joint in driven if (limit := joint.effort or joint_torque) is not None]
+    return {"limit": max(limits)}
+
+
+def _link(part: ArmJoint, joint_torque: float | None, passive: Collection[str]) -> dict[str, Any]:
+    joint = part.joint
+    driven = joint.name not in passive
+    return {
+        "name": joint.child,
+        "mass": part.body.mass,
+        "inertia": tidied(part.body.inertia).tolist(),
+        "center_of_mass": tidied(part.body.center_of_mass).tolist(),
+        "joint": _pose(part.pose),
+        "actuated": driven,
+        "torque_limit": (joint.effort or joint_torque) if driven else None,
+        "damping": joint.damping,
+    }
+
+
+def _pose(pose: Pose) -> dict[str, Any]:
+    rotation, position = poses.to_rotation_and_position(pose)
+    return {"position": tidied(np.array(position)).tolist(), "rotation": tidied(np.array(rotation)).tolist()}
+
+
+def _start(joint: UrdfJoint) -> float:
+    if joint.limits is None or joint.limits[0] <= 0.0 <= joint.limits[1]:
+        return 0.0
+    return 0.5 * (joint.limits[0] + joint.limits[1])
+
+
+def _default_target(scene: Scene) -> dict[str, Any]:
+    """Where the tip is when every joint has moved a bit."""
+    start = scene.initial_state
+    angles = [angle + _TARGET_OFFSET for angle in start.joint_angles]
+    pose = kinematics.tip_pose(Chain.from_scene(scene), start.base_pose.dual_quaternion, angles, ())
+    return _pose(tuple(pose))

@@ -1,0 +1,115 @@
+"""Robots that others wrote, from packages on PyPI, and what the tests ask of any scene's robot."""
+
+import warnings
+from importlib.metadata import PackageNotFoundError, distribution
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env import scene_from_urdf
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.kernels.equations import SceneEquations
+from dq_space_arm_env.scene import StateLayout
+
+_EXAMPLES = "cmeel.prefix/share/example-robot-data/robots"
+
+# Name: package, path of the URDF in it, tip link, and arguments besides.
+ROBOTS = {
+    "ur3e": ("airo-models", "airo_models/arms/ur3e/ur3e.urdf", "tool0", {}),
+    "ur5e": ("airo-models", "airo_models/arms/ur5e/ur5e.urdf", "tool0", {}),
+    "kuka-kr16": (
+        "rtb-data",
+        "rtbdata/xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf",
+        "tool0",
+        {"joint_torque": 500.0},
+    ),
+    "panda": (
+        "example-robot-data",
+        f"{_EXAMPLES}/panda_description/urdf/panda.urdf",
+        "panda_hand_tcp",
+        {"lock_branches": True},
+    ),
+    "kinova": (
+        "example-robot-data",
+        f"{_EXAMPLES}/kinova_description/robots/kinova.urdf",
+        "j2s6s200_end_effector",
+        {},
+    ),
+    "ur5": (
+        "example-robot-data",
+        f"{_EXAMPLES}/ur_description/urdf/ur5_robot.urdf",
+        "ee_link",
+        {},
+    ),
+    "xarm7": ("example-robot-data", f"{_EXAMPLES}/xarm_description/urdf/xarm7.urdf", "link_eef", {}),
+    "talos-left-arm": (
+        "example-robot-data",
+        f"{_EXAMPLES}/talos_data/robots/talos_left_arm.urdf",
+        "gripper_left_base_link",
+        {"lock_branches": True},
+    ),
+    "anymal-kinova": (
+        "example-robot-data",
+        f"{_EXAMPLES}/anymal_b_simple_description/robots/anymal-kinova.urdf",
+        "j2s6s200_end_effector",
+        {"lock_branches": True},
+    ),
+    "borinot": (
+        "example-robot-data",
+        f"{_EXAMPLES}/borinot_description/urdf/borinot_flying_arm_2.urdf",
+        "flying_arm_2__ee",
+        {},
+    ),
+}
+
+
+def robot_file(name):
+    """Path, tip and arguments of a robot; skips the test where its package is not installed."""
+    package, path, tip, arguments = ROBOTS[name]
+    try:
+        file = distribution(package).locate_file(path)
+    except PackageNotFoundError:
+        pytest.skip(f"needs {package}")
+    return str(file), tip, arguments
+
+
+def foreign_scene(name):
+    """The scene of a robot; friction that is left out and inertias of no body come with a warning."""
+    file, tip, arguments = robot_file(name)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*(Coulomb friction|used as it is)")
+        return scene_from_urdf(file, tip, **arguments)
+
+
+def random_state(scene, rng):
+    """Any attitude, positions of meters, joint angles of radians, rates of about 1 rad/s."""
+    layout = StateLayout.of(scene)
+    x = rng.normal(size=layout.n_x)
+    rotation, position = rng.normal(size=4), rng.normal(size=3)
+    rotation[0] = abs(rotation[0])
+    if layout.planar:
+        rotation[1:3], position[2] = 0.0, 0.0
+    rotation /= np.linalg.norm(rotation)
+    pose = np.array(poses.from_rotation_and_position(tuple(rotation), tuple(position)))
+    x[layout.state.pose] = pose[[0, 3, 5, 6]] if layout.planar else pose
+    return x
+
+
+def random_inputs(scene, rng):
+    return rng.normal(size=StateLayout.of(scene).n_u)
+
+
+def accelerations(scene, x, u):
+    """Accelerations of base and joints by the scene's own equations."""
+    equations = SceneEquations.nominal(scene)
+    return np.array(equations.field.accelerations(equations.y(x.tolist()), u.tolist()), dtype=float)
+
+
+def tip_pose(scene, x):
+    """Rotation matrix and position of the tip, by the scene's own equations."""
+    rotation, position = poses.to_matrix(SceneEquations.nominal(scene).tip(x.tolist()))
+    return np.array(rotation), np.array(position)
+
+
+def relative_error(found, expected):
+    return np.linalg.norm(np.asarray(found) - expected) / np.linalg.norm(expected)

@@ -1,0 +1,152 @@
+"""MJCF of scenes in MuJoCo: accelerations, inverse dynamics, tip, start, limits."""
+
+import numpy as np
+import pytest
+from foreign_robots import (
+    ROBOTS,
+    accelerations,
+    foreign_scene,
+    random_inputs,
+    random_state,
+    relative_error,
+    tip_pose,
+)
+
+from dq_space_arm_env import SceneError, load_scene, scene_to_mjcf
+from dq_space_arm_env.algebra import poses, rotations
+from dq_space_arm_env.scene import StateLayout
+
+mujoco = pytest.importorskip("mujoco")
+
+SCENES = ("paper", "no-wrist", "planar", "payload", "six-joint", "free-floating", "reaction-wheels")
+
+
+def mujoco_state(scene, x):
+    """MuJoCo's qpos and qvel, and the rotation matrix from base to inertial axes."""
+    entries = StateLayout.of(scene).state
+    angles, rates = x[entries.joint_angles], x[entries.joint_rates]
+    if StateLayout.of(scene).planar:
+        pose = np.zeros(8)
+        pose[[0, 3, 5, 6]] = x[entries.pose]
+        omega, velocity = x[entries.base_velocity][:1], np.array([*x[entries.base_velocity][1:], 0.0])
+    else:
+        pose = x[entries.pose]
+        omega, velocity = x[entries.angular_velocity], x[entries.linear_velocity]
+    matrix, position = (np.array(part) for part in poses.to_matrix(tuple(pose)))
+    velocity = matrix @ velocity
+    if StateLayout.of(scene).planar:
+        yaw = 2.0 * np.arctan2(pose[3], pose[0])
+        return [*position[:2], yaw, *angles], [*velocity[:2], *omega, *rates], matrix
+    return [*position, *pose[:4], *angles], [*velocity, *omega, *rates], matrix
+
+
+def scene_accelerations(scene, x, qacc, matrix):
+    """The scene's accelerations from MuJoCo's: the components of the velocity turn with the base."""
+    entries = StateLayout.of(scene).state
+    if StateLayout.of(scene).planar:
+        omega, (v_x, v_y) = x[entries.base_velocity][0], x[entries.base_velocity][1:]
+        linear = matrix.T @ [*qacc[:2], 0.0] - omega * np.array([-v_y, v_x, 0.0])
+        return np.array([qacc[2], *linear[:2], *qacc[3:]])
+    turning = np.cross(x[entries.angular_velocity], x[entries.linear_velocity])
+    return np.array([*qacc[3:6], *(matrix.T @ qacc[:3] - turning), *qacc[6:]])
+
+
+def limited(scene, u):
+    """The part of the inputs that MuJoCo has motors for, within their limits."""
+    count = StateLayout.of(scene).control.joint_torque.stop
+    u = np.clip(u, -0.9 * (limit := StateLayout.of(scene).control_limit), 0.9 * limit)
+    u[count:] = 0.0
+    return u, u[:count]
+
+
+def check_accelerations(scene, samples=5):
+    """MuJoCo's accelerations and its inverse dynamics at random states."""
+    model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene, wrist="fixed"))
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for _ in range(samples):
+        x = random_state(scene, rng)
+        u, motors = limited(scene, random_inputs(scene, rng))
+        data.qpos, data.qvel, matrix = mujoco_state(scene, x)
+        data.ctrl = motors
+        mujoco.mj_forward(model, data)
+        found = scene_accelerations(scene, x, data.qacc, matrix)
+        assert relative_error(found, accelerations(scene, x, u)) < 1e-12
+        applied = data.qfrc_actuator.copy()
+        mujoco.mj_inverse(model, data)
+        assert relative_error(data.qfrc_inverse, applied) < 1e-12
+    return data, x
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_accelerations_and_forces_are_the_same(name):
+    check_accelerations(load_scene(name))
+
+
+@pytest.mark.parametrize("name", ["paper", "six-joint"])
+def test_springs_dampers_and_passive_joints_are_the_same(name):
+    scene = load_scene(name)
+    parts = {"stiffness": 3.0, "rest_angle": 0.4, "damping": 0.7, "torque_limit": None}
+    links = [{**link.model_dump(), **parts, "actuated": i != 1} for i, link in enumerate(scene.links)]
+    check_accelerations(scene.replace(links=links))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_robots_of_others_accelerate_the_same(name):
+    check_accelerations(foreign_scene(name))
+
+
+@pytest.mark.parametrize("name", ["planar", "payload", "six-joint"])
+def test_the_tip_is_a_site(name):
+    scene = load_scene(name)
+    data, x = check_accelerations(scene, samples=1)
+    rotation, position = tip_pose(scene, x)
+    np.testing.assert_allclose(data.site("tip").xmat.reshape(3, 3), rotation, atol=1e-13)
+    np.testing.assert_allclose(data.site("tip").xpos, position, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["planar", "tumbling", "no-wrist"])
+def test_the_start_is_a_key_frame(name):
+    scene = load_scene(name)
+    model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene, wrist="fixed"))
+    qpos, qvel, _ = mujoco_state(scene, StateLayout.of(scene).initial_state)
+    key = model.key("start")
+    sign = np.ones(model.nq)
+    if not StateLayout.of(scene).planar and key.qpos[3] * qpos[3] < 0:
+        sign[3:7] = -1.0
+    np.testing.assert_allclose(key.qpos * sign, qpos, atol=1e-14)
+    np.testing.assert_allclose(key.qvel, qvel, atol=1e-14)
+
+
+def test_motors_have_the_names_and_limits_of_the_inputs():
+    scene = load_scene("six-joint")
+    scene = scene.replace(actuators={**scene.actuators.model_dump(), "base_force": {"limit": float("inf")}})
+    layout = StateLayout.of(scene)
+    model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene))
+    assert [model.actuator(i).name for i in range(model.nu)] == list(layout.control.names)
+    assert model.actuator_ctrllimited.astype(bool).tolist() == [False] * 3 + [True] * 9
+    np.testing.assert_array_equal(model.actuator_ctrlrange[3:, 1], layout.control_limit[3:])
+    assert model.opt.timestep == scene.simulation.dt
+    assert not model.opt.gravity.any()
+
+
+def test_a_lamina_is_a_body_to_mujoco_too():
+    """Its largest moment of inertia is the sum of the others, to the last digit; its axes lie askew."""
+    scene = load_scene("no-wrist")
+    turn = np.array(rotations.to_matrix(rotations.from_euler_321(0.3, -0.8, 1.1)))
+    for a, b in ((0.3, 0.7), (0.1, 0.2), (1.3, 1e-3)):
+        inertia = turn @ np.diag([a, b, a + b]) @ turn.T
+        base = {"mass": 10.0, "inertia": inertia.tolist()}
+        check_accelerations(scene.replace(base=base), samples=1)
+
+
+def test_what_mjcf_cannot_hold_is_refused():
+    with pytest.raises(
+        SceneError, match=r"written as MJCF:\n  - the wrist has joints without mass.*wrist='fixed'"
+    ):
+        scene_to_mjcf(load_scene("paper"))
+    with pytest.raises(
+        SceneError, match=r"no constant wrench at the tip: leave it out with replace\(tip_wrench"
+    ):
+        scene_to_mjcf(load_scene("tip-load"), wrist="fixed")
+    with pytest.raises(ValueError, match="wrist: 'free', it must be 'refuse' or 'fixed'"):
+        scene_to_mjcf(load_scene("paper"), wrist="free")

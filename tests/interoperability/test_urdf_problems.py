@@ -1,0 +1,343 @@
+"""What no scene can be made of, or written as URDF, is refused with a sentence that names it."""
+
+from time import process_time
+
+import numpy as np
+import pytest
+from foreign_robots import accelerations, random_inputs, random_state, relative_error
+
+from dq_space_arm_env import SceneError, load_scene, scene_from_urdf, scene_to_urdf
+from dq_space_arm_env.scene import StateLayout
+
+INERTIA = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+BODY = f'<inertial><mass value="2"/>{INERTIA}</inertial>'
+
+
+def link(name, content=BODY):
+    return f'<link name="{name}">{content}</link>'
+
+
+def joint(name, parent, child, kind="revolute", content='<limit effort="1" velocity="1"/>'):
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{content}</joint>'
+
+
+def robot(*parts):
+    return f'<robot name="r">{"".join(parts)}</robot>'
+
+
+GOOD = (link("base"), joint("j1", "base", "arm"), link("arm"))
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("<robot><link></robot>", "not valid XML: mismatched tag: line 1, column 15"),
+        ("<sdf/>", "the outermost element is <sdf>, it must be <robot>"),
+        ('<!DOCTYPE robot [<!ENTITY a "b">]><robot/>', "document type declaration .* has no place"),
+        (robot("<xacro:macro/>"), "<xacro:macro> belongs to xacro, .* expand the file first"),
+        (robot('<link name="${prefix}arm"/>'), "<link> belongs to xacro"),
+        (robot("<link/>"), "a <link>: the attribute 'name' is missing"),
+        (robot(link("a"), link("a")), "two links are named 'a'"),
+        (robot(*GOOD, joint("j1", "arm", "b"), link("b")), "two joints are named 'j1'"),
+        (robot(link("a", "<inertial/>")), "link 'a', <inertial>: <mass> is missing"),
+        (
+            robot(link("a", f'<inertial><mass value="-1"/>{INERTIA}</inertial>')),
+            "link 'a', <inertial>: mass = -1 kg, it must be 0 or greater",
+        ),
+        (
+            robot(link("a", f'<inertial><mass value="0"/>{INERTIA}</inertial>')),
+            "link 'a', <inertial>: a mass of 0 with an inertia that is not",
+        ),
+        (
+            robot(link("a", '<inertial><mass value="heavy"/><inertia/></inertial>')),
+            "link 'a', <inertial>, <mass>: value = 'heavy', it must be a finite number",
+        ),
+        (robot(*GOOD, joint("j2", "arm", "b", "hinge"), link("b")), "joint 'j2': type = 'hinge', it must be"),
+        (
+            robot(link("base"), joint("j1", "base", "arm", content='<axis xyz="0 0 0"/>'), link("arm")),
+            "joint 'j1': the axis has zero length",
+        ),
+        (
+            robot(link("base"), joint("j1", "base", "arm", content='<origin xyz="0 0"/>'), link("arm")),
+            "joint 'j1', <origin>: xyz = '0 0', it must be 3 finite numbers",
+        ),
+        (
+            robot(link("base"), joint("j1", "base", "arm", content='<dynamics damping="-1"/>'), link("arm")),
+            "joint 'j1': damping = -1, it must be 0 or greater",
+        ),
+        (
+            robot(
+                link("base"),
+                joint("j1", "base", "arm", content='<limit lower="1" upper="0" effort="1" velocity="1"/>'),
+                link("arm"),
+            ),
+            "joint 'j1': lower = 1 rad is greater than upper = 0 rad",
+        ),
+        (
+            robot(*GOOD, joint("j2", "arm", "han"), link("hand")),
+            "its child link 'han' does not exist; did you",
+        ),
+        (
+            robot(*GOOD, link("b"), joint("j2", "base", "b"), joint("j3", "arm", "b")),
+            "link 'b' hangs on two joints, 'j2' and 'j3': a closed loop",
+        ),
+        (
+            robot(*GOOD, link("b")),
+            "exactly one link must be no joint's child, the root; there are several: base, b",
+        ),
+        (
+            robot(*GOOD, link("b"), link("c"), joint("j2", "b", "c"), joint("j3", "c", "b")),
+            "joint 'j[23]' is part of a loop",
+        ),
+        (
+            robot(link("base"), joint("j1", "base", "arm", "prismatic"), link("arm")),
+            "joint 'j1' on the way to link 'arm' is prismatic; a scene has revolute, continuous and fixed",
+        ),
+        (
+            robot(link("base"), joint("j1", "base", "arm", "planar"), link("arm")),
+            "joint 'j1' on the way to link 'arm' is planar",
+        ),
+        (
+            robot(*GOOD[:2], link("elbow"), joint("j2", "elbow", "arm"), link("arm"))
+            .replace('child link="arm"', 'child link="elbow"', 1)
+            .replace('<child link="arm"/>', '<child link="arm"/><mimic joint="j1"/>'),
+            "joint 'j2' on the way to link 'arm' mimics joint 'j1'",
+        ),
+        (robot(link("base"), joint("j1", "base", "arm", "fixed"), link("arm")), "no joint moves link 'arm'"),
+        (robot(link("base", ""), *GOOD[1:]), "base link 'base' has no mass, .* give the spacecraft"),
+        (robot(*GOOD[:2], link("arm", "")), "link 'arm', moved by joint 'j1', has no mass"),
+        (
+            robot(link("base"), joint("j1", "base", "arm", content=""), link("arm")),
+            "no effort limit for joint j1: give joint_torque",
+        ),
+        (
+            robot(*GOOD, joint("j2", "base", "panel"), link("panel")),
+            r"joint 'j2' \(revolute\) moves a mass beside the chain .* lock_branches=True holds such joints",
+        ),
+        (
+            robot(*GOOD[:2], link("arm", BODY.replace('izz="1"', 'izz="3"'))),
+            "link 'arm', <inertia>: principal moments 1, 1, 3 kg m\\^2, of which the two smaller must add up",
+        ),
+        (
+            robot(*GOOD[:2], link("arm", BODY.replace('izz="1"', 'izz="0"'))),
+            "link 'arm', <inertia>: principal moments .*, all must be greater than 0",
+        ),
+        (
+            robot(
+                *GOOD[:2],
+                link("arm", BODY.replace('izz="1"', 'izz="9"')),
+                joint("f", "arm", "b", "fixed"),
+                link("b", BODY.replace('ixx="1"', 'ixx="-1"')),
+            ),
+            "link 'arm', with b fixed to it, <inertia>: .*; link 'arm', <inertia>: .*; link 'b', <inertia>: "
+            "principal moments -1, 1, 1",
+        ),
+        (robot(), "there is no <link> in <robot>"),
+        (robot(joint("j1", "a", "arm"), link("b")), "its parent link 'a' does not exist; the links are b"),
+        (robot(link("arm"), joint("j1", "arm", "arm")), "joint 'j1' connects link 'arm' with itself"),
+        (
+            robot(joint("a", "arm", "b"), joint("b", "b", "arm"), link("arm"), link("b")),
+            "the root; the joints form a loop: a, b",
+        ),
+        (
+            robot(link("base"), joint("j1", "base", "arm", "floating"), link("arm")),
+            "choose link 'arm' as base",
+        ),
+        (robot(*GOOD[:2], link("arm", BODY + BODY)), "link 'arm': <inertial> stands 2 times in it"),
+        (
+            robot(*GOOD[:2], link("arm", BODY.replace("<mass", '<mass value="3"/><mass'))),
+            "<mass> stands 2 times",
+        ),
+        (robot(*GOOD).replace("<limit", '<limit effort="2"/><limit'), "joint 'j1': <limit> stands 2 times"),
+        (
+            robot(*GOOD).replace('effort="1"', 'effort="-1"'),
+            "joint 'j1': effort = -1, it must be 0 or greater",
+        ),
+        (robot(*GOOD, link(" ")), "a <link>: the attribute 'name' is missing"),
+        ("", "the text '' must begin with '<', or be a file's path"),
+        ("name: x\nbase: 1\n", "must begin with '<'"),
+        (b"<robot/>", "neither a file's path nor the text of a URDF"),
+        ("nul\0", "cannot be read: embedded null byte"),
+    ],
+)
+def test_what_no_scene_can_be_made_of_is_refused(text, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        scene_from_urdf(text, "arm")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"tip": "amr"}, "tip: 'amr' is no link of 'r'; did you mean 'arm'\\? its links are base, arm"),
+        ({"tip": "arm", "base": "bus"}, "base: 'bus' is no link of 'r'"),
+        ({"tip": "base", "base": "arm"}, "joint 'j1' carries the base and not the tip; choose link 'base'"),
+        ({"tip": "ARM"}, "tip: 'ARM' is no link of 'r'; its links are base, arm"),
+        ({"tip": "j1"}, "'j1' is no link of 'r'; it is a joint, which carries link 'arm'; its links are"),
+        ({"tip": None}, "tip: None is no link of 'r'"),
+        ({"tip": "base"}, "tip: link 'base' is the base: choose a link that the joints move"),
+        ({"tip": "arm", "passive": ["j2"]}, "passive: 'j2' is no joint between base and tip, which are j1"),
+        ({"tip": "arm", "passive": "j1"}, "passive = 'j1': must be a list"),
+        ({"tip": "arm", "joint_torque": -1}, "joint_torque = -1: must be a number greater than 0, N m"),
+        ({"tip": "arm", "joint_torque": float("nan")}, "joint_torque = nan: must be a number greater"),
+        ({"tip": "arm", "spacecraft": 80}, "spacecraft = 80: must be a mapping"),
+        (
+            {"tip": "arm", "spacecraft": {"mass": -1, "inertia": [1, 1, 1]}},
+            "spacecraft:\n  - mass = -1: .* \\(mass of the spacecraft, kg\\)",
+        ),
+        ({"tip": "arm", "spacecraft": {"mass": 1}}, "spacecraft:\n  - inertia: missing"),
+        ({"tip": "arm", "base_force": -1}, "actuators.base_force.limit = -1: must be"),
+    ],
+)
+def test_wrong_arguments_are_refused(arguments, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        scene_from_urdf(robot(*GOOD), **arguments)
+
+
+def test_a_locked_joint_must_not_follow_the_chain():
+    follower = joint("j2", "base", "panel", content='<mimic joint="j1"/>')
+    with pytest.raises(SceneError, match="joint 'j2' mimics joint 'j1' of the chain"):
+        scene_from_urdf(robot(*GOOD, follower, link("panel")), "arm", lock_branches=True)
+
+
+def test_a_file_that_is_not_there_is_named():
+    with pytest.raises(SceneError, match=r"nowhere.urdf cannot be read: No such file"):
+        scene_from_urdf("nowhere.urdf", "arm")
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [(b"", "is empty"), (b" \n", "is empty"), (bytes(90), "is no XML"), (b"\x89<\xff", "not valid XML")],
+)
+def test_files_that_are_no_text_are_refused(content, sentence, tmp_path):
+    file = tmp_path / "robot.urdf"
+    file.write_bytes(content)
+    with pytest.raises(SceneError, match=sentence):
+        scene_from_urdf(file, "arm")
+    with pytest.raises(SceneError, match="Is a directory"):
+        scene_from_urdf(tmp_path, "arm")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_a_file_in_the_encoding_that_it_declares(encoding, tmp_path):
+    declared = encoding.removesuffix("-sig")
+    text = f'<?xml version="1.0" encoding="{declared}"?>' + robot(*GOOD).replace('"arm"', '"ärm"')
+    file = tmp_path / "robot.urdf"
+    file.write_bytes(text.encode(encoding))
+    assert scene_from_urdf(file, "ärm").links[0].name == "ärm"
+    assert scene_from_urdf("\ufeff" + text, "ärm").links[0].name == "ärm"
+
+
+def test_an_inertia_that_a_neighbor_hides_comes_with_a_warning():
+    bad = BODY.replace('izz="1"', 'izz="3"')
+    text = robot(*GOOD, joint("f", "arm", "hand", "fixed"), link("hand", bad), link("big")).replace(
+        "</robot>", joint("g", "arm", "big", "fixed") + "</robot>"
+    )
+    with pytest.warns(
+        UserWarning, match="link 'hand', <inertia>: principal moments 1, 1, 3 .* used as it is"
+    ):
+        assert scene_from_urdf(text, "hand").links[0].mass == 6.0
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e200])
+def test_the_length_of_an_axis_does_not_matter(length):
+    text = robot(*GOOD).replace("<limit", f'<axis xyz="{length} {length} 0"/><limit')
+    unit = robot(*GOOD).replace("<limit", '<axis xyz="1 1 0"/><limit')
+    assert scene_from_urdf(text, "arm") == scene_from_urdf(unit, "arm")
+
+
+def test_a_long_file_is_read_in_a_moment():
+    """Links and joints are looked at once, not once for each other."""
+    parts = [link("link 0"), link("arm")]
+    for i in range(3000):
+        parts += [joint(f"j{i}", f"link {i}", f"link {i + 1}", "fixed"), link(f"link {i + 1}", "")]
+    began = process_time()
+    scene_from_urdf(robot(*parts, joint("last", "link 3000", "arm")), "arm")
+    assert process_time() - began < 10.0
+
+
+def test_the_weight_of_the_torques_makes_arms_of_any_size_move_alike():
+    """The natural frequency (w (1 + d^2) / (4 b I^2))^(1/4) of an inertia I with its tip at distance d."""
+    text = robot(*GOOD, link("hand", "")).replace(
+        "</robot>", joint("f", "arm", "hand", "fixed", '<origin xyz="0 2 0"/>') + "</robot>"
+    )
+    heavy = text.replace('ixx="1"', 'ixx="100"').replace('iyy="1"', 'iyy="100"')
+    for urdf, inertia in ((text, 1.0), (heavy, 100.0)):
+        weight = scene_from_urdf(urdf, "hand").cost.joint_torque
+        assert (15 * (1 + 2**2) / (4 * weight * inertia**2)) ** 0.25 == pytest.approx(0.7, rel=0.01)
+
+
+def test_digits_stay_as_they_were_given():
+    text = robot(*GOOD).replace("<limit", '<origin xyz="0.1 0 0.7"/><axis xyz="0 1 0"/><limit')
+    (part,) = scene_from_urdf(text.replace('iyy="1"', 'iyy="1.1"'), "arm").links
+    assert part.joint.position == (0.1, 0.0, 0.7)
+    assert part.inertia == ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.1))
+
+
+def test_friction_is_left_out_with_a_warning():
+    text = robot(*GOOD).replace("<limit", '<dynamics friction="0.1"/><limit')
+    with pytest.warns(UserWarning, match="Coulomb friction of j1 is left out"):
+        assert scene_from_urdf(text, "arm").links[0].damping == 0.0
+
+
+def test_what_drives_the_arm_is_an_option():
+    text = robot(*GOOD, joint("j2", "arm", "hand", content=""), link("hand"))
+    scene = scene_from_urdf(text, "hand", base_force=None, base_torque=[1, 2, 3], joint_torque=4)
+    layout = StateLayout.of(scene)
+    assert layout.control.names[:3] == ("base torque x", "base torque y", "base torque z")
+    assert layout.control_limit.tolist() == [1.0, 2.0, 3.0, 1.0, 4.0]
+    scene = scene_from_urdf(text, "hand", passive=["j2"], name="mine", target={"position": [1, 2, 3]})
+    assert StateLayout.of(scene).actuated_joints == (0,)
+    assert scene.name == "mine"
+    assert scene.target.pose.position == (1.0, 2.0, 3.0)
+
+
+def test_a_scene_comes_back_from_its_urdf():
+    """Everything that URDF can hold: bodies, joints, tip, dampers, limits, motors and their absence."""
+    scene = load_scene("payload")
+    links = [{**part.model_dump(), "damping": 0.5, "actuated": i != 1} for i, part in enumerate(scene.links)]
+    scene = scene.replace(links=links)
+    again = scene_from_urdf(scene_to_urdf(scene), "tip", passive=["link 2 joint"])
+    rng = np.random.default_rng(0)
+    x, u = random_state(scene, rng), random_inputs(scene, rng)
+    assert relative_error(accelerations(again, x, u), accelerations(scene, x, u)) < 1e-13
+    expected, found = StateLayout.of(scene), StateLayout.of(again)
+    np.testing.assert_array_equal(found.control_limit, expected.control_limit)
+    assert found.state.names == expected.state.names
+    assert again.tip.position == pytest.approx(scene.tip.position, abs=1e-15)
+
+
+def test_a_fixed_wrist_changes_no_acceleration():
+    scene = load_scene("paper")
+    again = scene_from_urdf(scene_to_urdf(scene, wrist="fixed"), "tip")
+    rng, layout = np.random.default_rng(0), StateLayout.of(scene)
+    x, u = random_state(scene, rng), random_inputs(scene, rng)
+    without = np.delete(x, range(layout.n_x)[layout.state.wrist_angles])
+    found = accelerations(again, without, u[:9])
+    assert relative_error(found, accelerations(scene, x, u)) < 1e-13
+
+
+def test_names_of_our_own_make_way():
+    scene = load_scene("no-wrist")
+    names = ("base", "tip", "tip_")
+    scene = scene.replace(
+        links=[{**part.model_dump(), "name": name} for part, name in zip(scene.links, names, strict=True)]
+    )
+    again = scene_from_urdf(scene_to_urdf(scene), "tip__", "base_")
+    assert [part.name for part in again.links] == list(names)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "sentence"),
+    [
+        ("paper", {}, "the wrist has joints without mass"),
+        ("tip-load", {}, "no constant wrench at the tip"),
+        ("planar", {}, "no base that moves in a plane"),
+        ("no-wrist", {"stiffness": 1.0}, "no joint springs, and link 'link 1' has one"),
+    ],
+)
+def test_what_urdf_cannot_hold_is_refused(name, change, sentence):
+    scene = load_scene(name)
+    scene = scene.replace(links=[{**part.model_dump(), **change} for part in scene.links])
+    with pytest.raises(SceneError, match=f"cannot be written as URDF:(?s:.*){sentence}"):
+        scene_to_urdf(scene)
