@@ -181,14 +181,21 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
         """Close the vector environment; again is harmless."""
         self.vector_env.close()
 
-    def get_images(self) -> list[None]:
-        """Warn that a vector environment draws nothing; a single `DQSpaceArmEnv` does.
+    def get_images(self) -> list[NDArray[np.uint8]] | list[None]:
+        """Draw the present state of every copy; with render mode None, warn that there is nothing to see.
 
         Returns:
-            None for each copy.
+            A picture for each copy, red, green, blue, shape (height, width, 3); None without a render mode.
+
+        Raises:
+            ResetNeeded: Before the first reset.
         """
-        warnings.warn("The vector environment draws nothing: its render mode is None.", stacklevel=2)
-        return [None] * self.num_envs
+        if self.render_mode is None:
+            warnings.warn(
+                'The environment draws nothing: make it with render_mode="rgb_array".', stacklevel=2
+            )
+            return [None] * self.num_envs
+        return list(self.vector_env.render() or ())
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Read an attribute of the vector environment, which all copies share.

@@ -14,6 +14,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.environment.picture_format import PictureFormat
 from dq_space_arm_env.environment.start_options import check_size, given_start
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
@@ -110,7 +111,9 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
     | Parameter     | Type                     | Default   | Description                                            |
     |---------------|--------------------------|-----------|--------------------------------------------------------|
     | `scene`       | **str, Path or Scene**   | `"paper"` | name of a shipped scene, path of a YAML file, a mapping like one, a `Scene` |
-    | `render_mode` | **str or None**          | `None`    | `"rgb_array"` or `"human"`; needs the extra `render`   |
+    | `render_mode` | **str or None**          | `None`    | `"rgb_array"`, or `"human"` for a window, which needs a display and the extra `render` |
+    | `width`, `height` | **int**              | 640, 480  | size of the pictures, pixels                           |
+    | `default_camera_config` | **dict or None** | `None`  | where the camera is, as in Gymnasium's MuJoCo environments: any of `azimuth`, `elevation` (direction in which it looks, deg; a negative elevation looks down), `lookat` (point that it looks at, m) and `distance` from there (m); the rest is chosen so that start, target and the arm between them are in view |
 
     ```python
     >>> import gymnasium
@@ -144,20 +147,29 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
     }
 
     def __init__(
-        self, scene: Scene | Mapping[str, Any] | str | Path = "paper", render_mode: str | None = None
+        self,
+        scene: Scene | Mapping[str, Any] | str | Path = "paper",
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+        default_camera_config: Mapping[str, Any] | None = None,
     ) -> None:
         """Load a scene and compile what a step needs (or take it from the cache).
 
         Args:
             scene: Name of a shipped scene, path of a YAML file, what such a file holds as a mapping, or a scene.
             render_mode: None, "rgb_array" or "human".
+            width: Width of the pictures, pixels.
+            height: Height of the pictures, pixels.
+            default_camera_config: Any of "azimuth" and "elevation" [deg], "distance" [m] and "lookat", shape (3,), m.
 
         Raises:
             SceneError: If the scene cannot be loaded.
             ValueError: If the scene has no actuator, or one without a finite limit, or starts too far from the origin, or the
-                render mode is unknown.
+                render mode is unknown, or the size or the camera of the pictures makes no sense.
         """
-        EzPickle.__init__(self, scene, render_mode)
+        EzPickle.__init__(self, scene, render_mode, width, height, default_camera_config)
+        self._picture = PictureFormat.checked(width, height, default_camera_config)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             modes = ", ".join(self.metadata["render_modes"])
             raise ValueError(f"render_mode: {render_mode!r} is unknown; there are {modes}, or None")
@@ -354,11 +366,12 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         """Draw the present state.
 
         Returns:
-            Picture of shape (480, 640, 3), uint8, for render mode "rgb_array"; None for "human", which shows a window.
+            Picture of shape (height, width, 3), uint8, for render mode "rgb_array"; None for "human", which shows a window.
 
         Raises:
             ResetNeeded: Before the first reset.
-            DependencyNotInstalled: If the extra `render` is not installed.
+            DependencyNotInstalled: If a window is asked for and the extra `render` is not installed.
+            Error: If a window is asked for and there is no display (`gymnasium.error.Error`).
         """
         if self.render_mode is None:
             gymnasium.logger.warn(
@@ -370,7 +383,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         if self._renderer is None:
             from dq_space_arm_env.environment.rendering import Renderer
 
-            self._renderer = Renderer(self.scene)
+            self._renderer = Renderer(self.scene, self._picture)
         self._renderer.aim_at(self.target)
         frames, trail = self.kernels.frame_poses(self._x), np.array(self._trail)
         if self.render_mode == "rgb_array":
@@ -379,7 +392,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         return None
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if there is one; again is harmless."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -103,7 +103,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
     |---------------|--------------------------|-------------------|---------------------------------------------------------|
     | `scene`       | **str, Path or Scene**   | `"random-target"` | name of a shipped scene, path of a YAML file, a mapping like one, a `Scene` |
     | `reward_type` | **str**                  | `"sparse"`        | `"sparse"` or `"dense"`                                 |
-    | `render_mode` | **str or None**          | `None`            | `"rgb_array"` or `"human"`; needs the extra `render`    |
+    | `render_mode`, `width`, `height`, `default_camera_config` | | | as in `DQSpaceArm-v0`                         |
 
     ```python
     >>> import gymnasium
@@ -138,6 +138,9 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         scene: Scene | Mapping[str, Any] | str | Path = "random-target",
         reward_type: RewardType = "sparse",
         render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+        default_camera_config: Mapping[str, Any] | None = None,
     ) -> None:
         """Load a scene and compile what a step needs (or take it from the cache).
 
@@ -145,16 +148,19 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
             scene: Name of a shipped scene, path of a YAML file, what such a file holds as a mapping, or a scene.
             reward_type: "sparse" or "dense".
             render_mode: None, "rgb_array" or "human".
+            width: Width of the pictures, pixels.
+            height: Height of the pictures, pixels.
+            default_camera_config: Any of "azimuth" and "elevation" [deg], "distance" [m] and "lookat", shape (3,), m.
 
         Raises:
             SceneError: If the scene cannot be loaded.
             ValueError: If the type of reward or the render mode is unknown, or `DQSpaceArmEnv` refuses the scene.
         """
-        EzPickle.__init__(self, scene, reward_type, render_mode)
+        EzPickle.__init__(self, scene, reward_type, render_mode, width, height, default_camera_config)
         if reward_type not in get_args(RewardType):
             kinds = " and ".join(get_args(RewardType))
             raise ValueError(f"reward_type: {reward_type!r} is unknown; there are {kinds}")
-        self._env = DQSpaceArmEnv(scene, render_mode)
+        self._env = DQSpaceArmEnv(scene, render_mode, width, height, default_camera_config)
         self.scene, self.kernels = self._env.scene, self._env.kernels
         self.reward_type, self.render_mode = reward_type, render_mode
         self.metadata = self._env.metadata
@@ -332,11 +338,12 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         """Draw the present state, as `DQSpaceArmEnv.render` does.
 
         Returns:
-            Picture of shape (480, 640, 3), uint8, for render mode "rgb_array"; None for "human", which shows a window.
+            Picture of shape (height, width, 3), uint8, for render mode "rgb_array"; None for "human", which shows a window.
 
         Raises:
             ResetNeeded: Before the first reset.
-            DependencyNotInstalled: If the extra `render` is not installed.
+            DependencyNotInstalled: If a window is asked for and the extra `render` is not installed.
+            Error: If a window is asked for and there is no display (`gymnasium.error.Error`).
         """
         return self._env.render()
 

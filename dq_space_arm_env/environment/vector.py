@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
@@ -14,14 +15,20 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.environment.copies import Copies
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
+from dq_space_arm_env.environment.picture_format import PictureFormat
 from dq_space_arm_env.environment.results import StepResult
 from dq_space_arm_env.environment.start_options import GivenStart, given_start
+from dq_space_arm_env.environment.trails import Trails
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.report import REPORT
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.start import target_entries
+
+if TYPE_CHECKING:
+    from dq_space_arm_env.environment.rendering import Renderer
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
@@ -45,17 +52,27 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
     What happens after the end of an episode is the autoreset mode's choice: the next step resets
     (`NEXT_STEP`, the default), the same step resets and `info` holds `final_obs` and `final_info`
     (`SAME_STEP`), or the caller does (`DISABLED`).
+
+    With render mode "rgb_array", `render()` gives a picture of each copy, as Gymnasium's vector environments
+    do; after a step that has reset a copy, it shows the new episode.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["rgb_array"],
+        "render_fps": DQSpaceArmEnv.metadata["render_fps"],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
 
     def __init__(
         self,
         num_envs: int = 1,
         scene: Scene | Mapping[str, Any] | str | Path = "paper",
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        render_mode: None = None,
+        render_mode: str | None = None,
         threads: int = 1,
+        width: int = 640,
+        height: int = 480,
+        default_camera_config: Mapping[str, Any] | None = None,
     ) -> None:
         """Load a scene and compile what a step needs (or take it from the cache).
 
@@ -64,27 +81,37 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
             scene: Name of a shipped scene, path of a YAML file, what such a file holds as a mapping, or a
                 scene.
             autoreset_mode: What happens after the end of an episode.
-            render_mode: None; a single environment draws pictures.
+            render_mode: None or "rgb_array".
             threads: Most threads that a step is shared among. More than one pays for some thousand copies on
                 idle cores; with a core taken by another process it costs little.
+            width: Width of the pictures, pixels.
+            height: Height of the pictures, pixels.
+            default_camera_config: As for `DQSpaceArmEnv`.
 
         Raises:
             SceneError: If the scene cannot be loaded.
-            ValueError: If num_envs or threads is not positive, the scene has no normalized actions, or a
-                render mode is given.
+            ValueError: If num_envs or threads is not positive, the scene has no normalized actions, the
+                render mode is unknown, or the size or the camera of the pictures makes no sense.
         """
-        EzPickle.__init__(self, num_envs, scene, autoreset_mode, render_mode, threads)
+        picture = width, height, default_camera_config
+        EzPickle.__init__(self, num_envs, scene, autoreset_mode, render_mode, threads, *picture)
         if num_envs < 1:
             raise ValueError(f"num_envs: {num_envs}, should be at least 1")
-        if render_mode is not None:
+        if render_mode not in (None, "rgb_array"):
             raise ValueError(
-                f"render_mode: {render_mode!r}; a vector environment draws nothing, should be None"
+                f"render_mode: {render_mode!r}; a vector environment has no window, "
+                "should be 'rgb_array' or None"
             )
+        self._picture = PictureFormat.checked(*picture)
         single = DQSpaceArmEnv(scene)
         self.scene, self.kernels = single.scene, compile_scene(single.scene, threads)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {
+            **type(self).metadata,
+            "render_fps": single.metadata["render_fps"],
+            "autoreset_mode": self.autoreset_mode,
+        }
         self.single_action_space: spaces.Space[Any] = single.action_space
         self.single_observation_space: spaces.Space[Any] = single.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -98,6 +125,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         # Copies whose episodes are over and that the next step, or the caller, is to reset.
         self._over = _NOBODY
         self._seen: Array | None = None
+        self._trails = None if render_mode is None else Trails(num_envs)
+        self._renderer: Renderer | None = None
 
     @property
     def states(self) -> Array:
@@ -150,6 +179,9 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         result.report[:, others], result.flags[:, others] = 0.0, False
         self._over = np.setdiff1d(self._over, rows)
         self._remember(result.observation)
+        if self._trails is not None:
+            self._trails.begin(rows)
+            self._trails.append(self._tip_positions())
         return result.observation, self._info(result, mask)
 
     def _remember(self, observations: Array) -> None:
@@ -235,6 +267,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
             else:
                 self._over = rows
         self._remember(result.observation)
+        if self._trails is not None:
+            self._trails.append(self._tip_positions())
         info = self._info(result, self._everything)
         if final is not None:
             info |= final
@@ -243,7 +277,39 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
     def _begin_anew(self, rows: Rows, result: StepResult) -> None:
         """Begin new episodes of copies, and put what they see where the old ones' stands."""
         self._copies.begin(rows)
+        if self._trails is not None:
+            self._trails.begin(rows)
         self._copies.observe(rows, result)
+
+    def _tip_positions(self) -> Array:
+        return np.array(poses.position(self.kernels.tip_pose(self._copies.x).T)).T
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Draw the present state of every copy.
+
+        Returns:
+            A picture of shape (height, width, 3), uint8, for each copy; None without a render mode.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+        """
+        if self._trails is None:
+            gymnasium.logger.warn(
+                "render() does nothing without a render mode, e.g. "
+                'gymnasium.make_vec("DQSpaceArm-v0", render_mode="rgb_array")'
+            )
+            return None
+        if not self._begun:
+            raise ResetNeeded("call reset() before render()")
+        if self._renderer is None:
+            from dq_space_arm_env.environment.rendering import Renderer
+
+            self._renderer = Renderer(self.scene, self._picture)
+        frames, targets, pictures = self.kernels.frame_poses(self._copies.x), self.targets, []
+        for row in range(self.num_envs):
+            self._renderer.aim_at(targets[row])
+            pictures.append(self._renderer.draw(frames[row], self._trails.of(row)))
+        return tuple(pictures)
 
     def _final(self, rows: Rows, result: StepResult) -> dict[str, Any]:
         """What episodes that a step ended and begins anew leave behind."""

@@ -335,6 +335,16 @@ def test_nothing_is_drawn():
         assert venv.render() is None
 
 
+def test_copies_are_drawn_with_a_render_mode():
+    venv = DQSpaceArmVecEnv(2, SHORT, seed=0, render_mode="rgb_array", width=64, height=48)
+    venv.reset()
+    pictures = venv.get_images()
+    assert [picture.shape for picture in pictures] == [(48, 64, 3)] * 2
+    assert not np.array_equal(*pictures)
+    np.testing.assert_array_equal(pictures, venv.vector_env.render())
+    assert venv.render().shape == (96, 64, 3)  # Stable-Baselines3 tiles them
+
+
 def test_closing_twice_is_harmless():
     venv = DQSpaceArmVecEnv(2, SHORT)
     venv.reset()

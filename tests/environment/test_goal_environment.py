@@ -374,9 +374,7 @@ def test_make_vec_steps_several():
     venv.close()
 
 
-@pytest.mark.render
 def test_pictures_are_those_of_the_environment_without_goals():
-    pytest.importorskip("pygame")
     pictures = []
     for name in ("DQSpaceArm-v0", "DQSpaceArmGoal-v0"):
         env = gymnasium.make(name, scene="random-target", render_mode="rgb_array")

@@ -1,5 +1,6 @@
 """Pictures of scenes: what they show, that near hides far, and what is said when they are impossible."""
 
+import contextlib
 import itertools
 import subprocess
 import sys
@@ -8,18 +9,17 @@ import gymnasium
 import numpy as np
 import pytest
 
-pytest.importorskip("pygame")
-
+from dq_space_arm_env import DQSpaceArmEnv, compile_scene
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.kinematics import frame_poses
+from dq_space_arm_env.environment.picture_format import PictureFormat, View
 from dq_space_arm_env.environment.rendering import Renderer
 from dq_space_arm_env.environment.rendering.spacecraft import LINK, SpacecraftModel
 from dq_space_arm_env.scene import Scene, list_scenes, load_scene
 
-pytestmark = pytest.mark.render
-
 NO_TRAIL = np.zeros((0, 3))
+SMALL = PictureFormat(160, 120)
 
 
 def start_poses(scene, joint_angles=None):
@@ -31,9 +31,13 @@ def start_poses(scene, joint_angles=None):
 
 
 def empty_picture(renderer):
-    """What the renderer draws where nothing is: a gradient that is the same in every column."""
-    picture = renderer.draw(np.full((renderer._model.frame_count, 8), np.nan), NO_TRAIL)
-    return np.repeat(picture[:, -1:], picture.shape[1], axis=1)
+    """What the renderer draws where nothing is: the sky."""
+    frames = np.full((renderer._model.frame_count, 8), np.nan)
+    target = renderer._target
+    renderer.aim_at(np.full(8, np.nan))
+    picture = renderer.draw(frames, NO_TRAIL)
+    renderer.aim_at(target)
+    return picture
 
 
 def scene_with(**fields):
@@ -52,7 +56,7 @@ LINKLESS = [
 @pytest.mark.parametrize("name", list_scenes())
 def test_every_shipped_scene_is_drawn_in_view(name):
     scene = load_scene(name)
-    renderer = Renderer(scene, width=320, height=240)
+    renderer = Renderer(scene, PictureFormat(320, 240))
     picture = renderer.draw(start_poses(scene), NO_TRAIL)
     assert picture.shape == (240, 320, 3)
     assert picture.dtype == np.uint8
@@ -72,7 +76,10 @@ def test_scene_without_links_is_drawn(scene):
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (97, 301), (8, 5), (1, 1)])
 def test_picture_has_the_size_asked_for(width, height):
     scene = load_scene("paper")
-    assert Renderer(scene, width, height).draw(start_poses(scene), NO_TRAIL).shape == (height, width, 3)
+    picture = Renderer(scene, PictureFormat(width, height)).draw(start_poses(scene), NO_TRAIL)
+    assert picture.shape == (height, width, 3)
+    assert picture.dtype == np.uint8
+    assert picture.flags.c_contiguous
 
 
 def test_same_state_gives_same_bytes():
@@ -157,7 +164,7 @@ def test_planar_scene_is_seen_from_above():
 def test_up_is_up():
     camera = Renderer(load_scene("paper")).camera
     bottom, top = camera.project(np.array([(0.3, -2.9, 4.4), (0.3, -2.9, 5.4)]))[:, :2]
-    assert top[0] == pytest.approx(bottom[0])
+    assert camera.axes[0, 2] == pytest.approx(0.0), "the horizon is level"
     assert top[1] < bottom[1] - 50
 
 
@@ -170,15 +177,74 @@ def test_link_is_seen_where_it_is():
     np.testing.assert_allclose(color / color.max(), np.array(LINK) / max(LINK), atol=0.02)
 
 
-@pytest.mark.parametrize("name", ["paper", "payload", "six-joint", "planar"])
-def test_whole_reach_stays_in_view(name):
+@pytest.mark.parametrize("name", ["paper", "payload", "six-joint", "planar", "random-target"])
+def test_drawn_starts_are_in_view(name):
     scene = load_scene(name)
     renderer, rng = Renderer(scene), np.random.default_rng(4)
     size = np.array([renderer.camera.width, renderer.camera.height])
     for _ in range(200):
-        frames = start_poses(scene, rng.uniform(-np.pi, np.pi, len(scene.links)))
-        seen = renderer.camera.project(np.array(poses.position(frames.T)).T)[:, :2]
+        spread = scene.spread.joint_angles
+        angles = scene.initial_state.joint_angles + rng.uniform(-spread, spread, len(scene.links))
+        seen = renderer.camera.project(np.array(poses.position(start_poses(scene, angles).T)).T)[:, :2]
         assert ((seen > 0) & (seen < size)).all()
+
+
+@pytest.mark.parametrize("name", ["paper", "planar"])
+def test_tip_is_projected_to_where_the_kernels_have_it(name):
+    """The origin of the tip's axes, drawn alone in front of everything, is seen at the kernels' tip pose."""
+    scene = load_scene(name)
+    kernels, renderer = compile_scene(scene), Renderer(scene)
+    x = kernels.layout.initial_state
+    rotation, position = poses.to_matrix(kernels.tip_pose(x))
+    # Nothing but the tip's axes: the other frames are not drawn.
+    frames = np.full((renderer._model.frame_count, 8), np.nan)
+    frames[-1] = kernels.frame_poses(x)[-1]
+    renderer.aim_at(np.full(8, np.nan))
+    drawn = (renderer.draw(frames, NO_TRAIL) != empty_picture(renderer)).any(axis=2)
+    ends = np.array(position) + renderer._model.axis_length * np.array(rotation).T
+    corners = renderer.camera.project(np.vstack([position, ends]))[:, :2]
+    found = np.argwhere(drawn)[:, ::-1]
+    np.testing.assert_allclose(found.min(axis=0), corners.min(axis=0), atol=8.0)
+    np.testing.assert_allclose(found.max(axis=0), corners.max(axis=0), atol=8.0)
+    column, row = corners[0].astype(int)
+    assert drawn[row, column]
+
+
+def test_target_is_drawn_where_the_scene_has_it():
+    scene = load_scene("paper")
+    renderer = Renderer(scene)
+    away = np.full((renderer._model.frame_count, 8), np.nan)
+    drawn = (renderer.draw(away, NO_TRAIL) != empty_picture(renderer)).any(axis=2)
+    column, row = renderer.camera.project(np.array(scene.target.pose.position))[:2].astype(int)
+    assert drawn[row, column]
+    distances = np.linalg.norm(np.argwhere(drawn)[:, ::-1] - (column, row), axis=1)
+    pixels_per_meter = (
+        renderer.camera.focal_length * renderer.camera.project(np.array(scene.target.pose.position))[2]
+    )
+    assert distances.max() < 1.2 * renderer._model.axis_length * pixels_per_meter
+
+
+def test_camera_goes_where_it_is_told():
+    scene = load_scene("paper")
+    view = View(azimuth=90.0, elevation=-30.0, distance=7.0, lookat=(0.5, -3.0, 4.5))
+    camera = Renderer(scene, PictureFormat(320, 240, view)).camera
+    expected = np.array((0.5, -3.0, 4.5)) - 7.0 * np.array((0.0, np.cos(np.pi / 6), -0.5))
+    np.testing.assert_allclose(camera.position, expected, atol=1e-12)
+    np.testing.assert_allclose(camera.project(np.array(view.lookat)), (160.0, 120.0, 1.0 / 7.0))
+
+
+def test_camera_may_be_told_a_part():
+    scene = load_scene("paper")
+    own = Renderer(scene).camera
+    turned = Renderer(scene, PictureFormat(view=View(azimuth=30.0))).camera
+    assert turned.axes[2, 2] == pytest.approx(own.axes[2, 2]), "the elevation is the scene's"
+    near = Renderer(scene, PictureFormat(view=View(distance=3.0))).camera
+    np.testing.assert_allclose(near.axes, own.axes)
+    moved = near.position - own.position
+    assert moved @ own.axes[2] == pytest.approx(np.linalg.norm(moved)), "it has gone straight ahead"
+    point = (1.0, -3.0, 4.0)
+    aimed = Renderer(scene, PictureFormat(view=View(lookat=point))).camera
+    np.testing.assert_allclose(aimed.project(np.array(point))[:2], (320.0, 240.0))
 
 
 def test_trail_is_drawn_where_the_tip_was():
@@ -189,7 +255,7 @@ def test_trail_is_drawn_where_the_tip_was():
     columns, rows = renderer.camera.project(trail[5:-5])[:, :2].astype(int).T
     assert (before[rows, columns] != after[rows, columns]).any(axis=1).all()
     old, new = after[rows, columns].astype(int)[[0, -1]]
-    assert old[2] > new[2] + 50, "older parts are fainter"
+    assert new[0] > old[0] + 100, "older parts are fainter"
     np.testing.assert_array_equal(after, renderer.draw(frames, trail.tolist()))
 
 
@@ -258,32 +324,49 @@ def test_wrong_shapes_are_refused(frames, trail, sentence):
 
 
 @pytest.mark.parametrize(
-    ("width", "height", "field"), [(0, 480, "width"), (640, -1, "height"), (640.0, 480, "width")]
+    ("arguments", "sentence"),
+    [
+        ({"width": 0}, "width: 0 is no number of pixels, it must be a positive integer"),
+        ({"height": -1}, "height: -1 is no number of pixels"),
+        ({"width": 640.0}, "width: 640.0 is no number of pixels"),
+        ({"height": True}, "height: True is no number of pixels"),
+        ({"width": 8193}, "width: 8193 pixels, should be at most 8192"),
+        ({"height": 10**30}, "height: 10{30} pixels, should be at most 8192"),
+        ({"default_camera_config": "azimuth"}, "default_camera_config: 'azimuth', should be a mapping"),
+        (
+            {"default_camera_config": {"azimut": 3}},
+            "'azimut' is unknown; there are azimuth, elevation, distance",
+        ),
+        ({"default_camera_config": {"azimuth": "x"}}, "azimuth 'x', should be a finite number"),
+        ({"default_camera_config": {"elevation": np.inf}}, "elevation inf, should be a finite number"),
+        ({"default_camera_config": {"distance": 0}}, "distance 0, should be positive, m"),
+        ({"default_camera_config": {"lookat": (1, 2)}}, r"lookat \(1, 2\), should be 3 finite numbers, m"),
+    ],
 )
-def test_impossible_sizes_are_refused(width, height, field):
-    with pytest.raises(ValueError, match=f"{field}: .* must be a positive integer"):
-        Renderer(load_scene("paper"), width, height)
+def test_impossible_pictures_are_refused(arguments, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        DQSpaceArmEnv(**arguments)
 
 
-def test_missing_pygame_is_one_sentence(monkeypatch):
+def test_pictures_need_no_pygame_and_a_window_says_what_it_needs(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
+    scene = load_scene("paper")
+    renderer = Renderer(scene)
+    renderer.draw(start_poses(scene), NO_TRAIL)
     with pytest.raises(gymnasium.error.DependencyNotInstalled) as caught:
-        Renderer(load_scene("paper"))
+        renderer.show(start_poses(scene), NO_TRAIL, 60)
     assert 'pip install "dq-space-arm[render]"' in str(caught.value)
 
 
-def test_rendering_loads_pygame_late_and_needs_no_display():
+def test_pictures_load_neither_pygame_nor_matplotlib_nor_casadi():
     program = """
 import os, sys
 import dq_space_arm_env
 from dq_space_arm_env.environment.rendering import Renderer
-assert not {"pygame", "matplotlib"} & set(sys.modules)
 before = dict(os.environ)
 scene = dq_space_arm_env.load_scene("planar")
-renderer = Renderer(scene)
-renderer.draw([[1, 0, 0, 0, 0, 0, 0, 0]] * 5, [[0, 0, 0]])
-import pygame
-assert not pygame.display.get_init()
+Renderer(scene).draw([[1, 0, 0, 0, 0, 0, 0, 0]] * 5, [[0, 0, 0]])
+assert not {"pygame", "matplotlib", "numba", "casadi"} & set(sys.modules)
 assert dict(os.environ) == before
 """
     subprocess.run([sys.executable, "-c", program], check=True)
@@ -291,7 +374,7 @@ assert dict(os.environ) == before
 
 @pytest.fixture
 def invisible_display(monkeypatch):
-    import pygame
+    pygame = pytest.importorskip("pygame")
 
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pygame.display.quit()
@@ -299,9 +382,10 @@ def invisible_display(monkeypatch):
     pygame.display.quit()
 
 
+@pytest.mark.render
 def test_window_shows_the_picture(invisible_display):
     scene = load_scene("paper")
-    renderer, frames = Renderer(scene, 160, 120), start_poses(scene)
+    renderer, frames = Renderer(scene, SMALL), start_poses(scene)
     renderer.show(frames, NO_TRAIL, 1000)
     surface = renderer._window._window.get_surface()
     shown = invisible_display.surfarray.array3d(surface).transpose(1, 0, 2)
@@ -312,27 +396,89 @@ def test_window_shows_the_picture(invisible_display):
     renderer.close()
 
 
+@pytest.mark.render
 def test_window_that_its_user_closes_stays_closed(invisible_display):
     scene = load_scene("paper")
-    renderer, other = Renderer(scene, 160, 120), Renderer(scene, 160, 120)
+    renderer, other = Renderer(scene, SMALL), Renderer(scene, SMALL)
     frames = start_poses(scene)
     renderer.show(frames, NO_TRAIL, 1000)
     other.show(frames, NO_TRAIL, 1000)
     window = renderer._window._window
     invisible_display.event.post(invisible_display.event.Event(invisible_display.WINDOWCLOSE, window=window))
+    other.show(frames, NO_TRAIL, 1000)  # leaves the wish to whom it concerns
     renderer.show(frames, NO_TRAIL, 1000)
-    renderer.show(frames, NO_TRAIL, 1000)
-    assert renderer._window._window is None
+    assert not renderer._window.is_open
     other.show(frames, NO_TRAIL, 1000)
-    assert other._window._window is not None
+    assert other._window.is_open
     other.close()
 
 
+@pytest.mark.render
+def test_window_heeds_its_user_after_much_moving_of_the_mouse(invisible_display):
+    """A queue of 65,535 events that nobody reads is full within minutes, and takes no further one."""
+    scene = load_scene("planar")
+    renderer, frames = Renderer(scene, PictureFormat(16, 12)), start_poses(scene)
+    renderer.show(frames, NO_TRAIL, 1000)
+    moved = invisible_display.event.Event(
+        invisible_display.MOUSEMOTION, pos=(1, 1), rel=(0, 0), buttons=(0, 0, 0)
+    )
+    with contextlib.suppress(invisible_display.error):  # when it is full
+        for _ in range(70_000):
+            invisible_display.event.post(moved)
+    renderer.show(frames, NO_TRAIL, 1000)
+    window = renderer._window._window
+    invisible_display.event.post(invisible_display.event.Event(invisible_display.WINDOWCLOSE, window=window))
+    renderer.show(frames, NO_TRAIL, 1000)
+    assert not renderer._window.is_open
+
+
+@pytest.mark.render
+def test_window_opens_again_after_others_have_shut_pygame_down(invisible_display):
+    """As Gymnasium's CartPole does when it closes."""
+    scene = load_scene("planar")
+    renderer, frames = Renderer(scene, SMALL), start_poses(scene)
+    renderer.show(frames, NO_TRAIL, 1000)
+    invisible_display.quit()
+    renderer.show(frames, NO_TRAIL, 1000)
+    surface = renderer._window._window.get_surface()
+    shown = invisible_display.surfarray.array3d(surface).transpose(1, 0, 2)
+    np.testing.assert_array_equal(shown, renderer.draw(frames, NO_TRAIL))
+    invisible_display.quit()
+    renderer.close()
+
+
+@pytest.mark.render
+def test_window_shows_the_picture_in_any_size(invisible_display):
+    scene = load_scene("paper")
+    renderer, frames = Renderer(scene, SMALL), start_poses(scene)
+    renderer.show(frames, NO_TRAIL, 1000)
+    renderer._window._window.size = (400, 120)
+    renderer.show(frames, NO_TRAIL, 1000)
+    surface = renderer._window._window.get_surface()
+    shown = invisible_display.surfarray.array3d(surface).transpose(1, 0, 2)
+    assert shown.shape == (120, 400, 3)
+    np.testing.assert_array_equal(shown[:, 120:280], renderer.draw(frames, NO_TRAIL))
+    assert not shown[:, :120].any()
+    assert not shown[:, 280:].any()
+    renderer.close()
+
+
+@pytest.mark.render
+def test_nothing_is_drawn_for_a_window_that_is_closed(invisible_display, monkeypatch):
+    scene = load_scene("paper")
+    renderer = Renderer(scene, SMALL)
+    renderer.show(start_poses(scene), NO_TRAIL, 1000)
+    renderer._window.close()
+    monkeypatch.setattr(renderer, "draw", lambda *_: pytest.fail("drawn"))
+    renderer.show(start_poses(scene), NO_TRAIL, 1000)
+
+
+@pytest.mark.render
 def test_window_waits_for_the_next_picture(invisible_display):
     import time
 
     scene = load_scene("planar")
-    renderer, frames = Renderer(scene, 64, 48), start_poses(scene)
+    renderer, frames = Renderer(scene, PictureFormat(64, 48)), start_poses(scene)
     renderer.show(frames, NO_TRAIL, 50)
     begin = time.perf_counter()
     for _ in range(5):
@@ -341,6 +487,7 @@ def test_window_waits_for_the_next_picture(invisible_display):
     renderer.close()
 
 
+@pytest.mark.render
 @pytest.mark.parametrize("driver", ["offscreen", "dummy"])
 def test_missing_display_is_one_sentence(monkeypatch, invisible_display, driver):
     monkeypatch.delenv("SDL_VIDEODRIVER")
@@ -351,6 +498,7 @@ def test_missing_display_is_one_sentence(monkeypatch, invisible_display, driver)
         Renderer(scene).show(start_poses(scene), NO_TRAIL, 60)
 
 
+@pytest.mark.render
 def test_display_that_refuses_is_one_sentence(monkeypatch, invisible_display):
     def refuse():
         raise invisible_display.error("No available video device")

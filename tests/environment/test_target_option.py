@@ -120,9 +120,7 @@ def test_a_target_outside_the_plane_is_refused():
         env.reset(options={"target": TARGET})
 
 
-@pytest.mark.render
 def test_pictures_show_the_target_of_the_episode():
-    pytest.importorskip("pygame")
     from dq_space_arm_env.environment.rendering import Renderer
 
     env = make(render_mode="rgb_array")

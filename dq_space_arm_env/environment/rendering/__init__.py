@@ -1,4 +1,4 @@
-"""Pictures of a scene: solids made from its data, a camera, a depth buffer in NumPy, and a window."""
+"""Pictures of a scene: solids made from its data, a camera, a compiled depth buffer, and a window."""
 
 from dq_space_arm_env.environment.rendering.renderer import Renderer
 

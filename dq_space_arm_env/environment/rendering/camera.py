@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.environment.picture_format import View
+
 Array = NDArray[np.float64]
 
 
@@ -44,25 +46,11 @@ class Camera:
         plane = self.focal_length * seen[..., :2] * inverse_depth
         return np.concatenate([plane + 0.5 * np.array([self.width, self.height]), inverse_depth], axis=-1)
 
-    def scaled(self, factor: int) -> Camera:
-        """Make the camera that sees the same in a larger picture.
-
-        Args:
-            factor: How many times wider and higher.
-
-        Returns:
-            The camera.
-        """
-        return Camera(
-            self.position, self.axes, factor * self.focal_length, factor * self.width, factor * self.height
-        )
-
 
 def camera_around(
     centers: ArrayLike,
     radii: ArrayLike,
-    azimuth: float,
-    elevation: float,
+    view: View,
     width: int,
     height: int,
     field_of_view: float = math.radians(30.0),
@@ -72,33 +60,50 @@ def camera_around(
     Args:
         centers: Centers of the balls in the inertial frame, shape (balls, 3), m.
         radii: Their radii, shape (balls,), m.
-        azimuth: Where the camera stands, seen from the balls: angle about z from x, rad.
-        elevation: Its angle above the x-y plane, rad; z points up in the picture.
+        view: Direction in which it looks, azimuth and elevation not None; and, where they are not None, the
+            point that it looks at and the distance from there, whatever is in view then.
         width: Width of the picture, pixels.
         height: Height of the picture, pixels.
         field_of_view: Angle between the lower and the upper edge of the picture, rad.
 
     Returns:
         The camera.
+
+    Raises:
+        ValueError: If the view has no direction.
     """
+    if view.azimuth is None or view.elevation is None:
+        raise ValueError(f"view: {view}, should have azimuth and elevation, deg")
+    azimuth, elevation = math.radians(view.azimuth), math.radians(view.elevation)
     sine, cosine = math.sin(azimuth), math.cos(azimuth)
-    right = np.array([-sine, cosine, 0.0])
-    forward = -np.array([math.cos(elevation) * cosine, math.cos(elevation) * sine, math.sin(elevation)])
+    right = np.array([sine, -cosine, 0.0])
+    forward = np.array([math.cos(elevation) * cosine, math.cos(elevation) * sine, math.sin(elevation)])
     axes = np.array([right, np.cross(forward, right), forward])
     balls = np.asarray(centers, dtype=np.float64) @ axes.T
-    margin = np.asarray(radii, dtype=np.float64)
-    half_angle = 0.5 * field_of_view
-    focal_length = 0.5 * height / math.tan(half_angle)
+    focal_length = 0.5 * height / math.tan(0.5 * field_of_view)
+    position = _closest(balls, np.asarray(radii, dtype=np.float64), width, height, focal_length)
+    distance = view.distance
+    if distance is None:
+        distance = float(balls[:, 2].mean() - position[2])
+    if view.lookat is not None:
+        position = axes @ np.array(view.lookat) - (0.0, 0.0, distance)
+    elif view.distance is not None:
+        position[2] = balls[:, 2].mean() - distance
+    return Camera(position @ axes, axes, focal_length, width, height)
+
+
+def _closest(balls: Array, radii: Array, width: int, height: int, focal_length: float) -> Array:
+    """Where, in its own axes, a camera has all balls in view and is as close as it can be."""
     position = np.empty(3)
     depths = []
     for axis, half_size in ((0, 0.5 * width), (1, 0.5 * height)):
         # The planes through the camera and two opposite edges of the picture keep a ball between them if
         # tangent * (its depth - the camera's) +- (its center - the camera's) >= radius / cos(half angle).
         tangent = half_size / focal_length
-        reach = margin * math.hypot(1.0, tangent)
+        reach = radii * math.hypot(1.0, tangent)
         low = np.min(tangent * balls[:, 2] + balls[:, axis] - reach)
         high = np.min(tangent * balls[:, 2] - balls[:, axis] - reach)
         position[axis] = 0.5 * (low - high)
         depths.append(0.5 * (low + high) / tangent)
     position[2] = min(depths)
-    return Camera(position @ axes, axes, focal_length, width, height)
+    return position

@@ -1,8 +1,4 @@
-"""From solids and a trail to colored faces in the picture, and from those to pixels.
-
-Pictures are drawn with `OVERSAMPLING` subpixels per pixel and direction, and each pixel is their mean: that
-smooths the edges. A subpixel's color is packed into one number, its bytes red, green, blue, 0.
-"""
+"""From solids and a trail to lit faces in the picture, and the sky behind them."""
 
 from __future__ import annotations
 
@@ -10,28 +6,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env.environment.rendering.camera import Camera
-from dq_space_arm_env.environment.rendering.rasterizer import nearest_faces
+from dq_space_arm_env.environment.rendering.rasterizer import Faces
 from dq_space_arm_env.environment.rendering.solids import Mesh
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-PackedImage = NDArray[np.uint32]
 
-OVERSAMPLING = 2
+# Directions toward the lights in camera axes (right, down, forward), and their strengths: the sun over the
+# left shoulder, and what the Earth, below on the right, throws back. They move with the camera.
+_SUN, _SUN_STRENGTH = np.array([-0.50, -0.66, -0.56]), 0.70
+_EARTH, _EARTH_STRENGTH = np.array([0.74, 0.52, -0.42]), 0.22
+_AMBIENT = 0.38
+_SHARPNESS = 5  # of a reflection: squarings of the cosine
+_NEAREST = 1e-3  # m; what is nearer to the plane of the camera is not seen
 
-_BACKGROUND_TOP, _BACKGROUND_BOTTOM = np.array((0.975, 0.98, 0.985)), np.array((0.86, 0.875, 0.895))
-_TRAIL_OLD, _TRAIL_NEW = np.array((0.95, 0.80, 0.70)), np.array((0.93, 0.36, 0.08))
-_TRAIL_WIDTH = 2.5 / 480  # of the picture's height
+_TRAIL_OLD, _TRAIL_NEW = np.array((0.22, 0.20, 0.24)), np.array((1.0, 0.66, 0.22))
+_TRAIL_WIDTH = 2.6 / 480  # of the picture's height
 _TRAIL_STEP = 1.5 / 480  # between the drawn points of the trail, of the picture's height
 
-# Directions toward the lights in camera axes (right, down, forward), and their strengths.
-_LIGHTS = ((np.array([-0.48, -0.70, -0.53]), 0.50), (np.array([0.80, 0.10, -0.59]), 0.18))
-_AMBIENT = 0.50
+_SKY_TOP, _SKY_BOTTOM = np.array((7.0, 9.0, 19.0)), np.array((14.0, 19.0, 36.0))
+# Center of the Earth's disk, of the picture's width and height; its radius and the height of the air over it,
+# of the picture's height; the colors of air and sea in full light.
+_EARTH_CENTER, _EARTH_RADIUS, _AIR_HEIGHT = (0.62, 3.02), 2.16, 0.020
+_AIR, _SEA = np.array((70.0, 128.0, 205.0)), np.array((9.0, 26.0, 58.0))
+_STARS_PER_PIXEL = 6e-4
+_STARS_SEED = 2018
 
-_EVEN_BYTES = np.uint32(0x00FF00FF)
 
-
-def mesh_faces(mesh: Mesh, rotations: Array, positions: Array, camera: Camera) -> tuple[Array, Array]:
+def mesh_faces(mesh: Mesh, rotations: Array, positions: Array, camera: Camera) -> Faces:
     """Project and light the faces of closed solids that look toward the camera.
 
     Args:
@@ -41,21 +43,71 @@ def mesh_faces(mesh: Mesh, rotations: Array, positions: Array, camera: Camera) -
         camera: The camera.
 
     Returns:
-        Corners as x, y [pixels] and inverse depth [1/m], shape (faces, 4, 3), and colors, 0 to 1, shape
-        (faces, 3).
+        The faces.
     """
-    corners, normals = mesh.placed(rotations, positions)
-    toward_camera = camera.position - corners[:, 0]
-    # NaN, from a simulation that has blown up, faces nobody.
-    facing = np.flatnonzero(np.einsum("fi,fi->f", normals, toward_camera) > 0.0)
-    normals = normals[facing] @ camera.axes.T
-    light = np.full(len(facing), _AMBIENT)
-    for direction, strength in _LIGHTS:
-        light += strength * np.maximum(normals @ direction, 0.0)
-    return camera.project(corners[facing]), mesh.colors[facing] * light[:, None]
+    halfway = _SUN + np.array([0.0, 0.0, -1.0])
+    directions = np.array([_SUN, _EARTH, halfway / np.linalg.norm(halfway)]) @ camera.axes
+    parts: list[Array] = []
+    cosines: list[Array] = []
+    shown: list[NDArray[np.intp]] = []
+    # Frame by frame, in axes of the frame: light and camera are turned instead of all faces.
+    for frame, faces in mesh.ranges:
+        rotation, position = rotations[frame], positions[frame]
+        toward_camera = (camera.position - position) @ rotation - mesh.corners[faces, 0]
+        # NaN, from a simulation that has blown up, faces nobody.
+        facing = np.flatnonzero(np.einsum("fi,fi->f", mesh.normals[faces], toward_camera) > 0.0)
+        facing += faces.start
+        shown.append(facing)
+        parts.append(mesh.corners[facing] @ rotation.T + position)
+        cosines.append(mesh.corner_normals[facing] @ (directions @ rotation).T)
+    indices = np.concatenate(shown)
+    sun, earth, reflected = np.moveaxis(np.maximum(np.concatenate(cosines), 0.0), 2, 0)
+    light = _AMBIENT + _SUN_STRENGTH * sun + _EARTH_STRENGTH * earth
+    for _ in range(_SHARPNESS):
+        reflected = reflected * reflected
+    glint = mesh.shine[indices, None] * reflected
+    colors = mesh.colors[indices, None] * light[..., None] + glint[..., None]
+    return _seen(np.concatenate(parts), colors, mesh.sieved[indices], camera)
 
 
-def trail_faces(trail: Array, camera: Camera) -> tuple[Array, Array]:
+def _seen(corners: Array, colors: Array, sieved: NDArray[np.bool_], camera: Camera) -> Faces:
+    """Project faces; of those that reach behind the camera, the parts in front of it."""
+    projected = camera.project(corners)
+    lost = ~(projected[..., 2] < 1.0 / _NEAREST)  # true for NaN
+    cut = np.flatnonzero(lost.any(axis=1) & ~lost.all(axis=1))
+    if not len(cut):
+        return Faces(projected, colors, sieved)
+    whole = np.flatnonzero(~lost.any(axis=1))
+    outlines: list[Array] = []
+    origins: list[int] = []
+    for face in cut:
+        for triangle in ([0, 1, 2], [0, 2, 3]):
+            outlines.append(_in_front(corners[face, triangle], colors[face, triangle], camera))
+            origins.append(int(face))
+    parts = np.array(outlines)
+    return Faces(
+        np.concatenate([projected[whole], camera.project(parts[..., :3])]),
+        np.concatenate([colors[whole], parts[..., 3:]]),
+        np.concatenate([sieved[whole], sieved[origins]]),
+    )
+
+
+def _in_front(corners: Array, colors: Array, camera: Camera) -> Array:
+    """What is in front of the camera of a triangle: positions and colors of 4 corners, (4, 6), or NaN."""
+    heights = (corners - camera.position) @ camera.axes[2] - _NEAREST
+    points = np.hstack([corners, colors])
+    outline: list[Array] = []
+    for here, there in ((0, 1), (1, 2), (2, 0)):
+        if heights[here] >= 0.0:
+            outline.append(points[here])
+        if heights[here] * heights[there] < 0.0:
+            share = heights[here] / (heights[here] - heights[there])
+            outline.append(points[here] + share * (points[there] - points[here]))
+    # Neighbors may be equal: what is left of a triangle has 3 or 4 corners.
+    return np.array([*outline, *outline[-1:] * (4 - len(outline))] or np.full((4, 6), np.nan))
+
+
+def trail_faces(trail: Array, camera: Camera) -> Faces:
     """Make a ribbon of constant width in the picture along past positions, older ones fainter.
 
     Args:
@@ -63,8 +115,7 @@ def trail_faces(trail: Array, camera: Camera) -> tuple[Array, Array]:
         camera: The camera.
 
     Returns:
-        Corners as x, y [pixels] and inverse depth [1/m], shape (faces, 4, 3), and colors, 0 to 1, shape
-        (faces, 3).
+        The faces.
     """
     points = camera.project(trail)
     points = points[np.isfinite(points).all(axis=1)]
@@ -72,81 +123,46 @@ def trail_faces(trail: Array, camera: Camera) -> tuple[Array, Array]:
     marks = np.floor(steps.cumsum() / (_TRAIL_STEP * camera.height))
     points = points[np.diff(marks, prepend=-1.0) > 0.0]
     if len(points) < 2:
-        return np.empty((0, 4, 3)), np.empty((0, 3))
+        return Faces(np.empty((0, 4, 3)), np.empty((0, 4, 3)), np.empty(0, dtype=np.bool_))
     along = np.gradient(points[:, :2], axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     half = np.zeros_like(points)
     half[:, :2] = 0.5 * _TRAIL_WIDTH * camera.height * along[:, ::-1] * (-1.0, 1.0)
     one, other = points + half, points - half
-    age = np.linspace(1.0, 0.0, len(points) - 1)[:, None]
     corners = np.stack([one[:-1], one[1:], other[1:], other[:-1]], axis=1)
-    return corners, _TRAIL_NEW + age * (_TRAIL_OLD - _TRAIL_NEW)
+    youth = np.linspace(0.0, 1.0, len(points) - 1)[:, None, None]
+    colors = np.repeat(_TRAIL_OLD + youth * (_TRAIL_NEW - _TRAIL_OLD), 4, axis=1)
+    return Faces(corners, colors, np.zeros(len(corners), dtype=np.bool_))
 
 
-def paint_background(width: int, height: int) -> PackedImage:
-    """Make a vertical gradient.
-
-    Args:
-        width: Width, subpixels.
-        height: Height, subpixels.
-
-    Returns:
-        Packed subpixels, shape (height, width).
-    """
-    down = np.linspace(0.0, 1.0, height)[:, None]
-    rows = _packed(_BACKGROUND_TOP + down * (_BACKGROUND_BOTTOM - _BACKGROUND_TOP))
-    return np.repeat(rows[:, None], width, axis=1)
-
-
-def paint_faces(image: Image, background: PackedImage, corners: Array, colors: Array) -> None:
-    """Draw faces in front of a background.
+def paint_sky(width: int, height: int) -> Image:
+    """Paint stars, and the Earth's limb below, the same for every picture of a size.
 
     Args:
-        image: Picture of the background alone, shape (height, width, 3); the faces are drawn into it.
-        background: Packed subpixels, shape (OVERSAMPLING * height, OVERSAMPLING * width).
-        corners: Corners as x, y [subpixels] and inverse depth [1/m], shape (faces, 4, 3).
-        colors: Colors, 0 to 1, shape (faces, 3).
-    """
-    # Only the part of the picture that the faces may touch is drawn anew.
-    size = np.array(image.shape[1::-1])
-    points = corners[..., :2].reshape(-1, 2) / OVERSAMPLING
-    # fmin and fmax ignore the NaN of what is behind the camera.
-    left, top = np.clip(np.floor(np.fmin.reduce(points, initial=np.inf)), 0, size).astype(int)
-    right, bottom = np.clip(np.ceil(np.fmax.reduce(points, initial=-np.inf)), 0, size).astype(int)
-    if left >= right or top >= bottom:
-        return
-    origin = OVERSAMPLING * np.array([left, top, 0.0])
-    part = background[OVERSAMPLING * top : OVERSAMPLING * bottom, OVERSAMPLING * left : OVERSAMPLING * right]
-    nearest = nearest_faces(corners - origin, part.shape[1], part.shape[0])
-    palette = np.concatenate([np.zeros(1, dtype=np.uint32), _packed(colors)])
-    image[top:bottom, left:right] = mean_of_subpixels(np.where(nearest > 0, palette.take(nearest), part))
-
-
-def mean_of_subpixels(packed: PackedImage) -> Image:
-    """Average and unpack.
-
-    Args:
-        packed: Packed subpixels, shape (OVERSAMPLING * height, OVERSAMPLING * width).
+        width: Width, pixels.
+        height: Height, pixels.
 
     Returns:
         Picture, shape (height, width, 3).
     """
-    height, width = packed.shape[0] // OVERSAMPLING, packed.shape[1] // OVERSAMPLING
-    # Two of the four bytes at a time, so that each has 16 bits for its sum.
-    even, odd = np.zeros((height, width), dtype=np.uint32), np.zeros((height, width), dtype=np.uint32)
-    for row in range(OVERSAMPLING):
-        for column in range(OVERSAMPLING):
-            part = packed[row::OVERSAMPLING, column::OVERSAMPLING]
-            even += part & _EVEN_BYTES
-            odd += (part >> np.uint32(8)) & _EVEN_BYTES
-    even //= np.uint32(OVERSAMPLING**2)
-    odd //= np.uint32(OVERSAMPLING**2)
-    mean = (even & _EVEN_BYTES) | ((odd & _EVEN_BYTES) << np.uint32(8))
-    return mean.view(np.uint8).reshape(height, width, 4)[..., :3]
-
-
-def _packed(colors: Array) -> PackedImage:
-    """Colors, 0 to 1, shape (..., 3), as packed subpixels, shape (...)."""
-    channels = np.zeros((*colors.shape[:-1], 4), dtype=np.uint8)
-    channels[..., :3] = np.rint(255.0 * np.clip(colors, 0.0, 1.0))
-    return channels.view(np.uint32)[..., 0]
+    rng = np.random.default_rng(_STARS_SEED)
+    down = np.linspace(0.0, 1.0, height)[:, None, None]
+    sky = np.repeat(_SKY_TOP + down * (_SKY_BOTTOM - _SKY_TOP), width, axis=1)
+    count = round(_STARS_PER_PIXEL * width * height)
+    rows, columns = rng.integers(height, size=count), rng.integers(width, size=count)
+    brightness = 25.0 + 200.0 * rng.random(count) ** 5
+    tint = 1.0 + rng.uniform(-0.12, 0.12, (count, 1)) * np.array((1.0, 0.0, -1.0))
+    sky[rows, columns] += brightness[:, None] * tint
+    # Distance from the Earth's limb, of the picture's height, positive outside.
+    y, x = np.mgrid[:height, :width] / height
+    above = (np.hypot(x - _EARTH_CENTER[0] * width / height, y - _EARTH_CENTER[1]) - _EARTH_RADIUS)[..., None]
+    day = np.clip(1.15 - 0.85 * x[..., None] * height / width, 0.0, 1.0)
+    inside = np.maximum(-above, 0.0)
+    earth = day * (_AIR * 0.62 * np.exp(-inside / 0.05) + _SEA)
+    air = day * _AIR * np.exp(-np.maximum(above, 0.0) / _AIR_HEIGHT)
+    cover = np.clip(0.5 - above * height, 0.0, 1.0)
+    sky = (1.0 - cover) * (sky + air) + cover * earth
+    # Noise of half a step hides the steps of so slow a gradient.
+    noisy = np.floor(sky + rng.random((height, width, 1)))
+    picture: Image = np.clip(noisy, 0.0, 255.0).astype(np.uint8)
+    return picture

@@ -1,80 +1,137 @@
-"""Which face is seen in which pixel: coverage of pixel centers and a depth buffer, in array operations."""
+"""Faces into a picture: edges, depth and color of each as affine functions of x and y, then machine code.
+
+Which of several faces is seen is decided sample by sample with a depth buffer, so that bodies may intersect
+and overlap in any order; a pixel is the mean of its samples, which smooths the edges.
+"""
 
 from __future__ import annotations
+
+import ctypes
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dq_space_arm_env.environment.rendering.depth_buffer import FACE_COLUMNS, LANES, fill_kernel
+
 Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
+Image = NDArray[np.uint8]
 
-_SMALLEST_AREA = 1e-6  # pixels^2; a face seen edge-on covers no pixel center
-_FACE_BITS = 2**24 - 1  # room for 16 million faces, and for depths that differ by a part in 10^8
+_SMALLEST_AREA = 1e-6  # pixels^2; a face seen edge-on covers no sample
+_FLATTEST = 1e-2  # pixels^2, added to a face's second moments: the colors of a sliver need no gradient across
 
 
-def nearest_faces(corners: Array, width: int, height: int) -> Integers:
-    """Find the nearest face in every pixel.
+class Faces(NamedTuple):
+    """Convex planar quadrilaterals in the picture.
 
-    Faces may intersect, overlap in any order and reach out of the picture.
-
-    Args:
-        corners: x, y [pixels] and inverse depth [1/m] of the corners of convex planar faces, in order either
-            way around, shape (faces, 4, 3); neighboring corners may be equal. A face with a NaN is not drawn.
-        width: Width of the picture, pixels.
-        height: Height of the picture, pixels.
-
-    Returns:
-        Number of the nearest face plus one where there is one, 0 elsewhere, shape (height, width).
+    Attributes:
+        corners: x, y [pixels] and inverse depth [1/m] of the corners in order, either way around, shape
+            (faces, 4, 3); neighbors may be equal. A face with a corner that is not finite is not drawn.
+        colors: Red, green, blue at the corners, 0 to 1, shape (faces, 4, 3).
+        sieved: Whether a face covers every other sample only, so that it looks transparent, shape (faces,).
     """
+
+    corners: Array
+    colors: Array
+    sieved: NDArray[np.bool_]
+
+
+class Rasterizer:
+    """Draws faces into pictures of one size.
+
+    Attributes:
+        width: Width of the pictures, pixels.
+        height: Height of the pictures, pixels.
+    """
+
+    def __init__(self, width: int, height: int, samples: int = 3) -> None:
+        """Compile what draws, or take it from the cache, and make room for the samples of a row.
+
+        Args:
+            width: Width of the pictures, pixels.
+            height: Height of the pictures, pixels.
+            samples: Samples per pixel and direction, 1 to 15.
+        """
+        self.width, self.height, self._samples = width, height, samples
+        self._kernel = fill_kernel(samples)
+        stride = -(-samples * width // LANES) * LANES
+        self._keys = np.zeros((samples, stride), dtype=np.uint64)
+
+    def draw(self, faces: Faces, image: Image) -> None:
+        """Draw faces in front of what is in a picture.
+
+        Args:
+            faces: The faces; they may intersect, overlap in any order, and reach out of the picture.
+            image: The picture, C-contiguous, shape (height, width, 3), changed in place.
+
+        Raises:
+            ValueError: If the picture has another size, or is not C-contiguous.
+        """
+        if image.shape != (self.height, self.width, 3) or not image.flags.c_contiguous:
+            raise ValueError(
+                f"image: shape {image.shape}, should be ({self.height}, {self.width}, 3), C-contiguous"
+            )
+        scale = np.array([self._samples, self._samples, 1.0])
+        rows, numbers = _prepared(faces, scale, self._samples * self.height)
+        arrays = rows, numbers, self._keys, image
+        buffers = (ctypes.c_int64 * 7)(
+            *(array.ctypes.data for array in arrays), len(rows), self._keys.shape[1], self.width
+        )
+        self._kernel.function(0, self.height, ctypes.addressof(buffers))
+
+
+def _prepared(faces: Faces, scale: Array, height: int) -> tuple[NDArray[np.int32], Array]:
+    """Rows of samples of each face, (m, 2), and its numbers as the kernel reads them, (m, FACE_COLUMNS)."""
+    corners = faces.corners * scale
     # In a perspective picture the inverse depth of a plane is an affine function of x and y.
     normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    drawn = np.flatnonzero(np.abs(normal[:, 2]) > _SMALLEST_AREA)
+    drawn = np.flatnonzero(np.isfinite(normal).all(axis=1) & (np.abs(normal[:, 2]) > _SMALLEST_AREA))
     corners, normal = corners[drawn], normal[drawn]
+    x, y, inverse_depth = np.moveaxis(corners, 2, 0)
+    rows = np.empty((len(drawn), 2), dtype=np.int32)
+    rows[:, 0] = np.clip(np.ceil(y.min(axis=1) - 0.5), 0, height)
+    rows[:, 1] = np.clip(np.ceil(y.max(axis=1) - 0.5), 0, height)
+
+    numbers = np.empty((len(drawn), FACE_COLUMNS))
+    numbers[:, 0:16] = _sides(x, y, normal[:, 2] > 0.0)
     gradient = -normal[:, :2] / normal[:, 2:]
-    at_origin = corners[:, 0, 2] - np.sum(gradient * corners[:, 0, :2], axis=1)
-
-    face, row = _rows(corners, height)
-    left, right = _spans(corners, normal[:, 2] > 0.0, face, row)
-    first = np.clip(np.ceil(left - 0.5), 0, width).astype(np.int64)
-    last = np.clip(np.ceil(right - 0.5), 0, width).astype(np.int64)
-    span, column = _ranges(first, last)
-    slope = gradient[face, 0]
-    in_row = at_origin[face] + gradient[face, 1] * (row + 0.5) + 0.5 * slope
-    inverse_depth = in_row[span] + slope[span] * column
-
-    # Positive floats are ordered as their bits are. With the face in the lowest bits, one maximum finds both.
-    nearness = (inverse_depth.view(np.int64) & ~_FACE_BITS) | (drawn[face] + 1)[span]
-    buffer = np.zeros(height * width, dtype=np.int64)
-    np.maximum.at(buffer, (row * width)[span] + column, nearness)
-    return (buffer & _FACE_BITS).reshape(height, width)
+    numbers[:, 16] = inverse_depth[:, 0] - gradient[:, 0] * x[:, 0] - gradient[:, 1] * y[:, 0]
+    numbers[:, 17], numbers[:, 18] = gradient[:, 1], gradient[:, 0]
+    numbers[:, 19:28] = _color_functions(x, y, 255.0 * faces.colors[drawn])
+    numbers[:, 28] = faces.sieved[drawn]
+    return rows, numbers
 
 
-def _rows(corners: Array, height: int) -> tuple[Integers, Integers]:
-    """Pairs of a face and a row of the picture that it may cover."""
-    first = np.clip(np.ceil(corners[..., 1].min(axis=1) - 0.5), 0, height).astype(np.int64)
-    last = np.clip(np.ceil(corners[..., 1].max(axis=1) - 0.5), 0, height).astype(np.int64)
-    return _ranges(first, last)
+def _sides(x: Array, y: Array, turns_positive: NDArray[np.bool_]) -> Array:
+    """What bounds x from the left and from the right in a row: value at row 0 and slope per edge, (m, 16).
+
+    Every edge bounds it from one side; on the other its value is infinite.
+    """
+    across, down = np.roll(x, -1, axis=1) - x, np.roll(y, -1, axis=1) - y
+    climbs = down != 0.0
+    slope = np.divide(across, down, out=np.zeros_like(down), where=climbs)
+    at_zero = x - slope * y
+    is_left = (down < 0.0) == turns_positive[:, None]
+    sides = np.zeros((len(x), 2, 4, 2))
+    for side, is_bound, unbounded in ((0, is_left, -np.inf), (1, ~is_left, np.inf)):
+        is_bound = is_bound & climbs
+        sides[:, side, :, 0] = np.where(is_bound, at_zero, unbounded)
+        sides[:, side, :, 1] = np.where(is_bound, slope, 0.0)
+    return sides.reshape(-1, 16)
 
 
-def _ranges(first: Integers, last: Integers) -> tuple[Integers, Integers]:
-    """All integers of the ranges first[i] .. last[i] - 1: the i of each, and the integer."""
-    counts = np.maximum(last - first, 0)
-    owner = np.repeat(np.arange(len(counts)), counts)
-    offset = first - (np.cumsum(counts) - counts)
-    return owner, np.arange(len(owner)) + offset[owner]
-
-
-def _spans(
-    corners: Array, turns_positive: NDArray[np.bool_], face: Integers, row: Integers
-) -> tuple[Array, Array]:
-    """Where the middle of each row enters and leaves its face: every edge bounds x from one side."""
-    start, end = corners[..., :2], np.roll(corners[..., :2], -1, axis=1)
-    step = end - start
-    climbs = step[..., 1] != 0.0
-    slope = np.divide(step[..., 0], step[..., 1], out=np.zeros(climbs.shape), where=climbs)
-    at_zero = start[..., 0] - slope * start[..., 1]
-    is_left = (step[..., 1] < 0.0) == turns_positive[:, None]
-    left = np.where(climbs & is_left, at_zero, -np.inf)
-    right = np.where(climbs & ~is_left, at_zero, np.inf)
-    crossing = slope[face] * (row[:, None] + 0.5)
-    return (left[face] + crossing).max(axis=1), (right[face] + crossing).min(axis=1)
+def _color_functions(x: Array, y: Array, colors: Array) -> Array:
+    """The affine functions of x and y nearest to the corners' colors: value at 0, d/dy, d/dx, (m, 9)."""
+    middle_x, middle_y = x.mean(axis=1), y.mean(axis=1)
+    right, down = x - middle_x[:, None], y - middle_y[:, None]
+    mean = colors.mean(axis=1)
+    along_x = np.einsum("fc,fck->fk", right, colors)
+    along_y = np.einsum("fc,fck->fk", down, colors)
+    xx = np.einsum("fc,fc->f", right, right) + _FLATTEST
+    yy = np.einsum("fc,fc->f", down, down) + _FLATTEST
+    xy = np.einsum("fc,fc->f", right, down)
+    determinant = (xx * yy - xy * xy)[:, None]
+    d_dx = (yy[:, None] * along_x - xy[:, None] * along_y) / determinant
+    d_dy = (xx[:, None] * along_y - xy[:, None] * along_x) / determinant
+    at_zero = mean - d_dx * middle_x[:, None] - d_dy * middle_y[:, None]
+    return np.stack([at_zero, d_dy, d_dx], axis=2).reshape(-1, 9)

@@ -2,77 +2,54 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.environment.picture_format import PictureFormat, View
 from dq_space_arm_env.environment.rendering.camera import camera_around
-from dq_space_arm_env.environment.rendering.drawing import (
-    OVERSAMPLING,
-    Image,
-    mean_of_subpixels,
-    mesh_faces,
-    paint_background,
-    paint_faces,
-    trail_faces,
-)
-from dq_space_arm_env.environment.rendering.label import Label
+from dq_space_arm_env.environment.rendering.drawing import Image, mesh_faces, paint_sky, trail_faces
+from dq_space_arm_env.environment.rendering.rasterizer import Faces, Rasterizer
 from dq_space_arm_env.environment.rendering.spacecraft import SpacecraftModel
 from dq_space_arm_env.environment.rendering.window import Window
 from dq_space_arm_env.scene import Scene
 
 Array = NDArray[np.float64]
 
-_AZIMUTH, _ELEVATION = math.radians(25.0), math.radians(25.0)
+_DEFAULT_VIEW = View(azimuth=190.0, elevation=-22.0)
 # A planar scene is seen from straight above, x to the right and y up.
-_PLANAR_AZIMUTH, _PLANAR_ELEVATION = math.radians(-90.0), math.radians(90.0)
+_PLANAR_VIEW = View(azimuth=90.0, elevation=-90.0)
 
 
 class Renderer:
-    """Draws a scene from a fixed camera that has the whole reach of the arm and the target in view.
+    """Draws a scene from a fixed camera.
 
-    The target is the scene's until another is given; where the scene draws it for each episode, the whole
-    spread of its position is in view.
+    The tip has solid axes, red, green and blue for x, y and z; the target has paler ones and the likeness of
+    a hand. The target is the scene's until another is given; where the scene draws it for each episode, the
+    whole spread of its position is in view.
 
     Attributes:
         camera: The camera.
     """
 
-    def __init__(self, scene: Scene, width: int = 640, height: int = 480) -> None:
+    def __init__(self, scene: Scene, picture: PictureFormat | None = None) -> None:
         """Build the scene's solids and place the camera.
 
         Args:
             scene: A validated scene.
-            width: Width of the pictures, pixels.
-            height: Height of the pictures, pixels.
-
-        Raises:
-            ValueError: If width or height is not a positive integer.
-            DependencyNotInstalled: If pygame is not installed.
+            picture: Size of the pictures and from where to look; by default 640 by 480 pixels, with start,
+                target and what lies between in view.
         """
-        for name, value in (("width", width), ("height", height)):
-            if not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name}: {value!r} is no number of pixels, it must be a positive integer")
-        planar = scene.base.motion == "planar"
-        azimuth, elevation = (_PLANAR_AZIMUTH, _PLANAR_ELEVATION) if planar else (_AZIMUTH, _ELEVATION)
+        width, height, view = picture or PictureFormat()
+        default = _PLANAR_VIEW if scene.base.motion == "planar" else _DEFAULT_VIEW
+        given = {key: value for key, value in view._asdict().items() if value is not None}
         self._model = SpacecraftModel(scene)
-        centers, radii = self._model.region
-        self.camera = camera_around(centers, radii, azimuth, elevation, width, height)
-        self._fine_camera = self.camera.scaled(OVERSAMPLING)
-        self._background = paint_background(self._fine_camera.width, self._fine_camera.height)
-        self._empty_image = mean_of_subpixels(self._background)
+        self.camera = camera_around(*self._model.region, default._replace(**given), width, height)
+        self._rasterizer = Rasterizer(width, height)
+        self._sky = paint_sky(width, height)
         self._target = np.array(scene.target.pose.dual_quaternion)
-        self._label = self._label_of(self._target)
         self._title = f"DQ Space Arm: {scene.name}"
         self._window: Window | None = None
-
-    def _label_of(self, target: Array) -> Label:
-        """The word next to the target's axes."""
-        rotation, position = poses.to_matrix(target)
-        ends = self._model.axis_length * np.array(rotation).T + np.array(position)
-        return Label("target", self.camera, np.array(position), ends)
 
     def aim_at(self, target: ArrayLike) -> None:
         """Move the target.
@@ -80,10 +57,10 @@ class Renderer:
         Args:
             target: Its pose in the inertial frame, shape (8,), real part dimensionless, dual part m.
         """
-        pose = np.array(target, dtype=np.float64)
-        if not np.array_equal(pose, self._target):
-            self._target, self._label = pose, self._label_of(pose)
+        self._target = np.array(target, dtype=np.float64)
 
+    # What has blown up (infinite, NaN) is not drawn; nobody needs a warning for each of its numbers.
+    @np.errstate(over="ignore", invalid="ignore")
     def draw(self, frame_poses: ArrayLike, trail: ArrayLike) -> Image:
         """Draw a state; the same arguments give the same picture.
 
@@ -99,10 +76,9 @@ class Renderer:
             ValueError: If a shape does not fit.
         """
         dual_quaternions = _checked("frame_poses", frame_poses, (self._model.frame_count, 8))
-        corners, colors = self._faces(dual_quaternions, _checked("trail", trail, (None, 3)))
-        image = self._empty_image.copy()
-        paint_faces(image, self._background, corners, colors)
-        self._label.draw(image)
+        faces = self._faces(dual_quaternions, _checked("trail", trail, (None, 3)))
+        image = self._sky.copy()
+        self._rasterizer.draw(faces, image)
         return image
 
     def show(self, frame_poses: ArrayLike, trail: ArrayLike, fps: float) -> None:
@@ -115,11 +91,13 @@ class Renderer:
 
         Raises:
             ValueError: If a shape does not fit.
+            DependencyNotInstalled: If pygame is not installed.
             Error: If there is no display (`gymnasium.error.Error`).
         """
         if self._window is None:
             self._window = Window(self._title, self.camera.width, self.camera.height)
-        self._window.show(self.draw(frame_poses, trail), fps)
+        if self._window.is_open:
+            self._window.show(self.draw(frame_poses, trail), fps)
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -127,17 +105,18 @@ class Renderer:
             self._window.close()
             self._window = None
 
-    # What has blown up (infinite, NaN) is not drawn; nobody needs a warning for each of its numbers.
-    @np.errstate(over="ignore", invalid="ignore")
-    def _faces(self, dual_quaternions: Array, trail: Array) -> tuple[Array, Array]:
-        """Corners and colors of all that may be seen, in subpixels."""
+    def _faces(self, dual_quaternions: Array, trail: Array) -> Faces:
+        """All that may be seen."""
         # The frame after the robot's is the target's.
         matrices, origins = poses.to_matrix(np.vstack([dual_quaternions, self._target]).T)
         rotations: Array = np.moveaxis(np.array(matrices), 2, 0)
-        positions = np.array(origins).T
-        solids = mesh_faces(self._model.mesh, rotations, positions, self._fine_camera)
-        ribbon = trail_faces(trail, self._fine_camera)
-        return np.concatenate([solids[0], ribbon[0]]), np.concatenate([solids[1], ribbon[1]])
+        solids = mesh_faces(self._model.mesh, rotations, np.array(origins).T, self.camera)
+        ribbon = trail_faces(trail, self.camera)
+        return Faces(
+            np.concatenate([solids.corners, ribbon.corners]),
+            np.concatenate([solids.colors, ribbon.colors]),
+            np.concatenate([solids.sieved, ribbon.sieved]),
+        )
 
 
 def _checked(name: str, value: ArrayLike, shape: tuple[int | None, int]) -> Array:

@@ -7,13 +7,18 @@ array holds them all.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Color = tuple[float, float, float]  # red, green, blue, 0 to 1
+
+SHINE = 0.25  # of a surface of which nothing is said
+
+_FOLDS, _CRUMPLE, _FOIL_SHINE, _FOIL_SEED = 7, 0.13, 0.45, 3
 
 _AXES = np.eye(3)
 
@@ -25,13 +30,20 @@ class Mesh:
     Attributes:
         corners: Corners in the face's frame, in order around the face, shape (faces, 4, 3), m.
         normals: Outward unit normals in the face's frame, shape (faces, 3).
+        corner_normals: Outward unit normals at the corners of the surface that the faces stand for, shape
+            (faces, 4, 3); light is computed with them, so that a prism looks like a cylinder.
         colors: Red, green, blue, 0 to 1, shape (faces, 3).
-        frames: Number of the frame that carries the face, shape (faces,).
+        shine: Strength of the light's reflection, 0 to 1, shape (faces,).
+        sieved: Whether the face is to look transparent, shape (faces,).
+        frames: Number of the frame that carries the face, shape (faces,), ascending.
     """
 
     corners: Array
     normals: Array
+    corner_normals: Array
     colors: Array
+    shine: Array
+    sieved: NDArray[np.bool_]
     frames: NDArray[np.intp]
 
     @classmethod
@@ -42,32 +54,79 @@ class Mesh:
             meshes: At least one mesh.
 
         Returns:
-            One mesh with all faces, in the order given.
+            One mesh with all faces, ordered by frame, and within a frame as given.
         """
         parts = list(meshes)
-        return cls(
-            np.concatenate([part.corners for part in parts]),
-            np.concatenate([part.normals for part in parts]),
-            np.concatenate([part.colors for part in parts]),
-            np.concatenate([part.frames for part in parts]),
-        )
+        order = np.argsort(np.concatenate([part.frames for part in parts]), kind="stable")
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts])[order] for name in names))
 
-    def placed(self, rotations: Array, positions: Array) -> tuple[Array, Array]:
-        """Take all faces to inertial axes.
+    @cached_property
+    def ranges(self) -> list[tuple[int, slice]]:
+        """The frames that carry faces, and where those faces stand."""
+        starts = np.flatnonzero(np.diff(self.frames, prepend=-1))
+        ends = np.append(starts[1:], len(self.frames))
+        return [
+            (int(self.frames[start]), slice(int(start), int(end)))
+            for start, end in zip(starts, ends, strict=True)
+        ]
+
+    def moved(self, frame: int, rotation: ArrayLike, position: ArrayLike) -> Mesh:
+        """Fix the faces in another frame.
 
         Args:
-            rotations: Rotation matrix of each frame, shape (frames, 3, 3).
-            positions: Origin of each frame in the inertial frame, shape (frames, 3), m.
+            frame: Its number.
+            rotation: Rotation matrix from the present frame's axes to the other's, shape (3, 3).
+            position: Origin of the present frame in the other one, shape (3,), m.
 
         Returns:
-            Corners, shape (faces, 4, 3), m, and normals, shape (faces, 3), in the inertial frame.
+            The mesh.
         """
-        rotation = rotations[self.frames]
-        corners = self.corners @ rotation.transpose(0, 2, 1) + positions[self.frames][:, None]
-        return corners, np.einsum("fij,fj->fi", rotation, self.normals)
+        matrix = np.asarray(rotation, dtype=np.float64).T
+        return replace(
+            self,
+            corners=self.corners @ matrix + np.asarray(position),
+            normals=self.normals @ matrix,
+            corner_normals=self.corner_normals @ matrix,
+            frames=np.full_like(self.frames, frame),
+        )
+
+    def likeness(self, color: Color) -> Mesh:
+        """Make the mesh look transparent, all of one color.
+
+        Args:
+            color: The color.
+
+        Returns:
+            The mesh.
+        """
+        return replace(self, colors=np.tile(color, (len(self.frames), 1)), sieved=np.ones_like(self.sieved))
 
 
-def box(frame: int, center: ArrayLike, size: ArrayLike, color: Color, axes: ArrayLike = _AXES) -> Mesh:
+def _uniform(
+    frame: int, corners: Array, normals: Array, corner_normals: Array, colors: ArrayLike, shine: float
+) -> Mesh:
+    """A mesh in one frame, of one shine."""
+    count = len(corners)
+    return Mesh(
+        corners,
+        normals,
+        corner_normals,
+        np.broadcast_to(np.asarray(colors, dtype=np.float64), (count, 3)).copy(),
+        np.full(count, shine),
+        np.zeros(count, dtype=np.bool_),
+        np.full(count, frame),
+    )
+
+
+def box(
+    frame: int,
+    center: ArrayLike,
+    size: ArrayLike,
+    color: Color,
+    axes: ArrayLike = _AXES,
+    shine: float = SHINE,
+) -> Mesh:
     """Make a box.
 
     Args:
@@ -76,6 +135,7 @@ def box(frame: int, center: ArrayLike, size: ArrayLike, color: Color, axes: Arra
         size: Edge lengths along the box's axes, shape (3,), m.
         color: Its color.
         axes: The box's axes as orthonormal columns in that frame, shape (3, 3).
+        shine: Strength of the light's reflection, 0 to 1.
 
     Returns:
         Mesh of 6 faces.
@@ -88,7 +148,44 @@ def box(frame: int, center: ArrayLike, size: ArrayLike, color: Color, axes: Arra
         normals[face, axis] = side
     columns = np.asarray(axes, dtype=np.float64)
     corners = 0.5 * corners * np.asarray(size) @ columns.T + np.asarray(center)
-    return Mesh(corners, normals @ columns.T, np.tile(color, (6, 1)), np.full(6, frame))
+    normals = normals @ columns.T
+    return _uniform(frame, corners, normals, np.repeat(normals[:, None], 4, axis=1), color, shine)
+
+
+def crumpled_box(
+    frame: int, center: ArrayLike, size: ArrayLike, color: Color, axes: ArrayLike = _AXES
+) -> Mesh:
+    """Make a box in foil: its faces are flat, but reflect light as if they were crumpled.
+
+    Args:
+        frame: Number of the frame that carries it.
+        center: Center in that frame, shape (3,), m.
+        size: Edge lengths along the box's axes, shape (3,), m.
+        color: Its color.
+        axes: The box's axes as orthonormal columns in that frame, shape (3, 3).
+
+    Returns:
+        Mesh of 6 * _FOLDS ** 2 faces; the same arguments give the same folds.
+    """
+    rng = np.random.default_rng(_FOIL_SEED)
+    plain = box(frame, center, size, color, axes)
+    steps = np.linspace(0.0, 1.0, _FOLDS + 1)
+    corners: list[Array] = []
+    normals: list[Array] = []
+    for (first, second, third, fourth), normal in zip(plain.corners, plain.normals, strict=True):
+        grid = (
+            first
+            + steps[:, None, None] * (second - first)
+            + steps[:, None]
+            * ((1 - steps)[:, None, None] * (fourth - first) + steps[:, None, None] * (third - second))
+        )
+        bent = normal + _CRUMPLE * rng.normal(size=grid.shape)
+        bent /= np.linalg.norm(bent, axis=2, keepdims=True)
+        for vectors, target in ((grid, corners), (bent, normals)):
+            tiles = [vectors[:-1, :-1], vectors[1:, :-1], vectors[1:, 1:], vectors[:-1, 1:]]
+            target.append(np.stack(tiles, axis=2).reshape(-1, 4, 3))
+    flat = np.repeat(plain.normals, _FOLDS**2, axis=0)
+    return _uniform(frame, np.concatenate(corners), flat, np.concatenate(normals), color, _FOIL_SHINE)
 
 
 def lathe(
@@ -98,6 +195,8 @@ def lathe(
     profile: Sequence[tuple[float, float]],
     colors: Color | Sequence[Color],
     sides: int = 24,
+    shine: float = SHINE,
+    smooth: bool = False,
 ) -> Mesh:
     """Turn a profile around an axis: cylinders, cones, disks and balls.
 
@@ -108,6 +207,8 @@ def lathe(
         profile: Height along the axis and radius of each ring, m; 0 at both ends of a closed solid.
         colors: One color, or one for each of the bands between the rings.
         sides: Number of faces around the axis.
+        shine: Strength of the light's reflection, 0 to 1.
+        smooth: Whether the profile is meant to be a curve, without edges between its bands.
 
     Returns:
         Mesh of (rings - 1) * sides faces.
@@ -119,15 +220,29 @@ def lathe(
     around = np.outer(np.cos(angles), across) + np.outer(np.sin(angles), np.cross(along, across))
     heights, radii = np.array(profile).T
     rings = np.asarray(start) + heights[:, None, None] * along + radii[:, None, None] * around
-    corners = np.stack([rings[:-1, :-1], rings[:-1, 1:], rings[1:, 1:], rings[1:, :-1]], axis=2).reshape(
-        -1, 4, 3
-    )
+    # Components of each band's normal away from the axis and along it, at its lower and at its upper ring.
+    tilt = np.stack([np.diff(heights), -np.diff(radii)], axis=1)
+    tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
+    tilts = np.stack([tilt, tilt])
+    if smooth:
+        at_rings = np.vstack([tilt[:1], tilt[:-1] + tilt[1:], tilt[-1:]])
+        at_rings[radii < 1e-9 * radii.max(), 0] = 0.0  # at a pole, where the bands meet in one direction
+        at_rings /= np.linalg.norm(at_rings, axis=1, keepdims=True)
+        tilts = np.stack([at_rings[:-1], at_rings[1:]])
+    lower, upper = tilts[..., 0, None, None] * around + tilts[..., 1, None, None] * along
+    corners = _quadrilaterals(rings[:-1], rings[1:])
     # With the rings counterclockwise about the axis, the diagonals turn outward.
     normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     bands = len(profile) - 1
-    per_band = np.broadcast_to(np.array(colors), (bands, 3))
-    return Mesh(corners, normals, np.repeat(per_band, sides, axis=0), np.full(bands * sides, frame))
+    per_band = np.repeat(np.broadcast_to(np.array(colors), (bands, 3)), sides, axis=0)
+    return _uniform(frame, corners, normals, _quadrilaterals(lower, upper), per_band, shine)
+
+
+def _quadrilaterals(lower: Array, upper: Array) -> Array:
+    """Vectors at lower and upper ring of each band, (bands, sides + 1, 3), by face, (bands * sides, 4, 3)."""
+    corners = [lower[:, :-1], lower[:, 1:], upper[:, 1:], upper[:, :-1]]
+    return np.stack(corners, axis=2).reshape(-1, 4, 3)
 
 
 def cylinder(
@@ -168,4 +283,4 @@ def ball(frame: int, center: ArrayLike, radius: float, color: Color, sides: int 
     """
     latitudes = np.linspace(-0.5 * np.pi, 0.5 * np.pi, sides // 2 + 1)
     profile = [(radius * float(np.sin(angle)), radius * float(np.cos(angle))) for angle in latitudes]
-    return lathe(frame, center, _AXES[2], profile, color, sides)
+    return lathe(frame, center, _AXES[2], profile, color, sides, smooth=True)

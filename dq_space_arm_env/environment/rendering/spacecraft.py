@@ -13,20 +13,31 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.environment.rendering.solids import Mesh, ball, box, cylinder, lathe
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematics import frame_poses
+from dq_space_arm_env.environment.rendering.solids import (
+    Mesh,
+    ball,
+    box,
+    crumpled_box,
+    cylinder,
+    lathe,
+)
 from dq_space_arm_env.scene import Scene
 
 Array = NDArray[np.float64]
 
-FOIL = (0.93, 0.76, 0.45)
+FOIL = (1.0, 0.74, 0.34)
 METAL = (0.62, 0.65, 0.70)
 RADIATOR = (0.80, 0.82, 0.85)
 DARK_METAL = (0.24, 0.26, 0.31)
-CELLS = (0.17, 0.27, 0.52)
+CELLS = (0.16, 0.27, 0.58)
 LINK = (0.95, 0.95, 0.96)
 JOINT = (0.36, 0.42, 0.52)
 GRASPED = (0.42, 0.60, 0.58)
-AXIS_COLORS = ((0.84, 0.15, 0.16), (0.13, 0.60, 0.24), (0.14, 0.36, 0.85))
+LIKENESS = (0.80, 0.88, 1.0)
+AXIS_COLORS = ((1.0, 0.24, 0.22), (0.26, 0.88, 0.34), (0.26, 0.52, 1.0))
 
 _THINNEST = 0.05  # of the longest edge: even a flat body is drawn with some thickness
 
@@ -84,23 +95,45 @@ class SpacecraftModel:
     @cached_property
     def mesh(self) -> Mesh:
         """All solids; the frame after the robot's is the target's."""
-        return Mesh.joined([*self._base(), *self._arm(), *self._hand(), *self._payload(), *self._axes()])
+        hand = list(self._hand())
+        # Where the hand is fixed with respect to the tip, the target's likeness of it is to the target.
+        from_tip = np.array(self.scene.tip.rotation_matrix)
+        likeness = [
+            part.moved(self.frame_count, from_tip.T, -from_tip.T @ self._offsets[-1]).likeness(LIKENESS)
+            for part in hand
+        ]
+        return Mesh.joined([*self._base(), *self._arm(), *hand, *self._payload(), *self._axes(), *likeness])
 
     @cached_property
     def axis_length(self) -> float:
         """Length of the drawn axes of tip and target, m; without an arm they have to come out of the body."""
-        return 7.0 * self._thickness if self._arm_length else 0.8 * float(self._body_size.max())
+        return 8.5 * self._thickness if self._arm_length else 0.8 * float(self._body_size.max())
 
     @property
     def region(self) -> tuple[Array, Array]:
-        """Balls that hold base, reach of the arm, and target: centers, (3, 3), m, and radii, (3,), m."""
-        start = self.scene.initial_state.base_pose
-        base = np.array(start.position)
-        shoulder = base + np.array(start.rotation_matrix) @ self._offsets[0]
-        centers = np.array([base, shoulder, self.scene.target.pose.position])
-        wings = float(np.linalg.norm(self._wing_tip))
-        target = 1.2 * self.axis_length + math.sqrt(3.0) * self.scene.spread.target_position
-        return centers, np.array([wings, self._arm_length + self._overhang(), target])
+        """Balls that hold start, target, and the arm between: centers, (n, 3), m, and radii, (n,), m."""
+        start, spread = self.scene.initial_state, self.scene.spread
+        chain = Chain.from_scene(self.scene)
+        poses_at_start = frame_poses(
+            chain, start.base_pose.dual_quaternion, start.joint_angles, start.wrist_angles
+        )
+        frames = np.array([poses.position(pose) for pose in poses_at_start], dtype=np.float64)
+        rotation = np.array(start.base_pose.rotation_matrix)
+        wing = rotation @ (self._body_axes[:, self._wing_axes[0]] * self._wing_tip[self._wing_axes[0]])
+        shoulder = frames[min(1, len(frames) - 1)]
+        # Not all that the arm might reach: it works between start and target, and is seen better from near.
+        reach = self._arm_length + self._overhang()
+        target = 1.2 * self.axis_length + math.sqrt(3.0) * spread.target_position
+        balls = [
+            (frames[0], 0.75 * float(np.linalg.norm(self._body_size))),
+            (frames[0] + wing, 0.3 * float(self._body_size.max())),
+            (frames[0] - wing, 0.3 * float(self._body_size.max())),
+            (shoulder, 0.6 * reach),
+            (frames[-1], 0.15 * reach + self._overhang()),
+            (np.array(self.scene.target.pose.position), target),
+        ]
+        centers, radii = zip(*balls, strict=True)
+        return np.array(centers), np.array(radii)
 
     @cached_property
     def _wing_axes(self) -> tuple[int, int, int]:
@@ -123,7 +156,7 @@ class SpacecraftModel:
 
     def _base(self) -> Iterator[Mesh]:
         size, axes = self._body_size, self._body_axes
-        yield box(0, (0.0, 0.0, 0.0), size, FOIL, axes)
+        yield crumpled_box(0, (0.0, 0.0, 0.0), size, FOIL, axes)
         yield from self._rims()
         yield from self._wing(1.0)
         yield from self._wing(-1.0)
@@ -170,7 +203,7 @@ class SpacecraftModel:
             for row in (-1.0, 1.0):
                 for column in (-1.0, 1.0):
                     offset = outward * 0.228 * panel_length * row + axes[:, across] * 0.24 * width * column
-                    yield box(0, outward * center + offset, size, CELLS, axes)
+                    yield box(0, outward * center + offset, size, CELLS, axes, shine=0.7)
 
     def _thrusters(self) -> Iterator[Mesh]:
         """Nozzles at the edges of the body; for a planar base, in the plane."""
@@ -263,8 +296,8 @@ class SpacecraftModel:
     def _axes(self) -> Iterator[Mesh]:
         """Axes of the tip, and thicker and lighter ones at the target."""
         thickness, length = self._thickness, self.axis_length
-        yield from _arrows(self.frame_count - 1, length, 0.2 * thickness, 0.0)
-        yield from _arrows(self.frame_count, length, 0.42 * thickness, 0.45)
+        yield from _arrows(self.frame_count - 1, length, 0.26 * thickness, 0.0)
+        yield from _arrows(self.frame_count, length, 0.42 * thickness, 0.5)
 
 
 def _arrows(frame: int, length: float, radius: float, lightness: float) -> Iterator[Mesh]:

@@ -34,13 +34,16 @@ def import_pygame() -> ModuleType:
         import pygame
     except ImportError as error:
         raise gymnasium.error.DependencyNotInstalled(
-            'pictures need pygame-ce, which is not installed: pip install "dq-space-arm[render]"'
+            'a window needs pygame-ce, which is not installed: pip install "dq-space-arm[render]"'
         ) from error
     return pygame
 
 
 class Window:
-    """A window of the desktop. Once its user has closed it, it stays closed and the simulation goes on."""
+    """A window of the desktop, of any size that its user gives it.
+
+    Once its user has closed it, it stays closed and the simulation goes on.
+    """
 
     def __init__(self, title: str, width: int, height: int) -> None:
         """Open the window.
@@ -54,6 +57,10 @@ class Window:
             Error: If there is no display.
         """
         self._pygame = import_pygame()
+        self._title, self._size = title, (width, height)
+        self._open()
+
+    def _open(self) -> None:
         try:
             self._pygame.display.init()
         except self._pygame.error as error:
@@ -62,11 +69,16 @@ class Window:
         if driver in _INVISIBLE_DRIVERS and os.environ.get("SDL_VIDEODRIVER") != driver:
             self._pygame.display.quit()
             raise gymnasium.error.Error(_NO_DISPLAY)
-        self._window: pygame.Window | None = self._pygame.Window(title, (width, height))
+        self._window: pygame.Window | None = self._pygame.Window(self._title, self._size, resizable=True)
         self._clock = self._pygame.time.Clock()
 
+    @property
+    def is_open(self) -> bool:
+        """Whether anybody sees what is shown."""
+        return self._window is not None
+
     def show(self, image: NDArray[np.uint8], fps: float) -> None:
-        """Show a picture, and wait until it is time for the next one.
+        """Show a picture as large as the window allows, and wait until it is time for the next one.
 
         Args:
             image: Picture, shape (height, width, 3).
@@ -74,14 +86,30 @@ class Window:
         """
         if self._window is None:
             return
+        if not self._pygame.display.get_init():
+            self._open()  # Gymnasium's own environments take all windows with them when they close
         height, width, _ = image.shape
         picture = self._pygame.image.frombuffer(image.tobytes(), (width, height), "RGB")
-        self._window.get_surface().blit(picture, (0, 0))
+        surface = self._window.get_surface()
+        scale = min(surface.get_width() / width, surface.get_height() / height)
+        if scale != 1.0:
+            size = max(1, round(scale * width)), max(1, round(scale * height))
+            picture = self._pygame.transform.smoothscale(picture, size)
+        surface.fill((0, 0, 0))
+        surface.blit(picture, picture.get_rect(center=surface.get_rect().center))
         self._window.flip()
         self._clock.tick(fps)
+        self._heed_closing()
+
+    def _heed_closing(self) -> None:
+        """Close if the user wants it; other events are left to whom they concern."""
         for event in self._pygame.event.get([self._pygame.QUIT, self._pygame.WINDOWCLOSE]):
             if event.type == self._pygame.QUIT or event.window is self._window:
                 self.close()
+            elif event.window is not None:
+                self._pygame.event.post(event)
+        # Unread, these would fill the queue within minutes: a wish to close would find no room in it.
+        self._pygame.event.clear([self._pygame.MOUSEMOTION, self._pygame.FINGERMOTION])
 
     def close(self) -> None:
         """Close the window, if it is open."""

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import poses
@@ -53,6 +54,19 @@ class Faces(NamedTuple):
             All of them.
         """
         return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+class _Solids(NamedTuple):
+    """Faces, each in the frame that carries it; as in `Mesh`, without what only its pictures need."""
+
+    corners: FloatArray
+    normals: FloatArray
+    colors: FloatArray
+    frames: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> _Solids:
+        return cls(mesh.corners, mesh.normals, mesh.colors, mesh.frames)
 
 
 class Schematic:
@@ -130,7 +144,7 @@ class Schematic:
             for start, end in pairwise(centers)
             if np.linalg.norm(end - start) > 0.0
         ]
-        return self._lit(Mesh.joined(parts), np.eye(3)[None], np.zeros((1, 3)))
+        return self._lit(_Solids.of(Mesh.joined(parts)), np.eye(3)[None], np.zeros((1, 3)))
 
     def target_points(self) -> FloatArray:
         """Say where the axes of the target begin and end.
@@ -177,11 +191,13 @@ class Schematic:
         if self._scene.wrist is not None:
             yield ball(joints + 1, np.zeros(3), 1.6 * radius, JOINT_COLOR, _SIDES)
 
-    def _lit(self, mesh: Mesh, rotations: FloatArray, positions: FloatArray) -> Faces:
-        """Place a mesh and put light on it."""
-        corners, normals = mesh.placed(rotations, positions)
+    def _lit(self, solids: _Solids, rotations: FloatArray, positions: FloatArray) -> Faces:
+        """Place solids, given the rotation matrix and origin of each frame, and put light on them."""
+        rotation = rotations[solids.frames]
+        corners = solids.corners @ rotation.transpose(0, 2, 1) + positions[solids.frames][:, None]
+        normals = np.einsum("fij,fj->fi", rotation, solids.normals)
         brightness = 0.74 + 0.26 * (normals @ self._light)
-        return Faces(corners, normals, np.clip(mesh.colors * brightness[:, None], 0.0, 1.0))
+        return Faces(corners, normals, np.clip(solids.colors * brightness[:, None], 0.0, 1.0))
 
 
 def _rod(
@@ -197,7 +213,7 @@ def _rod(
     return lathe(frame, start, direction, profile, color, sides)
 
 
-def _axes(length: float, radius: float) -> Mesh:
+def _axes(length: float, radius: float) -> _Solids:
     """Arrows along x, y and z."""
     neck = length - 6.0 * radius
     profile = [(0.0, 0.0), (0.0, radius), (neck, radius), (neck, 2.5 * radius), (length, 0.0)]
@@ -208,7 +224,7 @@ def _axes(length: float, radius: float) -> Mesh:
     return _divided(Mesh.joined(arrows), 0.25 * length)
 
 
-def _divided(mesh: Mesh, longest: float) -> Mesh:
+def _divided(mesh: Mesh, longest: float) -> _Solids:
     """Cut faces until no edge is longer than given: to be sorted by depth, they have to be small."""
     corners = mesh.corners
     across = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
@@ -221,14 +237,14 @@ def _divided(mesh: Mesh, longest: float) -> Mesh:
         chosen = (cuts == (columns, rows)).all(axis=1)
         count = columns * rows
         parts.append(
-            Mesh(
+            _Solids(
                 _cut(corners[chosen], columns, rows),
                 np.repeat(mesh.normals[chosen], count, axis=0),
                 np.repeat(mesh.colors[chosen], count, axis=0),
                 np.repeat(mesh.frames[chosen], count, axis=0),
             )
         )
-    return Mesh.joined(parts)
+    return _Solids(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def _cut(corners: FloatArray, columns: int, rows: int) -> FloatArray:
