@@ -322,7 +322,8 @@ class BoxDDP:
                 progress.optimality = self._promise(progress, proposal.outcome)
             if progress.optimality <= self.tolerance and reason is not StopReason.INTERRUPTED:
                 reason, message = StopReason.CONVERGED, "no step promises to lower the cost"
-        message += f"; an undamped step promises a relative decrease of {progress.optimality:.1e}"
+        if np.isfinite(progress.optimality):
+            message += f"; an undamped step promises a relative decrease of {progress.optimality:.1e}"
         return self._collect(progress, reason, message, work.update.gains.copy())
 
     def _final_update(self, progress: Progress) -> _Proposal:

@@ -166,9 +166,9 @@ def _short(value: Any) -> str:
 
 @cache
 def _source_hash() -> str:
-    """Hash of the code that demonstrations come from: the environment's, and the experts' but for reports."""
+    """Hash of the code that demonstrations come from: environment and experts, but not what only shows."""
     digest = hashlib.sha256()
-    for package, left_out in ((dq_space_arm_env, ()), (experts, ("report",))):
+    for package, left_out in ((dq_space_arm_env, ()), (experts, ("replay", "report"))):
         folder = Path(str(package.__file__)).parent
         for path in sorted(folder.rglob("*.py")):
             if path.relative_to(folder).parts[0] not in left_out:

@@ -1,0 +1,65 @@
+// What the page was given: solids, flights and curves, out of one block of base 64.
+
+import { blendPoses, positionOf } from "./algebra.mjs";
+
+const ARRAYS = { float32: Float32Array, int8: Int8Array, uint8: Uint8Array, uint16: Uint16Array };
+
+/** Read the data of the page. */
+export function readRecording(text) {
+  const data = JSON.parse(text);
+  const letters = atob(data.blob);
+  const bytes = new Uint8Array(letters.length);
+  // Of a long flight these are tens of millions: a loop takes a tenth of a second, a callback for each seconds.
+  for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
+  const array = (place) => new ARRAYS[place.type](bytes.buffer, place.start, place.length);
+  const { solids, view } = data;
+  for (const name of ["positions", "normals", "colors", "triangles"]) solids[name] = array(solids[name]);
+  view.points = array(view.points);
+  const frameCount = solids.counts.length - 1; // the last one is the target's
+  const flights = data.flights.map(
+    (flight) => new Flight({ ...flight, frames: array(flight.frames) }, frameCount, data.scene.dt),
+  );
+  const panels = data.panels.map((panel) => ({
+    ...panel,
+    curves: panel.curves.map(array),
+    disturbed: panel.disturbed.map((place) => place && array(place)),
+  }));
+  return { scene: data.scene, solids, view, flights, panels };
+}
+
+/** A flight: its poses at any time; before its beginning the first, after its end the last. */
+export class Flight {
+  constructor(description, frameCount, dt) {
+    Object.assign(this, description); // label, steps, note, verdict, target, frames
+    this.frameCount = frameCount;
+    this.dt = dt;
+    // The target's pose comes after the robot's.
+    this.poses = new Float32Array(8 * (frameCount + 1));
+    this.poses.set(this.target, 8 * frameCount);
+  }
+
+  get duration() {
+    return this.steps * this.dt;
+  }
+
+  /** Set `poses` to those at a time, in s. */
+  moveTo(time) {
+    const place = Math.min(Math.max(time / this.dt, 0), this.steps);
+    const before = Math.min(Math.floor(place), this.steps - 1);
+    const size = 8 * this.frameCount;
+    blendPoses(this.frames, before * size, (before + 1) * size, place - before, this.frameCount, this.poses);
+  }
+
+  /** Position of the tip at an instant. */
+  tipAt(instant) {
+    return positionOf(this.frames, 8 * ((instant + 1) * this.frameCount - 1));
+  }
+
+  get tip() {
+    return positionOf(this.poses, 8 * (this.frameCount - 1));
+  }
+
+  get aim() {
+    return positionOf(this.poses, 8 * this.frameCount);
+  }
+}
