@@ -1,4 +1,5 @@
 # make paper   solve and replay the paper's maneuver: figures and table in results/paper
+# make docs    the documentation in results/docs, from docs and from schemas, docstrings and commands
 # make test    lint, type check, tests (with CI set also the slow tests, the quick numerical report, and the
 #              tests of the extras agents and ray, whose PyTorch is a download of gigabytes; they are skipped
 #              without them)
@@ -10,10 +11,13 @@ BIN := $(VENV)/bin
 COMMA := ,
 TEST := test$(if $(CI),$(COMMA)agents$(COMMA)ray)
 
-.PHONY: paper test lint lock clean
+.PHONY: paper docs test lint lock clean
 
 paper: $(VENV)/installed-plots
 	$(BIN)/python scripts/reproduce_paper.py
+
+docs: $(VENV)/installed-docs
+	$(BIN)/sphinx-build -q -W -n --keep-going -b html docs results/docs
 
 test: $(VENV)/installed-$(TEST) lint
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal $(if $(CI),-m "")

@@ -1,12 +1,12 @@
-"""The command `python -m agents.evaluate --policy ... --scene paper`.
+"""The command `python -m agents.evaluate POLICY...`, which is `dq-space-arm evaluate`.
 
 To be run, not imported: `agents.evaluate` is the function.
 """
 
 import sys
 
-from agents.evaluation.command import main
+from agents.command_line import main
 
 if __name__ != "__main__":
     raise ImportError("agents.evaluate is a command; the function is agents.evaluation.evaluate")
-sys.exit(main())
+sys.exit(main(["evaluate", *sys.argv[1:]]))

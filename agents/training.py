@@ -1,40 +1,24 @@
-"""Training from a configuration, and the command `python -m agents.train`."""
+"""Training from a configuration."""
 
-import argparse
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from rich.console import Console
 
 from agents.configuration import (
     AgentConfiguration,
     Configuration,
     ConfigurationError,
     ImitationConfiguration,
-    list_configurations,
     load_configuration,
 )
 from agents.configuration.residual import ResidualConfiguration
-from agents.progress import Advance, ProgressDisplay
-from experts.demonstrations import DemonstrationsError
-from experts.report.command import INTERRUPTED, complain, guarded
+from agents.progress import Advance
 
 if TYPE_CHECKING:
     from agents.imitation.training import Imitated
     from agents.reinforcement.training import Trained
-
-FAILURE = 1
-
-_DESCRIPTION = """Train an agent as a configuration says.
-
-The folder of the run gets the resolved configuration, commit and versions, checkpoints, curves for
-TensorBoard, the learning curve, and the policy, exported. A run that was interrupted or killed goes on at its
-last checkpoint when the same command is given again.
-Exit status: 0; 1 if the folder is for another run, or in use; 2 if the input is unusable; 130 if
-interrupted."""
 
 
 def train(
@@ -59,6 +43,7 @@ def train(
         SceneError: If its scene cannot be loaded.
         RunFolderError: If the folder is for another configuration, or another process trains there.
         ImportError: If the extra `agents` is not installed.
+        DivergedError, ValueError: If the training diverges; the last checkpoint remains.
         KeyboardInterrupt: If the user interrupts it; the last checkpoint remains.
     """
     checked = load_configuration(configuration)
@@ -105,66 +90,36 @@ def default_folder(configuration: AgentConfiguration) -> Path:
     return Path("results") / "agents" / f"{configuration.name}-{configuration.seed}"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command.
+def with_changes(
+    configuration: AgentConfiguration,
+    *,
+    seed: int | None = None,
+    total_steps: int | None = None,
+    minutes: float | None = None,
+) -> AgentConfiguration:
+    """Change what command lines may change.
 
     Args:
-        arguments: Command line without the program's name; that of the process if None.
+        configuration: Of the agent.
+        seed: In place of its own, if given.
+        total_steps: Environment steps in place of its own, if given.
+        minutes: Limit of time in place of its own, if given, min.
 
     Returns:
-        Exit status.
+        The configuration, changed.
+
+    Raises:
+        ConfigurationError: If it has no such setting, or the value cannot be used.
     """
-    options = _parse(arguments)
-    console = Console(highlight=False)
-    return guarded(lambda: _train(console, options))
-
-
-def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m agents.train",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    names = ", ".join(list_configurations())
-    parser.add_argument(
-        "--config", required=True, help=f"name of a shipped configuration ({names}), or path of a YAML file"
-    )
-    parser.add_argument("--out", type=Path, help="folder of the run (default: results/agents/<name>-<seed>)")
-    parser.add_argument("--seed", type=int, help="in place of the configuration's")
-    parser.add_argument("--total-steps", type=int, help="environment steps, in place of the configuration's")
-    parser.add_argument("--minutes", type=float, help="limit of time, in place of the configuration's")
-    return parser.parse_args(arguments)
-
-
-def _train(console: Console, options: argparse.Namespace) -> int:
-    configuration = _with_options(load_configuration(options.config), options)
-    folder = options.out or default_folder(configuration)
-    from agents.run_folder import RunFolderError
-
-    try:
-        with ProgressDisplay(console) as shown:
-            train(configuration, folder, report=shown.update)
-    except (RunFolderError, DemonstrationsError) as error:
-        complain([str(error)])
-        return FAILURE
-    except KeyboardInterrupt:
-        sentence = f"Interrupted: the same command goes on at the last checkpoint in {folder}."
-        console.print(sentence, markup=False)
-        return INTERRUPTED
-    console.print(f"{folder}: the policy is in policy.npz", markup=False)
-    return 0
-
-
-def _with_options(configuration: AgentConfiguration, options: argparse.Namespace) -> AgentConfiguration:
     content = configuration.model_dump(exclude_none=True)
-    if options.seed is not None:
-        content["seed"] = options.seed
-    for name in ("total_steps", "minutes"):
-        if getattr(options, name) is not None:
+    if seed is not None:
+        content["seed"] = seed
+    for name, value in (("total_steps", total_steps), ("minutes", minutes)):
+        if value is not None:
             if "schedule" not in content:
                 option = "--" + name.replace("_", "-")
                 raise ConfigurationError(
                     f"{option} is for reinforcement learning: {configuration.name} imitates"
                 )
-            content["schedule"][name] = getattr(options, name)
+            content["schedule"][name] = value
     return load_configuration(content)

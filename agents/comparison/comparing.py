@@ -233,7 +233,7 @@ class _Work:
         options = ["--scene", self.scene_name, "-n", str(self.n), "--controller", short]
         if name == RECEDING:
             options += ["--receding-starts", str(n)]
-        command = shlex.join(["python", "scripts/compare_agents.py", *options, "--condition"])
+        command = shlex.join(["dq-space-arm", "compare", "agents", *options, "--condition"])
         return Row(evaluation, False, planning_seconds, None, command)
 
     def _plans(

@@ -1,11 +1,12 @@
-"""The command `python -m agents.evaluate`."""
+"""`dq-space-arm evaluate`, also `python -m agents.evaluate`: policies beside the expert's optimal costs."""
 
-import argparse
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress, TaskID
@@ -17,13 +18,11 @@ from agents.evaluation.expert_costs import EVALUATION_SEEDS
 from agents.evaluation.records import evaluation_record
 from agents.evaluation.runs import groups
 from agents.evaluation.statistics import Interval
-from agents.policies import PolicyFileError
-from experts.demonstrations import DemonstrationsError
 from experts.files import write_atomically
-from experts.report.command import INTERRUPTED, complain, guarded, table_console
 from experts.report.provenance import provenance
 
-FAILURE = 1
+ALL = "all"
+"""In place of conditions: all of them."""
 _COLUMNS = (
     "policy",
     "success\n%",
@@ -38,86 +37,60 @@ _COLUMNS = (
     "training\ns",
     "expert\nsolves",
 )
-_DESCRIPTION = """Evaluate policies on the evaluation starts of a scene, beside the expert's optimal costs.
-
-The expert's costs are computed at the first use, which takes minutes, and kept in the cache folder; what is
-interrupted goes on there. Several policies that differ in their training seeds alone are also aggregated.
-Exit status: 0; 1 if the expert had to stop; 2 if the input is unusable; 130 if interrupted."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command.
+@dataclass(frozen=True)
+class Options:
+    """What to evaluate.
+
+    Attributes:
+        policies: Names of the zoo, exported policies, models of Stable-Baselines3, or folders of training
+            runs; at least one.
+        scene: Name of a shipped scene, or path of a YAML file.
+        n: Number of starts, the first ones.
+        conditions: What is changed in the scene, or `ALL`.
+        expert: Whether to compare with the expert's optimal costs.
+        workers: Processes of the expert; one per processor if None.
+        out: Folder for a JSON file for each evaluation, with episodes, if wanted.
+    """
+
+    policies: Sequence[str]
+    scene: str = "paper"
+    n: int = EVALUATION_SEEDS
+    conditions: Sequence[str] = ("training",)
+    expert: bool = True
+    workers: int | None = None
+    out: Path | None = None
+
+
+def run(console: Console, options: Options) -> list[dict[str, Any]]:
+    """Evaluate, and print a table for each condition.
+
+    The expert's costs are computed at the first use, and kept in the cache folder. Policies that differ in
+    their training seeds alone are also aggregated.
 
     Args:
-        arguments: Command line without the program's name; that of the process if None.
+        console: Where to print.
+        options: What to evaluate.
 
     Returns:
-        Exit status.
+        Summaries, JSON values.
+
+    Raises:
+        ValueError: If an option, a policy or the scene cannot be used.
+        DemonstrationsError: If the expert had to stop.
+        PolicyFileError: If a policy's file is damaged.
     """
-    options = _parse(arguments)
-    console = table_console(150)
-
-    def run() -> int:
-        try:
-            _evaluate(console, options)
-        except (DemonstrationsError, PolicyFileError) as error:
-            complain([str(error)])
-            return FAILURE
-        except KeyboardInterrupt:
-            complain(["Interrupted: what the expert has solved is kept, and the same command goes on there."])
-            return INTERRUPTED
-        return 0
-
-    return guarded(run)
-
-
-def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m agents.evaluate",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--policy",
-        nargs="+",
-        required=True,
-        help="names of the zoo, exported policies (.npz), models of Stable-Baselines3 (.zip), or folders of "
-        "training runs",
-    )
-    parser.add_argument("--scene", default="paper", help="name of a shipped scene, or path of a YAML file")
-    parser.add_argument(
-        "-n", type=int, default=EVALUATION_SEEDS, help="number of starts, the first ones (default: all 500)"
-    )
-    parser.add_argument(
-        "--condition",
-        nargs="+",
-        default=["training"],
-        choices=[*CONDITIONS, "all"],
-        help="what is changed in the scene (default: training, nothing)",
-    )
-    parser.add_argument(
-        "--no-expert", dest="expert", action="store_false", help="do without the expert's optimal costs"
-    )
-    parser.add_argument("--workers", type=int, help="processes of the expert (default: one per processor)")
-    parser.add_argument("--out", type=Path, help="folder for a JSON file for each evaluation, with episodes")
-    parser.add_argument("--json", action="store_true", help="print summaries as JSON in place of tables")
-    return parser.parse_args(arguments)
-
-
-def _evaluate(console: Console, options: argparse.Namespace) -> None:
-    conditions = CONDITIONS if "all" in options.condition else options.condition
     summaries = []
-    for condition in conditions:
-        evaluations = [_one(options, policy, condition) for policy in options.policy]
+    for condition in CONDITIONS if ALL in options.conditions else options.conditions:
+        evaluations = [_one(options, policy, condition) for policy in options.policies]
         summaries += [evaluation.summary() for evaluation in evaluations]
-        if not options.json:
-            _show(console, evaluations)
+        _show(console, evaluations)
         if options.out is not None:
             options.out.mkdir(parents=True, exist_ok=True)
             for number, evaluation in enumerate(evaluations, 1):
                 _save(options.out, number, evaluation)
-    if options.json:
-        print(json.dumps(summaries, indent=1, allow_nan=False))
+    return summaries
 
 
 def _show(console: Console, evaluations: Sequence[Evaluation]) -> None:
@@ -168,7 +141,7 @@ def remarks(evaluations: Sequence[Evaluation]) -> list[str]:
     return sentences
 
 
-def _one(options: argparse.Namespace, policy: str, condition: str) -> Evaluation:
+def _one(options: Options, policy: str, condition: str) -> Evaluation:
     with stage_bars() as show:
         return evaluate(
             policy,

@@ -122,7 +122,7 @@ def check_fit(policy: ActingPolicy, scene: Scene) -> None:
     if kind == "residual":
         raise PolicyError(
             f"{policy.label} chooses corrections of a plan rather than actions, so it cannot fly alone: "
-            "compare it by scripts/compare_residual.py"
+            "use `dq-space-arm compare residual`"
         )
     if kind not in _KINDS:
         raise PolicyError(f"{policy.label} sees {kind!r} observations, which no environment shows")

@@ -152,8 +152,8 @@ def training_command(metadata: Mapping[str, Any], policy: Path | None = None) ->
     if options is None:
         if policy is None or not (policy.parent / CONFIGURATION).is_file():
             return None
-        options = ["--config", str(policy.parent / CONFIGURATION)]
-    return shlex.join(["python", "-m", "agents.train", *options])
+        options = [str(policy.parent / CONFIGURATION)]
+    return shlex.join(["dq-space-arm", "train", *options])
 
 
 def evaluation_command(policy: Path, scene: str, n: int) -> str:
@@ -168,8 +168,8 @@ def evaluation_command(policy: Path, scene: str, n: int) -> str:
         The command.
     """
     name = policy.stem if policy.parent == SHELF else str(policy)
-    options = ["--policy", name, "--scene", scene, "-n", str(n), "--condition"]
-    return shlex.join(["python", "-m", "agents.evaluate", *options])
+    options = [name, "--scene", scene, "-n", str(n), "--condition"]
+    return shlex.join(["dq-space-arm", "evaluate", *options])
 
 
 def _shipped(configuration: Mapping[str, Any]) -> list[str] | None:
@@ -181,7 +181,7 @@ def _shipped(configuration: Mapping[str, Any]) -> list[str] | None:
         shipped = load_configuration(name).model_dump(mode="json", exclude_none=True)
     except ConfigurationError:
         return None
-    options = ["--config", str(name), "--seed", str(configuration.get("seed", 0))]
+    options = [str(name), "--seed", str(configuration.get("seed", 0))]
     here, there = configuration.get("schedule"), shipped.get("schedule")
     if isinstance(here, Mapping) and isinstance(there, Mapping):
         for key, option in _BUDGET.items():

@@ -243,13 +243,17 @@ class ExportedPolicy:
             PolicyFileError: If there is no such file, it is of another format, or its parts do not fit.
         """
         try:
-            # Read first: of a file that is no archive, NumPy would leave the descriptor open.
-            with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as content:
+            archive = io.BytesIO(Path(path).read_bytes())
+            if not zipfile.is_zipfile(archive):  # NumPy would advise to load it unsafely
+                raise ValueError("it is no archive of arrays, or not all of one")
+            with np.load(archive, allow_pickle=False) as content:
                 arrays = {name: content[name] for name in content.files}
         except _UNREADABLE as error:
             raise PolicyFileError(f"{path} cannot be read as a policy ({error})") from error
         found = arrays.get("format")
-        if found is None or found.shape != () or found != FORMAT:
+        if found is None:
+            raise PolicyFileError(f"{path} is no exported policy: it holds {', '.join(arrays) or 'nothing'}")
+        if found.shape != () or found != FORMAT:
             raise PolicyFileError(
                 f"{path} has format {found}, this version reads {FORMAT}: export the policy again"
             )

@@ -89,7 +89,7 @@ def _read(source: str) -> ExportedPolicy:
         if not path.exists():
             raise ConfigurationError(
                 f"start_from: there is no {path}; train a policy first, "
-                "python -m agents.train --config cloning-with-gains, and give its run's folder"
+                "dq-space-arm train cloning-with-gains, and give its run's folder"
             )
         return ExportedPolicy.load(path)
     except (PolicyError, PolicyFileError) as error:

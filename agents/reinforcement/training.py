@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
+from traceback import walk_tb
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +62,7 @@ def train_by_reinforcement(
         RunFolderError: If the folder is for another configuration.
         ConfigurationError: If the policy that it begins with is not there, or does not fit.
         DemonstrationsError: If the demonstrations that it learns from cannot be made or read, or do not fit.
+        DivergedError: If the network no longer gives numbers; likewise.
         KeyboardInterrupt: If the user interrupts it; the last checkpoint remains.
     """
     scene = load_scene(configuration.scene)
@@ -95,7 +97,8 @@ def train_learner(
         The trained agent.
 
     Raises:
-        KeyboardInterrupt: If the user interrupts it; the last checkpoint remains.
+        DivergedError: If the network no longer gives numbers; the last checkpoint remains.
+        KeyboardInterrupt: If the user interrupts it; likewise.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(configuration.threads)
@@ -153,6 +156,18 @@ def _learn(model: BaseAlgorithm, watcher: Watcher, configuration: Configuration)
     if left <= 0 or watcher.is_time_up:
         return
     # Stable-Baselines3 adds what it is asked for to what was done before, and counts schedules by the sum.
-    model.learn(left, callback=watcher, reset_num_timesteps=model.num_timesteps == 0)
+    try:
+        model.learn(left, callback=watcher, reset_num_timesteps=model.num_timesteps == 0)
+    except (ValueError, RuntimeError) as error:
+        if _is_refusal_of_numbers(error):
+            raise watcher.diverged() from error
+        raise
+    watcher.check_network()
     watcher.evaluate()
     watcher.write_checkpoint()
+
+
+def _is_refusal_of_numbers(error: BaseException) -> bool:
+    """Whether PyTorch's distributions refuse what a network gives, or its optimizers the size of a step."""
+    origin = [frame for frame, _ in walk_tb(error.__traceback__)][-1].f_globals.get("__name__", "")
+    return str(origin).startswith(("torch.distributions.", "torch.optim."))

@@ -6,6 +6,7 @@ from datetime import timedelta
 from time import perf_counter
 from typing import Any, NamedTuple
 
+import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -60,6 +61,10 @@ class Advance(NamedTuple):
                 f"{curve['attitude_error']:.1f} deg, {curve['position_error']:.3f} m"
             )
         return line
+
+
+class DivergedError(RuntimeError):
+    """A training has run away: its network no longer gives numbers."""
 
 
 class Watcher(BaseCallback):
@@ -130,6 +135,32 @@ class Watcher(BaseCallback):
         """
         return export_policy(self.model, self.metadata())
 
+    def check_network(self) -> None:
+        """Refuse to go on with a network that is no longer made of numbers; nothing of it is written.
+
+        Raises:
+            DivergedError: If it is not.
+        """
+        with torch.no_grad():
+            if not all(bool(torch.isfinite(weights).all()) for weights in self.model.policy.parameters()):
+                raise self.diverged()
+
+    def diverged(self) -> DivergedError:
+        """Say where a training has diverged, and what is kept.
+
+        Returns:
+            The error, to be raised.
+        """
+        last = self._folder.checkpoint()
+        kept = (
+            "there is no checkpoint yet" if last is None else f"the checkpoint at {int(last.name):,} is kept"
+        )
+        steps, rate = self.progress.environment_steps, self._configuration.algorithm.learning_rate
+        return DivergedError(
+            f"{self._folder.path}: the training has diverged before step {steps:,}, its network no longer "
+            f"gives numbers; {kept}. Let algorithm.learning_rate be smaller than {rate:g}, in another folder"
+        )
+
     def _on_step(self) -> bool:
         return not self.is_time_up
 
@@ -141,6 +172,7 @@ class Watcher(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         """Here, and only here, all that was seen has been learned from."""
+        self.check_network()
         steps, schedule = self.progress.environment_steps, self._configuration.schedule
         if steps >= self._next_evaluation:
             self._next_evaluation = _next(steps, schedule.evaluate_every)

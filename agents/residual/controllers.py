@@ -206,7 +206,7 @@ class Corrected:
         if settings is None:
             raise ValueError(
                 "policy: chooses actions rather than corrections of a plan; evaluate it by "
-                "python -m agents.evaluate"
+                "`dq-space-arm evaluate`"
             )
         kernels = compile_scene(scene)
         expected, actual = (Sight.size(kernels), kernels.n_u), (policy.n_observation, policy.n_action)

@@ -83,13 +83,13 @@ def commands(comparison: Comparison, options: Sequence[str]) -> list[str]:
 
     Args:
         comparison: The comparison.
-        options: Of scripts/compare_residual.py.
+        options: Of `dq-space-arm compare residual`.
 
     Returns:
         Those that train the policies, as far as they can be told, and the one that compares.
     """
     trained = [training_command(policy.metadata, file) for policy, file in comparison.policies.values()]
-    compare = shlex.join(["python", "scripts/compare_residual.py", *options])
+    compare = shlex.join(["dq-space-arm", "compare", "residual", *options])
     return [*(command for command in trained if command is not None), compare]
 
 

@@ -99,8 +99,7 @@ def card(name: str, policy: ExportedPolicy, record: Mapping[str, Any]) -> str:
         evaluation="\n\n".join(markdown_table(_table(record))),
         angle=f"{success['attitude_error_deg']:g}",
         distance=f"{success['position_error']:g}",
-        again=f"python -m agents.evaluate --policy {name} --scene {record['scene']} -n {starts} "
-        f"--condition {conditions}",
+        again=f"dq-space-arm evaluate {name} --scene {record['scene']} -n {starts} --condition {conditions}",
         limits="\n".join(f"- {sentence}" for sentence in _limits(record)),
     )
 

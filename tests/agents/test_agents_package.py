@@ -25,8 +25,8 @@ from agents import DQSpaceArmVecEnv
 
 
 TRAINING = """
-from agents.training import main
-sys.exit(main(["--config", "ppo", "--out", sys.argv[1]]))
+from agents.command_line import main
+sys.exit(main(["train", "ppo", "--out", sys.argv[1]]))
 """
 
 
@@ -46,7 +46,7 @@ def test_the_command_names_what_is_missing_in_a_sentence(tmp_path):
     code = WITHOUT_THE_EXTRA.partition("import agents")[0] + TRAINING
     done = run(code, str(tmp_path / "run"))
     assert done.returncode == 2
-    assert re.fullmatch(r'training needs \w+: pip install "dq-space-arm\[agents\]"\n', done.stderr)
+    assert re.fullmatch(r'Error: training needs \w+: pip install "dq-space-arm\[agents\]"\n', done.stderr)
     assert not (tmp_path / "run").exists()
 
 

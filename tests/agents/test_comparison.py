@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from agents import compare
+from agents.command_line.comparing import compare as compare_verb
+from agents.command_line.learning import evaluate as evaluate_verb
 from agents.comparison import CONTROLLERS
 from agents.comparison.comparing import Comparison
 from agents.comparison.controllers import FEEDBACK, OPEN_LOOP, RECEDING
@@ -268,32 +270,28 @@ def test_commands_make_the_rows_again(comparison):
     """Each command names what it is for, and is one that the programs understand."""
     found = [shlex.split(command) for command in commands(comparison)]
     assert len(found) == len(CONTROLLERS) + 3
-    script = load_script()
-    from agents.evaluation.command import _parse as parse_evaluation
-
     for words in found:
-        parse = script._parse if words[1].startswith("scripts/") else parse_evaluation
-        options = parse(words[2:] if words[1].startswith("scripts/") else words[3:])
-        assert options.condition == ["training", "heavy_payload"]
-        assert options.n == N
+        comparing = words[1] == "compare"
+        command = compare_verb.default if comparing else evaluate_verb.default
+        options = command.make_context("test", words[3:] if comparing else words[2:]).params
+        assert options["conditions"] == ("training", "heavy_payload")
+        assert options["n"] == N
     receding = next(words for words in found if "receding" in words)
     assert receding[receding.index("--receding-starts") + 1] == "3"
 
 
 def test_the_training_command_is_the_shortest_that_gives_the_configuration(tmp_path):
     shipped = load_configuration("ppo").model_dump(mode="json", exclude_none=True)
-    assert training_command({"configuration": {**shipped, "seed": 3}}) == (
-        "python -m agents.train --config ppo --seed 3"
-    )
+    assert training_command({"configuration": {**shipped, "seed": 3}}) == ("dq-space-arm train ppo --seed 3")
     longer = {**shipped, "schedule": {**shipped["schedule"], "total_steps": 9}}
     assert training_command({"configuration": longer}) == (
-        f"python -m agents.train --config ppo --seed {shipped['seed']} --total-steps 9"
+        f"dq-space-arm train ppo --seed {shipped['seed']} --total-steps 9"
     )
     changed = {**shipped, "network": {**shipped["network"], "hidden": [3]}}
     assert training_command({"configuration": changed}) is None
     (tmp_path / "config.yaml").touch()
     assert training_command({"configuration": changed}, tmp_path / "policy.npz") == (
-        f"python -m agents.train --config {tmp_path / 'config.yaml'}"
+        f"dq-space-arm train {tmp_path / 'config.yaml'}"
     )
     assert training_command({}) is None
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from agents import evaluate
+from agents.command_line import main
 from agents.evaluation import (
     CONDITIONS,
     EVALUATION_SEEDS,
@@ -18,7 +19,7 @@ from agents.evaluation import (
     optimal_costs,
     scene_under,
 )
-from agents.evaluation.command import main, remarks
+from agents.evaluation.command import remarks
 from agents.evaluation.conditions import physics_hash
 from agents.evaluation.policies import PolicyError, as_policy
 from agents.evaluation.records import evaluation_of, evaluation_record
@@ -339,7 +340,7 @@ def test_a_policy_of_another_scene_is_refused_in_a_sentence(tmp_path):
     policy = exported(agent="stub", scene="paper")
     with pytest.raises(PolicyError, match="stub turns 24 numbers into 12 inputs, as it was trained"):
         evaluate(policy, QUICK, 3, expert=False)
-    with pytest.raises(PolicyError, match=r"cannot fly alone: compare it by scripts/compare_residual\.py"):
+    with pytest.raises(PolicyError, match=r"cannot fly alone: use `dq-space-arm compare residual`"):
         evaluate(exported(agent="stub", observation="residual"), SHORT, 3, expert=False)
     with pytest.raises(PolicyError, match="scene 'short' shows 24 and has 12"):
         evaluate(exported(n_observation=31), SHORT, 3, expert=False)
@@ -380,7 +381,10 @@ def test_the_command_prints_json_for_programs(tmp_path, capsys):
     exported(agent="stub").save(tmp_path / "policy.npz")
     SHORT.to_yaml(tmp_path / "short.yaml")
     arguments = ["--policy", str(tmp_path / "policy.npz"), "--scene", str(tmp_path / "short.yaml")]
-    assert main([*arguments, "-n", "3", "--no-expert", "--json", "--condition", "training", "spin"]) == 0
+    assert (
+        main(["evaluate", *arguments, "-n", "3", "--no-expert", "--json", "--condition", "training", "spin"])
+        == 0
+    )
     summaries = json.loads(capsys.readouterr().out)
     assert [summary["condition"] for summary in summaries] == ["training", "spin"]
     assert summaries[0]["success_rate"][0] == 0.0
@@ -394,7 +398,7 @@ def test_the_command_writes_a_table_and_every_episode(tmp_path, capsys):
     SHORT.to_yaml(tmp_path / "short.yaml")
     policies = [str(tmp_path / f"{number}.npz") for number in range(4)]
     arguments = ["--policy", *policies, "--scene", str(tmp_path / "short.yaml")]
-    assert main([*arguments, "-n", "4", "--no-expert", "--out", str(tmp_path / "out")]) == 0
+    assert main(["evaluate", *arguments, "-n", "4", "--no-expert", "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
     assert "Scene short, 4 episodes" in printed
     assert "stub, 3 runs (seeds 0, 1, 2): success 0.0 % [0.0, 0.0]" in printed
@@ -405,13 +409,13 @@ def test_the_command_writes_a_table_and_every_episode(tmp_path, capsys):
 
 
 def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
-    assert main(["--policy", str(tmp_path / "policy.npz"), "--no-expert"]) == 2
+    assert main(["evaluate", str(tmp_path / "policy.npz"), "--no-expert"]) == 2
     assert "there is no such file or folder" in capsys.readouterr().err
     (tmp_path / "damaged.npz").write_bytes(b"nothing")
-    assert main(["--policy", str(tmp_path / "damaged.npz"), "--no-expert"]) == 1
+    assert main(["evaluate", "--policy", str(tmp_path / "damaged.npz"), "--no-expert"]) == 1
     assert "cannot be read as a policy" in capsys.readouterr().err
-    assert main(["--policy", "nobody", "--no-expert"]) == 2
+    assert main(["evaluate", "--policy", "nobody", "--no-expert"]) == 2
     assert "the zoo has no policy 'nobody'" in capsys.readouterr().err
     exported().save(tmp_path / "policy.npz")
-    assert main(["--policy", str(tmp_path / "policy.npz"), "--no-expert", "-n", "501"]) == 2
+    assert main(["evaluate", "--policy", str(tmp_path / "policy.npz"), "--no-expert", "-n", "501"]) == 2
     assert "should be from 1 to 500" in capsys.readouterr().err

@@ -162,7 +162,7 @@ def rewritten(path, **changes):
     ("changes", "message"),
     [
         ({"format": np.array(99)}, "has format 99, this version reads 1: export the policy again"),
-        ({"format": None}, "has format None"),
+        ({"format": None}, "is no exported policy: it holds"),
         ({"bias_1": None}, "is no policy: it has no bias_1"),
         ({"weight_2": np.zeros((8, 4))}, r"is no policy: weight_2: shape \(8, 4\), should be \(8, 3\)"),
         ({"metadata": np.array("[1]")}, "is no policy: metadata: should be names with values"),

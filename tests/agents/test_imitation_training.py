@@ -10,9 +10,10 @@ pytest.importorskip("tensorboard")
 
 import agents  # noqa: E402
 from agents import ExportedPolicy  # noqa: E402
+from agents.command_line import main  # noqa: E402
 from agents.imitation.progress import TrainingAdvance  # noqa: E402
 from agents.run_folder import RunFolderError  # noqa: E402
-from agents.training import main, train  # noqa: E402
+from agents.training import train  # noqa: E402
 from agents.validation import validate, validation_seeds  # noqa: E402
 
 pytestmark = pytest.mark.agents
@@ -137,12 +138,12 @@ def test_the_command_trains_and_refuses(settings, tmp_path, capsys):
     path = tmp_path / "small.yaml"
     content = settings("cloning", algorithm={"name": "cloning", "optimization": {"updates": 5, **STEPS}})
     path.write_text(json.dumps(content))  # JSON is YAML
-    assert main(["--config", str(path), "--out", str(tmp_path / "run"), "--seed", "3"]) == 0
+    assert main(["train", "--config", str(path), "--out", str(tmp_path / "run"), "--seed", "3"]) == 0
     assert "policy.npz" in capsys.readouterr().out
     assert ExportedPolicy.load(tmp_path / "run" / "policy.npz").metadata["configuration"]["seed"] == 3
-    assert main(["--config", str(path), "--minutes", "3"]) == 2
+    assert main(["train", "--config", str(path), "--minutes", "3"]) == 2
     assert "--minutes is for reinforcement learning" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
     path.write_text(json.dumps({**content, "demonstrations": {"folder": str(tmp_path / "empty")}}))
-    assert main(["--config", str(path), "--out", str(tmp_path / "other")]) == 1
+    assert main(["train", "--config", str(path), "--out", str(tmp_path / "other")]) == 1
     assert "holds no demonstrations" in capsys.readouterr().err

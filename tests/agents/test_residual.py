@@ -1,13 +1,13 @@
 """Corrections of plans: without one the plan flies, with one it is bounded, and what is learned is kept."""
 
-import importlib.util
 import json
 import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from agents.command_line import main
+from agents.command_line.comparing import residual
 from agents.comparison.controllers import FEEDBACK, OPEN_LOOP, RECEDING
 from agents.configuration import ConfigurationError, load_configuration
 from agents.configuration.residual import Mismatch, ResidualConfiguration
@@ -303,7 +303,7 @@ def test_the_table_says_what_it_shows(comparison):
     assert [row[2] for row in made.rows[:4]] == ["24", "24", "24", "3"]
     again = commands(comparison, ["-n", "24"])
     text = markdown(comparison, again)
-    for sentence in [*notes(comparison), "python scripts/compare_residual.py -n 24"]:
+    for sentence in [*notes(comparison), "dq-space-arm compare residual -n 24"]:
         assert sentence in text
     assert any("flies the first 3 starts" in sentence for sentence in notes(comparison))
     json.dumps(record(comparison, again), allow_nan=False)
@@ -320,24 +320,27 @@ def test_the_figure_has_a_mark_for_each_row(comparison):
         assert len(marks) == len(comparison.rows)
 
 
-def load_script():
-    path = Path(__file__).parents[2] / "scripts" / "compare_residual.py"
-    spec = importlib.util.spec_from_file_location("compare_residual", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_script_writes_table_record_and_picture(small_scene, tmp_path, capsys, monkeypatch):
+def test_the_command_writes_table_record_and_picture(small_scene, tmp_path, capsys, monkeypatch):
     pytest.importorskip("matplotlib")
     small_scene.to_yaml(tmp_path / "small.yaml")
     run, out = write_correction(tmp_path / RUN, small_scene), tmp_path / "out"
-    arguments = ["--policy", str(run), "--scene", str(tmp_path / "small.yaml"), "-n", "3", "--workers", "1"]
+    arguments = [
+        "compare",
+        "residual",
+        str(run),
+        "--scene",
+        str(tmp_path / "small.yaml"),
+        "-n",
+        "3",
+        "--workers",
+        "1",
+    ]
     arguments += ["--condition", "as-planned", "small-pushes", "--tolerance-scale", "1", "--out", str(out)]
-    assert load_script().main(arguments) == 0
-    (command,) = [line for line in capsys.readouterr().out.splitlines() if "compare_residual.py" in line]
-    again = load_script()._parse(shlex.split(command)[2:])
-    assert (again.policy, again.n, again.condition) == ([str(run)], 3, ["as-planned", "small-pushes"])
+    assert main(arguments) == 0
+    (command,) = [line for line in capsys.readouterr().out.splitlines() if "dq-space-arm" in line]
+    again = residual.make_context("test", shlex.split(command)[3:]).params
+    assert (again["policies"], again["n"]) == ((str(run),), 3)
+    assert again["conditions"] == ("as-planned", "small-pushes")
     assert {path.name for path in out.iterdir()} == {
         "plans-small-3-1",
         "rows",
@@ -353,18 +356,17 @@ def test_the_script_writes_table_record_and_picture(small_scene, tmp_path, capsy
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt
 
-    script = load_script()
-    monkeypatch.setattr(script, "compare_under_mismatch", interrupt)
-    assert script.main(arguments) == 130
+    monkeypatch.setattr("agents.residual.command.compare_under_mismatch", interrupt)
+    assert main(arguments) == 130
     assert "what is finished is kept" in capsys.readouterr().err
 
 
-def test_the_script_refuses_before_it_plans(small_scene, tmp_path, capsys):
+def test_the_command_refuses_before_it_plans(small_scene, tmp_path, capsys):
     out = ["--out", str(tmp_path / "out")]
-    assert load_script().main(["--policy", str(tmp_path / "nothing.npz"), *out]) == 2
+    assert main(["compare", "residual", str(tmp_path / "nothing.npz"), *out]) == 2
     assert "there is no such file or folder" in capsys.readouterr().err
     run = write_correction(tmp_path / RUN, small_scene)
-    assert load_script().main(["--policy", str(run), *out]) == 2
+    assert main(["compare", "residual", str(run), *out]) == 2
     assert "corrects scene 'small'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert list(read_corrections([run, run / "policy.npz"], small_scene)) == [f"{RUN} (1)", f"{RUN} (2)"]

@@ -109,9 +109,16 @@ def test_the_script_writes_numbers_and_pictures(exported, tmp_path, capsys):
     assert "the zoo has no policy 'nobody'" in capsys.readouterr().err
 
 
-@pytest.mark.render
+def test_without_pillow_a_gif_is_refused_before_anything_flies(exported, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("agents.showing.command.find_spec", lambda name: None)
+    out = tmp_path / "out"
+    options = ["--gif", str(tmp_path / "flight.gif"), "--out", str(out)]
+    assert load_script().main(["--policy", str(exported), *options]) == 2
+    assert 'pip install "dq-space-arm[plots]"' in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
+
+
 def test_the_script_draws_the_flight(exported, tmp_path):
-    pytest.importorskip("pygame")
     image = pytest.importorskip("PIL.Image")
     options = ["--no-picture", "--out", str(tmp_path), "--gif", str(tmp_path / "flight.gif")]
     assert load_script().main(["--policy", str(exported), *options]) == 1

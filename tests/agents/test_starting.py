@@ -158,7 +158,7 @@ def test_policies_that_do_not_fit_are_refused(start, scene_file):
     assert "network.activation is tanh there and relu here" in refusal(
         network={"hidden": list(HIDDEN), "activation": "relu"}
     )
-    assert "python -m agents.train --config cloning-with-gains" in refusal(start_from="nowhere/policy.npz")
+    assert "dq-space-arm train cloning-with-gains" in refusal(start_from="nowhere/policy.npz")
     assert "the zoo has no policy 'nowhere'" in refusal(start_from="nowhere")
     with pytest.raises(ConfigurationError, match="is for PPO, not for SAC"):
         configuration(start, scene_file, algorithm={"name": "SAC"})

@@ -17,14 +17,16 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import agents
 from agents import DQSpaceArmVecEnv, ExportedPolicy, evaluate
+from agents.command_line import main
 from agents.configuration import ConfigurationError, load_configuration
 from agents.evaluation.policies import as_policy
 from agents.reinforcement.building import load_to_act, make_environment, make_learner
 from agents.reinforcement.checkpoints import read_checkpoint
 from agents.reinforcement.export import export_policy
 from agents.reinforcement.held_actions import HeldActions
+from agents.reinforcement.watching import DivergedError
 from agents.run_folder import RunFolder, RunFolderError, reserved
-from agents.training import main, train
+from agents.training import train
 from dq_space_arm_env import load_scene
 
 pytestmark = pytest.mark.agents
@@ -406,11 +408,11 @@ def test_the_command_trains_and_names_what_is_wrong(scene_file, tmp_path, capsys
     path, out = tmp_path / "ppo.yaml", str(tmp_path / "run")
     content = configuration("PPO", scene_file).model_dump(mode="json", exclude_none=True)
     path.write_text(json.dumps(content))  # JSON is YAML
-    assert main(["--config", str(path), "--out", out, "--total-steps", "800"]) == 0
-    assert "800 of 800 steps" in capsys.readouterr().out
-    assert main(["--config", str(path), "--out", out, "--seed", "5"]) == 1
+    assert main(["train", "--config", str(path), "--out", out, "--total-steps", "800"]) == 0
+    assert "800 of 800 steps" in capsys.readouterr().err
+    assert main(["train", "--config", str(path), "--out", out, "--seed", "5"]) == 1
     assert "seed is 0 there and 5 here" in capsys.readouterr().err
-    assert main(["--config", "pppo", "--out", out]) == 2
+    assert main(["train", "pppo", "--out", out]) == 2
     assert "did you mean 'ppo'" in capsys.readouterr().err
 
 
@@ -420,3 +422,31 @@ def test_commands_are_not_imported_in_place_of_functions():
             __import__(name)
     assert callable(agents.train)
     assert callable(agents.evaluate)
+
+
+@pytest.mark.parametrize(("algorithm", "rate"), [("PPO", 1e3), ("PPO", 1e38), ("TD3", 1e38)])
+def test_a_training_that_diverges_ends_in_one_sentence(algorithm, rate, scene_file, tmp_path, monkeypatch):
+    monkeypatch.setitem(ALGORITHMS, algorithm, {**ALGORITHMS[algorithm], "learning_rate": rate})
+    with pytest.raises(DivergedError, match=r"has diverged before step .*learning_rate be smaller than 1"):
+        train(configuration(algorithm, scene_file), tmp_path)
+    assert not (tmp_path / "policy.npz").exists()
+
+
+def test_a_network_of_no_numbers_is_not_kept(scene_file, tmp_path, monkeypatch):
+    """What was written before stays: one checkpoint, in which all weights are numbers."""
+    learn = PPO.train
+
+    def spoil(self):
+        learn(self)
+        if self.num_timesteps * REPEAT >= 2400:
+            next(self.policy.mlp_extractor.value_net.parameters()).data.fill_(np.nan)
+
+    monkeypatch.setattr(PPO, "train", spoil)
+    checked = configuration("PPO", scene_file)
+    with pytest.raises(DivergedError, match=r"the checkpoint at 1,600 is kept"):
+        train(checked, tmp_path)
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [f"{1600:012d}"]
+    model, _ = read_checkpoint(
+        RunFolder(tmp_path, checked).checkpoint(), checked, make_environment(checked, load_scene(scene_file))
+    )
+    assert all(torch.isfinite(weights).all() for weights in model.policy.parameters())

@@ -106,7 +106,7 @@ def test_a_policy_is_added_with_its_evaluation_and_card(cache, shipped, tmp_path
         "my-stub",
         conditions=("training", "spin"),
         n=5,
-        training="python -m agents.train --config mine.yaml",
+        training="dq-space-arm train mine.yaml",
         shelf=shelf,
         executor=SerialExecutor(),
     )
@@ -115,11 +115,11 @@ def test_a_policy_is_added_with_its_evaluation_and_card(cache, shipped, tmp_path
     policy = ExportedPolicy.load(shelf / "my-stub.npz")
     text = written.read_text()
     assert text == card("my-stub", policy, record)
-    assert "python -m agents.train --config mine.yaml" in text
+    assert "dq-space-arm train mine.yaml" in text
     assert "It knows nothing." in text
     assert record["sha256"] in text
     assert "It misses the target in 100.0 % of the flights even as trained." in text
-    assert "--policy my-stub --scene quick -n 5 --condition training spin" in text
+    assert "dq-space-arm evaluate my-stub --scene quick -n 5 --condition training spin" in text
     evaluation = evaluate(run, QUICK, 5, executor=SerialExecutor())
     assert record["is_success"] == evaluation.flights.is_success.tolist()
     assert record["evaluations"][0]["median_cost"] == pytest.approx(

@@ -1,21 +1,21 @@
 """Demonstrations as a Minari data set: what a user of Minari gets, and that nobody ever sees half of it."""
 
 import fcntl
-import importlib.util
 import os
 import re
 import shutil
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 
+from agents.command_line import main
 from experts.demonstrations import Demonstrations, DemonstrationsError, export_to_minari, minari_export
 
 minari = pytest.importorskip("minari")
@@ -23,7 +23,6 @@ pytest.importorskip("h5py")
 
 ID = "space-arm/quick/expert-v0"
 STAGING = ".space-arm-quick-expert-v0.part"
-SCRIPT = Path(__file__).parents[2] / "scripts" / "export_demonstrations.py"
 
 
 @pytest.fixture
@@ -274,29 +273,23 @@ def test_without_minari_there_is_a_sentence(
     assert not root.exists()
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("export_demonstrations", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def run(arguments: Sequence[str]) -> int:
+    return main(["demonstrations", "export", *arguments])
 
 
 def test_the_script_exports_with_a_data_card(
-    script: ModuleType, whole: Demonstrations, root: Path, capsys: pytest.CaptureFixture[str]
+    whole: Demonstrations, root: Path, capsys: pytest.CaptureFixture[str]
 ):
     arguments = [str(whole.path), ID, "--author", "Ada", "--no-gains"]
-    assert script.main(arguments) == 0
+    assert run(arguments) == 0
     assert f"{ID}: 18 episodes" in capsys.readouterr().out
     dataset = minari.load_dataset(ID)
     assert dataset.storage.metadata["author"] == {"Ada"}
     card = (root / ID / "README.md").read_text(encoding="utf-8")
     assert f'minari.load_dataset("{ID}")' in card
-    assert script.main(arguments) == 1
+    assert run(arguments) == 1
     assert "already" in capsys.readouterr().err
-    assert script.main([*arguments, "--overwrite"]) == 0
-    assert script.main([str(whole.path), "quick"]) == 2
-    assert script.main([str(root), ID]) == 1
+    assert run([*arguments, "--overwrite"]) == 0
+    assert run([str(whole.path), "quick"]) == 2
+    assert run([str(root), ID]) == 1
     assert "holds no demonstrations" in " ".join(capsys.readouterr().err.split())

@@ -1,16 +1,16 @@
 """The summary of a data set: the page shows its numbers and failures, and the card follows from the data."""
 
-import importlib.util
 import json
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
+from agents.command_line import main
 from dq_space_arm_env import Scene
 from experts import generate_demonstrations, load_demonstrations
 from experts.demonstrations import Demonstrations, SerialExecutor, shard
@@ -18,8 +18,6 @@ from experts.demonstrations.columns import SUMMARIES, TRAJECTORIES
 from experts.report.demonstrations import Facts, data_card, gather, tables, write_summary
 from experts.report.demonstrations.card import MEANINGS
 from experts.report.demonstrations.sections import sections, shortcomings
-
-SCRIPT = Path(__file__).parents[2] / "scripts" / "generate_demonstrations.py"
 
 
 @pytest.fixture(scope="module")
@@ -193,17 +191,11 @@ def test_what_the_card_tells_to_do_works(
     assert names["deviations"].shape == (1, 12)
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("generate_demonstrations", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def run(arguments: Sequence[str]) -> int:
+    return main(["demonstrations", "generate", *arguments])
 
 
-def test_the_script_writes_it_unless_told_not_to(script: ModuleType, quick_scene: Scene, tmp_path: Path):
+def test_the_script_writes_it_unless_told_not_to(quick_scene: Scene, tmp_path: Path):
     quick_scene.to_yaml(tmp_path / "quick.yaml")
     arguments = [
         "--scene",
@@ -215,8 +207,8 @@ def test_the_script_writes_it_unless_told_not_to(script: ModuleType, quick_scene
         "--out",
         str(tmp_path / "data"),
     ]
-    assert script.main([*arguments, "--no-summary"]) == 0
+    assert run([*arguments, "--no-summary"]) == 0
     assert not (tmp_path / "data" / "summary").exists()
-    assert script.main(arguments) == 0
+    assert run(arguments) == 0
     assert (tmp_path / "data" / "summary" / "summary.html").is_file()
     assert (tmp_path / "data" / "README.md").is_file()

@@ -1,18 +1,19 @@
 """The report on one page: what HTML and Markdown hold, and how the script ends."""
 
-import importlib.util
 import json
 import re
 from base64 import b64decode
+from collections.abc import Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
+from agents.command_line import main
 from experts.report.command import INACCURATE, INTERRUPTED, SUCCESS
+from experts.report.page import command
 from experts.report.page.parts import AGREEMENT, PARTS, Announce, disagreements
 from experts.report.page.rendering import html_page, markdown_page
 from experts.report.page.sections import Figure, Section, printed
@@ -22,7 +23,6 @@ from experts.report.throughput.agreement import ACCELERATIONS, ANGLES, Agreement
 from experts.report.throughput.kernels import VECTOR
 from experts.report.throughput.timing import OURS
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "report.py"
 PNG = b"\x89PNG made up"
 TABLE = TextTable("A <title>\nexplained", ("", "m | s", "two\nlines"), (("a & b", "1", "2"),), right=1)
 
@@ -46,14 +46,8 @@ def origin() -> dict[str, Any]:
     return provenance()
 
 
-@pytest.fixture
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("report", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def run(arguments: Sequence[str]) -> int:
+    return main(["report", *arguments])
 
 
 class Tags(HTMLParser):
@@ -100,6 +94,17 @@ def test_html_is_well_formed_and_needs_no_other_file(origin: dict[str, Any]) -> 
     for value in (origin["machine"]["processor_name"], f"numpy {origin['versions']['numpy']}"):
         assert value in page
     assert "as accurate as declared" in page
+
+
+def test_numbers_are_not_broken_at_their_hyphen(origin: dict[str, Any]) -> None:
+    table = TextTable("A title", ("case", "error"), (("masses 1e-6 to 1e6 apart", "2.5e-16"),), right=1)
+    page = html_page([replace(section(), tables=[table])], origin)
+    assert '<td>masses <span class="number">1e-6</span> to 1e6 apart</td>' in page
+    assert '<td class="right"><span class="number">2.5e-16</span></td>' in page
+
+
+def test_html_fits_a_narrow_screen(origin: dict[str, Any]) -> None:
+    assert '<meta name="viewport" content="width=device-width, initial-scale=1">' in html_page([], origin)
 
 
 def test_markdown_tables_have_a_cell_for_each_column(origin: dict[str, Any]) -> None:
@@ -149,7 +154,7 @@ def test_other_engines_must_agree_with_ours_in_double_precision() -> None:
 
 
 def test_script_writes_both_pages_and_fails_on_what_is_inaccurate(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked = []
 
@@ -158,9 +163,9 @@ def test_script_writes_both_pages_and_fails_on_what_is_inaccurate(
         asked.append(quick)
         return section()
 
-    monkeypatch.setattr(script, "PARTS", {"part": part})
+    monkeypatch.setattr(command, "PARTS", {"part": part})
     out = tmp_path / "deep" / "out"
-    assert script.main(["--quick", "--out", str(out)]) == SUCCESS
+    assert run(["--quick", "--out", str(out)]) == SUCCESS
     assert sorted(file.name for file in out.iterdir()) == [
         "made_up.png",
         "part.json",
@@ -169,27 +174,28 @@ def test_script_writes_both_pages_and_fails_on_what_is_inaccurate(
     ]
     assert (out / "made_up.png").read_bytes() == PNG
     bad = replace(section(), shortcomings=["Something is off."])
-    monkeypatch.setattr(script, "PARTS", {"part": lambda quick, announce: bad})
-    assert script.main(["--out", str(out)]) == INACCURATE
+    monkeypatch.setattr(command, "PARTS", {"part": lambda quick, announce: bad})
+    assert run(["--out", str(out)]) == INACCURATE
     assert "Something is off." in capsys.readouterr().err
     assert asked == [True]
 
 
-def test_an_interrupt_keeps_the_parts_before_it(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_keeps_the_parts_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*, quick: bool, announce: Announce) -> Section:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(script, "PARTS", {"part": lambda quick, announce: section(), "next": interrupted})
-    assert script.main(["--out", str(tmp_path)]) == INTERRUPTED
+    monkeypatch.setattr(command, "PARTS", {"part": lambda quick, announce: section(), "next": interrupted})
+    assert run(["--out", str(tmp_path)]) == INTERRUPTED
     assert "What &lt;is&gt; seen" in (tmp_path / "report.html").read_text()
     assert json.loads((tmp_path / "part.json").read_text())["measured"] == 1.5
 
 
-def test_every_part_is_an_option(script: ModuleType) -> None:
+def test_every_part_is_an_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(command, "run", lambda destination, *, parts, quick: asked.append(parts))
     for name in PARTS:
-        assert script._parse(["--part", name]).part == [name]
+        assert run(["--part", name]) == SUCCESS
+    assert asked == [(name,) for name in PARTS]
 
 
 @pytest.mark.slow

@@ -1,27 +1,26 @@
 """What scenes leave out: sizes, operations, imports, and programs that are there or not; never how long."""
 
 import dataclasses
-import importlib.util
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 from rich.console import Console
 
+from agents.command_line import main
 from dq_space_arm_env import Scene, compile_scene, list_scenes, load_scene
 from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.kernels.environment_programs import EnvironmentPrograms
 from dq_space_arm_env.kernels.programs import ScenePrograms
 from experts.report import to_json
 from experts.report.command import INTERRUPTED, SUCCESS, UNUSABLE
-from experts.report.scene_cost import measurement
+from experts.report.scene_cost import command, measurement
 from experts.report.scene_cost.measurement import (
     OUTPUTS,
     Effort,
@@ -38,7 +37,6 @@ from experts.report.scene_cost.tables import tables
 from experts.report.throughput import timing
 from experts.report.throughput.features import feature_variants
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "scene_cost.py"
 SHORT = Effort(("paper",), timing.Effort((1,), 1, 1e-4), compilations=1, processes=1)
 
 
@@ -281,24 +279,20 @@ def test_figure_is_a_png_with_bars_and_units(report: SceneCostReport) -> None:
         assert all(bar.get_hatch() for bar in time_bars)
 
 
-@pytest.fixture
-def script(report: SceneCostReport, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The script with measurements that are there already."""
-    spec = importlib.util.spec_from_file_location("scene_cost", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    monkeypatch.setattr(module, "measure", lambda effort, scenes: report)
-    return module
+@pytest.fixture(autouse=True)
+def measured(report: SceneCostReport, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measurements are there already."""
+    monkeypatch.setattr(command, "measure", lambda effort, scenes: report)
 
 
-def test_script_writes_record_and_picture(
-    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def run(arguments: Sequence[str]) -> int:
+    return main(["report", "scene-cost", *arguments])
+
+
+def test_script_writes_record_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "deep" / "out"
-    assert script.main(["--quick", "--out", str(out)]) == SUCCESS
+    assert run(["--quick", "--out", str(out)]) == SUCCESS
     record = json.loads((out / "scene_cost.json").read_text(encoding="utf-8"))
     assert {"scenes", "features", "outputs", "processes", "installation"} <= set(record)
     assert record["machine"]["processor_name"]
@@ -309,20 +303,19 @@ def test_script_writes_record_and_picture(
 
 
 def test_script_measures_the_scenes_that_are_named(
-    script: ModuleType,
     report: SceneCostReport,
     short_scene: Scene,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[Any] = []
-    monkeypatch.setattr(script, "measure", lambda *arguments: asked.append(arguments) or report)
+    monkeypatch.setattr(command, "measure", lambda *arguments: asked.append(arguments) or report)
     file = tmp_path / "short.yaml"
     file.write_text(short_scene.to_yaml())
     out = tmp_path / "out"
     common = ["--no-picture", "--out", str(out)]
-    assert script.main(["--scene", str(file), "--scene", "planar", *common]) == SUCCESS
-    assert script.main(common) == SUCCESS
+    assert run(["--scene", str(file), "--scene", "planar", *common]) == SUCCESS
+    assert run(common) == SUCCESS
     assert asked == [
         (measurement.FULL, {"short": short_scene, "planar": load_scene("planar")}),
         (measurement.FULL, None),
@@ -330,20 +323,16 @@ def test_script_measures_the_scenes_that_are_named(
     assert [file.name for file in out.iterdir()] == ["scene_cost.json"]
 
 
-def test_script_refuses_an_unknown_scene(
-    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert script.main(["--scene", "no such scene", "--out", str(tmp_path / "out")]) == UNUSABLE
+def test_script_refuses_an_unknown_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--scene", "no such scene", "--out", str(tmp_path / "out")]) == UNUSABLE
     assert "no such scene" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_an_interrupt_saves_nothing(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_saves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(script, "measure", interrupted)
-    assert script.main(["--out", str(tmp_path)]) == INTERRUPTED
+    monkeypatch.setattr(command, "measure", interrupted)
+    assert run(["--out", str(tmp_path)]) == INTERRUPTED
     assert not list(tmp_path.iterdir())

@@ -68,8 +68,22 @@ def test_without_installation_the_sources_say_what_is_required(folder: Path) -> 
     base, *extras = measure_installation()
     assert base.distributions == {NAME: 7, "numpy": 11}
     assert "gymnasium" in base.missing
-    assert [size.extra for size in extras] == ["agents", "minari", "plots", "ray", "render", "test"]
+    assert [size.extra for size in extras] == ["agents", "docs", "minari", "plots", "ray", "render", "test"]
     assert "stable-baselines3" in extras[0].missing
+
+
+def test_own_bytes_are_those_of_the_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(installation, "_root", lambda: tmp_path)
+    for place in (
+        "agents/a.py",
+        "configs/agents/b.yaml",
+        "configs/scenes/c.yaml",
+        "experts/__pycache__/d.nbc",
+        "tests/e.py",
+    ):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).write_bytes(bytes(5))
+    assert installation._own_bytes() == 15
 
 
 def test_nothing_is_known_without_installation_and_sources(

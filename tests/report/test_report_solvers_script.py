@@ -1,34 +1,26 @@
 """The script that measures the expert: what it writes, how it ends."""
 
-import importlib.util
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
+from agents.command_line import main
 from dq_space_arm_env import Scene
 from experts.report.command import INTERRUPTED, UNUSABLE
-from experts.report.solvers import benchmark
+from experts.report.solvers import benchmark, command
 from experts.report.solvers.effort import PARTS, QUICK, Effort
 from experts.report.solvers.ours import GUIDED, TITLES
 from experts.report.solvers.random_starts import RandomStart, StartSolve
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "benchmark_expert.py"
 SHORT = replace(QUICK, piece_repeats=1, horizons=(10,), compared_starts=0, starts=1)
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("benchmark_expert", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def run(arguments: Sequence[str]) -> int:
+    return main(["report", "expert", *arguments])
 
 
 @pytest.fixture
@@ -47,10 +39,10 @@ def numbers(value: Any) -> Iterator[float | None]:
         yield value
 
 
-def test_script_writes_record_and_picture(script: ModuleType, scene_file: str, tmp_path: Path) -> None:
+def test_script_writes_record_and_picture(scene_file: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "deep" / "out"
-    assert script.main(["--quick", "--scene", scene_file, "--out", str(out)]) == 0
+    assert run(["--quick", "--scene", scene_file, "--out", str(out)]) == 0
     record = json.loads((out / "expert.json").read_text(encoding="utf-8"))
     assert record["interrupted"] is False
     assert [costs["integrator"] for costs in record["iterations"]] == ["symplectic_euler", "rk4"]
@@ -77,11 +69,11 @@ def test_script_writes_record_and_picture(script: ModuleType, scene_file: str, t
 
 @pytest.mark.parametrize("part", PARTS)
 def test_parts_are_measured_alone(
-    script: ModuleType, scene_file: str, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene_file: str, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(script, "QUICK", SHORT)
+    monkeypatch.setattr(command, "QUICK", SHORT)
     arguments = ["--quick", "--part", part, "--scene", scene_file, "--out", str(tmp_path), "--no-picture"]
-    assert script.main(arguments) == 0
+    assert run(arguments) == 0
     record = json.loads((tmp_path / "expert.json").read_text(encoding="utf-8"))
     measured = ("iterations", "time_to_accuracy", "random_starts", "receding_horizon")
     assert [bool(record[name]) for name in measured] == [name == part for name in PARTS]
@@ -89,7 +81,6 @@ def test_parts_are_measured_alone(
 
 
 def test_an_interrupt_keeps_what_is_done(
-    script: ModuleType,
     scene_file: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -101,7 +92,7 @@ def test_an_interrupt_keeps_what_is_done(
 
     monkeypatch.setattr(benchmark, "solve_random_starts", interrupted)
     arguments = ["--quick", "--part", "starts", "--part", "horizon", "--scene", scene_file]
-    assert script.main([*arguments, "--out", str(tmp_path)]) == INTERRUPTED
+    assert run([*arguments, "--out", str(tmp_path)]) == INTERRUPTED
     record = json.loads((tmp_path / "expert.json").read_text(encoding="utf-8"))
     assert record["interrupted"] is True
     assert len(record["random_starts"][0]["starts"]) == 1
@@ -120,34 +111,34 @@ def test_an_interrupt_keeps_what_is_done(
     ],
 )
 def test_unusable_input_is_one_sentence(
-    script: ModuleType,
     arguments: list[str],
     sentence: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "out"
-    assert script.main([*arguments, "--out", str(out)]) == UNUSABLE
+    assert run([*arguments, "--out", str(out)]) == UNUSABLE
     assert sentence in capsys.readouterr().err
     assert not out.exists()
 
 
 def test_a_scene_without_limits_is_refused_before_anything_is_measured(
-    script: ModuleType, spread_scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    spread_scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "unlimited.yaml"
     actuators = {"base_torque": {"limit": float("inf")}}
     file.write_text(spread_scene.replace(actuators=actuators).to_yaml())
-    assert script.main(["--quick", "--scene", str(file), "--out", str(tmp_path / "out")]) == UNUSABLE
+    assert run(["--quick", "--scene", str(file), "--out", str(tmp_path / "out")]) == UNUSABLE
     assert "no finite limit" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
 
 
-def test_efforts_follow_the_options(script: ModuleType) -> None:
+def test_efforts_follow_the_options(monkeypatch: pytest.MonkeyPatch) -> None:
     def effort(*arguments: str) -> Effort:
-        found = script._effort(script._parse(arguments))
-        assert isinstance(found, Effort)
-        return found
+        asked: list[Effort] = []
+        monkeypatch.setattr(command, "run", lambda destination, effort, **_: asked.append(effort))
+        assert run(arguments) == 0
+        return asked[0]
 
     assert effort() == Effort()
     assert effort("--starts", "7", "--slow-peers", "--no-peers") == replace(

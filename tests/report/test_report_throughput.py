@@ -1,24 +1,25 @@
 """The benchmark: rows are there and positive, results agree where they are timed; never how fast they are."""
 
-import importlib.util
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 
 import gymnasium
 import numpy as np
 import pytest
 from rich.console import Console
 
-from dq_space_arm_env import Scene, compile_scene
+from agents.command_line import main
+from dq_space_arm_env import Scene, compile_scene, list_scenes
 from experts.report import to_json
 from experts.report.command import UNUSABLE
 from experts.report.integrators import COMPARED_INTEGRATORS
 from experts.report.peak import Peak
+from experts.report.throughput import command
 from experts.report.throughput import timing as timing_module
 from experts.report.throughput.environments import MAKE, MAKE_VEC, UNWRAPPED, single_case, vector_case
 from experts.report.throughput.kernels import SCALAR, VECTOR
@@ -44,7 +45,6 @@ from experts.report.throughput.timing import (
 )
 from experts.report.throughput.variants import PLAIN, VARIANTS, Variant
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "benchmark_throughput.py"
 SHORT = Effort(batch_sizes=(1, 5), repeats=2, sample_seconds=1e-4)
 PEAKS = {FLOAT64: Peak(FLOAT64, 8, 12, 100.0), FLOAT32: Peak(FLOAT32, 16, 12, 200.0)}
 
@@ -292,25 +292,19 @@ def test_picture_shows_engines_as_lines_whose_names_do_not_overlap(result: Scene
         assert all(below.y1 <= above.y0 for below, above in pairwise(boxes))
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("benchmark_throughput", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def run(arguments: Sequence[str]) -> int:
+    return main(["report", "throughput", *arguments])
 
 
 def test_script_writes_record_and_picture(
-    script: ModuleType, short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(script, "QUICK", replace(SHORT, repeats=1))
+    monkeypatch.setattr(command, "QUICK", replace(SHORT, repeats=1))
     scene = tmp_path / "short.yaml"
     scene.write_text(short_scene.to_yaml())
     out = tmp_path / "out"
-    assert script.main(["--quick", "--features", "--scene", str(scene), "--out", str(out)]) == 0
+    assert run(["--quick", "--features", "--scene", str(scene), "--out", str(out)]) == 0
     record = json.loads((out / "throughput.json").read_text(encoding="utf-8"))
     assert [result["scene"] for result in record["scenes"]] == ["short"]
     assert [cost["title"] for cost in record["scene_costs"]] == ["short"]
@@ -323,9 +317,7 @@ def test_script_writes_record_and_picture(
     assert (out / "throughput.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_script_compares_all_shipped_scenes(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_script_compares_all_shipped_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[list[str]] = []
 
     def measure_costs(scenes: dict[str, Scene], *_: object, **__: object) -> list[object]:
@@ -333,17 +325,15 @@ def test_script_compares_all_shipped_scenes(
         raise ValueError("enough")
 
     empty = SceneThroughput("short", "rk4", 0.01, [], [], [], [])
-    monkeypatch.setattr(script, "measure_peak", lambda repeats: PEAKS)
-    monkeypatch.setattr(script, "measure_scene", lambda scene, effort: empty)
-    monkeypatch.setattr(script, "print_scene", lambda *_: None)
-    monkeypatch.setattr(script, "measure_costs", measure_costs)
-    assert script.main(["--all-scenes", "--out", str(tmp_path)]) == UNUSABLE
-    assert asked == [["paper", *(name for name in script.list_scenes() if name != "paper")]]
+    monkeypatch.setattr(command, "measure_peak", lambda repeats: PEAKS)
+    monkeypatch.setattr(command, "measure_scene", lambda scene, effort: empty)
+    monkeypatch.setattr(command, "print_scene", lambda *_: None)
+    monkeypatch.setattr(command, "measure_costs", measure_costs)
+    assert run(["--all-scenes", "--out", str(tmp_path)]) == UNUSABLE
+    assert asked == [["paper", *(name for name in list_scenes() if name != "paper")]]
 
 
-def test_script_refuses_an_unknown_scene(
-    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert script.main(["--scene", "no such scene", "--out", str(tmp_path / "out")]) == UNUSABLE
+def test_script_refuses_an_unknown_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--scene", "no such scene", "--out", str(tmp_path / "out")]) == UNUSABLE
     assert "no such scene" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

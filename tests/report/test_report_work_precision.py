@@ -385,7 +385,7 @@ def test_the_integrator_of_each_scene_follows_from_the_errors(name: str) -> None
 def test_missing_packages_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     module = "experts.report.work_precision.benchmark.find_spec"
     monkeypatch.setattr(module, lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match="pip install scipy mpmath"):
+    with pytest.raises(ModuleNotFoundError, match=r"scipy and mpmath: pip install .dq-space-arm\[test\]"):
         measure(SHORT)
 
 

@@ -1,33 +1,29 @@
 """The script that measures error against run time: what it writes, how it ends."""
 
-import importlib.util
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
+from agents.command_line import main
 from dq_space_arm_env.integrators import INTEGRATORS
 from experts.report.command import INACCURATE, INTERRUPTED, UNUSABLE
-from experts.report.work_precision import benchmark
+from experts.report.work_precision import benchmark, command
 from experts.report.work_precision.effort import QUICK
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "work_precision.py"
 
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("work_precision", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+@pytest.fixture(autouse=True)
+def little(monkeypatch: pytest.MonkeyPatch) -> None:
     timing = replace(QUICK.timing, repeats=1)
-    module.__dict__["QUICK"] = replace(QUICK, duration=1.0, most_steps=400, states=2, timing=timing)
-    return module
+    quick = replace(QUICK, duration=1.0, most_steps=400, states=2, timing=timing)
+    monkeypatch.setattr(command, "QUICK", quick)
+
+
+def run(arguments: Sequence[str]) -> int:
+    return main(["report", "work-precision", *arguments])
 
 
 def numbers(value: Any) -> Iterator[float | None]:
@@ -40,14 +36,14 @@ def numbers(value: Any) -> Iterator[float | None]:
 
 
 @pytest.mark.slow
-def test_script_writes_record_and_picture(script: ModuleType, tmp_path: Path) -> None:
+def test_script_writes_record_and_picture(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "deep" / "out"
     arguments = ["--quick", "--case", "body", "--case", "maneuver", "--case", "formulations"]
     names = ["rk4", "paper_projected"]
     for name in names:
         arguments += ["--integrator", name]
-    assert script.main([*arguments, "--out", str(out)]) == 0
+    assert run([*arguments, "--out", str(out)]) == 0
     record = json.loads((out / "work_precision.json").read_text(encoding="utf-8"))
     body, maneuver = record["cases"]
     assert [method["method"] for method in body["methods"]] == ["rk4"]
@@ -68,28 +64,29 @@ def test_script_writes_record_and_picture(script: ModuleType, tmp_path: Path) ->
     assert (out / "work_precision.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_every_integrator_is_an_option(script: ModuleType) -> None:
+def test_every_integrator_is_an_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(command, "run", lambda destination, *, integrators, **_: asked.append(integrators))
     for name in INTEGRATORS:
-        assert script._parse(["--integrator", name]).integrator == [name]
+        assert run(["--integrator", name]) == 0
+    assert asked == [(name,) for name in INTEGRATORS]
 
 
 @pytest.mark.slow
 def test_what_is_less_accurate_than_declared_fails(
-    script: ModuleType,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(benchmark, "LIMITS", {"float64": 1e-30, "float32": 1.0})
     arguments = ["--quick", "--case", "formulations", "--out", str(tmp_path), "--no-picture"]
-    assert script.main(arguments) == INACCURATE
+    assert run(arguments) == INACCURATE
     assert "minimal coordinates in float64: relative error" in capsys.readouterr().err
     assert len(json.loads((tmp_path / "work_precision.json").read_text())["shortcomings"]) == 5
     assert not (tmp_path / "work_precision.png").exists()
 
 
 def test_an_interrupt_and_a_missing_package_end_in_one_sentence(
-    script: ModuleType,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -99,9 +96,9 @@ def test_an_interrupt_and_a_missing_package_end_in_one_sentence(
 
     arguments = ["--quick", "--case", "formulations", "--out", str(tmp_path)]
     monkeypatch.setattr(benchmark, "measure_formulations", interrupted)
-    assert script.main(arguments) == INTERRUPTED
-    assert "nothing is saved" in capsys.readouterr().out
+    assert run(arguments) == INTERRUPTED
+    assert "nothing is saved" in capsys.readouterr().err
     monkeypatch.setattr(benchmark, "find_spec", lambda name: None)
-    assert script.main(arguments) == UNUSABLE
-    assert "not installed" in capsys.readouterr().err
+    assert run(arguments) == UNUSABLE
+    assert 'pip install "dq-space-arm[test]"' in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

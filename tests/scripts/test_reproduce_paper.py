@@ -1,19 +1,19 @@
 """The script as a user runs it: files, numbers, exit status; honesty about a solve that did not end well."""
 
-import importlib.util
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
+from agents.command_line import main
 from dq_space_arm_env import load_scene
 from experts import Solution
-from experts.report import SolveProgress
+from experts.report import SolveProgress, reproduction
 
 pytest.importorskip("matplotlib")
 
@@ -46,14 +46,8 @@ simulation: {dt: 0.05, steps: 60}
 """
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("reproduce_paper", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def run(arguments: Sequence[str]) -> int:
+    return main(["report", "paper", *arguments])
 
 
 @pytest.fixture
@@ -94,36 +88,36 @@ def test_a_user_gets_every_file_and_the_right_numbers(scene_file: Path) -> None:
 
 
 def test_no_color_is_respected_on_a_terminal(
-    script: ModuleType, scene_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    scene_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("NO_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm-256color")
-    assert script.main(["--scene", str(scene_file), "--out", str(scene_file.parent), "--no-figures"]) == 0
+    assert run(["--scene", str(scene_file), "--out", str(scene_file.parent), "--no-figures"]) == 0
     output = capsys.readouterr().out
     assert "\x1b[2K" in output  # the line of progress is rewritten
     assert "\x1b[3" not in output
     assert "\x1b[9" not in output
 
 
-def test_no_figures(script: ModuleType, scene_file: Path, tmp_path: Path) -> None:
+def test_no_figures(scene_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "deep" / "out"
-    assert script.main(["--scene", str(scene_file), "--out", str(out), "--no-figures"]) == 0
+    assert run(["--scene", str(scene_file), "--out", str(out), "--no-figures"]) == 0
     assert names(out) == DATA
 
 
-def test_integrator_is_in_the_saved_scene(script: ModuleType, scene_file: Path, tmp_path: Path) -> None:
+def test_integrator_is_in_the_saved_scene(scene_file: Path, tmp_path: Path) -> None:
     arguments = ["--scene", str(scene_file), "--out", str(tmp_path), "--integrator", "symplectic_euler"]
-    assert script.main([*arguments, "--no-figures"]) == 0
+    assert run([*arguments, "--no-figures"]) == 0
     assert load_scene(tmp_path / "scene.yaml").simulation.integrator == "symplectic_euler"
     assert load_scene(tmp_path / "scene.yaml").simulation.steps == 60
 
 
 def test_unconverged_solve_is_reported_and_fails(
-    script: ModuleType, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    status = script.main(["--scene", str(scene_file), "--out", str(out), "--max-iterations", "2"])
+    status = run(["--scene", str(scene_file), "--out", str(out), "--max-iterations", "2"])
     assert status == 1
     assert names(out) == DATA | FIGURES
     assert "NOT CONVERGED" in capsys.readouterr().out
@@ -132,7 +126,6 @@ def test_unconverged_solve_is_reported_and_fails(
 
 
 def test_interrupted_solve_saves_the_best_so_far(
-    script: ModuleType,
     scene_file: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -147,7 +140,7 @@ def test_interrupted_solve_saves_the_best_so_far(
 
     monkeypatch.setattr(SolveProgress, "update", interrupt)
     out = tmp_path / "out"
-    assert script.main(["--scene", str(scene_file), "--out", str(out), "--no-figures"]) == 130
+    assert run(["--scene", str(scene_file), "--out", str(out), "--no-figures"]) == 130
     assert "INTERRUPTED after 3 iterations" in capsys.readouterr().out
     solution = Solution.load(out / "solution.npz")
     assert solution.stop_reason == "interrupted"
@@ -157,14 +150,14 @@ def test_interrupted_solve_saves_the_best_so_far(
 
 
 def test_interrupt_before_the_solve_saves_nothing(
-    script: ModuleType, scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(script, "run_maneuver", interrupt)
+    monkeypatch.setattr(reproduction, "run_maneuver", interrupt)
     out = tmp_path / "out"
-    assert script.main(["--scene", str(scene_file), "--out", str(out)]) == 130
+    assert run(["--scene", str(scene_file), "--out", str(out)]) == 130
     assert names(out) == set()
 
 
@@ -179,41 +172,39 @@ def test_interrupt_before_the_solve_saves_nothing(
 def test_unusable_input_is_one_sentence(
     arguments: list[str],
     sentence: str,
-    script: ModuleType,
     scene_file: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     defaults = ["--scene", str(scene_file), "--out", str(tmp_path)]
-    assert script.main([*defaults, *arguments]) == 2
+    assert run([*defaults, *arguments]) == 2
     assert sentence in capsys.readouterr().err
 
 
 def test_scene_that_the_environment_refuses(
-    script: ModuleType, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene_file.write_text(SCENE.replace("{limit: 2}", "{limit: .inf}"))
-    assert script.main(["--scene", str(scene_file), "--out", str(tmp_path)]) == 2
+    assert run(["--scene", str(scene_file), "--out", str(tmp_path)]) == 2
     assert "give each actuator a finite limit" in " ".join(capsys.readouterr().err.split())
 
 
 def test_missing_matplotlib_is_told_before_the_solve(
-    script: ModuleType,
     scene_file: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(script, "find_spec", lambda name: None)
+    monkeypatch.setattr(reproduction, "find_spec", lambda name: None)
     arguments = ["--scene", str(scene_file), "--out", str(tmp_path / "out")]
-    assert script.main(arguments) == 2
+    assert run(arguments) == 2
     assert 'pip install "dq-space-arm[plots]"' in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
-    assert script.main([*arguments, "--no-figures"]) == 0
+    assert run([*arguments, "--no-figures"]) == 0
 
 
 def test_diverged_solve_draws_nothing_and_says_so(
-    script: ModuleType, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # At this rate and with this step, the explicit integration of a stiff spring blows up.
     stiff = (
@@ -221,7 +212,7 @@ def test_diverged_solve_draws_nothing_and_says_so(
     )
     scene_file.write_text(stiff)
     out = tmp_path / "out"
-    assert script.main(["--scene", str(scene_file), "--out", str(out)]) == 1
+    assert run(["--scene", str(scene_file), "--out", str(out)]) == 1
     assert "DIVERGED" in capsys.readouterr().out
     assert names(out) == DATA
     summary = json.loads((out / "summary.json").read_text())

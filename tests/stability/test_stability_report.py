@@ -1,17 +1,17 @@
 """Rows, references, the function that hands payloads over, the script, and what of them can fail."""
 
-import importlib.util
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from agents.command_line import main
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.algebra import rotations
 from dq_space_arm_env.dynamics.capture import Velocities, capture
@@ -40,8 +40,6 @@ from experts.report.stability.rows import Handled, NotClaimed, Refused, refusal
 from experts.report.stability.scenes import sprung_inertia, sprung_joint
 from experts.report.stability.stiff_joints import LIMITS, STIFF_METHODS, rate_left, stiff_arm, swing
 from experts.report.stability.tables import failures, print_rows, summary
-
-SCRIPT = Path(__file__).parents[2] / "scripts" / "stability.py"
 
 
 def row_of(outcome: object, bound: float = 1.0) -> Row:
@@ -270,19 +268,13 @@ def test_tables_and_record_show_every_row() -> None:
     assert found["counts"] == {"handled": 1, "refused": 1, "not claimed": 0, "failed": 1}
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("stability_script", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def run(arguments: Sequence[str]) -> int:
+    return main(["report", "stability", *arguments])
 
 
-def test_script_writes_record_and_picture(script: ModuleType, tmp_path: Path) -> None:
+def test_script_writes_record_and_picture(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    assert script.main(["--group", "stiff joints", "--out", str(tmp_path)]) == SUCCESS
+    assert run(["--group", "stiff joints", "--out", str(tmp_path)]) == SUCCESS
     found = json.loads((tmp_path / "stability.json").read_text(encoding="utf-8"))
     assert {row["group"] for row in found["rows"]} == {"stiff joints"}
     assert found["counts"]["failed"] == 0
@@ -290,18 +282,14 @@ def test_script_writes_record_and_picture(script: ModuleType, tmp_path: Path) ->
     assert (tmp_path / "stability.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_script_fails_with_a_case(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_script_fails_with_a_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import experts.report.stability as package
 
     monkeypatch.setattr(package, "run_cases", lambda *_: [row_of(Handled(2.0))])
-    assert script.main(["--no-picture", "--out", str(tmp_path)]) == INACCURATE
+    assert run(["--no-picture", "--out", str(tmp_path)]) == INACCURATE
     assert not (tmp_path / "stability.png").exists()
 
 
-def test_script_refuses_an_unknown_group(
-    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert script.main(["--group", "mass", "--out", str(tmp_path / "out")]) == UNUSABLE
+def test_script_refuses_an_unknown_group(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--group", "mass", "--out", str(tmp_path / "out")]) == UNUSABLE
     assert "there are masses" in capsys.readouterr().err

@@ -5,6 +5,6 @@ try:
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError('figures need matplotlib: pip install "dq-space-arm[plots]"') from error
 
-from experts.report.figures.writing import write_figures, write_readme_picture
+from experts.report.figures.writing import write_figures, write_maneuver_figures, write_readme_picture
 
-__all__ = ["write_figures", "write_readme_picture"]
+__all__ = ["write_figures", "write_maneuver_figures", "write_readme_picture"]

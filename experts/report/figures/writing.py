@@ -1,7 +1,7 @@
 """The figures of a run as files."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -27,6 +27,9 @@ _README_SIZE = (8.0, 3.5)  # inches
 _README_DOTS = 200
 
 
+Draw = Callable[[], Figure | None]
+
+
 def write_figures(run: ManeuverRun, folder: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
     """Write Figures 2 to 6 and the convergence of the solver.
 
@@ -38,15 +41,32 @@ def write_figures(run: ManeuverRun, folder: Path, formats: Sequence[str] = ("png
     Returns:
         The files; figures of actuators that the scene does not have are left out.
     """
-    maneuver = run.maneuver
-    figures: dict[str, Callable[[], Figure | None]] = {
+    convergence: dict[str, Draw] = {"convergence": lambda: convergence_figure(run)}
+    return write_maneuver_figures(run.maneuver, folder, formats) + _write(convergence, folder, formats)
+
+
+def write_maneuver_figures(maneuver: Maneuver, folder: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
+    """Write Figures 2 to 6.
+
+    Args:
+        maneuver: A maneuver with a finite trajectory.
+        folder: An existing folder.
+        formats: File formats: "png", "pdf", or any other that matplotlib has.
+
+    Returns:
+        The files; figures of actuators that the scene does not have are left out.
+    """
+    figures: dict[str, Draw] = {
         "figure-2-snapshots": lambda: figure_2(maneuver),
         "figure-3-pose-error": lambda: figure_3(maneuver),
         "figure-4-error-norms": lambda: figure_4(maneuver),
         "figure-5-base-inputs": lambda: figure_5(maneuver),
         "figure-6-arm-inputs": lambda: figure_6(maneuver),
-        "convergence": lambda: convergence_figure(run),
     }
+    return _write(figures, folder, formats)
+
+
+def _write(figures: Mapping[str, Draw], folder: Path, formats: Sequence[str]) -> list[Path]:
     files = []
     with house_style():
         for name, draw in figures.items():

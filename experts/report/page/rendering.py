@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -41,6 +42,7 @@ th { border-bottom: 1px solid #111; vertical-align: bottom; white-space: pre-lin
 th, td { padding: 0.15rem 0.7rem; text-align: left; }
 tr:nth-child(even) td { background: #f4f4f4; }
 .right { text-align: right; font-variant-numeric: tabular-nums; }
+.number { white-space: nowrap; }
 .wide, pre { overflow-x: auto; }
 pre { font-size: 0.75rem; line-height: 1.3; }
 figure { margin: 1.5rem 0; }
@@ -72,6 +74,7 @@ def html_page(sections: Sequence[Section], origin: Mapping[str, Any], heading: H
         HTML text.
     """
     lines = ["<!DOCTYPE html>", '<html lang="en">', "<head>", '<meta charset="utf-8">']
+    lines.append('<meta name="viewport" content="width=device-width, initial-scale=1">')
     lines += [f"<title>{escape(heading.title)}</title>", f"<style>{_STYLE}</style>", "</head>", "<body>"]
     lines.append(f"<h1>{escape(heading.title)}</h1>")
     lines += _html_table(origin_table(origin))
@@ -172,7 +175,9 @@ def _html_cells(tag: str, cells: Sequence[str], right: int | None) -> str:
     written = []
     for index, cell in enumerate(cells):
         style = ' class="right"' if right is not None and index >= right else ""
-        written.append(f"<{tag}{style}>{escape(cell)}</{tag}>")
+        # Browsers break lines at a hyphen, that of 1e-06 too.
+        whole = re.sub(r"\d[\d.]*e-\d+", r'<span class="number">\g<0></span>', escape(cell))
+        written.append(f"<{tag}{style}>{whole}</{tag}>")
     return "".join(written)
 
 

@@ -16,7 +16,7 @@ import dq_space_arm_env
 
 NAME = "dq-space-arm"
 BASE = ""
-_SOURCES = ("agents", "configs/scenes", "dq_space_arm_env", "experts")
+_SOURCES = ("agents", "configs/agents", "configs/scenes", "dq_space_arm_env", "experts")
 # A requirement: name, extras in brackets, version, and after a semicolon when it holds.
 _REQUIREMENT = re.compile(r"([\w.-]+)\s*(?:\[([^]]*)\])?[^;]*(?:;(.*))?")
 _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
@@ -103,7 +103,7 @@ def _own_bytes() -> int:
     """This package; its sources are counted, for an editable installation lists none of them."""
     folders = (_root() / name for name in _SOURCES)
     files = (path for folder in folders for path in folder.rglob("*"))
-    return sum(path.stat().st_size for path in files if path.is_file() and path.suffix != ".pyc")
+    return sum(path.stat().st_size for path in files if path.is_file() and path.parent.name != "__pycache__")
 
 
 def _parsed(text: str) -> _Requirement:

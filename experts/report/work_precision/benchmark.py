@@ -91,7 +91,7 @@ def check_packages() -> None:
     missing = [name for name in ("scipy", "mpmath") if find_spec(name) is None]
     if missing:
         raise ModuleNotFoundError(
-            f"the references need {' and '.join(missing)}, not installed (pip install {' '.join(missing)})"
+            f'the references need {" and ".join(missing)}: pip install "dq-space-arm[test]"'
         )
 
 

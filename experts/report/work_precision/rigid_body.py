@@ -9,7 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import mpmath
+try:
+    import mpmath
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError('the references need mpmath: pip install "dq-space-arm[test]"') from error
 
 Number = Any  # an mpmath number
 _TURN_PER_EXPANSION = 0.25  # rad; the series converge to about 1.5 rad

@@ -1,0 +1,74 @@
+"""Solve a scene's maneuver and draw it as a GIF, as the environment's render mode "rgb_array" shows it.
+
+Exit status: 0; 2 if the input is unusable; 130 if interrupted.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from dq_space_arm_env import load_scene
+from dq_space_arm_env.environment.picture_format import PictureFormat
+from experts import BoxDDP
+from experts.files import write_atomically
+from experts.report.animation import check_gif, draw_maneuver, encode_gif
+from experts.report.command import SUCCESS, guarded
+from experts.report.maneuver import Maneuver
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the script.
+
+    Args:
+        arguments: Command line without the program's name; that of the process if None.
+
+    Returns:
+        Exit status.
+    """
+    options = _parse(arguments)
+    return guarded(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    config = {key: value for key, value in vars(options).items() if key in ("azimuth", "elevation")}
+    picture = PictureFormat.checked(options.width, options.height, config)
+    check_gif(options.fps, options.hold, options.colors)
+    scene = load_scene(options.scene)
+    solution = BoxDDP(scene).solve()
+    maneuver = Maneuver(scene, solution.states, solution.controls)
+    pictures = draw_maneuver(maneuver, picture, options.fps, options.seconds)
+    content = encode_gif(pictures, options.fps, options.hold, options.colors)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(options.out, content)
+    verdict = "converged" if solution.converged else f"NOT CONVERGED: {solution.message}"
+    Console(highlight=False).print(
+        f"{options.out}: {len(pictures)} pictures, {len(content) / 1e6:.2f} MB; the solution has {verdict}",
+        markup=False,
+        soft_wrap=True,
+    )
+    return SUCCESS
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument("--scene", default="paper", help="name of a shipped scene, or path of a YAML file")
+    parser.add_argument("--out", type=Path, default=Path("results/maneuver.gif"), help="the file")
+    parser.add_argument("--width", type=int, default=640, help="pixels")
+    parser.add_argument("--height", type=int, default=400, help="pixels")
+    parser.add_argument("--fps", type=float, default=16.0, help="pictures per second")
+    parser.add_argument("--seconds", type=float, default=7.0, help="of the maneuver, in real time")
+    parser.add_argument("--hold", type=float, default=2.0, help="seconds for which the last picture stays")
+    parser.add_argument("--colors", type=int, default=240, help="of the palette, 2 to 255")
+    own = argparse.SUPPRESS  # what is not given is the scene's choice
+    parser.add_argument("--azimuth", type=float, default=own, help="direction of view about z from x, deg")
+    parser.add_argument("--elevation", type=float, default=own, help="of the direction, negative: down, deg")
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

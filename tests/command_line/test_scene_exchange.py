@@ -1,0 +1,181 @@
+"""`scenes import` and `scenes export`: what they write can be flown, and mistakes are told in options."""
+
+import json
+import re
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+import click
+import pytest
+
+from agents.command_line import main
+from agents.command_line.names import PartOf
+from agents.command_line.verb import SUCCESS, UNUSABLE
+from dq_space_arm_env import load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
+
+ARM = str(Path(__file__).parents[2] / "scripts" / "examples" / "small-arm.urdf")
+CARRIED = ["--spacecraft-mass", "80", "--spacecraft-inertia", "8", "8", "6"]
+SPACECRAFT = {"mass": 80, "inertia": [8, 8, 6]}
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_an_imported_file_is_the_scene_with_comments(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenes", "import", ARM, "--tip", "hand", *CARRIED]) == SUCCESS
+    printed = capsys.readouterr().out
+    assert load_scene("small-arm.yaml") == scene_from_urdf(ARM, "hand", spacecraft=SPACECRAFT)
+    assert "# mass of the base, kg" in (here / "small-arm.yaml").read_text(encoding="utf-8")
+    for part in (
+        "upper arm 4 kg",
+        "base    80 kg\n",
+        "joints 2 N m",
+        "34.4 degrees and 0.415 m",
+        "solve small-",
+    ):
+        assert part in printed
+    assert main(["scenes", "validate", "small-arm.yaml"]) == SUCCESS
+
+
+def test_every_argument_has_an_option(here: Path) -> None:
+    options = ["--base-force", "0", "--base-torque", "3", "--passive", "elbow", "--joint-torque", "7"]
+    words = ["--name", "mine", "--out", "deep/mine.yaml", *options, *CARRIED]
+    assert main(["scenes", "import", ARM, "--tip", "forearm", "--base", "mount", *words]) == SUCCESS
+    expected = scene_from_urdf(
+        ARM,
+        "forearm",
+        "mount",
+        name="mine",
+        spacecraft=SPACECRAFT,
+        base_force=None,
+        base_torque=3,
+        joint_torque=7,
+        passive=["elbow"],
+    )
+    assert load_scene("deep/mine.yaml") == expected
+
+
+def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["scenes", "import", ARM, "--tip", "hand", *CARRIED]
+    (here / "small-arm.yaml").write_text("mine")
+    assert main(words) == UNUSABLE
+    assert "small-arm.yaml exists: give another name, or --force" in capsys.readouterr().err
+    assert (here / "small-arm.yaml").read_text() == "mine"
+    assert main([*words, "--force", "--json"]) == SUCCESS
+    record = json.loads(capsys.readouterr().out)
+    assert record["links"] == ["upper arm", "forearm"]
+    assert record["start_attitude_error_deg"] == pytest.approx(34.3775, abs=1e-4)
+    assert record["warnings"] == []
+    assert load_scene("small-arm.yaml").name == "small arm"
+    assert main([*words, "--out", "arm.txt"]) == UNUSABLE
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            [ARM],
+            "--tip LINK is missing, .* links at the end of .*small-arm.urdf are hand; the others mount, ",
+        ),
+        ([ARM, "--tip", "hnd"], "--tip: 'hnd' is no link of 'small arm'; did you mean 'hand'"),
+        ([ARM, "--tip", "elbow"], "it is a joint, which carries link 'forearm'"),
+        ([ARM, "--tip", "hand"], "give the spacecraft .*, --spacecraft-mass and --spacecraft-inertia$"),
+        ([ARM, "--tip", "hand", "--spacecraft-mass", "80"], "--spacecraft-inertia need each other"),
+        ([ARM, "--tip", "hand", *CARRIED, "--passive", "j"], "--passive: 'j' is no joint .* shoulder, elbow"),
+        ([ARM, "--tip", "hand", *CARRIED, "--joint-torque", "0"], "--joint-torque = 0.0: must be a number"),
+        ([ARM, "--tip", "mount", "--base", "hand"], "choose link '.*', or one above it, as --base$"),
+        (["nowhere.urdf", "--tip", "hand"], "nowhere.urdf cannot be read: No such file"),
+        (["nowhere.urdf"], "nowhere.urdf cannot be read: No such file"),
+        ([".", "--tip", "hand"], "cannot be read: Is a directory"),
+    ],
+)
+def test_mistakes_are_told_in_options(
+    words: list[str], sentence: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["scenes", "import", *words, "--out", "arm.yaml"]) == UNUSABLE
+    message = capsys.readouterr().err.partition(" (see ")[0].strip()
+    assert re.search(sentence, message)
+    assert not (here / "arm.yaml").exists()
+
+
+def test_warnings_and_the_options_that_help(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = Path(ARM).read_text(encoding="utf-8")
+    finger = '<joint name="f" type="revolute"><parent link="forearm"/><child link="finger"/></joint>'
+    body = text[text.index("<inertial>") : text.index("</inertial>") + len("</inertial>")]
+    text = text.replace("</robot>", f'{finger}<link name="finger">{body}</link></robot>')
+    text = text.replace('<limit effort="2" velocity="1"/>', '<dynamics friction="1"/>')
+    Path("gripper.urdf").write_text(text, encoding="utf-8")
+    words = ["scenes", "import", "gripper.urdf", "--tip", "hand", *CARRIED]
+    assert main(words) == UNUSABLE
+    assert "a scene has no branches: --lock-branches holds such joints" in capsys.readouterr().err
+    assert main([*words, "--lock-branches"]) == UNUSABLE
+    message = capsys.readouterr().err
+    assert "no effort limit for joint elbow: give --joint-torque, N m, for all joints without one" in message
+    assert "or name those without a motor with --passive" in message
+    assert main([*words, "--lock-branches", "--joint-torque", "1"]) == SUCCESS
+    assert "Warning: Coulomb friction of elbow is left out" in capsys.readouterr().err
+    assert load_scene("gripper.yaml").links[1].mass == 6.0
+
+
+@pytest.mark.parametrize("name", ["no-wrist", "paper", "payload"])
+def test_export_writes_the_robot(name: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = load_scene(name)
+    assert main(["scenes", "export", name, "--wrist", "fixed"]) == SUCCESS
+    text = capsys.readouterr().out
+    assert text == scene_to_urdf(scene, wrist="fixed")
+    words = ["scenes", "export", name, "--format", "mjcf", "--wrist", "fixed", "--out", "deep/robot.xml"]
+    assert main(words) == SUCCESS
+    assert Path("deep/robot.xml").read_text(encoding="utf-8") == scene_to_mjcf(scene, wrist="fixed")
+    assert main(words) == UNUSABLE
+    assert "exists: give another name, or --force" in capsys.readouterr().err
+    assert main([*words, "--force"]) == SUCCESS
+    Path("again.urdf").write_text(text, encoding="utf-8")
+    assert main(["scenes", "import", "again.urdf", "--tip", "tip"]) == SUCCESS
+    assert [link.name for link in load_scene("again.yaml").links] == [link.name for link in scene.links]
+
+
+def test_what_a_format_cannot_say_is_told_in_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenes", "export", "paper"]) == UNUSABLE
+    assert "would be infinite: --wrist fixed writes it at its initial angles" in capsys.readouterr().err
+    assert main(["scenes", "export", "planar"]) == UNUSABLE
+    assert "no base that moves in a plane" in capsys.readouterr().err
+    assert main(["scenes", "export", "papr"]) == UNUSABLE
+    assert "did you mean 'paper'" in capsys.readouterr().err
+
+
+def test_links_and_joints_are_completed() -> None:
+    def words(part: str, file: str | None, incomplete: str) -> list[str]:
+        context = click.Context(click.Command("import"))
+        context.params["robot"] = file
+        found = PartOf(part, "robot").shell_complete(context, click.Option(["--tip"]), incomplete)
+        return [item.value for item in found]
+
+    assert words("link", ARM, "") == ["mount", "upper arm", "forearm", "hand"]
+    assert words("joint", ARM, "e") == ["elbow"]
+    assert words("link", ARM, "x") == words("link", None, "") == words("link", "/", "") == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("package", "path", "tip"),
+    [("", ARM, "hand"), ("airo-models", "airo_models/arms/ur3e/ur3e.urdf", "tool0")],
+)
+def test_the_maneuver_to_begin_with_is_solved_and_flown(
+    package: str, path: str, tip: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        file = str(distribution(package).locate_file(path)) if package else path
+    except PackageNotFoundError:
+        pytest.skip(f"needs {package}")
+    assert main(["scenes", "import", file, "--tip", tip, "--out", "arm.yaml", *CARRIED]) == SUCCESS
+    capsys.readouterr()
+    assert main(["solve", "arm.yaml", "--json"]) == SUCCESS
+    solved = json.loads(capsys.readouterr().out)
+    assert solved["converged"]
+    assert solved["is_success"]
+    plan = f"{Path(solved['files'][0])}"
+    assert main(["simulate", "arm.yaml", "--policy", plan, "--json"]) == SUCCESS
+    assert json.loads(capsys.readouterr().out)["is_success"]

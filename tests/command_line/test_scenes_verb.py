@@ -1,0 +1,146 @@
+"""The verb `scenes`: lists, summaries, problems with their lines, and new files that are valid."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from agents.command_line import main
+from agents.command_line.scene_problems import check
+from agents.command_line.scene_summary import left_out
+from agents.command_line.scene_template import commented_yaml
+from agents.command_line.verb import FAILURE, SUCCESS, UNUSABLE
+from dq_space_arm_env import list_scenes, load_scene
+from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.validation import parse_yaml
+
+BROKEN = """\
+name: broken
+base: {mass: -5, inertia: [1, 1, 1]}
+links:
+  - name: arm
+    mas: 2
+    inertia: [1, 1, 9]
+    center_of_mass: [0, 0, 0]
+    joint: {position: [0, 0]}
+target: {pose: {position: [1, 0, 0]}}
+simulation:
+  dt: 0.01
+  integrator: rk5
+"""
+
+
+def test_list_has_every_scene(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenes", "list"]) == SUCCESS
+    output = capsys.readouterr().out
+    assert main(["scenes", "list", "--json"]) == SUCCESS
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in rows] == list_scenes()
+    for row in rows:
+        assert row["name"] in output
+        assert load_scene(row["file"]) == load_scene(row["name"])
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_show_has_states_and_inputs(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    layout = StateLayout.of(load_scene(name))
+    assert main(["scenes", "show", name, "--json"]) == SUCCESS
+    record = json.loads(capsys.readouterr().out)
+    assert [entry["name"] for entry in record["states"]] == list(layout.state.names)
+    assert [entry["name"] for entry in record["inputs"]] == list(layout.control.names)
+    assert [entry["limit"] for entry in record["inputs"]] == layout.control_limit.tolist()
+    assert load_scene(record["scene"]) == load_scene(name)
+    assert main(["scenes", "show", name]) == SUCCESS
+    output = capsys.readouterr().out
+    assert f"State, {layout.n_x} numbers; tangent, {layout.n_t}" in output
+    assert f"Inputs, {layout.n_u} numbers" in output
+
+
+def test_what_is_left_out_is_said() -> None:
+    assert not {"wrist", "thrusters: no force on the base"} & set(left_out(load_scene("paper")))
+    assert "thrusters: no force on the base" in set(left_out(load_scene("reaction-wheels")))
+    assert {"wrist"} <= set(left_out(load_scene("payload")))
+    assert "payload" not in set(left_out(load_scene("payload")))
+    assert any("plane" in part for part in left_out(load_scene("planar")))
+
+
+def test_problems_come_with_their_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "broken.yaml"
+    file.write_text(BROKEN)
+    found = {problem.field: problem.line for problem in check(str(file))}
+    assert found == {
+        "base.mass": 2,
+        "links[0].mas": 5,
+        "links[0].mass": 4,
+        "links[0].inertia": 6,
+        "links[0].joint.position": 8,
+        "simulation.integrator": 12,
+    }
+    assert main(["scenes", "validate", str(file), "paper"]) == FAILURE
+    output = capsys.readouterr().out
+    assert f"{file}:2: base.mass = -5: must be" in output
+    assert "paper: valid" in output
+    assert main(["scenes", "validate", "--json", str(file), "paper"]) == FAILURE
+    broken, paper = json.loads(capsys.readouterr().out)
+    assert not broken["valid"]
+    assert len(broken["problems"]) == len(found)
+    assert paper == {"file": "paper", "valid": True, "problems": []}
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "sentence"),
+    [
+        ("name: [1\nbase: 2\n", 2, "not valid YAML"),
+        ("name: a\nname: b\n", 2, "duplicate key 'name'"),
+        ("", None, "the file is empty"),
+        ("- 1\n", None, "must be a mapping"),
+    ],
+)
+def test_files_that_are_no_scenes(text: str, line: int | None, sentence: str, tmp_path: Path) -> None:
+    file = tmp_path / "scene.yaml"
+    file.write_text(text)
+    (problem,) = check(str(file))
+    assert (problem.line, problem.field) == (line, None)
+    assert sentence in problem.message
+
+
+def test_a_file_that_is_not_there() -> None:
+    (problem,) = check("nowhere.yaml")
+    assert problem.message == "there is no such file"
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_a_new_file_is_the_scene_with_comments(name: str) -> None:
+    scene = load_scene(name)
+    text = commented_yaml(scene)
+    assert load_scene(parse_yaml(text)) == scene
+    assert all(len(line) <= 110 for line in text.splitlines())
+    for key in ("mass of the base, kg", "time step, s", "what counts as reaching the target"):
+        assert key in text
+
+
+@pytest.mark.parametrize(
+    "name", ['a "b" \\ c', "two\nlines", "tab\t", "next\u0085line", "1e3", "true", "手/ü", "#a: b"]
+)
+def test_a_name_may_be_any_text(name: str) -> None:
+    scene = load_scene("planar").replace(name=name, description=name)
+    assert load_scene(parse_yaml(commented_yaml(scene))) == scene
+
+
+def test_new_writes_a_valid_file_and_spoils_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "deep" / "mine.yaml"
+    assert main(["scenes", "new", str(file), "--from", "planar"]) == SUCCESS
+    assert load_scene(file) == load_scene("planar").replace(name="mine")
+    assert main(["scenes", "new", str(file)]) == UNUSABLE
+    assert "exists: give another name, or --force" in capsys.readouterr().err
+    assert load_scene(file).base.motion == "planar"
+    assert main(["scenes", "new", str(file), "--force", "--name", "other", "--json"]) == SUCCESS
+    assert json.loads(capsys.readouterr().out) == {"file": str(file), "name": "other", "from": "paper"}
+    assert load_scene(file) == load_scene("paper").replace(name="other")
+    assert main(["scenes", "new", str(tmp_path / "mine.txt")]) == UNUSABLE
+    assert "ends in .yaml" in capsys.readouterr().err
+
+
+def test_new_to_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenes", "new", "-", "--from", "payload"]) == SUCCESS
+    assert load_scene(parse_yaml(capsys.readouterr().out)) == load_scene("payload")

@@ -1,0 +1,100 @@
+"""The maneuver as a moving picture: which states are drawn, and what the file holds."""
+
+import io
+import math
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env import compile_scene, load_scene
+from dq_space_arm_env.environment.picture_format import PictureFormat
+from dq_space_arm_env.environment.rendering import Renderer
+from experts.report.animation import check_gif, draw_maneuver, encode_gif
+from experts.report.maneuver import Maneuver
+
+SMALL = PictureFormat(64, 48)
+
+
+@pytest.fixture(scope="module")
+def maneuver():
+    """The nominal start, drifting with some initial motion of the joints."""
+    scene = load_scene("paper")
+    kernels = compile_scene(scene)
+    states = [kernels.layout.initial_state.copy()]
+    states[0][-3:] = (0.5, -0.4, 0.6)
+    for _ in range(100):
+        states.append(kernels.step(states[-1], np.zeros(12)))
+    return Maneuver(scene, np.array(states), np.zeros((100, 12)))
+
+
+def test_pictures_are_those_of_the_states_at_their_times(maneuver):
+    pictures = draw_maneuver(maneuver, SMALL, fps=10.0, seconds=9.0)
+    assert len(pictures) == 16, "1.5 s, both ends included"
+    renderer = Renderer(maneuver.scene, SMALL)
+    kernels = compile_scene(maneuver.scene)
+    for number, stage in ((0, 0), (3, 20), (15, 100)):
+        tips = maneuver.frames[: stage + 1, -1]
+        from_half = [2.0 * _imaginary_product(tip[4:], tip[:4]) for tip in tips]
+        expected = renderer.draw(kernels.frame_poses(maneuver.states[stage]), np.array(from_half))
+        np.testing.assert_array_equal(pictures[number], expected)
+
+
+def _imaginary_product(dual, real):
+    """Vector part of q_d q_r*: half the position of a pose."""
+    return dual[1:] * real[0] - dual[0] * real[1:] - np.cross(dual[1:], real[1:])
+
+
+def test_nonsense_is_refused(maneuver):
+    with pytest.raises(ValueError, match="fps: 0, should be positive"):
+        draw_maneuver(maneuver, SMALL, fps=0, seconds=1.0)
+    with pytest.raises(ValueError, match=r"seconds: -1\.0, should be positive"):
+        draw_maneuver(maneuver, SMALL, fps=10, seconds=-1.0)
+    with pytest.raises(ValueError, match="fps: inf, should be finite"):
+        draw_maneuver(maneuver, SMALL, fps=math.inf, seconds=1.0)
+
+
+@pytest.mark.parametrize(
+    ("fps", "hold", "colors", "sentence"),
+    [
+        (50.1, 0.0, 2, r"fps: 50\.1, should be positive and at most 50"),
+        (math.nan, 0.0, 2, "fps: nan"),
+        (10.0, -0.1, 2, r"hold: -0\.1, should be 0 to 600 s"),
+        (10.0, math.inf, 2, "hold: inf"),
+        (10.0, 0.0, 1, "colors: 1, should be 2 to 255"),
+        (10.0, 0.0, 256, "colors: 256"),
+    ],
+)
+def test_gif_that_cannot_be_is_refused(fps, hold, colors, sentence):
+    check_gif(50.0, 0.0, 255)
+    with pytest.raises(ValueError, match=sentence):
+        encode_gif([np.zeros((4, 4, 3), dtype=np.uint8)], fps, hold, colors)
+
+
+def test_gif_keeps_real_time_though_it_counts_in_hundredths():
+    """16 pictures per second stay for 0.0625 s each, which a GIF cannot say."""
+    pillow = pytest.importorskip("PIL.Image")
+    pictures = [np.zeros((8, 8, 3), dtype=np.uint8) for _ in range(33)]
+    for number, picture in enumerate(pictures):
+        picture[number // 8, number % 8] = 255
+    file = pillow.open(io.BytesIO(encode_gif(pictures, fps=16.0, hold=1.0, colors=200)))
+    durations = []
+    for number in range(file.n_frames):
+        file.seek(number)
+        durations.append(file.info["duration"])
+    assert set(durations[:-1]) == {60, 70}
+    assert sum(durations[:-1]) == 2000
+    assert durations[-1] == 1000
+
+
+def test_gif_plays_what_was_drawn(maneuver):
+    pillow = pytest.importorskip("PIL.Image")
+    pictures = draw_maneuver(maneuver, SMALL, fps=10.0, seconds=1.0)
+    file = pillow.open(io.BytesIO(encode_gif(pictures, fps=10.0, hold=2.0, colors=200)))
+    assert file.n_frames == len(pictures) == 11
+    assert file.info["loop"] == 0
+    for number, picture in enumerate(pictures):
+        file.seek(number)
+        assert file.info["duration"] == (2000 if number == 10 else 100)
+        shown = np.asarray(file.convert("RGB")).astype(int)
+        assert np.abs(shown - picture).mean() < 4.0
+        assert (np.abs(shown - picture).max(axis=2) > 60).mean() < 0.02
