@@ -1,0 +1,1 @@
+"""What the documentation is made with: pages from what the program uses itself; formulas as MathML."""

@@ -1,0 +1,244 @@
+"""The documentation tells the truth: its code runs, commands exist, recipes apply, and keys have units."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import click
+import pytest
+import yaml
+from pydantic import BaseModel
+
+import agents
+import dq_space_arm_env
+import experts
+from agents.command_line.verb import VerbsWithDefault
+from agents.zoo import list_policies
+from agents.zoo.shelf import policy_file
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = sorted(path.stem for path in DOCS.glob("*.md"))
+TEXTS = {page: (DOCS / f"{page}.md").read_text(encoding="utf-8") for page in PAGES}
+RECIPES = dict(re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", TEXTS["extending"], re.MULTILINE | re.DOTALL))
+PACKAGES = ("agents", "configs", "dq_space_arm_env", "experts")
+SLOW = {("expert", 0), ("expert", 1), ("expert", 2), ("demonstrations", 0)}
+"""Blocks that solve something; the README has the like among the quick tests."""
+
+sys.path.insert(0, str(DOCS))
+commands = import_module("extensions.commands")
+keys = import_module("extensions.keys")
+policies = import_module("extensions.policies")
+generated_marks = re.compile(r"^<!-- generated: ([\w-]+) -->$", flags=re.MULTILINE)
+
+DIMENSIONLESS = {
+    "Cost.pose",
+    "Cost.terminal_pose",
+    "Cost.base_velocity",
+    "Cost.terminal_base_velocity",
+    "Spread.base_mass",
+    "Spread.base_inertia",
+    "Spread.link_masses",
+    "Spread.link_inertias",
+    "Spread.payload_mass",
+    "Spread.payload_inertia",
+    "AxisLimits.limit",
+}
+"""Keys of a scene without a unit, or, the last one, with that of the actuator that it limits."""
+
+
+def code_of(text: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def blocks() -> list[object]:
+    found = []
+    for page in PAGES:
+        for number in range(len(code_of(TEXTS[page], "python"))):
+            if page != "extending":
+                marks = [pytest.mark.slow] if (page, number) in SLOW else []
+                found.append(pytest.param(page, number, marks=marks))
+    return found
+
+
+@pytest.mark.parametrize(("page", "number"), blocks())
+def test_code_in_the_documentation_runs(page, number, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code = code_of(TEXTS[page], "python")[number]
+    if "import pinocchio" in code:
+        pytest.importorskip("pinocchio")
+    exec(compile(code, f"{page}.md, block {number}", "exec"), {})
+    capsys.readouterr()
+
+
+def test_scene_files_in_the_documentation_are_scenes():
+    files = code_of(TEXTS["scene"], "yaml")
+    assert files
+    for file in files:
+        scene = dq_space_arm_env.load_scene(yaml.safe_load(file))
+        assert scene.simulation.dt == 0.015
+
+
+def shell_lines() -> list[tuple[str, str]]:
+    found = []
+    for page in PAGES:
+        for block in code_of(TEXTS[page], "bash"):
+            found += [(page, line) for line in block.splitlines() if line.strip()]
+    return found
+
+
+@pytest.mark.parametrize(("page", "line"), shell_lines())
+def test_commands_in_the_documentation_exist(page, line):
+    words = shlex.split(line, comments=True)
+    if words[0] == "make":
+        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    elif words[:2] == ["pip", "install"]:
+        extras = re.findall(r"\[(.*)\]", words[2])
+        known = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+        assert all(
+            re.search(rf"^{name} = \[", known, re.MULTILINE) for each in extras for name in each.split(",")
+        )
+    else:
+        assert words[0] == commands.PROGRAM
+        check_verb(words)
+
+
+def check_verb(words: list[str]) -> None:
+    known = commands.all_commands()
+    verb = max((name for name in known if words[: len(name.split())] == name.split()), key=len)
+    command, rest = known[verb], words[len(verb.split()) :]
+    if isinstance(command, VerbsWithDefault):
+        command = command.default
+    assert rest == [] or verb != commands.PROGRAM
+    if command.params and getattr(command.params[0], "type", None) is click.UNPROCESSED:
+        return  # its own parser is tested with the packages that it belongs to
+    options = {name for option in command.params for name in (*option.opts, *option.secondary_opts)}
+    used = {word.partition("=")[0] for word in rest if re.match(r"--?[a-z]", word)}
+    assert used <= options | {"--help"}
+    # Paths need not exist: only the command line is read.
+    command.make_context(verb, list(rest), resilient_parsing=True)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_generated_parts_are_known(page):
+    known = (DOCS / "extensions" / "generated.py").read_text(encoding="utf-8")
+    for name in generated_marks.findall(TEXTS[page]):
+        assert f'"{name}":' in known
+
+
+def test_every_page_is_in_the_index():
+    listed = re.findall(r"^([\w-]+)$", "\n".join(code_of(TEXTS["index"], "{toctree}")), flags=re.MULTILINE)
+    assert sorted([*listed, "index"]) == PAGES
+
+
+@pytest.mark.parametrize("package", [agents, dq_space_arm_env, experts])
+def test_every_public_name_is_described(package):
+    described = set(re.findall(r"auto\w+:: ([\w.]+)", TEXTS["api"]))
+    assert set(package.__all__) <= described
+
+
+def models() -> list[type[BaseModel]]:
+    from agents import configuration
+    from agents.configuration.residual import ResidualConfiguration
+
+    roots = (
+        dq_space_arm_env.Scene,
+        configuration.Configuration,
+        configuration.ImitationConfiguration,
+        ResidualConfiguration,
+    )
+    return list(dict.fromkeys(model for root in roots for model in keys.models_of(root)))
+
+
+@pytest.mark.parametrize("model", models(), ids=lambda model: model.__name__)
+def test_every_key_has_a_description(model):
+    for name, field in model.model_fields.items():
+        assert field.description or name == "name", f"{model.__name__}.{name}"
+
+
+def test_every_number_of_a_scene_has_a_unit():
+    without = {
+        f"{model.__name__}.{name}"
+        for model in keys.models_of(dq_space_arm_env.Scene)
+        for name, field in model.model_fields.items()
+        if keys.holds_numbers(field) and not keys.units_of(field)
+    }
+    assert without == DIMENSIONLESS
+
+
+def test_tables_of_keys_are_complete():
+    text = keys.key_tables(dq_space_arm_env.Scene)
+    rows = re.findall(r"^\| `(\w+)` \|", text, flags=re.MULTILINE)
+    expected = [name for model in keys.models_of(dq_space_arm_env.Scene) for name in model.model_fields]
+    assert rows == expected
+    assert "| `stiffness` | stiffness of the joint spring, N m/rad | number | `0` |" in text
+    assert "| `mass` | mass of the base, kg | number | **required** |" in text
+
+
+def test_the_table_of_policies_says_what_their_cards_say():
+    rows = policies.policy_table().splitlines()[2:]
+    assert len(rows) == len(list_policies())
+    for row, name in zip(rows, list_policies(), strict=True):
+        card = policy_file(name).with_suffix(".md").read_text(encoding="utf-8")
+        measured = re.findall(r"^\| [^|]+ \| ([\d.]+) \[", card, flags=re.MULTILINE)
+        cells = [cell.strip() for cell in row.strip("|").split("|")]
+        assert cells[0] == f"`{name}`"
+        shown = [float(cell.partition("&nbsp;")[0]) for cell in cells[1:6]]
+        assert shown == [float(rate) for rate in measured[:5]]
+
+
+def with_recipe(title: str, folder: Path) -> None:
+    """Copy the packages and change the copy as a recipe says."""
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "recipe.diff").write_text("".join(code_of(RECIPES[title], "diff")), encoding="utf-8")
+    surroundings = os.environ | {"GIT_CEILING_DIRECTORIES": str(folder.parent)}
+    subprocess.run(["git", "apply", "recipe.diff"], cwd=folder, env=surroundings, check=True)
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="recipes are applied by git")
+@pytest.mark.parametrize("title", RECIPES)
+def test_recipes_apply(title, tmp_path):
+    with_recipe(title, tmp_path)
+    for line in re.findall(r"^\+\+\+ b/(.+)$", RECIPES[title], flags=re.MULTILINE):
+        compile((tmp_path / line).read_text(encoding="utf-8"), line, "exec")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("git") is None, reason="recipes are applied by git")
+@pytest.mark.parametrize("title", RECIPES)
+def test_recipes_work(title, tmp_path):
+    with_recipe(title, tmp_path)
+    surroundings = os.environ | {"PYTHONPATH": str(tmp_path)}
+    for code in code_of(RECIPES[title], "python"):
+        subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=surroundings, check=True)
+
+
+@pytest.mark.slow
+def test_documentation_builds_without_warnings(tmp_path):
+    pytest.importorskip("sphinx")
+    build = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "-n",
+        "-b",
+        "html",
+        str(DOCS),
+        str(tmp_path / "html"),
+    ]
+    done = subprocess.run(build, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in (tmp_path / "html").glob("*.html")}
+    assert pages.keys() >= set(PAGES)
+    for name, page in pages.items():
+        loaded = re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="(https?:[^"]+)"', page)
+        assert loaded == [], f"{name} asks the network for {loaded}"
+        assert "<math" in page or "$$" not in TEXTS.get(name, "")
