@@ -232,7 +232,7 @@ def test_ctrl_c_ends_the_script_and_its_tasks(cluster: LocalCluster, quick_scene
         os.killpg(process.pid, signal.SIGINT)
         output, _ = process.communicate(timeout=60)
     assert process.returncode == 130, output
-    assert "Interrupted. The shards that are complete remain" in " ".join(output.split())
+    assert "Interrupted: the shards that are complete remain" in " ".join(output.split())
     assert "Traceback" not in output
     ray.init(cluster.address, log_to_driver=False, logging_level="ERROR")
     try:
