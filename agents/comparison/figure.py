@@ -7,7 +7,6 @@ edge, as triangles, which the axis says.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from agents.comparison.comparing import Comparison, Row
 from agents.evaluation.runs import agent_of
 from agents.evaluation.statistics import Interval
-from experts.report.figures.style import BLACK, COLORS, DOTS_PER_INCH, GRAY, LIMIT_STYLE, WIDTH, house_style
+from experts.report.figures.style import BLACK, COLORS, GRAY, LIMIT_STYLE, WIDTH, as_png
 
 FLOOR = 0.01
 """Cost gap that smaller ones are drawn at, %."""
@@ -36,10 +35,7 @@ def picture(comparison: Comparison) -> bytes:
     Returns:
         A PNG file.
     """
-    file = BytesIO()
-    with house_style():
-        comparison_figure(comparison).savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()
+    return as_png(lambda: comparison_figure(comparison))
 
 
 def comparison_figure(comparison: Comparison) -> Any:

@@ -1,11 +1,10 @@
 """What cloning reaches over how many demonstrations it has, as a picture."""
 
 from collections.abc import Sequence
-from io import BytesIO
 from typing import Any
 
 from agents.imitation.data_efficiency import TITLES, VARIANTS, Point
-from experts.report.figures.style import COLORS, DOTS_PER_INCH, LINE_STYLES, WIDTH, house_style
+from experts.report.figures.style import COLORS, LINE_STYLES, WIDTH, as_png
 
 _MARKERS = ("o", "s", "^")
 _HEIGHT = 2.9  # inches
@@ -21,10 +20,7 @@ def picture(points: Sequence[Point]) -> bytes:
     Returns:
         A PNG file.
     """
-    file = BytesIO()
-    with house_style():
-        figure(points).savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()
+    return as_png(lambda: figure(points))
 
 
 def figure(points: Sequence[Point]) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from io import BytesIO
 from typing import Any
 
 from agents.comparison.figure import (
@@ -14,7 +13,7 @@ from agents.comparison.figure import (
     spread,
 )
 from agents.residual.evaluation import Comparison
-from experts.report.figures.style import DOTS_PER_INCH, LIMIT_STYLE, WIDTH, house_style
+from experts.report.figures.style import LIMIT_STYLE, WIDTH, as_png
 
 _PANEL_HEIGHT = 2.3  # inches
 
@@ -28,10 +27,7 @@ def picture(comparison: Comparison) -> bytes:
     Returns:
         A PNG file.
     """
-    file = BytesIO()
-    with house_style():
-        mismatch_figure(comparison).savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()
+    return as_png(lambda: mismatch_figure(comparison))
 
 
 def mismatch_figure(comparison: Comparison) -> Any:

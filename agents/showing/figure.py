@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -16,11 +14,11 @@ from experts.report.figures.style import (
     BLACK,
     BLUE,
     COLORS,
-    DOTS_PER_INCH,
     GRAY,
     LIMIT_STYLE,
     VERMILION,
     WIDTH,
+    encode,
     house_style,
 )
 from experts.report.maneuver import ActuatorHistory
@@ -40,7 +38,7 @@ def errors_picture(pair: SideBySide) -> bytes:
         A PNG file.
     """
     with house_style():
-        return _png(errors_figure(pair))
+        return encode(errors_figure(pair))
 
 
 def inputs_picture(pair: SideBySide) -> bytes:
@@ -53,7 +51,7 @@ def inputs_picture(pair: SideBySide) -> bytes:
         A PNG file.
     """
     with house_style():
-        return _png(inputs_figure(pair))
+        return encode(inputs_figure(pair))
 
 
 def errors_figure(pair: SideBySide) -> Figure:
@@ -147,10 +145,3 @@ def _short(names: Sequence[str]) -> list[str]:
     shared = set.intersection(*(set(name.split()) for name in names))
     short = [" ".join(word for word in name.split() if word not in shared) for name in names]
     return short if all(short) else list(names)
-
-
-def _png(figure: Figure) -> bytes:
-    FigureCanvasAgg(figure)
-    file = BytesIO()
-    figure.savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from io import BytesIO
 from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -18,12 +16,12 @@ from experts.report.demonstrations.facts import Facts, Quantity
 from experts.report.figures.snapshots import SnapshotPainter
 from experts.report.figures.style import (
     BLUE,
-    DOTS_PER_INCH,
     GREEN,
     LIMIT_STYLE,
     PURPLE,
     VERMILION,
     WIDTH,
+    encode,
     house_style,
 )
 from experts.report.maneuver import Maneuver
@@ -57,7 +55,7 @@ def distributions(facts: Facts) -> bytes:
             axes.set_axis_off()
         for axes, quantity in zip(grid.flat, shown, strict=False):
             _draw_histogram(axes, quantity)
-        return _png(figure)
+        return encode(figure)
 
 
 def _draw_histogram(axes: Any, quantity: Quantity) -> None:
@@ -118,7 +116,7 @@ def samples(demonstrations: Demonstrations, count: int) -> bytes:
             _share_scale(row[: len(positions)])
         for axes in grid[:, len(positions) :].flat:
             axes.set_axis_off()
-        return _png(figure)
+        return encode(figure)
 
 
 def _draw_sample(column: Any, demonstrations: Demonstrations, demonstration: Demonstration) -> None:
@@ -165,11 +163,3 @@ def _limit_share(actions: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     edges = np.unique(np.linspace(0, len(actions), _BLOCKS + 1).astype(np.int64))
     clamped = np.mean(np.abs(actions) == 1.0, axis=1)
     return np.add.reduceat(clamped, edges[:-1]) / np.diff(edges), edges
-
-
-def _png(figure: Figure) -> bytes:
-    """Draw without pyplot, which would choose a window system and keep the figure."""
-    FigureCanvasAgg(figure)
-    file = BytesIO()
-    figure.savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()

@@ -1,12 +1,11 @@
 """What scenes and their parts cost as a picture: operations and time, relative to those of a whole scene."""
 
 from collections.abc import Sequence
-from io import BytesIO
 from typing import Any
 
 import numpy as np
 
-from experts.report.figures.style import BLACK, BLUE, DOTS_PER_INCH, ORANGE, WIDTH, house_style
+from experts.report.figures.style import BLACK, BLUE, ORANGE, WIDTH, as_png
 from experts.report.scene_cost.measurement import SceneCostReport, SceneRow
 from experts.report.scene_cost.records import ratios
 
@@ -23,10 +22,7 @@ def picture(report: SceneCostReport) -> bytes:
     Returns:
         A PNG file.
     """
-    file = BytesIO()
-    with house_style():
-        scene_cost_figure(report).savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()
+    return as_png(lambda: scene_cost_figure(report))
 
 
 def scene_cost_figure(report: SceneCostReport) -> Any:

@@ -5,7 +5,6 @@ for each scene: the share of which a solver had solved after a time, its cost wi
 """
 
 from collections.abc import Sequence
-from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,10 @@ import numpy as np
 from experts.report.figures.style import (
     BLACK,
     COLORS,
-    DOTS_PER_INCH,
     GRAY,
     LIMIT_STYLE,
     WIDTH,
-    house_style,
+    as_png,
 )
 from experts.report.solvers.accuracy import SolverComparison
 from experts.report.solvers.random_starts import CLOSE, RandomStarts, is_best
@@ -44,10 +42,7 @@ def picture(comparisons: Sequence[SolverComparison], random_starts: Sequence[Ran
     Returns:
         A PNG file.
     """
-    file = BytesIO()
-    with house_style():
-        solvers_figure(comparisons, random_starts).savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()
+    return as_png(lambda: solvers_figure(comparisons, random_starts))
 
 
 def solvers_figure(comparisons: Sequence[SolverComparison], random_starts: Sequence[RandomStarts]) -> Any:

@@ -8,18 +8,16 @@ curve for each integrator: about 1 where the vibration is damped, at the upper e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
 from typing import Any
 
 from experts.report.figures.style import (
     BLACK,
     COLORS,
-    DOTS_PER_INCH,
     GRAY,
     LIMIT_STYLE,
     LINE_STYLES,
     WIDTH,
-    house_style,
+    as_png,
 )
 from experts.report.stability import mass_properties, stiff_joints
 from experts.report.stability.rows import Row
@@ -39,10 +37,7 @@ def picture(rows: Sequence[Row]) -> bytes:
     Returns:
         A PNG file.
     """
-    file = BytesIO()
-    with house_style():
-        stability_figure(rows).savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()
+    return as_png(lambda: stability_figure(rows))
 
 
 def stability_figure(rows: Sequence[Row]) -> Any:

@@ -1,11 +1,14 @@
 """How the figures look: size, fonts, colors and line styles; and panels of curves in that look."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from io import BytesIO
 from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from experts.problem import FloatArray
 
@@ -58,6 +61,36 @@ def house_style() -> Iterator[None]:
     """Draw in this style inside the context; the user's own settings of matplotlib stay as they are."""
     with matplotlib.rc_context({**matplotlib.rcParamsDefault, **_SETTINGS}):
         yield
+
+
+def encode(figure: Figure, file_format: str = "png", dots_per_inch: int = DOTS_PER_INCH) -> bytes:
+    """Draw a figure without pyplot, which would choose a window system and keep the figure.
+
+    Args:
+        figure: The figure.
+        file_format: "png", "pdf", or any other that matplotlib has.
+        dots_per_inch: Of pixels, 1/inch.
+
+    Returns:
+        The file.
+    """
+    FigureCanvasAgg(figure)
+    file = BytesIO()
+    figure.savefig(file, format=file_format, dpi=dots_per_inch)
+    return file.getvalue()
+
+
+def as_png(make: Callable[[], Figure]) -> bytes:
+    """Make a figure in the house style, and draw it.
+
+    Args:
+        make: Makes the figure.
+
+    Returns:
+        A PNG file.
+    """
+    with house_style():
+        return encode(make())
 
 
 def finish_panel(axes: Axes, title: str, label: str) -> None:

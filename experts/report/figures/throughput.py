@@ -4,7 +4,6 @@ On the left the kernel of the forward dynamics, on the right the environment, wh
 """
 
 from collections.abc import Mapping, Sequence
-from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,10 @@ from experts.problem import FloatArray
 from experts.report.figures.style import (
     BLACK,
     BLUE,
-    DOTS_PER_INCH,
     GRAY,
     VERMILION,
     WIDTH,
-    house_style,
+    as_png,
 )
 from experts.report.throughput.environments import MAKE, MAKE_VEC
 from experts.report.throughput.formats import integrator_title
@@ -42,10 +40,7 @@ def picture(results: Sequence[SceneThroughput]) -> bytes:
     Returns:
         A PNG file.
     """
-    file = BytesIO()
-    with house_style():
-        throughput_figure(results).savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()
+    return as_png(lambda: throughput_figure(results))
 
 
 def throughput_figure(results: Sequence[SceneThroughput]) -> Any:

@@ -7,7 +7,6 @@ for each decade of time; gray lines show these slopes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -15,12 +14,11 @@ import numpy as np
 from experts.report.figures.style import (
     BLACK,
     COLORS,
-    DOTS_PER_INCH,
     GRAY,
     LIGHT_GRAY,
     LIMIT_STYLE,
     WIDTH,
-    house_style,
+    as_png,
 )
 from experts.report.throughput.timing import FLOAT64
 from experts.report.work_precision.benchmark import WorkPrecision
@@ -48,10 +46,7 @@ def picture(found: WorkPrecision) -> bytes:
     Returns:
         A PNG file.
     """
-    file = BytesIO()
-    with house_style():
-        work_precision_figure(found).savefig(file, format="png", dpi=DOTS_PER_INCH)
-    return file.getvalue()
+    return as_png(lambda: work_precision_figure(found))
 
 
 def work_precision_figure(found: WorkPrecision) -> Any:

@@ -2,10 +2,8 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from io import BytesIO
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from experts.files import write_atomically
@@ -19,7 +17,7 @@ from experts.report.figures.curves import (
     figure_6,
 )
 from experts.report.figures.snapshots import SnapshotPainter, figure_2, snapshot_stages
-from experts.report.figures.style import DOTS_PER_INCH, house_style
+from experts.report.figures.style import encode, house_style
 from experts.report.maneuver import Maneuver
 from experts.report.run import ManeuverRun
 
@@ -76,7 +74,7 @@ def _write(figures: Mapping[str, Draw], folder: Path, formats: Sequence[str]) ->
                 if figure is None:
                     file.unlink(missing_ok=True)  # of an earlier run with another scene
                     continue
-                write_atomically(file, _drawn(figure, format_, DOTS_PER_INCH))
+                write_atomically(file, encode(figure, format_))
                 files.append(file)
     return files
 
@@ -89,7 +87,7 @@ def write_readme_picture(run: ManeuverRun, file: Path) -> None:
         file: PNG file to write; its folder must exist.
     """
     with house_style():
-        write_atomically(file, _drawn(_readme_figure(run.maneuver), "png", _README_DOTS))
+        write_atomically(file, encode(_readme_figure(run.maneuver), "png", _README_DOTS))
 
 
 def _readme_figure(maneuver: Maneuver) -> Figure:
@@ -107,11 +105,3 @@ def _readme_figure(maneuver: Maneuver) -> Figure:
     lower.set_xlabel("time [s]")
     lower.locator_params(axis="x", nbins=4)
     return figure
-
-
-def _drawn(figure: Figure, format_: str, dots_per_inch: int) -> bytes:
-    """Draw without pyplot, which would choose a window system and keep the figure."""
-    FigureCanvasAgg(figure)
-    file = BytesIO()
-    figure.savefig(file, format=format_, dpi=dots_per_inch)
-    return file.getvalue()
