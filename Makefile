@@ -1,8 +1,7 @@
 # make paper   solve and replay the paper's maneuver: figures and table in results/paper
-# make docs    the documentation in results/docs, from docs and from schemas, docstrings and commands
-# make test    lint, type check, tests (with CI set also the slow tests, the quick numerical report, and the
-#              tests of the extras agents and ray, whose PyTorch is a download of gigabytes; they are skipped
-#              without them)
+# make docs    bring generated parts of the pages up to date, build the documentation in results/docs
+# make test    lint, import contracts, types, tests; with CI set also the slow tests, the quick benchmarks, and the
+#              tests of the extras agents and ray (skipped otherwise: PyTorch is a download of gigabytes)
 # make clean   remove the virtual environment and the results
 
 PYTHON ?= python3
@@ -17,25 +16,27 @@ paper: $(VENV)/installed-plots
 	$(BIN)/python scripts/reproduce_paper.py
 
 docs: $(VENV)/installed-docs
+	$(BIN)/python docs/write_generated.py
 	$(BIN)/sphinx-build -q -W -n --keep-going -b html docs results/docs
 
 test: $(VENV)/installed-$(TEST) lint
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal $(if $(CI),-m "")
-	$(if $(CI),$(BIN)/python scripts/report.py --quick)
+	$(if $(CI),$(BIN)/python -m scripts.benchmarks --quick)
 
 lint: $(VENV)/installed-$(TEST)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-logo --no-cache
 	$(BIN)/mypy
 	$(BIN)/mypy scripts
 
-# A file per set of extras, so that a second run installs nothing.
+# One marker file per set of extras: a second run installs nothing.
 $(VENV)/installed-%: pyproject.toml requirements.lock
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable ".[$*]"
 	touch $@
 
-# Versions that are known to work together, for every supported Python; needs uv.
+# Pin versions that work together on every supported Python; needs uv.
 lock:
 	uv pip compile --quiet --universal --all-extras --no-annotate --no-header --output-file requirements.lock pyproject.toml
 

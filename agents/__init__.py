@@ -1,9 +1,9 @@
-"""Agents: what learns on the environment, and how far it is from the optimal controller.
+"""Agents that learn on the environment, and how close they come to the optimal controller.
 
-`train` makes an agent from a configuration, `evaluate` flies it from fixed starts beside the expert,
-`compare` sets agents beside the expert's controllers, `zoo` has those that ship with the package, and
-`DQSpaceArmVecEnv` is the native vector environment as Stable-Baselines3 wants it. Importing this package
-loads neither that library nor PyTorch; what needs them loads them, and an exported policy needs neither.
+`train` trains an agent from a configuration, `evaluate` flies it from fixed starts beside the expert,
+`compare` compares agents with the expert's controllers, `zoo` holds those that ship with the package, and
+`DQSpaceArmVecEnv` is the native vector environment for Stable-Baselines3. That library and PyTorch are loaded
+on first use; an exported policy needs neither.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from agents.comparison import compare
-    from agents.evaluation import evaluate
+    from agents.evaluation import compare, evaluate
     from agents.policies import ExportedPolicy
     from agents.training import train
     from agents.vec_env import DQSpaceArmVecEnv
@@ -23,7 +22,7 @@ __all__ = ["DQSpaceArmVecEnv", "ExportedPolicy", "compare", "evaluate", "train"]
 _HOMES = {
     "DQSpaceArmVecEnv": "vec_env",
     "ExportedPolicy": "policies",
-    "compare": "comparison",
+    "compare": "evaluation",
     "evaluate": "evaluation",
     "train": "training",
 }

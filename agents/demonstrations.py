@@ -1,4 +1,4 @@
-"""Demonstrations for agents: generated for a run, or those that are there, checked to fit its scene."""
+"""Demonstrations for an agent: generated or existing, and checked to fit its scene."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from agents.configuration.demonstrations import DemonstrationSource
-from agents.evaluation.expert_costs import SEED_OF_SEEDS
+from agents.configuration.schema import RESERVED_SEED, DemonstrationSource
 from agents.minari_reading import read_from_minari
 from dq_space_arm_env import Scene
-from experts.arm_problem import in_double_precision
 from experts.demonstrations import (
     Advance,
     Demonstrations,
@@ -21,6 +19,7 @@ from experts.demonstrations import (
 )
 from experts.demonstrations.folder import LOG
 from experts.demonstrations.settings import differences
+from experts.problems.arm_problem import in_double_precision
 
 
 def prepare_demonstrations(
@@ -31,24 +30,9 @@ def prepare_demonstrations(
     workers: int | None = None,
     progress: Callable[[Advance], None] | None = None,
 ) -> Demonstrations:
-    """Get the demonstrations that an agent learns from, and check that it may.
+    """Generate or load the demonstrations an agent learns from, and check that they fit its scene.
 
-    Args:
-        source: Which ones.
-        scene: What the agent is for.
-        folder: Where to generate them, or to write what is read from Minari; what is there already of the
-            same remains, so that an interrupted run goes on.
-        workers: Processes that generate them; one for each processor by default.
-        progress: Called at the beginning and now and then while they are generated.
-
-    Returns:
-        The demonstrations.
-
-    Raises:
-        DemonstrationsError: If they cannot be made or read, are of another scene, or begin where agents are
-            evaluated.
-        ValueError: If demonstrations of the scene are impossible.
-        KeyboardInterrupt: If the user interrupts it; the same call goes on.
+    Generated ones, and those read from Minari, go to `folder`; an interrupted call resumes there.
     """
     if source.folder is not None:
         demonstrations = load_demonstrations(source.folder)
@@ -64,7 +48,7 @@ def prepare_demonstrations(
             workers=workers,
             progress=progress,
         )
-        assert generated is not None  # one part is all of it
+        assert generated is not None  # not one part of several
         demonstrations = generated
     _check_seed(demonstrations.settings["seed"])
     check_scene(demonstrations, scene)
@@ -72,34 +56,19 @@ def prepare_demonstrations(
 
 
 def expert_seconds(demonstrations: Demonstrations) -> float:
-    """Add up what a folder of demonstrations took to generate, as its log says.
-
-    Args:
-        demonstrations: Of the folder.
-
-    Returns:
-        Time on one processor, s; 0 if there is no log.
-    """
+    """Processor time that generating a folder of demonstrations took, s; 0 without a log."""
     lines = [
         json.loads(line)
         for path in sorted((demonstrations.path / LOG).glob("*.jsonl"))
         for line in path.read_text(encoding="utf-8").splitlines()
     ]
-    # A shard may have been made more than once; the last time counts.
+    # A shard may have been generated more than once; the last time counts.
     shards = {line["shard"]: math.fsum(line["seconds"].values()) for line in lines if "shard" in line}
     return math.fsum(shards.values())
 
 
 def stricter(scene: Scene, scale: float) -> Scene:
-    """Make a scene whose success asks for more.
-
-    Args:
-        scene: The scene.
-        scale: Of its tolerances, dimensionless, in (0, 1].
-
-    Returns:
-        The scene; the same one for a scale of 1.
-    """
+    """Scale the tolerances of success, in (0, 1]; the same scene for 1."""
     if scale == 1.0:
         return scene
     tolerances = scene.success.model_dump()
@@ -107,15 +76,7 @@ def stricter(scene: Scene, scale: float) -> Scene:
 
 
 def check_scene(demonstrations: Demonstrations, scene: Scene) -> None:
-    """Check that a policy for a scene may learn from demonstrations.
-
-    Args:
-        demonstrations: What it learns from.
-        scene: What it is for.
-
-    Raises:
-        DemonstrationsError: If their scene differs in more than name, description and tolerances of success.
-    """
+    """Refuse demonstrations whose scene differs in more than name, description and tolerances of success."""
     theirs, ours = (
         each.model_dump(mode="json", exclude_none=True, exclude={"name", "description", "success"})
         for each in (demonstrations.scene, in_double_precision(scene))
@@ -129,7 +90,7 @@ def check_scene(demonstrations: Demonstrations, scene: Scene) -> None:
 
 
 def _check_seed(seed: int) -> None:
-    if seed == SEED_OF_SEEDS:
+    if seed == RESERVED_SEED:
         raise DemonstrationsError(
-            f"demonstrations with seed {seed} begin where agents are evaluated: take another seed"
+            f"demonstrations with seed {seed} start where agents are evaluated: use another seed"
         )

@@ -1,7 +1,4 @@
-"""Demonstrations that come as a Minari data set, written by `scripts/export_demonstrations.py`.
-
-They are copied into a folder like those of generated ones, so that whatever reads these reads them too.
-"""
+"""Read demonstrations from a Minari data set, as `demonstrations export` writes them, into a folder."""
 
 from __future__ import annotations
 
@@ -16,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env import Scene
+from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.kernels import Kernels
+from experts.ddp.solution import StopReason
 from experts.demonstrations import Demonstrations, DemonstrationsError, load_demonstrations
-from experts.demonstrations.columns import NOTES
 from experts.demonstrations.folder import MANIFEST, SETTINGS, SHARDS
 from experts.demonstrations.outcomes import GUESSES, REASONS
 from experts.demonstrations.settings import FORMAT, SHARD_SIZE
+from experts.demonstrations.shard import NOTES
 from experts.demonstrations.tensors import pack
-from experts.files import write_atomically
-from experts.solution import StopReason
 
 GAINS = "feedback_gains"
 
@@ -32,28 +29,17 @@ GAINS = "feedback_gains"
 def read_from_minari(dataset_id: str, folder: Path) -> Demonstrations:
     """Copy a Minari data set of demonstrations into a folder, unless it is there already.
 
-    Its gains are zero if the data set was exported without. How much the final pose was emphasized is not in
-    it, and NaN here.
-
-    Args:
-        dataset_id: Its name, with the version.
-        folder: Where to write; made if it does not exist.
-
-    Returns:
-        The demonstrations.
-
-    Raises:
-        DemonstrationsError: If Minari is not installed, has no such data set, or it is not one of
-            demonstrations; if the folder holds others.
+    Gains are zero if the data set was exported without them; the weight on the final pose, which Minari does
+    not keep, is NaN.
     """
     dataset = _open(dataset_id)
     settings = _settings(dataset, dataset_id)
     text = json.dumps(settings, indent=2) + "\n"
     if (folder / MANIFEST).is_file():
         if (folder / SETTINGS).read_text(encoding="utf-8") != text:
-            raise DemonstrationsError(f"{folder} holds other demonstrations: take another folder")
+            raise DemonstrationsError(f"{folder} holds other demonstrations: use another folder")
         return load_demonstrations(folder)
-    shutil.rmtree(folder / SHARDS, ignore_errors=True)  # what a killed run has begun
+    shutil.rmtree(folder / SHARDS, ignore_errors=True)  # of an interrupted run
     (folder / SHARDS).mkdir(parents=True)
     kernels = Demonstrations(folder, settings, {"shards": [], "demonstrations": 0}).kernels
     shards = []
@@ -99,20 +85,20 @@ def _open(dataset_id: str) -> Any:
 
 
 def _settings(dataset: Any, dataset_id: str) -> dict[str, Any]:
-    """What the demonstrations follow from, as the exporting script has noted it."""
+    """Settings of the demonstrations, from the data set's metadata."""
     noted = dataset.storage.metadata.get("demonstrations")
     scene = dataset.spec.env_spec.kwargs.get("scene") if dataset.spec.env_spec is not None else None
     if noted is None or scene is None:
         raise DemonstrationsError(
-            f"the Minari data set {dataset_id} holds no demonstrations: scripts/export_demonstrations.py has "
-            "not written it"
+            f"the Minari data set {dataset_id} holds no demonstrations: it was not written by "
+            "`dq-space-arm demonstrations export`"
         )
     resolved = Scene.model_validate(scene).model_dump(mode="json", exclude_none=True)
     return {**noted, "format": FORMAT, "scene": resolved, "minari": dataset_id}
 
 
 def _arrays(dataset: Any, indices: Sequence[int], kernels: Kernels) -> dict[str, NDArray[Any]]:
-    """The arrays of a shard, see `experts.demonstrations.columns`."""
+    """The arrays of a shard, see `experts.demonstrations.shard`."""
     episodes = list(dataset.iterate_episodes(indices))
     facts = list(dataset.storage.get_episode_metadata(indices))
     states = np.array([episode.infos["state"] for episode in episodes])

@@ -14,11 +14,11 @@ from agents.configuration import (
     load_configuration,
 )
 from agents.configuration.residual import ResidualConfiguration
-from agents.progress import Advance
+from dq_space_arm_env.common.progress import Advance
 
 if TYPE_CHECKING:
-    from agents.imitation.training import Imitated
-    from agents.reinforcement.training import Trained
+    from agents.imitation.imitation_training import Imitated
+    from agents.reinforcement.reinforcement_training import Trained
 
 
 def train(
@@ -27,24 +27,24 @@ def train(
     *,
     report: Callable[[Advance], None] | None = None,
 ) -> "Trained | Imitated":
-    """Train an agent; a run that was interrupted or killed goes on at its last checkpoint.
+    """Train an agent in a run folder; the same call resumes an interrupted run at its last checkpoint.
 
     Args:
-        configuration: Name of a shipped configuration, path of a YAML file, what such a file holds as a
-            mapping, or a configuration.
+        configuration: Name of a shipped configuration, path of a YAML file, its content as a mapping, or a
+            configuration.
         out: Folder of the run; results/agents/<name>-<seed> by default.
-        report: Called between updates.
+        report: Called with the progress between updates.
 
     Returns:
-        The folder, the learner of Stable-Baselines3 or the network, and its policy, exported.
+        The folder, the Stable-Baselines3 model or the network, and the exported policy.
 
     Raises:
-        ConfigurationError: If the configuration cannot be used.
+        ConfigurationError: If the configuration is invalid.
         SceneError: If its scene cannot be loaded.
         RunFolderError: If the folder is for another configuration, or another process trains there.
         ImportError: If the extra `agents` is not installed.
         DivergedError, ValueError: If the training diverges; the last checkpoint remains.
-        KeyboardInterrupt: If the user interrupts it; the last checkpoint remains.
+        KeyboardInterrupt: On Ctrl-C; the last checkpoint remains.
     """
     checked = load_configuration(configuration)
     folder = Path(out) if out is not None else default_folder(checked)
@@ -63,30 +63,23 @@ def train(
 def _run(
     checked: AgentConfiguration, folder: Path, tell: Callable[[Advance], None]
 ) -> "Callable[[], Trained | Imitated]":
-    """What trains such an agent; finding it loads what it needs."""
+    """The training function for a configuration, imported with what it needs."""
     if isinstance(checked, ImitationConfiguration):
-        from agents.imitation.training import train_by_imitation
+        from agents.imitation.imitation_training import train_by_imitation
 
         return partial(train_by_imitation, checked, folder, tell)
     if isinstance(checked, ResidualConfiguration):
-        from agents.residual.training import train_residual
+        from agents.residual.residual_training import train_residual
 
         return partial(train_residual, checked, folder, tell)
-    from agents.reinforcement.training import train_by_reinforcement
+    from agents.reinforcement.reinforcement_training import train_by_reinforcement
 
     assert isinstance(checked, Configuration)
     return partial(train_by_reinforcement, checked, folder, tell)
 
 
 def default_folder(configuration: AgentConfiguration) -> Path:
-    """Name the folder of a run.
-
-    Args:
-        configuration: Of the agent.
-
-    Returns:
-        The folder.
-    """
+    """The default run folder, results/agents/<name>-<seed>."""
     return Path("results") / "agents" / f"{configuration.name}-{configuration.seed}"
 
 
@@ -97,20 +90,7 @@ def with_changes(
     total_steps: int | None = None,
     minutes: float | None = None,
 ) -> AgentConfiguration:
-    """Change what command lines may change.
-
-    Args:
-        configuration: Of the agent.
-        seed: In place of its own, if given.
-        total_steps: Environment steps in place of its own, if given.
-        minutes: Limit of time in place of its own, if given, min.
-
-    Returns:
-        The configuration, changed.
-
-    Raises:
-        ConfigurationError: If it has no such setting, or the value cannot be used.
-    """
+    """Replace settings by those of the command line, minutes being the time limit."""
     content = configuration.model_dump(exclude_none=True)
     if seed is not None:
         content["seed"] = seed
@@ -119,7 +99,7 @@ def with_changes(
             if "schedule" not in content:
                 option = "--" + name.replace("_", "-")
                 raise ConfigurationError(
-                    f"{option} is for reinforcement learning: {configuration.name} imitates"
+                    f"{option} is for reinforcement learning, and {configuration.name} imitates"
                 )
             content["schedule"][name] = value
     return load_configuration(content)

@@ -23,7 +23,6 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "extensions.formulas",
-    "extensions.generated",
 ]
 exclude_patterns = ["extensions"]
 myst_enable_extensions = ["amsmath", "deflist", "dollarmath"]

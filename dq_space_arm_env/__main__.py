@@ -1,8 +1,8 @@
-"""`python -m dq_space_arm_env` is the command line `dq-space-arm`; it lives in `agents.command_line`."""
+"""`python -m dq_space_arm_env`: the command line `dq-space-arm`."""
 
 import sys
 
-from agents.command_line import main
+from dq_space_arm_env.command_line import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,11 +1,15 @@
 """Experts: optimal control of a scene, by control-limited differential dynamic programming."""
 
-from experts.box_ddp import BoxDDP
-from experts.demonstrations import generate_demonstrations, load_demonstrations
-from experts.guesses import GuidedDDP
-from experts.problem import ShootingProblem
-from experts.receding_horizon import RecedingHorizonExpert
-from experts.solution import Solution, StopReason
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from experts.ddp.box_ddp import BoxDDP
+    from experts.ddp.solution import Solution, StopReason
+    from experts.demonstrations import generate_demonstrations, load_demonstrations
+    from experts.guesses.guided import GuidedDDP
+    from experts.problems.shooting_problem import ShootingProblem
+    from experts.receding_horizon import RecedingHorizonExpert
 
 __all__ = [
     "BoxDDP",
@@ -17,3 +21,24 @@ __all__ = [
     "generate_demonstrations",
     "load_demonstrations",
 ]
+
+_HOMES = {
+    "BoxDDP": "ddp.box_ddp",
+    "GuidedDDP": "guesses.guided",
+    "RecedingHorizonExpert": "receding_horizon",
+    "ShootingProblem": "problems.shooting_problem",
+    "Solution": "ddp.solution",
+    "StopReason": "ddp.solution",
+    "generate_demonstrations": "demonstrations",
+    "load_demonstrations": "demonstrations",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

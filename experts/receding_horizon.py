@@ -1,17 +1,19 @@
-"""A receding-horizon expert: the maneuver is optimized anew at every step, over the next stages only.
+"""A receding-horizon expert (model predictive control): every step re-optimizes the next stages.
 
-The whole maneuver is planned once per episode, from where it starts (`ManeuverPlan`). At every step the
-expert then solves a shorter problem, from the state that it is given to a horizon beyond which the plan tells
-what the rest will cost, to second order. What was found one step ago, shifted by one stage and with its
-feedback, is so close to the new optimum that one iteration is enough.
+The whole maneuver is planned once per episode, from its start (`ManeuverPlan`). Every step then solves a
+shorter problem from the given state, whose terminal cost is the plan's value function, to second order. The
+previous solution, shifted by one stage and with its feedback, is so close to the new optimum that one
+iteration is enough.
 
-The iterations are Gauss-Newton's. Their model is convex wherever noise and pushes take the state, also where
-exact second derivatives have no minimum; near the plan the curvature that they leave out is in the model of
-what the rest will cost. Where the cheapest maneuver would end outside of the tolerances, plan and steps
-emphasize the final pose as much as reaching the target takes.
+The iterations are Gauss-Newton's: their model is convex wherever noise and pushes take the state, even where
+exact second derivatives have no minimum; near the plan the value function contains the curvature that they
+neglect. Where the cheapest maneuver would end outside the tolerances, plan and steps emphasize the final pose
+as much as reaching the target requires.
 """
 
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,55 +21,104 @@ from numpy.typing import ArrayLike
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.scene.start import PLANAR_POSE
-from experts.arm_problem import ArmProblem
-from experts.backward_sweep import SWEEP_DONE
-from experts.box_ddp import BoxDDP
-from experts.checks import check_array, check_at_least
-from experts.line_search import line_search
-from experts.maneuver_plan import ManeuverPlan
-from experts.problem import FloatArray, as_problem
-from experts.shooting import ShootingWorkspace
-from experts.solution import Solution
-from experts.window_problem import WindowProblem
+from experts.ddp.box_ddp import BoxDDP
+from experts.ddp.shooting import ShootingWorkspace, line_search
+from experts.ddp.solution import Policy, Solution, StopReason
+from experts.guesses.guided import GuidedDDP
+from experts.problems.arm_problem import ArmProblem, WindowProblem, as_problem
+from experts.problems.shooting_problem import FloatArray, check_array, check_at_least
 
 WORTHWHILE = 1e-12
-"""A step that promises less than this share of the plan's cost is not tried: rounding would decide on it."""
+"""A smaller predicted reduction, relative to the plan's cost, is not tried: rounding would decide."""
+
+
+@dataclass(frozen=True, eq=False)
+class ManeuverPlan:
+    """An optimal maneuver from a stage of the episode to its end; M stages."""
+
+    first_stage: int  # of the episode
+    solution: Solution
+    policy: Policy  # of the solution; counts stages from the plan's start
+    # factor of the final pose's weights at which the solution is a minimum: 1, or as much as reaching the
+    # target requires (`reaching`)
+    emphasis: float
+    Vx: FloatArray  # at every stage, with this emphasis, shape (M, n_t)
+    # at every stage, shape (M, n_t, n_t), without negative curvature: off the plan it would predict costs
+    # without a lower bound
+    Vxx: FloatArray
+
+    @classmethod
+    def make(cls, maneuver: ArmProblem, state: FloatArray, stage: int, known: Solution) -> Self:
+        """Plan from a state at a stage; the policy of a known solution of the whole maneuver is a guess.
+
+        Raises:
+            RuntimeError: If the maneuver cannot be simulated or differentiated from this state.
+        """
+        problem = WindowProblem(maneuver, maneuver.horizon - stage)
+        rest = replace(
+            known,
+            states=known.states[stage:],
+            controls=known.controls[stage:],
+            feedback_gains=known.feedback_gains[stage:],
+        )
+        # At stage 0 the problem is the maneuver itself, which adds the tip's screw motion to the guesses.
+        solver = GuidedDDP(maneuver if stage == 0 else problem, library=[rest])
+        solution = solver.solve(state)
+        emphasis = float(solution.metadata["emphasis"])
+        exact = problem.has_second_order
+        work = ShootingWorkspace(problem, second_order=exact, keep_values=True)
+        with maneuver.emphasized(emphasis):
+            work.start(state, solution.controls)
+            work.differentiate()
+            if exact:
+                work.differentiate_twice()
+            # The exact model may have no minimum where the solver ran out of iterations.
+            models = (True, False) if exact else (False,)
+            found = any(work.backward_pass(0.0, exact=model).completed for model in models)
+        if solution.stop_reason is StopReason.DIVERGED or not found:
+            raise RuntimeError(f"there is no plan from the state at stage {stage}: {solution.message}")
+        hessians = _convex_part(work.update.Vxx_all)
+        return cls(stage, solution, solution.policy(), emphasis, work.update.Vx_all, hessians)
+
+
+def _convex_part(matrices: FloatArray) -> FloatArray:
+    """Set the negative eigenvalues of symmetric matrices to zero."""
+    values, vectors = np.linalg.eigh(matrices)
+    return np.ascontiguousarray(vectors * np.maximum(values, 0.0)[:, None, :] @ vectors.transpose(0, 2, 1))
 
 
 class RecedingHorizonExpert:
     """A policy `action = expert(observation_or_state)`; it owns its work arrays, so give each thread its own.
 
-    Observations are those of `DQSpaceArm-v0`, and tell the stage by the time left; the first one, and one
-    with no less time left than the last, begins a new episode. States tell no stage: calls are counted, and
-    `reset` begins an episode. A state has n_x entries, an observation one more. Noise in the norm of the pose
-    is removed.
+    Observations of `DQSpaceArm-v0` reveal the stage by the time left; the first one, and any with no less
+    time left than the last, begins a new episode. States do not reveal it: calls are counted, and `reset`
+    begins an episode. A state has n_x entries, an observation one more. Poses are normalized.
 
     The call that begins an episode plans it first, which takes a fraction of a second; so does `reset` with a
-    state. Target and masses are the scene's: where the environment draws them, give the expert
+    state. Target and masses are those of the scene: where the environment draws them, pass
     `env.unwrapped.episode_scene`.
 
     Attributes:
         maneuver: The scene as a shooting problem of N stages.
-        horizon: Stages that are optimized at every step.
+        horizon: Stages optimized at every step.
         iterations: Iterations per step.
         plan: Plan of the episode; None before it begins.
         control: Last control in N, N m, rad/s, shape (n_u,).
-        fallbacks: Actions of this episode that came from the plan's feedback policy u = clip(u_k + K_k (x (-)
-            x_k)) since the state was so far off that no finite rollout began there; of the plan's u_k alone
-            where not even that is finite.
+        fallbacks: Actions of this episode from the plan's feedback policy u = clip(u_k + K_k (x (-) x_k)), or
+            from u_k alone where that is not finite, because no finite rollout started at the state.
     """
 
     def __init__(self, scene: Scene | str | Path, horizon: int = 100, iterations: int = 1) -> None:
-        """Prepare; nothing is planned yet.
+        """Prepare the expert; planning comes later.
 
         Args:
             scene: A scene, the name of a shipped one, or a path to a YAML file.
-            horizon: Stages to optimize at every step; the rest of the episode if there are fewer left.
-            iterations: Iterations per step; 0 only follows the plan with its feedback.
+            horizon: Stages to optimize at every step, or the rest of the episode if that is shorter.
+            iterations: Iterations per step; 0 only applies the plan's feedback.
 
         Raises:
             SceneError: If the scene cannot be loaded.
-            ValueError: If a setting is too small, or the scene has no actuator or one without a limit.
+            ValueError: If a setting is too small, or the scene has no actuators or one without a limit.
         """
         check_at_least("horizon", horizon, 1)
         check_at_least("iterations", iterations, 0)
@@ -76,7 +127,7 @@ class RecedingHorizonExpert:
         if not np.isfinite(self.maneuver.control_upper).all():
             unlimited = int(np.argmax(~np.isfinite(self.maneuver.control_upper)))
             name = self.maneuver.kernels.layout.control.names[unlimited]
-            raise ValueError(f"{name} has no finite limit; actions are fractions of limits, so give it one")
+            raise ValueError(f"{name} has no finite limit, but actions are fractions of limits: give it one")
         self.horizon, self.iterations = horizon, iterations
         self.plan: ManeuverPlan | None = None
         self.control: FloatArray = np.zeros(self.maneuver.n_controls)
@@ -92,8 +143,8 @@ class RecedingHorizonExpert:
         """Begin an episode.
 
         Args:
-            observation_or_state: Where it starts, shape (n_x + 1,) or (n_x,), to have it planned now; None to
-                have the next call do that.
+            observation_or_state: Its start, shape (n_x + 1,) or (n_x,), to plan now; None plans in the next
+                call.
 
         Raises:
             ValueError: If it has another shape or is not finite.
@@ -113,7 +164,7 @@ class RecedingHorizonExpert:
             Inputs as fractions of their limits, in [-1, 1], shape (n_u,).
 
         Raises:
-            ValueError: If it has another shape, is not finite, or tells a time that is not of the episode.
+            ValueError: If it has another shape, is not finite, or its time left exceeds the episode.
             RuntimeError: If the episode is over, or the maneuver cannot be simulated from its start.
         """
         state, stage = self._read(observation_or_state)
@@ -132,14 +183,14 @@ class RecedingHorizonExpert:
         return self.control / self.maneuver.control_upper
 
     def _read(self, observation_or_state: ArrayLike) -> tuple[FloatArray, int]:
-        """Return the state and its stage, or say what is wrong with what was given."""
+        """Return the state and its stage."""
         maneuver = self.maneuver
         given = np.asarray(observation_or_state, dtype=np.float64)
         if given.shape == (maneuver.n_states + 1,):
             check_array("observation", given, given.shape)
             stage = maneuver.horizon - round(given[-1] / maneuver.time_step)
             if stage == maneuver.horizon:
-                raise RuntimeError("the observation says that no time is left: the episode is over")
+                raise RuntimeError("the observation has no time left: the episode is over")
             if not 0 <= stage < maneuver.horizon:
                 duration = maneuver.horizon * maneuver.time_step
                 raise ValueError(
@@ -160,28 +211,28 @@ class RecedingHorizonExpert:
         return self._of_unit_norm(given), self._next_stage
 
     def _of_unit_norm(self, state: FloatArray) -> FloatArray:
-        """A copy of a state, its pose made a unit dual quaternion."""
+        """Return a state with its pose normalized to a unit dual quaternion."""
         layout = self.maneuver.kernels.layout
         stored = list(PLANAR_POSE if layout.planar else range(8))
         pose = np.zeros(8)
         pose[stored] = state[layout.state.pose]
         if not pose[:4].any():
-            raise ValueError("the base quaternion of the state is zero; its norm should be 1")
+            raise ValueError("the base quaternion of the state is zero; its norm must be 1")
         result = state.copy()
         result[layout.state.pose] = np.array(dual_quaternion.normalize(pose.tolist()))[stored]
         return result
 
     def _begin(self, state: FloatArray, stage: int) -> None:
-        """Plan an episode; the policy of the nominal maneuver is a better first guess than doing nothing."""
+        """Plan an episode, with the policy of the nominal maneuver as a guess."""
         if self._nominal is None:
             self._nominal = BoxDDP(self.maneuver).solve()
         self.plan = ManeuverPlan.make(self.maneuver, state, stage, self._nominal)
         self._work, self._next_stage, self.fallbacks = None, stage, 0
 
     def _window(self, plan: ManeuverPlan, stage: int) -> ShootingWorkspace:
-        """Prepare the problem that starts at a stage, with what is known of its solution as the reference.
+        """Prepare the problem that starts at a stage.
 
-        That is the last solution, if it is one stage old, and the plan beyond its end; else the plan.
+        Its reference is the last solution, if that is one stage old, then the plan beyond its end.
         """
         last = self._work if stage == self._next_stage else None
         horizon = min(self.horizon, self.maneuver.horizon - stage)
@@ -192,20 +243,20 @@ class RecedingHorizonExpert:
             kept = last.problem.horizon - 1
             work.current.states[:kept] = last.current.states[1 : kept + 1]
             work.current.controls[:kept] = last.current.controls[1:]
-            work.update.gains[:kept] = last.update.gains[1:]
+            work.update.K[:kept] = last.update.K[1:]
         solution = plan.solution
         rest = slice(stage + kept - plan.first_stage, end - plan.first_stage)
         work.current.states[kept:horizon] = solution.states[rest]
         work.current.controls[kept:] = solution.controls[rest]
-        work.update.gains[kept:] = solution.feedback_gains[rest]
+        work.update.K[kept:] = solution.feedback_gains[rest]
         if end < self.maneuver.horizon:
             self._model_state[0] = solution.states[rest.stop]
-            self._model_gradient[0] = plan.value_gradients[rest.stop]
-            self._model_hessian[0] = plan.value_hessians[rest.stop]
+            self._model_gradient[0] = plan.Vx[rest.stop]
+            self._model_hessian[0] = plan.Vxx[rest.stop]
         return work
 
     def _workspace(self, horizon: int, *, ends_early: bool) -> ShootingWorkspace:
-        """The last workspace if it has the right size; it changes only where the end of the episode nears."""
+        """Return the last workspace if it fits; only near the end of the episode it does not."""
         if self._work is not None:
             problem = self._work.problem
             assert isinstance(problem, WindowProblem)
@@ -215,7 +266,7 @@ class RecedingHorizonExpert:
         return ShootingWorkspace(WindowProblem(self.maneuver, horizon, model), second_order=False)
 
     def _optimize(self, work: ShootingWorkspace, state: FloatArray, scale: float) -> bool:
-        """Follow the reference from a state, and improve on that; return whether the rollout is finite."""
+        """Follow the reference from a state and improve it; return whether the rollout is finite."""
         work.trial.states[0] = state
         if not np.isfinite(work.try_step(0.0)):
             return False
@@ -223,8 +274,8 @@ class RecedingHorizonExpert:
         work.trial.states[0] = state
         for _ in range(self.iterations):
             work.differentiate()
-            outcome = work.sweep(0.0)
-            if outcome.status != SWEEP_DONE or outcome.promise(1.0) <= WORTHWHILE * scale:
+            outcome = work.backward_pass(0.0)
+            if not outcome.completed or outcome.predicted_reduction(1.0) <= WORTHWHILE * scale:
                 break
             if line_search(work, outcome) == 0.0:
                 break
@@ -232,7 +283,7 @@ class RecedingHorizonExpert:
 
 
 def _planned_control(plan: ManeuverPlan, state: FloatArray, stage: int) -> FloatArray:
-    """Control of the plan's feedback policy, or the plan's own where the feedback is not finite."""
+    """Control of the plan's feedback policy, or of the plan alone where that is not finite."""
     index = stage - plan.first_stage
     with np.errstate(over="ignore", invalid="ignore"):
         control = plan.policy(state, index)

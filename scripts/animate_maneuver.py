@@ -11,25 +11,19 @@ from pathlib import Path
 from rich.console import Console
 
 from dq_space_arm_env import load_scene
-from dq_space_arm_env.environment.picture_format import PictureFormat
+from dq_space_arm_env.command_line.verb_program import run_to_end
+from dq_space_arm_env.common.console import SUCCESS
+from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.viewing.picture_format import PictureFormat
 from experts import BoxDDP
-from experts.files import write_atomically
-from experts.report.animation import check_gif, draw_maneuver, encode_gif
-from experts.report.command import SUCCESS, guarded
-from experts.report.maneuver import Maneuver
+from experts.figures.animation import check_gif, draw_maneuver, encode_gif
+from experts.maneuver import Maneuver
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the script.
-
-    Args:
-        arguments: Command line without the program's name; that of the process if None.
-
-    Returns:
-        Exit status.
-    """
+    """Run the script and return its exit status."""
     options = _parse(arguments)
-    return guarded(lambda: _run(options))
+    return run_to_end(lambda: _run(options))
 
 
 def _run(options: argparse.Namespace) -> int:

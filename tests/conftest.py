@@ -1,11 +1,45 @@
-"""Shared by all tests: where helper modules are found, and signals as a terminal would send them."""
+"""Shared by all tests: paths of helper modules, signals as a terminal sends them, and a short scene."""
 
 import signal
 import sys
 from pathlib import Path
+
+import pytest
+
+from dq_space_arm_env import Scene
 
 sys.path.append(str(Path(__file__).parent / "compiler"))
 
 # A shell that runs the tests in the background lets all its processes ignore Ctrl-C, which some tests press.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session")
+def short_scene() -> Scene:
+    """A scene that compiles and solves in seconds: planar, wheels and one joint, no thrusters, no wrist."""
+    return Scene.model_validate(
+        {
+            "name": "short",
+            "base": {"motion": "planar", "mass": 20, "inertia": [1, 1, 1]},
+            "links": [
+                {
+                    "name": "link",
+                    "mass": 2,
+                    "inertia": [0.01, 0.05, 0.05],
+                    "center_of_mass": [0.3, 0, 0],
+                    "joint": {"position": [0.3, 0, 0]},
+                }
+            ],
+            "tip": {"position": [0.6, 0, 0]},
+            "actuators": {"base_torque": {"limit": 2}, "joint_torque": {"limit": 0.5}},
+            "target": {"pose": {"position": [0.6, 0.5, 0], "rotation": {"axis": [0, 0, 1], "angle": 60}}},
+            "simulation": {"dt": 0.05, "steps": 60},
+        }
+    )
+
+
+@pytest.fixture(scope="session")
+def spread_scene(short_scene: Scene) -> Scene:
+    """With random starts; its kernels are the same."""
+    return short_scene.replace(spread={"joint_angles": 0.5, "base_position": 0.1, "base_rotation": 0.1})

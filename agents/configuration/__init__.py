@@ -1,17 +1,10 @@
-"""Configurations of agents: validated YAML files that say what is trained, on what, and for how long."""
+"""Configurations of agents: validated YAML files that say what to train, on what, and for how long."""
 
 from agents.configuration.algorithms import PPO, SAC, TD3, TQC, Algorithm, Demonstrated, Hindsight, OffPolicy
-from agents.configuration.demonstrations import DemonstrationSource
 from agents.configuration.imitation import Cloning, Dagger, ImitationConfiguration
 from agents.configuration.loading import ConfigurationError, list_configurations, load_configuration
-from agents.configuration.schema import (
-    ActionScale,
-    AgentConfiguration,
-    Configuration,
-    Network,
-    Practice,
-    Schedule,
-)
+from agents.configuration.reinforcement import ActionScale, Configuration, Practice, Schedule
+from agents.configuration.schema import AgentConfiguration, DemonstrationSource, Network
 
 __all__ = [
     "PPO",

@@ -1,73 +1,73 @@
-"""The algorithms of reinforcement learning that can be asked for, with the names of Stable-Baselines3."""
+"""Reinforcement-learning algorithms and their hyperparameters, named as in Stable-Baselines3."""
 
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool
 
-from agents.configuration.demonstrations import DemonstrationSource
+from agents.configuration.schema import DemonstrationSource
 from dq_space_arm_env.validation import Count, Finite, Fraction, Model, NonNegative, Positive, Problem
 
 
 class _Common(Model):
-    learning_rate: Positive = Field(default=3e-4, description="step size of Adam at the beginning")
+    learning_rate: Positive = Field(default=3e-4, description="initial step size of Adam")
     final_learning_rate: NonNegative | None = Field(
-        default=None, description="step size at the end, reached linearly; absent: that of the beginning"
+        default=None, description="final step size, reached linearly; absent: learning_rate"
     )
-    batch_size: Count = Field(default=256, description="decisions of a minibatch")
-    gamma: Fraction = Field(default=0.98, description="discount of a decision")
+    batch_size: Count = Field(default=256, description="decisions per minibatch")
+    gamma: Fraction = Field(default=0.98, description="discount per decision")
 
 
 class PPO(_Common):
     """Proximal policy optimization (Schulman et al., 2017)."""
 
     name: Literal["PPO"]
-    batch_size: Count = Field(default=4096, description="decisions of a minibatch")
+    batch_size: Count = Field(default=4096, description="decisions per minibatch")
     n_steps: Count = Field(default=50, description="decisions of each copy between updates")
-    n_epochs: Count = Field(default=10, description="passes over these decisions in an update")
+    n_epochs: Count = Field(default=10, description="passes over these decisions per update")
     gae_lambda: Fraction = Field(default=0.95, description="decay of the advantage estimate")
     clip_range: Positive = Field(default=0.2, description="largest change of a probability ratio")
     ent_coef: NonNegative = Field(default=0.0, description="weight of the entropy")
     vf_coef: Positive = Field(default=0.5, description="weight of the value function's loss")
     max_grad_norm: Positive = Field(default=0.5, description="largest norm of a gradient")
     target_kl: Positive | None = Field(
-        default=None, description="divergence of the policy at which an update ends early; absent: none"
+        default=None, description="KL divergence at which an update ends early; absent: none"
     )
     desired_kl: Positive | None = Field(
         default=None,
-        description="divergence of the policy that an update is to cause: below learning_rate, the actor's "
-        "steps are as large as that; absent: they are learning_rate",
+        description="KL divergence that an update should cause: the actor's step size adapts to it, below "
+        "learning_rate; absent: it is learning_rate",
     )
     first_step_factor: Positive = Field(
         default=1.0,
-        description="size of the actor's first steps with desired_kl, relative to learning_rate, at most 1",
+        description="the actor's initial step size with desired_kl, relative to learning_rate, at most 1",
     )
     critic_warm_up: Annotated[int, Field(strict=True, ge=0)] = Field(
-        default=0, description="first updates, in which the critic learns alone"
+        default=0, description="first updates, which train the critic alone"
     )
     log_std_init: Finite = Field(
-        default=-0.7, description="logarithm of the first standard deviation of actions, in action scales"
+        default=-0.7, description="log of the initial standard deviation of actions, in action scales"
     )
 
     def _problems(self) -> Iterator[Problem]:
         if self.first_step_factor > 1.0:
             yield Problem(
-                ("first_step_factor",), self.first_step_factor, "must be at most 1, for learning_rate itself"
+                ("first_step_factor",), self.first_step_factor, "must be at most 1, learning_rate itself"
             )
         if self.batch_size < 2:
             yield Problem(
                 ("batch_size",),
                 self.batch_size,
-                "must be at least 2: advantages are normalized in a minibatch",
+                "must be at least 2: advantages are normalized per minibatch",
             )
 
 
 class Hindsight(Model):
     """Hindsight experience replay (Andrychowicz et al., NeurIPS 2017), on the goal environment."""
 
-    n_sampled_goal: Count = Field(default=4, description="relabeled decisions for each real one")
+    n_sampled_goal: Count = Field(default=4, description="relabeled decisions per real one")
     goal_selection_strategy: Literal["future", "final", "episode"] = Field(
-        default="future", description="which achieved goals take the place of desired ones"
+        default="future", description="which achieved goals replace desired ones"
     )
     reward_type: Literal["sparse", "dense"] = Field(
         default="sparse", description="reward of the goal environment"
@@ -75,14 +75,14 @@ class Hindsight(Model):
 
 
 class OffPolicy(_Common):
-    """What the algorithms with a replay buffer have in common."""
+    """Settings common to the algorithms with a replay buffer."""
 
-    buffer_size: Count = Field(default=1_000_000, description="decisions that are remembered")
+    buffer_size: Count = Field(default=1_000_000, description="decisions in the replay buffer")
     learning_starts: Count = Field(default=10_000, description="random decisions before learning")
-    tau: Positive = Field(default=0.005, description="share by which target networks follow")
+    tau: Positive = Field(default=0.005, description="update rate of the target networks")
     train_freq: Count = Field(default=1, description="decisions of each copy between updates")
-    gradient_steps: Count = Field(default=1, description="gradient steps of an update")
-    n_critics: Count = Field(default=2, description="critics; the lowest, or lowest quantiles, are believed")
+    gradient_steps: Count = Field(default=1, description="gradient steps per update")
+    n_critics: Count = Field(default=2, description="critics; the lowest value or quantiles count")
     hindsight: Hindsight | None = Field(
         default=None, description="learn on the goal environment, with hindsight; absent: neither"
     )
@@ -100,9 +100,9 @@ class _MaximumEntropy(OffPolicy):
     ent_coef: Positive | Literal["auto"] = Field(
         default="auto", description="weight of the entropy, or 'auto' to learn it"
     )
-    ent_coef_init: Positive = Field(default=0.1, description="first weight of the entropy if it is learned")
+    ent_coef_init: Positive = Field(default=0.1, description="initial weight of the entropy if it is learned")
     target_entropy: Finite | Literal["auto"] = Field(
-        default="auto", description="entropy to learn it for; 'auto': minus the number of actions"
+        default="auto", description="entropy it is learned for; 'auto': minus the number of actions"
     )
 
 
@@ -112,17 +112,17 @@ class Demonstrated(Model):
     source: DemonstrationSource = Field(
         default_factory=DemonstrationSource, description="where they come from"
     )
-    share: Positive = Field(default=0.5, description="of demonstrated decisions in a batch, less than 1")
+    share: Positive = Field(default=0.5, description="share of demonstrations in a batch, less than 1")
     cloning_weight: NonNegative = Field(
         default=0.0,
-        description="weight of the mean squared difference from demonstrated actions, in action scales, in "
+        description="weight of the mean squared difference from demonstrated actions (in action scales) in "
         "the actor's loss, relative to the mean size of values",
     )
 
     def _problems(self) -> Iterator[Problem]:
         if self.share >= 1.0:
             yield Problem(
-                ("share",), self.share, "must be less than 1: the agent's own decisions are the rest"
+                ("share",), self.share, "must be less than 1: the rest are the agent's own decisions"
             )
 
 
@@ -132,21 +132,21 @@ class SAC(_MaximumEntropy):
     name: Literal["SAC"]
     layer_norm: StrictBool = Field(default=False, description="whether critics are layer-normalized")
     demonstrations: Demonstrated | None = Field(
-        default=None, description="decisions of the expert to learn from as well; absent: none"
+        default=None, description="expert decisions to learn from as well; absent: none"
     )
 
     def _problems(self) -> Iterator[Problem]:
         yield from super()._problems()
         if self.demonstrations is not None and self.hindsight is not None:
             yield Problem(
-                ("demonstrations",), "given", "must be absent with hindsight, whose replay buffer is another"
+                ("demonstrations",), "given", "must be absent with hindsight, which has its own replay buffer"
             )
         share = 0.5 if self.demonstrations is None else self.demonstrations.share
         if self.demonstrations is not None and not 1 <= round(share * self.batch_size) < self.batch_size:
             yield Problem(
                 ("demonstrations", "share"),
                 share,
-                f"must leave room for decisions of both kinds in a batch, which has {self.batch_size}",
+                f"must leave room for decisions of both kinds in a batch of {self.batch_size}",
             )
 
 
@@ -156,7 +156,7 @@ class TQC(_MaximumEntropy):
     name: Literal["TQC"]
     n_quantiles: Count = Field(default=25, description="quantiles of a critic")
     top_quantiles_to_drop_per_net: Count = Field(
-        default=2, description="highest quantiles of each critic that are not believed"
+        default=2, description="highest quantiles of each critic to drop"
     )
 
     def _problems(self) -> Iterator[Problem]:
@@ -173,13 +173,13 @@ class TD3(OffPolicy):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al., ICML 2018)."""
 
     name: Literal["TD3"]
-    policy_delay: Count = Field(default=2, description="critic updates for each actor update")
+    policy_delay: Count = Field(default=2, description="critic updates per actor update")
     target_policy_noise: NonNegative = Field(
         default=0.2, description="noise of target actions, in action scales"
     )
-    target_noise_clip: Positive = Field(default=0.5, description="its largest size, in action scales")
+    target_noise_clip: Positive = Field(default=0.5, description="bound of this noise, in action scales")
     action_noise: NonNegative = Field(
-        default=0.1, description="standard deviation of exploration, in action scales"
+        default=0.1, description="standard deviation of the exploration noise, in action scales"
     )
 
 

@@ -1,4 +1,4 @@
-"""From a name or a file to a validated configuration; finds those that ship with the package."""
+"""Load and validate configurations by name, path or content."""
 
 import importlib.resources
 from collections.abc import Mapping
@@ -6,14 +6,14 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, get_args
 
-import yaml
 from pydantic import ValidationError
 
 from agents.configuration.algorithms import Algorithm
 from agents.configuration.imitation import Cloning, Dagger, ImitationConfiguration
+from agents.configuration.reinforcement import Configuration
 from agents.configuration.residual import ResidualConfiguration, ResidualPPO, ResidualSAC
-from agents.configuration.schema import AgentConfiguration, Configuration
-from dq_space_arm_env.validation import did_you_mean, parse_yaml
+from agents.configuration.schema import AgentConfiguration
+from dq_space_arm_env.validation import YAMLError, did_you_mean, parse_yaml
 
 _SUFFIXES = (".yaml", ".yml")
 
@@ -32,35 +32,28 @@ _CLASSES: dict[str, type[AgentConfiguration]] = {
     for algorithm in algorithms
     for name in _names(algorithm)
 }
-"""Class of configuration for each name of an algorithm."""
+"""Configuration class by algorithm name."""
 
 
 class ConfigurationError(ValueError):
-    """A configuration cannot be used; the message gives field, value, and what would be right."""
+    """An unusable configuration; the message gives field, value, and what would be right."""
 
 
 def list_configurations() -> list[str]:
-    """List the configurations that ship with the package.
-
-    Returns:
-        Their names, sorted.
-
-    Raises:
-        ConfigurationError: If the package has lost them.
-    """
+    """Names of the configurations that ship with the package, sorted."""
     names = (Path(entry.name) for entry in _directory().iterdir())
     return sorted(name.stem for name in names if name.suffix == ".yaml")
 
 
 def load_configuration(source: str | Path | Mapping[str, Any] | AgentConfiguration) -> AgentConfiguration:
-    """Load and validate a configuration; the name of its algorithm decides about its class.
+    """Load and validate a configuration.
 
     Args:
         source: Name of a shipped configuration ("ppo"), path of a YAML file (with a slash or ending in
-            .yaml), what such a file holds as a mapping, or a configuration.
+            .yaml), its content as a mapping, or a configuration.
 
     Returns:
-        The validated configuration, of the class that its algorithm belongs to.
+        The configuration, of the class its algorithm belongs to.
 
     Raises:
         ConfigurationError: If it cannot be found, read or validated; the message lists every problem.
@@ -76,7 +69,7 @@ def load_configuration(source: str | Path | Mapping[str, Any] | AgentConfigurati
         close = did_you_mean(source, names)
         raise ConfigurationError(
             f"no configuration is named {source!r}{f'; {close}' if close else '. '}They are "
-            f"{', '.join(names)}; a file of your own is given by its path, ending in .yaml"
+            f"{', '.join(names)}; give a file of your own by its path, ending in .yaml"
         )
     return _read(_directory() / f"{source}.yaml")
 
@@ -98,7 +91,7 @@ def _read(file: Traversable) -> AgentConfiguration:
         data = parse_yaml(file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ConfigurationError(f"{file}: there is no such file") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, UnicodeDecodeError, YAMLError) as error:
         raise ConfigurationError(f"{file}: cannot be read: {error}") from error
     if not isinstance(data, dict):
         raise ConfigurationError(f"{file}: must be a mapping (key: value) at the top")

@@ -1,4 +1,4 @@
-"""The configuration of an agent that corrects plans by reinforcement, in worlds that differ from theirs."""
+"""Configuration of an agent that learns to correct plans under model mismatch."""
 
 from collections.abc import Iterator
 from typing import Annotated, Literal
@@ -6,18 +6,18 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from agents.configuration.algorithms import PPO, SAC
-from agents.configuration.demonstrations import DemonstrationSource
-from agents.configuration.schema import ActionScale, AgentConfiguration, Configuration, Practice, Schedule
+from agents.configuration.reinforcement import ActionScale, Configuration, Practice, Schedule
+from agents.configuration.schema import AgentConfiguration, DemonstrationSource
 from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
 
 PREFIX = "residual-"
 
 
 class Mismatch(Model):
-    """How the world of an episode may differ from the plan's.
+    """Model mismatch: how an episode's world may differ from the plan's model.
 
-    Masses are fixed for each copy of the environment; the rest is drawn for each episode, uniformly between
-    nothing and these numbers.
+    Masses are fixed per copy of the environment; the rest is drawn per episode, uniformly between zero and
+    these numbers.
     """
 
     mass_factors: tuple[Positive, ...] = Field(
@@ -26,20 +26,18 @@ class Mismatch(Model):
         description="factors of mass and inertia of the payload, or of the last link without one",
     )
     noise: NonNegative = Field(
-        default=0.01,
-        description="largest standard deviation of the noise on what is measured, rad, m, rad/s, m/s",
+        default=0.01, description="largest standard deviation of the measurement noise, rad, m, rad/s, m/s"
     )
     push: NonNegative = Field(
-        default=0.02,
-        description="largest standard deviation of jumps of the base's velocities, rad/s, m/s",
+        default=0.02, description="largest standard deviation of jumps of the base velocities, rad/s, m/s"
     )
-    pushes: Count = Field(default=6, description="mean number of these jumps in an episode, at random times")
+    pushes: Count = Field(default=6, description="mean number of these jumps per episode, at random times")
 
 
 class ResidualPractice(Model):
-    """The environment as the agent practices in it; the plan with its gains flies, the agent corrects it."""
+    """The training environment: the plan flies with its gains, and the agent corrects it."""
 
-    copies: Count = Field(default=125, description="environments that are stepped together")
+    copies: Count = Field(default=125, description="environments stepped together")
     action_repeat: Count = Field(
         default=20, description="time steps for which a correction is held; the plan's feedback acts at each"
     )
@@ -51,22 +49,21 @@ class ResidualPractice(Model):
     )
     reward_scale: Positive = Field(default=0.02, description="factor of rewards")
     cost_power: Positive = Field(
-        default=0.5,
-        description="power of the cost of a time step, at most 1; below, small errors count more",
+        default=0.5, description="exponent of the cost of a step, at most 1; below 1, small errors count more"
     )
     memory: Positive = Field(
-        default=0.3, description="time over which the agent sees deviations averaged, besides the last one, s"
+        default=0.3, description="time over which the agent sees deviations averaged, beside the current, s"
     )
 
     full_authority: Positive = Field(
         default=0.3,
-        description="size of the averaged deviation from the plan, rad, m, rad/s, m/s together, at which "
-        "corrections count in full; below in proportion, and not at all as planned",
+        description="norm of the averaged deviation from the plan (rad, m, rad/s, m/s together) at which "
+        "corrections have full authority; below it in proportion, on the plan none",
     )
 
     def _problems(self) -> Iterator[Problem]:
         if self.cost_power > 1.0:
-            yield Problem(("cost_power",), self.cost_power, "must be at most 1, for the cost itself")
+            yield Problem(("cost_power",), self.cost_power, "must be at most 1, the cost itself")
 
 
 class ResidualPPO(PPO):
@@ -82,14 +79,14 @@ class ResidualSAC(SAC):
 
 
 class ResidualConfiguration(AgentConfiguration):
-    """All that the training of a correction follows from, but for the code."""
+    """Everything that determines the training of a correction, apart from the code."""
 
     demonstrations: DemonstrationSource = Field(
-        default_factory=DemonstrationSource, description="plans that are flown, with their feedback gains"
+        default_factory=DemonstrationSource, description="plans to fly with their feedback gains"
     )
-    mismatch: Mismatch = Field(default_factory=Mismatch, description="what the plans do not know")
+    mismatch: Mismatch = Field(default_factory=Mismatch, description="what the plans do not model")
     environment: ResidualPractice = Field(
-        default_factory=ResidualPractice, description="what the agent practices in"
+        default_factory=ResidualPractice, description="the training environment"
     )
     algorithm: Annotated[ResidualPPO | ResidualSAC, Field(discriminator="name")] = Field(
         description="the algorithm, with its hyperparameters"
@@ -107,18 +104,14 @@ class ResidualConfiguration(AgentConfiguration):
         for name in ("hindsight", "demonstrations"):
             if getattr(self.algorithm, name, None) is not None:
                 yield Problem(
-                    ("algorithm", name), "given", "must be left out: corrections are learned without"
+                    ("algorithm", name), "given", "must be left out: corrections are learned without it"
                 )
 
     def learner(self) -> Configuration:
-        """Describe the learner alone, to which the plan is a part of the environment.
-
-        Returns:
-            The configuration of an agent that learns by reinforcement.
-        """
+        """Configuration of the learner alone, for which the plan is part of the environment."""
         kept = self.model_dump(exclude_none=True, exclude={"demonstrations", "mismatch"})
         own = ResidualPractice.model_fields.keys() - Practice.model_fields.keys()
-        # The environment itself takes the power of costs.
+        # The residual environment applies the cost exponent itself.
         kept["environment"] = {
             name: value
             for name, value in kept["environment"].items()

@@ -1,11 +1,11 @@
-"""What agents are evaluated on: the scene they were trained on, and scenes that they have not seen."""
+"""Evaluation conditions: the scene that agents are trained in, and variants they have not seen."""
 
 import hashlib
 import json
 from collections.abc import Callable, Mapping
 
 from dq_space_arm_env import Scene
-from dq_space_arm_env.scene import Link, Payload
+from dq_space_arm_env.environment.disturbances import with_masses
 
 WIDER = 1.5
 """Factor of the spread of starts."""
@@ -24,60 +24,40 @@ _WIDENED = (
     "joint_rates",
 )
 _MEASURED = ("training", "wide_starts", "spin")
-"""Conditions that differ in their starts alone."""
+"""Conditions that change nothing but the start, which a controller measures."""
 
 
 def scene_under(scene: Scene, condition: str) -> Scene:
-    """Change a scene as a condition says.
+    """Apply a condition to a scene.
 
     Args:
-        scene: The scene that agents are trained on.
-        condition: One of `CONDITIONS`: "training" leaves it as it is; "wide_starts" spreads starts 1.5 times
-            as far; "light_payload" and "heavy_payload" take 30 % off the payload's mass and inertia, or add
-            them, and where there is no payload, as with the paper's massless wrist, to the last link; "spin"
-            lets the base start turning.
+        scene: The scene that agents are trained in.
+        condition: One of `CONDITIONS`: "training" changes nothing; "wide_starts" spreads starts 1.5 times as
+            far; "light_payload" and "heavy_payload" change mass and inertia of the payload by 30 %, or, where
+            there is no payload, as with the paper's massless wrist, of the last link; "spin" starts with a
+            turning base.
 
     Returns:
-        The scene to evaluate on.
+        The scene to evaluate in.
 
     Raises:
-        ValueError: If there is no such condition, or the scene has no arm whose mass could be changed.
+        ValueError: If the condition is unknown, or the scene has no mass to change.
     """
     if condition not in _CHANGES:
-        raise ValueError(f"condition: {condition!r} is unknown; there are {', '.join(CONDITIONS)}")
+        raise ValueError(f"condition: {condition!r} is unknown; choose from {', '.join(CONDITIONS)}")
     if condition == "training":
         return scene
     return _CHANGES[condition](scene).replace(name=f"{scene.name}, {condition}")
 
 
 def as_known(scene: Scene, condition: str) -> Scene:
-    """The scene as a controller knows it that plans a flight under a condition.
-
-    Where a flight starts, and how fast, is measured before it; what the payload weighs is not.
-
-    Args:
-        scene: The scene that agents are trained on.
-        condition: One of `CONDITIONS`.
-
-    Returns:
-        The scene to plan in: that of the condition if it changes nothing but starts, else the unchanged one.
-
-    Raises:
-        ValueError: As for `scene_under`.
-    """
+    """The scene that a controller plans in: it measures its start, and does not know a changed payload."""
     flown = scene_under(scene, condition)
     return flown if condition in _MEASURED else scene
 
 
 def physics_hash(scene: Scene) -> str:
-    """Identify what a policy flies in: neither names, nor where it starts, what is charged and tolerated.
-
-    Args:
-        scene: The scene.
-
-    Returns:
-        SHA-256 of the rest as canonical JSON, 64 hexadecimal digits.
-    """
+    """SHA-256 of the dynamics: everything but names, starts, cost and tolerances."""
     named = ("name", "description", "spread", "initial_state", "cost", "success")
     content = scene.model_dump(mode="json", exclude=set(named))
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -90,19 +70,11 @@ def _wide_starts(scene: Scene) -> Scene:
 
 def _with_load(factor: float) -> Callable[[Scene], Scene]:
     def change(scene: Scene) -> Scene:
-        if scene.payload is not None:
-            return scene.replace(payload=_scaled(scene.payload, factor))
-        if not scene.links:
+        if scene.payload is None and not scene.links:
             raise ValueError(f"scene {scene.name!r} has neither payload nor links: no load can be changed")
-        *others, last = scene.links
-        return scene.replace(links=[*others, _scaled(last, factor)])
+        return with_masses(scene, factor)
 
     return change
-
-
-def _scaled(body: Link | Payload, factor: float) -> dict[str, object]:
-    inertia = tuple(tuple(factor * entry for entry in row) for row in body.inertia)
-    return body.model_dump() | {"mass": factor * body.mass, "inertia": inertia}
 
 
 def _spin(scene: Scene) -> Scene:

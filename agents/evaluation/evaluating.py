@@ -1,58 +1,59 @@
-"""The evaluation protocol: fixed starts, the expert's costs beside the agent's, and what follows."""
+"""The evaluation protocol: fixed starts, the agent's costs relative to the expert's, and their statistics."""
+
+from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluation.conditions import scene_under
 from agents.evaluation.expert_costs import EVALUATION_SEEDS, OptimalCosts, evaluation_seeds, optimal_costs
-from agents.evaluation.flights import Flights, fly, time_per_action
-from agents.evaluation.policies import as_policy, check_fit
 from agents.evaluation.statistics import Interval, bootstrap_interval, wilson_interval
+from agents.policies.flying import Flights, fly, from_json_list, json_list, time_per_action
+from agents.zoo.finding import as_policy, check_fit
 from dq_space_arm_env import Scene, load_scene
 from experts.demonstrations.executors import Executor
 
 CHEAPER = 1e-3
-"""Share by which a flight has to be cheaper than the expert's to count as such."""
+"""Relative margin from which a flight counts as cheaper than the expert's."""
 TAIL = 95.0
-"""Percentile of the cost gap that tells how bad the bad flights are."""
+"""Percentile of the cost gap that describes the bad flights."""
+_OPTIMAL = {"cost": "expert_cost", "is_success": "expert_success", "seconds": "expert_seconds"}
 
 
 class Advance(NamedTuple):
-    """How far an evaluation has come.
-
-    Attributes:
-        stage: What is being done: "optimal costs" or "flights".
-        done: How much of it: problems, or time steps.
-        total: Of how much.
-    """
+    """Progress of an evaluation."""
 
     stage: str
-    done: int
+    done: int  # problems, flights or time steps
     total: int
+
+    def describe(self) -> str:
+        """The progress in one line."""
+        return f"{self.stage}: {self.done} of {self.total}"
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """How an agent does on the evaluation starts of a scene.
+    """Results of an agent from the evaluation starts of a scene.
 
     Attributes:
-        policy: What it is called.
-        scene: Name of the scene that it was evaluated on.
-        condition: Which of `CONDITIONS`.
-        seeds: Of the episodes, shape (n,).
-        flights: What became of each episode.
-        optimal: What the expert pays from the same starts; None if nobody asked.
-        action_seconds: Median time for one action, s.
-        wall_seconds: Time that all the flights took together, s.
-        metadata: How the policy came about, as its file says.
-        same_scene: Whether it was trained in the scene that the condition changes; None if nobody knows.
+        policy: Its name.
+        scene: Name of the scene that it was evaluated in.
+        condition: One of `CONDITIONS`.
+        seeds: Seeds of the episodes, shape (n,).
+        flights: Outcome of each episode.
+        optimal: The expert's costs from the same starts; None if not asked for.
+        action_seconds: Time per action, s.
+        wall_seconds: Time of all flights together, s.
+        metadata: Metadata of the policy's file.
+        same_scene: Whether it was trained in the scene that the condition changes; None if unknown.
     """
 
     policy: str
@@ -73,7 +74,7 @@ class Evaluation:
 
     @cached_property
     def cost_gaps(self) -> NDArray[np.float64]:
-        """J / J_expert - 1 of each episode, shape (n,); NaN where the expert's optimum is not known."""
+        """J / J_expert - 1 of each episode, shape (n,); NaN where the expert's optimum is unknown."""
         if self.optimal is None:
             return np.full(len(self.seeds), np.nan)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -82,20 +83,23 @@ class Evaluation:
     @cached_property
     def median_cost_gap(self) -> Interval:
         """Median of the known cost gaps, with a bootstrap interval."""
-        return bootstrap_interval(_known(self.cost_gaps), _median)
+        return bootstrap_interval(self._known_gaps, lambda gaps: float(np.median(gaps)))
 
     @cached_property
     def tail_cost_gap(self) -> Interval:
         """95th percentile of the known cost gaps, with a bootstrap interval."""
-        return bootstrap_interval(_known(self.cost_gaps), _tail)
+        return bootstrap_interval(self._known_gaps, lambda gaps: float(np.percentile(gaps, TAIL)))
+
+    @property
+    def _known_gaps(self) -> NDArray[np.float64]:
+        return self.cost_gaps[~np.isnan(self.cost_gaps)]
 
     def summary(self) -> dict[str, Any]:
-        """Put the evaluation into numbers.
+        """Summarize the evaluation as a row of JSON values, None for what is unknown.
 
         Returns:
-            JSON values, None for what is not known: rates and gaps with their intervals; medians of angle
-            [deg], distance [m], effort and base turn [deg]; the time of an action [s]; and what the training
-            took.
+            Rates and gaps with their intervals; medians of angle [deg], distance [m], effort and base turn
+            [deg]; time per action [s]; and the effort of the training.
         """
         flights, training = self.flights, self.metadata.get("training", {})
         return {
@@ -104,8 +108,8 @@ class Evaluation:
             "condition": self.condition,
             "episodes": len(self.seeds),
             "success_rate": list(self.success_rate),
-            "median_cost_gap": _finite(self.median_cost_gap),
-            "tail_cost_gap": _finite(self.tail_cost_gap),
+            "median_cost_gap": known_interval(self.median_cost_gap),
+            "tail_cost_gap": known_interval(self.tail_cost_gap),
             "unknown_optima": int(np.isnan(self.cost_gaps).sum()),
             "cheaper_than_expert": int((flights.is_success & (self.cost_gaps < -CHEAPER)).sum()),
             "expert_success_rate": None
@@ -127,6 +131,39 @@ class Evaluation:
             "expert_solves": training.get("expert_solves"),
         }
 
+    def record(self) -> dict[str, Any]:
+        """The evaluation as JSON values: its summary, the policy's metadata, and columns of all episodes."""
+        episodes: dict[str, Any] = {"seed": self.seeds.tolist(), **self.flights.columns()}
+        if self.optimal is not None:
+            for name, column in _OPTIMAL.items():
+                episodes[column] = json_list(getattr(self.optimal, name))
+        episodes["cost_gap"] = json_list(self.cost_gaps)
+        return {"summary": self.summary(), "metadata": self.metadata, "episodes": episodes}
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Self:
+        """The evaluation that `record` has written; KeyError, TypeError or ValueError for anything else."""
+        summary, episodes = record["summary"], record["episodes"]
+        seeds = np.array(episodes["seed"], dtype=np.int64)
+        optimal = None
+        if all(column in episodes for column in _OPTIMAL.values()):
+            cost, success, seconds = (episodes[column] for column in _OPTIMAL.values())
+            optimal = OptimalCosts(
+                seeds, from_json_list(cost), from_json_list(success, np.bool_), from_json_list(seconds)
+            )
+        return cls(
+            policy=str(summary["policy"]),
+            scene=str(summary["scene"]),
+            condition=str(summary["condition"]),
+            seeds=seeds,
+            flights=Flights.from_columns(episodes),
+            optimal=optimal,
+            action_seconds=float(summary["action_seconds"]),
+            wall_seconds=float(summary["wall_seconds"]),
+            metadata=dict(record["metadata"]),
+            same_scene=summary["same_scene"],
+        )
+
 
 def evaluate(
     policy: Any,
@@ -140,20 +177,20 @@ def evaluate(
     label: str | None = None,
     progress: Callable[[Advance], None] = lambda advance: None,
 ) -> Evaluation:
-    """Evaluate a policy on the fixed evaluation starts of a scene.
+    """Evaluate a policy from the fixed evaluation starts of a scene.
 
     Args:
-        policy: Name of a policy of the zoo; path of an exported policy (.npz), of a model of
-            Stable-Baselines3 (.zip), or of the folder of a training run; an `ExportedPolicy`; a model; or a
-            function of observations, see `agents.evaluation.flights.fly`.
+        policy: Name of a policy of the zoo; path of an exported policy (.npz), of a Stable-Baselines3 model
+            (.zip), or of the folder of a training run; an `ExportedPolicy`; a model; or a function from
+            observations, shape (B, n_obs), to actions, fractions of the limits, shape (B, n_u).
         scene: A scene, the name of a shipped one, or a path to a YAML file.
         n: Number of starts, the first ones of the 500.
-        condition: What is changed in the scene, one of `CONDITIONS`.
+        condition: Variant of the scene, one of `CONDITIONS`.
         expert: Whether to compare with the expert's costs. They are computed once for each scene, which takes
-            minutes, and kept.
-        workers: Number of processes that compute them; one for each processor by default.
-        executor: Who computes them, in place of processes.
-        label: What tables call the policy.
+            minutes, and cached.
+        workers: Number of processes that compute them; one per processor by default.
+        executor: Computes them in place of these processes.
+        label: Name in tables.
         progress: Called now and then.
 
     Returns:
@@ -161,7 +198,7 @@ def evaluate(
 
     Raises:
         SceneError: If the scene cannot be loaded.
-        PolicyError, PolicyFileError: If the policy is none, does not fit the scene, or its file cannot be
+        PolicyError, PolicyFileError: If the policy is of no known kind, does not fit the scene, or cannot be
             read.
         ValueError: If an argument is out of range; if the expert is asked for in a scene that draws targets
             or masses, which it cannot solve in bulk; if the policy's actions do not fit the scene.
@@ -181,7 +218,7 @@ def evaluate(
         )
     started = perf_counter()
     flights = fly(acting.act, flown, seeds, lambda done, total: progress(Advance("flights", done, total)))
-    wall_seconds = perf_counter() - started
+    wall_seconds, made_in = perf_counter() - started, acting.metadata.get("scene_hash")
     return Evaluation(
         policy=acting.label,
         scene=flown.name,
@@ -192,27 +229,10 @@ def evaluate(
         action_seconds=time_per_action(acting.act_once, flown, batched=acting.batched),
         wall_seconds=wall_seconds,
         metadata=dict(acting.metadata),
-        same_scene=_is_scene_of(acting.metadata, given),
+        same_scene=None if made_in is None else bool(made_in == given.content_hash()),
     )
 
 
-def _is_scene_of(metadata: Mapping[str, Any], scene: Scene) -> bool | None:
-    """Whether metadata are those of a policy that was trained in a scene; None if they do not say."""
-    made_in = metadata.get("scene_hash")
-    return None if made_in is None else bool(made_in == scene.content_hash())
-
-
-def _known(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return values[~np.isnan(values)]
-
-
-def _median(values: NDArray[np.float64]) -> float:
-    return float(np.median(values))
-
-
-def _tail(values: NDArray[np.float64]) -> float:
-    return float(np.percentile(values, TAIL))
-
-
-def _finite(interval: Interval) -> list[float] | None:
+def known_interval(interval: Interval) -> list[float] | None:
+    """An interval as JSON values; None if it is NaN."""
     return None if np.isnan(interval.value) else list(interval)

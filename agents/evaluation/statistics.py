@@ -1,7 +1,6 @@
-"""Statistics of evaluations: intervals for rates, medians, and what several training runs have in common.
+"""Statistics of evaluations: intervals for rates and medians, and aggregates over training runs.
 
-NumPy alone, since policies are evaluated where no more is installed: SciPy would be a hundred megabytes for
-three formulas. The tests compare with it.
+Policies must be evaluated without SciPy, a hundred megabytes for three formulas; the tests compare with it.
 """
 
 import math
@@ -15,21 +14,15 @@ FloatArray = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000
-"""Resamples of a bootstrap: its bounds are then right to some per cent of their distance."""
+"""Resamples of a bootstrap: enough for bounds within a few per cent of the interval's width."""
 FEWEST_RUNS = 3
-"""Training runs that tell something about an algorithm rather than about a seed."""
+"""Training runs below which a result describes a seed rather than an algorithm."""
 
 _NORMAL_QUANTILE = 1.959963984540054  # of CONFIDENCE, two-sided
 
 
 class Interval(NamedTuple):
-    """An estimate and its 95 % confidence interval.
-
-    Attributes:
-        value: The estimate.
-        low: Lower bound.
-        high: Upper bound.
-    """
+    """An estimate and its 95 % confidence interval."""
 
     value: float
     low: float
@@ -37,52 +30,27 @@ class Interval(NamedTuple):
 
 
 class Runs(NamedTuple):
-    """What several training runs of one agent, which differ in their seeds, have in common.
+    """Aggregates over training runs of one agent with different seeds."""
 
-    Attributes:
-        success_rate: Share of successful episodes, of all runs.
-        cost_gap: Interquartile mean of the cost gap over runs and episodes.
-    """
-
-    success_rate: Interval
-    cost_gap: Interval
+    success_rate: Interval  # of all episodes of all runs
+    cost_gap: Interval  # interquartile mean over runs and episodes
 
 
 def wilson_interval(successes: int, trials: int) -> Interval:
-    """Estimate a rate by Wilson's score interval, which also holds near 0 and 1 (Wilson, JASA 1927).
-
-    Args:
-        successes: Number of successes.
-        trials: Number of trials.
-
-    Returns:
-        The rate and its interval.
-
-    Raises:
-        ValueError: If the numbers are none of trials.
-    """
+    """Wilson's score interval of a rate, which holds near 0 and 1 too (Wilson, JASA 1927)."""
     if not 0 <= successes <= trials or trials == 0:
         raise ValueError(f"{successes} successes of {trials} trials: should be 0 <= successes <= trials > 0")
     z, n, rate = _NORMAL_QUANTILE, trials, successes / trials
     center = (rate + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
-    # At the ends one bound is the rate itself, but for rounding.
+    # At rates of 0 and 1 one bound equals the rate; guard against rounding.
     return Interval(rate, min(rate, max(0.0, center - half)), max(rate, min(1.0, center + half)))
 
 
 def bootstrap_interval(
     values: ArrayLike, statistic: Callable[[FloatArray], float], *, seed: int = 0
 ) -> Interval:
-    """Estimate a statistic of independent values by the percentile bootstrap.
-
-    Args:
-        values: Shape (n,), any unit.
-        statistic: Function of values of this shape.
-        seed: Seed of the resamples.
-
-    Returns:
-        The statistic and its interval, in the statistic's unit; NaN without values.
-    """
+    """Percentile bootstrap of a statistic of independent values; NaN without values."""
     sample = np.asarray(values, dtype=np.float64)
     if sample.size == 0:
         return Interval(math.nan, math.nan, math.nan)
@@ -92,14 +60,7 @@ def bootstrap_interval(
 
 
 def interquartile_mean(values: ArrayLike) -> float:
-    """Mean of the middle half of some values: as robust as a median, and less wasteful.
-
-    Args:
-        values: Any shape and unit.
-
-    Returns:
-        Mean of what is left without the lowest and the highest quarter, rounded down; NaN without values.
-    """
+    """Mean without the lowest and highest quarter: robust as the median, and statistically more efficient."""
     ordered = np.sort(np.asarray(values, dtype=np.float64), axis=None)
     if ordered.size == 0:
         return math.nan
@@ -110,17 +71,13 @@ def interquartile_mean(values: ArrayLike) -> float:
 def compare_runs(successes: Sequence[ArrayLike], gaps: Sequence[ArrayLike], *, seed: int = 0) -> Runs:
     """Aggregate training runs that differ in their seeds (after Agarwal et al., NeurIPS 2021).
 
-    Resamples draw starts, and then runs for each stratum. The stratum is the set of all starts: a run's
-    episodes stand or fall with its policy, and drawing runs for each start anew, as if they were independent,
-    would make three runs look like hundreds.
+    Each resample draws whole runs and starts. Episodes of a run share its policy: drawing a run for each
+    start anew, as if they were independent, would make three runs look like hundreds.
 
     Args:
-        successes: Whether each episode succeeded: for each run, shape (n,), the same starts in all runs.
-        gaps: Cost gaps likewise; NaN where the optimal cost is not known.
+        successes: Success of each episode: for each run, shape (n,), the same starts in all runs.
+        gaps: Cost gaps likewise; NaN where the optimal cost is unknown.
         seed: Seed of the resamples.
-
-    Returns:
-        Success rate and cost gap with intervals.
 
     Raises:
         ValueError: If there are fewer than 3 runs, or their numbers of episodes differ.

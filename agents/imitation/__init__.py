@@ -1,10 +1,9 @@
-"""Imitation: networks that learn the expert's maneuvers from demonstrations.
+"""Imitation: networks learn the expert's maneuvers from demonstrations.
 
-`clone` trains a network on what the expert does (behavior cloning), on how the expert would change it
-(cloning with gains: the derivative of the policy is matched to the feedback gains), and on what the gains say
-about states around the demonstrations (augmentation), each as the settings weigh it. `aggregate` lets the
-network fly, has the expert label the states that it visits, and trains on (DAgger). Importing this package
-loads no PyTorch; training does.
+`clone` trains a network on the expert's actions (behavior cloning), on its feedback gains (the policy's
+derivative should match them), and on states around the demonstrations with actions extrapolated by the gains
+(augmentation), each weighted by the settings. `aggregate` flies the network, has the expert label the states
+it visits, and keeps training (DAgger). Importing this package loads no PyTorch; training does.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from agents.imitation.aggregation import Aggregated, aggregate
     from agents.imitation.cloning import Cloned, Making, clone
-    from agents.imitation.training import train_by_imitation
+    from agents.imitation.imitation_training import train_by_imitation
 
 __all__ = ["Aggregated", "Cloned", "Making", "aggregate", "clone", "train_by_imitation"]
 

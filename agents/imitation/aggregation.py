@@ -1,9 +1,9 @@
-"""DAgger: the network flies, the expert says what it should have done there, and the network learns that too.
+"""DAgger: the network flies, the expert labels the states it visits, and the network trains on them too.
 
-A network that has only seen the expert's way is lost where its own errors lead it. So training and flying
-take turns, and what has been corrected is kept: after Ross, Gordon and Bagnell, "A Reduction of Imitation
-Learning and Structured Prediction to No-Regret Online Learning" (AISTATS 2011), with the network flying from
-the first round on.
+A network that has only seen the expert's trajectories is lost where its own errors lead it. Training and
+flying alternate, and all labels are kept: Ross, Gordon and Bagnell, "A Reduction of Imitation Learning and
+Structured Prediction to No-Regret Online Learning" (AISTATS 2011), with the network flying from the first
+round on.
 """
 
 from __future__ import annotations
@@ -23,64 +23,43 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.configuration.imitation import Dagger
-from agents.imitation.checkpoints import CheckpointError
 from agents.imitation.cloning import Cloned, Making, fingerprint
-from agents.imitation.flights import record
 from agents.imitation.labels import Solver, label_by_gains
 from agents.imitation.objective import Objective
-from agents.imitation.progress import Labeling
 from agents.imitation.samples import NAMES, Corrections, Mixture, Statistics
-from agents.imitation.trainer import Progress, Record, Spent, Trainer, Watch, torch_threads
+from agents.imitation.trainer import CheckpointError, Progress, Record, Spent, Trainer, Watch, torch_threads
 from agents.policies.exported import ExportedPolicy
 from agents.policies.network import PolicyNetwork
+from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.progress import Status
+from dq_space_arm_env.environment.rollouts import rollout
 from experts.demonstrations import Demonstrations
-from experts.files import write_atomically
 
 CORRECTIONS = "corrections.npz"
 
 
 class Round(NamedTuple):
-    """What the network did at the beginning of a round.
+    """The network's flights at the start of a round, and their labeling."""
 
-    Attributes:
-        number: Of the round, from 0.
-        success: Share of its flights that arrived within the tolerances of the demonstrations, 0 to 1.
-        gap: Median of J / J_expert - 1 over them, dimensionless.
-        corrections: Time steps that the expert has labeled so far.
-        solves: Plans that it has made for this round.
-        seconds: Time to fly and to label, s.
-    """
-
-    number: int
-    success: float
-    gap: float
-    corrections: int
-    solves: int
-    seconds: float
+    number: int  # from 0
+    success: float  # share of flights within the tolerances of the demonstrations
+    gap: float  # median of J / J_expert - 1 over the flights
+    corrections: int  # time steps labeled so far
+    solves: int  # plans made in this round
+    seconds: float  # to fly and to label
 
 
 @dataclass(frozen=True, eq=False)
 class Aggregated:
-    """A corrected network.
-
-    Attributes:
-        network: The network.
-        rounds: What it did at the beginning of every round.
-        history: Of the training before and in every round, see `Trainer`.
-        facts: JSON values: scene and training, for the exported policy.
-    """
+    """A network trained by DAgger."""
 
     network: PolicyNetwork
     rounds: list[Round]
-    history: list[Record]
-    facts: dict[str, Any]
+    history: list[Record]  # of the cloning and of every round, see `Trainer`
+    facts: dict[str, Any]  # metadata of the exported policy, JSON values
 
     def export(self) -> ExportedPolicy:
-        """Make the policy that needs NumPy alone.
-
-        Returns:
-            The policy; its metadata says for which scene and how it was trained.
-        """
+        """Export the policy, which needs NumPy alone."""
         return self.network.export(self.facts)
 
 
@@ -95,24 +74,20 @@ def aggregate(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Aggregated:
-    """Correct a network where it goes.
-
-    A run that was interrupted is resumed by the same call: what the expert has labeled is kept, and so are
-    checkpoints of the training.
+    """Train a cloned network with DAgger; the same call resumes an interrupted run.
 
     Args:
-        cloned: Where to begin; it is left as it is.
-        demonstrations: What it was trained on; the expert's corrections keep to their tolerances.
-        settings: How to correct it; of how it was cloned, what was minimized and how often there was a
-            checkpoint go on.
-        folder: Where to keep what is needed to go on; None for nowhere.
+        cloned: Where to start; it is left as it is.
+        demonstrations: What it was trained on; the expert plans to their tolerances.
+        settings: Settings of DAgger; objective and checkpoint interval are those of its `cloning`.
+        folder: Where to keep labels and checkpoints; None for nowhere.
         making: Seed and threads; `Making()` by default.
-        starts: Demonstrations from whose starts it flies; those it was trained on by default.
+        starts: Demonstrations from whose starts the network flies; `demonstrations` by default.
         progress: Called now and then in every round.
-        watch: Called with the network after every round; what it returns is added to the history.
+        watch: Called with the network at every validation; its result is added to the history.
 
     Returns:
-        The network.
+        The network, with the rounds and the history of its training.
 
     Raises:
         CheckpointError: If the folder holds another run, or a damaged file.
@@ -125,7 +100,7 @@ def aggregate(
     network = copy.deepcopy(cloned.network)
     statistics = Statistics.of(demonstrations)
     expert = _Expert(starts, settings, making.seed, progress)
-    flown = expert.episodes * starts.scene.simulation.steps  # in a round
+    environment_steps = expert.episodes * starts.scene.simulation.steps  # per round
     rounds: list[Round] = []
     corrections: list[Corrections] = []
     history = list(cloned.history)
@@ -144,7 +119,7 @@ def aggregate(
                 validate_every=settings.cloning.validate_every,
                 seed=making.seed + 1 + number,
                 part=_part(number),
-                before=_spent(history[-1], done, flown),
+                before=_spent(history[-1], done, environment_steps),
             )
             trainer.train(mixture, None, place, identity, progress=progress, watch=watch)
         history += trainer.history
@@ -152,7 +127,6 @@ def aggregate(
 
 
 def _spent(last: Record, done: Round, environment_steps: int) -> Spent:
-    """What a network has cost when it is trained in a round."""
     return Spent(
         last["updates"], last["seconds"] + done.seconds, last["environment_steps"] + environment_steps
     )
@@ -163,7 +137,7 @@ def _part(number: int) -> str:
 
 
 class _Expert:
-    """Lets a network fly, and labels where it has been."""
+    """Flies a network, and labels the states it visits."""
 
     def __init__(
         self, starts: Demonstrations, settings: Dagger, seed: int, progress: Progress | None
@@ -173,7 +147,7 @@ class _Expert:
 
     @property
     def episodes(self) -> int:
-        """Of a round: there are no more than starts."""
+        """Episodes per round, at most one per start."""
         return min(self._settings.episodes, len(self._starts))
 
     def correct(self, network: PolicyNetwork, number: int) -> tuple[Round, Corrections]:
@@ -181,8 +155,8 @@ class _Expert:
         rng = np.random.default_rng([self._seed, number])
         count = self.episodes
         starts = self._starts.select(np.sort(rng.permutation(len(self._starts))[:count]))
-        visits = record(network.export({}), starts.scene, starts.column("seed").tolist())
-        gap = float(np.median(visits.flights.cost / starts.column("cost") - 1.0))
+        visits = rollout(network.export({}), starts.scene, starts.column("seed").tolist(), record=True)
+        gap = float(np.median(visits.cost / starts.column("cost") - 1.0))
         solves = 0
         if self._solver is None:
             corrections = label_by_gains(starts, visits)
@@ -190,19 +164,19 @@ class _Expert:
             tell = partial(self._tell, number, count)
             corrections, solves = self._solver.label(starts, visits, settings.solves, rng, tell)
         corrections = corrections.thinned(settings.every)
-        success = float(visits.flights.is_success.mean())
+        success = float(visits.is_success.mean())
         seconds = perf_counter() - started
         return Round(number, success, gap, len(corrections), solves, seconds), corrections
 
     def _tell(self, number: int, count: int, done: int) -> None:
         if self._progress is not None:
-            self._progress(Labeling(_part(number), done, count))
+            self._progress(Status(done, count, f"{_part(number)}: {done} of {count} flights labeled"))
 
 
 def _corrections(
     place: Path | None, identity: dict[str, Any], make: Callable[[], tuple[Round, Corrections]]
 ) -> tuple[Round, Corrections]:
-    """What the expert has labeled in a round: read if it is there, else made, and written."""
+    """The labels of a round: read from its folder, or made and written there."""
     path = None if place is None else place / CORRECTIONS
     if path is not None and path.is_file():
         return _read(path, identity)
@@ -225,5 +199,5 @@ def _read(path: Path, identity: dict[str, Any]) -> tuple[Round, Corrections]:
     except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         raise CheckpointError(f"{path} cannot be read ({error}); remove its folder and later ones") from error
     if facts["identity"] != identity:
-        raise CheckpointError(f"{path} is that of another run; take another folder")
+        raise CheckpointError(f"{path} is of another run; use another folder")
     return Round(**facts["round"]), corrections

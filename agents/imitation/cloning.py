@@ -1,4 +1,4 @@
-"""Training of a network on demonstrations."""
+"""Clone the expert: train a network on demonstrations."""
 
 from __future__ import annotations
 
@@ -24,39 +24,23 @@ from experts.demonstrations import Demonstrations
 
 @dataclass(frozen=True)
 class Making:
-    """What a training follows from besides demonstrations and hyperparameters.
-
-    Attributes:
-        network: Sizes and activation of the network.
-        seed: Of everything that is drawn.
-        threads: Of PyTorch; another number changes the last digits.
-    """
+    """Network, seed and threads of a training."""
 
     network: Network = field(default_factory=Network)
     seed: int = 0
-    threads: int = 1
+    threads: int = 1  # of PyTorch; another number changes the last digits
 
 
 @dataclass(frozen=True, eq=False)
 class Cloned:
-    """A trained network.
+    """A cloned network."""
 
-    Attributes:
-        network: With the weights of the best validation.
-        history: Losses at every validation, see `Trainer`.
-        facts: JSON values: scene and training, for the exported policy.
-    """
-
-    network: PolicyNetwork
-    history: list[Record]
-    facts: dict[str, Any]
+    network: PolicyNetwork  # with the weights of the lowest validation loss
+    history: list[Record]  # losses at every validation, see `Trainer`
+    facts: dict[str, Any]  # metadata of the exported policy, JSON values
 
     def export(self) -> ExportedPolicy:
-        """Make the policy that needs NumPy alone.
-
-        Returns:
-            The policy; its metadata says for which scene and how it was trained.
-        """
+        """Export the policy, which needs NumPy alone."""
         return self.network.export(self.facts)
 
 
@@ -70,28 +54,24 @@ def clone(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Cloned:
-    """Train a network on demonstrations.
-
-    A run that was interrupted is resumed by the same call, and ends with the weights of an uninterrupted one.
+    """Train a network on demonstrations; the same call resumes an interrupted run, with the same result.
 
     Args:
-        demonstrations: At least two; some are set aside for the validation.
-        settings: How to train; cloning with gains by default.
-        folder: Where to keep a checkpoint; None for none.
+        demonstrations: What to learn from, a part of them kept for validation.
+        settings: Hyperparameters; `Cloning()` by default.
+        folder: Where to keep a checkpoint; None for nowhere.
         making: Network, seed and threads; `Making()` by default.
-        scene: The scene that the policy is for; that of the demonstrations by default. Theirs may have
-            stricter tolerances: where the cheapest way to succeed ends just within the tolerances, a policy
-            that is a little less exact than the expert needs a margin.
+        scene: The scene to fly in, which may differ in its tolerances; that of the demonstrations by default.
         progress: Called now and then.
-        watch: Called with the network at every validation; what it returns is added to the history.
+        watch: Called with the network at every validation; its result is added to the history.
 
     Returns:
         The network.
 
     Raises:
-        ValueError: If there are too few demonstrations, or gains are asked for and they have none.
-        DemonstrationsError: If the scene differs from theirs in more than tolerances.
-        CheckpointError: If the folder holds the checkpoint of another training, or a damaged one.
+        ValueError: If there are too few demonstrations, gains are missing, or the training diverges.
+        DemonstrationsError: If the demonstrations are of another scene.
+        CheckpointError: If the folder holds another training, or a damaged checkpoint.
     """
     settings, making = settings or Cloning(), making or Making()
     intended = scene or demonstrations.scene
@@ -115,15 +95,7 @@ def clone(
 
 
 def new_network(statistics: Statistics, making: Making) -> PolicyNetwork:
-    """Make a network that has learned nothing but the units.
-
-    Args:
-        statistics: Of the demonstrations.
-        making: Sizes, and the seed of its weights.
-
-    Returns:
-        The network; PyTorch's generator is as before.
-    """
+    """An untrained network that knows the units of its data."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(making.seed)
         sizes = len(statistics.observation_mean), len(statistics.action_mean)
@@ -138,7 +110,7 @@ def new_network(statistics: Statistics, making: Making) -> PolicyNetwork:
 
 
 def _facts(demonstrations: Demonstrations, settings: Cloning, making: Making, scene: Scene) -> dict[str, Any]:
-    """What a training follows from, JSON values."""
+    """Metadata that identifies a training, JSON values."""
     return {
         "scene": scene.name,
         "scene_hash": scene.content_hash(),
@@ -156,32 +128,25 @@ def _facts(demonstrations: Demonstrations, settings: Cloning, making: Making, sc
 
 
 def fingerprint(demonstrations: Demonstrations) -> str:
-    """Name a choice among the demonstrations of a folder.
-
-    Args:
-        demonstrations: The choice.
-
-    Returns:
-        16 hexadecimal digits.
-    """
+    """Hash that identifies a selection of a folder's demonstrations."""
     return hashlib.sha256(demonstrations.column("index").tobytes()).hexdigest()[:16]
 
 
 def _divide(
     demonstrations: Demonstrations, settings: Cloning, seed: int
 ) -> tuple[Demonstrations, Demonstrations | None]:
-    """Split by problem into what to train and what to validate on."""
+    """Split into demonstrations to train on and to validate on."""
     count, share, gains = len(demonstrations), settings.validation_share, settings.objective.needs_gains
     aside = max(1, round(share * count)) if share else 0
     if count - aside < 1 or (gains and count - aside < 2):
         raise ValueError(
             f"{count} demonstrations, {aside} of them for the validation, are too few: training needs one, "
-            "with gains two, whose spread is the unit of deviations"
+            "or two with gains, whose spread is the unit of deviations"
         )
     if gains and not demonstrations[0].feedback_gains.any():
         raise ValueError(
             f"{demonstrations.path}: these demonstrations have no feedback gains, which gain_weight and "
-            "augmentation_weight ask for: set both to 0, or export them with gains"
+            "augmentation_weight need: set both to 0, or export with gains"
         )
     if not aside:
         return demonstrations, None

@@ -1,34 +1,28 @@
-"""What the expert would have done in states that a network visits."""
+"""Label the states that a network visits with what the expert would have done there."""
 
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 import numpy as np
 
-from agents.imitation.flights import Visits
 from agents.imitation.samples import Corrections
 from dq_space_arm_env import Scene
-from experts.arm_problem import ArmProblem
-from experts.box_ddp import BoxDDP
+from dq_space_arm_env.environment.rollouts import Rollout
+from experts.ddp.box_ddp import BoxDDP
 from experts.demonstrations import Demonstrations, DemonstrationsError
 from experts.demonstrations.reading import Demonstration
-from experts.problem import FloatArray
-from experts.window_problem import WindowProblem
+from experts.problems.arm_problem import ArmProblem, WindowProblem
+from experts.problems.shooting_problem import FloatArray
 
 
-def label_by_gains(demonstrations: Demonstrations, visits: Visits) -> Corrections:
-    """Ask the feedback policies of the demonstrations from the same starts.
+def label_by_gains(demonstrations: Demonstrations, visits: Rollout) -> Corrections:
+    """Label every visited state by the feedback policy of the demonstration from the same start.
 
-    It costs nothing, and holds as far as the flight is close to the demonstration.
-
-    Args:
-        demonstrations: M of them.
-        visits: From their starts, in the same order.
-
-    Returns:
-        All visited states, with the actions clip(a_k + G_k (x (-) x_k)) and the gains. Inputs that these
-        actions bring to a limit have no gain.
+    The actions are clip(a_k + G_k (x (-) x_k)); inputs at a limit get zero gains. This costs nothing, and
+    holds as long as the flight stays close to the demonstration.
     """
+    assert visits.states is not None
+    assert visits.observations is not None
     parts = []
     for i, demonstration in enumerate(demonstrations):
         steps = slice(int(visits.length[i]))
@@ -49,51 +43,30 @@ def label_by_gains(demonstrations: Demonstrations, visits: Visits) -> Correction
 
 
 class Solver:
-    """Plans the rest of a maneuver anew, from states that a network visits."""
+    """Replans the rest of a maneuver from visited states, in a scene in double precision."""
 
     def __init__(self, scene: Scene) -> None:
-        """Prepare.
-
-        Args:
-            scene: The scene, in double precision.
-        """
         self._maneuver = ArmProblem(scene)
         self._kernels = self._maneuver.kernels
 
     def label(
         self,
         demonstrations: Demonstrations,
-        visits: Visits,
+        visits: Rollout,
         solves: int,
         rng: np.random.Generator,
         progress: Callable[[int], None] = lambda done: None,
     ) -> tuple[Corrections, int]:
-        """Plan anew from some stages of every flight.
+        """Replan from `solves` stages of every flight, drawn one from each of as many equal parts.
 
-        The plan from a stage holds until the next one, so that a flight gives as many time steps as it has
-        stages. Each begins at a visited state, and goes on as the expert would: back to where it can still
-        arrive. The solver begins with the demonstration's feedback policy from there, and a plan that does
-        not converge is not taken.
-
-        Args:
-            demonstrations: M of them.
-            visits: From their starts, in the same order.
-            solves: Stages to plan from in each flight; the first one is drawn from the first part of the
-                flight, the second from the second, and so on.
-            rng: Draws them.
-            progress: Called after each flight with the number of those that are done.
-
-        Returns:
-            Time steps of the plans, and the number of plans, those that did not converge included.
-
-        Raises:
-            ValueError: If the demonstrations do not say with which emphasis they were planned.
-            DemonstrationsError: If no plan has converged.
+        A plan labels the stages up to the next one. It starts at a visited state and returns to the target as
+        the expert would; its initial guess is the demonstration's feedback policy from there. Plans that do
+        not converge are dropped. Returns the labels and the number of plans, dropped ones included.
         """
         if np.isnan(demonstrations.column("emphasis")).any():
             raise ValueError(
-                f"{demonstrations.path}: these demonstrations do not say how much the final pose was "
-                "emphasized, so that the expert cannot plan as it did: take labels from gains"
+                f"{demonstrations.path}: these demonstrations lack the weight on the final pose that the "
+                "expert planned with, so it cannot replan: set labels to gains"
             )
         plans: list[Corrections | None] = []
         for i, demonstration in enumerate(demonstrations):
@@ -105,18 +78,14 @@ class Solver:
         return Corrections.joined(parts), len(plans)
 
     def _plans(
-        self,
-        demonstration: Demonstration,
-        visits: Visits,
-        flight: int,
-        solves: int,
-        rng: np.random.Generator,
+        self, demonstration: Demonstration, visits: Rollout, i: int, solves: int, rng: np.random.Generator
     ) -> Iterator[Corrections | None]:
-        length = int(visits.length[flight])
+        assert visits.states is not None
+        length = int(visits.length[i])
         bounds = np.linspace(0, length, solves + 1).astype(np.int64)
         stages = [int(rng.integers(a, b)) for a, b in pairwise(bounds.tolist()) if a < b]
         for stage, end in zip(stages, [*stages[1:], self._maneuver.horizon], strict=True):
-            yield self._plan(demonstration, visits.states[flight, stage], stage, end)
+            yield self._plan(demonstration, visits.states[i, stage], stage, end)
 
     def _plan(
         self, demonstration: Demonstration, state: FloatArray, stage: int, end: int
@@ -124,7 +93,7 @@ class Solver:
         maneuver, limits = self._maneuver, self._maneuver.control_upper
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         guess = self._followed(demonstration, state, stage) * limits
-        # With the same weight of the final pose, so that what has missed the target otherwise reaches it.
+        # The demonstration's own weight on the final pose: without it some plans miss the target.
         with maneuver.emphasized(float(demonstration.facts["emphasis"])):
             solution = BoxDDP(problem).solve(x0=state, u_init=guess)
         if not solution.converged:
@@ -141,7 +110,7 @@ class Solver:
         )
 
     def _followed(self, demonstration: Demonstration, state: FloatArray, stage: int) -> FloatArray:
-        """Actions of the demonstration's feedback policy from a state on."""
+        """Actions of the demonstration's feedback policy, rolled out from a state."""
         actions = demonstration.actions[stage:].copy()
         limits = self._maneuver.control_upper
         for k in range(len(actions)):

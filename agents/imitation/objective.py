@@ -1,13 +1,13 @@
-"""What training by imitation minimizes: errors of actions, of their derivatives, and around demonstrations.
+"""Loss of training by imitation: errors of actions, of their derivatives, and around demonstrations.
 
-With x (+) d the state moved along tangent coordinates, the expert does a(x (+) d) = clip(a + G d) to first
-order, so a policy pi that sees o(x) should have
+With x (+) d the state moved along tangent coordinates d, the expert acts as a(x (+) d) = clip(a + G d) to
+first order, so a policy pi that observes o(x) should satisfy
 
-    d/de pi(o(x (+) e d)) = G d
+    d/de pi(o(x (+) e d)) = G d   at e = 0
 
-in every direction d, at e = 0. Each update asks that of one random direction per time step: of a whole
-Jacobian that is right only if it is right in all of them. Inputs at a limit are left out: their rows of G are
-zero because the limit holds them, and clipping does so for the policy too, which may want more than it gets.
+in every direction d. Each update checks one random direction per time step, which in expectation checks the
+whole Jacobian. Inputs at a limit are left out: their rows of G are zero because the limit holds them, and
+clipping holds the policy's output as well, whatever lies beyond.
 """
 
 from __future__ import annotations
@@ -24,40 +24,25 @@ from agents.imitation.samples import Statistics
 from agents.policies.network import PolicyNetwork
 from dq_space_arm_env.kernels import Kernels
 from experts.demonstrations.reading import Batch
-from experts.problem import FloatArray
+from experts.problems.shooting_problem import FloatArray
 
-STEP = 1e-5
-"""Length of a central difference, relative to the direction: errors of 1e-10 both ways."""
+STEP = 1e-5  # of central differences, relative to the direction: truncation and rounding errors near 1e-10
 
 
 @dataclass(frozen=True)
 class Losses:
-    """Mean squares of errors, in units of the demonstrations' variation.
+    """Mean squared errors, in units of the demonstrations' spread; 0 without weight."""
 
-    Attributes:
-        total: What is minimized, the weighted sum.
-        action: Of actions.
-        gain: Of derivatives relative to the size of the gains; 0 if they have no weight.
-        augmentation: Of actions at states around the demonstrations; 0 if they have no weight.
-    """
-
-    total: Tensor
+    total: Tensor  # the weighted sum, which is minimized
     action: Tensor
-    gain: Tensor
-    augmentation: Tensor
+    gain: Tensor  # of derivatives, relative to the size of the gains
+    augmentation: Tensor  # of actions at states around the demonstrations
 
 
 class Objective:
-    """Evaluates a network on batches."""
+    """Evaluates a network on batches; `kernels` are in double precision."""
 
     def __init__(self, kernels: Kernels, statistics: Statistics, weights: ObjectiveWeights) -> None:
-        """Prepare.
-
-        Args:
-            kernels: Of the scene, in double precision.
-            statistics: Of the demonstrations.
-            weights: Of the parts.
-        """
         self._kernels, self._weights, self._spread = kernels, weights, statistics.spread
         self._action_deviation = statistics.action_deviation
         self._gain_size = torch.from_numpy(statistics.gain_size.astype(np.float32))
@@ -70,16 +55,7 @@ class Objective:
         return ("observations", "actions")
 
     def __call__(self, network: PolicyNetwork, batch: Batch, rng: np.random.Generator) -> Losses:
-        """Evaluate a network.
-
-        Args:
-            network: The network.
-            batch: B time steps with the arrays that `needs` names.
-            rng: Draws the directions.
-
-        Returns:
-            The losses, with gradients.
-        """
+        """Evaluate the losses, with gradients, on B time steps with the arrays of `needs`."""
         weights, arrays = self._weights, batch.arrays
         normalized = network.normalized(arrays["observations"])
         none = torch.zeros(())
@@ -104,14 +80,14 @@ class Objective:
     def _gain_error(
         self, network: PolicyNetwork, slopes: Tensor, batch: Batch, directions: FloatArray
     ) -> Tensor:
-        """Error of the policy's derivative, each action relative to the size of its gains."""
+        """Error of d/de pi(o(x (+) e d)) - G d, each input relative to the size of its gains."""
         wanted = torch.from_numpy(_times(batch.arrays["feedback_gains"], directions).astype(np.float32))
         free = torch.from_numpy(np.abs(batch.arrays["actions"]) < 1.0)
         errors = (slopes * network.action_scale.float() - wanted) / self._gain_size
         return torch.where(free, errors, 0.0).square().mean()
 
     def _augmentation_error(self, network: PolicyNetwork, batch: Batch, rng: np.random.Generator) -> Tensor:
-        """Error of actions at states around the demonstrations, where their gains say what to do."""
+        """Error of actions at x (+) d, against clip(a + G d)."""
         arrays = batch.arrays
         directions = self._weights.augmentation_scale * self._directions(arrays["states"], rng)
         states = self._kernels.retract(arrays["states"], directions)
@@ -123,17 +99,7 @@ class Objective:
 def observation_change(
     kernels: Kernels, states: FloatArray, observations: FloatArray, directions: FloatArray
 ) -> FloatArray:
-    """Derivative of the observation along tangent coordinates, in a direction for each state.
-
-    Args:
-        kernels: Of the scene, in double precision.
-        states: Shape (B, n_x), units of the state.
-        observations: Of these states; only the time left is read, which does not change, shape (B, n_obs).
-        directions: Shape (B, n_t), units of the tangent coordinates.
-
-    Returns:
-        d/de o(x (+) e d) at e = 0, shape (B, n_obs), units of the observation.
-    """
+    """Directional derivative d/de o(x (+) e d) at e = 0, shape (B, n_obs), one direction per state."""
     time_left = observations[:, -1:]
     ahead, behind = (
         kernels.observation(kernels.retract(states, sign * STEP * directions), time_left)[0]

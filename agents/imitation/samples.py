@@ -1,4 +1,4 @@
-"""Where time steps to learn from come from: demonstrations, corrections of a network's flights, or both."""
+"""Sources of training samples: demonstrations, labeled flights of a network, or a mixture."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,54 +9,35 @@ from numpy.typing import NDArray
 
 from experts.demonstrations import Demonstrations
 from experts.demonstrations.reading import Batch
-from experts.problem import FloatArray
+from experts.problems.shooting_problem import FloatArray
 
 NAMES = ("states", "observations", "actions", "feedback_gains")
-"""What is learned from."""
-LOOKS = 50
-"""Stages at which the spread of demonstrations is measured."""
+SPREAD_STAGES = 50  # at which the spread of demonstrations is measured
 
 
 class Source(Protocol):
-    """What `Demonstrations.batches` offers."""
+    """Samples in batches, as `Demonstrations` offers them."""
 
     def batches(
         self, size: int, names: Sequence[str], *, seed: int | None, drop_last: bool
     ) -> Iterator[Batch]:
-        """Go through all time steps once; see `Demonstrations.batches`."""
+        """One pass over all time steps, see `Demonstrations.batches`."""
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Units for a network: how much things vary in demonstrations.
+    """Spread of demonstrations, which gives a network its units."""
 
-    Attributes:
-        observation_mean, observation_deviation: Shape (n_obs,), units of the observation.
-        action_mean, action_deviation: Shape (n_u,), fractions of limits; the deviation of an action that
-            never varies is 1.
-        spread: Deviation of states from each other at the same stage, shape (n_t,), units of the tangent
-            coordinates.
-        gain_size: Root mean square of the change of the action, by the gains, over deviations with the
-            spread, shape (n_u,), fractions of limits; 1 where gains are zero.
-    """
-
-    observation_mean: FloatArray
-    observation_deviation: FloatArray
-    action_mean: FloatArray
-    action_deviation: FloatArray
-    spread: FloatArray
-    gain_size: FloatArray
+    observation_mean: FloatArray  # (n_obs,), units of the observation
+    observation_deviation: FloatArray  # (n_obs,)
+    action_mean: FloatArray  # (n_u,), fractions of the limits
+    action_deviation: FloatArray  # (n_u,), 1 where actions do not vary
+    spread: FloatArray  # deviation of states about their mean trajectory, tangent coordinates, (n_t,)
+    gain_size: FloatArray  # root mean square of G d for directions d of that spread, (n_u,), 1 for zero gains
 
     @classmethod
     def of(cls, demonstrations: Demonstrations) -> "Statistics":
-        """Measure demonstrations, in one pass.
-
-        Args:
-            demonstrations: Some of them.
-
-        Returns:
-            The statistics.
-        """
+        """Measure demonstrations in one pass."""
         spread = _spread(demonstrations)
         observations = _Moments()
         actions = _Moments()
@@ -64,7 +45,7 @@ class Statistics:
         for demonstration in demonstrations:
             observations.add(demonstration.observations[:-1])
             actions.add(demonstration.actions)
-            # E (G d)^2 over independent d is the sum of the squares of G's columns times their deviations.
+            # E (G d)^2 for independent d is the sum over the columns of (G_j sigma_j)^2.
             changes = (demonstration.feedback_gains * spread) ** 2
             gains.add(changes.sum(axis=2, dtype=np.float64))
         deviation, size = actions.deviation(), np.sqrt(gains.mean())
@@ -79,7 +60,7 @@ class Statistics:
 
 
 class _Moments:
-    """Mean and deviation of rows that come in pieces, each of about the size of the others."""
+    """Mean and standard deviation of rows that come in chunks of similar size."""
 
     def __init__(self) -> None:
         self._means: list[FloatArray] = []
@@ -97,8 +78,8 @@ class _Moments:
 
 
 def _spread(demonstrations: Demonstrations) -> FloatArray:
-    """Deviation of states from those of the first demonstration, about its mean, averaged over stages."""
-    stages = np.linspace(0, demonstrations.scene.simulation.steps - 1, LOOKS).astype(np.int64)
+    """Standard deviation of states about their mean trajectory, averaged over stages."""
+    stages = np.linspace(0, demonstrations.scene.simulation.steps - 1, SPREAD_STAGES).astype(np.int64)
     reference = demonstrations[0].states[stages]
     deviations = [demonstrations.tangent(reference, each.states[stages]) for each in demonstrations]
     return np.asarray(np.sqrt(np.var(deviations, axis=0).mean(axis=0)))
@@ -106,60 +87,27 @@ def _spread(demonstrations: Demonstrations) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Corrections:
-    """Time steps with what the expert would do there, M of them, in memory; a `Source`.
+    """M time steps labeled with the expert's actions and gains, in memory; a `Source`."""
 
-    Attributes:
-        states: Shape (M, n_x), units of the state.
-        observations: Shape (M, n_obs), as the environment gives them.
-        actions: Inputs as fractions of their limits, shape (M, n_u).
-        feedback_gains: Of the action over tangent coordinates, float32, shape (M, n_u, n_t).
-    """
-
-    states: FloatArray
-    observations: FloatArray
-    actions: FloatArray
-    feedback_gains: NDArray[np.float32]
+    states: FloatArray  # (M, n_x)
+    observations: FloatArray  # (M, n_obs)
+    actions: FloatArray  # (M, n_u), fractions of the limits
+    feedback_gains: NDArray[np.float32]  # (M, n_u, n_t)
 
     def __len__(self) -> int:
         return len(self.states)
 
     @classmethod
     def joined(cls, parts: Sequence["Corrections"]) -> "Corrections":
-        """Put several together.
-
-        Args:
-            parts: At least one.
-
-        Returns:
-            All of their time steps.
-        """
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in NAMES))
 
     def thinned(self, every: int) -> "Corrections":
-        """Keep some.
-
-        Args:
-            every: One in so many is kept.
-
-        Returns:
-            Those.
-        """
+        """Keep one time step in `every`."""
         return Corrections(*(getattr(self, name)[::every].copy() for name in NAMES))
 
     def batches(
         self, size: int, names: Sequence[str], *, seed: int | None, drop_last: bool
     ) -> Iterator[Batch]:
-        """Go through all time steps once.
-
-        Args:
-            size: Time steps of a batch.
-            names: What to give, of `NAMES`.
-            seed: Seed of the order; None for that of the time steps.
-            drop_last: Whether to leave out the last batch if it is smaller.
-
-        Yields:
-            Batches; each time step counts as a demonstration of one stage.
-        """
         order = np.arange(len(self))
         if seed is not None:
             order = np.random.default_rng(seed).permutation(order)
@@ -172,13 +120,7 @@ class Corrections:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Batches that come partly from one source and partly from another; a `Source`.
-
-    Attributes:
-        first: It is gone through once.
-        second: It is gone through again and again as long as the first lasts.
-        share: Share of the second in a batch.
-    """
+    """Batches of which a share comes from the second source; one pass over the first is a pass."""
 
     first: Source
     second: Source
@@ -187,17 +129,6 @@ class Mixture:
     def batches(
         self, size: int, names: Sequence[str], *, seed: int | None, drop_last: bool
     ) -> Iterator[Batch]:
-        """Go through the first source once.
-
-        Args:
-            size: Time steps of a batch, at least 2.
-            names: What to give, of `NAMES`.
-            seed: Seed of the order; None for the sources' own.
-            drop_last: Whether to leave out the last batch of the first source if it is smaller.
-
-        Yields:
-            Batches, those of the first source followed by those of the second, which may be fewer at its end.
-        """
         other = min(max(1, round(self.share * size)), size - 1)
         second = self._endless(other, names, seed)
         for batch in self.first.batches(size - other, names, seed=seed, drop_last=drop_last):

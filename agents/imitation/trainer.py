@@ -1,62 +1,82 @@
-"""Steps of an optimizer on demonstrations, with validations and checkpoints."""
+"""Train a network on demonstrations, with validation and checkpoints that resume exactly."""
 
 from __future__ import annotations
 
 import copy
+import io
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from agents.configuration.imitation import Optimization
-from agents.imitation.checkpoints import load_checkpoint, save_checkpoint
 from agents.imitation.objective import Losses, Objective
-from agents.imitation.progress import TrainingAdvance
 from agents.imitation.samples import Source
 from agents.policies.network import PolicyNetwork
-from agents.progress import Advance
+from agents.run_folder import RunFolderError
+from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.progress import Advance
+from experts.demonstrations.settings import differences
 
-VALIDATION_BATCHES = 32
-"""Batches that a validation looks at, at most; their time steps are the same every time."""
+CHECKPOINT = "checkpoint.pt"
+VALIDATION_BATCHES = 32  # at most; the same time steps every time
 UPDATES_BETWEEN_MESSAGES = 20
-LAST_RATE = 1e-3
-"""Learning rate at the end, relative to the largest one."""
+FINAL_RATE = 1e-3  # learning rate at the end, relative to its peak
 
 Record = dict[str, float]
 Progress = Callable[[Advance], None]
 Watch = Callable[[PolicyNetwork, Record, bool], Record]
-"""Looks at a network between updates, given the record of a validation and whether it is the last one; what
-it returns is added to the record."""
+"""Called with the network, the record of a validation, and whether it is the last; returns what to add."""
+
+
+class CheckpointError(RunFolderError):
+    """A checkpoint cannot be used."""
 
 
 @dataclass(frozen=True)
 class Spent:
-    """What a network has cost before a training.
-
-    Attributes:
-        updates: Steps of an optimizer.
-        seconds: Time, s.
-        environment_steps: That it has flown to be corrected.
-    """
+    """Effort spent on a network before a training."""
 
     updates: float = 0.0
     seconds: float = 0.0
     environment_steps: float = 0.0
 
 
+class TrainingAdvance(NamedTuple):
+    """Progress of a training, for display."""
+
+    total: int  # updates
+    done: int
+    rate: float  # updates per second in this run; 0 at first
+    losses: Mapping[str, float]  # of the last validation, or of the training since without one, by name
+    part: str = ""  # label of the line
+
+    def describe(self) -> str:
+        line = f"{self.part}{': ' * bool(self.part)}{self.done} of {self.total} updates"
+        for name in ("action", "gain"):
+            value = self.losses.get(f"validation_{name}", self.losses.get(name, 0.0))
+            if value:
+                line += f", {name} loss {value:.2e}"
+        if self.rate > 0.0:
+            line += f", {self.rate:.0f} a second"
+            seconds_left = (self.total - self.done) / self.rate
+            if seconds_left > 0.0:
+                line += f", {timedelta(seconds=round(seconds_left))} left"
+        if "success_rate" in self.losses:
+            line += f"; success {self.losses['success_rate']:.0%}"
+        return line
+
+
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Have PyTorch use some threads inside a `with` block.
-
-    Args:
-        count: Number of threads.
-    """
+    """Set PyTorch's number of threads inside a `with` block."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -66,11 +86,7 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 class Trainer:
-    """Trains a network with an objective.
-
-    Attributes:
-        history: Losses at every validation, beside what was spent until then, under the names of `Spent`.
-    """
+    """Trains a network with Adam on an objective; `history` holds a record per validation."""
 
     def __init__(
         self,
@@ -83,21 +99,10 @@ class Trainer:
         part: str = "",
         before: Spent | None = None,
     ) -> None:
-        """Begin.
-
-        Args:
-            network: What to train.
-            objective: What to minimize.
-            optimization: How.
-            validate_every: Updates between validations, each with a checkpoint.
-            seed: Of everything that is drawn.
-            part: Name of the training among others, for messages.
-            before: What others have spent on the network; nothing by default.
-        """
         self._network, self._objective, self._optimization = network, objective, optimization
         self._validate_every, self._seed, self._part = validate_every, seed, part
         self._before = before or Spent()
-        # One kernel for all parameters: for small networks the calls count, not the numbers.
+        # One kernel for all parameters: small networks are bound by calls, not by arithmetic.
         self._optimizer = torch.optim.Adam(network.parameters(), lr=optimization.learning_rate, fused=True)
         self._epoch, self._position, self._updates = 0, 0, 0
         self._best, self._best_weights = math.inf, copy.deepcopy(network.state_dict())
@@ -114,31 +119,21 @@ class Trainer:
         progress: Progress | None = None,
         watch: Watch | None = None,
     ) -> None:
-        """Train until the updates are used up.
+        """Train to the last update, resuming from a checkpoint in `folder` whose identity must match.
 
-        Args:
-            training: What to learn from.
-            validation: What to judge by; None for nothing, and the last weights are the result.
-            folder: Where to keep a checkpoint, and to look for one to go on from; None for none.
-            identity: What the training follows from.
-            progress: Called now and then.
-            watch: Called at every validation.
-
-        Raises:
-            ValueError: If the training diverges.
-            CheckpointError: If the folder holds the checkpoint of another training, or a damaged one.
+        With validation data, the network ends with the weights of the lowest validation loss.
         """
         if folder is not None:
-            self._resume(load_checkpoint(folder, identity))
+            self._resume(_load_checkpoint(folder, identity))
         self._begin = perf_counter() - self._seconds
         reporter = _Reporter(self._optimization.updates, self._updates, self._part, progress)
         while self._updates < self._optimization.updates:
-            for batch in self._rest_of_a_pass(training):
+            for batch in self._rest_of_epoch(training):
                 self._update(batch, reporter)
                 if self._updates % self._validate_every == 0 or self._is_done:
-                    self._look(validation, reporter, watch)
+                    self._record(validation, reporter, watch)
                     if folder is not None:
-                        save_checkpoint(folder, {"identity": identity, **self._state()})
+                        _save_checkpoint(folder, {"identity": identity, **self._state()})
                 if self._is_done:
                     break
             else:
@@ -150,8 +145,8 @@ class Trainer:
     def _is_done(self) -> bool:
         return self._updates == self._optimization.updates
 
-    def _rest_of_a_pass(self, training: Source) -> Iterator[Any]:
-        """Go through the data once; its order follows from the number of the pass."""
+    def _rest_of_epoch(self, training: Source) -> Iterator[Any]:
+        """The rest of one pass over the data, in an order seeded by the epoch."""
         order = int(np.random.SeedSequence([self._seed, self._epoch]).generate_state(1)[0])
         batches = training.batches(
             self._optimization.batch_size, self._objective.needs, seed=order, drop_last=False
@@ -165,7 +160,7 @@ class Trainer:
     def _update(self, batch: Any, reporter: _Reporter) -> None:
         for group in self._optimizer.param_groups:
             group["lr"] = self._rate()
-        # What is drawn follows from the number of the update, so that no generator is kept.
+        # Seeded by the update, so that checkpoints need no generator state.
         losses = self._objective(self._network, batch, np.random.default_rng([self._seed, self._updates]))
         self._optimizer.zero_grad()
         losses.total.backward()
@@ -175,14 +170,14 @@ class Trainer:
         reporter.add(self._updates, losses)
 
     def _rate(self) -> float:
-        """Learning rate of the next update: a linear rise, then half a cosine."""
+        """Learning rate of the next update: linear warm-up times cosine decay."""
         settings, done = self._optimization, self._updates
         cosine = 0.5 * (1.0 + math.cos(math.pi * done / settings.updates))
-        rise = min(1.0, (done + 1) / (settings.warm_up + 1))
-        return settings.learning_rate * rise * (LAST_RATE + (1.0 - LAST_RATE) * cosine)
+        warm_up = min(1.0, (done + 1) / (settings.warm_up + 1))
+        return settings.learning_rate * warm_up * (FINAL_RATE + (1.0 - FINAL_RATE) * cosine)
 
-    def _look(self, validation: Source | None, reporter: _Reporter, watch: Watch | None) -> None:
-        """Validate, and remember the weights if they are the best so far."""
+    def _record(self, validation: Source | None, reporter: _Reporter, watch: Watch | None) -> None:
+        """Validate, and keep the weights if they are the best so far."""
         self._seconds = perf_counter() - self._begin
         record = {
             "updates": self._before.updates + self._updates,
@@ -194,8 +189,8 @@ class Trainer:
             record |= {f"validation_{name}": value for name, value in self._validate(validation).items()}
         if not all(map(math.isfinite, record.values())):
             raise ValueError(
-                f"after {self._updates} updates the losses are no numbers any more: let "
-                "optimization.learning_rate be smaller"
+                f"training diverged: after {self._updates} updates the losses are no longer finite; "
+                "reduce optimization.learning_rate"
             )
         if validation is not None and record["validation_total"] < self._best:
             self._best = record["validation_total"]
@@ -242,7 +237,7 @@ class Trainer:
 
 
 class _Reporter:
-    """Averages losses and tells them."""
+    """Averages losses, and reports progress."""
 
     def __init__(self, updates: int, done: int, part: str, progress: Progress | None) -> None:
         self._updates, self._first, self._part, self._progress = updates, done, part, progress
@@ -255,14 +250,39 @@ class _Reporter:
             self.tell(done)
 
     def means(self) -> Record:
-        """Means of the losses since the last time."""
+        """Mean losses since the last call."""
         values = np.mean(self._rows, axis=0).tolist()
         self._rows.clear()
         return dict(zip(("action", "gain", "augmentation"), values, strict=True))
 
     def tell(self, done: int, losses: Record | None = None) -> None:
-        """Call back; losses that are not given are those of the last time."""
+        """Report losses, by default the last ones reported."""
         self._losses = losses or self._losses
         if self._progress is not None:
             rate = (done - self._first) / (perf_counter() - self._begin)
             self._progress(TrainingAdvance(self._updates, done, rate, self._losses, self._part))
+
+
+def _save_checkpoint(folder: Path, content: dict[str, Any]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    stream = io.BytesIO()
+    torch.save(content, stream)
+    write_atomically(folder / CHECKPOINT, stream.getvalue())
+
+
+def _load_checkpoint(folder: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
+    """Read a checkpoint of a training with this identity, if there is one; nothing in it is executed."""
+    path = folder / CHECKPOINT
+    if not path.is_file():
+        return None
+    try:
+        content = torch.load(path, weights_only=True)
+        there = content["identity"]
+    except Exception as error:  # damaged bytes make the reader raise anything
+        raise CheckpointError(
+            f"{path} cannot be read ({error}); remove it to restart the training"
+        ) from error
+    found = differences(there, identity)
+    if found:
+        raise CheckpointError(f"{path} is of another training: {'; '.join(found)}. Use another folder")
+    return dict(content)

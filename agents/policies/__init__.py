@@ -1,8 +1,7 @@
-"""Policies: small networks that choose an action from an observation.
+"""Policies: small networks that map an observation to an action.
 
-`ExportedPolicy` is a trained network as arrays in one file; it needs NumPy alone. `PolicyNetwork` is the same
-network in PyTorch, to be trained, and exports itself. Importing this package loads no PyTorch; using
-`PolicyNetwork` does.
+`ExportedPolicy` holds a trained network as arrays in one file and needs NumPy alone. `PolicyNetwork` is its
+trainable twin in PyTorch, loaded on first use.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """A trained policy as arrays in one file, evaluated with NumPy alone.
 
-One observation takes a few microseconds: its arrays are allocated once, and the normalization is part of the
-first layer. Weights are kept in single precision, like those of the training; the arithmetic is in double
-precision, which for networks of this size takes hardly longer: in single precision the sums over some hundred
-terms would be wrong by more than 1e-6.
+An observation takes a few microseconds: work arrays are allocated once, and the normalization is folded into
+the first layer. Weights are stored in single precision, as trained, but evaluated in double precision, which
+costs little at this size: sums of some hundred terms would be off by more than 1e-6 in single precision.
 """
 
 from __future__ import annotations
@@ -22,13 +21,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.policies.activations import ACTIVATIONS, SQUASHES
-from experts.files import write_atomically
+from dq_space_arm_env.common.files import write_atomically
 
-FORMAT = 1
-"""Version of the files; to be raised when they change."""
+FORMAT = 1  # version of the files
 
-_UNREADABLE = (
+_UNREADABLE = (  # raised for damaged archives, depending on the bytes
     OSError,
     ValueError,
     EOFError,
@@ -39,30 +36,50 @@ _UNREADABLE = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What reading an archive of arrays raises, depending on which of its bytes are damaged."""
 
 FloatArray = NDArray[np.float64]
 SingleArray = NDArray[np.float32]
 
 
 class PolicyFileError(Exception):
-    """A file holds no policy that this version can read."""
+    """A file is not a policy that this version can read."""
+
+
+def _tanh(values: FloatArray, spare: FloatArray) -> None:
+    np.tanh(values, out=values)
+
+
+def _relu(values: FloatArray, spare: FloatArray) -> None:
+    np.maximum(values, 0.0, out=values)
+
+
+def _silu(values: FloatArray, spare: FloatArray) -> None:
+    # z / (1 + exp(-z)), in a form that cannot overflow: z / 2 (1 + tanh(z / 2)).
+    values *= 0.5
+    np.tanh(values, out=spare)
+    spare += 1.0
+    values *= spare
+
+
+def _clip(values: FloatArray, spare: FloatArray) -> None:
+    # numpy.clip takes several times as long for a few numbers.
+    np.maximum(values, -1.0, out=values)
+    np.minimum(values, 1.0, out=values)
+
+
+# In place on an array, with a spare one of the same shape.
+InPlace = Callable[[FloatArray, FloatArray], None]
+ACTIVATIONS: Mapping[str, InPlace] = {"tanh": _tanh, "silu": _silu, "relu": _relu}
+SQUASHES: Mapping[str, InPlace] = {"clip": _clip, "tanh": _tanh}
 
 
 class _Work(NamedTuple):
-    """What an evaluation needs besides the observation, for one of them or a batch.
+    """Arrays and functions that an evaluation needs, for one observation or a batch."""
 
-    Attributes:
-        normalized: Shape (..., n_obs).
-        layers: Matrix and bias of each inner layer, its result and a spare array of the same shape.
-        activate: Function between layers, of values and a spare array.
-        squash: The same of the last layer's outputs.
-    """
-
-    normalized: FloatArray
-    layers: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]
-    activate: Callable[[FloatArray, FloatArray], None]
-    squash: Callable[[FloatArray, FloatArray], None]
+    normalized: FloatArray  # (..., n_obs)
+    layers: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]  # matrix, bias, result, spare
+    activate: InPlace
+    squash: InPlace
 
     @classmethod
     def of(cls, policy: ExportedPolicy, lead: tuple[int, ...]) -> Self:
@@ -79,19 +96,19 @@ class _Work(NamedTuple):
 class ExportedPolicy:
     """A network of L layers from observations to actions: `action = policy(observation)`.
 
-    It owns its work arrays, so give each thread its own.
+    Not safe to share between threads: it owns its work arrays.
 
     Attributes:
         weights: Of each layer, float32, shapes (n_obs, h_1), (h_1, h_2), ..., (h_{L-1}, n_u).
         biases: Of each layer, float32, shapes (h_1,), ..., (n_u,).
         activation: Function between layers: "tanh", "silu" or "relu".
-        squash: What brings the last layer's outputs into [-1, 1]: "clip" or "tanh".
-        action_scale: What they are then multiplied by, shape (n_u,), fractions of limits; None for ones.
+        squash: Function that maps the last layer's outputs to [-1, 1]: "clip" or "tanh".
+        action_scale: Factor of the squashed outputs, shape (n_u,), fractions of limits; None for ones.
         mean: Subtracted from observations, shape (n_obs,), units of the observation.
-        scale: What the difference is then multiplied by, shape (n_obs,), one over those units; 0 for entries
-            to ignore, those that were constant in training.
-        normalized_limit: Normalized observations are clipped to this size, dimensionless; inf for none.
-        metadata: JSON values: for which scene, how trained.
+        scale: Factor of the difference, shape (n_obs,), one over these units; 0 ignores an entry that was
+            constant in training.
+        normalized_limit: Bound at which normalized observations are clipped, dimensionless; inf for none.
+        metadata: JSON values: scene, configuration, training.
     """
 
     weights: tuple[SingleArray, ...]
@@ -103,14 +120,13 @@ class ExportedPolicy:
     action_scale: FloatArray | None = None
     normalized_limit: float = math.inf
     metadata: Mapping[str, Any] = field(default_factory=dict)
-    # What a call reads and writes, made once; matrices and offsets are weights and biases in double
-    # precision, the first matrix with the scale in it.
+    # Weights and biases in double precision, the first matrix with the scale folded in.
     _matrices: tuple[FloatArray, ...] = field(init=False, repr=False)
     _offsets: tuple[FloatArray, ...] = field(init=False, repr=False)
     _work: _Work = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check that the parts fit each other, and allocate what a call needs.
+        """Check the shapes, and allocate work arrays.
 
         Raises:
             ValueError: If a shape does not fit, a number is not finite, or a function is unknown.
@@ -124,8 +140,7 @@ class ExportedPolicy:
         _check(self)
         first, *others = (array.astype(np.float64) for array in self.weights)
         if math.isinf(self.normalized_limit):
-            # Part of the first layer, it costs nothing.
-            first *= self.scale[:, None]
+            first *= self.scale[:, None]  # folded into the first layer, scaling is free
         self._adopt("_matrices", (first, *others))
         self._adopt("_offsets", tuple(array.astype(np.float64) for array in self.biases))
         self._adopt("_work", _Work.of(self, ()))
@@ -135,19 +150,19 @@ class ExportedPolicy:
 
     @property
     def n_observation(self) -> int:
-        """Entries of an observation."""
+        """Number of entries of an observation."""
         return len(self.mean)
 
     @property
     def n_action(self) -> int:
-        """Entries of an action."""
+        """Number of entries of an action."""
         return len(self.biases[-1])
 
     def __call__(self, observation: ArrayLike) -> SingleArray:
         """Choose actions.
 
         Args:
-            observation: As the environment gives it, shape (n_obs,) or (B, n_obs).
+            observation: As the environment returns it, shape (n_obs,) or (B, n_obs).
 
         Returns:
             Inputs as fractions of their limits, in [-1, 1], float32, shape (n_u,) or (B, n_u).
@@ -172,13 +187,13 @@ class ExportedPolicy:
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
     ) -> tuple[SingleArray, None]:
-        """Choose actions, as the policies of Stable-Baselines3 do.
+        """Choose actions by the interface of Stable-Baselines3.
 
         Args:
             observation: Shape (n_obs,) or (B, n_obs).
-            state: None; the policy remembers nothing.
-            episode_start: Which episodes have just begun, shape (B,); of no effect.
-            deterministic: True; the policy draws nothing.
+            state: None; the policy has no memory.
+            episode_start: Which episodes have just started, shape (B,); ignored.
+            deterministic: Ignored; the policy is deterministic.
 
         Returns:
             Actions, shape (n_u,) or (B, n_u), and None.
@@ -207,10 +222,10 @@ class ExportedPolicy:
         return action.astype(np.float32)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the policy into a file, complete or not at all.
+        """Write the policy to a file atomically.
 
         Args:
-            path: The file, `.npz` by custom.
+            path: The file, `.npz` by convention.
         """
         arrays: dict[str, NDArray[Any]] = {
             "format": np.array(FORMAT),
@@ -231,7 +246,7 @@ class ExportedPolicy:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a policy that `save` has written; nothing in the file is executed.
+        """Read a policy written by `save`; nothing in the file is executed.
 
         Args:
             path: The file.
@@ -240,19 +255,19 @@ class ExportedPolicy:
             The policy.
 
         Raises:
-            PolicyFileError: If there is no such file, it is of another format, or its parts do not fit.
+            PolicyFileError: If the file is missing, damaged, or of another format.
         """
         try:
             archive = io.BytesIO(Path(path).read_bytes())
-            if not zipfile.is_zipfile(archive):  # NumPy would advise to load it unsafely
-                raise ValueError("it is no archive of arrays, or not all of one")
+            if not zipfile.is_zipfile(archive):  # NumPy would suggest loading it unsafely
+                raise ValueError("it is not an archive of arrays, or incomplete")
             with np.load(archive, allow_pickle=False) as content:
                 arrays = {name: content[name] for name in content.files}
         except _UNREADABLE as error:
             raise PolicyFileError(f"{path} cannot be read as a policy ({error})") from error
         found = arrays.get("format")
         if found is None:
-            raise PolicyFileError(f"{path} is no exported policy: it holds {', '.join(arrays) or 'nothing'}")
+            raise PolicyFileError(f"{path} holds no policy but {', '.join(arrays) or 'nothing'}")
         if found.shape != () or found != FORMAT:
             raise PolicyFileError(
                 f"{path} has format {found}, this version reads {FORMAT}: export the policy again"
@@ -260,16 +275,16 @@ class ExportedPolicy:
         try:
             return cls(**_fields(arrays))
         except KeyError as error:
-            raise PolicyFileError(f"{path} is no policy: it has no {error.args[0]}") from error
+            raise PolicyFileError(f"{path} is not a policy: it has no {error.args[0]}") from error
         except (ValueError, TypeError) as error:
-            raise PolicyFileError(f"{path} is no policy: {error}") from error
+            raise PolicyFileError(f"{path} is not a policy: {error}") from error
 
 
 def _fields(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     layers = range(sum(name.startswith("weight_") for name in arrays))
     metadata = json.loads(str(arrays["metadata"]))
     if not isinstance(metadata, dict):
-        raise ValueError("metadata: should be names with values")
+        raise ValueError("metadata: should be a mapping")
     return {
         "weights": tuple(arrays[f"weight_{i}"] for i in layers),
         "biases": tuple(arrays[f"bias_{i}"] for i in layers),
@@ -289,7 +304,7 @@ def _check(policy: ExportedPolicy) -> None:
         ("squash", policy.squash, SQUASHES),
     ):
         if value not in known:
-            raise ValueError(f"{name}: {value!r} is unknown; there are {', '.join(known)}")
+            raise ValueError(f"{name}: {value!r} is unknown; choose from {', '.join(known)}")
     if not policy.weights or len(policy.weights) != len(policy.biases):
         raise ValueError(
             f"{len(policy.weights)} weights and {len(policy.biases)} biases, should be one of each per layer"

@@ -1,4 +1,4 @@
-"""The network of a policy in PyTorch, to be trained; its twin in NumPy is `ExportedPolicy`."""
+"""The trainable network of a policy, in PyTorch; `ExportedPolicy` is its twin in NumPy."""
 
 from __future__ import annotations
 
@@ -12,27 +12,18 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from agents.policies.activations import SMOOTH
+from agents.configuration.imitation import SMOOTH_ACTIVATIONS
 from agents.policies.exported import ExportedPolicy, FloatArray
 
-CONSTANT = 1e-9
-"""Entries of observations that vary by less, m, rad, m/s, rad/s, s, count as constant."""
-FIRST_OUTPUTS = 0.1
-"""Size of the last layer's first weights relative to PyTorch's: training begins near the mean action."""
+CONSTANT = 1e-9  # standard deviation below which an entry of the observation is constant, in its unit
+FIRST_OUTPUTS = 0.1  # initial size of the last layer relative to PyTorch's, to start near the mean action
 
 
 class PolicyNetwork(nn.Module):
-    """Layers from normalized observations to actions that are not clipped yet.
+    """Layers from normalized observations to normalized actions, before clipping.
 
-    Inside, both are in units of their variation in the training data: so a loss counts each entry of an
-    action relative to how much it is used, however small a fraction of its limit that is.
-
-    Attributes:
-        activation: Function between layers.
-        hidden: Sizes of the layers between.
-        layers: The layers.
-        observation_mean, observation_scale: As in `ExportedPolicy`, shape (n_obs,).
-        action_mean, action_scale: Mean and standard deviation of actions, shape (n_u,), fractions of limits.
+    Both are in units of their spread in the training data, so that a loss weighs each input relative to how
+    much it is used, however small a fraction of its limit that is.
     """
 
     observation_mean: Tensor
@@ -43,23 +34,13 @@ class PolicyNetwork(nn.Module):
     def __init__(
         self, n_observation: int, n_action: int, hidden: Sequence[int] = (256, 256), activation: str = "tanh"
     ) -> None:
-        """Make a network with random weights, drawn from PyTorch's generator, and without normalization.
-
-        Args:
-            n_observation: Entries of an observation.
-            n_action: Entries of an action.
-            hidden: Sizes of the layers between.
-            activation: Function between layers, "tanh" or "silu".
-
-        Raises:
-            ValueError: If a size is not positive, or the activation is unknown or not smooth.
-        """
+        """Make a network with random weights from PyTorch's generator, without normalization."""
         super().__init__()
         sizes = [n_observation, *hidden, n_action]
         if min(sizes) < 1:
             raise ValueError(f"sizes of the layers: {sizes}, should be at least 1")
-        if activation not in SMOOTH:
-            raise ValueError(f"activation: {activation!r}, should be one of {', '.join(SMOOTH)}")
+        if activation not in SMOOTH_ACTIVATIONS:
+            raise ValueError(f"activation: {activation!r}, should be one of {', '.join(SMOOTH_ACTIVATIONS)}")
         self.activation, self.hidden = activation, tuple(hidden)
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
         last = self._linear[-1]
@@ -76,7 +57,6 @@ class PolicyNetwork(nn.Module):
 
     @property
     def _linear(self) -> list[nn.Linear]:
-        """The layers by their type."""
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def normalize(
@@ -86,15 +66,7 @@ class PolicyNetwork(nn.Module):
         action_mean: ArrayLike,
         action_deviation: ArrayLike,
     ) -> None:
-        """Set what the network takes for the unit of each entry.
-
-        Args:
-            observation_mean: Shape (n_obs,), units of the observation.
-            observation_deviation: Standard deviations, shape (n_obs,), units of the observation; entries that
-                do not vary are ignored from then on.
-            action_mean: Shape (n_u,), fractions of limits.
-            action_deviation: Shape (n_u,), fractions of limits; entries that do not vary keep their mean.
-        """
+        """Set the units of observations and actions."""
         deviation = np.asarray(observation_deviation, dtype=np.float64)
         varies = deviation > CONSTANT
         values = {
@@ -107,26 +79,11 @@ class PolicyNetwork(nn.Module):
             getattr(self, name).copy_(torch.as_tensor(np.asarray(value, dtype=np.float64)))
 
     def normalized(self, observation: ArrayLike) -> Tensor:
-        """Bring observations into the units of the network.
-
-        Args:
-            observation: Shape (B, n_obs), units of the observation.
-
-        Returns:
-            What `forward` takes, float32, shape (B, n_obs).
-        """
+        """Observations in the units of the network, float32."""
         difference = np.asarray(observation, dtype=np.float64) - self.observation_mean.numpy()
         return torch.from_numpy((difference * self.observation_scale.numpy()).astype(np.float32))
 
     def forward(self, normalized: Tensor) -> Tensor:
-        """Evaluate the layers.
-
-        Args:
-            normalized: Observations, shape (B, n_obs), dimensionless.
-
-        Returns:
-            Actions in units of the network, (a - action_mean) / action_scale, not clipped, shape (B, n_u).
-        """
         values = normalized
         for layer in self._linear[:-1]:
             values = layer(values)
@@ -135,16 +92,9 @@ class PolicyNetwork(nn.Module):
         return result
 
     def forward_with_tangent(self, normalized: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor]:
-        """Evaluate the layers and their derivative in a direction, both open to a gradient.
+        """Evaluate the layers and their directional derivative, both differentiable in the weights.
 
-        Forward-mode differentiation, written out: without bookkeeping it takes twice a forward pass.
-
-        Args:
-            normalized: Observations, shape (B, n_obs), dimensionless.
-            tangent: Directions, in the same units, shape (B, n_obs).
-
-        Returns:
-            What `forward` returns, and its change in the direction, both of shape (B, n_u).
+        Forward-mode differentiation written out by hand: without bookkeeping it costs two forward passes.
         """
         values = normalized
         for layer in self._linear[:-1]:
@@ -161,14 +111,7 @@ class PolicyNetwork(nn.Module):
         return last(values), tangent @ last.weight.T
 
     def act(self, observation: ArrayLike) -> FloatArray:
-        """Choose actions, without a gradient; in double precision, as the exported policy does.
-
-        Args:
-            observation: Shape (B, n_obs), units of the observation.
-
-        Returns:
-            Inputs as fractions of their limits, in [-1, 1], shape (B, n_u).
-        """
+        """Choose actions without gradients, in double precision like the exported policy."""
         inputs = torch.from_numpy(np.array(observation, dtype=np.float64))
         twin = copy.deepcopy(self).double()
         with torch.no_grad():
@@ -177,14 +120,7 @@ class PolicyNetwork(nn.Module):
         return np.asarray(actions.numpy())
 
     def export(self, metadata: Mapping[str, Any]) -> ExportedPolicy:
-        """Write the network as arrays; the units of its actions become part of the last layer.
-
-        Args:
-            metadata: JSON values: for which scene, how trained.
-
-        Returns:
-            The policy; its actions are those of `act` but for the rounding of its last weights.
-        """
+        """Export the network, with the units of its actions folded into the last layer."""
         weights = [layer.weight.detach().double().numpy().T for layer in self._linear]
         biases = [layer.bias.detach().double().numpy() for layer in self._linear]
         scale = self.action_scale.numpy()

@@ -1,4 +1,1 @@
-"""Reinforcement learning on the environment, with the algorithms of Stable-Baselines3 and sb3-contrib.
-
-Everything in here needs the extra `agents`.
-"""
+"""Reinforcement learning with Stable-Baselines3 and sb3-contrib; needs the extra `agents`."""

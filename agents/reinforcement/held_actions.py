@@ -1,4 +1,4 @@
-"""The environment as an agent practices in it: actions held for several time steps, small, rewards scaled."""
+"""The training environment: small actions, held for several time steps, and scaled rewards."""
 
 import math
 from collections.abc import Mapping
@@ -12,19 +12,18 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 
 class HeldActions(VecEnvWrapper):
-    """Holds each action for some time steps, so that a decision is one of dozens, not of a thousand.
+    """Holds each action for several time steps: dozens of decisions per episode instead of a thousand.
 
-    Rewards of the steps are added up and scaled, or, where a reward is that of being somewhere, as on the
-    goal environment, the last one stands for all: it is what hindsight recomputes. Of the mean cost of a step
-    a power may be taken: with 1/2 the quadratic cost becomes one that grows like the error, so that the last
-    centimeters, a thousandth of the cost of a maneuver, are worth an agent's while. An episode that ends in
-    success may be rewarded for it, and the errors at the end may cost more than the scene charges: its
-    optimum ends just outside the tolerances for some starts. The action space shrinks
-    to the part of the environment's that the agent is meant to use; what it holds are still the environment's
-    actions, so a policy that was trained here flies there.
+    Rewards of the held steps are added up and scaled. On the goal environment, where a reward is that of
+    being somewhere, the last one counts alone, since hindsight recomputes it. `cost_power` raises the mean
+    cost of a step to a power: with 1/2 the quadratic cost grows like the error, so that the last centimeters,
+    a thousandth of a maneuver's cost, are worth the effort. `success_reward` pays for an episode that ends in
+    success; `end_error_cost` charges the final errors beyond what the scene does, whose optimum ends just
+    outside the tolerances for some starts. The action space shrinks to the agent's part of the environment's;
+    the actions are still the environment's, so a policy trained here flies there.
 
-    A copy whose episode ends while an action is held begins the next one, and the rest of the hold is its
-    first steps; they are not counted for the episode that has ended.
+    A copy whose episode ends during a hold starts the next one with the rest of the hold; these steps do not
+    count for the episode that ended.
     """
 
     def __init__(
@@ -40,20 +39,6 @@ class HeldActions(VecEnvWrapper):
         tolerances: tuple[float, float] = (math.inf, math.inf),
         add_rewards: bool = True,
     ) -> None:
-        """Wrap an environment.
-
-        Args:
-            venv: The environment, its actions fractions of limits.
-            repeat: Time steps for which an action is held.
-            action_scale: Largest action of each input, shape (n_u,), fraction of its limit.
-            reward_scale: Factor of rewards.
-            cost_power: Power of the mean cost of the steps, in (0, 1]; rewards are minus costs.
-            success_reward: Reward of an episode that ends in success, not scaled.
-            end_error_cost: What it costs to end far off, not scaled; e^2 / (1 + e^2) of it are charged, e^2
-                the sum of the squares of angle and distance over their tolerances.
-            tolerances: Of success, for angle and distance, deg and m.
-            add_rewards: Whether rewards are added up, or the last one counts.
-        """
         space = spaces.Box(-action_scale, action_scale, dtype=np.float32)
         super().__init__(venv, action_space=space)
         self.repeat, self.add_rewards = repeat, add_rewards
@@ -63,14 +48,7 @@ class HeldActions(VecEnvWrapper):
         self._actions: NDArray[Any] | None = None
 
     def around(self, venv: VecEnv) -> "HeldActions":
-        """Wrap another environment in the same way.
-
-        Args:
-            venv: The environment.
-
-        Returns:
-            The wrapped one.
-        """
+        """Wrap another environment in the same way."""
         return HeldActions(
             venv,
             repeat=self.repeat,
@@ -84,28 +62,12 @@ class HeldActions(VecEnvWrapper):
         )
 
     def reset(self) -> VecEnvObs:
-        """Begin new episodes of all copies.
-
-        Returns:
-            Observations, shape (num_envs, n_obs), units as in `DQSpaceArmEnv`.
-        """
         return self.venv.reset()
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take the actions that `step_wait` holds.
-
-        Args:
-            actions: Inputs as fractions of their limits, shape (num_envs, n_u).
-        """
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Hold the actions.
-
-        Returns:
-            Observations, shape (num_envs, n_obs), after the last step; rewards, and whether an episode ended,
-            shape (num_envs,); infos, empty but at the end of an episode.
-        """
         if self._actions is None:
             raise RuntimeError("call step_async() before step_wait()")
         total = np.zeros(self.num_envs)
@@ -121,13 +83,13 @@ class HeldActions(VecEnvWrapper):
         scaled = self._scaled(total)
         if self.success_reward or self.end_error_cost:
             for i in np.flatnonzero(done):
-                scaled[i] += self._reward_at_the_end(infos[i])
+                scaled[i] += self._final_reward(infos[i])
         return observations, scaled, done, infos
 
-    def _reward_at_the_end(self, info: Mapping[str, Any]) -> float:
+    def _final_reward(self, info: Mapping[str, Any]) -> float:
         angle, distance = self.tolerances
         errors = (info["attitude_error"] / angle) ** 2 + (info["position_error"] / distance) ** 2
-        # Bounded, or the few flights that go astray would be all that a critic learns.
+        # Bounded, or a few stray flights would dominate the critic.
         charged = self.end_error_cost * float(errors / (1.0 + errors))
         return self.success_reward * float(info["is_success"]) - charged
 
@@ -139,12 +101,5 @@ class HeldActions(VecEnvWrapper):
 
 
 def action_limits(venv: VecEnv) -> NDArray[np.float32]:
-    """Largest action of each input.
-
-    Args:
-        venv: An environment whose action space is a symmetric box.
-
-    Returns:
-        Shape (n_u,), fractions of limits.
-    """
+    """Upper bounds of the actions, shape (n_u,)."""
     return np.asarray(cast(spaces.Box, venv.action_space).high, dtype=np.float32)

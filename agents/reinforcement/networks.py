@@ -1,98 +1,63 @@
-"""What an agent's networks add to those of Stable-Baselines3: units of observations and of actions.
+"""Networks of Stable-Baselines3 with units for observations and actions, and their export to plain arrays.
 
-Both are part of the model: a saved one needs no file with statistics beside it, and acts in the environment.
+The units are part of the model: a saved one needs no file of statistics, and acts in the environment as is.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
-from torch import Tensor
+from torch import Tensor, nn
 
-ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
-    "tanh": torch.nn.Tanh,
-    "relu": torch.nn.ReLU,
-    "silu": torch.nn.SiLU,
-}
-"""Modules by the names of the configuration."""
+from agents.policies import ExportedPolicy
+
+ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "silu": nn.SiLU}
 
 
 class ScaledObservations(BaseFeaturesExtractor):
-    """Observations in units of their variation; those of a dictionary joined, keys in alphabetical order.
+    """Observations in units of their spread; the parts of a dictionary joined in alphabetical order."""
 
-    Attributes:
-        mean: Subtracted, shape (n_obs,), units of the observation.
-        scale: What the difference is multiplied by, shape (n_obs,), one over those units.
-    """
-
-    mean: Tensor
-    scale: Tensor
+    mean: Tensor  # (n_obs,), units of the observation
+    scale: Tensor  # (n_obs,), one over these units
 
     def __init__(
         self, observation_space: spaces.Space[Any], mean: Sequence[float], scale: Sequence[float]
     ) -> None:
-        """Take the units.
-
-        Args:
-            observation_space: A box, or a dictionary of boxes.
-            mean: n_obs numbers, units of the observation.
-            scale: n_obs numbers, one over those units.
-        """
         super().__init__(observation_space, features_dim=len(mean))
-        # In double precision: the error of a pose is small beside its mean.
+        # Double precision: the error of a pose is small beside its mean.
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float64))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
 
     def set_units(self, mean: Sequence[float], scale: Sequence[float]) -> None:
-        """Take other units.
-
-        Args:
-            mean: n_obs numbers, units of the observation.
-            scale: n_obs numbers, one over those units.
-        """
         self.mean.copy_(torch.tensor(mean, dtype=torch.float64))
         self.scale.copy_(torch.tensor(scale, dtype=torch.float64))
 
     def forward(self, observations: Tensor | dict[str, Tensor]) -> Tensor:
-        """Scale observations.
-
-        Args:
-            observations: Shape (B, n_obs), units of the observation; or parts of them, by name.
-
-        Returns:
-            Shape (B, n_obs), dimensionless.
-        """
         return self.in_double_precision(observations).float()
 
     def in_double_precision(self, observations: Tensor | dict[str, Tensor]) -> Tensor:
-        """Scale observations, and leave them in double precision.
-
-        Args:
-            observations: As for `forward`.
-
-        Returns:
-            float64, shape (B, n_obs), dimensionless.
-        """
         if isinstance(observations, dict):
             observations = torch.cat([observations[key] for key in sorted(observations)], dim=1)
         return (observations - self.mean) * self.scale
 
 
 class ScaledActionsPolicy(ActorCriticPolicy):
-    """The policy of PPO for an action space whose box is small: 1 means the bound, whatever that is.
+    """PPO's policy for a small action box: an output of 1 means the bound, whatever its size.
 
-    Stable-Baselines3 scales actions only where they are squashed, and otherwise has the network give them in
-    the units of the space, where a standard deviation of 0.5 would be hundreds of times too large for some.
-    What exceeds 1 is not cut off here: the bound is the agent's unit rather than the actuator's limit, at
-    which the environment clips.
+    Stable-Baselines3 scales squashed actions only. Other networks act in the units of the space, where a
+    standard deviation of 0.5 would be hundreds of times too large for some inputs. Outputs beyond 1 are not
+    clipped here: the bound is the agent's unit, not the actuator's limit, at which the environment clips.
     """
 
     def _build(self, lr_schedule: Schedule) -> None:
-        """Make networks, and an optimizer with two groups: the actor's parameters, and the critic's."""
+        """Make the networks, and an optimizer with two parameter groups: actor, then critic."""
         super()._build(lr_schedule)
         critic = [*self.mlp_extractor.value_net.parameters(), *self.value_net.parameters()]
         theirs = {id(parameter) for parameter in critic}
@@ -103,21 +68,13 @@ class ScaledActionsPolicy(ActorCriticPolicy):
 
     @property
     def squash_output(self) -> bool:
-        """True: actions are scaled from [-1, 1] to the box."""
-        return True
+        return True  # has Stable-Baselines3 scale actions from [-1, 1] to the box
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
-        """Choose actions, those without noise in double precision.
+        """Choose actions, deterministic ones in double precision.
 
-        In single precision, sums over some hundred entries come out 2e-6 apart in different libraries, with
-        gains as large as those of a policy that was cloned.
-
-        Args:
-            observation: Shape (B, n_obs), units of the observation.
-            deterministic: Whether to do without noise.
-
-        Returns:
-            Shape (B, n_u), in units of the box's bounds.
+        With gains as large as a cloned policy's, sums of some hundred terms in single precision differ by
+        2e-6 between libraries.
         """
         if not deterministic:
             return super()._predict(observation)
@@ -125,8 +82,79 @@ class ScaledActionsPolicy(ActorCriticPolicy):
         assert isinstance(extractor, ScaledObservations)
         values = extractor.in_double_precision(observation)
         for module in (*self.mlp_extractor.policy_net, self.action_net):
-            if isinstance(module, torch.nn.Linear):
-                values = torch.nn.functional.linear(values, module.weight.double(), module.bias.double())
+            if isinstance(module, nn.Linear):
+                values = nn.functional.linear(values, module.weight.double(), module.bias.double())
             else:
                 values = module(values)
         return values.float()
+
+
+def export_policy(model: BaseAlgorithm, metadata: Mapping[str, Any]) -> ExportedPolicy:
+    """Export the deterministic policy of PPO, SAC, TQC or TD3; ValueError if it cannot be exported."""
+    modules, squash = _layers(model)
+    linear = [module for module in modules if isinstance(module, nn.Linear)]
+    weights = [layer.weight.detach().double().numpy().T for layer in linear]
+    biases = [layer.bias.detach().double().numpy() for layer in linear]
+    space = model.action_space
+    assert isinstance(space, spaces.Box)
+    if not np.array_equal(space.low, -space.high):
+        raise ValueError(
+            f"actions in [{space.low}, {space.high}]: should be symmetric, as in the environment"
+        )
+    # Squashed actions are scaled afterwards, others in the last layer.
+    scale = np.asarray(space.high, dtype=np.float64)
+    if squash == "clip":
+        if isinstance(model.policy, ScaledActionsPolicy):
+            weights[-1], biases[-1] = weights[-1] * scale, biases[-1] * scale
+        elif not (scale == 1.0).all():
+            raise ValueError("actions are not in [-1, 1]: use ScaledActionsPolicy for a smaller box")
+        scale = np.ones_like(scale)
+    mean, factor = _units(model, weights[0].shape[0])
+    kind = "goal" if isinstance(model.observation_space, spaces.Dict) else "plain"
+    return ExportedPolicy(
+        weights=tuple(weights),
+        biases=tuple(biases),
+        activation=_activation(modules),
+        squash=squash,
+        action_scale=scale,
+        mean=mean,
+        scale=factor,
+        metadata={**metadata, "observation": kind},
+    )
+
+
+def _layers(model: BaseAlgorithm) -> tuple[list[nn.Module], str]:
+    """The actor's modules in order, and how its outputs are squashed."""
+    policy: Any = model.policy
+    if isinstance(policy, ActorCriticPolicy):
+        return [*policy.mlp_extractor.policy_net, policy.action_net], "clip"
+    actor: Any = getattr(policy, "actor", None)
+    if hasattr(actor, "latent_pi"):  # SAC, TQC
+        return [*actor.latent_pi, actor.mu], "tanh"
+    if isinstance(getattr(actor, "mu", None), nn.Sequential):  # TD3
+        *modules, last = actor.mu
+        assert isinstance(last, nn.Tanh)
+        return modules, "tanh"
+    raise ValueError(
+        f"{type(policy).__name__} cannot be exported: it is not a policy of PPO, SAC, TQC or TD3"
+    )
+
+
+def _activation(modules: list[nn.Module]) -> str:
+    between = {type(module) for module in modules if not isinstance(module, nn.Linear)}
+    names = [name for name, module in ACTIVATIONS.items() if between <= {module}]
+    if not names:
+        kinds = ", ".join(sorted(kind.__name__ for kind in between))
+        raise ValueError(f"activations {kinds}: should all be the same, one of {', '.join(ACTIVATIONS)}")
+    return names[0]
+
+
+def _units(model: BaseAlgorithm, n_observation: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    if model.get_vec_normalize_env() is not None:
+        raise ValueError("observations of VecNormalize cannot be exported: use ScaledObservations instead")
+    policy: Any = model.policy
+    # PPO shares one extractor; in the other algorithms each network has its own.
+    extractor = getattr(policy, "actor", policy).features_extractor
+    if isinstance(extractor, ScaledObservations):
+        return extractor.mean.double().numpy(), extractor.scale.double().numpy()
+    return np.zeros(n_observation), np.ones(n_observation)

@@ -1,4 +1,4 @@
-"""Proximal policy optimization with a first phase for the critic, and steps as large as the policy bears."""
+"""Proximal policy optimization with a critic warm-up and an adaptive actor step size."""
 
 from typing import Any
 
@@ -8,30 +8,22 @@ from stable_baselines3.common.utils import explained_variance
 from torch import nn
 from torch.optim import Optimizer
 
-GROWTH = 1.3
-"""Factor by which the step size changes from one update to the next at most."""
-LEAST, MOST = 0.01, 1.0
-"""Bounds of the step size, as fractions of the schedule's."""
+GROWTH = 1.3  # largest change of the step size from one update to the next, a factor
+LEAST, MOST = 0.01, 1.0  # bounds of the step size, as fractions of the schedule's
 
 
 class ProximalPolicyOptimization(PPO):
-    """PPO of Stable-Baselines3 with two additions, both of which are off by default.
+    """PPO of Stable-Baselines3 with two additions, both off by default.
 
-    A policy that was cloned knows what to do before its critic knows what that is worth, and the first
-    advantages, all noise, would undo what it knows: so the critic may learn alone for some updates.
+    A cloned policy knows what to do before its critic knows what that is worth, and the first advantages, all
+    noise, would undo the cloning: the critic may learn alone for `critic_warm_up` updates.
 
-    The deviation of actions falls by an order of magnitude in training, and with it the size of a step that
-    leaves the policy close to what it was: so the actor's step size may follow the divergence that it
-    causes, within what the schedule allows. The idea is that of Rudin et al. ("Learning to walk in minutes",
-    CoRL 2021); what is done is not quite theirs. They change the step size of actor and critic from minibatch
-    to minibatch by a factor of 1.5 where the exact divergence leaves a band. Here it changes between updates,
-    for the actor alone, by the root of desired over estimated divergence, which grows with the square of the
-    step; the estimate is that of Stable-Baselines3, the mean over the minibatches of the last pass.
-
-    Attributes:
-        critic_warm_up: Updates in which the critic learns alone.
-        desired_kl: Divergence of the policy that an update is to cause; None for steps by the schedule.
-        step_factor: What the schedule's step size is multiplied by for the actor, in [LEAST, MOST].
+    The standard deviation of actions falls by an order of magnitude during training, and with it the step
+    that keeps the policy close: with `desired_kl` the actor's step size follows the KL divergence it causes.
+    The idea is that of Rudin et al. ("Learning to Walk in Minutes", CoRL 2021), who change actor and critic
+    steps per minibatch by a factor of 1.5 where the exact divergence leaves a band. Here the actor's step
+    changes between updates, by the square root of desired over estimated divergence, which grows with the
+    square of the step; the estimate is Stable-Baselines3's mean over the minibatches of the last pass.
     """
 
     def __init__(
@@ -42,22 +34,11 @@ class ProximalPolicyOptimization(PPO):
         first_step_factor: float = 1.0,
         **options: Any,
     ) -> None:
-        """Make a learner.
-
-        Args:
-            *arguments: As for PPO.
-            critic_warm_up: Updates in which the critic learns alone.
-            desired_kl: Divergence of the policy that an update is to cause, mean over the minibatches of its
-                last pass; None for steps by the schedule.
-            first_step_factor: See `step_factor`.
-            **options: As for PPO.
-        """
         self.critic_warm_up, self.desired_kl, self.step_factor = critic_warm_up, desired_kl, first_step_factor
         super().__init__(*arguments, **options)
 
     def train(self) -> None:
-        """Learn from the decisions gathered last."""
-        # SB3 counts passes; while the critic warms up, none is cut short.
+        # SB3 counts passes over the data; none is cut short while the critic warms up.
         if self._n_updates < self.critic_warm_up * self.n_epochs:
             self._train_critic()
             return
@@ -79,7 +60,7 @@ class ProximalPolicyOptimization(PPO):
                 loss = nn.functional.mse_loss(values, data.returns)
                 self.policy.optimizer.zero_grad()
                 (self.vf_coef * loss).backward()
-                # The actor has no gradients, and Adam leaves alone what has none.
+                # The actor has no gradients, and Adam skips parameters without.
                 nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
                 self.policy.optimizer.step()
                 losses.append(loss.item())
@@ -93,7 +74,7 @@ class ProximalPolicyOptimization(PPO):
     def _update_learning_rate(self, optimizers: list[Optimizer] | Optimizer) -> None:
         super()._update_learning_rate(optimizers)
         if self.desired_kl is not None:
-            # The first group is the actor, see ScaledActionsPolicy; the critic goes by the schedule.
+            # The first group is the actor, see ScaledActionsPolicy; the critic follows the schedule.
             group = self.policy.optimizer.param_groups[0]
             group["lr"] *= self.step_factor
             self.logger.record("train/actor_learning_rate", group["lr"])

@@ -1,9 +1,9 @@
-"""Soft actor-critic that learns from demonstrations too, and the critic and the replay buffer for that.
+"""Soft actor-critic that also learns from demonstrations, with its critic and replay buffer.
 
-Half of each batch is demonstrated, and critics are layer-normalized, so that they believe no action that
-nobody tried to be wonderful: both after Ball et al., "Efficient online reinforcement learning with offline
-data" (ICML 2023). The actor may be drawn to what was demonstrated, as Fujimoto and Gu's is ("A minimalist
-approach to offline reinforcement learning", NeurIPS 2021).
+Part of each batch is demonstrated, and the critics are layer-normalized, which keeps them from overestimating
+out-of-distribution actions: both after Ball et al., "Efficient Online Reinforcement Learning with Offline
+Data" (ICML 2023). The actor may be drawn to demonstrated actions as in Fujimoto and Gu, "A Minimalist
+Approach to Offline Reinforcement Learning" (NeurIPS 2021).
 """
 
 from typing import Any
@@ -22,19 +22,13 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 
-from agents.reinforcement.demonstrating import Flown
+from agents.reinforcement.warm_start import Flown
 
 
 class LayerNormalizedCritic(ContinuousCritic):
     """Critics with a layer normalization before each activation."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        """Make the critics.
-
-        Args:
-            *arguments: As for `ContinuousCritic`.
-            **options: As for `ContinuousCritic`.
-        """
         super().__init__(*arguments, **options)
         for number, plain in enumerate(self.q_networks):
             assert isinstance(plain, nn.Sequential)
@@ -54,44 +48,20 @@ class LayerNormalizedPolicy(SACPolicy):
     """The policy of SAC, with layer-normalized critics."""
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        """Make the critics.
-
-        Args:
-            features_extractor: What they see observations through; one of their own by default.
-
-        Returns:
-            The critics.
-        """
         options = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return LayerNormalizedCritic(**options).to(self.device)
 
 
 class DemonstrationBuffer(ReplayBuffer):
-    """A replay buffer whose batches end with demonstrated decisions, a share of them.
-
-    Attributes:
-        share: Of demonstrated decisions in a batch; 0 before there are any.
-    """
+    """A replay buffer that fills the end of each batch with demonstrated transitions, a `share` of it."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        """Make a buffer without demonstrations.
-
-        Args:
-            *arguments: As for `ReplayBuffer`.
-            **options: As for `ReplayBuffer`.
-        """
         super().__init__(*arguments, **options)
         self.share = 0.0
         self._demonstrated: tuple[NDArray[np.float32], ...] = ()
 
     def demonstrate(self, flown: Flown, unit: NDArray[np.float32], share: float) -> None:
-        """Take demonstrations.
-
-        Args:
-            flown: Their decisions.
-            unit: Largest actions, shape (n_u,), fractions of limits; the buffer keeps actions relative to it.
-            share: Of demonstrated decisions in a batch.
-        """
+        """Add demonstrations; actions are kept in fractions of `unit`, the agent's largest, shape (n_u,)."""
         self.share = share
         columns = (
             flown.observations,
@@ -103,31 +73,16 @@ class DemonstrationBuffer(ReplayBuffer):
         self._demonstrated = tuple(np.asarray(column, dtype=np.float32) for column in columns)
 
     def demonstrated(self, batch_size: int) -> int:
-        """Count the demonstrated decisions in a batch.
-
-        Args:
-            batch_size: Decisions in all.
-
-        Returns:
-            Those at its end that are demonstrated.
-        """
+        """Number of demonstrated transitions in a batch."""
         return round(self.share * batch_size)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """Draw a batch.
-
-        Args:
-            batch_size: Decisions in all.
-            env: None; observations are not normalized here.
-
-        Returns:
-            The batch, demonstrated decisions last.
-        """
+        """Draw a batch, demonstrated transitions last."""
         count = self.demonstrated(batch_size)
         own = super().sample(batch_size - count, env)
         if not count:
             return own
-        # The generator that SB3's buffers draw from, and that its seed is for.
+        # The generator that SB3's buffers draw from, which its seed sets.
         rows = np.random.randint(len(self._demonstrated[0]), size=count)  # noqa: NPY002
         others = (self.to_torch(column[rows]) for column in self._demonstrated)
         parts = (own.observations, own.actions, own.next_observations, own.dones, own.rewards)
@@ -135,31 +90,17 @@ class DemonstrationBuffer(ReplayBuffer):
 
 
 class SoftActorCritic(SAC):
-    """SAC of Stable-Baselines3, whose actor may be drawn to demonstrated actions.
+    """SAC of Stable-Baselines3 with a cloning term in the actor's loss.
 
-    Attributes:
-        cloning_weight: Of the mean squared difference from demonstrated actions, relative to the mean size of
-            values.
+    `cloning_weight` weighs the mean squared difference from demonstrated actions, relative to the mean size
+    of values; 0 is SAC's own loss.
     """
 
     def __init__(self, *arguments: Any, cloning_weight: float = 0.0, **options: Any) -> None:
-        """Make a learner.
-
-        Args:
-            *arguments: As for SAC.
-            cloning_weight: See the class; 0 for SAC's own loss.
-            **options: As for SAC.
-        """
         self.cloning_weight = cloning_weight
         super().__init__(*arguments, **options)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Learn from batches of the replay buffer.
-
-        Args:
-            gradient_steps: Batches.
-            batch_size: Decisions of each.
-        """
         if not self.cloning_weight:
             super().train(gradient_steps, batch_size)
             return
@@ -176,16 +117,16 @@ class SoftActorCritic(SAC):
             self.logger.record(f"train/{name}", np.mean(values))
 
     def _step(self, batch_size: int) -> tuple[float, ...]:
-        """One step of temperature, critics and actor, as in SAC but for the last term."""
+        """One step of temperature, critics and actor: SAC plus the cloning term."""
         buffer = self.replay_buffer
         assert isinstance(buffer, DemonstrationBuffer)
         data = buffer.sample(batch_size)
         actions, log_probability = self.actor.action_log_prob(data.observations)
         temperature = self._temperature(log_probability)
         with torch.no_grad():
-            following, following_log = self.actor.action_log_prob(data.next_observations)
-            values = self._lowest(self.critic_target(data.next_observations, following))
-            values = values - temperature * following_log.reshape(-1, 1)
+            next_actions, next_log = self.actor.action_log_prob(data.next_observations)
+            values = self._lowest(self.critic_target(data.next_observations, next_actions))
+            values = values - temperature * next_log.reshape(-1, 1)
             target = data.rewards + (1.0 - data.dones) * self.gamma * values
         critics = self.critic(data.observations, data.actions)
         critic_loss = 0.5 * torch.stack([mse_loss(values, target) for values in critics]).sum()
@@ -205,7 +146,7 @@ class SoftActorCritic(SAC):
         return critic_loss.item(), actor_loss.item(), cloning_loss.item(), temperature.item()
 
     def _temperature(self, log_probability: Tensor) -> Tensor:
-        """The weight of the entropy, before it makes a step of its own."""
+        """Entropy weight before this step, which then updates it."""
         if self.ent_coef_optimizer is None or self.log_ent_coef is None:
             return self.ent_coef_tensor
         temperature = torch.exp(self.log_ent_coef.detach())
@@ -218,5 +159,5 @@ class SoftActorCritic(SAC):
 
     @staticmethod
     def _lowest(values: tuple[Tensor, ...]) -> Tensor:
-        """The least that critics expect, shape (B, 1)."""
+        """Minimum over the critics, shape (B, 1)."""
         return torch.cat(values, dim=1).min(dim=1, keepdim=True).values

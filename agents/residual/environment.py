@@ -1,4 +1,4 @@
-"""Correcting plans as a vector environment for Stable-Baselines3."""
+"""Corrections of plans as a vector environment for Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -12,27 +12,26 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from agents.configuration.residual import Mismatch
-from agents.plans import FloatArray, Followed, Plans
-from agents.residual.controllers import Sight, corrected
-from agents.residual.worlds import Disturbance, Disturbances, Worlds
+from agents.evaluation.plans import FloatArray, Followed, Plans
+from agents.residual.corrections import CorrectionObserver, corrected
 from dq_space_arm_env import Scene
+from dq_space_arm_env.environment.disturbances import Disturbances, MassMismatchVectorEnv
 from experts.demonstrations import Demonstrations
 
 Info = dict[str, Any]
 
 
 class ResidualVecEnv(VecEnv):
-    """Copies of an episode in which a plan flies with its gains, and the actions correct it.
+    """Episodes in which a plan flies with its gains, and actions correct it.
 
-    Each episode begins where a demonstration does, whose plan is followed; the world has other masses than
-    the plan, measurements are noisy, and there are pushes. A twin of each copy, in the same world, with the
-    same noise and the same pushes, is left to the plan with its gains alone: the reward of a step is what it
-    costs the twin minus what it costs the copy. So much of the luck cancels, and a policy that corrects
-    nothing has rewards of zero.
+    Each episode starts where a demonstration does, and follows its plan; masses differ from the plan's,
+    measurements are noisy, and there are pushes. Each has a twin with the same masses, noise and pushes that
+    flies the plan with its gains alone: the reward of a step is the cost of the twin minus the cost of the
+    corrected flight. This cancels much of the luck, and a policy that corrects nothing has rewards of zero.
 
     An action is a correction, in fractions of limits, within `action_space`; observations are those of
-    `Sight`. Episodes of all copies begin and end together. At its end an episode's info has `episode`, as of
-    SB3's `Monitor`, `cost` and `twin_cost`.
+    `CorrectionObserver`. All episodes begin and end together. At the end, an episode's info has `episode`, as
+    of SB3's `Monitor`, `cost` and `twin_cost`.
     """
 
     observation_space: spaces.Box
@@ -52,31 +51,31 @@ class ResidualVecEnv(VecEnv):
         cost_power: float = 1.0,
         seed: int | None = None,
     ) -> None:
-        """Make the copies.
+        """Set up.
 
         Args:
-            demonstrations: Plans that episodes follow, each chosen with equal probability.
-            scene: The scene that they are for.
-            copies: How many.
-            mismatch: How worlds differ from the plans'; copies share the masses evenly.
+            demonstrations: Plans that episodes follow, drawn with equal probability.
+            scene: Their scene.
+            copies: Number of episodes side by side.
+            mismatch: Distribution of masses, noise and pushes; episodes share the masses evenly.
             action_scale: Largest corrections, shape (n_u,), fractions of limits.
-            memory: Time over which deviations are averaged, s.
+            memory: Time constant of the averaged deviation, s.
             full_authority: Size of the averaged deviation at which corrections count in full.
             cost_power: Power of the cost of a step in rewards.
-            seed: Of everything random; None for an unpredictable one.
+            seed: Seed of everything random; None for an unpredictable one.
 
         Raises:
-            ValueError: If the scene has no masses that could be others.
+            ValueError: If the scene has no masses to change.
         """
         factors = np.resize(np.array(mismatch.mass_factors), copies)
-        # In one batch, which is faster: the copies, and after them their twins.
-        self._worlds = Worlds(scene, np.tile(factors, 2).tolist())
+        # The corrected flights and, after them, their twins: one batch is faster.
+        self._worlds = MassMismatchVectorEnv(scene, np.tile(factors, 2).tolist())
         self._plans, self._scene, self._mismatch = Plans.of(demonstrations), scene, mismatch
         self._scale, self._power = np.asarray(action_scale, dtype=np.float64), cost_power
-        self._sight = Sight(scene, memory, full_authority)
+        self._observer = CorrectionObserver(scene, memory, full_authority)
         self._rng = np.random.default_rng(seed)
         self._actions: NDArray[Any] | None = None
-        size = Sight.size(self._worlds.kernels)
+        size = CorrectionObserver.size(self._worlds.kernels)
         super().__init__(
             copies,
             spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32),
@@ -84,55 +83,43 @@ class ResidualVecEnv(VecEnv):
         )
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Renew the random generator.
-
-        Args:
-            seed: For all copies together.
-
-        Returns:
-            The seed for each copy.
-        """
+        """Renew the random generator of all episodes."""
         self._rng = np.random.default_rng(seed)
         return [seed] * self.num_envs
 
     def reset(self) -> NDArray[np.float32]:
-        """Begin new episodes of all copies.
-
-        Returns:
-            Observations, shape (num_envs, n_obs).
-        """
+        """Begin new episodes; returns observations, shape (num_envs, n_obs)."""
         mismatch, count = self._mismatch, self.num_envs
         chosen = self._rng.integers(len(self._plans.states), size=count)
         self._plans = self._plans.choose(np.tile(chosen, 2))
         noise, push = (largest * self._rng.random(count) for largest in (mismatch.noise, mismatch.push))
-        self._disturbances = Disturbances(self._scene, noise, push, mismatch.pushes, self._rng)
-        self._flight = self._worlds.begin(self._plans.starts)
-        self._returns = np.zeros(count)
-        self._sight.begin()
-        return self._look()
+        self._disturbances = Disturbances(
+            self._scene, self._rng, push=push, pushes=mismatch.pushes, measurement=noise
+        )
+        self._worlds.reset(self._plans.starts)
+        self._stage, self._cost, self._returns = 0, np.zeros(2 * count), np.zeros(count)
+        self._flying, self._success = np.ones(2 * count, dtype=np.bool_), np.zeros(2 * count, dtype=np.bool_)
+        self._observer.reset()
+        return self._observe()
 
-    def _look(self) -> NDArray[np.float32]:
-        """Let the present stage's disturbance happen to copies and twins, and see what plans ask for."""
-        draw, stage, count = self._disturbances.draw(), self._flight.stage, self.num_envs
-        measured = self._flight.measure(Disturbance(*(np.tile(part, (2, 1)) for part in draw)))
-        followed = self._plans.follow(self._worlds.kernels, stage, measured)
+    def _observe(self) -> NDArray[np.float32]:
+        """Disturb flights and twins alike, and compute the plans' actions."""
+        draw, count, kernels = self._disturbances.draw(), self.num_envs, self._worlds.kernels
+        assert draw.push is not None
+        assert draw.measurement is not None
+        self._worlds.perturb(np.tile(draw.push, (2, 1)))
+        measured = kernels.retract(self._worlds.states, np.tile(draw.measurement, (2, 1)))
+        followed = self._plans.follow(kernels, self._stage, measured)
         self._uncorrected: FloatArray = followed.action
-        return self._sight(stage, measured[:count], Followed(*(part[:count] for part in followed)))
+        few = Followed(*(part[:count] for part in followed))
+        return self._observer(self._stage, measured[:count], few)
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take the corrections of the step that `step_wait` makes.
-
-        Args:
-            actions: Fractions of limits, shape (num_envs, n_u); clipped to the action space.
-        """
+        """Set the corrections of the next step, fractions of limits, clipped to the action space."""
         self._actions = actions
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[Info]]:
         """Fly one time step; after the last one the next episodes begin at once.
-
-        Returns:
-            Observations, shape (num_envs, n_obs), of new episodes where they ended; rewards and whether
-            episodes ended, shape (num_envs,); infos, empty but at the end.
 
         Raises:
             RuntimeError: Before the first `step_async`.
@@ -140,91 +127,66 @@ class ResidualVecEnv(VecEnv):
         if self._actions is None:
             raise RuntimeError("call step_async() before step_wait()")
         count, actions = self.num_envs, self._uncorrected.copy()
-        actions[:count] = corrected(actions[:count], self._actions, self._scale, self._sight.authority())
-        cost = self._flight.act(actions) ** self._power
-        rewards = cost[count:] - cost[:count]
+        actions[:count] = corrected(actions[:count], self._actions, self._scale, self._observer.authority())
+        charged = self._charged(actions)
+        rewards = charged[count:] - charged[:count]
         self._returns += rewards
-        over = self._flight.stage == self._scene.simulation.steps
-        infos: list[Info] = [{} for _ in range(self.num_envs)]
+        over = self._stage == self._scene.simulation.steps
+        infos: list[Info] = [{} for _ in range(count)]
         if over:
             self._describe(infos)
-        observations = self.reset() if over else self._look()
-        return observations, rewards.astype(np.float32), np.full(self.num_envs, over), infos
+        observations = self.reset() if over else self._observe()
+        return observations, rewards.astype(np.float32), np.full(count, over), infos
+
+    def _charged(self, actions: FloatArray) -> FloatArray:
+        """Fly a time step, and give its costs as they count in rewards, shape (2 num_envs,)."""
+        _, rewards, terminated, _, info = self._worlds.step(actions)
+        cost, ending = np.where(self._flying, -rewards, 0.0), self._flying & terminated
+        self._cost += cost
+        left: Any = 1
+        if ending.any():
+            self._success |= ending & info["is_success"]
+            self._flying &= ~terminated
+            # A flight that diverges is charged at once for all steps that are left.
+            left = np.where(ending, self._scene.simulation.steps - self._stage, 1)
+        self._stage += 1
+        return np.asarray(left * (cost / left) ** self._power)
 
     def _describe(self, infos: list[Info]) -> None:
-        success, length = self._flight.is_success(), self._scene.simulation.steps
         for i, info in enumerate(infos):
-            info["episode"] = {"r": float(self._returns[i]), "l": length, "t": 0.0}
-            info["cost"], info["twin_cost"] = self._flight.cost[[i, i + self.num_envs]].tolist()
-            info["is_success"] = bool(success[i])
+            steps = self._scene.simulation.steps
+            info["episode"] = {"r": float(self._returns[i]), "l": steps, "t": 0.0}
+            info["cost"], info["twin_cost"] = self._cost[[i, i + self.num_envs]].tolist()
+            info["is_success"] = bool(self._success[i])
             info["TimeLimit.truncated"] = False
 
     def close(self) -> None:
-        """Do nothing: there is nothing to close."""
+        """Nothing to close."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Read an attribute, which all copies share.
-
-        Args:
-            attr_name: Its name.
-            indices: Copies that are asked, all by default.
-
-        Returns:
-            The attribute, for each copy that is asked.
-
-        Raises:
-            AttributeError: If there is no such attribute.
-        """
+        """An attribute, which all episodes share."""
         return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute, for all copies.
-
-        Args:
-            attr_name: Its name.
-            value: Its value.
-            indices: All copies, the default.
-
-        Raises:
-            ValueError: If only some copies are meant.
-        """
+        """Set an attribute of all episodes."""
         self._require_all(indices)
         setattr(self, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method once, for all copies.
-
-        Args:
-            method_name: Its name.
-            *method_args: Positional arguments.
-            indices: All copies, the default.
-            **method_kwargs: Named arguments.
-
-        Returns:
-            What it returned, for each copy.
-
-        Raises:
-            ValueError: If only some copies are meant.
-        """
+        """Call a method once, for all episodes."""
         self._require_all(indices)
         return [getattr(self, method_name)(*method_args, **method_kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Tell whether copies are in a wrapper of Gymnasium.
-
-        Args:
-            wrapper_class: Its class.
-            indices: Copies that are asked, all by default.
-
-        Returns:
-            False for each.
-        """
+        """No episode has a Gymnasium wrapper."""
         return [False] * len(list(self._get_indices(indices)))
 
     def _require_all(self, indices: VecEnvIndices) -> None:
         if isinstance(indices, Iterable) and len(set(indices)) == self.num_envs:
             return
         if indices is not None:
-            raise ValueError(f"copies {indices}: all {self.num_envs} share what they have, leave indices out")
+            raise ValueError(
+                f"indices: {indices}, should be left out: all {self.num_envs} episodes share attributes"
+            )

@@ -1,37 +1,32 @@
-"""What the expert pays who knows the masses, and meets neither noise nor pushes.
+"""Optimal costs of an expert that knows the true masses, and meets neither noise nor pushes.
 
-It is solved in groups of starts, once for each mass, and kept in the cache folder: what is interrupted goes
-on.
+Solved in groups of starts, once for each mass, and cached: an interrupted computation resumes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
+from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agents.comparison.planned_flights import agents_source
-from agents.evaluation.cached_groups import CachedGroups, known_groups
-from agents.plans import FloatArray, Plans
-from agents.residual.controllers import Controller, GainScheduled
-from agents.residual.flights import Adversity, fly
-from dq_space_arm_env import Scene, compile_scene
+from agents.evaluation.expert_costs import OptimalCosts
+from agents.evaluation.kept_results import CachedGroups, Row
+from agents.evaluation.plan_followers import follower
+from agents.evaluation.planned_flights import agents_source
+from agents.evaluation.plans import FloatArray, Plans
+from dq_space_arm_env import Scene
+from dq_space_arm_env.environment.disturbances import with_masses
+from dq_space_arm_env.environment.rollouts import rollout
 from experts import BoxDDP
 from experts.demonstrations import Demonstrations
-from experts.report.solvers.receding import with_masses
+from experts.problems.arm_problem import ArmProblem
 
 SOURCES = (
-    "plans.py",
-    "policies",
-    "residual/controllers.py",
-    "residual/evaluation.py",
-    "residual/flights.py",
-    "residual/informed.py",
-    "residual/worlds.py",
+    *("evaluation/plan_followers.py", "evaluation/plans.py", "policies"),
+    *(f"residual/{name}.py" for name in ("corrections", "informed", "mismatch", "mismatch_comparison")),
 )
-"""Code of this package that flights under mismatch follow from."""
+"""Files and folders of this package that flights under mismatch follow from."""
 _GROUP = 16
 
 
@@ -41,72 +36,51 @@ def informed_costs(
     plans: Plans,
     mass_factor: float,
     progress: Callable[[int, int], None] = lambda done, starts: None,
-) -> FloatArray:
-    """Look up what the expert pays who knows the masses; solve what is not there yet.
+) -> OptimalCosts:
+    """Look up the informed expert's costs from where demonstrations begin; solve those that are missing.
 
-    Args:
-        scene: The scene that was planned in.
-        demonstrations: From where they begin; with nominal masses, what they cost.
-        plans: The same as plans, whose feedback in the changed scene is where the solver begins.
-        mass_factor: Of mass and inertia of the payload, or of the last link without one.
-        progress: Called with the number of starts that are done, and of all.
-
-    Returns:
-        Costs, shape (B,), dimensionless; NaN where it found no optimum.
-
-    Raises:
-        ValueError: If the scene has no masses that could be others.
-        KeyboardInterrupt: If the user interrupts it. What is solved remains.
+    With nominal masses they are the costs of the demonstrations. Else the solver starts from a flight of the
+    plan with gains in the changed scene.
     """
+    seeds = demonstrations.column("seed")
     if mass_factor == 1.0:
-        return demonstrations.column("cost").astype(np.float64)
-    seeds, changed = demonstrations.column("seed").tolist(), with_masses(scene, mass_factor)
+        costs, count = demonstrations.column("cost").astype(np.float64), len(seeds)
+        return OptimalCosts(seeds, costs, np.ones(count, dtype=np.bool_), np.full(count, np.nan))
+    changed = with_masses(scene, mass_factor)
     follows_from = {
         "plans": dict(demonstrations.settings),
-        "seeds": seeds,
+        "seeds": seeds.tolist(),
         "solved in": changed.content_hash(),
         "agents": agents_source(SOURCES),
     }
-    files = CachedGroups("informed-costs", follows_from, ("seed", "cost"))
-    groups = range(-(-len(seeds) // _GROUP))
-    rows, missing = known_groups(files, groups, lambda group: _members(seeds, group))
-    progress(sum(map(len, rows.values())), len(seeds))
-    solver = BoxDDP(changed) if missing else None
-    for group in missing:
+    columns = ("seed", "cost", "is_success", "seconds")
+    files = CachedGroups("informed-costs", follows_from, columns, seeds.tolist(), _GROUP)
+    progress(len(files.rows), len(seeds))
+    problem = ArmProblem(changed)
+    solver = BoxDDP(problem) if files.missing else None
+    for group in files.missing:
         assert solver is not None
-        few = plans.choose(_members(plans.chosen.tolist(), group))
-        recorder = _Recorder(GainScheduled(scene))
-        fly(recorder, scene, few, Adversity(mass_factor, 0.0, 0.0, 0.0, seed=0))
-        guesses = np.stack(recorder.actions, axis=1) * compile_scene(scene).layout.control_limit
-        costs = [_cost(solver, start, guess) for start, guess in zip(few.starts, guesses, strict=True)]
-        rows[group] = [
-            {"seed": seed, "cost": cost} for seed, cost in zip(_members(seeds, group), costs, strict=True)
-        ]
-        files.write(group, rows[group])
-        progress(sum(map(len, rows.values())), len(seeds))
-    found = [row["cost"] for group in sorted(rows) for row in rows[group]]
-    return np.array([np.nan if cost is None else cost for cost in found], dtype=np.float64)
+        few = plans.choose(plans.chosen[group * _GROUP : (group + 1) * _GROUP])
+        flown = rollout(
+            follower(scene, few, feedback=True),
+            scene,
+            starts=few.starts,
+            mass_factors=[mass_factor] * len(few),
+            record=True,
+        )
+        assert flown.controls is not None
+        starts = zip(files.seeds(group), few.starts, flown.controls, strict=True)
+        files.add(group, [_solved(problem, solver, *start) for start in starts])
+        progress(len(files.rows), len(seeds))
+    return OptimalCosts.of(files.rows)
 
 
-class _Recorder:
-    """A controller that remembers its actions."""
-
-    def __init__(self, controller: Controller) -> None:
-        self._controller = controller
-        self.actions: list[NDArray[Any]] = []
-
-    def begin(self, plans: Plans) -> None:
-        self._controller.begin(plans)
-
-    def __call__(self, stage: int, measured: FloatArray) -> NDArray[Any]:
-        self.actions.append(self._controller(stage, measured))
-        return self.actions[-1]
-
-
-def _members(values: Sequence[int], group: int) -> Sequence[int]:
-    return values[group * _GROUP : (group + 1) * _GROUP]
-
-
-def _cost(solver: BoxDDP, start: FloatArray, guess: FloatArray) -> float | None:
+def _solved(problem: ArmProblem, solver: BoxDDP, seed: int, start: FloatArray, guess: FloatArray) -> Row:
+    began = perf_counter()
     solution = solver.solve(x0=start, u_init=guess)
-    return solution.cost if solution.converged else None
+    return {
+        "seed": seed,
+        "cost": solution.cost if solution.converged else None,
+        "is_success": bool(problem.is_success(solution.states[-1])),
+        "seconds": perf_counter() - began,
+    }

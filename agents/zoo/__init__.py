@@ -3,8 +3,8 @@
     policy = load_policy(list_policies()[0])
     action = policy(observation)
 
-A card says what a policy is, how it was trained, by which command, and how it does on the evaluation starts.
-Wherever a policy is asked for, in `evaluate` and on command lines, its name will do.
+A card describes a policy, the command that trains it, and its results on the evaluation starts. `evaluate`
+and the command line take its name wherever they take a policy.
 """
 
 from agents.zoo.shelf import ZooError, list_policies, load_policy

@@ -1,4 +1,4 @@
-"""The policies that ship with the package: where they lie, and how to take one."""
+"""The policies that ship with the package."""
 
 from __future__ import annotations
 
@@ -11,48 +11,36 @@ from agents.policies import ExportedPolicy
 from dq_space_arm_env.validation import did_you_mean
 
 SHELF = Path(__file__).parent / "policies"
-"""Their folder; for each `<name>.npz`, its weights, `<name>.json`, its evaluation, `<name>.md`, its card."""
-MOST_BYTES = 2_000_000
-"""What all weights may take together."""
+"""Folder of `<name>.npz` (weights), `<name>.json` (evaluation) and `<name>.md` (model card)."""
+MOST_BYTES = 2_000_000  # limit of all weights together
 
 
 class ZooError(ValueError):
-    """The zoo has no such policy, or cannot take one; the message says what would be right."""
+    """The zoo has no such policy, or cannot take it; the message says what would be right."""
 
 
 def list_policies(shelf: Path | None = None) -> list[str]:
     """List the policies that ship with the package.
 
     Args:
-        shelf: A folder in place of the package's own.
+        shelf: Another folder than the package's own.
 
     Returns:
-        Their names, sorted; none if the zoo is empty.
+        Their names, sorted.
     """
     return sorted(path.stem for path in (shelf or SHELF).glob("*.npz"))
 
 
 def policy_file(name: str, shelf: Path | None = None) -> Path:
-    """Find the weights of a policy.
-
-    Args:
-        name: Its name.
-        shelf: A folder in place of the package's own.
-
-    Returns:
-        The file.
-
-    Raises:
-        ZooError: If there is no policy of this name.
-    """
+    """Path of a policy's weights; ZooError if there is no policy of this name."""
     names = list_policies(shelf)
     if name in names:
         return (shelf or SHELF) / f"{name}.npz"
     close = did_you_mean(name, names)
     known = f"It has {', '.join(names)}" if names else "It is empty"
     raise ZooError(
-        f"the zoo has no policy {name!r}{f'; {close}' if close else '. '}{known}. A policy of your own is "
-        "given by the path of its file, which ends in .npz, or by the folder of its training run"
+        f"the zoo has no policy {name!r}{f'; {close}' if close else '. '}{known}. Give a policy of "
+        "your own by the path of its .npz file, or by its run folder"
     )
 
 
@@ -73,18 +61,7 @@ def load_policy(name: str) -> ExportedPolicy:
 
 
 def load_record(name: str, shelf: Path | None = None) -> dict[str, Any]:
-    """Load what is known of a policy: how it was evaluated, and the hash of its file.
-
-    Args:
-        name: Its name.
-        shelf: A folder in place of the package's own.
-
-    Returns:
-        JSON values, see `agents.zoo.adding`.
-
-    Raises:
-        ZooError: If there is no policy of this name, or nothing is known of it.
-    """
+    """Record of a policy's evaluation, JSON values as `scripts/add_to_zoo.py` describes them."""
     file = policy_file(name, shelf).with_suffix(".json")
     try:
         return dict(json.loads(file.read_text(encoding="utf-8")))
@@ -93,12 +70,5 @@ def load_record(name: str, shelf: Path | None = None) -> dict[str, Any]:
 
 
 def file_hash(path: Path) -> str:
-    """Identify a file by its content.
-
-    Args:
-        path: The file.
-
-    Returns:
-        SHA-256, 64 hexadecimal digits.
-    """
+    """SHA-256 of a file, 64 hexadecimal digits."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

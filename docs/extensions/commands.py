@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import click
 
-from agents.command_line.program import program
+from dq_space_arm_env.command_line.verb_program import program
 
 PROGRAM = "dq-space-arm"
 HELP = ["-h", "--help"]
@@ -33,15 +33,23 @@ def all_commands() -> dict[str, click.Command]:
 def _walk(command: click.Command, words: str) -> Iterator[tuple[str, click.Command]]:
     yield words, command
     if isinstance(command, click.Group):
-        for name, inner in command.commands.items():
+        for name, inner in _commands(command).items():
             yield from _walk(inner, f"{words} {name}")
+
+
+def _commands(command: click.Command) -> dict[str, click.Command]:
+    if not isinstance(command, click.Group):
+        return {}
+    context = click.Context(command)
+    found = {name: command.get_command(context, name) for name in command.list_commands(context)}
+    return {name: inner for name, inner in found.items() if inner is not None}
 
 
 def _sections(command: click.Command, words: str, level: int) -> Iterator[str]:
     if level > 1:
         yield f"{'#' * level} `{words.removeprefix(PROGRAM + ' ')}`\n"
     yield _help(command, words)
-    for name, inner in getattr(command, "commands", {}).items():
+    for name, inner in _commands(command).items():
         yield from _sections(inner, f"{words} {name}", level + 1)
 
 

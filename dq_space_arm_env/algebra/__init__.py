@@ -1,7 +1,9 @@
 """The algebra of the paper, written once over plain scalars: quaternions, dual quaternions, poses, screws.
 
 Every function takes and returns flat tuples of scalars. A scalar may be a float, a NumPy array (a batch: the
-component axis comes first), a CasADi symbol, or a number inside numba; see `scalars` and `numba_support`.
+component axis comes first) or a CasADi symbol; see `scalars`. Docstrings give the shapes as NumPy signatures,
+for example `(3, 3), (3,) -> (3,)`. Units are SI and rad: a pose is dimensionless (real part) and m (dual
+part), a twist rad/s and m/s, its integral rad and m; the other functions keep the units of their arguments.
 
     vectors          3-vectors and 3 x 3 matrices
     quaternion       Table I, (1), (2)
@@ -10,14 +12,14 @@ component axis comes first), a CasADi symbol, or a number inside numba; see `sca
     dual_matrices    8 x 8 matrices: (6), [a]_L, [b]_R, H(M), dual inertia (10), adjoint
     dual_vectors     twists and wrenches as 6 numbers
     poses            unit dual quaternions from and to rotation and position, pose error (31)
-    screw            exponential, logarithm, screw parameters, interpolation
+    screw            exponential, its Jacobian, logarithm, interpolation
+    symbolic         CasADi matrices, for tracing
 """
 
 from dq_space_arm_env.algebra import (
     dual_matrices,
     dual_quaternion,
     dual_vectors,
-    numba_support,
     poses,
     quaternion,
     rotations,
@@ -44,7 +46,6 @@ __all__ = [
     "logarithm",
     "multiply",
     "normalize",
-    "numba_support",
     "poses",
     "position",
     "quaternion",

@@ -30,16 +30,10 @@ def _polynomial(x: Scalar, coefficients: tuple[float, ...]) -> Scalar:
 
 
 def stumpff(s: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]:
-    """Return the Stumpff functions c_k(s) = sum_j (-s)^j / (2 j + k)!, k = 0..5.
+    """Return the Stumpff functions c_k(s) = sum_j (-s)^j / (2 j + k)!, k = 0..5: () -> (6,).
 
-    With t = sqrt(s) they are c0 = cos t, c1 = sin t / t, c2 = (1 - cos t) / t^2, c3 = (t - sin t) / t^3,
-    c4 = (1/2 - c2) / t^2, c5 = (1/6 - c3) / t^2. Their derivatives are dc_k/ds = (k c_{k+2} - c_{k+1}) / 2.
-
-    Args:
-        s: Squared angle, shape (), rad^2.
-
-    Returns:
-        c0 to c5, shape (6,), dimensionless.
+    With t = sqrt(s) they are c0 = cos t, c1 = sin t / t, c2 = (1 - cos t) / t^2, c3 = (t - sin t) / t^3, c4 =
+    (1/2 - c2) / t^2, c5 = (1/6 - c3) / t^2. Their derivatives are dc_k/ds = (k c_{k+2} - c_{k+1}) / 2.
     """
     is_small = s < _SERIES_BELOW
 
@@ -71,15 +65,7 @@ def stumpff(s: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]:
 
 
 def logarithm_coefficients(cosine: Scalar, sine_squared: Scalar) -> tuple[Scalar, Scalar]:
-    """Return h / sin h and (sin h - h cos h) / sin^3 h for an angle h in [0, pi/2].
-
-    Args:
-        cosine: cos h, at least 0, shape (), dimensionless.
-        sine_squared: sin^2 h, shape (), dimensionless.
-
-    Returns:
-        The two coefficients, shape (2,), dimensionless.
-    """
+    """Return h / sin h and (sin h - h cos h) / sin^3 h for an angle h in [0, pi/2]: (), () -> (2,)."""
     is_small = sine_squared < _ARCTAN_SERIES_BELOW * cosine * cosine
 
     small_cosine = select(is_small, cosine, 1.0)

@@ -1,8 +1,8 @@
 """The types of the algebra: flat tuples of plain scalars.
 
-Nothing here has a class of its own. A quaternion is a tuple of 4 scalars, a dual quaternion a tuple of 8, a
+There are no classes. A quaternion is a tuple of 4 scalars, a dual quaternion a tuple of 8, a
 3-vector a tuple of 3, a dual vector (twist, wrench) a tuple of 6 and a matrix a tuple of row tuples. That is
-what lets the same function run on floats, on NumPy batches, inside numba and under CasADi.
+what lets the same function run on floats, on NumPy batches and under CasADi.
 """
 
 from typing import Any, Protocol
@@ -31,7 +31,7 @@ Matrix8 = tuple[
 
 
 class Components(Protocol):
-    """What a function accepts: anything whose components are reached by index, the component axis first."""
+    """A function's argument: anything indexed by component, the component axis first."""
 
     def __getitem__(self, index: int, /) -> Any:
         """Return one component, or one row of a matrix."""

@@ -38,11 +38,9 @@ def _from_blocks(real: Matrix4, dual: Matrix4) -> Matrix8:
 def cross_matrix(s: Components) -> Matrix8:
     """Return the matrix [s]^x of (6): for vector dual quaternions s and b, [s]^x b = s x b.
 
-    Args:
-        s: Vector dual quaternion, shape (8,), any unit; its scalar components are not used.
+    (8,) -> (8, 8).
 
-    Returns:
-        Matrix, shape (8, 8), the unit of `s`.
+    The scalar components of `s` are not used.
     """
     return _from_blocks(
         quaternion.cross_matrix(dual_quaternion.real_part(s)),
@@ -51,14 +49,7 @@ def cross_matrix(s: Components) -> Matrix8:
 
 
 def left_matrix(a: Components) -> Matrix8:
-    """Return the matrix [a]_L with [a]_L b = ab for every dual quaternion b.
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Matrix, shape (8, 8), the unit of `a`.
-    """
+    """Return the matrix [a]_L with [a]_L b = ab for every dual quaternion b: (8,) -> (8, 8)."""
     return _from_blocks(
         quaternion.left_matrix(dual_quaternion.real_part(a)),
         quaternion.left_matrix(dual_quaternion.dual_part(a)),
@@ -66,14 +57,7 @@ def left_matrix(a: Components) -> Matrix8:
 
 
 def right_matrix(b: Components) -> Matrix8:
-    """Return the matrix [b]_R with [b]_R a = ab for every dual quaternion a.
-
-    Args:
-        b: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Matrix, shape (8, 8), the unit of `b`.
-    """
+    """Return the matrix [b]_R with [b]_R a = ab for every dual quaternion a: (8,) -> (8, 8)."""
     return _from_blocks(
         quaternion.right_matrix(dual_quaternion.real_part(b)),
         quaternion.right_matrix(dual_quaternion.dual_part(b)),
@@ -83,12 +67,7 @@ def right_matrix(b: Components) -> Matrix8:
 def matrix_multiply(matrix: Components, a: Components) -> DualQuaternion:
     """Return the product of a matrix and the components of a dual quaternion, the star of (9).
 
-    Args:
-        matrix: Matrix, shape (8, 8), any unit.
-        a: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Product, shape (8,), the product of the units.
+    (8, 8), (8,) -> (8,).
     """
     product = dual_quaternion.circle
     return (
@@ -104,14 +83,7 @@ def matrix_multiply(matrix: Components, a: Components) -> DualQuaternion:
 
 
 def swap_columns(matrix: Components) -> Matrix8:
-    """Return H(M), the matrix with H(M) a = M a^s for every dual quaternion a.
-
-    Args:
-        matrix: Matrix M, shape (8, 8), any unit.
-
-    Returns:
-        H(M), shape (8, 8), the unit of `matrix`.
-    """
+    """Return H(M), the matrix with H(M) a = M a^s for every dual quaternion a: (8, 8) -> (8, 8)."""
     swap = dual_quaternion.swap
     return (
         swap(matrix[0]),
@@ -128,12 +100,9 @@ def swap_columns(matrix: Components) -> Matrix8:
 def dual_inertia_matrix(mass: Scalar, inertia: Components) -> Matrix8:
     """Return the dual inertia matrix M of (10); M (w)^s is the dual momentum m v + eps J w.
 
-    Args:
-        mass: Mass of the body, shape (), kg.
-        inertia: Inertia about the center of mass, shape (3, 3), kg m^2.
+    (), (3, 3) -> (8, 8).
 
-    Returns:
-        Dual inertia matrix, shape (8, 8), kg and kg m^2; 1 in its two scalar slots.
+    Its two scalar slots are 1.
     """
     return (
         (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -148,14 +117,7 @@ def dual_inertia_matrix(mass: Scalar, inertia: Components) -> Matrix8:
 
 
 def adjoint_matrix(q: Components) -> Matrix8:
-    """Return the matrix [q]_L [q*]_R of Ad(q) s = q s q*.
-
-    Args:
-        q: Unit dual quaternion, shape (8,), dimensionless and m.
-
-    Returns:
-        Matrix, shape (8, 8), dimensionless and m.
-    """
+    """Return the matrix [q]_L [q*]_R of Ad(q) s = q s q*: (8,) -> (8, 8)."""
     real = quaternion.left_matrix(dual_quaternion.real_part(q))
     dual = quaternion.left_matrix(dual_quaternion.dual_part(q))
     # [q*]_R is the transpose of [q]_R, hence row times [q*]_R is the quaternion product of the row with q.

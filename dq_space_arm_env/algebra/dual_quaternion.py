@@ -41,52 +41,22 @@ ZERO = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def real_part(a: Components) -> Quaternion:
-    """Return the real part a_r; of a pose, the rotation.
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Quaternion, shape (4,), the unit of `a`.
-    """
+    """Return the real part a_r; of a pose, the rotation: (8,) -> (4,)."""
     return (a[0], a[1], a[2], a[3])
 
 
 def dual_part(a: Components) -> Quaternion:
-    """Return the dual part a_d; of a pose, half the position times the rotation.
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Quaternion, shape (4,), the unit of `a`.
-    """
+    """Return the dual part a_d; of a pose, half the position times the rotation: (8,) -> (4,)."""
     return (a[4], a[5], a[6], a[7])
 
 
 def from_parts(real: Components, dual: Components) -> DualQuaternion:
-    """Return real + eps dual.
-
-    Args:
-        real: Quaternion, shape (4,), any unit.
-        dual: Quaternion, shape (4,), any unit.
-
-    Returns:
-        Dual quaternion, shape (8,), the units of the parts.
-    """
+    """Return real + eps dual: (4,), (4,) -> (8,)."""
     return (real[0], real[1], real[2], real[3], dual[0], dual[1], dual[2], dual[3])
 
 
 def add(a: Components, b: Components) -> DualQuaternion:
-    """Return a + b (Table II).
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-        b: Dual quaternion, shape (8,), the unit of `a`.
-
-    Returns:
-        Sum, shape (8,), the unit of `a`.
-    """
+    """Return a + b (Table II): (8,), (8,) -> (8,)."""
     return from_parts(
         quaternion.add(real_part(a), real_part(b)),
         quaternion.add(dual_part(a), dual_part(b)),
@@ -94,15 +64,7 @@ def add(a: Components, b: Components) -> DualQuaternion:
 
 
 def subtract(a: Components, b: Components) -> DualQuaternion:
-    """Return a - b.
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-        b: Dual quaternion, shape (8,), the unit of `a`.
-
-    Returns:
-        Difference, shape (8,), the unit of `a`.
-    """
+    """Return a - b: (8,), (8,) -> (8,)."""
     return from_parts(
         quaternion.subtract(real_part(a), real_part(b)),
         quaternion.subtract(dual_part(a), dual_part(b)),
@@ -110,28 +72,12 @@ def subtract(a: Components, b: Components) -> DualQuaternion:
 
 
 def scale(factor: Scalar, a: Components) -> DualQuaternion:
-    """Return factor * a (Table II).
-
-    Args:
-        factor: Number, shape (), any unit.
-        a: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Multiple, shape (8,), the product of the units.
-    """
+    """Return factor * a (Table II): (), (8,) -> (8,)."""
     return from_parts(quaternion.scale(factor, real_part(a)), quaternion.scale(factor, dual_part(a)))
 
 
 def multiply(a: Components, b: Components) -> DualQuaternion:
-    """Return the product ab (Table II); of poses, q_{Z/X} = q_{Y/X} q_{Z/Y}.
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-        b: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Product, shape (8,), the product of the units.
-    """
+    """Return the product ab (Table II); of poses, q_{Z/X} = q_{Y/X} q_{Z/Y}: (8,), (8,) -> (8,)."""
     return from_parts(
         quaternion.multiply(real_part(a), real_part(b)),
         quaternion.add(
@@ -142,26 +88,14 @@ def multiply(a: Components, b: Components) -> DualQuaternion:
 
 
 def conjugate(a: Components) -> DualQuaternion:
-    """Return the conjugate a* (Table II); of a pose, the inverse: q_{X/Y}* = q_{Y/X}.
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Conjugate, shape (8,), the unit of `a`.
-    """
+    """Return the conjugate a* (Table II); of a pose, the inverse: q_{X/Y}* = q_{Y/X}: (8,) -> (8,)."""
     return from_parts(quaternion.conjugate(real_part(a)), quaternion.conjugate(dual_part(a)))
 
 
 def dot(a: Components, b: Components) -> DualQuaternion:
     """Return the dot product of a and b (Table II), a dual quaternion with zero vector parts.
 
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-        b: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Dot product in components 0 and 4, shape (8,), the product of the units.
+    (8,), (8,) -> (8,).
     """
     return from_parts(
         quaternion.dot(real_part(a), real_part(b)),
@@ -173,15 +107,7 @@ def dot(a: Components, b: Components) -> DualQuaternion:
 
 
 def cross(a: Components, b: Components) -> DualQuaternion:
-    """Return the cross product of a and b (Table II).
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-        b: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Cross product, shape (8,), the product of the units.
-    """
+    """Return the cross product of a and b (Table II): (8,), (8,) -> (8,)."""
     return from_parts(
         quaternion.cross(real_part(a), real_part(b)),
         quaternion.add(
@@ -194,12 +120,7 @@ def cross(a: Components, b: Components) -> DualQuaternion:
 def circle(a: Components, b: Components) -> DualQuaternion:
     """Return the circle product of a and b (Table II), the sum of the 8 products in component 0.
 
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-        b: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Circle product in component 0, shape (8,), the product of the units.
+    (8,), (8,) -> (8,).
     """
     return from_parts(
         quaternion.add(
@@ -211,76 +132,37 @@ def circle(a: Components, b: Components) -> DualQuaternion:
 
 
 def swap(a: Components) -> DualQuaternion:
-    """Return a^s = a_d + eps a_r (Table II).
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Dual quaternion with its parts exchanged, shape (8,), the unit of `a`.
-    """
+    """Return a^s = a_d + eps a_r (Table II): (8,) -> (8,)."""
     return from_parts(dual_part(a), real_part(a))
 
 
 def norm(a: Components) -> Scalar:
-    """Return the norm sqrt(a o a) (Table II); its derivative at the origin is taken as 0.
+    """Return the norm sqrt(a o a) (Table II); its derivative at the origin is taken as 0: (8,) -> ().
 
     Of a pose at position r it is sqrt(1 + |r|^2 / 4), not 1: "unit" means q* q = 1.
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Norm, shape (), the unit of `a`.
     """
     return safe_sqrt(circle(a, a)[0])
 
 
 def vector_part(a: Components) -> DualQuaternion:
-    """Return vec(a) (Table II): both scalar components set to zero.
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Vector dual quaternion, shape (8,), the unit of `a`.
-    """
+    """Return vec(a) (Table II): both scalar components set to zero: (8,) -> (8,)."""
     return from_parts(quaternion.vector_part(real_part(a)), quaternion.vector_part(dual_part(a)))
 
 
 def from_vector(v: Components) -> DualQuaternion:
-    """Return the vector dual quaternion of a dual vector.
-
-    Args:
-        v: Dual vector, shape (6,), any unit.
-
-    Returns:
-        Vector dual quaternion, shape (8,), the unit of `v`.
-    """
+    """Return the vector dual quaternion of a dual vector: (6,) -> (8,)."""
     return (0.0, v[0], v[1], v[2], 0.0, v[3], v[4], v[5])
 
 
 def to_vector(a: Components) -> DualVector:
-    """Return the dual vector in a dual quaternion, dropping its scalar components.
-
-    Args:
-        a: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        Dual vector, shape (6,), the unit of `a`.
-    """
+    """Return the dual vector in a dual quaternion, dropping its scalar components: (8,) -> (6,)."""
     return (a[1], a[2], a[3], a[5], a[6], a[7])
 
 
 def adjoint(q: Components, s: Components) -> DualQuaternion:
     """Return Ad(q) s = q s q*: with q_{X/Y} it takes s^X to s^Y, a twist as well as a wrench.
 
-    Args:
-        q: Unit dual quaternion, shape (8,), dimensionless and m.
-        s: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        The same in the other frame, shape (8,), the unit of `s`.
+    (8,), (8,) -> (8,).
     """
     return multiply(multiply(q, s), conjugate(q))
 
@@ -288,50 +170,25 @@ def adjoint(q: Components, s: Components) -> DualQuaternion:
 def inverse_adjoint(q: Components, s: Components) -> DualQuaternion:
     """Return q* s q, the frame change of (7): with q_{Y/X} it takes s^X to s^Y. The inverse of `adjoint`.
 
-    Args:
-        q: Unit dual quaternion, shape (8,), dimensionless and m.
-        s: Dual quaternion, shape (8,), any unit.
-
-    Returns:
-        The same in the other frame, shape (8,), the unit of `s`.
+    (8,), (8,) -> (8,).
     """
     return multiply(multiply(conjugate(q), s), q)
 
 
 def derivative(q: Components, velocity: Components) -> DualQuaternion:
-    """Return the time derivative 1/2 q_{X/Y} w^X of (8).
-
-    Args:
-        q: Pose q_{X/Y}, shape (8,), dimensionless and m.
-        velocity: Dual velocity w of X relative to Y, in frame X, shape (6,), rad/s and m/s.
-
-    Returns:
-        Derivative, shape (8,), 1/s and m/s.
-    """
+    """Return the time derivative 1/2 q_{X/Y} w^X of (8): (8,), (6,) -> (8,)."""
     return scale(0.5, multiply(q, from_vector(velocity)))
 
 
 def derivative_from_reference(q: Components, velocity: Components) -> DualQuaternion:
-    """Return the time derivative 1/2 w^Y q_{X/Y} of (8).
-
-    Args:
-        q: Pose q_{X/Y}, shape (8,), dimensionless and m.
-        velocity: Dual velocity w of X relative to Y, in frame Y, shape (6,), rad/s and m/s.
-
-    Returns:
-        Derivative, shape (8,), 1/s and m/s.
-    """
+    """Return the time derivative 1/2 w^Y q_{X/Y} of (8): (8,), (6,) -> (8,)."""
     return scale(0.5, multiply(from_vector(velocity), q))
 
 
 def normalize(a: Components) -> DualQuaternion:
     """Return the unit dual quaternion a (a* a)^(-1/2): unit real part, dual part orthogonal to it.
 
-    Args:
-        a: Dual quaternion with nonzero real part, shape (8,), dimensionless and m.
-
-    Returns:
-        Unit dual quaternion, shape (8,), dimensionless and m.
+    (8,) -> (8,).
     """
     real, dual = real_part(a), dual_part(a)
     inverse_norm = 1.0 / sqrt(quaternion.dot(real, real)[0])
@@ -344,10 +201,6 @@ def normalize(a: Components) -> DualQuaternion:
 def canonical(q: Components) -> DualQuaternion:
     """Return the one of q and -q, which are the same pose, whose first nonzero component is positive.
 
-    Args:
-        q: Unit dual quaternion, shape (8,), dimensionless and m.
-
-    Returns:
-        Unit dual quaternion with q0 >= 0, shape (8,), dimensionless and m.
+    (8,) -> (8,).
     """
     return scale(quaternion.sign(real_part(q)), q)

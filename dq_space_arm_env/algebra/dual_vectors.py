@@ -23,90 +23,39 @@ __all__ = [
 
 
 def real_part(a: Components) -> Vector:
-    """Return the real part a_r.
-
-    Args:
-        a: Dual vector, shape (6,), any unit.
-
-    Returns:
-        Vector, shape (3,), the unit of `a`.
-    """
+    """Return the real part a_r: (6,) -> (3,)."""
     return (a[0], a[1], a[2])
 
 
 def dual_part(a: Components) -> Vector:
-    """Return the dual part a_d.
-
-    Args:
-        a: Dual vector, shape (6,), any unit.
-
-    Returns:
-        Vector, shape (3,), the unit of `a`.
-    """
+    """Return the dual part a_d: (6,) -> (3,)."""
     return (a[3], a[4], a[5])
 
 
 def from_parts(real: Components, dual: Components) -> DualVector:
-    """Return real + eps dual.
-
-    Args:
-        real: Vector, shape (3,), any unit.
-        dual: Vector, shape (3,), any unit.
-
-    Returns:
-        Dual vector, shape (6,), the units of the parts.
-    """
+    """Return real + eps dual: (3,), (3,) -> (6,)."""
     return (real[0], real[1], real[2], dual[0], dual[1], dual[2])
 
 
 def add(a: Components, b: Components) -> DualVector:
-    """Return a + b.
-
-    Args:
-        a: Dual vector, shape (6,), any unit.
-        b: Dual vector, shape (6,), the unit of `a`.
-
-    Returns:
-        Sum, shape (6,), the unit of `a`.
-    """
+    """Return a + b: (6,), (6,) -> (6,)."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5])
 
 
 def subtract(a: Components, b: Components) -> DualVector:
-    """Return a - b.
-
-    Args:
-        a: Dual vector, shape (6,), any unit.
-        b: Dual vector, shape (6,), the unit of `a`.
-
-    Returns:
-        Difference, shape (6,), the unit of `a`.
-    """
+    """Return a - b: (6,), (6,) -> (6,)."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] - b[3], a[4] - b[4], a[5] - b[5])
 
 
 def scale(factor: Scalar, a: Components) -> DualVector:
-    """Return factor * a.
-
-    Args:
-        factor: Number, shape (), any unit.
-        a: Dual vector, shape (6,), any unit.
-
-    Returns:
-        Multiple, shape (6,), the product of the units.
-    """
+    """Return factor * a: (), (6,) -> (6,)."""
     return (factor * a[0], factor * a[1], factor * a[2], factor * a[3], factor * a[4], factor * a[5])
 
 
 def cross(a: Components, b: Components) -> DualVector:
     """Return a x b = a_r x b_r + eps (a_d x b_r + a_r x b_d), the cross product of Table II.
 
-    Args:
-        a: Dual vector, shape (6,), any unit.
-        b: Dual vector, shape (6,), any unit.
-
-    Returns:
-        Cross product, shape (6,), the product of the units.
+    (6,), (6,) -> (6,).
     """
     return from_parts(
         vectors.cross(real_part(a), real_part(b)),
@@ -117,13 +66,7 @@ def cross(a: Components, b: Components) -> DualVector:
 def transform(rotation_matrix: Components, position: Components, s: Components) -> DualVector:
     """Return Ad(q) s = R s_r + eps (R s_d + p x R s_r), which takes s^X to s^Y for the pose q = q_{X/Y}.
 
-    Args:
-        rotation_matrix: R, from axes X to axes Y, shape (3, 3), dimensionless.
-        position: p, the origin of X in frame Y, shape (3,), m.
-        s: Dual vector s^X, shape (6,), any unit.
-
-    Returns:
-        Dual vector s^Y, shape (6,), the unit of `s`.
+    (3, 3), (3,), (6,) -> (6,).
     """
     real = vectors.matrix_vector(rotation_matrix, real_part(s))
     dual = vectors.matrix_vector(rotation_matrix, dual_part(s))
@@ -133,13 +76,7 @@ def transform(rotation_matrix: Components, position: Components, s: Components) 
 def inverse_transform(rotation_matrix: Components, position: Components, s: Components) -> DualVector:
     """Return Ad(q*) s = R^T s_r + eps R^T (s_d - p x s_r), which takes s^Y to s^X for the pose q = q_{X/Y}.
 
-    Args:
-        rotation_matrix: R, from axes X to axes Y, shape (3, 3), dimensionless.
-        position: p, the origin of X in frame Y, shape (3,), m.
-        s: Dual vector s^Y, shape (6,), any unit.
-
-    Returns:
-        Dual vector s^X, shape (6,), the unit of `s`.
+    (3, 3), (3,), (6,) -> (6,).
     """
     moved = vectors.subtract(dual_part(s), vectors.cross(position, real_part(s)))
     return from_parts(
@@ -149,15 +86,7 @@ def inverse_transform(rotation_matrix: Components, position: Components, s: Comp
 
 
 def transform_matrix(rotation_matrix: Components, position: Components) -> Matrix6:
-    """Return the matrix [[R, 0], [[p]^x R, R]] of `transform`.
-
-    Args:
-        rotation_matrix: R, from axes X to axes Y, shape (3, 3), dimensionless.
-        position: p, the origin of X in frame Y, shape (3,), m.
-
-    Returns:
-        Matrix, shape (6, 6), dimensionless and m.
-    """
+    """Return the matrix [[R, 0], [[p]^x R, R]] of `transform`: (3, 3), (3,) -> (6, 6)."""
     r = rotation_matrix
     moved = vectors.matrix_product(vectors.skew_matrix(position), r)
     zero = (0.0, 0.0, 0.0)

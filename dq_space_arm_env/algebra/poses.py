@@ -28,11 +28,7 @@ __all__ = [
 def position(q: Components) -> Vector:
     """Return the position r^Y = 2 q_d q_r* of the pose q_{X/Y}, in the axes of the reference frame Y.
 
-    Args:
-        q: Unit dual quaternion, shape (8,), dimensionless and m.
-
-    Returns:
-        Position, shape (3,), m.
+    (8,) -> (3,).
     """
     real, dual = dual_quaternion.real_part(q), dual_quaternion.dual_part(q)
     half = quaternion.multiply(dual, quaternion.conjugate(real))
@@ -40,13 +36,9 @@ def position(q: Components) -> Vector:
 
 
 def body_position(q: Components) -> Vector:
-    """Return the position r^X = 2 q_r* q_d of the pose q_{X/Y}, in the axes of its own frame X.
+    """Return the position r^X = 2 q_r* q_d of the pose q_{X/Y}, in the body axes X.
 
-    Args:
-        q: Unit dual quaternion, shape (8,), dimensionless and m.
-
-    Returns:
-        Position, shape (3,), m.
+    (8,) -> (3,).
     """
     real, dual = dual_quaternion.real_part(q), dual_quaternion.dual_part(q)
     half = quaternion.multiply(quaternion.conjugate(real), dual)
@@ -56,161 +48,72 @@ def body_position(q: Components) -> Vector:
 def from_rotation_and_position(rotation: Components, position: Components) -> DualQuaternion:
     """Return the pose of a rotation and a position in reference axes, q_d = 1/2 r^Y q_r.
 
-    Args:
-        rotation: Unit quaternion q_r, shape (4,), dimensionless.
-        position: r^Y, shape (3,), m.
-
-    Returns:
-        Unit dual quaternion, shape (8,), dimensionless and m.
+    (4,), (3,) -> (8,).
     """
     half = quaternion.from_vector(vectors.scale(0.5, position))
     return dual_quaternion.from_parts(rotation, quaternion.multiply(half, rotation))
 
 
 def from_rotation_and_body_position(rotation: Components, position: Components) -> DualQuaternion:
-    """Return the pose of a rotation and a position in body axes, q_d = 1/2 q_r r^X.
-
-    Args:
-        rotation: Unit quaternion q_r, shape (4,), dimensionless.
-        position: r^X, shape (3,), m.
-
-    Returns:
-        Unit dual quaternion, shape (8,), dimensionless and m.
-    """
+    """Return the pose of a rotation and a position in body axes, q_d = 1/2 q_r r^X: (4,), (3,) -> (8,)."""
     half = quaternion.from_vector(vectors.scale(0.5, position))
     return dual_quaternion.from_parts(rotation, quaternion.multiply(rotation, half))
 
 
 def to_rotation_and_position(q: Components) -> tuple[Quaternion, Vector]:
-    """Return the rotation and the position in reference axes.
-
-    Args:
-        q: Unit dual quaternion, shape (8,), dimensionless and m.
-
-    Returns:
-        The unit quaternion q_r, shape (4,), dimensionless, and r^Y, shape (3,), m.
-    """
+    """Return the rotation and the position in reference axes: (8,) -> (4,), (3,)."""
     return dual_quaternion.real_part(q), position(q)
 
 
 def from_matrix(matrix: Components, position: Components) -> DualQuaternion:
-    """Return the pose of a rotation matrix and a position.
-
-    Args:
-        matrix: Rotation matrix, v^Y = R v^X, shape (3, 3), dimensionless.
-        position: r^Y, shape (3,), m.
-
-    Returns:
-        Unit dual quaternion with q0 >= 0, shape (8,), dimensionless and m.
-    """
+    """Return the pose of a rotation matrix and a position: (3, 3), (3,) -> (8,)."""
     return from_rotation_and_position(rotations.from_matrix(matrix), position)
 
 
 def to_matrix(q: Components) -> tuple[Matrix3, Vector]:
     """Return the rotation matrix and the position, as `dual_vectors.transform` takes them.
 
-    Args:
-        q: Unit dual quaternion, shape (8,), dimensionless and m.
-
-    Returns:
-        The rotation matrix, shape (3, 3), dimensionless, and r^Y, shape (3,), m.
+    (8,) -> (3, 3), (3,).
     """
     return rotations.to_matrix(dual_quaternion.real_part(q)), position(q)
 
 
 def from_euler_321(psi: Scalar, theta: Scalar, phi: Scalar, position: Components) -> DualQuaternion:
-    """Return the pose of 3-2-1 Euler angles and a position.
-
-    Args:
-        psi: Yaw angle about z, shape (), rad.
-        theta: Pitch angle about the new y, shape (), rad.
-        phi: Roll angle about the newest x, shape (), rad.
-        position: r^Y, shape (3,), m.
-
-    Returns:
-        Unit dual quaternion, shape (8,), dimensionless and m.
-    """
+    """Return the pose of 3-2-1 Euler angles and a position: (), (), (), (3,) -> (8,)."""
     return from_rotation_and_position(rotations.from_euler_321(psi, theta, phi), position)
 
 
 def to_euler_321(q: Components) -> tuple[Scalar, Scalar, Scalar, Vector]:
-    """Return the 3-2-1 Euler angles and the position; phi is 0 at gimbal lock.
-
-    Args:
-        q: Unit dual quaternion, shape (8,), dimensionless and m.
-
-    Returns:
-        psi, theta, phi, each of shape (), rad, and r^Y, shape (3,), m.
-    """
+    """Return the 3-2-1 Euler angles and the position; phi is 0 at gimbal lock: (8,) -> (), (3,)."""
     psi, theta, phi = rotations.to_euler_321(dual_quaternion.real_part(q))
     return psi, theta, phi, position(q)
 
 
 def from_axis_angle(axis: Components, angle: Scalar, position: Components) -> DualQuaternion:
-    """Return the pose of a rotation by an angle about an axis, and a position.
-
-    Args:
-        axis: Unit vector, shape (3,), dimensionless.
-        angle: Angle, shape (), rad.
-        position: r^Y, shape (3,), m.
-
-    Returns:
-        Unit dual quaternion, shape (8,), dimensionless and m.
-    """
+    """Return the pose of a rotation by an angle about an axis, and a position: (3,), (), (3,) -> (8,)."""
     return from_rotation_and_position(rotations.from_axis_angle(axis, angle), position)
 
 
 def to_axis_angle(q: Components) -> tuple[Vector, Scalar, Vector]:
-    """Return the axis and the angle of the shortest rotation, and the position.
-
-    Args:
-        q: Unit dual quaternion, shape (8,), dimensionless and m.
-
-    Returns:
-        The axis, shape (3,), dimensionless, (1, 0, 0) without rotation; the angle in [0, pi], shape (), rad;
-        and r^Y, shape (3,), m.
-    """
+    """Return the axis and the angle of the shortest rotation, and the position: (8,) -> (3,), (), (3,)."""
     axis, angle = rotations.to_axis_angle(dual_quaternion.real_part(q))
     return axis, angle, position(q)
 
 
 def error_pose(actual: Components, desired: Components) -> DualQuaternion:
-    """Return the error q_{D/G} = q_{G/I}* q_{D/I} of (31).
+    """Return the error q_{D/G} = q_{G/I}* q_{D/I} of (31): (8,), (8,) -> (8,).
 
     Its `position` is the position error in the axes of G.
-
-    Args:
-        actual: Pose q_{G/I}, shape (8,), dimensionless and m.
-        desired: Pose q_{D/I}, shape (8,), dimensionless and m.
-
-    Returns:
-        Unit dual quaternion q_{D/G}, shape (8,), dimensionless and m.
     """
     return dual_quaternion.multiply(dual_quaternion.conjugate(actual), desired)
 
 
 def error_angle(actual: Components, desired: Components) -> Scalar:
-    """Return the Euler angle of the error (31), that of the shortest rotation.
-
-    Args:
-        actual: Pose q_{G/I}, shape (8,), dimensionless and m.
-        desired: Pose q_{D/I}, shape (8,), dimensionless and m.
-
-    Returns:
-        Angle in [0, pi], shape (), rad.
-    """
+    """Return the Euler angle of the error (31), that of the shortest rotation: (8,), (8,) -> ()."""
     actual_inverse = quaternion.conjugate(dual_quaternion.real_part(actual))
     return rotations.angle(quaternion.multiply(actual_inverse, dual_quaternion.real_part(desired)))
 
 
 def error_distance(actual: Components, desired: Components) -> Scalar:
-    """Return the length of the position error of (31).
-
-    Args:
-        actual: Pose q_{G/I}, shape (8,), dimensionless and m.
-        desired: Pose q_{D/I}, shape (8,), dimensionless and m.
-
-    Returns:
-        Distance, shape (), m.
-    """
+    """Return the length of the position error of (31): (8,), (8,) -> ()."""
     return vectors.norm(vectors.subtract(position(desired), position(actual)))

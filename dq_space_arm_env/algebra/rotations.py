@@ -32,11 +32,7 @@ _GIMBAL_LOCK_BELOW = 1e-30
 def exponential(rotation_vector: Components) -> Quaternion:
     """Return exp(v / 2), the rotation by |v| about v: the solution of (2) after unit time at velocity v.
 
-    Args:
-        rotation_vector: v, axis times angle, shape (3,), rad.
-
-    Returns:
-        Unit quaternion, shape (4,), dimensionless.
+    (3,) -> (4,).
     """
     half = vectors.scale(0.5, rotation_vector)
     c0, c1, _, _, _, _ = stumpff(vectors.dot(half, half))
@@ -44,13 +40,9 @@ def exponential(rotation_vector: Components) -> Quaternion:
 
 
 def logarithm(q: Components) -> Vector:
-    """Return the rotation vector of the shortest rotation, the inverse of `exponential`.
+    """Return the rotation vector of the shortest rotation, the inverse of `exponential`: (4,) -> (3,).
 
-    Args:
-        q: Unit quaternion, shape (4,), dimensionless; q and -q give the same.
-
-    Returns:
-        Rotation vector of length at most pi, shape (3,), rad.
+    Both q and -q give the same result.
     """
     unit = quaternion.canonical(q)
     sine = quaternion.to_vector(unit)
@@ -59,54 +51,30 @@ def logarithm(q: Components) -> Vector:
 
 
 def rotate(q: Components, v: Components) -> Vector:
-    """Return the vector part of q v q*: with q_{X/Y} it takes v^X to v^Y.
-
-    Args:
-        q: Unit quaternion, shape (4,), dimensionless.
-        v: Vector, shape (3,), any unit.
-
-    Returns:
-        Rotated vector, shape (3,), the unit of `v`.
-    """
+    """Return the vector part of q v q*: with q_{X/Y} it takes v^X to v^Y: (4,), (3,) -> (3,)."""
     axis = quaternion.to_vector(q)
     twice = vectors.scale(2.0, vectors.cross(axis, v))
     return vectors.add(v, vectors.add(vectors.scale(q[0], twice), vectors.cross(axis, twice)))
 
 
 def angle(q: Components) -> Scalar:
-    """Return the angle of the shortest rotation.
+    """Return the angle of the shortest rotation: (4,) -> ().
 
-    Args:
-        q: Unit quaternion, shape (4,), dimensionless; q and -q give the same.
-
-    Returns:
-        Angle in [0, pi], shape (), rad.
+    Both q and -q give the same result.
     """
     return 2.0 * arctan2(vectors.norm(quaternion.to_vector(q)), abs(q[0]))
 
 
 def from_axis_angle(axis: Components, angle: Scalar) -> Quaternion:
-    """Return the rotation by an angle about an axis.
-
-    Args:
-        axis: Unit vector, shape (3,), dimensionless.
-        angle: Angle, shape (), rad.
-
-    Returns:
-        Unit quaternion, shape (4,), dimensionless.
-    """
+    """Return the rotation by an angle about an axis: (3,), () -> (4,)."""
     sine = sin(0.5 * angle)
     return (cos(0.5 * angle), sine * axis[0], sine * axis[1], sine * axis[2])
 
 
 def to_axis_angle(q: Components) -> tuple[Vector, Scalar]:
-    """Return the axis and the angle of the shortest rotation.
+    """Return the axis and the angle of the shortest rotation: (4,) -> (3,), ().
 
-    Args:
-        q: Unit quaternion, shape (4,), dimensionless; q and -q give the same.
-
-    Returns:
-        The axis, shape (3,), dimensionless, (1, 0, 0) for the identity; the angle in [0, pi], shape (), rad.
+    Both q and -q give the same result.
     """
     unit = quaternion.canonical(q)
     axis, sine = vectors.direction_and_length(quaternion.to_vector(unit))
@@ -114,14 +82,7 @@ def to_axis_angle(q: Components) -> tuple[Vector, Scalar]:
 
 
 def to_matrix(q: Components) -> Matrix3:
-    """Return the rotation matrix R of q_{X/Y}, v^Y = R v^X.
-
-    Args:
-        q: Unit quaternion, shape (4,), dimensionless.
-
-    Returns:
-        Rotation matrix, shape (3, 3), dimensionless.
-    """
+    """Return the rotation matrix R of q_{X/Y}, v^Y = R v^X: (4,) -> (3, 3)."""
     xx, yy, zz = 2.0 * q[1] * q[1], 2.0 * q[2] * q[2], 2.0 * q[3] * q[3]
     xy, yz, zx = 2.0 * q[1] * q[2], 2.0 * q[2] * q[3], 2.0 * q[3] * q[1]
     wx, wy, wz = 2.0 * q[0] * q[1], 2.0 * q[0] * q[2], 2.0 * q[0] * q[3]
@@ -143,16 +104,10 @@ def _select_quaternion(condition: Scalar, if_true: Quaternion, if_false: Quatern
 
 
 def from_matrix(matrix: Components) -> Quaternion:
-    """Return the quaternion q_{X/Y} of a rotation matrix R, v^Y = R v^X.
+    """Return the quaternion q_{X/Y} of a rotation matrix R, v^Y = R v^X: (3, 3) -> (4,).
 
     S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1 (1978): R gives the products
     4 q_i q_j; the row of the largest q_i is a multiple of q that involves no cancellation.
-
-    Args:
-        matrix: Rotation matrix, shape (3, 3), dimensionless.
-
-    Returns:
-        Unit quaternion with q0 >= 0, shape (4,), dimensionless.
     """
     m = matrix
     ww = 1.0 + m[0][0] + m[1][1] + m[2][2]
@@ -173,13 +128,7 @@ def from_matrix(matrix: Components) -> Quaternion:
 def from_euler_321(psi: Scalar, theta: Scalar, phi: Scalar) -> Quaternion:
     """Return the rotation C_3 Rz(psi) Ry(theta) Rx(phi): yaw, then pitch, then roll, about the moving axes.
 
-    Args:
-        psi: Yaw angle about z, shape (), rad.
-        theta: Pitch angle about the new y, shape (), rad.
-        phi: Roll angle about the newest x, shape (), rad.
-
-    Returns:
-        Unit quaternion, shape (4,), dimensionless.
+    (), (), () -> (4,).
     """
     cos_psi, sin_psi = cos(0.5 * psi), sin(0.5 * psi)
     cos_theta, sin_theta = cos(0.5 * theta), sin(0.5 * theta)
@@ -198,17 +147,13 @@ def _wrap(x: Scalar) -> Scalar:
 
 
 def to_euler_321(q: Components) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the angles psi, theta, phi of a rotation, the inverse of `from_euler_321`.
+    """Return the angles psi, theta, phi of a rotation, the inverse of `from_euler_321`: (4,) -> (3,).
 
     E. Bernardes and S. Viollet, "Quaternion to Euler angles conversion: a direct, general and computationally
     efficient method", PLoS ONE 17 (2022): the sum and the difference of psi and phi come from one arctangent
     each. At theta = +-pi/2 only one of the two is defined; there phi is set to 0.
 
-    Args:
-        q: Unit quaternion, shape (4,), dimensionless; q and -q give the same.
-
-    Returns:
-        psi in [-pi, pi], theta in [-pi/2, pi/2], phi in [-pi, pi], shape (3,), rad.
+    Both q and -q give the same result.
     """
     # (sum_x, sum_y) points along half of phi + psi, (difference_x, difference_y) along half of phi - psi.
     # Their lengths are sqrt(2) times sin and cos of pi/4 - theta/2.

@@ -1,4 +1,4 @@
-"""Vectors of 3 and matrices of 3 x 3, the little that rotations need.
+"""Operations on 3-vectors and 3 x 3 matrices, as far as rotations need them.
 
 A vector is a tuple of 3 scalars, a matrix a tuple of 3 rows.
 """
@@ -23,67 +23,27 @@ __all__ = [
 
 
 def add(a: Components, b: Components) -> Vector:
-    """Return a + b.
-
-    Args:
-        a: Vector, shape (3,), any unit.
-        b: Vector, shape (3,), the unit of `a`.
-
-    Returns:
-        Sum, shape (3,), the unit of `a`.
-    """
+    """Return a + b: (3,), (3,) -> (3,)."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 def subtract(a: Components, b: Components) -> Vector:
-    """Return a - b.
-
-    Args:
-        a: Vector, shape (3,), any unit.
-        b: Vector, shape (3,), the unit of `a`.
-
-    Returns:
-        Difference, shape (3,), the unit of `a`.
-    """
+    """Return a - b: (3,), (3,) -> (3,)."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
 def scale(factor: Scalar, a: Components) -> Vector:
-    """Return factor * a.
-
-    Args:
-        factor: Number, shape (), any unit.
-        a: Vector, shape (3,), any unit.
-
-    Returns:
-        Multiple, shape (3,), the product of the units.
-    """
+    """Return factor * a: (), (3,) -> (3,)."""
     return (factor * a[0], factor * a[1], factor * a[2])
 
 
 def dot(a: Components, b: Components) -> Scalar:
-    """Return the scalar product of a and b.
-
-    Args:
-        a: Vector, shape (3,), any unit.
-        b: Vector, shape (3,), any unit.
-
-    Returns:
-        Scalar product, shape (), the product of the units.
-    """
+    """Return the scalar product of a and b: (3,), (3,) -> ()."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a: Components, b: Components) -> Vector:
-    """Return the vector product a x b.
-
-    Args:
-        a: Vector, shape (3,), any unit.
-        b: Vector, shape (3,), any unit.
-
-    Returns:
-        Vector product, shape (3,), the product of the units.
-    """
+    """Return the vector product a x b: (3,), (3,) -> (3,)."""
     return (
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
@@ -92,15 +52,9 @@ def cross(a: Components, b: Components) -> Vector:
 
 
 def norm(a: Components) -> Scalar:
-    """Return the length of a; its derivative at the origin is taken as 0.
+    """Return the length of a; its derivative at the origin is taken as 0: (3,) -> ().
 
     The squares underflow for a length below 1e-154: there `direction_and_length` is accurate.
-
-    Args:
-        a: Vector, shape (3,), any unit.
-
-    Returns:
-        Length, shape (), the unit of `a`.
     """
     return safe_sqrt(dot(a, a))
 
@@ -108,11 +62,9 @@ def norm(a: Components) -> Scalar:
 def direction_and_length(a: Components) -> tuple[Vector, Scalar]:
     """Return the unit vector along a, and the length of a, without overflow or underflow.
 
-    Args:
-        a: Vector, shape (3,), any unit; the zero vector is given the direction (1, 0, 0).
+    (3,) -> (3,), ().
 
-    Returns:
-        The direction, shape (3,), dimensionless, and the length, shape (), the unit of `a`.
+    The zero vector is given the direction (1, 0, 0).
     """
     largest = maximum(abs(a[0]), maximum(abs(a[1]), abs(a[2])))
     is_nonzero = largest > 0.0
@@ -124,26 +76,12 @@ def direction_and_length(a: Components) -> tuple[Vector, Scalar]:
 
 
 def skew_matrix(a: Components) -> Matrix3:
-    """Return the matrix [a]^x with [a]^x b = a x b, the block of (1).
-
-    Args:
-        a: Vector, shape (3,), any unit.
-
-    Returns:
-        Skew-symmetric matrix, shape (3, 3), the unit of `a`.
-    """
+    """Return the matrix [a]^x with [a]^x b = a x b, the block of (1): (3,) -> (3, 3)."""
     return ((0.0, -a[2], a[1]), (a[2], 0.0, -a[0]), (-a[1], a[0], 0.0))
 
 
 def transpose(matrix: Components) -> Matrix3:
-    """Return the transpose.
-
-    Args:
-        matrix: Matrix, shape (3, 3), any unit.
-
-    Returns:
-        Transpose, shape (3, 3), the unit of `matrix`.
-    """
+    """Return the transpose: (3, 3) -> (3, 3)."""
     return (
         (matrix[0][0], matrix[1][0], matrix[2][0]),
         (matrix[0][1], matrix[1][1], matrix[2][1]),
@@ -152,41 +90,17 @@ def transpose(matrix: Components) -> Matrix3:
 
 
 def matrix_vector(matrix: Components, a: Components) -> Vector:
-    """Return the product of a matrix and a vector.
-
-    Args:
-        matrix: Matrix, shape (3, 3), any unit.
-        a: Vector, shape (3,), any unit.
-
-    Returns:
-        Product, shape (3,), the product of the units.
-    """
+    """Return the product of a matrix and a vector: (3, 3), (3,) -> (3,)."""
     return (dot(matrix[0], a), dot(matrix[1], a), dot(matrix[2], a))
 
 
 def transposed_matrix_vector(matrix: Components, a: Components) -> Vector:
-    """Return the product of the transpose of a matrix and a vector.
-
-    Args:
-        matrix: Matrix, shape (3, 3), any unit.
-        a: Vector, shape (3,), any unit.
-
-    Returns:
-        Product, shape (3,), the product of the units.
-    """
+    """Return the product of the transpose of a matrix and a vector: (3, 3), (3,) -> (3,)."""
     return matrix_vector(transpose(matrix), a)
 
 
 def matrix_product(left: Components, right: Components) -> Matrix3:
-    """Return the product of two matrices.
-
-    Args:
-        left: Matrix, shape (3, 3), any unit.
-        right: Matrix, shape (3, 3), any unit.
-
-    Returns:
-        Product, shape (3, 3), the product of the units.
-    """
+    """Return the product of two matrices: (3, 3), (3, 3) -> (3, 3)."""
     columns = transpose(right)
     return (
         matrix_vector(columns, left[0]),

@@ -1,5 +1,5 @@
 """From functions over plain scalars to machine code; knows no robot.
 
-`graph` traces, `emit` and `elementary` write LLVM, `program` strings graphs together and loops over rows,
-`build` compiles, and `native` keeps and loads the result.
+`graph` traces, `program` chains graphs, `emit` and `elementary` write LLVM with `vector_builder`, `build`
+compiles the loop over rows, and `native` caches and loads the result.
 """

@@ -1,43 +1,29 @@
-"""Build a program: emit it, compile it, and note down what a caller must know."""
+"""From a program to machine code: the loop over rows, LLVM's module, the object file."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from llvmlite import ir
 
+from dq_space_arm_env.common.host_machine import host_machine
 from dq_space_arm_env.compiler import native
-from dq_space_arm_env.compiler.emit import Target
-from dq_space_arm_env.compiler.program import Buffer, Program, emit_program
+from dq_space_arm_env.compiler.emit import emit_graph
+from dq_space_arm_env.compiler.program import Buffer, Program, place
+from dq_space_arm_env.compiler.transpose import ArrayAccess
+from dq_space_arm_env.compiler.vector_builder import ELEMENTS, INDEX, POINTER, Target, VectorBuilder
 
 
 def assembly(program: Program, lanes: int, precision: str = "float64") -> str:
-    """LLVM assembly of a program.
-
-    Args:
-        program: The program.
-        lanes: Rows that the code works on at a time.
-        precision: What it computes in, "float64" or "float32".
-
-    Returns:
-        The module as text, before optimization.
-    """
+    """LLVM assembly of a program that works on `lanes` rows at a time, before optimization."""
     module = ir.Module(program.name)
-    emit_program(module, program, Target(lanes, native.host_machine().fused, precision))
+    emit_program(module, program, Target(lanes, host_machine().fused, precision))
     return str(module)
 
 
 def build_program(program: Program, lanes: int, precision: str = "float64") -> tuple[bytes, dict[str, Any]]:
-    """Compile a program.
-
-    Args:
-        program: The program.
-        lanes: Rows that the code works on at a time.
-        precision: What it computes in, "float64" or "float32".
-
-    Returns:
-        Object file, and the metadata `kernels.BoundKernel` reads.
-    """
+    """Compile a program; returns the object file and the metadata that `kernels.bound.BoundKernel` reads."""
 
     def noted(buffer: Buffer) -> list[Any]:
         return [
@@ -55,3 +41,140 @@ def build_program(program: Program, lanes: int, precision: str = "float64") -> t
         "indexed": program.indexed,
     }
     return native.compile_to_object(assembly(program, lanes, precision)), metadata
+
+
+def emit_program(module: ir.Module, program: Program, target: Target) -> None:
+    """Add a program to a module as an external function, with the graphs that it calls.
+
+    The last block of a batch that is not a multiple of the lanes repeats its last row in the lanes left over:
+    they read and write the same values as the lane that owns the row.
+    """
+    sizes, zeroed = program.scratch_sizes(), program.read_before_written()
+    functions: dict[str, ir.Function] = {}
+    for call in program.calls:
+        if call.graph.name not in functions:
+            functions[call.graph.name] = emit_graph(module, call.graph, target)
+
+    kernel = ir.Function(module, ir.FunctionType(ir.VoidType(), [INDEX, INDEX, POINTER]), program.name)
+    begin, end, addresses = kernel.args
+    entry = kernel.append_basic_block("entry")
+    head, body, done = (kernel.append_basic_block(name) for name in ("head", "body", "done"))
+    builder = ir.IRBuilder(entry)
+    vectors = VectorBuilder(builder, target)
+    # Each array's address, and the place on the stack of every buffer's vectors, stay fixed over the loop.
+    arrays = _Arrays(builder, program, addresses)
+    starts, total = place(sizes, program.lifetimes())
+    program.check_memory(starts)
+    stack = builder.alloca(vectors.type, size=INDEX(max(total, 1)))
+    stack.align = vectors.alignment
+    blocks = {name: vectors.address(stack, start) for name, start in starts.items()}
+    for name in zeroed:
+        _clear(builder, blocks[name], vectors.alignment * sizes[name])
+    builder.branch(head)
+
+    builder.position_at_end(head)
+    row = builder.phi(INDEX)
+    row.add_incoming(begin, entry)
+    builder.cbranch(builder.icmp_signed("<", row, end), body, done)
+
+    builder.position_at_end(body)
+    last = builder.sub(end, INDEX(1))
+    rows = [arrays.row_number(_clamped(builder, row, lane, last)) for lane in range(target.lanes)]
+    access = {dtype: ArrayAccess(vectors, dtype) for dtype in ELEMENTS}
+    for buffer in program.inputs:
+        lanes = arrays.rows_of(buffer, rows, target)
+        element = access[buffer.dtype or target.precision]
+        element.gather(lanes, blocks[buffer.name], buffer.size, shared=buffer.shared)
+    _emit_calls(vectors, kernel, program, functions, blocks)
+    for buffer in program.outputs:
+        element, block = access[buffer.dtype or target.precision], blocks[buffer.name]
+        if buffer.by_column:
+            address, pitch = arrays.addresses[buffer.name], arrays.pitches[buffer.name]
+            if program.indexed or target.lanes == 1:
+                element.scatter_columns(block, address, pitch, rows, buffer.size)
+            else:
+                element.scatter_adjacent(block, address, pitch, row, end, buffer.size)
+        else:
+            element.scatter(block, arrays.rows_of(buffer, rows, target), buffer.size, buffer.positions)
+    row.add_incoming(builder.add(row, INDEX(target.lanes)), builder.block)
+    builder.branch(head)
+
+    builder.position_at_end(done)
+    builder.ret_void()
+
+
+def _emit_calls(
+    vectors: VectorBuilder,
+    kernel: ir.Function,
+    program: Program,
+    functions: Mapping[str, ir.Function],
+    blocks: Mapping[str, ir.Value],
+) -> None:
+    """Emit the calls of a program on its blocks of vectors, with the loops around them."""
+    builder = vectors.ir
+    begins, ends = ({getattr(loop, key): loop for loop in program.loops} for key in ("begin", "end"))
+    for position, call in enumerate(program.calls, start=1):
+        if position - 1 in begins:
+            repeated = kernel.append_basic_block("repeated")
+            builder.branch(repeated)
+            builder.position_at_end(repeated)
+        names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
+        builder.call(functions[call.graph.name], [blocks[call.bindings.get(name, name)] for name in names])
+        if position in ends:
+            after = kernel.append_basic_block("after")
+            builder.cbranch(vectors.any_nonzero(blocks[ends[position].condition]), repeated, after)
+            builder.position_at_end(after)
+
+
+class _Arrays:
+    """Addresses of the arrays of a program, read from `buffers` once."""
+
+    def __init__(self, builder: ir.IRBuilder, program: Program, buffers: ir.Value) -> None:
+        self._builder = builder
+        self._position = 0
+        self._buffers = buffers
+        self._index = builder.inttoptr(self._next(), POINTER) if program.indexed else None
+        self.addresses: dict[str, ir.Value] = {}
+        self.pitches: dict[str, ir.Value] = {}
+        for buffer in (*program.inputs, *program.outputs):
+            self.addresses[buffer.name] = builder.inttoptr(self._next(), POINTER)
+            if buffer.by_column:
+                self.pitches[buffer.name] = self._next()
+
+    def _next(self) -> ir.Value:
+        slot = self._builder.gep(self._buffers, [INDEX(self._position)], source_etype=INDEX)
+        self._position += 1
+        return self._builder.load(slot, typ=INDEX)
+
+    def row_number(self, position: ir.Value) -> ir.Value:
+        """Row at a position: itself, or the entry of the list of rows."""
+        if self._index is None:
+            return position
+        slot = self._builder.gep(self._index, [position], source_etype=INDEX)
+        return self._builder.load(slot, typ=INDEX)
+
+    def rows_of(self, buffer: Buffer, rows: list[ir.Value], target: Target) -> list[ir.Value]:
+        """Addresses of the rows of a block of lanes."""
+        array = self.addresses[buffer.name]
+        if buffer.shared:
+            return [array] * len(rows)
+        element = ELEMENTS[buffer.dtype or target.precision]
+        stride = INDEX(buffer.stride)
+        return [
+            self._builder.gep(array, [self._builder.mul(row, stride)], source_etype=element) for row in rows
+        ]
+
+
+def _clear(builder: ir.IRBuilder, block: ir.Value, size: int) -> None:
+    """Set a block of the stack to zero."""
+    arguments = [POINTER, ir.IntType(8), INDEX, ir.IntType(1)]
+    signature = ir.FunctionType(ir.VoidType(), arguments)
+    memset = builder.module.declare_intrinsic("llvm.memset.p0.i64", (), signature)
+    builder.call(memset, [block, ir.IntType(8)(0), INDEX(size), ir.IntType(1)(0)])
+
+
+def _clamped(builder: ir.IRBuilder, row: ir.Value, lane: int, last: ir.Value) -> ir.Value:
+    if lane == 0:
+        return row
+    wanted = builder.add(row, INDEX(lane))
+    return builder.select(builder.icmp_signed("<", wanted, last), wanted, last)

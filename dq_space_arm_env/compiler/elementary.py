@@ -1,40 +1,33 @@
 """Sine, cosine and arctangent as straight-line vector arithmetic.
 
-A call into the C mathematics library would force the compiler to leave its vector registers, once for every
-lane. These versions use only operations that exist as vector instructions, and they compute the same bits in
-a scalar register and in every lane of a vector one.
+A call into the C math library would force the compiler out of its vector registers, once per lane. These
+versions use only operations that exist as vector instructions, and compute the same bits in a scalar register
+as in every lane of a vector.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from llvmlite import ir
+from llvmlite import ir
 
-    from dq_space_arm_env.compiler.emit import VectorBuilder
+from dq_space_arm_env.compiler.vector_builder import VectorBuilder
 
 
 @dataclass(frozen=True)
 class _Coefficients:
-    """What the functions need of a precision.
+    """Coefficients by precision."""
 
-    Attributes:
-        half_pi: pi/2 in three pieces (Cody & Waite). The first two are short, so that their products with an
-            integer quotient are exact, up to 2^20 in double and 2^12 in single precision: the reduced
-            argument keeps its digits up to angles of about 1e6 and 6e3 rad.
-        sine: Taylor coefficients in x^2; on [-pi/4, pi/4] the first neglected term is below half a unit in
-            the last place.
-        cosine: The same.
-        arctangent: Minimax coefficients on |x| < 7/16 (Sun Microsystems fdlibm, s_atan.c and s_atanf.c):
-            atan(x) = x - x^3 P(x^2).
-    """
-
+    # pi/2 in three pieces (Cody & Waite). The first two are short: their products with an integer quotient
+    # are exact up to 2^20 in double and 2^12 in single precision, so the reduced argument keeps its digits up
+    # to angles of about 1e6 and 6e3 rad.
     half_pi: tuple[float, float, float]
+    # Taylor coefficients in x^2; on [-pi/4, pi/4] the first neglected term is below half a unit in the last
+    # place.
     sine: tuple[float, ...]
     cosine: tuple[float, ...]
+    # Minimax coefficients on |x| < 7/16 (Sun fdlibm, s_atan.c and s_atanf.c): atan(x) = x - x^3 P(x^2).
     arctangent: tuple[float, ...]
 
 
@@ -70,11 +63,7 @@ _COEFFICIENTS = {
         ),
     ),
     "float32": _Coefficients(
-        half_pi=(
-            float.fromhex("0x1.92p+0"),
-            float.fromhex("0x1.fb4p-12"),
-            float.fromhex("0x1.4442d2p-24"),
-        ),
+        half_pi=(float.fromhex("0x1.92p+0"), float.fromhex("0x1.fb4p-12"), float.fromhex("0x1.4442d2p-24")),
         sine=_sine_series(4),
         cosine=_cosine_series(5),
         arctangent=(
@@ -97,7 +86,7 @@ def _horner(builder: VectorBuilder, x: ir.Value, coefficients: tuple[float, ...]
 
 
 def sine_cosine(builder: VectorBuilder, x: ir.Value) -> tuple[ir.Value, ir.Value]:
-    """Emit sine and cosine of x rad: about a unit in the last place up to 1e6 (6e3 in single precision)."""
+    """Emit sine and cosine of x rad, to about one unit in the last place up to 1e6 (6e3 in float32)."""
     coefficients = _COEFFICIENTS[builder.target.precision]
     quotient = builder.round(builder.multiply(x, builder.constant(2.0 / math.pi)))
     reduced = x
@@ -124,7 +113,7 @@ def sine_cosine(builder: VectorBuilder, x: ir.Value) -> tuple[ir.Value, ir.Value
 
 
 def arctangent2(builder: VectorBuilder, y: ir.Value, x: ir.Value) -> ir.Value:
-    """Emit the angle of the point (x, y) in (-pi, pi]; a few units in the last place; 0 at the origin."""
+    """Emit the angle of the point (x, y) in (-pi, pi], to a few units in the last place; 0 at the origin."""
     zero = builder.constant(0.0)
     magnitude_y, magnitude_x = builder.absolute(y), builder.absolute(x)
     steep = builder.compare(">", magnitude_y, magnitude_x)

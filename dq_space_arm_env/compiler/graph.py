@@ -1,9 +1,9 @@
-"""Expression graphs: what a function computes, as a flat list of scalar operations.
+"""Expression graphs: a function as a flat list of scalar operations.
 
-A model function is written over plain scalars. `trace` runs it once with CasADi symbols in place of numbers;
-every constant folds, every structural zero disappears, common subexpressions are shared, and what remains is
-a `Graph`: a list of elementary operations in static single assignment form. The graph is all that the emitter
-(`emit.py`) needs to know; neither module knows what a robot is.
+A model function is written over plain scalars. `trace` runs it once on CasADi symbols: constants fold,
+structural zeros disappear, common subexpressions are shared, and the rest is a `Graph`, a list of elementary
+operations in static single assignment form. It is all the emitter (`emit`) needs; neither module knows
+robots.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Expression = Any  # a CasADi SX scalar, or a Python float that a trace folded
 
 @dataclass(frozen=True)
 class Node:
-    """One operation: its name, the nodes it reads, and a constant or an input position where it has one."""
+    """One operation: its name, the nodes it reads, and its constant or input position."""
 
     operation: str
     arguments: tuple[int, ...] = ()
@@ -30,25 +30,17 @@ class Node:
 
 @dataclass(frozen=True)
 class Graph:
-    """A traced function.
+    """A traced function."""
 
-    Attributes:
-        name: Name of the function, an identifier.
-        inputs: Name and number of scalars of each input vector.
-        outputs: Name and number of scalars of each output vector.
-        nodes: Operations in evaluation order.
-        results: For each scalar of each output, in order, the index of the node that computes it.
-    """
-
-    name: str
-    inputs: tuple[tuple[str, int], ...]
+    name: str  # an identifier
+    inputs: tuple[tuple[str, int], ...]  # name and size of each vector
     outputs: tuple[tuple[str, int], ...]
-    nodes: tuple[Node, ...]
-    results: tuple[tuple[int, ...], ...]
+    nodes: tuple[Node, ...]  # in evaluation order
+    results: tuple[tuple[int, ...], ...]  # for each output, the nodes of its scalars
 
     @property
     def operation_count(self) -> int:
-        """Number of arithmetic operations: everything but reading inputs and constants."""
+        """Number of arithmetic operations: all nodes but inputs and constants."""
         return sum(node.operation not in ("input", "constant") for node in self.nodes)
 
 
@@ -85,19 +77,10 @@ def trace(
     function: Callable[..., Mapping[str, Sequence[Expression]]],
     **given: Sequence[Expression],
 ) -> Graph:
-    """Run a function on symbols and record the operations that its outputs need.
+    """Trace a function of inputs of the given sizes, called with a list of symbols for each.
 
-    Args:
-        name: Name of the graph, an identifier.
-        inputs: Number of scalars of each input; the function gets each as a list under its name.
-        function: Plain-scalar function returning, for each output name, a sequence of scalars.
-        given: Further inputs, whose symbols the function knows already; an empty one is left out.
-
-    Returns:
-        The graph of the function.
-
-    Raises:
-        NotImplementedError: If the trace holds an operation that the emitter has no instruction for.
+    It returns a sequence of scalars per output. `given` are further inputs, by symbols that the function
+    already holds; empty ones are left out. Raises NotImplementedError for operations without an instruction.
     """
     symbols = {key: [casadi.SX.sym(f"{key}_{i}") for i in range(size)] for key, size in inputs.items()}
     outputs = function(**symbols)
@@ -109,19 +92,7 @@ def trace(
 def graph_of(
     name: str, symbols: Mapping[str, Sequence[Expression]], outputs: Mapping[str, Sequence[Expression]]
 ) -> Graph:
-    """Record the operations that lead from symbols to expressions.
-
-    Args:
-        name: Name of the graph.
-        symbols: The symbols of each input, scalars.
-        outputs: The expressions of each output, scalars.
-
-    Returns:
-        The graph.
-
-    Raises:
-        NotImplementedError: If an operation has no instruction in the emitter.
-    """
+    """Trace the operations from the symbols of each input to the expressions of each output."""
     flat = [casadi.SX(value) for values in outputs.values() for value in values]
     shared = casadi.cse(casadi.vertcat(*flat)) if flat else casadi.SX(0, 1)
     arguments = [casadi.vertcat(*values) if len(values) else casadi.SX(0, 1) for values in symbols.values()]
@@ -142,10 +113,10 @@ def graph_of(
 
 
 def _static_single_assignment(function: casadi.Function) -> tuple[tuple[Node, ...], list[int]]:
-    """Turn CasADi's instructions on a reused work vector into nodes that are written once.
+    """Turn CasADi's instructions on a reused work vector into nodes written once.
 
-    CasADi stores a polynomial's repeated subexpression once, but reuses registers, and it reads an input or
-    builds a constant again wherever that is cheaper; both are merged here.
+    CasADi stores a repeated subexpression once, but reuses registers, and it reads an input or builds a
+    constant again wherever that is cheaper; both are merged here.
     """
     nodes: list[Node] = []
     index: dict[Node, int] = {}
@@ -178,7 +149,7 @@ def _static_single_assignment(function: casadi.Function) -> tuple[tuple[Node, ..
 
 
 def use_counts(graph: Graph) -> Counter[int]:
-    """Count how often each node is read, by other nodes or as a result."""
+    """Count the readers of each node, other nodes and results."""
     counts: Counter[int] = Counter()
     for node in graph.nodes:
         counts.update(node.arguments)

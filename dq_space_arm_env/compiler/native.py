@@ -1,9 +1,8 @@
-"""Machine code: compile a program for this processor, keep the object file, load it without compiling.
+"""Machine code: compile for this processor, cache the object file, load it without compiling.
 
-An object file is cached under the hash of everything that it depends on: the program's content, the
-compiler's and the model's source, the versions of LLVM and CasADi, and the processor. A cached file is used
-only if it belongs to this user, is writable by nobody else, and its checksum and key are right; otherwise it
-is rebuilt.
+An object file is cached under the hash of everything it depends on: the program's content, the compiler's and
+the model's source, the versions of LLVM and CasADi, and the processor. A cached file is used only if it
+belongs to this user, is writable by nobody else, and its checksum and key match; otherwise it is rebuilt.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import stat
 import tempfile
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -27,39 +25,11 @@ import llvmlite
 import llvmlite.binding as llvm
 import platformdirs
 
+from dq_space_arm_env.common.host_machine import host_machine
+
 _MAGIC = b"DQSpaceArm native kernel 1\n"
 
 KernelFunction = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
-
-
-@dataclass(frozen=True)
-class Machine:
-    """The processor that code is made for.
-
-    Attributes:
-        cpu: LLVM's name of the processor.
-        features: Its instruction sets, as LLVM writes them.
-        lanes: Doubles in its widest vector register.
-        fused: Whether it has fused multiply-add.
-    """
-
-    cpu: str
-    features: str
-    lanes: int
-    fused: bool
-
-
-@cache
-def host_machine() -> Machine:
-    """Describe the processor that this process runs on."""
-    features = llvm.get_host_cpu_features()
-    triple = llvm.get_process_triple()
-    if triple.startswith(("x86_64", "amd64", "i686")):
-        lanes = 8 if features.get("avx512f") else 4 if features.get("avx") else 2
-        fused = bool(features.get("fma"))
-    else:  # 64-bit Arm and the like: 128-bit vectors, fused multiply-add is part of the base instruction set
-        lanes, fused = 2, True
-    return Machine(llvm.get_host_cpu_name(), features.flatten(), lanes, fused)
 
 
 # Above this many lines of assembly, LLVM's optimizer and its thorough code generator cost seconds and gain a
@@ -94,34 +64,14 @@ def _optimized(assembly: str) -> tuple[llvm.ModuleRef, llvm.TargetMachine]:
 
 
 def compile_to_object(assembly: str) -> bytes:
-    """Compile LLVM assembly to an object file for this processor.
-
-    Args:
-        assembly: LLVM module as text.
-
-    Returns:
-        The object file.
-    """
+    """Compile LLVM assembly to an object file for this processor."""
     module, machine = _optimized(assembly)
     return bytes(machine.emit_object(module))
 
 
-def disassemble(assembly: str) -> str:
-    """Compile LLVM assembly and return the processor's instructions as text, to look at.
-
-    Args:
-        assembly: LLVM module as text.
-
-    Returns:
-        Assembly language of this processor.
-    """
-    module, machine = _optimized(assembly)
-    return str(machine.emit_assembly(module))
-
-
 @cache
 def _linker() -> llvm.LLJIT:
-    """What links object files into this process.
+    """The linker of object files into this process.
 
     LLVM's JITLink keeps the code and the constants of an object file together. Its older linker may put them
     further apart than an instruction reaches, where large libraries fill the address space, and then aborts.
@@ -135,25 +85,13 @@ _library_numbers = count()
 
 
 class NativeKernel:
-    """A compiled program in memory.
+    """A compiled C function `void (int64 begin, int64 end, const int64 *buffers)` in memory.
 
-    Attributes:
-        address: Address of the C function `void (int64 begin, int64 end, const int64 *buffers)`.
-        function: The same, callable from Python.
-        metadata: What the compiler noted down, e.g. operation counts.
+    `address` is its address, `function` the same callable from Python, `metadata` the compiler's notes.
     """
 
     def __init__(self, name: str, object_code: bytes, metadata: dict[str, Any]) -> None:
-        """Load an object file.
-
-        Args:
-            name: Name of the function in it.
-            object_code: The object file.
-            metadata: Notes to keep with the kernel.
-
-        Raises:
-            LookupError: If the object file has no such function, or needs one that is nowhere to be found.
-        """
+        """Load an object file; LookupError if the function or one it needs is missing."""
         builder = llvm.JITLibraryBuilder().add_object_img(object_code).add_current_process()
         try:
             self._library = builder.export_symbol(name).link(_linker(), f"{name} {next(_library_numbers)}")
@@ -165,13 +103,13 @@ class NativeKernel:
 
 
 def cache_directory() -> Path:
-    """Folder of the compiled kernels: $DQ_SPACE_ARM_CACHE, or the user's cache folder of the platform."""
+    """Folder of the compiled kernels: $DQ_SPACE_ARM_CACHE, or the platform's user cache folder."""
     configured = os.environ.get("DQ_SPACE_ARM_CACHE")
     return Path(configured) if configured else Path(platformdirs.user_cache_dir("dq-space-arm"))
 
 
 def cache_key(*parts: str) -> str:
-    """Hash everything a kernel depends on, the machine and the versions of the tools included."""
+    """Hash everything a kernel depends on, including the machine and tool versions."""
     machine = host_machine()
     everything = [*parts, llvmlite.__version__, str(llvm.llvm_version_info), machine.cpu, machine.features]
     return hashlib.sha256(json.dumps(everything).encode()).hexdigest()
@@ -180,13 +118,7 @@ def cache_key(*parts: str) -> str:
 def load_or_build(name: str, key: str, build: Callable[[], tuple[bytes, dict[str, Any]]]) -> NativeKernel:
     """Load a kernel from the cache, or build and store it.
 
-    Args:
-        name: Name of the function.
-        key: Its `cache_key`.
-        build: Returns the object file and the metadata; called when the cache has no sound file.
-
-    Returns:
-        The kernel, loaded.
+    `build` returns the object file and the metadata; it is called when the cache has no sound file.
     """
     path = cache_directory() / f"{name}-{key[:32]}.kernel"
     cached = _read(path, key)
@@ -216,7 +148,7 @@ def _read(path: Path, key: str) -> tuple[bytes, dict[str, Any]] | None:
 
 
 def _write(path: Path, key: str, object_code: bytes, metadata: dict[str, Any]) -> None:
-    """Write a cache file under a temporary name and rename it, so that no reader sees half of it."""
+    """Write a cache file under a temporary name and rename it, so no reader sees a partial one."""
     payload = json.dumps({"key": key, "metadata": metadata}).encode() + b"\n" + object_code
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""Programs: graphs called one after another on the same block of lanes, and the loop over blocks around them.
+"""Programs: graphs called one after another on the same block of lanes.
 
-A Runge-Kutta step evaluates the same acceleration four times. Tracing it as one graph would compile the same
-thousand operations four times over; a `Program` compiles them once and calls them four times, on vectors that
-stay in the first-level cache. The compiled program is a C function
+A Runge-Kutta step evaluates the same acceleration four times. Traced as one graph, the same thousand
+operations would be compiled four times over; a `Program` compiles them once and calls them four times, on
+vectors that stay in the first-level cache. The compiled program is a C function
 
     void kernel(int64 begin, int64 end, const int64 *buffers)
 
@@ -17,48 +17,37 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from llvmlite import ir
-
-from dq_space_arm_env.compiler.emit import (
-    ELEMENTS,
-    INDEX,
-    POINTER,
-    Target,
-    VectorBuilder,
-    emit_graph,
-)
 from dq_space_arm_env.compiler.graph import Graph
-from dq_space_arm_env.compiler.placement import Lifetime, place
-from dq_space_arm_env.compiler.transpose import ArrayAccess
+
+
+@dataclass(frozen=True)
+class Lifetime:
+    """First and last call between which a buffer must keep its content, inclusive."""
+
+    first: int  # call that writes it; -1: before all calls
+    last: int  # call that needs it last
+
+    def overlaps(self, other: Lifetime) -> bool:
+        return self.first <= other.last and other.first <= self.last
 
 
 @dataclass(frozen=True)
 class Buffer:
-    """An array that a program reads or writes.
-
-    Attributes:
-        name: Name by which the calls refer to it.
-        size: Number of scalars that the graphs see per row.
-        shared: True for an input with a single row that all rows read.
-        positions: For an output, where in its row each scalar goes, when it is not simply one after another;
-            entries of the row that no scalar goes to are left as they are.
-        stride: Scalars per row of the array; `size` unless `positions` spreads them out.
-        dtype: Type of the array's elements, "float64", "float32" or "bool"; empty for the type that the
-            program computes in.
-        by_column: For an output, whether the array holds one column after another, shape (size, rows). The
-            entry after its address in `buffers` is then the number of elements from one column to the next.
-    """
+    """An array that a program reads or writes."""
 
     name: str
-    size: int
-    shared: bool = False
+    size: int  # scalars per row that the graphs see
+    shared: bool = False  # an input with a single row that all rows read
+    # For an output, the place of each scalar in its row, if not consecutive; other entries are left as they
+    # are.
     positions: tuple[int, ...] | None = None
-    stride: int = 0
-    dtype: str = ""
+    stride: int = 0  # scalars per row of the array; `size` unless `positions` spreads them out
+    dtype: str = ""  # "float64", "float32" or "bool"; empty for the program's precision
+    # For an output, the array is stored by column, shape (size, rows). The entry after its address in
+    # `buffers` is then the number of elements from one column to the next.
     by_column: bool = False
 
     def __post_init__(self) -> None:
-        """Fill in the stride."""
         if not self.stride:
             object.__setattr__(self, "stride", self.size)
 
@@ -73,63 +62,33 @@ class Call:
 
 @dataclass(frozen=True)
 class Loop:
-    """A stretch of a program's calls that is repeated.
+    """A repeated stretch of a program's calls."""
 
-    Attributes:
-        begin: Position of its first call.
-        end: Position after its last call.
-        condition: Buffer of one scalar. After each pass the calls are repeated if it is not zero in some
-            lane; lanes in which it is zero must pass through them unchanged.
-    """
-
-    begin: int
-    end: int
+    begin: int  # its first call
+    end: int  # one past its last call
+    # Buffer of one scalar: the calls repeat while it is nonzero in some lane; lanes in which it is zero must
+    # pass through them unchanged.
     condition: str
 
 
 @dataclass
 class Program:
-    """A sequence of calls.
+    """A sequence of calls."""
 
-    Attributes:
-        name: Name of the compiled function, an identifier.
-        inputs: Arrays that are read.
-        outputs: Arrays that are written.
-        calls: The calls in order. A buffer that is neither input nor output is scratch; it starts as zero.
-        indexed: Whether a list says which rows to work on.
-        loops: Stretches of the calls that are repeated, one after another; what they touch lives through all
-            passes.
-    """
-
-    name: str
+    name: str  # of the compiled function, an identifier
     inputs: Sequence[Buffer]
     outputs: Sequence[Buffer]
-    calls: list[Call] = field(default_factory=list)
-    indexed: bool = False
-    loops: list[Loop] = field(default_factory=list)
+    calls: list[Call] = field(default_factory=list)  # a buffer that is neither input nor output is scratch
+    indexed: bool = False  # a list says which rows to work on
+    loops: list[Loop] = field(default_factory=list)  # the buffers they touch live through all passes
 
     def call(self, graph: Graph, **bindings: str) -> None:
-        """Append a call.
-
-        Args:
-            graph: The graph to evaluate.
-            bindings: Buffer for each input and output of the graph whose name differs from the buffer's.
-        """
+        """Append a call; `bindings` map names of the graph to buffers of other names."""
         self.calls.append(Call(graph, bindings))
 
     @contextmanager
     def repeated_while(self, condition: str) -> Iterator[None]:
-        """Repeat the calls that are appended inside, which happens at least once.
-
-        Args:
-            condition: Buffer of one scalar, see `Loop`.
-
-        Yields:
-            Nothing.
-
-        Raises:
-            ValueError: If there is a loop inside.
-        """
+        """Repeat the calls appended inside, at least once, while `condition` is set; see `Loop`."""
         begin = len(self.calls)
         yield
         if any(loop.begin >= begin for loop in self.loops):
@@ -138,15 +97,11 @@ class Program:
 
     @property
     def operation_count(self) -> int:
-        """Arithmetic operations per row, over all calls; a loop counts once."""
+        """Arithmetic operations per row over all calls; a loop counts once."""
         return sum(call.graph.operation_count for call in self.calls)
 
     def scratch_sizes(self) -> dict[str, int]:
-        """Number of vectors of every buffer, scratch included.
-
-        Raises:
-            ValueError: If two calls disagree on the size of a buffer.
-        """
+        """Number of vectors of every buffer, scratch included; ValueError if two calls disagree."""
         sizes = {buffer.name: buffer.size for buffer in (*self.inputs, *self.outputs)}
         for call in self.calls:
             for name, size in (*call.graph.inputs, *call.graph.outputs):
@@ -159,7 +114,7 @@ class Program:
         return sizes
 
     def read_before_written(self) -> set[str]:
-        """Scratch buffers that some call reads before any call has written them; they start as zero."""
+        """Scratch buffers read before any call has written them; they start as zero."""
         known = {buffer.name for buffer in self.inputs}
         early: set[str] = set()
         for call in self.calls:
@@ -168,13 +123,13 @@ class Program:
         return early
 
     def lifetimes(self) -> dict[str, Lifetime]:
-        """When each buffer is needed: inputs from the start, outputs to the end, initial zeros always."""
+        """Lifetimes of the buffers: inputs from the start, outputs to the end, initial zeros always."""
         end = len(self.calls)
         always = self.read_before_written()
         used = {buffer.name: [-1] for buffer in self.inputs}
         loops = {number: loop for loop in self.loops for number in range(loop.begin, loop.end)}
         for number, call in enumerate(self.calls):
-            # What is written in one pass of a loop may be read in the next one.
+            # A buffer written in one pass of a loop may be read in the next.
             span = (loops[number].begin, loops[number].end - 1) if number in loops else (number,)
             for name, _ in (*call.graph.inputs, *call.graph.outputs):
                 used.setdefault(call.bindings.get(name, name), []).extend(span)
@@ -186,17 +141,10 @@ class Program:
         }
 
     def check_memory(self, starts: Mapping[str, int]) -> None:
-        """Make sure that the compiled calls find in memory what they should.
+        """Refuse calls that write to memory they also read, and writes to buffers that start as zero.
 
-        The functions of graphs promise LLVM that what they write lies apart from all else that they are given
-        (`noalias`): a call that breaks the promise gives wrong numbers without a word.
-
-        Args:
-            starts: Where each buffer begins, see `place`.
-
-        Raises:
-            ValueError: If a graph would write to memory that it also reads, or writes twice; or if a buffer
-                that starts as zero is written, so that the next rows would not find it zero.
+        Functions of graphs promise LLVM that their outputs overlap nothing else they are given (`noalias`): a
+        call that breaks the promise silently gives wrong numbers.
         """
         sizes, zeroed = self.scratch_sizes(), self.read_before_written()
         for number, call in enumerate(self.calls):
@@ -220,134 +168,19 @@ class Program:
                         )
 
 
-def emit_program(module: ir.Module, program: Program, target: Target) -> None:
-    """Add a program to a module as an external function of its name, with the graphs that it calls.
+def place(sizes: Mapping[str, int], lifetimes: Mapping[str, Lifetime]) -> tuple[dict[str, int], int]:
+    """Place buffers in one block of memory, sharing it between lifetimes; returns their starts and its size.
 
-    The last block of a batch that is not a multiple of the lanes repeats its last row in the lanes left over:
-    they read and write the same values as the lane that owns the row.
-
-    Args:
-        module: LLVM module to add to.
-        program: The program.
-        target: Lanes and instructions to use.
-
-    Raises:
-        ValueError: If two calls disagree on the size of a buffer, or arguments of one share memory.
+    First fit, the largest first. The vectors between calls fill the caches: the less room they take, the
+    better.
     """
-    sizes, zeroed = program.scratch_sizes(), program.read_before_written()
-    functions: dict[str, ir.Function] = {}
-    for call in program.calls:
-        if call.graph.name not in functions:
-            functions[call.graph.name] = emit_graph(module, call.graph, target)
-
-    kernel = ir.Function(module, ir.FunctionType(ir.VoidType(), [INDEX, INDEX, POINTER]), program.name)
-    begin, end, addresses = kernel.args
-    entry = kernel.append_basic_block("entry")
-    head, body, done = (kernel.append_basic_block(name) for name in ("head", "body", "done"))
-    builder = ir.IRBuilder(entry)
-    vectors = VectorBuilder(builder, target)
-    # Each array's address, and the place on the stack of every buffer's vectors, stay fixed over the loop.
-    arrays = _Arrays(builder, program, addresses)
-    starts, total = place(sizes, program.lifetimes())
-    program.check_memory(starts)
-    stack = builder.alloca(vectors.type, size=INDEX(max(total, 1)))
-    stack.align = vectors.alignment
-    blocks = {name: vectors.address(stack, start) for name, start in starts.items()}
-    for name in zeroed:
-        _clear(builder, blocks[name], vectors.alignment * sizes[name])
-    builder.branch(head)
-
-    builder.position_at_end(head)
-    row = builder.phi(INDEX)
-    row.add_incoming(begin, entry)
-    builder.cbranch(builder.icmp_signed("<", row, end), body, done)
-
-    builder.position_at_end(body)
-    last = builder.sub(end, INDEX(1))
-    rows = [arrays.row_number(_clamped(builder, row, lane, last)) for lane in range(target.lanes)]
-    access = {dtype: ArrayAccess(vectors, dtype) for dtype in ELEMENTS}
-    for buffer in program.inputs:
-        lanes = arrays.rows_of(buffer, rows, target)
-        element = access[buffer.dtype or target.precision]
-        element.gather(lanes, blocks[buffer.name], buffer.size, shared=buffer.shared)
-    begins, ends = ({getattr(loop, key): loop for loop in program.loops} for key in ("begin", "end"))
-    for position, call in enumerate(program.calls, start=1):
-        if position - 1 in begins:
-            repeated = kernel.append_basic_block("repeated")
-            builder.branch(repeated)
-            builder.position_at_end(repeated)
-        names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
-        builder.call(functions[call.graph.name], [blocks[call.bindings.get(name, name)] for name in names])
-        if position in ends:
-            after = kernel.append_basic_block("after")
-            builder.cbranch(vectors.any_nonzero(blocks[ends[position].condition]), repeated, after)
-            builder.position_at_end(after)
-    for buffer in program.outputs:
-        element, block = access[buffer.dtype or target.precision], blocks[buffer.name]
-        if buffer.by_column:
-            address, pitch = arrays.addresses[buffer.name], arrays.pitches[buffer.name]
-            if program.indexed or target.lanes == 1:
-                element.scatter_columns(block, address, pitch, rows, buffer.size)
-            else:
-                element.scatter_adjacent(block, address, pitch, row, end, buffer.size)
-        else:
-            element.scatter(block, arrays.rows_of(buffer, rows, target), buffer.size, buffer.positions)
-    row.add_incoming(builder.add(row, INDEX(target.lanes)), builder.block)
-    builder.branch(head)
-
-    builder.position_at_end(done)
-    builder.ret_void()
-
-
-class _Arrays:
-    """Where the arrays of a program are, read from `buffers` once."""
-
-    def __init__(self, builder: ir.IRBuilder, program: Program, buffers: ir.Value) -> None:
-        self._builder = builder
-        self._position = 0
-        self._buffers = buffers
-        self._index = builder.inttoptr(self._next(), POINTER) if program.indexed else None
-        self.addresses: dict[str, ir.Value] = {}
-        self.pitches: dict[str, ir.Value] = {}
-        for buffer in (*program.inputs, *program.outputs):
-            self.addresses[buffer.name] = builder.inttoptr(self._next(), POINTER)
-            if buffer.by_column:
-                self.pitches[buffer.name] = self._next()
-
-    def _next(self) -> ir.Value:
-        slot = self._builder.gep(self._buffers, [INDEX(self._position)], source_etype=INDEX)
-        self._position += 1
-        return self._builder.load(slot, typ=INDEX)
-
-    def row_number(self, position: ir.Value) -> ir.Value:
-        """The row to work on at a position: itself, or what the list of rows says."""
-        if self._index is None:
-            return position
-        slot = self._builder.gep(self._index, [position], source_etype=INDEX)
-        return self._builder.load(slot, typ=INDEX)
-
-    def rows_of(self, buffer: Buffer, rows: list[ir.Value], target: Target) -> list[ir.Value]:
-        """Where the rows of a block of lanes begin in an array."""
-        array = self.addresses[buffer.name]
-        if buffer.shared:
-            return [array] * len(rows)
-        element = ELEMENTS[buffer.dtype or target.precision]
-        stride = INDEX(buffer.stride)
-        return [
-            self._builder.gep(array, [self._builder.mul(row, stride)], source_etype=element) for row in rows
-        ]
-
-
-def _clear(builder: ir.IRBuilder, block: ir.Value, size: int) -> None:
-    """Set a block of the stack to zero."""
-    arguments = [POINTER, ir.IntType(8), INDEX, ir.IntType(1)]
-    signature = ir.FunctionType(ir.VoidType(), arguments)
-    memset = builder.module.declare_intrinsic("llvm.memset.p0.i64", (), signature)
-    builder.call(memset, [block, ir.IntType(8)(0), INDEX(size), ir.IntType(1)(0)])
-
-
-def _clamped(builder: ir.IRBuilder, row: ir.Value, lane: int, last: ir.Value) -> ir.Value:
-    if lane == 0:
-        return row
-    wanted = builder.add(row, INDEX(lane))
-    return builder.select(builder.icmp_signed("<", wanted, last), wanted, last)
+    starts: dict[str, int] = {}
+    for name in sorted(sizes, key=lambda name: -sizes[name]):
+        start = 0
+        taken = [other for other in starts if lifetimes[name].overlaps(lifetimes[other])]
+        for other in sorted(taken, key=starts.__getitem__):
+            if starts[other] - start >= sizes[name]:
+                break
+            start = max(start, starts[other] + sizes[other])
+        starts[name] = start
+    return starts, max((starts[name] + sizes[name] for name in starts), default=0)

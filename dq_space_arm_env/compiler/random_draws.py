@@ -1,8 +1,8 @@
 """Random numbers from many generators at once: NumPy's PCG64, compiled.
 
-A vectorized environment draws its starts from a generator for each copy, and each has to give the very bits
-of `numpy.random.Generator(PCG64(seed)).uniform(-1, 1)`, which a single environment uses. Calling a Python
-object for each copy would cost more than all else that a reset does.
+A vectorized environment draws its starts from one generator per copy, and each must give the very bits of
+`numpy.random.Generator(PCG64(seed)).uniform(-1, 1)`, which a single environment uses. Calling a Python object
+for each copy would cost more than the rest of a reset.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from llvmlite import ir
 from numpy.typing import NDArray
 
 from dq_space_arm_env.compiler import native
+from dq_space_arm_env.compiler.vector_builder import DOUBLE, INDEX, POINTER
 
-# Not from `compiler.emit`, which imports CasADi: with all kernels in the cache nothing else does.
-INDEX, DOUBLE, POINTER = ir.IntType(64), ir.DoubleType(), ir.PointerType()
 _WIDE = ir.IntType(128)
 # M. O'Neill, "PCG: A family of simple fast space-efficient statistically good algorithms for random number
 # generation" (2014): the multiplier of the 128-bit generator with output XSL RR.
@@ -28,16 +27,9 @@ _WORD = (1 << 64) - 1
 
 
 def generator_states(seeds: Sequence[int | None]) -> NDArray[np.uint64]:
-    """States of NumPy's PCG64.
+    """States of NumPy's PCG64 for seeds (None: unpredictable), shape (len(seeds), 4).
 
-    Args:
-        seeds: A seed for each generator; None for an unpredictable one.
-
-    Returns:
-        State and increment of each generator, low word first, shape (len(seeds), 4).
-
-    Raises:
-        ValueError: If a seed is negative.
+    A row is state and increment, low word first. Raises ValueError for a negative seed.
     """
     states = np.empty((len(seeds), 4), dtype=np.uint64)
     for row, seed in zip(states, seeds, strict=True):
@@ -49,14 +41,10 @@ def generator_states(seeds: Sequence[int | None]) -> NDArray[np.uint64]:
 
 @cache
 def draws_kernel(count: int) -> native.NativeKernel:
-    """Compile the generators, or load them from the cache.
+    """Compile generators of `count` numbers, or load them from the cache.
 
-    Args:
-        count: Numbers that each generator draws, at least 1.
-
-    Returns:
-        An indexed kernel with arrays `states` (rows of 4 uint64), which it advances, and `draws` (rows of
-        `count` float64), which it fills with uniform numbers in [-1, 1).
+    The indexed kernel advances `states` (rows of 4 uint64) and fills `draws` (rows of `count` float64) with
+    uniform numbers in [-1, 1).
     """
 
     def build() -> tuple[bytes, dict[str, Any]]:

@@ -1,9 +1,9 @@
 """Between arrays and registers: rows of an array become vectors with one row per lane, and back.
 
 Arrays hold one state after another, vectors one number of several states. Squares of as many columns as rows
-are transposed in registers, by exchanging ever smaller blocks; moving their numbers one by one would cost
-more than a step of the dynamics. Elements are converted on the way where an array's type is not the one that
-is computed in.
+are transposed in registers, by exchanging ever smaller blocks; moving the numbers one by one would cost more
+than a step of the dynamics. Elements are converted on the way where the array's type differs from the
+arithmetic's.
 """
 
 from __future__ import annotations
@@ -12,7 +12,14 @@ from collections.abc import Iterator, Sequence
 
 from llvmlite import ir
 
-from dq_space_arm_env.compiler.emit import BYTES, ELEMENTS, INDEX, POINTER, VectorBuilder, vector_type
+from dq_space_arm_env.compiler.vector_builder import (
+    BYTES,
+    ELEMENTS,
+    INDEX,
+    POINTER,
+    VectorBuilder,
+    vector_type,
+)
 
 INT32 = ir.IntType(32)
 
@@ -21,26 +28,13 @@ class ArrayAccess:
     """Reads and writes of arrays with elements of one type, appended to a basic block."""
 
     def __init__(self, vectors: VectorBuilder, dtype: str) -> None:
-        """Prepare.
-
-        Args:
-            vectors: Builder to append to.
-            dtype: Type of the array's elements: "float64", "float32" or "bool".
-        """
         self.vectors = vectors
         self.dtype = dtype
         self.element = ELEMENTS[dtype]
         self.lanes = vectors.target.lanes
 
     def gather(self, rows: Sequence[ir.Value], block: ir.Value, size: int, *, shared: bool) -> None:
-        """Read rows of an array into a block of vectors.
-
-        Args:
-            rows: Address of each lane's row.
-            block: Address of the block, `size` vectors.
-            size: Numbers in a row.
-            shared: Whether all lanes have the same row.
-        """
+        """Read rows, one address per lane, into a block of `size` vectors; `shared`: all lanes have one."""
         vectors, lanes = self.vectors, self.lanes
         width = _square_width(size, lanes)
         if shared or width == 1:
@@ -62,14 +56,7 @@ class ArrayAccess:
     def scatter(
         self, block: ir.Value, rows: Sequence[ir.Value], size: int, positions: Sequence[int] | None
     ) -> None:
-        """Write a block of vectors to rows of an array.
-
-        Args:
-            block: Address of the block, `size` vectors.
-            rows: Address of each lane's row.
-            size: Numbers that are written to a row.
-            positions: Where in a row each of them goes; None for one after another.
-        """
+        """Write a block of `size` vectors to rows, at `positions` in each (None: consecutively)."""
         for run in _runs(positions or range(size)):
             width = _square_width(len(run), self.lanes)
             for start in _square_starts(len(run), width):
@@ -77,7 +64,7 @@ class ArrayAccess:
                 self._scatter_square(columns, rows, run[start][0])
 
     def _scatter_square(self, columns: list[ir.Value], rows: Sequence[ir.Value], position: int) -> None:
-        """Write vectors next to each other, in squares of as many lanes."""
+        """Write vectors side by side, in squares of as many lanes."""
         width = len(columns)
         if width == 1:
             for lane, row in enumerate(rows):
@@ -91,15 +78,7 @@ class ArrayAccess:
     def scatter_columns(
         self, block: ir.Value, array: ir.Value, pitch: ir.Value, rows: Sequence[ir.Value], size: int
     ) -> None:
-        """Write a block of vectors to rows of an array that holds one column after another.
-
-        Args:
-            block: Address of the block, `size` vectors.
-            array: Address of the array.
-            pitch: Elements from one column to the next.
-            rows: Number of each lane's row.
-            size: Number of columns.
-        """
+        """Write a block of vectors to rows of an array stored by column, `pitch` elements apart."""
         builder = self.vectors.ir
         for index in range(size):
             column = builder.gep(array, [builder.mul(pitch, INDEX(index))], source_etype=self.element)
@@ -111,16 +90,7 @@ class ArrayAccess:
     def scatter_adjacent(
         self, block: ir.Value, array: ir.Value, pitch: ir.Value, row: ir.Value, end: ir.Value, size: int
     ) -> None:
-        """Write a block of vectors to adjacent rows of an array that holds one column after another.
-
-        Args:
-            block: Address of the block, `size` vectors.
-            array: Address of the array.
-            pitch: Elements from one column to the next.
-            row: First row of the block.
-            end: Row to stop before.
-            size: Number of columns.
-        """
+        """Write a block of vectors to adjacent rows `row` .. `end` - 1 of an array stored by column."""
         builder = self.vectors.ir
         for index in range(size):
             offset = builder.add(builder.mul(pitch, INDEX(index)), row)
@@ -149,7 +119,7 @@ class ArrayAccess:
     # Conversions between the array's elements and the numbers that are computed in.
 
     def _computed(self, vector: ir.Value) -> ir.Value:
-        """From elements to numbers."""
+        """Convert elements to numbers."""
         builder, wanted = self.vectors.ir, self.vectors.type
         if self.dtype == "bool":
             return builder.uitofp(vector, wanted)
@@ -158,7 +128,7 @@ class ArrayAccess:
         return builder.fptrunc(vector, wanted) if self.dtype == "float64" else builder.fpext(vector, wanted)
 
     def _stored(self, block: ir.Value, index: int) -> ir.Value:
-        """A vector of a block as elements; a truth value is whether the number is not zero."""
+        """A vector of a block converted to elements; a truth value is whether the number is not zero."""
         builder, wanted = self.vectors.ir, vector_type(self.element, self.lanes)
         vector = self.vectors.load(block, index)
         if self.dtype == "bool":
@@ -187,7 +157,7 @@ class ArrayAccess:
         return rows
 
     def _joined(self, parts: list[ir.Value]) -> ir.Value:
-        """Vectors one after another in a single one."""
+        """Concatenate vectors."""
         while len(parts) > 1:
             width = 2 * parts[0].type.count
             pairs = zip(parts[::2], parts[1::2], strict=True)
@@ -195,7 +165,7 @@ class ArrayAccess:
         return parts[0]
 
     def _part(self, vector: ir.Value, first: int, width: int) -> ir.Value:
-        """Some consecutive lanes of a vector."""
+        """Consecutive lanes of a vector."""
         if width == self.lanes:
             return vector
         return self.vectors.ir.shuffle_vector(vector, vector, _mask(range(first, first + width)))
@@ -222,7 +192,7 @@ class ArrayAccess:
 
 
 def _runs(positions: Sequence[int]) -> list[list[tuple[int, int]]]:
-    """Positions next to each other, in ascending order, each with its number in the sequence."""
+    """Runs of consecutive positions in ascending order, each position with its number in the sequence."""
     runs: list[list[tuple[int, int]]] = []
     for position, index in sorted(zip(positions, range(len(positions)), strict=True)):
         if runs and runs[-1][-1][0] + 1 == position:
@@ -233,7 +203,7 @@ def _runs(positions: Sequence[int]) -> list[list[tuple[int, int]]]:
 
 
 def _square_width(size: int, lanes: int) -> int:
-    """Largest power of two that neither a row nor a vector is shorter than."""
+    """Largest power of two that fits in both a row and a vector."""
     width = 1
     while 2 * width <= min(size, lanes):
         width *= 2

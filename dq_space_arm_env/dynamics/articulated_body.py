@@ -1,16 +1,16 @@
-"""Accelerations by the articulated-body algorithm: one joint after the other is eliminated, no matrix of all.
+"""Forward dynamics by the articulated-body algorithm (ABA), rooted at any body.
 
-An articulated body is a body with everything that its joints carry; its inertia says which wrench an
-acceleration of that body needs while the joints move freely (Featherstone, Rigid Body Dynamics Algorithms,
-2008, chapter 7). From both ends of the chain, each body hands its articulated inertia over the joint to the
-next, until they meet at the root, whose six accelerations are solved for; joints follow on the way back. The
-effort grows linearly with the number of joints.
+An articulated body is a body together with everything its joints carry; its inertia maps an acceleration of
+that body to the wrench it needs while the joints move freely (Featherstone, Rigid Body Dynamics Algorithms,
+2008, chapter 7). From both ends of the chain, each body hands its articulated inertia across the joint to the
+next, until they meet at the root, whose six accelerations are solved for; the joints follow on the way back.
+The cost is linear in the number of joints.
 
-Any body can be the root, and rounding decides which. Eliminating a joint takes off all inertia about its
-axis, exactly; but turned to other axes and added to a lighter body, what is left of a heavy one buries the
-little that the light one has about that axis. Toward the heaviest body, light ones are added to heavy ones
-instead, and extreme mass ratios cost no digits. A root next to the heaviest body, on the far side of its own
-joint, is as good: the axis of that joint is an axis of the root's frame, the last to be solved for.
+The root is free, and rounding decides it. Eliminating a joint removes all inertia about its axis, exactly;
+but rotated to other axes and added to a lighter body, the remainder of a heavy body buries the little inertia
+that the light one has about that axis. Toward the heaviest body, light bodies are added to heavy ones
+instead, and extreme mass ratios cost no digits. A root next to the heaviest body, across its own joint, is as
+good: the axis of that joint is an axis of the root's frame, the last to be solved for.
 """
 
 from __future__ import annotations
@@ -42,21 +42,15 @@ Wrench = tuple[Vector3, Vector3]
 
 @dataclass(frozen=True)
 class ArticulatedInertia:
-    """Wrench per acceleration: force = M a + H' alpha, torque = H a + J alpha, all about a frame's origin.
+    """Wrench per acceleration: force = M a + H' alpha, torque = H a + J alpha, about a frame's origin."""
 
-    Attributes:
-        mass: M, 3x3, symmetric, kg.
-        coupling: H, 3x3, kg m.
-        inertia: J, 3x3, symmetric, kg m^2.
-    """
-
-    mass: Rows
-    coupling: Rows
-    inertia: Rows
+    mass: Rows  # M, 3x3, symmetric, kg
+    coupling: Rows  # H, 3x3, kg m
+    inertia: Rows  # J, 3x3, symmetric, kg m^2
 
     @classmethod
     def of_body(cls, body: RigidBody) -> ArticulatedInertia:
-        """Inertia of a rigid body that carries nothing."""
+        """Inertia of a rigid body without joints."""
         m = body.mass
         point = cls([[m, 0.0, 0.0], [0.0, m, 0.0], [0.0, 0.0, m]], [ZERO] * 3, body.inertia)
         return point.shifted(body.center_of_mass)
@@ -75,7 +69,7 @@ class ArticulatedInertia:
         )
 
     def rotated(self, rotation: Rows) -> ArticulatedInertia:
-        """The same in other axes; the matrix maps to them."""
+        """The same in other axes, to which `rotation` maps."""
         mass, inertia = ([matrix_vector(part, row) for row in rotation] for part in (self.mass, self.inertia))
         coupling = [transposed_matrix_vector(self.coupling, row) for row in rotation]
         return ArticulatedInertia(
@@ -85,28 +79,22 @@ class ArticulatedInertia:
         )
 
     def plus(self, other: ArticulatedInertia) -> ArticulatedInertia:
-        """Sum of two inertias."""
         pairs = ((self.mass, other.mass), (self.coupling, other.coupling), (self.inertia, other.inertia))
         return ArticulatedInertia(*([add(a, b) for a, b in zip(*pair, strict=True)] for pair in pairs))
 
 
 @dataclass(frozen=True)
 class _Joint:
-    """An eliminated joint: what it takes to turn the body that it carries about its z axis.
+    """An eliminated joint, with the wrench per angular acceleration about its z axis."""
 
-    Attributes:
-        force: Force per angular acceleration, 3, kg m.
-        torque: Torque per angular acceleration, 3, kg m^2.
-        inverse: 1 over the inertia about the axis, 1/(kg m^2).
-    """
-
-    force: Vector3
-    torque: Vector3
-    inverse: Scalar
+    force: Vector3  # per angular acceleration, kg m
+    torque: Vector3  # per angular acceleration, kg m^2
+    inverse: Scalar  # of the inertia about the axis, 1/(kg m^2)
 
     @classmethod
     def eliminated(cls, body: ArticulatedInertia) -> tuple[_Joint, ArticulatedInertia]:
-        """Let a body turn freely about the z axis: nothing is left of its inertia about it."""
+        """Free a body about its z axis; the remainder has no inertia about it."""
+        # I^a = I - U D^-1 U' with U = I s, D = s' I s and the axis s = z (Featherstone, table 7.1).
         force, torque = body.coupling[2], [row[2] for row in body.inertia]
         joint = cls(force, torque, 1.0 / torque[2])
         by_force, by_torque = scale(joint.inverse, force), scale(joint.inverse, torque)
@@ -118,45 +106,37 @@ class _Joint:
         return joint, ArticulatedInertia(mass, [*coupling, ZERO], inertia)
 
     def passed(self, force: Vector3, torque: Vector3, own: Scalar) -> Wrench:
-        """What of a wrench on the body reaches the other side of the joint, given the joint's own torque.
+        """Share of a wrench on the body that crosses the joint.
 
-        Args:
-            force: 3, N.
-            torque: 3, N m.
-            own: Sum of the joint's torque on the body and the wrench's about the axis, N m.
-
-        Returns:
-            Force and torque, in the same frame.
+        `own` is the joint's torque on the body plus the wrench's about the axis, N m.
         """
+        # The wrench on the body minus U D^-1 u.
         turning = own * self.inverse
         return subtract(force, scale(turning, self.force)), subtract(torque, scale(turning, self.torque))
 
     def acceleration(self, own: Scalar, linear: Vector3, angular: Vector3) -> Scalar:
-        """Acceleration of the joint, given that of the body on its other side."""
+        """Joint acceleration, given the acceleration of the body on the other side."""
+        # qdd = D^-1 (u - U' a') (table 7.1).
         return (own - (dot(self.force, linear) + dot(self.torque, angular))) * self.inverse
 
 
 class ArticulatedBodies:
-    """The articulated inertias of a chain at given joint angles, and the root's, factorized."""
+    """Articulated inertias of a chain at given joint angles, with the root's factorized."""
 
     def __init__(self, chain: Chain, rotations: Sequence[Rows], root: int = 0) -> None:
-        """Eliminate all joints, from both ends of the chain to its root.
-
-        Args:
-            chain: The robot.
-            rotations: From `minimal.joint_rotations`, n.
-            root: Body at which the recursions from both ends meet: 0 is the base, i link i.
-        """
+        """Eliminate all joints, from both ends of the chain to its root (0 is the base, i link i)."""
         self._planar, self._rotations, self._root = chain.planar, rotations, root
         self._positions = [link.joint.position for link in chain.links]
         bodies = [
             ArticulatedInertia.of_body(body) for body in (chain.base, *(link.body for link in chain.links))
         ]
         self._joints: dict[int, _Joint] = {}
+        # From the base up to the root: the parent is carried by the joint, which turns backward.
         for i in range(self._root):
             body = bodies[i].shifted(scale(-1.0, self._positions[i])).rotated(transpose(rotations[i]))
             self._joints[i], body = _Joint.eliminated(body)
             bodies[i + 1] = bodies[i + 1].plus(body)
+        # From the tip down to the root.
         for i in reversed(range(self._root, len(rotations))):
             self._joints[i], body = _Joint.eliminated(bodies[i + 1])
             bodies[i] = bodies[i].plus(body.rotated(rotations[i]).shifted(self._positions[i]))
@@ -164,20 +144,11 @@ class ArticulatedBodies:
 
     @property
     def _free(self) -> Sequence[int]:
-        """Accelerations that the root has: linear ones, then angular ones."""
+        """The root's accelerations: linear ones, then angular ones."""
         return (0, 1, 5) if self._planar else range(6)
 
     def accelerations(self, wrenches: Sequence[Wrench], joints: Sequence[Scalar]) -> Accelerations:
-        """Accelerations that wrenches on the bodies and torques in the joints produce.
-
-        Args:
-            wrenches: Force [N] and torque [N m] on base and links about the origins of their frames, in their
-                axes, n + 1 pairs.
-            joints: Joint torques, n, N m.
-
-        Returns:
-            The accelerations, without any velocity-dependent term.
-        """
+        """See `forward.Inertia`."""
         acting, own = list(wrenches), list(joints)
         for i in range(self._root):
             force, torque = acting[i]
@@ -194,20 +165,11 @@ class ArticulatedBodies:
         return self._outward(acting[self._root], own)
 
     def solve(self, force: Vector3, torque: Vector3, joints: Sequence[Scalar]) -> Accelerations:
-        """Accelerations that generalized forces produce, the mass matrix's inverse times them.
-
-        Args:
-            force: Force on the base, base axes, 3, N.
-            torque: Torque on the base about its center of mass, 3, N m.
-            joints: Joint torques, n, N m.
-
-        Returns:
-            The accelerations, without any velocity-dependent term.
-        """
+        """See `forward.Inertia`."""
         return self.accelerations([(force, torque), *[(ZERO, ZERO)] * len(joints)], joints)
 
     def _outward(self, acting: Wrench, own: Sequence[Scalar]) -> Accelerations:
-        """Accelerations of the root, then of everything that it carries."""
+        """Accelerations of the root, then of everything it carries."""
         both = [*acting[0], *acting[1]]
         six: list[Scalar] = [0.0] * 6
         for index, value in zip(
@@ -234,7 +196,7 @@ class ArticulatedBodies:
 
 
 def _symmetric(entry: Callable[[int, int], Scalar]) -> list[list[Scalar]]:
-    """A symmetric matrix 3x3, its entries computed once."""
+    """Symmetric 3x3 matrix whose entries are computed once."""
     result: list[list[Scalar]] = [[0.0] * 3 for _ in range(3)]
     for i in range(3):
         for j in range(i, 3):
@@ -247,7 +209,7 @@ def _sum(a: Wrench, b: Wrench) -> Wrench:
 
 
 def _root_block(body: ArticulatedInertia, free: Sequence[int]) -> list[list[Scalar]]:
-    """Inertia of the root, linear directions first, its joint's axis last, where it moves."""
+    """Inertia of the root: linear directions first, its joint's axis (if it moves) last."""
     upper = [[*body.mass[i], *(row[i] for row in body.coupling)] for i in range(3)]
     lower = [[*body.coupling[i], *body.inertia[i]] for i in range(3)]
     matrix = [*upper, *lower]

@@ -1,9 +1,9 @@
 """The constants of a robot: what the equations of motion need of a scene, as plain scalars.
 
-A `Chain` is a base, revolute links in a row, perhaps a massless wrist, and a tip frame. Link frames are the
-joint frames of the paper: frame i is fixed in the distal body i+1, its z axis lies along the joint axis. A
-payload is merged into the body that holds it. Masses and inertias are numbers; where a scene draws them anew
-for each episode, they are symbols.
+A `Chain` is a base, revolute links in series, an optional massless wrist, and a tip frame. Link frames are
+the joint frames of the paper: frame i is fixed in the distal body i+1, with its z axis along the joint axis.
+A payload is merged into the body that holds it. Masses and inertias are numbers, or symbols where a scene
+randomizes them per episode.
 """
 
 from __future__ import annotations
@@ -33,89 +33,48 @@ Matrix = tuple[Vector, Vector, Vector]
 
 @dataclass(frozen=True)
 class RigidBody:
-    """Mass properties of a body.
+    """Mass properties of a body."""
 
-    Attributes:
-        mass: Mass, kg.
-        center_of_mass: Center of mass in the body's frame, m.
-        inertia: Inertia about the center of mass, body axes, 3x3, kg m^2.
-    """
-
-    mass: Scalar
-    center_of_mass: Sequence[Scalar]
-    inertia: Sequence[Sequence[Scalar]]
+    mass: Scalar  # kg
+    center_of_mass: Sequence[Scalar]  # in the body's frame, m
+    inertia: Sequence[Sequence[Scalar]]  # about the center of mass, body axes, 3x3, kg m^2
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A constant pose of one frame in another.
+    """Constant pose of one frame in another."""
 
-    Attributes:
-        position: Origin in the outer frame, m.
-        rotation: Rotation matrix from inner to outer axes; entries that are 0 or +-1 are exactly so.
-        dual_quaternion: The same as a unit dual quaternion, q_{inner/outer}, 8 numbers.
-    """
-
-    position: Vector
-    rotation: Matrix
-    dual_quaternion: tuple[float, ...]
+    position: Vector  # of the origin, in the outer frame, m
+    rotation: Matrix  # from inner to outer axes; entries of 0 and +-1 are exact
+    dual_quaternion: tuple[float, ...]  # q_{inner/outer}
 
 
 @dataclass(frozen=True)
 class RevoluteLink:
-    """A link and the revolute joint that carries it.
+    """A link and the revolute joint that carries it."""
 
-    Attributes:
-        body: Mass properties in the joint frame.
-        joint: Joint frame at zero angle in the parent's frame (base center of mass, or previous joint frame).
-        stiffness: Torsional spring, N m/rad.
-        rest_angle: Angle at which the spring is relaxed, rad.
-        damping: Viscous friction, N m s/rad.
-    """
-
-    body: RigidBody
-    joint: Placement
-    stiffness: float
-    rest_angle: float
-    damping: float
+    body: RigidBody  # in the joint frame
+    joint: Placement  # joint frame at zero angle in the parent's frame (base center of mass, or joint frame)
+    stiffness: float  # N m/rad
+    rest_angle: float  # of the spring, rad
+    damping: float  # N m s/rad
 
 
 @dataclass(frozen=True)
 class Chain:
-    """A free base with a chain of revolute links.
+    """A free base with a chain of revolute links."""
 
-    Attributes:
-        base: The base; its frame sits at its center of mass.
-        links: Links from base to tip.
-        wrist: Wrist frame at zero angles in the last link's frame, None without a wrist.
-        tip: Tip frame G in the wrist frame, or in the last link's frame without one.
-        tip_wrench: Force [N] and torque [N m] acting at G, in G axes (16); None where nothing acts.
-        planar: Whether the base moves in its x-y plane only.
-        heaviest: Which body has the greatest mass by the scene, whatever is drawn: 0 is the base, i link i.
-    """
-
-    base: RigidBody
-    links: tuple[RevoluteLink, ...]
-    wrist: Placement | None
-    tip: Placement
-    tip_wrench: tuple[float, ...] | None
-    planar: bool
-    heaviest: int = 0
+    base: RigidBody  # frame at the center of mass
+    links: tuple[RevoluteLink, ...]  # base to tip
+    wrist: Placement | None  # wrist frame at zero angles, in the last link's frame
+    tip: Placement  # tip frame G in the wrist frame, or in the last link's without a wrist
+    tip_wrench: tuple[float, ...] | None  # force [N], torque [N m] at G, in G axes (16)
+    planar: bool  # the base moves in its x-y plane only
+    heaviest: int = 0  # body of greatest nominal mass: 0 is the base, i link i
 
     @classmethod
     def from_scene(cls, scene: Scene, masses: MassFactors | None = None) -> Chain:
-        """Collect a scene's constants.
-
-        Args:
-            scene: A validated scene.
-            masses: What masses and inertias are multiplied by; None for the scene's own.
-
-        Returns:
-            The chain.
-
-        Raises:
-            ValueError: If there is a payload but no link to hold it.
-        """
+        """Collect a scene's constants, its masses and inertias scaled by `masses` if given."""
         wrench = scene.tip_wrench
         bodies = _link_bodies(scene, masses)
         return cls(
@@ -133,7 +92,7 @@ class Chain:
 
 
 def _heaviest(scene: Scene) -> int:
-    """Index of the heaviest body, the base's being 0."""
+    """Index of the heaviest body; the base is 0."""
     masses = [scene.base.mass, *(link.mass for link in scene.links)]
     if scene.payload is not None:
         masses[-1] += scene.payload.mass
@@ -145,7 +104,7 @@ def _base_factors(masses: MassFactors | None) -> tuple[Scalar, Scalar]:
 
 
 def _link_bodies(scene: Scene, masses: MassFactors | None) -> list[RigidBody]:
-    """Mass properties of the links in their joint frames, the payload merged into the last one."""
+    """Mass properties of the links in their joint frames, with the payload merged into the last one."""
     ones = (1.0,) * len(scene.links)
     factors = (ones, ones) if masses is None else (masses.link_masses, masses.link_inertias)
     bodies = [
@@ -173,7 +132,7 @@ def _placement(pose: Pose) -> Placement:
 
 
 def _moved(body: RigidBody, pose: Pose) -> RigidBody:
-    """Mass properties of a body in the frame in which its own has a given pose."""
+    """Mass properties in the frame in which the body's own frame has the given pose."""
     rotation = pose.rotation_matrix
     inertia = matrix_product(matrix_product(rotation, body.inertia), transpose(rotation))
     return RigidBody(body.mass, add(pose.position, matrix_vector(rotation, body.center_of_mass)), inertia)

@@ -1,4 +1,4 @@
-"""Forward dynamics, by a formulation to be chosen: accelerations that come of all that acts on the robot."""
+"""Forward dynamics: accelerations from everything that acts on the robot, by a choice of formulations."""
 
 from __future__ import annotations
 
@@ -17,52 +17,25 @@ Wrench = tuple[Vector3, Vector3]
 
 
 class Inertia(Protocol):
-    """How the robot, at given joint angles and without velocities, responds to forces."""
+    """Response to forces of a robot at rest, at given joint angles."""
 
     def accelerations(self, wrenches: Sequence[Wrench], joints: Sequence[Scalar]) -> Accelerations:
-        """Accelerations that wrenches on the bodies and torques in the joints produce.
+        """Accelerations from wrenches on base and links and from joint torques [N m], without velocity terms.
 
-        Args:
-            wrenches: Force [N] and torque [N m] on base and links about the origins of their frames, in their
-                axes, n + 1 pairs.
-            joints: Joint torques, n, N m.
-
-        Returns:
-            The accelerations, without any velocity-dependent term.
+        Each of the n + 1 wrenches is a force [N] and a torque [N m] about the origin of the body's frame, in
+        its axes.
         """
         ...
 
     def solve(self, force: Vector3, torque: Vector3, joints: Sequence[Scalar]) -> Accelerations:
-        """Accelerations that generalized forces produce.
-
-        Args:
-            force: Force on the base, base axes, 3, N.
-            torque: Torque on the base about its center of mass, 3, N m.
-            joints: Joint torques, n, N m.
-
-        Returns:
-            The accelerations, without any velocity-dependent term.
-        """
+        """Accelerations from generalized forces: M^-1 (force, torque, joints), the base's in base axes."""
         ...
 
 
 def inertia_of(
     formulation: str, chain: Chain, rotations: Sequence[Sequence[Vector3]], *, many: bool = False
 ) -> Inertia:
-    """Inertia of the robot by a formulation.
-
-    Args:
-        formulation: Its name in the scene file: `articulated_body` or `minimal_coordinates`.
-        chain: The robot.
-        rotations: From `minimal.joint_rotations`.
-        many: Whether there are many right-hand sides, as there are for derivatives.
-
-    Returns:
-        The inertia.
-
-    Raises:
-        ValueError: If there is no such formulation.
-    """
+    """Inertia in the scene's formulation; `many`: for many right-hand sides, as derivatives have."""
     if formulation == "minimal_coordinates":
         return MassMatrix(chain, rotations)
     if formulation != "articulated_body":
@@ -85,23 +58,10 @@ def forward_dynamics(
     acting: Sequence[Wrench],
     joints: Sequence[Scalar],
 ) -> Accelerations:
-    """Accelerations of a motion.
+    """Accelerations of a motion under external wrenches (as in `Inertia.accelerations`) and joint torques.
 
-    The wrenches that the motion needs without any acceleration are taken off those that act, body by body:
-    added up over the chain, what acts on a light body would drown in what a heavy one needs.
-
-    Args:
-        chain: The robot.
-        inertia: From `inertia_of`, at the same joint angles.
-        rotations: From `minimal.joint_rotations`.
-        angular_velocity: Angular velocity of the base, base axes, 3, rad/s.
-        joint_rates: Joint rates, n, rad/s.
-        acting: Force [N] and torque [N m] from outside on base and links about the origins of their frames,
-            in their axes, n + 1 pairs.
-        joints: Torques of motors, springs and dampers, n, N m.
-
-    Returns:
-        The accelerations.
+    Wrenches that the motion needs at zero acceleration are subtracted body by body: summed over the chain,
+    what acts on a light body would drown in what a heavy one needs.
     """
     rest = Accelerations(ZERO, ZERO, [0.0] * len(chain.links))
     needed = body_wrenches(chain, rotations, angular_velocity, joint_rates, rest)

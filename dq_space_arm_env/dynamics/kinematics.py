@@ -1,4 +1,4 @@
-"""Kinematics of the chain: poses (27) and their rates (30), velocities of the bodies, momentum, energy."""
+"""Kinematics of the chain: poses (27) and their rates (30), body velocities, momentum, energy."""
 
 from __future__ import annotations
 
@@ -26,41 +26,22 @@ Vector3 = Sequence[Scalar]
 
 
 def axis_rotation(axis: int, angle: Scalar) -> DualQuaternion:
-    """Pose that turns about a coordinate axis.
-
-    Args:
-        axis: 0, 1, 2 for x, y, z.
-        angle: Angle, rad.
-
-    Returns:
-        Unit dual quaternion, 8 numbers, without translation.
-    """
+    """Unit dual quaternion of a rotation about coordinate axis 0, 1 or 2."""
     result: list[Scalar] = [cos(0.5 * angle), *[0.0] * 7]
     result[1 + axis] = sin(0.5 * angle)
     return result
 
 
 def wrist_rotation(wrist_angles: Sequence[Scalar]) -> DualQuaternion:
-    """Rz(psi) Ry(theta) Rx(phi), the 3-2-1 rotation of the spherical joint.
-
-    Args:
-        wrist_angles: psi, theta, phi, rad.
-
-    Returns:
-        Unit dual quaternion, 8 numbers.
-    """
+    """Rz(psi) Ry(theta) Rx(phi), the 3-2-1 rotation of the spherical joint, as a unit dual quaternion."""
     psi, theta, phi = wrist_angles
     return dq.multiply(dq.multiply(axis_rotation(2, psi), axis_rotation(1, theta)), axis_rotation(0, phi))
 
 
 def wrist_rate_matrix(wrist_angles: Sequence[Scalar]) -> Sequence[Vector3]:
-    """Angular velocity of the wrist per unit Euler rates (psi, theta, phi), in the axes of the end effector.
+    """Map from Euler rates (psi, theta, phi) to the wrist's angular velocity in end-effector axes, 3x3.
 
-    Args:
-        wrist_angles: psi, theta, phi, rad.
-
-    Returns:
-        3x3; its determinant vanishes at gimbal lock, theta = +-90 deg.
+    It is singular at gimbal lock, theta = +-90 deg.
     """
     _, theta, phi = wrist_angles
     return (
@@ -73,18 +54,7 @@ def wrist_rate_matrix(wrist_angles: Sequence[Scalar]) -> Sequence[Vector3]:
 def frame_poses(
     chain: Chain, base_pose: DualQuaternion, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
 ) -> list[DualQuaternion]:
-    """Poses of all frames with respect to the inertial frame, factor by factor as in (27).
-
-    Args:
-        chain: The robot.
-        base_pose: q_{e0/I}, 8.
-        joint_angles: n, rad.
-        wrist_angles: psi, theta, phi, rad; ignored without a wrist.
-
-    Returns:
-        Poses of the base, the n joint frames, the end-effector frame at the wrist (if there is one), and the
-        tip G.
-    """
+    """Poses of base, joint frames, end effector (if any) and tip in the inertial frame: factors of (27)."""
     poses = [base_pose]
     for link, angle in zip(chain.links, joint_angles, strict=True):
         joint = dq.multiply(link.joint.dual_quaternion, axis_rotation(2, angle))
@@ -99,31 +69,12 @@ def frame_poses(
 def tip_pose(
     chain: Chain, base_pose: DualQuaternion, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
 ) -> DualQuaternion:
-    """Pose of the tip q_{G/I}, eq. (27).
-
-    Args:
-        chain: The robot.
-        base_pose: q_{e0/I}, 8.
-        joint_angles: n, rad.
-        wrist_angles: psi, theta, phi, rad; ignored without a wrist.
-
-    Returns:
-        Unit dual quaternion, 8 numbers.
-    """
+    """Pose of the tip q_{G/I}, eq. (27)."""
     return dq.multiply(base_pose, arm_pose(chain, joint_angles, wrist_angles))
 
 
 def arm_pose(chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]) -> DualQuaternion:
-    """Pose of the tip in the base frame, q_{G/e0}: (27) without its first factor.
-
-    Args:
-        chain: The robot.
-        joint_angles: n, rad.
-        wrist_angles: psi, theta, phi, rad; ignored without a wrist.
-
-    Returns:
-        Unit dual quaternion, 8 numbers.
-    """
+    """Pose of the tip in the base frame, q_{G/e0}: (27) without its first factor."""
     arm: DualQuaternion = chain.tip.dual_quaternion
     if chain.wrist is not None:
         arm = dq.multiply(wrist_rotation(wrist_angles), arm)
@@ -142,20 +93,7 @@ def tip_pose_rate(
     joint_rates: Sequence[Scalar],
     wrist_rates: Sequence[Scalar],
 ) -> DualQuaternion:
-    """Rate of the tip's pose, eq. (30); its last factor is q_{G/e3}, where the paper prints q_{G/3}.
-
-    Args:
-        chain: The robot.
-        base_pose: q_{e0/I}, 8.
-        joint_angles: n, rad.
-        wrist_angles: psi, theta, phi, rad.
-        base_twist: Angular [rad/s], then linear [m/s] velocity of the base in its axes, 6.
-        joint_rates: n, rad/s.
-        wrist_rates: psi, theta, phi rates, rad/s.
-
-    Returns:
-        Time derivative of q_{G/I}, 8 numbers, 1/s.
-    """
+    """Time derivative of q_{G/I}, eq. (30); its last factor is q_{G/e3}, where the paper prints q_{G/3}."""
     poses = frame_poses(chain, base_pose, joint_angles, wrist_angles)
     tip = poses[-1]
 
@@ -164,6 +102,8 @@ def tip_pose_rate(
         relative = dq.multiply(dq.conjugate(frame), tip)
         return dq.scale(0.5, dq.multiply(dq.multiply(frame, (0.0, *twist[:3], 0.0, *twist[3:])), relative))
 
+    # (30): 1/2 q_{e0/I} w_0 q_{G/e0} + 1/2 sum_i q_{e_i/I} w^{e_i}_{i/e_i} q_{G/e_i}, joint frames for the
+    # e_i.
     rate = contribution(base_pose, base_twist)
     for frame, speed in zip(poses[1:], joint_rates, strict=False):
         rate = dq.add(rate, contribution(frame, (0.0, 0.0, speed, 0.0, 0.0, 0.0)))
@@ -175,15 +115,10 @@ def tip_pose_rate(
 
 @dataclass(frozen=True)
 class BodyVelocity:
-    """Velocity of a body in its own frame.
+    """Velocity of a body in its own frame."""
 
-    Attributes:
-        angular: rad/s, 3.
-        linear: Of the frame's origin, m/s, 3.
-    """
-
-    angular: Vector3
-    linear: Vector3
+    angular: Vector3  # rad/s
+    linear: Vector3  # of the frame's origin, m/s
 
 
 def body_velocities(
@@ -192,17 +127,7 @@ def body_velocities(
     base_twist: Sequence[Scalar],
     joint_rates: Sequence[Scalar],
 ) -> list[BodyVelocity]:
-    """Velocities of base and links from base to tip, the recursion behind (12).
-
-    Args:
-        chain: The robot.
-        rotations: From `minimal.joint_rotations`.
-        base_twist: Angular [rad/s], then linear [m/s] velocity of the base in its axes, 6.
-        joint_rates: n, rad/s.
-
-    Returns:
-        n + 1 velocities.
-    """
+    """Velocities of base and links, n + 1, by the recursion behind (12); `base_twist` in base axes."""
     velocities = [BodyVelocity(tuple(base_twist[:3]), tuple(base_twist[3:]))]
     for link, rotation, rate in zip(chain.links, rotations, joint_rates, strict=True):
         parent = velocities[-1]
@@ -217,24 +142,14 @@ def body_velocities(
 def momentum(
     chain: Chain, rotations: Sequence[Sequence[Vector3]], velocities: Sequence[BodyVelocity]
 ) -> tuple[Vector3, Vector3, Vector3]:
-    """Momentum of the whole system in the base frame.
-
-    Args:
-        chain: The robot.
-        rotations: From `minimal.joint_rotations`.
-        velocities: From `body_velocities`.
-
-    Returns:
-        Linear momentum [kg m/s] and angular momentum about the system's center of mass [kg m^2/s], in base
-        axes, and the position of the system's center of mass in the base frame [m], 3 each.
-    """
+    """Linear momentum, angular momentum about the center of mass, and center of mass, in the base frame."""
     bodies = [chain.base, *(link.body for link in chain.links)]
     linear: list[Vector3] = []
     angular: list[Vector3] = []
     moments: list[Vector3] = []
     for body, velocity in zip(bodies, velocities, strict=True):
         c = body.center_of_mass
-        p = scale(body.mass, add(velocity.linear, cross(velocity.angular, c)))
+        p = scale(body.mass, add(velocity.linear, cross(velocity.angular, c)))  # m (v + omega x c)
         linear.append(p)
         angular.append(add(matrix_vector(body.inertia, velocity.angular), cross(c, p)))
         moments.append(scale(body.mass, c))
@@ -247,22 +162,13 @@ def momentum(
         angular[i] = add(angular[i], angular_at_parent)
         moments[i] = add(moments[i], add(matrix_vector(rotation, moments[i + 1]), scale(mass, position)))
     center = scale(1.0 / (mass + chain.base.mass), moments[0])
-    return linear[0], subtract(angular[0], cross(center, linear[0])), center
+    return linear[0], subtract(angular[0], cross(center, linear[0])), center  # L_c = L_O - c x p
 
 
 def energy(
     chain: Chain, joint_angles: Sequence[Scalar], velocities: Sequence[BodyVelocity]
 ) -> tuple[Scalar, Scalar]:
-    """Kinetic energy, and potential energy of the joint springs.
-
-    Args:
-        chain: The robot.
-        joint_angles: n, rad.
-        velocities: From `body_velocities`.
-
-    Returns:
-        Two energies, J.
-    """
+    """Kinetic energy and potential energy of the joint springs, J."""
     kinetic: Scalar = 0.0
     for body, velocity in zip([chain.base, *(link.body for link in chain.links)], velocities, strict=True):
         v = add(velocity.linear, cross(velocity.angular, body.center_of_mass))

@@ -1,4 +1,4 @@
-"""Linear algebra over plain scalars: LDL' and LU factorizations of small matrices, without pivoting."""
+"""LDL' and LU factorizations of small matrices over plain scalars, without pivoting."""
 
 from __future__ import annotations
 
@@ -11,26 +11,14 @@ Scalar = Any
 
 @dataclass(frozen=True)
 class LDLFactor:
-    """A = L D L' with unit lower triangular L.
+    """A = L D L' with unit lower triangular L."""
 
-    Attributes:
-        lower: Strict lower triangle of L, row i holding i entries.
-        inverse_diagonal: Reciprocals of D.
-    """
-
-    lower: Sequence[Sequence[Scalar]]
-    inverse_diagonal: Sequence[Scalar]
+    lower: Sequence[Sequence[Scalar]]  # strict lower triangle of L, row i holding i entries
+    inverse_diagonal: Sequence[Scalar]  # of D
 
 
 def factorize_ldl(matrix: Sequence[Sequence[Scalar]]) -> LDLFactor:
-    """Factorize a symmetric positive definite matrix without square roots or pivoting.
-
-    Args:
-        matrix: n x n; only the lower triangle is read.
-
-    Returns:
-        The factors.
-    """
+    """Factorize a symmetric positive definite matrix; only its lower triangle is read."""
     lower: list[list[Scalar]] = []
     inverse_diagonal: list[Scalar] = []
     for i, row in enumerate(matrix):
@@ -50,15 +38,7 @@ def factorize_ldl(matrix: Sequence[Sequence[Scalar]]) -> LDLFactor:
 
 
 def solve_ldl(factor: LDLFactor, right: Sequence[Scalar]) -> list[Scalar]:
-    """Solve A x = b.
-
-    Args:
-        factor: From `factorize_ldl`.
-        right: b, n.
-
-    Returns:
-        x, n.
-    """
+    """Solve A x = right."""
     forward: list[Scalar] = []
     for i, row in enumerate(factor.lower):
         value = right[i]
@@ -73,17 +53,11 @@ def solve_ldl(factor: LDLFactor, right: Sequence[Scalar]) -> list[Scalar]:
 
 
 def factorize_lu(matrix: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
-    """Factorize A = L U without pivoting: unit lower triangular L times upper triangular U.
+    """Factorize A = L U without pivoting; reciprocals of U's diagonal replace the diagonal.
 
     Meant for matrices I + A E with a positive definite A and a diagonal E >= 0, and for small changes of
     them: rounding errors are those of the symmetric I + E^1/2 A E^1/2, which needs no pivoting either,
     because scaling rows and columns by inverse factors scales every number of the elimination alike.
-
-    Args:
-        matrix: n x n.
-
-    Returns:
-        n x n: L below the diagonal, U above it, and the reciprocals of U's diagonal on it.
     """
     rows = [list(row) for row in matrix]
     for k, pivot_row in enumerate(rows):
@@ -96,15 +70,7 @@ def factorize_lu(matrix: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
 
 
 def solve_lu(factor: Sequence[Sequence[Scalar]], right: Sequence[Scalar]) -> list[Scalar]:
-    """Solve A x = b.
-
-    Args:
-        factor: From `factorize_lu`.
-        right: b, n.
-
-    Returns:
-        x, n.
-    """
+    """Solve A x = right."""
     solution: list[Scalar] = []
     for row, value in zip(factor, right, strict=True):
         for entry, known in zip(row, solution, strict=False):

@@ -1,7 +1,7 @@
-"""The mass matrix in minimal coordinates, by the composite-rigid-body algorithm, and its factorization.
+"""The mass matrix in minimal coordinates by the composite-rigid-body algorithm (CRBA), and its factorization.
 
-Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 6 and section 9.4. Besides accelerations, it gives
-the momentum of the system and what the base's velocity has to be for one.
+Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 6 and section 9.4. It also gives the system's
+momentum, and the base velocity for a given momentum.
 """
 
 from __future__ import annotations
@@ -19,25 +19,17 @@ Vector3 = Sequence[Scalar]
 
 
 class MassMatrix:
-    """The mass matrix of the robot at given joint angles, factorized.
+    """The mass matrix at given joint angles, factorized; `center` is the center of mass, base frame, m.
 
     The base's linear acceleration is eliminated first (its block is the total mass), which leaves a symmetric
-    positive definite system for the base's angular and the joints' accelerations. Like every LDL'
-    factorization of such a matrix it is backward stable in any order of elimination. But each entry is a sum
-    over bodies, in which light ones are lost in the rounding of heavy ones: the accelerations of a base that
-    is lighter than its arm are wrong by rounding over the mass ratio.
-
-    Attributes:
-        center: Center of mass of the system in the base frame, 3, m.
+    positive definite system for the base's angular and the joints' accelerations. LDL' is backward stable on
+    such a matrix in any order of elimination. But each entry is a sum over bodies, in which light ones are
+    lost in the rounding of heavy ones: the accelerations of a base lighter than its arm are off by rounding
+    over the mass ratio.
     """
 
     def __init__(self, chain: Chain, rotations: Sequence[Sequence[Vector3]]) -> None:
-        """Assemble and factorize (composite-rigid-body algorithm, Featherstone table 6.2 and 9.6).
-
-        Args:
-            chain: The robot.
-            rotations: From `joint_rotations`.
-        """
+        """Assemble (CRBA, Featherstone tables 6.2 and 9.6) and factorize."""
         self._chain, self._rotations = chain, rotations
         self._axes = (2,) if chain.planar else (0, 1, 2)
         mass, moment, inertia, columns, joint_block = _composite_bodies(chain, rotations)
@@ -48,6 +40,8 @@ class MassMatrix:
         self._forces = [force for force, _ in columns]
         self._torques = [subtract(torque, cross(self.center, force)) for force, torque in columns]
         about_center = self._inertia = _shifted_inertia(inertia, -mass, self.center, ZERO)
+        # With a = (f - sum F_j qdd_j) / m + c x alpha eliminated, rows and columns are (alpha, qdd):
+        # [J_c, T; T', H - F' F / m], F and T the columns' forces and torques about the center of mass.
         axes, n = self._axes, len(columns)
         reduced: list[list[Scalar]] = [[0.0] * (len(axes) + n) for _ in range(len(axes) + n)]
         for row, axis in enumerate(axes):
@@ -65,31 +59,13 @@ class MassMatrix:
     def accelerations(
         self, wrenches: Sequence[tuple[Vector3, Vector3]], joints: Sequence[Scalar]
     ) -> Accelerations:
-        """Accelerations that wrenches on the bodies and torques in the joints produce.
-
-        Args:
-            wrenches: Force [N] and torque [N m] on base and links about the origins of their frames, in their
-                axes, n + 1 pairs.
-            joints: Joint torques, n, N m.
-
-        Returns:
-            The accelerations, without any velocity-dependent term.
-        """
+        """See `forward.Inertia`."""
         total = passed_to_base(self._chain, self._rotations, wrenches)
         both = [own + other for own, other in zip(joints, total.joints, strict=True)]
         return self.solve(total.force, total.torque, both)
 
     def solve(self, force: Vector3, torque: Vector3, joints: Sequence[Scalar]) -> Accelerations:
-        """Accelerations that generalized forces produce.
-
-        Args:
-            force: Force on the base, base axes, 3, N.
-            torque: Torque on the base about its center of mass, 3, N m.
-            joints: Joint torques, n, N m.
-
-        Returns:
-            The accelerations, without any velocity-dependent term.
-        """
+        """See `forward.Inertia`."""
         inverse_mass = 1.0 / self._mass
         about_center = subtract(torque, cross(self.center, force))
         right = [about_center[axis] for axis in self._axes]
@@ -101,17 +77,14 @@ class MassMatrix:
         for axis, value in zip(self._axes, solution, strict=False):
             angular[axis] = value
         rates = solution[len(self._axes) :]
+        # a = f / m + c x alpha - sum F_j qdd_j / m.
         linear = add(scale(inverse_mass, force), cross(self.center, angular))
         for column, rate in zip(self._forces, rates, strict=True):
             linear = subtract(linear, scale(rate * inverse_mass, column))
         return Accelerations(angular, linear, rates)
 
     def joint_inertia(self) -> list[list[Scalar]]:
-        """Inertia that the joints feel on the free base, which is eliminated.
-
-        Returns:
-            Symmetric positive definite matrix n x n, kg m^2.
-        """
+        """Inertia that the joints feel on the free base: the Schur complement, symmetric (n, n), kg m^2."""
         count = len(self._axes)
         joints = [row[count:] for row in self._reduced[count:]]
         for j in range(len(joints)):
@@ -124,24 +97,15 @@ class MassMatrix:
         return joints
 
     def _locked_factor(self) -> LDLFactor:
-        """Factors of the inertia with all joints locked, the leading block of the factorized matrix."""
+        """Factors of the locked inertia, the leading block of the factorized matrix."""
         n = len(self._axes)
         return LDLFactor(self._factor.lower[:n], self._factor.inverse_diagonal[:n])
 
     def momentum(
         self, angular_velocity: Vector3, velocity: Vector3, joint_rates: Sequence[Scalar]
     ) -> tuple[Vector3, Vector3]:
-        """Momentum of the system, the inverse of `base_velocity`.
-
-        Args:
-            angular_velocity: Angular velocity of the base, base axes, 3, rad/s.
-            velocity: Velocity of the base's center of mass, base axes, 3, m/s.
-            joint_rates: n, rad/s.
-
-        Returns:
-            Linear momentum [kg m/s] and angular momentum about the system's center of mass [kg m^2/s], base
-            axes, 3 each.
-        """
+        """Linear momentum and angular momentum about the system's center of mass, base axes, 3 each."""
+        # p = m (v + omega x c) + sum F_j qd_j, L_c = J_c omega + sum T_j qd_j.
         linear = scale(self._mass, add(velocity, cross(angular_velocity, self.center)))
         angular: Vector3 = matrix_vector(self._inertia, angular_velocity)
         for force, torque, rate in zip(self._forces, self._torques, joint_rates, strict=True):
@@ -152,17 +116,9 @@ class MassMatrix:
     def base_velocity(
         self, linear: Vector3, angular: Vector3, joint_rates: Sequence[Scalar]
     ) -> tuple[Vector3, Vector3]:
-        """Velocity of the base with which the system has a given momentum.
+        """Angular and linear velocity of the base for a given momentum: the inverse of `momentum`.
 
         About the center of mass, the angular momentum involves the angular velocity and the joint rates only.
-
-        Args:
-            linear: Linear momentum of the system, base axes, 3, kg m/s.
-            angular: Angular momentum about the system's center of mass, base axes, 3, kg m^2/s.
-            joint_rates: n, rad/s.
-
-        Returns:
-            Angular velocity of the base [rad/s] and velocity of its center of mass [m/s], base axes, 3 each.
         """
         for force, torque, rate in zip(self._forces, self._torques, joint_rates, strict=True):
             linear = subtract(linear, scale(rate, force))

@@ -1,13 +1,13 @@
 """The paper's formulation: a dual-quaternion Newton-Euler equation per body, a constraint per joint.
 
-Frames e_0 .. e_n sit at the centers of mass; e_{i+1} is parallel to joint frame i. Unknown are the dual
+Frames e_0 .. e_n sit at the centers of mass; e_{i+1} is parallel to joint frame i. The unknowns are the dual
 accelerations of all bodies and the reaction wrenches of all joints (20). Indices and frames follow the
 corrected equations: reaction wrench i is what body i exerts on body i+1, in the axes of joint frame i and
-about its origin. A dual vector occupies 8 slots: scalar, vector of the real part, scalar, vector of the dual
+about its origin. A dual vector has 8 slots: scalar and vector of the real part, scalar and vector of the dual
 part; velocities carry the angular part in the real slots, wrenches the force.
 
-This formulation is the reference for those in minimal coordinates (`forward`), which simulations use: 8
-numbers per body against one per joint.
+It is the reference for minimal coordinates (`forward`), which simulations use: 8 numbers per body against one
+per joint.
 """
 
 from __future__ import annotations
@@ -34,36 +34,22 @@ FORBIDDEN = (1, 2, 5, 6, 7)
 
 @dataclass(frozen=True)
 class NewtonEulerSystem:
-    """The linear system (20): S11 ydot + S12 T = B1, S21 ydot = B2.
+    """The linear system (20): S11 ydot + S12 T = B1, S21 ydot = B2."""
 
-    Attributes:
-        s11: Block diagonal of H(M_i), (8 (n+1), 8 (n+1)).
-        s12: How reaction wrenches act on the bodies, (8 (n+1), 5 n).
-        s21: Joint constraints on the dual accelerations, (5 n, 8 (n+1)).
-        b1: Wrenches, 8 (n+1).
-        b2: Centripetal terms of the constraints, 5 n.
-    """
-
-    s11: Matrix
-    s12: Matrix
-    s21: Matrix
-    b1: list[Scalar]
-    b2: list[Scalar]
+    s11: Matrix  # block diagonal of H(M_i), (8 (n+1), 8 (n+1))
+    s12: Matrix  # reaction wrenches on the bodies, (8 (n+1), 5 n)
+    s21: Matrix  # joint constraints on the dual accelerations, (5 n, 8 (n+1))
+    b1: list[Scalar]  # wrenches, 8 (n+1)
+    b2: list[Scalar]  # centripetal terms of the constraints, 5 n
 
 
 @dataclass(frozen=True)
 class JointFrames:
-    """Relative poses around each joint.
+    """Relative poses around each joint."""
 
-    Attributes:
-        distal: q_{i/e_i} = C_i Rz(theta), joint frame i with respect to the body before it.
-        proximal: q_{e_{i+1}/i} = D_i, the body after the joint with respect to joint frame i; constant.
-        tip: q_{G/e_n}.
-    """
-
-    distal: Sequence[DualQuaternion]
-    proximal: Sequence[DualQuaternion]
-    tip: DualQuaternion
+    distal: Sequence[DualQuaternion]  # q_{i/e_i} = C_i Rz(theta), joint frame i in the body before it
+    proximal: Sequence[DualQuaternion]  # q_{e_{i+1}/i} = D_i, body after the joint in joint frame i; constant
+    tip: DualQuaternion  # q_{G/e_n}
 
 
 def _translation(position: Sequence[Scalar]) -> DualQuaternion:
@@ -71,16 +57,7 @@ def _translation(position: Sequence[Scalar]) -> DualQuaternion:
 
 
 def joint_frames(chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]) -> JointFrames:
-    """Poses that (13)-(19) refer to.
-
-    Args:
-        chain: The robot.
-        joint_angles: n, rad.
-        wrist_angles: psi, theta, phi, rad; ignored without a wrist.
-
-    Returns:
-        The relative poses.
-    """
+    """Relative poses that (13)-(19) refer to."""
     distal, proximal = [], []
     center: Sequence[float] = (0.0, 0.0, 0.0)
     for link, angle in zip(chain.links, joint_angles, strict=True):
@@ -95,17 +72,12 @@ def joint_frames(chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Seq
 
 
 def joint_velocity(frames: JointFrames, joint: int, velocities: Sequence[DualQuaternion]) -> DualQuaternion:
-    """Dual velocity of a joint in its own axes, omega^i_{i/e_i}; row 4 of it is the joint rate (12).
+    """Dual velocity of a joint in its own axes, omega^i_{i/e_i}.
 
-    Args:
-        frames: From `joint_frames`.
-        joint: Index i.
-        velocities: Dual velocities omega^{e_i}_{e_i/I} of all bodies, 8 each.
-
-    Returns:
-        Dual vector, 8 numbers; all but the rate about z vanish when the velocities obey the joint.
+    Entry 3 is the joint rate (12); the others vanish when the bodies obey the joint.
     """
     after, before = frames.proximal[joint], frames.distal[joint]
+    # (12): Ad(q_{e_{i+1}/i}) w_{i+1} - Ad(q_{i/e_i}*) w_i.
     return dq.subtract(
         dq.adjoint(after, velocities[joint + 1]), dq.inverse_adjoint(before, velocities[joint])
     )
@@ -120,16 +92,7 @@ def assemble(
 ) -> NewtonEulerSystem:
     """Assemble (20) from (13)-(16) and (19).
 
-    Args:
-        chain: The robot.
-        frames: From `joint_frames`.
-        velocities: Dual velocities omega^{e_i}_{e_i/I} of all bodies, 8 each.
-        base_wrench: External wrench on the base, force [N] real, torque [N m] dual, 8.
-        joint_torques: Torques about the joint axes on the distal bodies, springs and dampers included, n, N
-            m.
-
-    Returns:
-        The system.
+    `velocities` holds omega^{e_i}_{e_i/I}, 8 per body; `joint_torques` include springs and dampers.
     """
     n = len(chain.links)
     bodies = [chain.base, *(link.body for link in chain.links)]
@@ -139,21 +102,24 @@ def assemble(
     b2: list[Scalar] = []
     for i, (body, velocity) in enumerate(zip(bodies, velocities, strict=True)):
         inertia = dual_matrices.dual_inertia_matrix(body.mass, body.inertia)
-        _place(s11, 8 * i, 8 * i, dual_matrices.swap_columns(inertia))
+        _place(s11, 8 * i, 8 * i, dual_matrices.swap_columns(inertia))  # H(M_i) wdot_i = M_i wdot_i^s
         # (9): the gyroscopic term omega x (M omega^s) moves to the right.
         momentum = dual_matrices.matrix_multiply(inertia, dq.swap(velocity))
         b1 += dq.scale(-1.0, dq.cross(velocity, momentum))
-    _accumulate(b1, 0, base_wrench)
+    _accumulate(b1, 0, base_wrench)  # W_0 of (13)
     if chain.tip_wrench is not None:
         wrench = (0.0, *chain.tip_wrench[:3], 0.0, *chain.tip_wrench[3:])
-        _accumulate(b1, 8 * n, dq.adjoint(frames.tip, wrench))
+        _accumulate(b1, 8 * n, dq.adjoint(frames.tip, wrench))  # Ad(q_{G/e_n}) W_ext of (16)
     for j in range(n):
         before, after = frames.distal[j], frames.proximal[j]
+        # (13)-(16): +-Ad(.) E158' W~_{j+1/j} on the left, -+Ad(.) W_act,j+1 on the right.
         actuation = (0.0,) * 7 + (joint_torques[j],)
         for body_index, pose, sign in ((j, before, 1.0), (j + 1, dq.conjugate(after), -1.0)):
             transfer = dual_matrices.adjoint_matrix(pose)
             _place(s12, 8 * body_index, 5 * j, [[sign * row[c] for c in TRANSMITTED] for row in transfer])
             _accumulate(b1, 8 * body_index, dq.scale(-sign, dq.adjoint(pose, actuation)))
+        # (19): E145 Ad(q_{e_{j+1}/j}) wdot_{j+1} - E145 Ad(q_{j/e_j}*) wdot_j = E145 (w^j_{e_j/I} x
+        # w^j_{j/e_j}).
         back = dual_matrices.adjoint_matrix(dq.conjugate(before))
         _place(s21, 5 * j, 8 * (j + 1), [dual_matrices.adjoint_matrix(after)[row] for row in FORBIDDEN])
         _place(s21, 5 * j, 8 * j, [[-entry for entry in back[row]] for row in FORBIDDEN])
@@ -171,12 +137,6 @@ class SchurComplement:
     """
 
     def __init__(self, chain: Chain, system: NewtonEulerSystem) -> None:
-        """Factorize.
-
-        Args:
-            chain: The robot; the inverse of S11 is known in closed form from its mass properties.
-            system: From `assemble`; its right-hand side is not read.
-        """
         self._system = system
         self._bodies = [chain.base, *(link.body for link in chain.links)]
         count = len(system.s21)
@@ -191,22 +151,15 @@ class SchurComplement:
         )
 
     def solve(self, b1: Sequence[Scalar], b2: Sequence[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
-        """Dual accelerations (22) and reaction wrenches (21).
-
-        Args:
-            b1: Wrenches on the bodies, 8 (n+1), N and N m.
-            b2: Right-hand side of the constraints, 5 n.
-
-        Returns:
-            Dual accelerations of all bodies, 8 (n+1), and reaction wrenches, 5 n (fx, fy, fz in N, tx, ty in
-            N m per joint).
-        """
-        accelerations = _solve_inertia(self._bodies, b1)
+        """Dual accelerations (22), 8 (n+1), and reaction wrenches (21), 5 n, of right-hand sides b1, b2."""
+        accelerations = _solve_inertia(self._bodies, b1)  # S11^-1 B1
+        # (21): (-S21 S11^-1 S12) T = B2 - S21 S11^-1 B1.
         right = [
             b2[row] - _product(constraint, accelerations)
             for row, constraint in zip(self._order, self._constraints, strict=True)
         ]
         reactions = solve_ldl(self._factor, right)
+        # (22): ydot = S11^-1 (B1 - S12 T).
         for reaction, column in zip(reactions, self._weighted, strict=True):
             accelerations = [a - reaction * c for a, c in zip(accelerations, column, strict=True)]
         return accelerations, reactions
@@ -214,19 +167,11 @@ class SchurComplement:
     def refine(
         self, b1: Sequence[Scalar], b2: Sequence[Scalar], solution: tuple[list[Scalar], list[Scalar]]
     ) -> tuple[list[Scalar], list[Scalar]]:
-        """Solve once more, for what a solution leaves of the right-hand side (iterative refinement).
+        """Improve a solution by solving for its residual (iterative refinement).
 
         Entries of the Schur complement are as large as the greatest mobility of any body: about the axis of a
-        needle, 1 over its moment of inertia. What else they add up is rounded accordingly; the system itself
-        is not, and its residual tells.
-
-        Args:
-            b1: Wrenches on the bodies, 8 (n+1), N and N m.
-            b2: Right-hand side of the constraints, 5 n.
-            solution: From `solve`, for the same right-hand side.
-
-        Returns:
-            As `solve`.
+        needle, 1 over its moment of inertia. Smaller terms of the same sums are rounded accordingly; the
+        residual of the system itself is not.
         """
         accelerations, reactions = solution
         left = self._system
@@ -245,16 +190,7 @@ class SchurComplement:
 def solve_schur(
     chain: Chain, system: NewtonEulerSystem, refinements: int = 0
 ) -> tuple[list[Scalar], list[Scalar]]:
-    """Dual accelerations (22) and reaction wrenches (21) of a system.
-
-    Args:
-        chain: The robot.
-        system: From `assemble`.
-        refinements: How often to solve once more for the residual.
-
-    Returns:
-        As `SchurComplement.solve`.
-    """
+    """Dual accelerations (22) and reaction wrenches (21), refined a number of times."""
     complement = SchurComplement(chain, system)
     solution = complement.solve(system.b1, system.b2)
     for _ in range(refinements):
@@ -296,19 +232,12 @@ def _product(row: Sequence[Scalar], column: Sequence[Scalar]) -> Scalar:
 
 @dataclass(frozen=True)
 class PaperState:
-    """The paper's state: 46 numbers for three links and a wrist.
+    """The paper's state: 46 numbers for three links and a wrist."""
 
-    Attributes:
-        base_pose: q_{e0/I}, 8.
-        joint_angles: n, rad.
-        wrist_angles: psi, theta, phi, rad; empty without a wrist.
-        velocities: Dual velocities of all bodies, n + 1 times 8.
-    """
-
-    base_pose: DualQuaternion
-    joint_angles: Sequence[Scalar]
-    wrist_angles: Sequence[Scalar]
-    velocities: Sequence[DualQuaternion]
+    base_pose: DualQuaternion  # q_{e0/I}, 8
+    joint_angles: Sequence[Scalar]  # n, rad
+    wrist_angles: Sequence[Scalar]  # psi, theta, phi, rad; empty without a wrist
+    velocities: Sequence[DualQuaternion]  # dual velocities omega^{e_i}_{e_i/I} of all bodies
 
     @classmethod
     def from_vector(cls, chain: Chain, x: Sequence[Scalar]) -> PaperState:
@@ -326,18 +255,7 @@ def paper_rates(
     joint_torques: Sequence[Scalar],
     wrist_rates: Sequence[Scalar],
 ) -> tuple[list[Scalar], list[Scalar]]:
-    """Time derivative of the paper's state (11), (12), (22), and the reaction wrenches (21).
-
-    Args:
-        chain: The robot.
-        state: The state.
-        base_wrench: External wrench on the base, 8, N and N m.
-        joint_torques: Motor torques, n, N m.
-        wrist_rates: psi, theta, phi rates, rad/s; empty without a wrist.
-
-    Returns:
-        Derivative of the state vector, and the reaction wrenches, 5 n.
-    """
+    """Time derivative of the paper's state (11), (12), (22), and the reaction wrenches (21)."""
     system = system_of(chain, state, base_wrench, joint_torques)
     accelerations, reactions = solve_schur(chain, system)
     return [*paper_position_rates(chain, state, wrist_rates), *accelerations], reactions
@@ -346,17 +264,7 @@ def paper_rates(
 def system_of(
     chain: Chain, state: PaperState, base_wrench: DualQuaternion, joint_torques: Sequence[Scalar]
 ) -> NewtonEulerSystem:
-    """The system (20) of a state and its inputs, springs and dampers included.
-
-    Args:
-        chain: The robot.
-        state: The state.
-        base_wrench: External wrench on the base, 8, N and N m.
-        joint_torques: Motor torques, n, N m.
-
-    Returns:
-        The system.
-    """
+    """The system (20) of a state and its inputs, springs and dampers included."""
     frames = joint_frames(chain, state.joint_angles, state.wrist_angles)
     passive = passive_torques(chain, state.joint_angles, joint_speeds(chain, state))
     torques = [motor + other for motor, other in zip(joint_torques, passive, strict=True)]
@@ -364,45 +272,19 @@ def system_of(
 
 
 def joint_speeds(chain: Chain, state: PaperState) -> list[Scalar]:
-    """Joint rates (12) from the dual velocities of the bodies.
-
-    Args:
-        chain: The robot.
-        state: The state.
-
-    Returns:
-        Joint rates, n, rad/s.
-    """
+    """Joint rates (12) from the dual velocities of the bodies."""
     frames = joint_frames(chain, state.joint_angles, state.wrist_angles)
     return [joint_velocity(frames, j, state.velocities)[3] for j in range(len(chain.links))]
 
 
 def paper_position_rates(chain: Chain, state: PaperState, wrist_rates: Sequence[Scalar]) -> list[Scalar]:
-    """Rates of base pose (11), joint angles (12) and wrist angles.
-
-    Args:
-        chain: The robot.
-        state: The state.
-        wrist_rates: psi, theta, phi rates, rad/s; empty without a wrist.
-
-    Returns:
-        8 + n + (3) rates.
-    """
-    pose_rate = dq.scale(0.5, dq.multiply(state.base_pose, state.velocities[0]))
+    """Rates of base pose (11), joint angles (12) and wrist angles."""
+    pose_rate = dq.scale(0.5, dq.multiply(state.base_pose, state.velocities[0]))  # (8), (11)
     return [*pose_rate, *joint_speeds(chain, state), *wrist_rates]
 
 
 def paper_tip_rate(chain: Chain, state: PaperState, wrist_rates: Sequence[Scalar]) -> DualQuaternion:
-    """Rate of the tip's pose (30) from the paper's state: what the 54-dimensional formulation appends.
-
-    Args:
-        chain: The robot.
-        state: The state.
-        wrist_rates: psi, theta, phi rates, rad/s; empty without a wrist.
-
-    Returns:
-        Derivative of q_{G/I}, 8, 1/s.
-    """
+    """Time derivative of q_{G/I} (30), which the 54-dimensional formulation appends."""
     base = state.velocities[0]
     return tip_pose_rate(
         chain,

@@ -1,4 +1,4 @@
-"""The Gymnasium environments: one copy, many, one with goals; and their pictures."""
+"""The Gymnasium environments; `rollouts` flies episodes in them, `disturbances` disturbs these."""
 
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.environment.goal import DQSpaceArmGoalEnv

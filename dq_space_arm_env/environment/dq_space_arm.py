@@ -1,4 +1,8 @@
-"""The environment `DQSpaceArm-v0`: a spacecraft moves so that the tip of its arm reaches a given pose and rests there."""
+"""The environment `DQSpaceArm-v0`: a spacecraft brings the tip of its arm to a target pose at rest.
+
+`DQSpaceArmEnv.step` calls one compiled function. Its equations: action to inputs, reward, success and end of the episode in
+`task/episode.py` (`command`, `step`), cost and observation in `task/equations.py`, motion in `dynamics/`.
+"""
 
 from __future__ import annotations
 
@@ -14,41 +18,41 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.environment.picture_format import PictureFormat
-from dq_space_arm_env.environment.start_options import check_size, given_start
+from dq_space_arm_env.environment.reset_options import check_size, given_start
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
-from dq_space_arm_env.kernels.report import REPORT, STATE_LIMIT
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.start import episode_scene, target_entries
+from dq_space_arm_env.task.step_report import REPORT, STATE_LIMIT
+from dq_space_arm_env.viewing.picture_format import PictureFormat
 
 if TYPE_CHECKING:
-    from dq_space_arm_env.environment.rendering import Renderer
+    from dq_space_arm_env.viewing.rendering import Renderer
 
 Array = NDArray[Any]
 
-# No observation of a simulation that has not blown up (m, rad, m/s, rad/s) is beyond this.
+# Bound of every observation of a simulation that has not diverged, m, rad, m/s, rad/s.
 OBSERVATION_LIMIT = 2.0 * STATE_LIMIT
 
-_ONLY = np.zeros(1, dtype=np.int64)  # the row of the only state
+_ROW = np.zeros(1, dtype=np.int64)  # of the one state
 
 
 class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
     """
     ## Description
 
-    A spacecraft floats freely; its arm has revolute joints and, at the end, a massless spherical wrist. Forces and torques on the base, joint
-    torques, and the wrist's Euler rates are to bring the tip of the arm to a target pose at rest, with little effort: the pose-stabilization maneuver of
+    A free-floating spacecraft carries an arm with revolute joints and a massless spherical wrist. Forces and torques on the base, joint torques and the
+    wrist's Euler rates have to bring the tip of the arm to a target pose at rest, with little effort: the pose-stabilization maneuver of
     A. Valverde and P. Tsiotras, "Modeling of Spacecraft-Mounted Robot Dynamics and Control Using Dual Quaternions" (ACC 2018).
-    The dynamics are those of Newton and Euler for the whole system: nothing holds the base in place.
+    The dynamics are the Newton-Euler equations of the whole system: nothing holds the base in place.
 
-    The robot, its limits, the target, the cost, the start and the time step belong to a *scene*. What a scene does not have (wrist,
-    thrusters, wheels, joints) appears neither in the observation nor in the action. The tables show scene `paper`.
+    A *scene* defines the robot, its limits, the target, the cost, the start and the time step. Parts that a scene lacks (wrist, thrusters, wheels,
+    joints) appear neither in the observation nor in the action. The tables show scene `paper`.
 
     ## Action Space
 
-    A `Box(-1, 1, (12,), float32)`: inputs as fractions of their limits, constant over a time step. Values beyond the bounds are clipped, NaN is an
-    error. A float64 action is used at full precision.
+    A `Box(-1, 1, (12,), float32)`: inputs as fractions of their limits, constant over a time step. Values beyond the bounds are clipped; NaN raises an
+    error. A float64 action is used at full precision. `env.unwrapped.kernels.layout` converts: `to_control(action)`, `to_action(control)`.
 
     | Num | Action                                                 | Min  | Max | Unit  | Limit at 1 |
     |-----|--------------------------------------------------------|------|-----|-------|------------|
@@ -59,7 +63,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
     ## Observation Space
 
-    A `Box` of shape `(24,)`, float64; the bound of 1e6 is where a simulation counts as diverged:
+    A `Box` of shape `(24,)`, float64; a simulation whose numbers grow toward the bound of 1e6 counts as diverged:
 
     | Num   | Observation                                                           | Min  | Max | Unit  |
     |-------|-----------------------------------------------------------------------|------|-----|-------|
@@ -72,13 +76,13 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
     | 20-22 | rates of joints 1 to 3                                                | -1e6 | 1e6 | rad/s |
     | 23    | time left in the episode                                              | 0    | T   | s     |
 
-    The sign of q_{D/G}, of which both mean the same pose, is fixed at reset so that its scalar part is not negative, and then carried along by
-    continuity, as the cost does. The state follows from the observation; a planar scene's error has the four entries that are not identically zero.
+    q_{D/G} and -q_{D/G} are the same pose: the sign is chosen at reset such that the scalar part is not negative, and carried along by continuity, as in
+    the cost. The observation determines the state; in a planar scene the error has only the four entries that are not identically zero.
 
     ## Rewards
 
-    The reward of a step is minus the paper's stage cost of the state before the step and of the action; the last step of the episode also has minus the
-    terminal cost of the state after it, so the return of an episode is exactly -J. With weights of scene `paper`:
+    The reward of a step is minus the paper's stage cost, of the state before the step and of the action; the last step adds minus the terminal cost of
+    the state after it. The return of an episode is therefore exactly -J. The weights are those of scene `paper`:
 
     | Term (key in `info`)          | Formula                                                | Weight                               |
     |-------------------------------|--------------------------------------------------------|--------------------------------------|
@@ -88,32 +92,32 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
     | `terminal_cost_pose`          | as `cost_pose`, at the end; 0 before                   | 150                                  |
     | `terminal_cost_base_velocity` | as `cost_base_velocity`, at the end; 0 before          | 1                                    |
 
-    `info` further holds `attitude_error` [deg], `position_error` [m] of the tip, `is_success` (both within the scene's tolerances, 3 deg and 0.1 m)
-    and `diverged`.
+    `info` also holds the tip's `attitude_error` [deg] and `position_error` [m], `is_success` (both within the scene's tolerances, 3 deg and 0.1 m) and
+    `diverged`. `reset` returns the same keys, with costs of zero.
 
     ## Starting State
 
-    `reset(seed=...)` draws the start from the scene's spread, uniformly per component; where the scene has a spread for them, the target, masses and inertias too
+    `reset(seed=...)` draws the initial state from the scene's spread, uniformly per component, and the target, masses and inertias where they have a spread
     (scenes `random-target` and `random-masses`). `options={"nominal": True}` starts at the scene's initial state, `options={"initial_state": x}` at a state x
-    (`env.unwrapped.kernels.layout.state` names its entries); both leave target and masses at their nominal values. `options={"target": q}`, alone or with either,
-    sets the target where the scene draws it. `env.unwrapped.episode_scene` is the scene of the running episode, with what was drawn or given as plain numbers:
+    (`env.unwrapped.kernels.layout.state` names its entries); both keep target and masses nominal. `options={"target": q}`, alone or with either,
+    sets the target of a scene that draws it. `env.unwrapped.episode_scene` is the scene of the running episode with everything drawn or given as plain numbers:
     what an optimal controller may know.
 
     ## Episode End
 
-    1. Termination: the scene's number of steps (1000) is reached. The time left is part of the observation and the terminal cost part of the task, so this is an
-       end of the task, not a truncation.
-    2. Termination: the simulation diverged (a state that is not finite, or whose norm exceeds 5e5). `info["diverged"]` says so, and the remaining steps are charged at
-       the cost of the last sound state, so that ending early never pays.
+    1. Termination: the scene's number of steps (1000) is reached. The observation holds the time left and the task has a terminal cost, so this is the end of
+       the task, not a truncation.
+    2. Termination: the simulation diverged (the state is not finite, or its norm exceeds 5e5). `info["diverged"]` is true, and the remaining steps are charged at
+       the cost of the last sound state, so ending early never pays.
 
     ## Arguments
 
     | Parameter     | Type                     | Default   | Description                                            |
     |---------------|--------------------------|-----------|--------------------------------------------------------|
-    | `scene`       | **str, Path or Scene**   | `"paper"` | name of a shipped scene, path of a YAML file, a mapping like one, a `Scene` |
+    | `scene`       | **str, Path or Scene**   | `"paper"` | name of a shipped scene, path of a YAML file, its content as a mapping, or a `Scene` |
     | `render_mode` | **str or None**          | `None`    | `"rgb_array"`, or `"human"` for a window, which needs a display and the extra `render` |
     | `width`, `height` | **int**              | 640, 480  | size of the pictures, pixels                           |
-    | `default_camera_config` | **dict or None** | `None`  | where the camera is, as in Gymnasium's MuJoCo environments: any of `azimuth`, `elevation` (direction in which it looks, deg; a negative elevation looks down), `lookat` (point that it looks at, m) and `distance` from there (m); the rest is chosen so that start, target and the arm between them are in view |
+    | `default_camera_config` | **dict or None** | `None`  | camera placement as in Gymnasium's MuJoCo environments: any of `azimuth`, `elevation` (viewing direction, deg; negative elevations look down), `lookat` (point in the center of the picture, m) and `distance` from it (m); defaults keep start, target and the arm between them in view |
 
     ```python
     >>> import gymnasium
@@ -127,7 +131,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
     ## Vectorized environment
 
-    `DQSpaceArmVectorEnv` steps many copies with one call of vectorized machine code, and gives the bits of single environments with the same seeds.
+    `DQSpaceArmVectorEnv` steps many sub-environments with one call of vectorized machine code, bit-equal to single environments with the same seeds.
 
     ```python
     >>> venv = gymnasium.make_vec("DQSpaceArm-v0", num_envs=3)
@@ -154,10 +158,10 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         height: int = 480,
         default_camera_config: Mapping[str, Any] | None = None,
     ) -> None:
-        """Load a scene and compile what a step needs (or take it from the cache).
+        """Load a scene and compile its step, or take it from the cache.
 
         Args:
-            scene: Name of a shipped scene, path of a YAML file, what such a file holds as a mapping, or a scene.
+            scene: Name of a shipped scene, path of a YAML file, its content as a mapping, or a scene.
             render_mode: None, "rgb_array" or "human".
             width: Width of the pictures, pixels.
             height: Height of the pictures, pixels.
@@ -165,14 +169,14 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
         Raises:
             SceneError: If the scene cannot be loaded.
-            ValueError: If the scene has no actuator, or one without a finite limit, or starts too far from the origin, or the
-                render mode is unknown, or the size or the camera of the pictures makes no sense.
+            ValueError: If the scene has no actuator, or one without a finite limit, or starts too far from the origin; if the
+                render mode is unknown; or if size or camera of the pictures is invalid.
         """
         EzPickle.__init__(self, scene, render_mode, width, height, default_camera_config)
         self._picture = PictureFormat.checked(width, height, default_camera_config)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             modes = ", ".join(self.metadata["render_modes"])
-            raise ValueError(f"render_mode: {render_mode!r} is unknown; there are {modes}, or None")
+            raise ValueError(f"render_mode: {render_mode!r} is unknown; choose from {modes}, or None")
         self.scene = load_scene(scene)
         self.kernels = compile_scene(self.scene)
         layout = self.kernels.layout
@@ -208,7 +212,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
 
     def _bind_kernels(self) -> None:
-        """Give the compiled functions arrays of their own; those of a step get their addresses once."""
+        """Allocate the arrays of the compiled functions, whose addresses a step passes unchanged."""
         start = self.kernels.kernel("environment_start", lanes=1)
         observe = self.kernels.kernel("environment_observe", lanes=1)
         step = self.kernels.kernel("environment_step", lanes=1)
@@ -231,38 +235,24 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
     @property
     def state(self) -> Array:
-        """The state, shape (n_x,), units as in `kernels.layout.state`; a copy.
-
-        Raises:
-            ResetNeeded: Before the first reset.
-        """
-        if not self._begun:
-            raise ResetNeeded("call reset() before reading the state")
+        """The state, shape (n_x,), units as in `kernels.layout.state`; a copy. `ResetNeeded` before the first reset."""
+        self._require_reset("reading the state")
         return self._x.copy()
 
     @property
     def parameters(self) -> Array:
         """What the scene drew for this episode besides the state, as the equations of motion read it; a copy.
 
-        Shape (n_p,), empty for a scene that draws states only; `EpisodeParameters.of(scene).names` in
-        `dq_space_arm_env.kernels.parameters` says what each is.
-
-        Raises:
-            ResetNeeded: Before the first reset.
+        Shape (n_p,), empty for a scene that draws states only; `EpisodeParameters.of(scene).names` of
+        `dq_space_arm_env.task.parameters` names the entries. `ResetNeeded` before the first reset.
         """
-        if not self._begun:
-            raise ResetNeeded("call reset() before reading the parameters")
+        self._require_reset("reading the parameters")
         return self._parameters.copy()
 
     @property
     def target(self) -> Array:
-        """Pose q_{D/I} of this episode's target, shape (8,), real part dimensionless, dual part m; a copy.
-
-        Raises:
-            ResetNeeded: Before the first reset.
-        """
-        if not self._begun:
-            raise ResetNeeded("call reset() before reading the target")
+        """Pose q_{D/I} of this episode's target, shape (8,), dimensionless and m; a copy. `ResetNeeded` before the first reset."""
+        self._require_reset("reading the target")
         target = np.array(self.scene.target.pose.dual_quaternion, dtype=self.kernels.dtype)
         entries = list(target_entries(self.scene))
         target[entries] = self._parameters[: len(entries)]
@@ -270,15 +260,14 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
     @property
     def episode_scene(self) -> Scene:
-        """The scene with the target, masses and inertias of this episode, and without a spread.
-
-        Raises:
-            ResetNeeded: Before the first reset.
-        """
-        if not self._begun:
-            raise ResetNeeded("call reset() before asking for the episode's scene")
+        """The scene with the target, masses and inertias of this episode, without a spread. `ResetNeeded` before the first reset."""
+        self._require_reset("asking for the episode's scene")
         given = None if self._given_target is None else self._given_target.tolist()
         return episode_scene(self.scene, self._draws.tolist(), given)
+
+    def _require_reset(self, what: str) -> None:
+        if not self._begun:
+            raise ResetNeeded(f"call reset() before {what}")
 
     def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Apply an action for one time step.
@@ -301,7 +290,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         if shape != self._action_shape:
             raise ValueError(f"action: shape {shape}, should be {self._action_shape}")
         self._action[...] = action
-        self._take_step()
+        self._take_step()  # inputs, motion, observation, reward and end of the episode: task/episode.py
         over, success, diverged = self._flags.tolist()
         reward, pose, velocity, control, end_pose, end_velocity, angle, distance = self._report.tolist()
         if over and np.isnan(self._action).any():
@@ -309,7 +298,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         self._over = over
         if self.render_mode is not None:
             self._show()
-        # Written out: with a call, or a loop over names, a step would take some per cent longer.
+        # Written out: a call, or a loop over names, would make a step some per cent slower.
         info = {
             "cost_pose": pose,
             "cost_base_velocity": velocity,
@@ -329,7 +318,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         """Begin an episode.
 
         Args:
-            seed: Seed of the random start; None goes on with the generator.
+            seed: Seed of the random start; None keeps the generator.
             options: {"nominal": True} for the scene's initial state, or {"initial_state": x} with x of shape (n_x,);
                 {"target": q} for the target q_{D/I} of shape (8,), in a scene that draws it.
 
@@ -337,17 +326,17 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             Observation and info.
 
         Raises:
-            ValueError: If an option is unknown, or state or target have a wrong shape, are not finite, or their pose is not a unit dual quaternion; or if the
-                scene does not draw the target.
+            ValueError: If an option is unknown; if state or target has a wrong shape, is not finite, or its pose is not a unit dual quaternion; or if the
+                scene's target is not drawn.
         """
         super().reset(seed=seed)
         start = given_start(self.kernels, options or {})
         drawn = start.state is None
         self._draws[:] = self.np_random.uniform(-1.0, 1.0, self._draws.shape) if drawn else 0.0
-        self._start.on_rows(_ONLY)
+        self._start.on_rows(_ROW)
         start.apply(self.kernels, self._x, self._parameters)
         self._given_target = start.target
-        self._observe.on_rows(_ONLY)
+        self._observe.on_rows(_ROW)
         self._begun, self._over = True, False
         self._trail = []
         if self.render_mode is not None:
@@ -357,7 +346,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         return self._observation.copy(), {**info, "is_success": success, "diverged": diverged}
 
     def _show(self) -> None:
-        """Remember where the tip is, and update the window."""
+        """Extend the tip's trail, and update the window."""
         self._trail.append(np.array(poses.position(self.kernels.tip_pose(self._x).tolist())))
         if self.render_mode == "human":
             self.render()
@@ -370,18 +359,17 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
         Raises:
             ResetNeeded: Before the first reset.
-            DependencyNotInstalled: If a window is asked for and the extra `render` is not installed.
-            Error: If a window is asked for and there is no display (`gymnasium.error.Error`).
+            DependencyNotInstalled: If a window needs the extra `render` and it is not installed.
+            Error: If a window needs a display and there is none (`gymnasium.error.Error`).
         """
         if self.render_mode is None:
             gymnasium.logger.warn(
                 'render() does nothing without a render mode, e.g. gymnasium.make("DQSpaceArm-v0", render_mode="rgb_array")'
             )
             return None
-        if not self._begun:
-            raise ResetNeeded("call reset() before render()")
+        self._require_reset("render()")
         if self._renderer is None:
-            from dq_space_arm_env.environment.rendering import Renderer
+            from dq_space_arm_env.viewing.rendering import Renderer
 
             self._renderer = Renderer(self.scene, self._picture)
         self._renderer.aim_at(self.target)
@@ -392,7 +380,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         return None
 
     def close(self) -> None:
-        """Close the window, if there is one; again is harmless."""
+        """Close the window, if there is one; may be called again."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

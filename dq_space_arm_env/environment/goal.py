@@ -23,7 +23,7 @@ RewardType = Literal["sparse", "dense"]
 
 
 class _Comparison(NamedTuple):
-    """How far achieved goals are from desired ones: arrays of the shape of the batch, () for a single pair."""
+    """Distances of achieved from desired goals: arrays of the shape of the batch, () for a single pair."""
 
     attitude_error: Array
     position_error: Array
@@ -36,8 +36,8 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
     ## Description
 
     The spacecraft of `DQSpaceArm-v0` in the form that goal-conditioned agents and hindsight experience replay (HER; Andrychowicz et al., NeurIPS 2017) expect:
-    the tip of the arm is to reach a pose, the goal, and the reward can be computed anew for any other goal. Robot, limits, the draws of start and target, tolerances,
-    weights and the time step come from a scene. The interface is that of the multi-goal environments of Gymnasium-Robotics. The tables show scene `random-target`.
+    the tip of the arm has to reach a pose, the goal, and the reward can be recomputed for any other goal. A scene defines robot, limits, the spread of start and target,
+    tolerances, weights and the time step. The interface is that of Gymnasium-Robotics' multi-goal environments. The tables show scene `random-target`.
 
     ## Action Space
 
@@ -46,11 +46,11 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
     ## Observation Space
 
     A `Dict` of three boxes of the scene's precision, float64. A goal is a pose, a unit dual quaternion of 8 numbers in every scene; of a planar pose four are zero.
-    The bound of 1e6 is where a simulation counts as diverged.
+    A simulation whose numbers grow toward the bound of 1e6 counts as diverged.
 
     | Key             | Shape | Meaning                                                            | Min  | Max |
     |-----------------|-------|--------------------------------------------------------------------|------|-----|
-    | `observation`   | (23,) | the state, in which the goal plays no part                         | -1e6 | 1e6 |
+    | `observation`   | (23,) | the state, independent of the goal                                 | -1e6 | 1e6 |
     | `achieved_goal` | (8,)  | pose of the tip q_{G/I}: real part, then dual part in m            | -1, -1e6 | 1, 1e6 |
     | `desired_goal`  | (8,)  | pose of the target q_{D/I} of the episode, likewise                | -1, -1e6 | 1, 1e6 |
 
@@ -66,8 +66,8 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
     | 17-19 | velocity of the base's center of mass, base axes                      | -1e6 | 1e6 | m/s   |
     | 20-22 | rates of joints 1 to 3                                                | -1e6 | 1e6 | rad/s |
 
-    q and -q are one pose. The sign of `achieved_goal`, and with it that of the base's pose, is such that at reset its real part has a non-negative product with that
-    of `desired_goal`, and is then carried along by continuity. Rewards do not depend on the sign of either goal.
+    q and -q are the same pose. At reset the sign of `achieved_goal`, and with it that of the base's pose, is chosen such that its real part has a non-negative product
+    with that of `desired_goal`; it is then carried along by continuity. Rewards do not depend on the sign of either goal.
 
     ## Rewards
 
@@ -76,32 +76,32 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
     | `"sparse"`    | 0 if the tip is within the scene's tolerances of the goal after the step (3 deg and 0.1 m), else -1           |
     | `"dense"`     | -(q_{G/I} - q_{D/I})' W (q_{G/I} - q_{D/I}) after the step, weight 15: the paper's pose cost, the smaller over both signs |
 
-    `compute_reward(achieved_goal, desired_goal, info)` gives the reward for other goals, single ones (8,) or batches (B, 8); for those of a step and its `info` it gives
-    the reward of that step, bit for bit. Effort is not rewarded: it could not be computed from goals.
+    `compute_reward(achieved_goal, desired_goal, info)` returns the reward for other goals, single ones (8,) or batches (B, 8); for those of a step and its `info` it
+    returns the reward of that step, bit for bit. Effort is not part of the reward, as it could not be computed from goals.
 
-    `info` has the keys of `DQSpaceArm-v0`, the terms of the paper's cost included; `is_success` says whether the tip is within the tolerances.
+    `info` has the keys of `DQSpaceArm-v0`, the terms of the paper's cost included; `is_success` tells whether the tip is within the tolerances.
 
     ## Starting State
 
-    As in `DQSpaceArm-v0`, with the same seeds and options. The goal of an episode is drawn if the scene has a spread of the target, or given by
-    `options={"target": q}`; without such a spread it is the scene's target always. HER chooses goals among the achieved ones in any case.
+    As in `DQSpaceArm-v0`, with the same seeds and options. If the target has a spread, the goal of an episode is drawn, or given by
+    `options={"target": q}`; otherwise it is always the scene's target. HER relabels with achieved goals in either case.
 
     ## Episode End
 
-    Nothing terminates an episode: the goal is to be reached and held, and a success does not end it.
+    Nothing terminates an episode: the goal has to be reached and held, and success does not end it.
 
-    1. Truncation: the scene's number of steps (1000) is reached. This differs from `DQSpaceArm-v0`, where that is the end of the task: here the time left is not observed
-       and there is no terminal cost, so a step is worth the same at any time, and the value of what would follow should be estimated.
+    1. Truncation: the scene's number of steps (1000) is reached. In `DQSpaceArm-v0` that is the end of the task; here the time left is not observed and there is no
+       terminal cost, so a step has the same value at any time, and algorithms should bootstrap.
     2. Truncation: the simulation diverged. The observation shows the last sound state, `info["diverged"]` is true, and the reward is that of a whole episode
-       spent there: the dense reward times the number of steps, or -1000 if sparse. So diverging never pays, neither for who adds up rewards nor for who estimates values.
-       Where rewards are computed anew without `info`, as HER does by default, a diverged step counts like any other; it is no loophole, since a truncated
-       transition goes on with the value of the last sound state.
+       spent there: the dense reward times the number of steps, or -1000 if sparse. Diverging therefore never pays, with or without bootstrapping.
+       Recomputed without `info`, HER's default, the reward of a diverged step is that of any other; this is no loophole, since a truncated
+       transition bootstraps from the last sound state.
 
     ## Arguments
 
     | Parameter     | Type                     | Default           | Description                                             |
     |---------------|--------------------------|-------------------|---------------------------------------------------------|
-    | `scene`       | **str, Path or Scene**   | `"random-target"` | name of a shipped scene, path of a YAML file, a mapping like one, a `Scene` |
+    | `scene`       | **str, Path or Scene**   | `"random-target"` | name of a shipped scene, path of a YAML file, its content as a mapping, or a `Scene` |
     | `reward_type` | **str**                  | `"sparse"`        | `"sparse"` or `"dense"`                                 |
     | `render_mode`, `width`, `height`, `default_camera_config` | | | as in `DQSpaceArm-v0`                         |
 
@@ -118,7 +118,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
 
     ```
 
-    The same step would have been a success if the goal had been where the tip is:
+    With the goal at the tip, the same step would have been a success:
 
     ```python
     >>> env.unwrapped.compute_reward(observation["achieved_goal"], observation["achieved_goal"], info)
@@ -142,10 +142,10 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         height: int = 480,
         default_camera_config: Mapping[str, Any] | None = None,
     ) -> None:
-        """Load a scene and compile what a step needs (or take it from the cache).
+        """Load a scene and compile its step, or take it from the cache.
 
         Args:
-            scene: Name of a shipped scene, path of a YAML file, what such a file holds as a mapping, or a scene.
+            scene: Name of a shipped scene, path of a YAML file, its content as a mapping, or a scene.
             reward_type: "sparse" or "dense".
             render_mode: None, "rgb_array" or "human".
             width: Width of the pictures, pixels.
@@ -154,12 +154,12 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
 
         Raises:
             SceneError: If the scene cannot be loaded.
-            ValueError: If the type of reward or the render mode is unknown, or `DQSpaceArmEnv` refuses the scene.
+            ValueError: If the reward type or the render mode is unknown, or `DQSpaceArmEnv` refuses the scene.
         """
         EzPickle.__init__(self, scene, reward_type, render_mode, width, height, default_camera_config)
         if reward_type not in get_args(RewardType):
             kinds = " and ".join(get_args(RewardType))
-            raise ValueError(f"reward_type: {reward_type!r} is unknown; there are {kinds}")
+            raise ValueError(f"reward_type: {reward_type!r} is unknown; choose from {kinds}")
         self._env = DQSpaceArmEnv(scene, render_mode, width, height, default_camera_config)
         self.scene, self.kernels = self._env.scene, self._env.kernels
         self.reward_type, self.render_mode = reward_type, render_mode
@@ -176,36 +176,24 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         self._truncated = False
 
     def _box(self, size: int, real_part: int) -> spaces.Box:
-        """Bounds of numbers that begin with a unit quaternion, whose entries may exceed 1 by a rounding error."""
+        """Bounds of numbers that start with a unit quaternion, whose entries may exceed 1 by a rounding error."""
         high = np.full(size, OBSERVATION_LIMIT, self.kernels.dtype)
         high[:real_part] = 1.0 + 1e-5
         return spaces.Box(-high, high, dtype=high.dtype.type)
 
     @property
     def state(self) -> Array:
-        """The state, shape (n_x,), units as in `kernels.layout.state`; a copy.
-
-        Raises:
-            ResetNeeded: Before the first reset.
-        """
+        """The state, shape (n_x,), see `DQSpaceArmEnv.state`."""
         return self._env.state
 
     @property
     def parameters(self) -> Array:
-        """What the scene drew for this episode besides the state, shape (n_p,): see `DQSpaceArmEnv.parameters`.
-
-        Raises:
-            ResetNeeded: Before the first reset.
-        """
+        """Parameters of this episode, shape (n_p,), see `DQSpaceArmEnv.parameters`."""
         return self._env.parameters
 
     @property
     def episode_scene(self) -> Scene:
-        """The scene with the target, masses and inertias of this episode, and without a spread.
-
-        Raises:
-            ResetNeeded: Before the first reset.
-        """
+        """The scene of this episode, see `DQSpaceArmEnv.episode_scene`."""
         return self._env.episode_scene
 
     def reset(
@@ -214,7 +202,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         """Begin an episode.
 
         Args:
-            seed: Seed of the random start and goal; None goes on with the generator.
+            seed: Seed of the random start and goal; None keeps the generator.
             options: As for `DQSpaceArmEnv.reset`; {"target": q} with q of shape (8,) sets the goal.
 
         Returns:
@@ -254,7 +242,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         return {"observation": x, "achieved_goal": self.kernels.tip_pose(x), "desired_goal": self._env.target}
 
     def _judged(self, info: dict[str, Any], comparison: _Comparison) -> dict[str, Any]:
-        """Let `info` say of the goal what the reward says, to the last bit."""
+        """Make `info` agree with the reward about the goal, to the last bit."""
         info["attitude_error"] = float(comparison.attitude_error)
         info["position_error"] = float(comparison.position_error)
         info["is_success"] = bool(comparison.is_success) and not info["diverged"]
@@ -266,13 +254,12 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         desired_goal: ArrayLike,
         info: Info | Sequence[Info] | NDArray[Any] | None = None,
     ) -> float | Array:
-        """Compute the reward of steps that achieved some goals while others were desired.
+        """Compute the reward of steps for any achieved and desired goals.
 
         Args:
             achieved_goal: Poses of the tip after the step, shape (8,) or (B, 8), real part dimensionless, dual part m.
             desired_goal: Goals, shape (8,) or (B, 8), real part dimensionless, dual part m.
-            info: What the step returned, one dictionary or a sequence of B, shape (B,). Only whether the simulation diverged is read from it; it did not
-                where nothing is said.
+            info: The step's info, one dictionary or a sequence of shape (B,); only "diverged" is read, False by default.
 
         Returns:
             Reward, dimensionless, a float or shape (B,).
@@ -284,12 +271,12 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         return rewards if rewards.ndim else float(rewards)
 
     def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> bool:
-        """Tell whether a step terminates the episode; none does, whatever the goals.
+        """Tell whether a step terminates the episode, which none does.
 
         Args:
             achieved_goal: Poses of the tip after the step, shape (8,) or (B, 8).
             desired_goal: Goals, shape (8,) or (B, 8).
-            info: What the step returned.
+            info: The step's info.
 
         Returns:
             False.
@@ -297,12 +284,12 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         return False
 
     def compute_truncated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> bool:
-        """Tell whether the latest step truncated the episode; that is the same for all goals.
+        """Tell whether the latest step truncated the episode, whatever the goals.
 
         Args:
             achieved_goal: Poses of the tip after the step, shape (8,) or (B, 8).
             desired_goal: Goals, shape (8,) or (B, 8).
-            info: What the step returned.
+            info: The step's info.
 
         Returns:
             True after the scene's number of steps and after a divergence.
@@ -319,7 +306,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         return self._compare(observation["achieved_goal"], observation["desired_goal"])
 
     def _compare(self, achieved: ArrayLike, desired: ArrayLike) -> _Comparison:
-        """Compare goals in machine code, which gives each pair the same bits alone and in a batch."""
+        """Compare goals in machine code, bit-equal for a pair alone and in a batch."""
         goals = [np.asarray(goal, self.kernels.dtype) for goal in (achieved, desired)]
         if any(goal.shape[-1:] != (8,) for goal in goals):
             shapes = " and ".join(str(goal.shape) for goal in goals)
@@ -335,15 +322,10 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         return _Comparison(errors[..., 0], errors[..., 1], cost, success)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the present state, as `DQSpaceArmEnv.render` does.
+        """Draw the present state, see `DQSpaceArmEnv.render`.
 
         Returns:
-            Picture of shape (height, width, 3), uint8, for render mode "rgb_array"; None for "human", which shows a window.
-
-        Raises:
-            ResetNeeded: Before the first reset.
-            DependencyNotInstalled: If a window is asked for and the extra `render` is not installed.
-            Error: If a window is asked for and there is no display (`gymnasium.error.Error`).
+            Picture of shape (height, width, 3), uint8, or None for render mode "human".
         """
         return self._env.render()
 
@@ -353,7 +335,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
 
 
 def _diverged(info: Info | Sequence[Info] | NDArray[Any] | None) -> bool | NDArray[np.bool_]:
-    """Whether simulations diverged, as far as their infos say so."""
+    """Whether simulations diverged according to their infos."""
     if info is None:
         return False
     if isinstance(info, Mapping):

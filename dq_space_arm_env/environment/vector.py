@@ -1,4 +1,4 @@
-"""Many copies of `DQSpaceArm-v0` stepped by one call of vectorized machine code."""
+"""The native vector environment: many `DQSpaceArm-v0` stepped by one call of vectorized machine code."""
 
 from __future__ import annotations
 
@@ -16,19 +16,18 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.environment.copies import Copies
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
-from dq_space_arm_env.environment.picture_format import PictureFormat
-from dq_space_arm_env.environment.results import StepResult
-from dq_space_arm_env.environment.start_options import GivenStart, given_start
-from dq_space_arm_env.environment.trails import Trails
+from dq_space_arm_env.environment.reset_options import GivenStart, given_start
+from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
 from dq_space_arm_env.kernels import compile_scene
-from dq_space_arm_env.kernels.report import REPORT
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.start import target_entries
+from dq_space_arm_env.task.step_report import REPORT
+from dq_space_arm_env.viewing.picture_format import PictureFormat
+from dq_space_arm_env.viewing.trails import Trails
 
 if TYPE_CHECKING:
-    from dq_space_arm_env.environment.rendering import Renderer
+    from dq_space_arm_env.viewing.rendering import Renderer
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
@@ -36,25 +35,26 @@ Rows = NDArray[np.int64]
 
 # `info` holds the report without the reward, and the flags without the end of the episode.
 _KEYS = (*REPORT[1:], "is_success", "diverged")
-_NOBODY = np.empty(0, dtype=np.int64)
+_NONE = np.empty(0, dtype=np.int64)
 
 
 class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle):
-    """`num_envs` copies of `DQSpaceArmEnv`, bit for bit like single ones with the same seeds and actions.
+    """`num_envs` sub-environments, bit-equal to single `DQSpaceArmEnv` with the same seeds and actions.
 
-    `gymnasium.make_vec("DQSpaceArm-v0", num_envs=1024)` makes it. Spaces, reward, `info`, options and episode
-    ends are those of `DQSpaceArmEnv`; entries of `info` are arrays of shape (num_envs,), each with a mask of
-    the same name preceded by an underscore (read-only where it is True everywhere). `reset(seed=s)` seeds
-    copy i with s + i; a list gives each its own seed. `options` may hold "reset_mask", a bool array of shape
-    (num_envs,), to reset some copies only; "initial_state" and "target" may have a row for each copy, shape
-    (num_envs, n_x) and (num_envs, 8). Actions in float32, the type of the action space, are read as they are.
+    `gymnasium.make_vec("DQSpaceArm-v0", num_envs=1024)` creates it. Spaces, reward, `info`, options and
+    episode ends are those of `DQSpaceArmEnv`. Entries of `info` are arrays of shape (num_envs,), each with a
+    mask of the same name preceded by an underscore (read-only where True everywhere). `reset(seed=s)` seeds
+    sub-environment i with s + i; a list gives each its own seed. `options` may hold "reset_mask", a bool
+    array of shape (num_envs,), to reset only some; "initial_state" and "target" may have a row per
+    sub-environment, shapes (num_envs, n_x) and (num_envs, 8). Actions in float32, the type of the action
+    space, are used without a copy.
 
-    What happens after the end of an episode is the autoreset mode's choice: the next step resets
-    (`NEXT_STEP`, the default), the same step resets and `info` holds `final_obs` and `final_info`
-    (`SAME_STEP`), or the caller does (`DISABLED`).
+    The autoreset mode determines what follows the end of an episode: the next step resets (`NEXT_STEP`, the
+    default), the same step resets and `info` holds `final_obs` and `final_info` (`SAME_STEP`), or the caller
+    does (`DISABLED`).
 
-    With render mode "rgb_array", `render()` gives a picture of each copy, as Gymnasium's vector environments
-    do; after a step that has reset a copy, it shows the new episode.
+    With render mode "rgb_array", `render()` returns a picture of each sub-environment, as in Gymnasium's
+    vector environments; after a step that has reset one, its picture shows the new episode.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -74,16 +74,15 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         height: int = 480,
         default_camera_config: Mapping[str, Any] | None = None,
     ) -> None:
-        """Load a scene and compile what a step needs (or take it from the cache).
+        """Load a scene and compile its step, or take it from the cache.
 
         Args:
-            num_envs: Number of copies.
-            scene: Name of a shipped scene, path of a YAML file, what such a file holds as a mapping, or a
-                scene.
-            autoreset_mode: What happens after the end of an episode.
+            num_envs: Number of sub-environments.
+            scene: Name of a shipped scene, path of a YAML file, its content as a mapping, or a scene.
+            autoreset_mode: What follows the end of an episode.
             render_mode: None or "rgb_array".
-            threads: Most threads that a step is shared among. More than one pays for some thousand copies on
-                idle cores; with a core taken by another process it costs little.
+            threads: Largest number of threads for a step. More than one pays from some thousand
+                sub-environments on idle cores, and costs little on busy ones.
             width: Width of the pictures, pixels.
             height: Height of the pictures, pixels.
             default_camera_config: As for `DQSpaceArmEnv`.
@@ -91,7 +90,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         Raises:
             SceneError: If the scene cannot be loaded.
             ValueError: If num_envs or threads is not positive, the scene has no normalized actions, the
-                render mode is unknown, or the size or the camera of the pictures makes no sense.
+                render mode is unknown, or size or camera of the pictures is invalid.
         """
         picture = width, height, default_camera_config
         EzPickle.__init__(self, num_envs, scene, autoreset_mode, render_mode, threads, *picture)
@@ -107,8 +106,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         self.scene, self.kernels = single.scene, compile_scene(single.scene, threads)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {
-            **type(self).metadata,
+        self.metadata = type(self).metadata | {
             "render_fps": single.metadata["render_fps"],
             "autoreset_mode": self.autoreset_mode,
         }
@@ -117,13 +115,12 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
-        self._copies = Copies(self.kernels, num_envs)
+        self._envs = SubEnvironments(self.kernels, num_envs)
         self._begun = False
-        self._everything = np.ones(num_envs, dtype=np.bool_)
-        self._everything.setflags(write=False)
-        self._masks = dict.fromkeys((f"_{key}" for key in _KEYS), self._everything)
-        # Copies whose episodes are over and that the next step, or the caller, is to reset.
-        self._over = _NOBODY
+        self._all = np.ones(num_envs, dtype=np.bool_)
+        self._all.setflags(write=False)
+        self._masks = dict.fromkeys((f"_{key}" for key in _KEYS), self._all)
+        self._over = _NONE  # rows whose episodes are over, to be reset by the next step or the caller
         self._seen: Array | None = None
         self._trails = None if render_mode is None else Trails(num_envs)
         self._renderer: Renderer | None = None
@@ -131,15 +128,12 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
     @property
     def states(self) -> Array:
         """The states, shape (num_envs, n_x), units as in `kernels.layout.state`; a copy."""
-        return self._copies.x.copy()
+        return self._envs.x.copy()
 
     @property
     def parameters(self) -> Array:
-        """What the scene drew for each copy's episode besides the state, shape (num_envs, n_p); a copy.
-
-        See `DQSpaceArmEnv.parameters`.
-        """
-        return self._copies.parameters.copy()
+        """Parameters of each episode, shape (num_envs, n_p), see `DQSpaceArmEnv.parameters`; a copy."""
+        return self._envs.parameters.copy()
 
     @property
     def targets(self) -> Array:
@@ -147,7 +141,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         target = np.array(self.scene.target.pose.dual_quaternion, dtype=self.kernels.dtype)
         targets = np.tile(target, (self.num_envs, 1))
         entries = list(target_entries(self.scene))
-        targets[:, entries] = self._copies.parameters[:, : len(entries)]
+        targets[:, entries] = self._envs.parameters[:, : len(entries)]
         return targets
 
     def reset(
@@ -156,11 +150,11 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         """Begin episodes.
 
         Args:
-            seed: Seed s for seeds s, s + 1, ...; one seed per copy; or None to go on with the generators.
+            seed: Seed s for s, s + 1, ...; one seed per sub-environment; or None to keep the generators.
             options: As for `DQSpaceArmEnv.reset`, and "reset_mask".
 
         Returns:
-            Observations, shape (num_envs, n_obs); of copies that are not reset, their present ones. And info.
+            Observations, shape (num_envs, n_obs), the present ones where nothing is reset; and info.
 
         Raises:
             ValueError: If an option or the number of seeds is wrong.
@@ -170,10 +164,10 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         rows, others = np.flatnonzero(mask), np.flatnonzero(~mask)
         starts = self._given_starts(rows, rest)
         self._seed(seed, rows)
-        self._copies.begin(rows, starts)
-        result = self._copies.observe(rows)
+        self._envs.begin(rows, starts)
+        result = self._envs.observe(rows)
         if self._seen is None:
-            result.observation[others] = self._copies.observe(others).observation[others]
+            result.observation[others] = self._envs.observe(others).observation[others]
         else:
             result.observation[others] = self._seen[others]
         result.report[:, others], result.flags[:, others] = 0.0, False
@@ -185,39 +179,41 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         return result.observation, self._info(result, mask)
 
     def _remember(self, observations: Array) -> None:
-        """Where resets are the caller's, those of some copies show what the others saw last."""
+        """Keep observations for resets of some sub-environments, which return the others' last ones."""
         if self.autoreset_mode is AutoresetMode.DISABLED:
             self._seen = observations.copy()
 
     def _checked_mask(self, mask: Any) -> Mask:
         if mask is None:
-            return self._everything
+            return self._all
         if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
             raise ValueError(
                 f"options: reset_mask {mask!r}, should be a bool array of shape ({self.num_envs},)"
             )
         if not mask.any():
-            raise ValueError("options: reset_mask is False everywhere, should be True for a copy to reset")
+            raise ValueError(
+                "options: reset_mask is False everywhere, should be True for a sub-environment to reset"
+            )
         return mask
 
     def _seed(self, seed: int | Sequence[int | None] | None, rows: Rows) -> None:
-        """Renew the random generators of copies that are given a seed, or that have none yet."""
+        """Seed the generators that are given a seed or have none yet."""
         if seed is None or isinstance(seed, (int, np.integer)):
             seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
         else:
             seeds = list(seed)
         if len(seeds) != self.num_envs:
-            raise ValueError(f"seed: {len(seeds)} seeds, should be {self.num_envs}, one for each copy")
+            raise ValueError(f"seed: {len(seeds)} seeds, should be {self.num_envs}, one per sub-environment")
         if not self._begun:
-            self._copies.seed(np.arange(self.num_envs), seeds)
+            self._envs.seed(np.arange(self.num_envs), seeds)
             self._begun = True
         elif seed is not None:
             renewed = np.array([i for i in rows if seeds[i] is not None], dtype=np.int64)
-            self._copies.seed(renewed, [seeds[i] for i in renewed])
+            self._envs.seed(renewed, [seeds[i] for i in renewed])
 
     def _given_starts(self, rows: Rows, options: dict[str, Any]) -> GivenStart:
-        """What the options want copies to start from: the same for all, or arrays with a row for each."""
-        shapes = {"initial_state": self._copies.x.shape, "target": (self.num_envs, 8)}
+        """Starts that the options give: the same for all, or arrays with a row for each."""
+        shapes = {"initial_state": self._envs.x.shape, "target": (self.num_envs, 8)}
         each = {
             name: options[name]
             for name, shape in shapes.items()
@@ -234,7 +230,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         )
 
     def step(self, actions: ArrayLike) -> tuple[Array, Array, Mask, Mask, dict[str, Any]]:
-        """Apply an action to every copy for one time step.
+        """Apply an action to every sub-environment for one time step.
 
         Args:
             actions: Inputs as fractions of their limits, shape (num_envs, n_u); clipped to [-1, 1].
@@ -244,19 +240,20 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
 
         Raises:
             ResetNeeded: Before the first reset, and with autoreset disabled when an episode is over.
-            ValueError: If the actions have a wrong shape or a NaN; no copy has moved then.
+            ValueError: If the actions have a wrong shape or a NaN; nothing has moved then.
         """
         resetting = self._over
         if not self._begun:
             raise ResetNeeded("the episodes have not begun: call reset() before step()")
         if len(resetting) and self.autoreset_mode is AutoresetMode.DISABLED:
             raise ResetNeeded(
-                f"the episodes of copies {resetting.tolist()} are over: reset them with a reset_mask"
+                f"the episodes of sub-environments {resetting.tolist()} are over: "
+                "reset them with a reset_mask"
             )
-        result = self._copies.step(actions, resetting)
+        result = self._envs.step(actions, resetting)
         if len(resetting):
             self._begin_anew(resetting, result)
-            self._over = _NOBODY
+            self._over = _NONE
         rewards, terminated, final = result.report[0], result.flags[0], None
         if np.count_nonzero(terminated):
             rows = np.flatnonzero(terminated)
@@ -269,26 +266,68 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         self._remember(result.observation)
         if self._trails is not None:
             self._trails.append(self._tip_positions())
-        info = self._info(result, self._everything)
+        info = self._info(result, self._all)
         if final is not None:
             info |= final
         return result.observation, rewards, terminated, np.zeros(self.num_envs, dtype=np.bool_), info
 
-    def _begin_anew(self, rows: Rows, result: StepResult) -> None:
-        """Begin new episodes of copies, and put what they see where the old ones' stands."""
-        self._copies.begin(rows)
-        if self._trails is not None:
-            self._trails.begin(rows)
-        self._copies.observe(rows, result)
+    def perturb(self, increments: ArrayLike) -> None:
+        """Displace the states, as a push from outside would: x becomes x (+) increment.
 
-    def _tip_positions(self) -> Array:
-        return np.array(poses.position(self.kernels.tip_pose(self._copies.x).T)).T
+        Args:
+            increments: Tangent coordinates in the order of `kernels.layout.tangent`, shape (num_envs, n_t),
+                rad, m, rad/s, m/s; sub-environments whose row is zero stay exactly as they are.
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Draw the present state of every copy.
+        Raises:
+            ResetNeeded: Before the first reset.
+            ValueError: If the increments have a wrong shape.
+        """
+        if not self._begun:
+            raise ResetNeeded("the episodes have not begun: call reset() before perturb()")
+        increments = np.asarray(increments, dtype=np.float64)
+        expected = self.num_envs, self.kernels.n_t
+        if increments.shape != expected:
+            raise ValueError(f"increments: shape {increments.shape}, should be {expected}")
+        rows = np.flatnonzero(increments.any(axis=1))
+        if len(rows):
+            self._envs.move(rows, self.kernels.retract(self._envs.x[rows], increments[rows]))
+
+    def observe(self, states: ArrayLike | None = None) -> Array:
+        """Give observations without a step.
+
+        Args:
+            states: States in place of the present ones, for example as measured with noise, shape (num_envs,
+                n_x), units as in `kernels.layout.state`.
 
         Returns:
-            A picture of shape (height, width, 3), uint8, for each copy; None without a render mode.
+            Observations, shape (num_envs, n_obs).
+
+        Raises:
+            ResetNeeded: Before the first reset.
+            ValueError: If the states have a wrong shape.
+        """
+        if not self._begun:
+            raise ResetNeeded("the episodes have not begun: call reset() before observe()")
+        x = self._envs.x if states is None else np.asarray(states)
+        if x.shape != self._envs.x.shape:
+            raise ValueError(f"states: shape {x.shape}, should be {self._envs.x.shape}")
+        return self._envs.observe_states(x)
+
+    def _begin_anew(self, rows: Rows, result: StepResult) -> None:
+        """Begin new episodes, and overwrite the old observations."""
+        self._envs.begin(rows)
+        if self._trails is not None:
+            self._trails.begin(rows)
+        self._envs.observe(rows, result)
+
+    def _tip_positions(self) -> Array:
+        return np.array(poses.position(self.kernels.tip_pose(self._envs.x).T)).T
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Draw the present state of every sub-environment.
+
+        Returns:
+            A picture of shape (height, width, 3), uint8, for each; None without a render mode.
 
         Raises:
             ResetNeeded: Before the first reset.
@@ -302,17 +341,17 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         if not self._begun:
             raise ResetNeeded("call reset() before render()")
         if self._renderer is None:
-            from dq_space_arm_env.environment.rendering import Renderer
+            from dq_space_arm_env.viewing.rendering import Renderer
 
             self._renderer = Renderer(self.scene, self._picture)
-        frames, targets, pictures = self.kernels.frame_poses(self._copies.x), self.targets, []
+        frames, targets, pictures = self.kernels.frame_poses(self._envs.x), self.targets, []
         for row in range(self.num_envs):
             self._renderer.aim_at(targets[row])
             pictures.append(self._renderer.draw(frames[row], self._trails.of(row)))
         return tuple(pictures)
 
     def _final(self, rows: Rows, result: StepResult) -> dict[str, Any]:
-        """What episodes that a step ended and begins anew leave behind."""
+        """Entries of `info` on episodes that the same step ended and restarted."""
         ended = result.flags[0].copy()
         last_observations = np.full(self.num_envs, None, dtype=object)
         for i in rows:
@@ -326,10 +365,10 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         }
 
     def _info(self, result: StepResult, mask: Mask) -> dict[str, Any]:
-        """What `DQSpaceArmEnv` reports, as arrays."""
+        """Entries of `DQSpaceArmEnv`'s info, as arrays."""
         _, pose, velocity, control, end_pose, end_velocity, angle, distance = result.report
         _, success, diverged = result.flags
-        whole = mask is self._everything
+        whole = mask is self._all
         return {
             "cost_pose": pose,
             "cost_base_velocity": velocity,

@@ -1,8 +1,8 @@
-"""Dormand and Prince's pair of orders 5 and 4 on the group, with steps as small as the tolerances ask for.
+"""The Dormand-Prince pair of orders 5 and 4 on SE(3), with substeps as small as the tolerances require.
 
-A time step is divided into shares, each tried with the method of order 5; the embedded one of order 4 tells
-its error. Every state of a batch has shares of its own: the calls are repeated until the last lane has
-arrived, and lanes that wait pass through them unchanged.
+A time step is divided into substeps, each tried with the method of order 5; the embedded one of order 4
+estimates its error. Every state of a batch has its own substeps: the calls are repeated until the last
+lane has arrived, and waiting lanes pass through them unchanged.
 
 Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, section II.4 (2nd ed., 1993).
 """
@@ -16,134 +16,114 @@ from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra.symbolic import zeros
 from dq_space_arm_env.compiler.graph import graph_of, trace
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.compiler.symbols import zeros
+from dq_space_arm_env.dynamics.vector_field import VectorField, split_state
 from dq_space_arm_env.integrators.explicit_stages import ExplicitStages
-from dq_space_arm_env.integrators.field import VectorField, split_state
 from dq_space_arm_env.integrators.munthe_kaas import combined, stage_slopes
-from dq_space_arm_env.integrators.tableaus import (
-    DORMAND_PRINCE_5,
-    DORMAND_PRINCE_DENSE,
-    DORMAND_PRINCE_ERROR,
-)
+from dq_space_arm_env.integrators.tableaus import DORMAND_PRINCE_5, DORMAND_PRINCE_DENSE, DORMAND_PRINCE_ERROR
 
 Scalar = Any
 Scalars = Sequence[Scalar]
 
-SMALLEST_SHARE = 1e-6
-"""A time step that needs smaller shares than this is given up."""
-MOST_SHARES = 10_000
+SMALLEST_SUBSTEP = 1e-6
+"""Smallest substep, as a fraction of the step, before it is given up."""
+MOST_SUBSTEPS = 10_000
 """So is one that needs more of them than this, rejected ones included."""
 STRETCH = 1.01
-"""How much longer than chosen the last share may be."""
+"""Factor by which the last substep may exceed the chosen length."""
 SAFETY, SMALLEST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 5.0
-"""A share follows another that was 0.9 error^-3/16 as long, within these factors."""
+"""The next substep is 0.9 error^-3/16 times the last one, within these factors."""
 
 
 @dataclass(frozen=True)
 class DormandPrince:
-    """Dormand-Prince 5(4) with steps chosen inside the time step; the Munthe-Kaas method for the pose.
+    """Dormand-Prince 5(4) with adaptive substeps; Munthe-Kaas for the pose.
 
-    The error of a share is the root mean square, over the tangent coordinates, of the difference between both
-    solutions in multiples of what is tolerated: atol + rtol |v| for a velocity v, atol + rtol for the pose
-    and the angles, which have no natural zero to be relative to. A state that cannot be advanced within the
-    tolerances becomes NaN.
-
-    Derivatives are those of the steps that were taken, with their lengths held fixed.
-
-    Attributes:
-        rtol: Relative tolerance.
-        atol: Absolute tolerance, rad, m, rad/s and m/s.
+    The error of a substep is the root mean square, over the tangent coordinates, of the difference between
+    both solutions in units of the tolerance: atol + rtol |v| for a velocity v, atol + rtol for the pose and
+    the angles, which have no natural zero. A state that cannot be advanced within the tolerances becomes NaN.
+    Derivatives are those of the substeps taken, their lengths held fixed.
     """
 
     rtol: float = 1e-8
-    atol: float = 1e-10
-
-    name = "dormand_prince"
-    order = 5
-    has_curvature = False
+    atol: float = 1e-10  # rad, m, rad/s and m/s
 
     def append_step(self, program: Program, field: VectorField) -> None:
-        """Append the calls that turn buffers x, u, h into x_next."""
-        shares = _Shares(field)
-        shares.append_begin(program, (self.rtol, self.atol))
-        shares.stages.append_first(program)
+        substeps = _Substeps(field)
+        substeps.append_begin(program, (self.rtol, self.atol))
+        substeps.stages.append_first(program)
         with program.repeated_while("unfinished"):
-            shares.append_length(program)
-            shares.stages.append_later(program, h="share_time")
-            shares.append_attempt(program)
-            shares.append_choice(program, {"state": "state_tried", "y1": "y7", "k1": "k7"})
-        shares.append_end(program)
+            substeps.append_length(program)
+            substeps.stages.append_later(program, h="substep_time")
+            substeps.append_attempt(program)
+            substeps.append_choice(program, {"state": "state_tried", "y1": "y7", "k1": "k7"})
+        substeps.append_end(program)
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
-        """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
-        shares = _Shares(field)
-        shares.append_begin(program, (self.rtol, self.atol))
-        shares.stages.append_linearized_first(program)
+        substeps = _Substeps(field)
+        substeps.append_begin(program, (self.rtol, self.atol))
+        substeps.stages.append_linearized_first(program)
         names = {"state": "state_tried", "y1": "y7", "k1": "k7", "Y1": "Y7", "K1": "K7"}
         if field.pose is not None:
-            shares.append_pose_begin(program)
+            substeps.append_pose_begin(program)
             names["pose_change"] = "pose_change_tried"
         with program.repeated_while("unfinished"):
-            shares.append_length(program)
-            shares.stages.append_linearized_later(program, h="share_time", is_carried=True)
-            shares.append_attempt(program)
-            shares.append_pose_attempt(program)
-            shares.append_choice(program, names)
-        return shares.append_linearized_end(program)
+            substeps.append_length(program)
+            substeps.stages.append_linearized_later(program, h="substep_time", is_carried=True)
+            substeps.append_attempt(program)
+            substeps.append_pose_attempt(program)
+            substeps.append_choice(program, names)
+        return substeps.append_linearized_end(program)
 
 
 def append_measured_step(program: Program, field: VectorField) -> None:
-    """Append the calls that turn x, u, h, tolerances into x_next, `error` and `dense`: a step, undivided.
+    """Append the calls that turn x, u, h, tolerances into x_next, `error` and `dense`: one undivided step.
 
-    The error is that of `DormandPrince`, one scalar, at most 1 within the tolerances. `dense` has four
-    tangent vectors d_n: the solution passes x (+) sum_n theta^n d_n, a share theta of the step, to order 4.
-
-    Args:
-        program: Program to append to; its buffer `tolerances` has the relative and the absolute one.
-        field: The equations of motion.
+    The error is that of `DormandPrince`, at most 1 within the tolerances (rtol, atol). `dense` has four
+    tangent vectors d_n: the solution at a fraction theta of the step is x (+) sum_n theta^n d_n, to order 4.
     """
-    shares = _Shares(field)
-    shares.stages.append(program)
-    shares.append_attempt(program, x="x", h="h", state_tried="x_next")
-    program.call(shares.dense_graph())
+    substeps = _Substeps(field)
+    substeps.stages.append(program)
+    substeps.append_attempt(program, x="x", h="h", state_tried="x_next")
+    program.call(substeps.dense_graph())
 
 
-class _Shares:
-    """The calls of a time step that is divided into shares.
+class _Substeps:
+    """The calls of a time step that is divided into substeps.
 
-    Buffers: `state` and `left`, where the step stands and the share of it that is left; `share`, the length
-    to try next; `taken` and `share_time`, the length that is tried now, as a share and in s; `tries`.
+    Buffers: `state` and `left`, the present state and the fraction of the step left; `substep`, the fraction
+    to try next; `taken` and `substep_time`, the one being tried, as a fraction and in s; `tries`.
     """
 
     def __init__(self, field: VectorField) -> None:
         self.field = field
-        self.stages = ExplicitStages(field, DORMAND_PRINCE_5, DormandPrince.name)
+        self.stages = ExplicitStages(field, DORMAND_PRINCE_5)
         self.prefix = self.stages.prefix
 
     def append_begin(self, program: Program, tolerances: tuple[float, float]) -> None:
-        """The state at the start; the whole step is tried first."""
+        """Start at x; the whole step is tried first."""
 
         def begin(x: Scalars) -> dict[str, Any]:
-            return {"state": x, "left": [1.0], "share": [1.0], "tries": [0.0], "tolerances": tolerances}
+            return {"state": x, "left": [1.0], "substep": [1.0], "tries": [0.0], "tolerances": tolerances}
 
         program.call(trace(f"{self.prefix}_begin", {"x": self.field.n_x}, begin))
 
     def append_length(self, program: Program) -> None:
-        """The share to try: no more than is left."""
+        """Length of the substep to try: at most what is left."""
 
-        def length(h: Scalars, left: Scalars, share: Scalars) -> dict[str, Any]:
+        def length(h: Scalars, left: Scalars, substep: Scalars) -> dict[str, Any]:
             # A little more than was chosen, if a sliver would be left otherwise.
-            taken = casadi.if_else(left[0] <= STRETCH * share[0], left[0], share[0])
-            return {"taken": [taken], "share_time": [taken * h[0]]}
+            taken = casadi.if_else(left[0] <= STRETCH * substep[0], left[0], substep[0])
+            return {"taken": [taken], "substep_time": [taken * h[0]]}
 
-        program.call(trace(f"{self.prefix}_length", {"h": 1, "left": 1, "share": 1}, length))
+        program.call(trace(f"{self.prefix}_length", {"h": 1, "left": 1, "substep": 1}, length))
 
     def append_attempt(
-        self, program: Program, x: str = "state", h: str = "share_time", state_tried: str = "state_tried"
+        self, program: Program, x: str = "state", h: str = "substep_time", state_tried: str = "state_tried"
     ) -> None:
-        """The state that the stages lead to, and how its error compares with the tolerances."""
+        """The state after the stages, and its error in units of the tolerances."""
         field, stages = self.field, self.stages
 
         def attempt(x: Scalars, h: Scalars, tolerances: Scalars, **others: Scalars) -> dict[str, Any]:
@@ -176,11 +156,9 @@ class _Shares:
         return {f"{name}{i}": self.field.n_y for name in "yk" for i in self.stages.numbers}
 
     def append_choice(self, program: Program, names: Mapping[str, str]) -> None:
-        """Take what was tried if its error is tolerable, and choose the next share.
+        """Accept the attempt if its error is tolerable, and choose the next length.
 
-        Args:
-            program: Program to append to.
-            names: For each buffer that moves on, the buffer that was tried.
+        `names` maps each buffer that moves on to the one tried.
         """
         sizes = program.scratch_sizes()
 
@@ -192,9 +170,9 @@ class _Shares:
             remaining = casadi.if_else(accepted, left[0] - taken[0], left[0])
             eighth = casadi.sqrt(casadi.sqrt(casadi.sqrt(error[0])))
             factor = casadi.fmax(SAFETY / (eighth * casadi.sqrt(eighth)), SMALLEST_FACTOR)
-            share = taken[0] * casadi.fmin(factor, LARGEST_FACTOR)
-            going = casadi.logic_and(remaining > 0.0, share >= SMALLEST_SHARE)
-            unfinished = casadi.logic_and(going, tries[0] < MOST_SHARES - 1.0)
+            substep = taken[0] * casadi.fmin(factor, LARGEST_FACTOR)
+            going = casadi.logic_and(remaining > 0.0, substep >= SMALLEST_SUBSTEP)
+            unfinished = casadi.logic_and(going, tries[0] < MOST_SUBSTEPS - 1.0)
             kept = {
                 f"{old}_kept": [
                     casadi.if_else(accepted, b, a) for a, b in zip(others[old], others[new], strict=True)
@@ -202,15 +180,15 @@ class _Shares:
                 for old, new in names.items()
             }
             # A lane that is given up goes no further, however long others in its block take.
-            following = casadi.if_else(unfinished, share, 0.0)
-            scalars = {"left_kept": [remaining], "share_kept": [following], "tries_kept": [tries[0] + 1.0]}
+            following = casadi.if_else(unfinished, substep, 0.0)
+            scalars = {"left_kept": [remaining], "substep_kept": [following], "tries_kept": [tries[0] + 1.0]}
             return {**kept, **scalars, "unfinished": [unfinished]}
 
         values = {name: sizes[name] for pair in names.items() for name in pair}
         scalars = dict.fromkeys(("error", "taken", "left", "tries"), 1)
         program.call(trace(f"{self.prefix}_choice", {**scalars, **values}, choose))
         # A graph may not write where it reads.
-        carried = {name: sizes[name] for name in (*names, "left", "share", "tries")}
+        carried = {name: sizes[name] for name in (*names, "left", "substep", "tries")}
 
         def move(**kept: Scalars) -> dict[str, Any]:
             return {name: kept[f"{name}_kept"] for name in carried}
@@ -227,7 +205,7 @@ class _Shares:
         program.call(trace(f"{self.prefix}_end", {"state": self.field.n_x, "left": 1}, end))
 
     def dense_graph(self) -> Any:
-        """Graph of the tangent vectors of the solution inside a step."""
+        """Graph of the tangent vectors of the dense output."""
         field, stages = self.field, self.stages
 
         def dense(h: Scalars, **others: Scalars) -> dict[str, Any]:
@@ -254,12 +232,12 @@ class _Shares:
         program.call(graph_of(f"{self.prefix}_pose_begin", {}, {"pose_change": values}))
 
     def append_pose_attempt(self, program: Program) -> None:
-        """Derivative of the pose that was tried, by pose, y and u: dense, column by column."""
+        """Derivative of the tried pose by pose, y and u: dense, by column."""
         field, stages = self.field, self.stages
         if field.pose is None:
             return
         n = len(field.pose.directions)
-        buffer, pattern = stages.append_pose_change(program, h="share_time", numbers=stages.numbers)
+        buffer, pattern = stages.append_pose_change(program, h="substep_time", numbers=stages.numbers)
         by_pose, moved, inputs = stages.linearized_pose(pattern)
         before = casadi.SX.sym("before", n, n + field.n_y + field.n_u)
         after = casadi.mtimes(by_pose, before) + casadi.horzcat(zeros(n, n), moved)
@@ -271,7 +249,7 @@ class _Shares:
         program.call(graph, before="pose_change", after="pose_change_tried", pose_change=buffer)
 
     def append_linearized_end(self, program: Program) -> tuple[Any, Any]:
-        """A and B from the derivatives that were carried to the end; NaN if it was not reached."""
+        """A and B from the derivatives carried to the end; NaN if it was not reached."""
         field, stages = self.field, self.stages
         total, left = casadi.SX.sym("Y1", stages.start_pattern), casadi.SX.sym("left")
         inputs: dict[str, Scalars] = {"Y1": total.nonzeros(), "left": [left]}
@@ -288,5 +266,5 @@ class _Shares:
 
 
 def _or_nan(values: Scalars, left: Scalar) -> list[Scalar]:
-    """The values, or NaN while something is left of the step."""
+    """The values, or NaN while part of the step is left."""
     return [casadi.if_else(left > 0.0, math.nan, value) for value in values]

@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta methods of higher order on the group: any tableau, Munthe-Kaas for the pose."""
+"""Explicit Runge-Kutta methods on SE(3) from any tableau, with Munthe-Kaas for the pose."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra.symbolic import zeros
 from dq_space_arm_env.compiler.graph import graph_of, trace
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.compiler.symbols import zeros
+from dq_space_arm_env.dynamics.vector_field import VectorField, split_state
 from dq_space_arm_env.integrators.explicit_stages import ExplicitStages
-from dq_space_arm_env.integrators.field import VectorField, split_state
 from dq_space_arm_env.integrators.munthe_kaas import combined, stage_slopes
 from dq_space_arm_env.integrators.tableaus import ButcherTableau
 
@@ -18,32 +18,23 @@ Scalar = Any
 
 
 class ExplicitRungeKutta:
-    """An explicit Runge-Kutta-Munthe-Kaas method with fixed steps.
+    """An explicit Runge-Kutta-Munthe-Kaas method with fixed steps."""
 
-    Attributes:
-        name: Name in the scene file.
-        order: Order of convergence.
-        tableau: Its coefficients.
-    """
-
-    has_curvature = False
-
-    def __init__(self, name: str, tableau: ButcherTableau) -> None:
-        """Name a tableau."""
-        self.name, self.tableau, self.order = name, tableau, tableau.order
+    def __init__(self, tableau: ButcherTableau) -> None:
+        self.tableau = tableau
 
     def append_step(self, program: Program, field: VectorField) -> None:
-        """Append the calls that turn buffers x, u, h into x_next."""
-        stages, tableau = ExplicitStages(field, self.tableau, self.name), self.tableau
+        stages, tableau = ExplicitStages(field, self.tableau), self.tableau
         stages.append(program)
 
         def step(x: list[Scalar], h: list[Scalar], **others: list[Scalar]) -> dict[str, Any]:
             stored, start = split_state(field, x)
             rates = [others.get(f"k{i}", []) for i in stages.numbers]
-            y = stages.moved(start, tableau.weights, rates, h[0])
+            y = stages.moved(start, tableau.weights, rates, h[0])  # y + h sum_i b_i k_i
             if field.pose is None:
                 return {"x_next": y}
             twists = stages.twists([others[f"y{i}"] for i in stages.numbers])
+            # q exp(Omega / 2) with Omega = h sum_i b_i w_i, w_i the slopes dexp^-1(omega_i).
             increment = combined(tableau.weights, stage_slopes(field.pose, tableau, twists, h[0]), h[0])
             return {"x_next": [*field.pose.moved(stored, increment), *y]}
 
@@ -54,11 +45,11 @@ class ExplicitRungeKutta:
         program.call(trace(f"{stages.prefix}_sum", sizes, step))
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
-        """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
-        stages = ExplicitStages(field, self.tableau, self.name)
+        stages = ExplicitStages(field, self.tableau)
         stages.append_linearized(program)
         h = casadi.SX.sym("h")
         weights = zip(self.tableau.weights, stages.numbers, strict=True)
+        # dy+ = dy + h sum_i b_i K_i.
         change, inputs = stages.change([term for term in weights if term[0]], h, is_carried=False)
         bindings = {}
         if field.pose is None:

@@ -1,7 +1,7 @@
-"""The calls that explicit Runge-Kutta methods are made of: their stages, with or without derivatives.
+"""The stages of explicit Runge-Kutta methods, with or without derivatives, as calls.
 
-The rates are traced and compiled once and called for every stage, on vectors that stay in the cache; where a
-stage starts is a graph of its own for each of them, with the tableau's zeros left out.
+The rates are compiled once and called for every stage, on vectors that stay in the cache; the start of each
+stage is a separate graph, with the tableau's zeros left out.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra.symbolic import symbols, zeros
 from dq_space_arm_env.compiler.graph import Graph, graph_of, trace
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.compiler.symbols import symbols, zeros
-from dq_space_arm_env.integrators.field import VectorField, graph_inputs, split_state
-from dq_space_arm_env.integrators.linearization import pose_blocks
+from dq_space_arm_env.dynamics.vector_field import VectorField, split_state
+from dq_space_arm_env.integrators.method import graph_inputs
 from dq_space_arm_env.integrators.munthe_kaas import combined, increment_jacobians
-from dq_space_arm_env.integrators.rk4_stages import stage_pattern
+from dq_space_arm_env.integrators.pose_update import pose_blocks
 from dq_space_arm_env.integrators.tableaus import ButcherTableau
 
 Scalar = Any
@@ -28,20 +28,13 @@ Matrix = Any
 class ExplicitStages:
     """Stages of an explicit method on given equations of motion.
 
-    Their buffers are counted from 1: stage i starts at `y{i}` and has the rates `k{i}`; with derivatives,
-    `Y{i}` and `K{i}` are those of the two by (y, u) at the start of the step.
+    Buffers count from 1: stage i starts at `y{i}` and has the rates `k{i}`; with derivatives, `Y{i}` and
+    `K{i}` are those of the two by (y, u) at the start of the step.
     """
 
-    def __init__(self, field: VectorField, tableau: ButcherTableau, name: str) -> None:
-        """Take the equations and the method.
-
-        Args:
-            field: The equations of motion.
-            tableau: The method.
-            name: Identifier of the method, for the names of graphs.
-        """
+    def __init__(self, field: VectorField, tableau: ButcherTableau) -> None:
         self.field, self.tableau = field, tableau
-        self.prefix = f"{field.name}_{name}"
+        self.prefix = f"{field.name}_rk{tableau.order}"
         self.numbers = range(1, len(tableau.stages) + 1)
 
     # The stages themselves.
@@ -57,12 +50,7 @@ class ExplicitStages:
         program.call(self._rates, y="y1", rates="k1")
 
     def append_later(self, program: Program, *, h: str = "h") -> None:
-        """Append the calls that turn y1, k1, u and a time step into the y{i} and k{i} of all other stages.
-
-        Args:
-            program: Program to append to.
-            h: Buffer of the time step.
-        """
+        """Append the calls that turn y1, k1, u and a time step into y{i} and k{i} of the other stages."""
         for number in self.numbers[1:]:
             program.call(self._start(number), h=h, y=f"y{number}")
             program.call(self._rates, y=f"y{number}", rates=f"k{number}")
@@ -75,7 +63,7 @@ class ExplicitStages:
         )
 
     def _start(self, number: int) -> Graph:
-        """Graph of where a stage starts, from y1, h and the rates of the stages that it uses."""
+        """Graph of a stage's start, from y1, h and the rates of the stages it uses."""
         field, row = self.field, self.tableau.stages[number - 1]
 
         def start(y1: list[Scalar], h: list[Scalar], **k: list[Scalar]) -> dict[str, Any]:
@@ -104,7 +92,7 @@ class ExplicitStages:
         return [entry + change for entry, change in zip(y, combined(weights, rates, h), strict=True)]
 
     def twists(self, starts: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
-        """Free entries of the base twist at each stage, from where the stages start."""
+        """Free entries of the base twist at each stage's start."""
         assert self.field.pose is not None
         return [[y[i] for i in self.field.pose.twist_indices] for y in starts]
 
@@ -140,12 +128,9 @@ class ExplicitStages:
         self._append_linearized_rates(program, 1)
 
     def append_linearized_later(self, program: Program, *, h: str = "h", is_carried: bool = False) -> None:
-        """Append the calls that turn y1, k1, Y1, K1, u and a time step into the same of all other stages.
+        """Append the calls that turn y1, k1, Y1, K1, u and a time step into those of the other stages.
 
-        Args:
-            program: Program to append to.
-            h: Buffer of the time step.
-            is_carried: Whether Y1 may be anything; it is the identity otherwise.
+        Y1 is an input if `is_carried`, and the identity otherwise.
         """
         for number in self.numbers[1:]:
             program.call(self._start(number), h=h, y=f"y{number}")
@@ -162,7 +147,7 @@ class ExplicitStages:
         )
 
     def _start_change(self, number: int, is_carried: bool) -> Graph:
-        """Graph of Y{i} from h, the K{j} that it depends on, and Y1 unless that is the identity."""
+        """Graph of Y{i} from h, the K{j} it depends on, and Y1 unless that is the identity."""
         used, row = self.tableau.used[number - 1], self.tableau.stages[number - 1]
         h = casadi.SX.sym("h")
         change, symbols_of = self.change([(row[j], j + 1) for j in used], h, is_carried)
@@ -175,16 +160,7 @@ class ExplicitStages:
     def change(
         self, terms: Sequence[tuple[float, int]], h: Scalar, is_carried: bool
     ) -> tuple[Matrix, dict[str, Sequence[Scalar]]]:
-        """Y1 + h sum_j weight_j K{j}.
-
-        Args:
-            terms: Weight and number of each stage.
-            h: Time step.
-            is_carried: Whether Y1 is an input; the identity otherwise.
-
-        Returns:
-            The derivative, SX (n_y, n_y + n_u), and its symbols by the names of their buffers.
-        """
+        """Y1 + h sum_j weight_j K{j} of (weight, number) terms, and its symbols by buffer name."""
         inputs: dict[str, Sequence[Scalar]] = {}
         start = self.identity
         if is_carried:
@@ -217,16 +193,10 @@ class ExplicitStages:
     def append_pose_change(
         self, program: Program, *, h: str = "h", numbers: Sequence[int]
     ) -> tuple[str, Any]:
-        """Append the calls that turn y{i} and Y{i} into Omega (`increment`) and its derivative by (y, u).
+        """Append the calls that turn y{i} and Y{i} of some stages into Omega (`increment`) and its change.
 
-        Args:
-            program: Program to append to.
-            h: Buffer of the time step.
-            numbers: Stages that the step depends on.
-
-        Returns:
-            The buffer of the derivative's nonzeros, and their pattern (n, n_y + n_u) over the base's n
-            tangent directions.
+        Returns the buffer of its derivative by (y, u) and the pattern (n, n_y + n_u), n being the base's
+        directions.
         """
         field = self.field
         assert field.pose is not None
@@ -263,15 +233,7 @@ class ExplicitStages:
         return previous, product.sparsity()
 
     def linearized_pose(self, pattern: Any) -> tuple[Matrix, Matrix, dict[str, Sequence[Scalar]]]:
-        """Derivatives of the pose update, from what `append_pose_change` left.
-
-        Args:
-            pattern: Sparsity of the derivative of Omega.
-
-        Returns:
-            Derivatives by the pose (n, n) and by (y, u) (n, n_y + n_u), and the symbols that they hold:
-            `increment` and `pose_change`.
-        """
+        """Derivatives of the new pose by pose and (y, u), and their symbols `increment` and `pose_change`."""
         pose = self.field.pose
         assert pose is not None
         increment = symbols("increment", len(pose.directions))
@@ -279,3 +241,19 @@ class ExplicitStages:
         by_pose, by_increment = pose_blocks(pose, pose.full_twist(increment))
         moved = casadi.mtimes(by_increment, pose_change)
         return by_pose, moved, {"increment": increment, "pose_change": pose_change.nonzeros()}
+
+
+def stage_pattern(field: VectorField) -> Any:
+    """Sparsity that contains the derivative of any stage's rates with respect to (y, u)."""
+    y = symbols("y", field.n_y)
+    u = symbols("u", field.n_u)
+    _, by_y, by_u = field.linearized_rates(y, u)
+    direct = casadi.horzcat(by_y.sparsity(), by_u.sparsity())
+    identity = casadi.horzcat(casadi.Sparsity.diag(field.n_y), casadi.Sparsity(field.n_y, field.n_u))
+    pattern = direct
+    while True:
+        product = casadi.mtimes(casadi.DM(by_y.sparsity(), 1), casadi.DM(pattern.unite(identity), 1))
+        grown = direct.unite(casadi.sparsify(product).sparsity())
+        if grown == pattern:
+            return pattern
+        pattern = grown

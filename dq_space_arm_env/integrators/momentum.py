@@ -1,12 +1,12 @@
-"""Methods that keep the momentum of the whole system exactly: any method for vectors, in other coordinates.
+"""Methods that conserve the total momentum exactly: any method for vectors, in other coordinates.
 
-A step changes to coordinates in which the momentum is a state (`momentum_coordinates.py`), lets another
-method advance them, and changes back. Where no wrench acts from outside, the momentum after a step is that
-before it up to the rounding of a single evaluation; a base actuator or a wrench at the tip changes it by the
-impulse that the method computes. The order is that of the method.
+A step changes to coordinates in which the momentum is a state (`momentum_coordinates`), lets another method
+advance them, and changes back. Without external wrenches the momentum is conserved to the rounding of a
+single evaluation; a base actuator or a wrench at the tip changes it by the impulse that the method computes.
+The order is that of the inner method.
 
-A state holds the base's velocity, rounded, so that the momentum recomputed from it at every step wanders like
-the square root of the number of steps. Over millions of steps, `append_walk` hands the momentum on besides.
+A state holds the base's velocity, rounded, so the momentum recomputed from it at every step wanders like the
+square root of the number of steps. Over millions of steps, `append_walk` also hands on the momentum itself.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import casadi
 
 from dq_space_arm_env.algebra import dual_quaternion, poses, quaternion, rotations, screw
 from dq_space_arm_env.algebra.dual_vectors import transform_matrix
+from dq_space_arm_env.algebra.symbolic import matrix, symbols, zeros
 from dq_space_arm_env.algebra.vectors import (
     add,
     matrix_vector,
@@ -27,19 +28,10 @@ from dq_space_arm_env.algebra.vectors import (
 )
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.compiler.symbols import matrix, symbols, zeros
-from dq_space_arm_env.integrators.field import (
-    Integrator,
-    VectorField,
-    composed,
-    graph_inputs,
-    split_state,
-)
-from dq_space_arm_env.integrators.momentum_coordinates import (
-    FreeBaseField,
-    LocalState,
-    MomentumCoordinates,
-)
+from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
+from dq_space_arm_env.dynamics.vector_field import VectorField, composed, split_state
+from dq_space_arm_env.integrators.method import Integrator, graph_inputs
+from dq_space_arm_env.integrators.momentum_coordinates import LocalState, MomentumCoordinates
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -47,21 +39,12 @@ Matrix = Any
 
 
 class MomentumPreserving:
-    """A method for vectors, in coordinates that hold the momentum in place of the base's velocity."""
-
-    has_curvature = False
+    """A method for vectors, in coordinates with the momentum in place of the base's velocity."""
 
     def __init__(self, method: Integrator) -> None:
-        """Take over a method.
-
-        Args:
-            method: One that works for equations of motion without a pose apart.
-        """
         self.method = method
-        self.name, self.order = f"momentum_{method.name}", method.order
 
     def append_step(self, program: Program, field: VectorField) -> None:
-        """Append the calls that turn buffers x, u, h into x_next."""
         coordinates = _coordinates(field)
         x, center, local = _symbols(coordinates)
         start = _start(coordinates, split_state(field, x)[1])
@@ -74,8 +57,8 @@ class MomentumPreserving:
     def append_walk(self, program: Program, field: VectorField) -> None:
         """Append the calls that turn buffers x, momentum, u, h into x_next, momentum_next.
 
-        The momentum is that of `Kernels.momentum`, 6 numbers in inertial axes. It is handed on with what the
-        step adds to it, so that rounding errors of the states never enter it.
+        The momentum is that of `Kernels.momentum`, 6 entries in inertial axes. It is handed on plus the
+        change in the step, so rounding errors of the states never enter it.
         """
         coordinates = _coordinates(field)
         x, center, local = _symbols(coordinates)
@@ -103,7 +86,6 @@ class MomentumPreserving:
         program.call(self._graph("carry_out", coordinates, inputs, outputs))
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
-        """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
         coordinates = _coordinates(field)
         x, center, local = _symbols(coordinates)
         y = split_state(field, x)[1]
@@ -147,7 +129,7 @@ _BUFFERS = {"x": "local", "x_next": "local_next", "A": "local_A", "B": "local_B"
 
 
 def _take_over(program: Program, inner: Program) -> None:
-    """Append the calls of a program that knows the local state as x."""
+    """Append the calls of a program whose x is the local state."""
     for call in inner.calls:
         names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
         buffers = {name: call.bindings.get(name, name) for name in names}
@@ -155,18 +137,18 @@ def _take_over(program: Program, inner: Program) -> None:
 
 
 def _coordinates(field: VectorField) -> MomentumCoordinates:
-    if not isinstance(field, FreeBaseField):
+    if not isinstance(field, SpaceArmField):
         raise TypeError(f"equations {field.name!r} do not tell the momentum of the system")
     return MomentumCoordinates(field)
 
 
 def _symbols(coordinates: MomentumCoordinates) -> tuple[list[Scalar], list[Scalar], list[Scalar]]:
-    """State and center of mass in the base frame at a step's start, local state at its end."""
+    """State and center of mass in the base frame at the start of a step, local state at its end."""
     return symbols("x", coordinates.base.n_x), symbols("c", 3), symbols("z", coordinates.n_y)
 
 
 def _start(coordinates: MomentumCoordinates, y: Scalars) -> dict[str, Scalars]:
-    """The local state at a step's start, and the center of mass in the base frame."""
+    """The local state at the start of a step, and the center of mass in the base frame."""
     linear, angular, center = coordinates.balance.momentum(y)
     zero = (0.0, 0.0, 0.0)
     shape = [y[i] for i in coordinates.shape_indices]
@@ -176,7 +158,7 @@ def _start(coordinates: MomentumCoordinates, y: Scalars) -> dict[str, Scalars]:
 
 
 def _linearized_start(coordinates: MomentumCoordinates, y: Scalars) -> tuple[Matrix, Matrix]:
-    """Derivatives of the local state at a step's start, and of the center of mass, by y."""
+    """Derivatives of the local state at the start of a step, and of the center of mass, by y."""
     momentum, center = coordinates.momentum_jacobian(y)
     identity = casadi.SX.eye(coordinates.base.n_y)
     result = zeros(coordinates.n_y, coordinates.base.n_y)
@@ -188,10 +170,10 @@ def _linearized_start(coordinates: MomentumCoordinates, y: Scalars) -> tuple[Mat
 
 
 def _ending(coordinates: MomentumCoordinates, state: LocalState) -> tuple[Scalars, Scalars, Scalars]:
-    """Linear and angular momentum and twist of the base in its axes at a step's end.
+    """Linear and angular momentum and twist of the base in its axes at the end of a step.
 
-    Each vector is turned as v + 2 r x (...), not by a matrix: the entries of a matrix near 1 are rounded in
-    the same way at every step of a steady rotation, and the momentum would shrink or grow with them.
+    Each vector is rotated as v + 2 r x (...), not by a matrix: the entries of a matrix near 1 round the same
+    way at every step of a steady rotation, and the momentum would shrink or grow with them.
     """
     back = quaternion.conjugate(rotations.exponential(state.rotation))
     linear, angular = (rotations.rotate(back, part) for part in (state.linear, state.angular))
@@ -199,20 +181,14 @@ def _ending(coordinates: MomentumCoordinates, state: LocalState) -> tuple[Scalar
 
 
 def _relative_pose(state: LocalState, before: Scalars, after: Scalars) -> Scalars:
-    """Pose of the base as seen from the step's start.
-
-    Args:
-        state: Local state at the step's end.
-        before: Center of mass in the base frame at the start, 3.
-        after: And at the end.
-    """
+    """Pose of the base seen from the start of the step, given the centers of mass in the base frame."""
     rotation = rotations.exponential(state.rotation)
     position = subtract(add(state.displacement, before), rotations.rotate(rotation, after))
     return poses.from_rotation_and_position(rotation, position)
 
 
 def _left(coordinates: MomentumCoordinates, x: Scalars, before: Scalars, state: LocalState) -> list[Scalar]:
-    """The state after a step that began at x, with the center of mass there."""
+    """The state after a step from x, with the center of mass there."""
     pose = coordinates.base.pose
     end = coordinates.y(state.shape, _ending(coordinates, state)[2], state.joint_rates)
     relative = _relative_pose(state, before, coordinates.balance.momentum(end)[2])
@@ -224,15 +200,9 @@ def _left(coordinates: MomentumCoordinates, x: Scalars, before: Scalars, state: 
 def _linearized_left(
     coordinates: MomentumCoordinates, state: LocalState, before: Scalars
 ) -> tuple[Matrix, Matrix, Matrix]:
-    """Derivatives of the state after a step, in tangent coordinates.
+    """Derivatives of the new state, in tangent coordinates.
 
-    Args:
-        coordinates: The coordinates.
-        state: Local state at the step's end.
-        before: Center of mass in the base frame at the start, 3.
-
-    Returns:
-        By the pose at the start; by the local state at the end; and by the center of mass at the start.
+    By the pose at the start, by the local state at the end, and by the center of mass at the start.
     """
     field, change = coordinates.base, casadi.SX.eye(coordinates.n_y)
     linear, angular, twist = _ending(coordinates, state)

@@ -1,13 +1,13 @@
-"""Coordinates in which the momentum of the whole system is a state, and the base's velocity is not.
+"""Coordinates with the momentum of the whole system in place of the base's velocity.
 
-They are local to a step, seen from the base's frame at its start ("start axes"):
+They are local to a step, seen from the base frame at its start ("start axes"):
 
     rotation of the base (rotation vector), joint and wrist angles, displacement of the system's center of
     mass, linear momentum, angular momentum about the center of mass, joint rates.
 
 The base's angular velocity follows from the angular momentum, the joint rates and the locked inertia, its
-place from the center of mass. Without an external wrench both momenta have the time derivative zero, so that
-any method that adds multiples of derivatives keeps them exactly, and the center of mass moves on an exact
+position from the center of mass. Without an external wrench both momenta have time derivative zero: any
+method that adds multiples of derivatives conserves them exactly, and the center of mass moves on an exact
 straight line.
 """
 
@@ -16,10 +16,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra.symbolic import column, columns, symbols, zeros
 from dq_space_arm_env.algebra.vectors import (
     add,
     cross,
@@ -30,104 +31,39 @@ from dq_space_arm_env.algebra.vectors import (
     subtract,
     transposed_matrix_vector,
 )
-from dq_space_arm_env.compiler.symbols import column, columns, symbols, zeros
-from dq_space_arm_env.integrators.field import PoseCoordinates, VectorField, spread
-from dq_space_arm_env.integrators.linearization import DifferentiatedJacobian
+from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
+from dq_space_arm_env.dynamics.vector_field import DifferentiatedJacobian, spread
 
 Scalar = Any
 Scalars = Sequence[Scalar]
 Matrix = Any
 
 # Power series in the squared angle, the highest power first: sin(t) / t, (1 - cos(t)) / t^2, and
-# (1 - (t/2) cot(t/2)) / t^2. What is omitted is of order 10 in the rotation within a step, with factors
+# (1 - (t/2) cot(t/2)) / t^2. The remainder is of order 10 in the rotation within a step, with factors
 # below 3e-8.
 _SINE = tuple((-1.0) ** j / math.factorial(2 * j + 1) for j in reversed(range(5)))
 _COSINE = tuple((-1.0) ** j / math.factorial(2 * j + 2) for j in reversed(range(5)))
 _COTANGENT = (1 / 1209600, 1 / 30240, 1 / 720, 1 / 12)
 
 
-class MomentumBalance(Protocol):
-    """Momentum of a robot, in base axes; y is a state without the pose."""
-
-    @property
-    def mass(self) -> Scalar:
-        """Mass of the whole system, kg."""
-        ...
-
-    @property
-    def springs(self) -> tuple[Sequence[float], Sequence[float]]:
-        """Stiffness [N m/rad] and damping [N m s/rad] of the joints, n each."""
-        ...
-
-    def joint_inertia(self, y: Scalars) -> Sequence[Scalars]:
-        """Inertia that the joints feel while the base floats freely, symmetric (n, n)."""
-        ...
-
-    def momentum(self, y: Scalars) -> tuple[Scalars, Scalars, Scalars]:
-        """Linear momentum, angular momentum about the center of mass, and the center of mass, 3 each."""
-        ...
-
-    def base_twist(self, y: Scalars, linear: Scalars, angular: Scalars) -> list[Scalar]:
-        """The twist of the base, 6, that gives the system a momentum; y's own is not read."""
-        ...
-
-    def external_wrench(self, y: Scalars, u: Scalars) -> tuple[Scalars, Scalars]:
-        """Force, and torque about the base's origin, that act from outside; the number zero where none."""
-        ...
-
-
-@runtime_checkable
-class FreeBaseField(VectorField, Protocol):
-    """Equations of motion of a robot whose base floats freely."""
-
-    @property
-    def pose(self) -> PoseCoordinates:
-        """Coordinates of the pose."""
-        ...
-
-    @property
-    def momentum_balance(self) -> MomentumBalance:
-        """The momentum of the whole system, and what changes it."""
-        ...
-
-    @property
-    def beside_momentum(self) -> FreeBaseField:
-        """The same equations as they are cheapest where the momentum is computed too."""
-        ...
-
-
 @dataclass(frozen=True)
 class LocalState:
-    """The parts of a state in these coordinates; vectors have three numbers, in start axes.
+    """The parts of a state in these coordinates; vectors have 3 entries in start axes."""
 
-    Attributes:
-        rotation: Rotation vector of the base, rad.
-        shape: Joint and wrist angles, rad.
-        displacement: Of the system's center of mass, m.
-        linear: Linear momentum, kg m/s.
-        angular: Angular momentum about the center of mass, kg m^2/s.
-        joint_rates: rad/s.
-    """
-
-    rotation: Scalars
-    shape: Scalars
-    displacement: Scalars
-    linear: Scalars
-    angular: Scalars
-    joint_rates: Scalars
+    rotation: Scalars  # rotation vector of the base, rad
+    shape: Scalars  # joint and wrist angles, rad
+    displacement: Scalars  # of the system's center of mass, m
+    linear: Scalars  # momentum, kg m/s
+    angular: Scalars  # momentum about the center of mass, kg m^2/s
+    joint_rates: Scalars  # rad/s
 
 
 class MomentumCoordinates(DifferentiatedJacobian):
-    """Equations of motion in these coordinates: a `VectorField` without a pose apart."""
+    """Equations of motion in these coordinates: a `VectorField` with the pose as part of y."""
 
     pose = None
 
-    def __init__(self, field: FreeBaseField) -> None:
-        """Lay out the coordinates.
-
-        Args:
-            field: Equations of motion with the base's velocity among the states.
-        """
+    def __init__(self, field: SpaceArmField) -> None:
         self.base, self.balance = field.beside_momentum, field.momentum_balance
         self.name = f"{field.name}_momentum"
         self.parameters, self.n_u = field.parameters, field.n_u
@@ -161,7 +97,7 @@ class MomentumCoordinates(DifferentiatedJacobian):
         )
 
     def joined(self, state: LocalState) -> list[Scalar]:
-        """Put the parts of a state together; the inverse of `parts`."""
+        """Join the parts of a state; the inverse of `parts`."""
         return [
             *(state.rotation[i] for i in self.turning),
             *state.shape,
@@ -172,7 +108,7 @@ class MomentumCoordinates(DifferentiatedJacobian):
         ]
 
     def y(self, shape: Scalars, twist: Scalars, joint_rates: Scalars) -> list[Scalar]:
-        """A state of the given equations of motion, without the pose."""
+        """A state of the given equations, without the pose."""
         result = spread(shape, self.shape_indices, self.base.n_y)
         for index, direction in zip(self.base.pose.twist_indices, self.base.pose.directions, strict=True):
             result[index] = twist[direction]
@@ -196,7 +132,7 @@ class MomentumCoordinates(DifferentiatedJacobian):
         return omega, self.y(state.shape, [*omega, 0.0, 0.0, 0.0], state.joint_rates)
 
     def _momentum_rates(self, state: LocalState, u: Scalars) -> tuple[Scalars, Scalars]:
-        """What the external wrench changes, in start axes."""
+        """Rates of both momenta due to the external wrench, in start axes."""
         y = self.y(state.shape, [0.0] * 6, state.joint_rates)
         force, torque = self.balance.external_wrench(y, u)
         about_center = subtract(torque, cross(self.balance.momentum(y)[2], force))
@@ -204,15 +140,6 @@ class MomentumCoordinates(DifferentiatedJacobian):
         return matrix_vector(attitude, force), matrix_vector(attitude, about_center)
 
     def rates(self, y: Scalars, u: Scalars) -> list[Scalar]:
-        """Time derivative of a state.
-
-        Args:
-            y: State in these coordinates, n_y.
-            u: Input, n_u.
-
-        Returns:
-            n_y rates.
-        """
         state = self.parts(y)
         omega, moving = self._moving(state)
         return self._joined_rates(state, omega, self.base.rates(moving, u), u)
@@ -233,15 +160,8 @@ class MomentumCoordinates(DifferentiatedJacobian):
     def linearized_rates(self, y: Scalars, u: Scalars) -> tuple[list[Scalar], Matrix, Matrix]:
         """Time derivative of a state and its Jacobians.
 
-        The Jacobians of the given equations of motion are taken over; the angular velocity changes by what
-        keeps the momentum.
-
-        Args:
-            y: State in these coordinates, n_y expressions.
-            u: Input, n_u expressions.
-
-        Returns:
-            Rates (n_y), Jacobian with respect to y (n_y, n_y), Jacobian with respect to u (n_y, n_u).
+        The Jacobians of the given equations are reused; the angular velocity varies so as to conserve the
+        momentum.
         """
         free, inputs = symbols("z", self.n_y), symbols("w", self.n_u)
         both = column(*free, *inputs)
@@ -275,14 +195,7 @@ class MomentumCoordinates(DifferentiatedJacobian):
         return casadi.vertsplit(value), jacobian[:, : self.n_y], jacobian[:, self.n_y :]
 
     def momentum_jacobian(self, y: Scalars) -> tuple[Matrix, Matrix]:
-        """Derivatives, by a given y, of the momentum and of the center of mass in base axes.
-
-        Args:
-            y: State of the given equations without the pose, expressions.
-
-        Returns:
-            SX (6, n) of linear and angular momentum, and SX (3, n).
-        """
+        """Derivatives by y of the momentum, SX (6, n), and the center of mass, SX (3, n), in base axes."""
         free = symbols("v", self.base.n_y)
         linear, angular, center = self.balance.momentum(free)
         jacobians = [
@@ -292,16 +205,7 @@ class MomentumCoordinates(DifferentiatedJacobian):
         return casadi.sparsify(momentum), casadi.sparsify(center)
 
     def twist_change(self, y: Scalars, momentum: Matrix, local: Matrix) -> Matrix:
-        """Change of the base's twist.
-
-        Args:
-            y: State of the given equations without the pose.
-            momentum: Changes of linear and angular momentum in base axes, SX (6, m).
-            local: Changes of the state in these coordinates, SX (n_y, m), of which shape and rates count.
-
-        Returns:
-            SX (6, m).
-        """
+        """Change of the base's twist, SX (6, m), for m changes of momentum (base axes) and local state."""
         by_y = self.momentum_jacobian(y)[0]
         right = momentum - casadi.mtimes(by_y[:, self.shape_indices], local[self.shape, :])
         right = right - casadi.mtimes(by_y[:, self.joint_indices], local[self.joint_rates, :])
@@ -324,14 +228,7 @@ def _series(x: Scalar, coefficients: tuple[float, ...]) -> Scalar:
 
 
 def rotation_matrix(rotation: Scalars) -> list[list[Scalar]]:
-    """Rotation matrix of a rotation vector, by power series for rotations within a step.
-
-    Args:
-        rotation: Rotation vector, 3, rad.
-
-    Returns:
-        Matrix 3x3, from rotated axes to those from which they were rotated.
-    """
+    """Rotation matrix of a rotation vector, by power series for rotations within a step."""
     square = dot(rotation, rotation)
     sine = scale(_series(square, _SINE), rotation)
     cosine = scale(_series(square, _COSINE), rotation)
@@ -344,15 +241,7 @@ def rotation_matrix(rotation: Scalars) -> list[list[Scalar]]:
 
 
 def rotation_rate(rotation: Scalars, angular_velocity: Scalars) -> Scalars:
-    """Time derivative of the rotation vector, dexp^-1, by power series for rotations within a step.
-
-    Args:
-        rotation: Rotation vector, 3, rad.
-        angular_velocity: In the axes of the rotated frame, 3, rad/s.
-
-    Returns:
-        3 numbers, rad/s.
-    """
+    """Time derivative of the rotation vector, dexp^-1, by power series; angular velocity in rotated axes."""
     once = cross(rotation, angular_velocity)
     twice = cross(rotation, once)
     factor = _series(dot(rotation, rotation), _COTANGENT)

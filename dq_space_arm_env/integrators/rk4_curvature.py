@@ -1,18 +1,18 @@
-"""Second derivatives of the Runge-Kutta-Munthe-Kaas step, stage by stage.
+"""Second derivatives of the classical Runge-Kutta-Munthe-Kaas step, stage by stage.
 
 The step is a composition: stage s starts from y_s = y + a_s h k_{s-1} and has the rates k_s = f(y_s, u); the
 pose moves with Omega, which depends on the twists of the four stages. First derivatives Z_s of (y_s, u) are
-carried forward, multipliers mu_s of k_s and nu_s of y_s backward, nu_s = f_y' mu_s + tau_s with the gradient
-tau_s through the twist of the stage. Then the second derivative is
+propagated forward, multipliers mu_s of k_s and nu_s of y_s backward, nu_s = f_y' mu_s + tau_s with the
+gradient tau_s through the twist of the stage. Then the second derivative is
 
     sum_s Z_s' H_s Z_s + (terms of pairs of twists) + (terms of twists and pose),   H_s = mu_s . f_zz,
 
-because nothing else than f and the pose update is curved.
+because only f and the pose update are curved.
 
-It is collected as X, which is added to its transpose at the end, so each mixed derivative may stand on either
-side of the diagonal. It stands in the row of the state that couples with more others: the rows of the inputs
-and of the base's linear velocity stay empty then, and with them half of the work is saved. B_s is H_s in this
-form, and C_s holds what the pairs of twists add to the same rows: X = sum_s Z_s' (B_s Z_s + C_s).
+It is accumulated as X, which is added to its transpose at the end, so each mixed derivative may stand on
+either side of the diagonal. It stands in the row of the state that couples with more others: the rows of the
+inputs and of the base's linear velocity stay empty, which saves half of the work. B_s is H_s in this form,
+and C_s holds the contribution of the pairs of twists to the same rows: X = sum_s Z_s' (B_s Z_s + C_s).
 """
 
 from __future__ import annotations
@@ -23,13 +23,15 @@ from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra.symbolic import column, symbols, zeros
 from dq_space_arm_env.compiler.graph import graph_of, trace
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.compiler.symbols import column, symbols, zeros
-from dq_space_arm_env.integrators.curvature import upper_triangle
-from dq_space_arm_env.integrators.field import TwiceDifferentiableField, graph_inputs, split_state
-from dq_space_arm_env.integrators.rk4_pose_curvature import TwistCurvature, twist_curvature
-from dq_space_arm_env.integrators.rk4_stages import OFFSETS, WEIGHTS, stage_pattern, stage_twists
+from dq_space_arm_env.dynamics.vector_field import TwiceDifferentiableField, split_state
+from dq_space_arm_env.integrators.explicit_stages import stage_pattern
+from dq_space_arm_env.integrators.method import graph_inputs
+from dq_space_arm_env.integrators.munthe_kaas import TwistCurvature, stage_twists, twist_curvature
+from dq_space_arm_env.integrators.pose_update import upper_triangle
+from dq_space_arm_env.integrators.tableaus import RK4_OFFSETS, RK4_WEIGHTS
 
 Scalar = Any
 Matrix = Any
@@ -38,14 +40,10 @@ STAGES = range(1, 5)
 
 
 class StepCurvature:
-    """The graphs of one field; `append` calls them in order."""
+    """The graphs for one field; `append` calls them in order."""
 
     def __init__(self, field: TwiceDifferentiableField) -> None:
-        """Find out which entries can be nonzero, and on which side of the diagonal they stand.
-
-        Args:
-            field: The equations of motion.
-        """
+        """Find the structural nonzeros, and the side of the diagonal on which they stand."""
         self.field = field
         self.twist = list(field.pose.twist_indices)
         n_y, n_u = field.n_y, field.n_u
@@ -74,14 +72,7 @@ class StepCurvature:
         self.sum = self._stage_sum(*self._stage_symbols()).sparsity()
 
     def append(self, program: Program) -> Any:
-        """Append all calls.
-
-        Args:
-            program: Has the buffers x, u, h, multiplier.
-
-        Returns:
-            Sparsity pattern of the upper triangle in buffer `curvature`.
-        """
+        """Append all calls; x, u, h, multiplier are buffers. Returns the pattern of `curvature`."""
         program.call(self._offsets())
         jacobians, sensitivity = self._jacobians(), self._sensitivity()
         for s in STAGES:
@@ -134,11 +125,11 @@ class StepCurvature:
         return pattern
 
     def _offsets(self) -> Any:
-        """Times at which stages start, and weights of their rates; stage 5 stands for the end of the step."""
+        """Offsets and weights of the stages, times h; stage 5 stands for the end of the step."""
 
         def times(h: list[Scalar]) -> dict[str, list[Scalar]]:
-            offsets = {f"offset{s}": [a * h[0]] for s, a in enumerate((*OFFSETS, 0.0), start=1)}
-            return offsets | {f"weight{s}": [b * h[0]] for s, b in enumerate(WEIGHTS, start=1)}
+            offsets = {f"offset{s}": [a * h[0]] for s, a in enumerate((*RK4_OFFSETS, 0.0), start=1)}
+            return offsets | {f"weight{s}": [b * h[0]] for s, b in enumerate(RK4_WEIGHTS, start=1)}
 
         return trace(f"{self.field.name}_rk4_times", {"h": 1}, times)
 
@@ -195,8 +186,8 @@ class StepCurvature:
     def _pose(self) -> Any:
         """Graph of the derivatives of multiplier . (new pose) with respect to the twists of the stages.
 
-        Gradients tau_s; Hessian blocks W_st, in half for s = t; and D_s, with respect to the old pose and the
-        twist of stage s.
+        Gradients tau_s; Hessian blocks W_st, in half for s = t; and D_s, by the old pose and the twist of
+        stage s.
         """
         field = self.field
         x, h = symbols("x", field.n_x), casadi.SX.sym("h")
@@ -240,14 +231,14 @@ class StepCurvature:
         )
 
     def _twist_pairs(self) -> Any:
-        """Graph of C_s: what second derivatives by two twists add to the rows of stage s."""
+        """Graph of C_s: contributions of second derivatives by two twists to the rows of stage s."""
         field, n = self.field, len(self.twist)
         blocks = {(s, t): casadi.SX.sym(f"W{s}{t}", self.twice) for s in STAGES for t in range(1, s)}
         changes = [casadi.SX.sym(f"K{s}", self.change) for s in STAGES[:-1]]
         h = casadi.SX.sym("h")
         moved = {1: casadi.horzcat(casadi.SX.eye(field.n_y), zeros(field.n_y, field.n_u))[self.twist, :]}
         for s, change in zip(STAGES[1:], changes, strict=True):
-            moved[s] = self._moved(OFFSETS[s - 1] * h, change)[self.twist, :]
+            moved[s] = self._moved(RK4_OFFSETS[s - 1] * h, change)[self.twist, :]
         totals = {s: zeros(n, field.n_y + field.n_u) for s in STAGES}
         for (s, t), block in blocks.items():
             # A mixed derivative that does not stand in a row of stage s stands in one of stage t.
@@ -266,7 +257,7 @@ class StepCurvature:
         return (casadi.SX.sym("offset"), *(casadi.SX.sym(name, p) for name, p in named.items()))
 
     def _stage_sum(self, offset: Scalar, change: Matrix, half: Matrix, pairs: Matrix) -> Matrix:
-        """Z' (B Z + C): with its transpose, what a stage adds to the second derivative."""
+        """Z' (B Z + C): with its transpose, a stage's contribution to the second derivative."""
         n_y, n_u = self.field.n_y, self.field.n_u
         inputs = casadi.horzcat(zeros(n_u, n_y), casadi.SX.eye(n_u))
         start = casadi.vertcat(self._moved(offset, change), inputs)
@@ -275,7 +266,7 @@ class StepCurvature:
         return casadi.sparsify(casadi.mtimes(start.T, casadi.sparsify(product)))
 
     def _congruence(self) -> Any:
-        """Graph that adds a stage to X, and to the second derivative with respect to pose and (y, u)."""
+        """Graph that adds a stage to X, and to the second derivative by pose and (y, u)."""
         offset, change, half, pairs = self._stage_symbols()
         old, by_pose = casadi.SX.sym("X", self.sum), casadi.SX.sym("D", self.by_pose)
         pose_old = casadi.SX.sym("P", self.pose_sum)
@@ -299,7 +290,7 @@ class StepCurvature:
         )
 
     def _total(self) -> tuple[Any, Any]:
-        """Graph that puts everything together, with stage 1, whose start is that of the step."""
+        """Graph of the sum, with stage 1, which starts where the step does."""
         field, n = self.field, len(self.twist)
         later, pose = casadi.SX.sym("X", self.sum), casadi.SX.sym("P", self.pose_sum)
         _, _, half, pairs = self._stage_symbols()
@@ -326,7 +317,7 @@ class StepCurvature:
 
 
 def _union(patterns: Iterable[Any]) -> Any:
-    """Entries that any of the patterns has."""
+    """Union of patterns."""
     first, *others = patterns
     for pattern in others:
         first = first.unite(pattern)

@@ -1,15 +1,15 @@
-"""Rosenbrock methods: as stable as implicit ones, for joints as stiff as one likes, without iterations.
+"""Rosenbrock methods: implicit stability for joints of any stiffness, without iterations.
 
 Each stage solves a linear system with the exact Jacobian J of the equations of motion, and all stages share
 its factors (Hairer & Wanner, Solving Ordinary Differential Equations II, IV.7). Both methods are L-stable: a
 vibration that the step cannot resolve dies within a few steps, and the arm moves on as if locked at its
-springs. Then the order falls to about 3, as for all methods of this kind.
+springs. The order then drops to about 3, as for all methods of this kind.
 
-Two limits. While a vibration dies that a step cannot resolve, the momentum changes: by a thousandth of it for
-joints of 0.4 rad/s, at once. And the torque of spring and damper at the start of a step must not be so large
-that it alone would turn the arm by a radian within gamma h, as a damper of 1e6 N m s/rad does that meets a
-moving joint beside soft ones: J is then no guide to what happens within the step. Of the two methods rodas4
-is the safer one there; rodas5p is the more accurate one for vibrations that the step resolves.
+Two limits. While an unresolved vibration dies, the momentum changes: by a thousandth at once for joints of
+0.4 rad/s. And the torque of spring and damper at the start of a step must not be so large that it alone would
+turn the arm by a radian within gamma h, as when a damper of 1e6 N m s/rad meets a moving joint beside soft
+ones: J is then no guide to the motion within the step. There rodas4 is the safer method; rodas5p is the more
+accurate one for vibrations that the step resolves.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra.symbolic import column, columns, dense_entries, symbols, zeros
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.compiler.symbols import column, columns, dense_entries, symbols, zeros
-from dq_space_arm_env.integrators.field import VectorField, graph_inputs
+from dq_space_arm_env.dynamics.vector_field import VectorField
+from dq_space_arm_env.integrators.method import graph_inputs
 from dq_space_arm_env.integrators.rosenbrock_system import RosenbrockSystem
-from dq_space_arm_env.integrators.rosenbrock_tableaus import RODAS4, RODAS5P, RosenbrockTableau
+from dq_space_arm_env.integrators.rosenbrock_tableaus import RosenbrockTableau
 from dq_space_arm_env.integrators.step_field import StepField
 
 Scalar = Any
@@ -34,21 +35,10 @@ Matrix = Any
 class Rosenbrock:
     """A Rosenbrock method, given by its tableau."""
 
-    has_curvature = False
-
-    def __init__(self, name: str, tableau: RosenbrockTableau) -> None:
-        """Take over the tableau.
-
-        Args:
-            name: Name in the scene file.
-            tableau: Coefficients.
-        """
-        self.name = name
-        self.order = tableau.order
+    def __init__(self, tableau: RosenbrockTableau) -> None:
         self.tableau = tableau
 
     def append_step(self, program: Program, field: VectorField) -> None:
-        """Append the calls that turn buffers x, u, h into x_next."""
         steps = _Graphs(self, StepField(field))
         program.call(steps.first(), stage="stage0")
         stage = steps.stage()
@@ -58,11 +48,11 @@ class Rosenbrock:
         program.call(steps.total())
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
-        """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns.
+        """See `Integrator`.
 
         The derivative D_i of u_i by (y, u) solves a system with the same factors, (1 - gamma h J) D_i = gamma
         h (F_i Z_i + G_i + (J u_i)') + gamma sum c_ij D_j: F_i and G_i are the Jacobians at the stage, Z_i the
-        derivative of where it starts, and (J u_i)' that of J u_i at fixed u_i.
+        derivative of its start, and (J u_i)' that of J u_i at fixed u_i.
         """
         steps = _LinearizedGraphs(self, StepField(field))
         program.call(steps.at_start())
@@ -71,7 +61,7 @@ class Rosenbrock:
         accumulated, (total, a_pattern, b_pattern) = steps.accumulated(), steps.total_change()
         own = ("offset", "carried", "offset_change", "carried_change", "stage", "change")
         for number in range(self.tableau.stages):
-            # What the sums begin with, and all that the first stage takes, is scratch nobody writes: zero.
+            # The sums' initial values and the inputs of the first stage are unwritten scratch: zero.
             if number:
                 program.call(steps.sums(number))
             for earlier in range(number):
@@ -93,11 +83,11 @@ class Rosenbrock:
 
 
 class _Graphs:
-    """The graphs of a step: first stage, sums before a stage, stage, and new state."""
+    """Graphs of a step: first stage, sums before a stage, stage, and new state."""
 
     def __init__(self, method: Rosenbrock, step: StepField) -> None:
         self.step, self.field, self.tableau = step, step.field, method.tableau
-        self.prefix = f"{step.field.name}_{method.name}"
+        self.prefix = f"{step.field.name}_rosenbrock{self.tableau.order}"
         self.x, self.u = symbols("x", self.field.n_x), symbols("u", self.field.n_u)
         self.h = casadi.SX.sym("h")
         self.start = step.start(self.x)
@@ -109,9 +99,9 @@ class _Graphs:
         return graph_of(f"{self.prefix}_{name}", given, outputs)
 
     def first(self) -> Any:
-        """Graph of the factors and of the first stage."""
+        """Graph of the factors and the first stage."""
         scale = self.tableau.gamma * self.h
-        stage = self.system.solve([scale * rate for rate in self.rates])
+        stage = self.system.solve([scale * rate for rate in self.rates])  # (1 - gamma h J) u_1 = gamma h f(y)
         return self._graph("first", {}, {"factor": self.system.variables, "stage": stage})
 
     def stage(self) -> Any:
@@ -120,12 +110,13 @@ class _Graphs:
         offset, carried = symbols("offset", self.step.n_z), symbols("carried", self.step.n_z)
         z = [old + new for old, new in zip(self.start, offset, strict=True)]
         rates, scale = self.step.rates(z, self.u), self.tableau.gamma * self.h
+        # (1 - gamma h J) u_i = gamma h f(y + sum a_ij u_j) + gamma sum c_ij u_j.
         stage = known.solve([scale * rate + other for rate, other in zip(rates, carried, strict=True)])
         inputs = {"factor": known.variables, "offset": offset, "carried": carried}
         return self._graph("stage", inputs, {"stage": stage})
 
     def sums(self, number: int) -> Any:
-        """Graph of what a stage takes from those before: sum a_ij u_j, and gamma sum c_ij u_j."""
+        """Graph of a stage's sums over the earlier ones: sum a_ij u_j, and gamma sum c_ij u_j."""
         starts, gamma = self.tableau.starts, self.tableau.gamma
         stages = [symbols(f"u{i}", self.step.n_z) for i in range(number)]
         inputs = {f"stage{i}": stage for i, stage in enumerate(stages)}
@@ -149,7 +140,7 @@ class _Graphs:
 
 
 class _LinearizedGraphs(_Graphs):
-    """The graphs of a step with the derivatives of its stages by (y, u)."""
+    """Graphs of a step with the derivatives of its stages by (y, u)."""
 
     def __init__(self, method: Rosenbrock, step: StepField) -> None:
         super().__init__(method, step)
@@ -159,7 +150,7 @@ class _LinearizedGraphs(_Graphs):
         self.along_pattern, self.pattern = self._patterns()
 
     def _patterns(self) -> tuple[Any, Any]:
-        """Sparsity of the derivative of J u, and one that the derivative of any stage stays within."""
+        """Sparsity of the derivative of J u, and one that contains the derivative of any stage."""
         n_z, n_y = self.step.n_z, self.field.n_y
         _, by_z, by_u = self.step.linearized_rates(symbols("z", n_z), self.u)
         along = self.step.jacobian_along(
@@ -172,7 +163,7 @@ class _LinearizedGraphs(_Graphs):
         return along.sparsity(), casadi.mtimes(reach, _ones(direct)).sparsity()
 
     def at_start(self) -> Any:
-        """Graph of the factors, and of rates and Jacobians at the start of the step."""
+        """Graph of the factors, rates and Jacobians at the start of the step."""
         outputs = {"factor": self.system.variables, "rates": self.rates}
         outputs |= {"by_z": self.by_z.nonzeros(), "by_u": self.by_u.nonzeros()}
         return self._graph("start", {}, outputs)
@@ -203,7 +194,7 @@ class _LinearizedGraphs(_Graphs):
         return self._graph("change", inputs, {"change": change.nonzeros()})
 
     def coefficients(self) -> Any:
-        """Graph of the constants that `accumulated` takes: a_ij and gamma c_ij for stages i and j < i."""
+        """Graph of the constants of `accumulated`: a_ij and gamma c_ij for stages i and j < i."""
         rows = zip(self.tableau.starts, self.tableau.couplings, strict=True)
         gamma = self.tableau.gamma
         outputs = {
@@ -214,7 +205,7 @@ class _LinearizedGraphs(_Graphs):
         return graph_of(f"{self.prefix}_coefficients", {}, outputs)
 
     def accumulated(self) -> Any:
-        """Graph that adds what one stage gives to the derivatives of the sums of a later one."""
+        """Graph that adds a stage's contribution to the derivatives of the sums of a later one."""
         names = ("offset", "carried", "change")
         offset, carried, change = (casadi.SX.sym(name, self.pattern) for name in names)
         weights = symbols("weight", 2)
@@ -253,6 +244,3 @@ def _combined(weights: Sequence[float], vectors: Sequence[Sequence[Scalar]]) -> 
 def _ones(pattern: Matrix) -> Any:
     """Ones where a matrix has entries."""
     return casadi.DM(pattern.sparsity(), 1.0)
-
-
-RODAS_METHODS = (Rosenbrock("rodas4", RODAS4), Rosenbrock("rodas5p", RODAS5P))

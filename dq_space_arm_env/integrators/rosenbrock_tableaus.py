@@ -17,19 +17,12 @@ Row = tuple[float, ...]
 
 @dataclass(frozen=True)
 class RosenbrockTableau:
-    """Coefficients of a method with s stages.
-
-    Attributes:
-        order: Order of convergence.
-        gamma: The number that all stages share.
-        starts: a_ij, s rows, row i of i numbers.
-        couplings: c_ij, s rows, row i of i numbers.
-    """
+    """Coefficients of a method with s stages."""
 
     order: int
-    gamma: float
-    starts: tuple[Row, ...]
-    couplings: tuple[Row, ...]
+    gamma: float  # shared by all stages
+    starts: tuple[Row, ...]  # a_ij, s rows, row i of i numbers
+    couplings: tuple[Row, ...]  # c_ij, s rows, row i of i numbers
 
     @property
     def stages(self) -> int:

@@ -1,13 +1,13 @@
 """A linearly implicit method for stiff joints: springs and dampers implicit, everything else explicit.
 
-A W-method keeps its order with any matrix in place of the Jacobian; what is stiff should be in it. In
-coordinates that hold the momentum in place of the base's velocity (`momentum_coordinates.py`), the stiff part
-of the equations of motion is the block of the joints,
+A W-method keeps its order with any matrix in place of the Jacobian, which should contain whatever is stiff.
+In coordinates with the momentum in place of the base's velocity (`momentum_coordinates`), the stiff part of
+the equations of motion is the block of the joints,
 
     angles' = rates,    S rates' = -K angles - D rates + ...,
 
 with the inertia S that the joints feel on the free base. Each stage solves a system of one unknown per joint,
-with the positive definite matrix S + h g D + (h g)^2 K, factorized once in a step: the method costs little
+with the positive definite matrix S + h g D + (h g)^2 K, factorized once per step: the method costs little
 more than an explicit one of as many stages.
 
 ROS34PW2 of Rang & Angermann, New Rosenbrock W-methods of order 3 for partial differential algebraic equations
@@ -17,15 +17,17 @@ of index 1, BIT 45 (2005): four stages, order 3 with any matrix, L-stable, stiff
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra.symbolic import column, columns, matrix, symbols, zeros
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.compiler.symbols import column, columns, matrix, symbols, zeros
 from dq_space_arm_env.dynamics.linear import LDLFactor, factorize_ldl, solve_ldl
-from dq_space_arm_env.integrators.field import VectorField, graph_inputs
+from dq_space_arm_env.dynamics.vector_field import VectorField
+from dq_space_arm_env.integrators.method import graph_inputs
+from dq_space_arm_env.integrators.momentum_coordinates import MomentumCoordinates
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -33,12 +35,7 @@ Matrix = Any
 
 # Stage i solves (1 - h GAMMA J) k_i = h f(y + sum_j ALPHA[i][j] k_j) + h J sum_j GAMMAS[i][j] k_j.
 GAMMA = 0.43586652150845900
-ALPHA = (
-    (),
-    (0.87173304301691801,),
-    (0.84457060015369423, -0.11299064236484185),
-    (0.0, 0.0, 1.0),
-)
+ALPHA = ((), (0.87173304301691801,), (0.84457060015369423, -0.11299064236484185), (0.0, 0.0, 1.0))
 GAMMAS = (
     (),
     (-0.87173304301691801,),
@@ -49,40 +46,13 @@ WEIGHTS = (0.24212380706095346, -1.2232505839045147, 1.5452602553351020, GAMMA)
 STAGES = range(1, 5)
 
 
-@runtime_checkable
-class StiffField(VectorField, Protocol):
-    """Equations of motion that tell their stiff part.
-
-    Attributes:
-        stiff_angles: Entries of y that springs act on.
-        stiff_rates: Entries of y with the rates of these.
-        stiffness: K, one number for each, N m/rad.
-        damping: D, one number for each, N m s/rad.
-    """
-
-    stiff_angles: Sequence[int]
-    stiff_rates: Sequence[int]
-    stiffness: Sequence[float]
-    damping: Sequence[float]
-
-    def joint_inertia(self, y: Scalars) -> Sequence[Scalars]:
-        """S, symmetric (n, n): its inverse times joint torques gives the accelerations that they cause."""
-        ...
-
-
 class RosenbrockW:
     """ROS34PW2 with the springs and dampers of the joints as its matrix."""
 
-    name = "rosenbrock"
-    order = 3
-    has_curvature = False
-
     def append_step(self, program: Program, field: VectorField) -> None:
-        """Append the calls that turn buffers x, u, h into x_next."""
         _Stages(field).append_step(program)
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
-        """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
         return _Stages(field).append_linearization(program)
 
 
@@ -90,7 +60,7 @@ class _Stages:
     """The graphs of a step."""
 
     def __init__(self, field: VectorField) -> None:
-        if not isinstance(field, StiffField):
+        if not isinstance(field, MomentumCoordinates):
             raise TypeError(f"equations {field.name!r} do not tell which part of them is stiff")
         self.field = field
         self.angles, self.rates = list(field.stiff_angles), list(field.stiff_rates)
@@ -135,7 +105,7 @@ class _Stages:
         return [symbols(f"k{s}", self.n_y) for s, _ in enumerate(coefficients, start=1)]
 
     def _moved(self, y: Scalars, coefficients: Sequence[float], stages: Sequence[Scalars]) -> list[Scalar]:
-        """Y + sum of coefficients times increments."""
+        """Add multiples of the increments to y."""
         moved = list(y)
         for factor, k in zip(coefficients, stages, strict=True):
             if factor:
@@ -143,7 +113,7 @@ class _Stages:
         return moved
 
     def _prepare(self) -> Any:
-        """Graph of S at the step's start and of the factors of S + h g D + (h g)^2 K."""
+        """Graph of S at the start of the step, and of the factors of S + h g D + (h g)^2 K."""
         y, hg = symbols("x", self.n_y), GAMMA * self.h
         inertia = self.field.joint_inertia(y)
         system = [list(row) for row in inertia]
@@ -166,7 +136,7 @@ class _Stages:
         return inputs | {"inertia": self.inertia, "lower": self.lower, "inverse": self.inverse}
 
     def _combination(self, number: int) -> Any:
-        """Graph of where a stage evaluates the rates, and of what its matrix acts on besides."""
+        """Graph of a stage's argument of the rates, and of the vector that its matrix acts on."""
         y, stages = symbols("x", self.n_y), self._increments(ALPHA[number - 1])
         held = self._moved([0.0] * self.n_y, GAMMAS[number - 1], stages)
         outputs = {
@@ -211,7 +181,7 @@ class _Stages:
         return total
 
     def _pattern(self) -> Any:
-        """Sparsity that K stays within at every stage; the solution mixes the rows of the joints."""
+        """Sparsity that contains K at every stage; the solution mixes the rows of the joints."""
         y, u = symbols("y", self.n_y), symbols("u", self.n_u)
         _, by_y, by_u = self.field.linearized_rates(y, u)
         direct = casadi.horzcat(casadi.DM(by_y.sparsity(), 1), casadi.DM(by_u.sparsity(), 1))
@@ -279,7 +249,7 @@ class _Stages:
         return column(*solve_ldl(self._factor(), entries)) if right.nnz() else zeros(self.n, 1)
 
     def _inertia_change(self, x: Scalars, vector: Scalars) -> Matrix:
-        """Derivative of S times a constant vector by (y, u) at the step's start."""
+        """Derivative of S times a constant vector by (y, u) at the start of the step."""
         free, weights = symbols("y", self.n_y), symbols("v", self.n)
         products = []
         for row in self.field.joint_inertia(free):

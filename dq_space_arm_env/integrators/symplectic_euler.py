@@ -7,31 +7,28 @@ from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra.symbolic import column, symbols, zeros
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.compiler.symbols import column, symbols, zeros
-from dq_space_arm_env.integrators.curvature import pose_curvature, upper_triangle
-from dq_space_arm_env.integrators.field import (
+from dq_space_arm_env.dynamics.vector_field import (
     PoseCoordinates,
     TwiceDifferentiableField,
     VectorField,
-    graph_inputs,
     split_state,
 )
-from dq_space_arm_env.integrators.linearization import pose_blocks
+from dq_space_arm_env.integrators.method import graph_inputs
+from dq_space_arm_env.integrators.pose_update import pose_blocks, pose_curvature, upper_triangle
 
 Scalar = Any
 
 
 class SymplecticEuler:
-    """Semi-implicit Euler (Hairer, Lubich & Wanner, Geometric Numerical Integration, I.1)."""
+    """Semi-implicit Euler, v+ = v + h a(q, v, u) and q+ = q + h v+.
 
-    name = "symplectic_euler"
-    order = 1
-    has_curvature = True
+    Hairer, Lubich & Wanner, Geometric Numerical Integration, section I.1.
+    """
 
     def append_step(self, program: Program, field: VectorField) -> None:
-        """Append the calls that turn buffers x, u, h into x_next."""
         x, u, h = symbols("x", field.n_x), symbols("u", field.n_u), casadi.SX.sym("h")
         stored, start = split_state(field, x)
         y = self._advance(field, start, u, h, field.rates(start, u))
@@ -42,14 +39,13 @@ class SymplecticEuler:
         program.call(graph)
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
-        """Append the calls that turn x, u, h into the nonzeros of A and B; returns their patterns."""
         x, u, h = symbols("x", field.n_x), symbols("u", field.n_u), casadi.SX.sym("h")
         start_y = split_state(field, x)[1]
         rates, by_y, by_u = field.linearized_rates(start_y, u)
         identity = casadi.SX.eye(field.n_y)
         rate_change = casadi.horzcat(by_y, by_u)
         start = casadi.horzcat(identity, zeros(field.n_y, field.n_u))
-        # New rates first; positions then move with the new rates, whose derivative is already there.
+        # dv+ = dv + h da; positions then move with v+: dq+ = dq + h dv+.
         change = zeros(field.n_y, field.n_y + field.n_u)
         rows = list(field.rate_indices)
         change[rows, :] = start[rows, :] + h * rate_change[rows, :]
@@ -60,6 +56,7 @@ class SymplecticEuler:
         if field.pose is not None:
             increment = self._increment(field.pose, self._advance(field, start_y, u, h, rates), h)
             by_pose, by_increment = pose_blocks(field.pose, increment)
+            # d+ = Ad(exp(-Omega / 2)) d + Jr(Omega) h dv+.
             moved = casadi.mtimes(by_increment, h * change[list(field.pose.twist_indices), :])
             change = casadi.vertcat(moved, change)
             pose_columns = casadi.vertcat(by_pose, zeros(field.n_y, by_pose.shape[1]))
@@ -76,7 +73,6 @@ class SymplecticEuler:
         return a.sparsity(), b.sparsity()
 
     def append_curvature(self, program: Program, field: TwiceDifferentiableField) -> Any:
-        """Append the calls that turn x, u, h, multiplier into `curvature`; returns its pattern."""
         x, u, h = symbols("x", field.n_x), symbols("u", field.n_u), casadi.SX.sym("h")
         n_y, n_u, twist = field.n_y, field.n_u, list(field.pose.twist_indices)
         multiplier = symbols("l", len(twist) + n_y)
@@ -110,7 +106,7 @@ class SymplecticEuler:
     def _advance(
         self, field: VectorField, y: Sequence[Scalar], u: Sequence[Scalar], h: Scalar, rates: list[Scalar]
     ) -> list[Scalar]:
-        """New y: first its velocities, then the rest with the new velocities."""
+        """New y: first its velocities, then the rest from the new velocities."""
         moved = list(y)
         for i in field.rate_indices:
             moved[i] = y[i] + h * rates[i]

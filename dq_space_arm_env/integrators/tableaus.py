@@ -1,7 +1,7 @@
 """Butcher tableaus of explicit Runge-Kutta methods.
 
 Stage i starts at y + h sum_j a_ij k_j and has the rates k_i; a step ends at y + h sum_i b_i k_i. The
-equations of motion do not depend on time, so the abscissas c_i, the sums of the rows, are nowhere needed.
+equations of motion do not depend on time, so the abscissas c_i, the row sums, are not needed.
 """
 
 from __future__ import annotations
@@ -11,23 +11,22 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ButcherTableau:
-    """Coefficients of an explicit method.
-
-    Attributes:
-        order: Order of convergence.
-        stages: For each stage i the weights a_ij of the stages before it; the first row is empty.
-        weights: The weights b_i.
-    """
+    """Coefficients of an explicit method."""
 
     order: int
-    stages: tuple[tuple[float, ...], ...]
-    weights: tuple[float, ...]
+    stages: tuple[tuple[float, ...], ...]  # for stage i the a_ij of earlier stages; the first row is empty
+    weights: tuple[float, ...]  # b_i
 
     @property
     def used(self) -> tuple[tuple[int, ...], ...]:
-        """For each stage the numbers of the stages whose rates it starts from; stages count from 0."""
+        """For each stage, the numbers (from 0) of the stages it starts from."""
         return tuple(tuple(j for j, weight in enumerate(row) if weight) for row in self.stages)
 
+
+# The classical method (W. Kutta, 1901), whose stages each start from the one before: stage i starts at
+# y + RK4_OFFSETS[i] h k_{i-1}, and the step is h sum_i RK4_WEIGHTS[i] k_i.
+RK4_OFFSETS = (0.0, 0.5, 0.5, 1.0)
+RK4_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
 # M. Calvo, J. I. Montijano & L. Randez, A new embedded pair of Runge-Kutta formulas of orders 5 and 6,
 # Computers Math. Applic. 20 (1990): the formula of order 6, without the ninth stage that only its error

@@ -1,8 +1,7 @@
-"""A scene's dynamics as CasADi functions, for optimal control and estimation of one's own.
+"""A scene's dynamics as CasADi functions, for your own optimal control and estimation.
 
-They are the graphs that the compiler turns into machine code, turned back into CasADi expressions: the same
-operations on the same constants. CasADi differentiates them, and they go wherever its functions go: `Opti`,
-`nlpsol`, generated C.
+They hold the operations and constants of the compiled kernels. CasADi differentiates them, and they work
+wherever its functions do: `Opti`, `nlpsol`, generated C.
 """
 
 from __future__ import annotations
@@ -16,10 +15,9 @@ import casadi
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.compiler.graph import Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
-from dq_space_arm_env.integrators import INTEGRATORS
-from dq_space_arm_env.integrators.field import split_state
-from dq_space_arm_env.kernels.programs import ScenePrograms
-from dq_space_arm_env.scene import ADAPTIVE_INTEGRATORS, Scene, StateLayout
+from dq_space_arm_env.dynamics.vector_field import split_state
+from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
+from dq_space_arm_env.scene import INTEGRATORS, Scene, StateLayout
 from dq_space_arm_env.validation import did_you_mean
 
 Scalar = Any
@@ -30,8 +28,8 @@ class CasadiDynamics:
     """A scene's equations as `casadi.Function`s of dense columns, in double precision.
 
     States, inputs and units are those of `layout`. The inputs are not clipped to their limits,
-    `layout.control_limit`. Nothing normalizes the pose q_{e0/I}: a state that a solver is free to choose has
-    to be held at |q_r| = 1, q_r . q_d = 0, which `step` and the flow of `xdot` keep.
+    `layout.control_limit`. Nothing normalizes the pose q_{e0/I}: constrain a state that a solver may
+    choose to |q_r| = 1, q_r . q_d = 0, which `step` and the flow of `xdot` preserve.
 
     Attributes:
         scene: The scene.
@@ -75,7 +73,7 @@ def casadi_dynamics(scene: Scene, integrator: str | None = None) -> CasadiDynami
             f"integrator: {name!r} is unknown; {did_you_mean(name, INTEGRATORS)}It must be one of "
             f"{', '.join(INTEGRATORS)}"
         )
-    if name in ADAPTIVE_INTEGRATORS:
+    if INTEGRATORS[name].is_adaptive:
         raise ValueError(
             f"integrator: {name!r} divides a step as far as its tolerances ask, which CasADi cannot "
             "differentiate; give one with a fixed number of stages, for example integrator='rk8'"
@@ -109,7 +107,7 @@ def _state_derivative(programs: ScenePrograms) -> Program:
 
 
 def _function(program: Program) -> casadi.Function:
-    """A program without loops as a function of columns."""
+    """Convert a program without loops to a function of columns."""
     buffers = {name: [casadi.SX(0.0)] * size for name, size in program.scratch_sizes().items()}
     inputs = {buffer.name: casadi.SX.sym(buffer.name, buffer.size) for buffer in program.inputs}
     for name, column in inputs.items():
@@ -125,7 +123,7 @@ def _function(program: Program) -> casadi.Function:
 
 
 def _evaluated(graph: Graph, arguments: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
-    """Outputs of a graph, expression by expression."""
+    """Evaluate a graph node by node."""
     values: list[Scalar] = []
     for node in graph.nodes:
         if node.operation == "constant":

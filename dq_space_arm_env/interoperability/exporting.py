@@ -1,4 +1,4 @@
-"""What the exports to URDF and MJCF share: numbers as text, names, and what the formats cannot say."""
+"""Shared by the exports to URDF and MJCF: numbers as text, names, and features that the formats lack."""
 
 from __future__ import annotations
 
@@ -10,47 +10,20 @@ from dq_space_arm_env.scene import Scene, SceneError
 
 
 def words(numbers: Iterable[float]) -> str:
-    """Numbers separated by blanks, with all their digits.
-
-    Args:
-        numbers: The numbers.
-
-    Returns:
-        The text.
-    """
+    """Write numbers with all their digits, separated by blanks."""
     # Adding zero turns -0.0 into 0.0, and whole numbers lose their ".0".
     return " ".join(repr(float(number) + 0.0).removesuffix(".0") for number in numbers)
 
 
 def free_name(wanted: str, taken: Collection[str]) -> str:
-    """A name that nobody has.
-
-    Args:
-        wanted: The name to begin with.
-        taken: Names that are in use.
-
-    Returns:
-        The name, with as many underscores appended as it takes.
-    """
+    """Append underscores to a name until it is free."""
     while wanted in taken:
         wanted += "_"
     return wanted
 
 
 def refuse(scene: Scene, language: str, wrist: str, *, springs: bool = False, planar: bool = False) -> None:
-    """Refuse a scene whose robot cannot be written down without changing how it moves.
-
-    Args:
-        scene: A validated scene.
-        language: Name of the format.
-        wrist: What the user wants for a wrist, "refuse" or "fixed".
-        springs: Whether the format has no joint springs.
-        planar: Whether the format has no base that moves in a plane.
-
-    Raises:
-        SceneError: If the scene holds anything of that kind; the message says what to do.
-        ValueError: If `wrist` is something else.
-    """
+    """Refuse a scene that the format cannot represent without changing its motion."""
     if wrist not in ("refuse", "fixed"):
         raise ValueError(f"wrist: {wrist!r}, it must be 'refuse' or 'fixed'")
     problems = []
@@ -71,14 +44,7 @@ def refuse(scene: Scene, language: str, wrist: str, *, springs: bool = False, pl
 
 
 def tip_from_last_link(scene: Scene) -> tuple[float, ...]:
-    """Pose of the tip in the last link's frame (without links: the base's), the wrist at its initial angles.
-
-    Args:
-        scene: A validated scene.
-
-    Returns:
-        Unit dual quaternion, 8 numbers, m.
-    """
+    """Pose of the tip in the last link's (or the base's) frame, with the wrist at its initial angles."""
     if scene.wrist is None:
         return scene.tip.dual_quaternion
     turned = wrist_rotation(scene.initial_state.wrist_angles)

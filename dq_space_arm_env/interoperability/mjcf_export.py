@@ -1,4 +1,4 @@
-"""A scene's robot as MJCF, the language of MuJoCo."""
+"""A scene's robot as MJCF, MuJoCo's format."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _TORQUE_GEARS = ("0 0 0 1 0 0", "0 0 0 0 1 0", "0 0 0 0 0 1")
 def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
     """Write a scene's robot as MJCF.
 
-    There is no gravity and no shape, so nothing collides and nothing but frames and inertias can be seen.
+    There is no gravity, and there are no shapes: nothing collides, and only frames and inertias are visible.
     Body `base` has the frame e0 and a free joint, called `base joint`; in a planar scene it slides along x
     and y and turns about z. Each link is a body with the frame of its joint, a hinge about z called by the
     link's name and " joint", with the scene's damping and spring and no armature. Site `tip` has the frame G,
-    body `payload` is what the tip holds.
+    body `payload` is held at the tip.
 
     Actuators are motors with the names, limits and order of the scene's inputs, without the wrist's rates;
     forces and torques act in base axes at e0. MuJoCo clips controls at the limits, the scene's kernels do
@@ -35,12 +35,12 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     State: with (w, v) the base twist in base axes, R from base to inertial axes, MuJoCo's free joint has
     qpos = (position, quaternion scalar first) and qvel = (R v, w), and qacc = (R (dv + w x v), dw).
 
-    The massless wrist as three joints would have infinite accelerations; fixed at the start's angles it
+    The massless wrist as three joints would have infinite accelerations; fixed at its initial angles it
     changes no acceleration, but the tip cannot turn.
 
     Args:
         scene: A validated scene.
-        wrist: What happens to a wrist: "refuse" makes it an error, "fixed" writes it at its initial angles.
+        wrist: "refuse" makes a wrist an error, "fixed" writes it at its initial angles.
 
     Returns:
         The MJCF text, all numbers with 17 digits, in m, kg, s, rad.
@@ -91,7 +91,7 @@ def _placed(pose: Sequence[float]) -> dict[str, str]:
 
 
 def _add_inertial(parent: Element, body: Base | Link | Payload, center_of_mass: Sequence[float]) -> None:
-    """Mass properties, with the principal axes found here: MuJoCo's own search stops at 1e-12 kg m^2."""
+    """Add mass properties about principal axes; MuJoCo's own search for them stops at 1e-12 kg m^2."""
     inertia = np.array(body.inertia)
     moments, axes = np.diag(inertia), np.eye(3)
     if np.any(inertia != np.diag(moments)):

@@ -1,7 +1,4 @@
-"""A scene's robot as a Pinocchio model, and what turns states and inputs into Pinocchio's and back.
-
-Pinocchio is optional, `pip install pin`; it is imported when a model is asked for.
-"""
+"""A scene's robot as a Pinocchio model (`pip install pin`); conversions of states and inputs."""
 
 from __future__ import annotations
 
@@ -14,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.chain import Chain, Placement, RigidBody
+from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.interoperability.exporting import tip_from_last_link
-from dq_space_arm_env.kernels.motion import EquationsOfMotion
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.start import PLANAR_POSE
 
@@ -23,11 +20,11 @@ Array = NDArray[np.float64]
 
 
 def pinocchio_model(scene: Scene) -> Any:
-    """Build a scene's robot as a `pinocchio.Model`, for cross-checks and for what Pinocchio computes.
+    """Build a scene's robot as a `pinocchio.Model`.
 
     Joint `base` is a free flyer (planar scenes: a planar joint) with the frame e0, at the center of mass;
     each link has a joint about z, called by its name. There is no gravity; limits are not set. Frame `tip` is
-    G, a wrist being at its initial angles. `to_pinocchio` and `generalized_forces` give the arguments of
+    G, with the wrist at its initial angles. `to_pinocchio` and `generalized_forces` give the arguments of
     Pinocchio's algorithms: `pinocchio.aba(model, data, q, v, tau)` is (dv, dw, joint accelerations), where
     (dw, dv) are the scene's base accelerations.
 
@@ -121,9 +118,7 @@ def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: Array
 
 
 def generalized_forces(scene: Scene, x: ArrayLike, u: ArrayLike) -> Array:
-    """Write what acts on a scene's robot as Pinocchio's generalized forces tau.
-
-    They hold the inputs, the joints' springs and dampers, and the constant wrench at the tip.
+    """Collect inputs, joint springs and dampers, and the tip wrench as Pinocchio's generalized forces tau.
 
     Args:
         scene: A validated scene.

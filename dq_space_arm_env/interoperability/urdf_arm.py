@@ -1,8 +1,7 @@
-"""From the tree of a URDF to a free base with a chain of revolute joints: what a scene can be made of.
+"""From the tree of a URDF to a free base with a chain of revolute joints, as a scene has them.
 
-The chain runs from the base link to the tip link. What hangs on it by fixed joints is lumped into the body
-that carries it. Joints are turned about so that their axis is z, and the base's frame is moved to its center
-of mass, as a scene has them.
+The chain runs from the base link to the tip link. Bodies fixed to it are lumped into those that carry them.
+Joint frames are turned until z is the axis, and the base frame moves to the center of mass.
 """
 
 from __future__ import annotations
@@ -15,9 +14,10 @@ import numpy as np
 
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.algebra.quaternion import normalize
-from dq_space_arm_env.interoperability.rigid_body import Array, Body, flaw_of, lumped
+from dq_space_arm_env.interoperability.rigid_body import Array, Body, lumped
 from dq_space_arm_env.interoperability.urdf_elements import MOVABLE, Pose, UrdfJoint, UrdfRobot
 from dq_space_arm_env.scene import SceneError
+from dq_space_arm_env.scene.bodies import flaw_of
 from dq_space_arm_env.validation import did_you_mean
 
 _HERE: Pose = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -26,52 +26,29 @@ _MANY = 60
 
 @dataclass(frozen=True, eq=False)
 class ArmJoint:
-    """A joint of the chain, and the body that it carries.
-
-    Attributes:
-        joint: The joint as the file has it.
-        pose: Pose of the joint's frame, z along the axis, in the frame before, 8 numbers, m.
-        body: The body that turns with it, in the joint's frame.
-    """
+    """A joint of the chain, and the body that it carries."""
 
     joint: UrdfJoint
-    pose: Pose
-    body: Body
+    pose: Pose  # of the joint frame, z along the axis, in the frame before, 8 numbers, m
+    body: Body  # in the joint frame
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A free base with a chain of revolute joints.
+    """A free base with a chain of revolute joints."""
 
-    Attributes:
-        base: The base in its frame e0, whose origin is its center of mass and whose axes are the base link's.
-        base_link: Name of the base link.
-        base_center: Origin of e0 in the base link's frame, shape (3,), m.
-        joints: Joints from base to tip.
-        tip: Pose of the tip link's frame in the last joint's frame, 8 numbers, m.
-        flaws: Of links whose inertia no rigid body has, though the body that they are part of has one.
-    """
-
-    base: Body
+    base: Body  # in e0: origin at the center of mass, axes of the base link
     base_link: str
-    base_center: Array
-    joints: tuple[ArmJoint, ...]
-    tip: Pose
-    flaws: tuple[str, ...]
+    base_center: Array  # origin of e0 in the base link's frame, shape (3,), m
+    joints: tuple[ArmJoint, ...]  # base to tip
+    tip: Pose  # of the tip link in the last joint frame, 8 numbers, m
+    flaws: tuple[str, ...]  # impossible inertias of links that fixed neighbors make up for
 
 
 class UrdfTree:
-    """The links of a robot and what connects them."""
+    """Links and joints of a robot, checked to form one tree."""
 
     def __init__(self, robot: UrdfRobot) -> None:
-        """Check that the joints connect the links into one tree.
-
-        Args:
-            robot: The robot.
-
-        Raises:
-            SceneError: If they do not.
-        """
         self.robot = robot
         self._above: dict[str, UrdfJoint] = {}
         self._joints_at: dict[str, list[UrdfJoint]] = {name: [] for name in robot.links}
@@ -103,7 +80,7 @@ class UrdfTree:
                 raise SceneError(f"URDF: joint {joint.name!r} is part of a loop of joints")
 
     def _below(self, link: str) -> Iterator[str]:
-        """A link, and all that hangs on it."""
+        """A link, and all its descendants."""
         waiting = [link]
         while waiting:
             here = waiting.pop()
@@ -125,23 +102,12 @@ class UrdfTree:
         joint = self.robot.joints.get(link)
         hint = f"it is a joint, which carries link {joint.child!r}; " if joint else ""
         raise SceneError(
-            f"{argument}: {link!r} is no link of {self.robot.name!r}; "
+            f"{argument}: {link!r} is not a link of {self.robot.name!r}; "
             f"{hint or did_you_mean(str(link), self.robot.links)}its links are {_some(self.robot.links)}"
         )
 
     def chain(self, tip: str, base: str) -> list[UrdfJoint]:
-        """The movable joints between two links.
-
-        Args:
-            tip: Name of the last link.
-            base: Name of the first link.
-
-        Returns:
-            The joints, base to tip.
-
-        Raises:
-            SceneError: If there is no such link, no movable joint, or one that no scene can hold.
-        """
+        """Movable joints between two links, base to tip."""
         self._known(tip, "tip")
         self._known(base, "base")
         up, down = self._path(base), self._path(tip)
@@ -173,20 +139,7 @@ class UrdfTree:
         return chain
 
     def carried(self, link: str, pose: Pose, chain: list[UrdfJoint], lock_branches: bool) -> dict[str, Pose]:
-        """Everything that moves as one with a link.
-
-        Args:
-            link: Name of the link.
-            pose: Its pose in some frame, 8 numbers, m.
-            chain: The joints of the chain; they are not crossed.
-            lock_branches: Whether other movable joints are held at zero.
-
-        Returns:
-            Poses of the links in that frame, by name.
-
-        Raises:
-            SceneError: If a movable joint that is not held, or that follows the chain, moves a mass.
-        """
+        """Poses of all links that move as one with a link; the joints of the chain are not crossed."""
         found = {link: pose}
         waiting = [link]
         while waiting:
@@ -232,21 +185,7 @@ class UrdfTree:
 
 
 def arm_of(robot: UrdfRobot, tip: str, base: str | None, lock_branches: bool, extra: Body | None) -> Arm:
-    """Cut the chain from base to tip out of a robot.
-
-    Args:
-        robot: The robot.
-        tip: Name of the tip link.
-        base: Name of the base link; None for the root.
-        lock_branches: Whether movable joints beside the chain are held at zero.
-        extra: A body fixed to the base link, in its frame.
-
-    Returns:
-        The arm.
-
-    Raises:
-        SceneError: If the robot is no tree, or no scene can hold the chain.
-    """
+    """Cut the chain from base to tip out of a robot; `extra` is a body fixed to the base link."""
     tree = UrdfTree(robot)
     base = tree.root if base is None else base
     chain = tree.chain(tip, base)
@@ -255,8 +194,8 @@ def arm_of(robot: UrdfRobot, tip: str, base: str | None, lock_branches: bool, ex
     body = lumped(bodies)
     if body is None:
         raise SceneError(
-            f"URDF: base link {base!r} has no mass, nor has anything fixed to it: an arm made to stand on "
-            "the ground; give the spacecraft that carries it, spacecraft={'mass': ..., 'inertia': ...}"
+            f"URDF: base link {base!r} has no mass, nor has anything fixed to it: the arm is made to stand "
+            "on the ground; give the spacecraft that carries it, spacecraft={'mass': ..., 'inertia': ...}"
         )
     flaws = _checked(robot, placed, body, base)
     center = body.center_of_mass
@@ -281,7 +220,7 @@ def arm_of(robot: UrdfRobot, tip: str, base: str | None, lock_branches: bool, ex
 
 
 def _checked(robot: UrdfRobot, placed: dict[str, Pose], body: Body, link: str) -> list[str]:
-    """Refuse what moves with a link if no scene can hold it; find flaws of its parts that others hide."""
+    """Refuse an impossible inertia of bodies that move as one; list flaws of parts that others hide."""
     parts = {name: part for name in placed if (part := robot.links[name].body) is not None}
     flaws = [
         f"link {name!r}, <inertia>: {flaw}"
@@ -297,7 +236,7 @@ def _checked(robot: UrdfRobot, placed: dict[str, Pose], body: Body, link: str) -
 
 
 def _some(names: Collection[str]) -> str:
-    """Names with commas between them, not more than a reader reads."""
+    """Names separated by commas, up to sixty."""
     more = f" and {len(names) - _MANY} more" if len(names) > _MANY else ""
     return ", ".join(islice(names, _MANY)) + more
 
@@ -309,7 +248,7 @@ def _bodies(robot: UrdfRobot, placed: dict[str, Pose]) -> list[Body]:
 
 
 def _turned_to(axis: Array) -> Pose:
-    """Rotation that takes z to an axis, as a pose without translation."""
+    """Rotation from z to an axis, as a pose without translation."""
     x, y, z = axis.tolist()
     # The shortest way from z; for an axis that points down, half a turn about x and the shortest way from -z.
     quaternion = (1.0 + z, -y, x, 0.0) if z >= 0 else (-y, 1.0 - z, 0.0, x)

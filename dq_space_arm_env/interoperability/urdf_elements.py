@@ -1,10 +1,9 @@
-"""What stands in a URDF file, as checked plain data: links with their masses, joints with their frames.
+"""Reader of URDF files: checked plain data of links with their masses and joints with their frames.
 
-The file is read with Python's own expat. The URDF parsers on PyPI either bring a mesh library along
-(yourdfpy, urchin) or have had no release for years (urdf-parser-py), and all are lenient where a wrong robot
-would come out. Namespaces are not resolved: a prefix that nobody declared, such as `drake:acceleration`, is
-an error to a stricter reader, but it is what robots ship with. Document type declarations are refused, and
-with them everything that makes foreign XML dangerous.
+It uses Python's expat. The URDF parsers on PyPI either require a mesh library (yourdfpy, urchin) or are
+unmaintained (urdf-parser-py), and all accept files that give a wrong robot. Namespaces are not resolved:
+robots ship with undeclared prefixes such as `drake:acceleration`. Document type declarations are refused,
+and with them the attacks that XML allows.
 """
 
 from __future__ import annotations
@@ -31,58 +30,32 @@ Pose = tuple[float, ...]
 
 @dataclass(frozen=True, eq=False)
 class UrdfLink:
-    """A link.
-
-    Attributes:
-        name: Its name.
-        body: Mass properties in the link's frame; None for a link without mass.
-    """
+    """A link."""
 
     name: str
-    body: Body | None
+    body: Body | None  # in the link's frame; None for a link without mass
 
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """A joint; at zero angle the child's frame coincides with the joint's.
-
-    Attributes:
-        name: Its name.
-        type: One of `TYPES`.
-        parent: Name of the parent link.
-        child: Name of the child link.
-        origin: Pose of the joint's frame in the parent's, 8 numbers, m.
-        axis: Unit vector along the axis in the joint's frame, shape (3,).
-        effort: Largest torque, N m; None where the file gives none, or zero, which is what many files write
-            for an unknown one.
-        limits: Smallest and largest angle, rad; None for a joint without.
-        damping: Viscous friction, N m s/rad.
-        friction: Coulomb friction, N m.
-        mimics: Name of the joint that it follows; None for a free one.
-    """
+    """A joint."""
 
     name: str
-    type: str
+    type: str  # one of TYPES
     parent: str
     child: str
-    origin: Pose
-    axis: Array
-    effort: float | None
-    limits: tuple[float, float] | None
-    damping: float
-    friction: float
-    mimics: str | None
+    origin: Pose  # pose of the joint frame, and of the child at zero angle, in the parent's, 8 numbers, m
+    axis: Array  # unit vector in the joint frame, shape (3,)
+    effort: float | None  # largest torque, N m; None for none or 0, which many files write for unknown
+    limits: tuple[float, float] | None  # smallest and largest angle, rad
+    damping: float  # viscous, N m s/rad
+    friction: float  # Coulomb, N m
+    mimics: str | None  # the joint that it follows
 
 
 @dataclass(frozen=True)
 class UrdfRobot:
-    """A robot.
-
-    Attributes:
-        name: Its name; "robot" for one without.
-        links: Links by name.
-        joints: Joints by name.
-    """
+    """A robot."""
 
     name: str
     links: dict[str, UrdfLink]
@@ -90,17 +63,7 @@ class UrdfRobot:
 
 
 def read_robot(source: str | Path) -> UrdfRobot:
-    """Read a URDF file.
-
-    Args:
-        source: Path of the file, or its text, which begins with "<".
-
-    Returns:
-        Links and joints; what else the file holds (shapes, transmissions, simulator settings) is left out.
-
-    Raises:
-        SceneError: If the file cannot be read, is no URDF, or says something that no robot can be.
-    """
+    """Read a URDF file, given by its path or its text; shapes, transmissions and settings are left out."""
     root = _parse(_content(source))
     if root.tag != "robot":
         raise SceneError(f"URDF: the outermost element is <{root.tag}>, it must be <robot>")
@@ -120,15 +83,17 @@ def read_robot(source: str | Path) -> UrdfRobot:
 
 
 def _content(source: str | Path) -> str | bytes:
-    """The text itself, or the bytes of the file, whose encoding is the XML parser's to find."""
+    """The text, or the bytes of the file, whose encoding the XML parser detects."""
     if not isinstance(source, str | Path):
-        raise SceneError(f"URDF: {shorten(repr(source), 40)} is neither a file's path nor the text of a URDF")
+        raise SceneError(f"URDF: {shorten(repr(source), 40)} is neither the path nor the text of a URDF file")
     if isinstance(source, str):
         text = source.removeprefix("\ufeff").lstrip()
         if text.startswith("<"):
             return text
         if not text or "\n" in text:
-            raise SceneError(f"URDF: the text {shorten(text, 40)!r} must begin with '<', or be a file's path")
+            raise SceneError(
+                f"URDF: the text {shorten(text, 40)!r} must begin with '<', or be the path of a file"
+            )
     try:
         content = Path(source).read_bytes()
     except (OSError, ValueError) as error:
@@ -137,20 +102,12 @@ def _content(source: str | Path) -> str | bytes:
     if not content.strip():
         raise SceneError(f"URDF: {source} is empty")
     if b"<" not in content:
-        raise SceneError(f"URDF: {source} is no XML: it must be a text file that begins with '<'")
+        raise SceneError(f"URDF: {source} is not XML: it must be a text file that begins with '<'")
     return content
 
 
 def shorten(text: str, width: int) -> str:
-    """Cut a text that would fill the screen.
-
-    Args:
-        text: Any text.
-        width: Largest number of characters to keep.
-
-    Returns:
-        The text, or its beginning and "...".
-    """
+    """Cut a text to a width, with "..."."""
     return text if len(text) <= width else f"{text[:width]}..."
 
 
@@ -174,8 +131,8 @@ def _start_into(builder: TreeBuilder) -> Callable[[str, dict[str, str]], None]:
     def start(tag: str, attributes: dict[str, str]) -> None:
         if tag.startswith("xacro:") or any("${" in value or "$(" in value for value in attributes.values()):
             raise SceneError(
-                f"URDF: <{tag}> belongs to xacro, a language that writes URDF; expand the file first, with "
-                "ROS's command: xacro robot.urdf.xacro > robot.urdf"
+                f"URDF: <{tag}> belongs to xacro, a macro language; expand the file first, with ROS: "
+                "xacro robot.urdf.xacro > robot.urdf"
             )
         builder.start(tag, attributes)
 
@@ -183,7 +140,7 @@ def _start_into(builder: TreeBuilder) -> Callable[[str, dict[str, str]], None]:
 
 
 def _refuse_doctype(*declaration: object) -> None:
-    raise SceneError("URDF: a document type declaration (<!DOCTYPE ...>) has no place in it: remove it")
+    raise SceneError("URDF: remove the document type declaration (<!DOCTYPE ...>)")
 
 
 def _read_link(element: Element) -> UrdfLink:
@@ -202,7 +159,7 @@ def _read_link(element: Element) -> UrdfLink:
         raise SceneError(f"URDF: {where}: mass = {mass:g} kg, it must be 0 or greater")
     if mass == 0:
         if inertia.any():
-            raise SceneError(f"URDF: {where}: a mass of 0 with an inertia that is not: give it a mass, too")
+            raise SceneError(f"URDF: {where}: the mass is 0 and the inertia is not: give it a mass")
         return UrdfLink(name, None)
     return UrdfLink(name, Body(mass, np.zeros(3), inertia).seen_from(_origin(inertial, where)))
 
@@ -270,7 +227,7 @@ def _name(element: Element) -> str:
 def _only(element: Element, tag: str, where: str) -> Element | None:
     children = element.findall(tag)
     if len(children) > 1:
-        raise SceneError(f"URDF: {where}: <{tag}> stands {len(children)} times in it, and may only once")
+        raise SceneError(f"URDF: {where}: there are {len(children)} <{tag}>, at most one is allowed")
     return children[0] if children else None
 
 

@@ -1,4 +1,4 @@
-"""A scene's robot as URDF: what other tools can build, show and check."""
+"""A scene's robot as URDF."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ _ANY_RATE = "1e+06"
 def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
     """Write a scene's robot as URDF.
 
-    The root link `base` has the frame e0, at the center of mass; nothing holds it, so a simulator has to be
-    told that the base floats (Pinocchio: `JointModelFreeFlyer`). Each further link has the frame of its joint
-    and carries the scene's name; its joint is continuous, turns about z, and is called by the link's name and
-    " joint". A link `tip` without mass, or with that of the payload, has the frame G. Torque limits become
-    efforts, 0 for a joint without motor; thrusters, wheels, start and task have no place in URDF.
+    The root link `base` has the frame e0, at the center of mass; tell the simulator that it floats
+    (Pinocchio: `JointModelFreeFlyer`). Each further link has the frame of its joint and carries the scene's
+    name; its joint is continuous, turns about z, and is called by the link's name and " joint". A link `tip`
+    without mass, or with that of the payload, has the frame G. Torque limits become efforts, 0 for a joint
+    without motor; URDF has no thrusters, wheels, start or task.
 
-    What URDF cannot say and what would change the motion is refused: joint springs, a wrench at the tip, a
-    base that moves in a plane. The massless wrist as three joints would have infinite accelerations; fixed at
-    the start's angles it changes no acceleration, but the tip cannot turn.
+    Features that URDF lacks and that change the motion are refused: joint springs, a wrench at the tip, a
+    planar base. The massless wrist as three joints would have infinite accelerations; fixed at its initial
+    angles it changes no acceleration, but the tip cannot turn.
 
     Args:
         scene: A validated scene.
-        wrist: What happens to a wrist: "refuse" makes it an error, "fixed" writes it at its initial angles.
+        wrist: "refuse" makes a wrist an error, "fixed" writes it at its initial angles.
 
     Returns:
         The URDF text, all numbers with 17 digits; `scene_from_urdf` reads it.
 
     Raises:
-        SceneError: If the scene has what URDF cannot say.
+        SceneError: If URDF lacks a feature of the scene.
     """
     refuse(scene, "URDF", wrist, springs=True, planar=True)
     root = Element("robot", name=scene.name)

@@ -1,4 +1,4 @@
-"""A scene from a URDF file: its arm on a free spacecraft, with actuators and a target to begin with."""
+"""Scene from a URDF file: its arm on a free spacecraft, with default actuators and target."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from dq_space_arm_env.scene import Cost, Scene, SceneError
 from dq_space_arm_env.scene.bodies import Inertia
 from dq_space_arm_env.validation import Model, Positive, Vector3
 
-# How far the joints are from the start, rad, when the tip is at a target that nobody gave.
+# Angle from the start of every joint at the default target, rad.
 _TARGET_OFFSET = 0.3
-# How fast the joint that moves the largest inertia would close an error by itself, rad/s.
+# Natural frequency of the joint with the largest inertia under the default cost, rad/s.
 _FREQUENCY = 0.7
 
 
@@ -43,21 +43,20 @@ def scene_from_urdf(
 ) -> Scene:
     """Make a scene of a robot's URDF: the arm from the base link to the tip link, free in space.
 
-    Revolute, continuous and fixed joints are understood. What hangs on the chain by fixed joints is lumped
-    into the body that carries it, masses, centers of mass and turned inertias included; links without mass
-    are frames and nothing else. The links of the scene have the names of the links that the joints carry.
+    Revolute, continuous and fixed joints are supported. Bodies fixed to the chain are lumped into those that
+    carry them; links without mass are mere frames. Each link of the scene is named after the link that its
+    joint carries.
 
     Frames: the scene's base frame e0 has the axes of the base link and its origin at the center of mass of
     the base and of all that is fixed to it; the scene's description says where that is in the base link. The
     frame of a scene's joint has its z axis along the joint's axis; where the URDF has another axis, it is the
     child link's frame turned. The tip frame G is the tip link's. Joint angles are the URDF's.
 
-    Joint torques are limited to the efforts of the URDF. Not in a scene, and left out: limits of joint angles
-    and rates, shapes and meshes, transmissions and settings of simulators. Coulomb friction is left out with
-    a warning. Start: at rest, the base link's axes along the inertial ones, joints at zero, or, where their
-    limits exclude zero, in the middle between the limits. Cost: a scene's own, but the weight of the joint
-    torques is such that the arm moves within seconds, whatever its size. Further changes:
-    `scene.replace(...)`.
+    The efforts of the URDF limit the joint torques. Limits of joint angles and rates, shapes and meshes,
+    transmissions and simulator settings are left out, Coulomb friction with a warning. Start: at rest, the
+    base link's axes along the inertial ones, joints at zero, or midway between limits that exclude zero.
+    Cost: the defaults, but with a weight of the joint torques that lets an arm of any size move within
+    seconds. Change anything else with `scene.replace(...)`.
 
     Args:
         source: Path of a URDF file, or its text, which begins with "<"; xacro has to be expanded before.
@@ -82,8 +81,8 @@ def scene_from_urdf(
         The scene.
 
     Raises:
-        SceneError: If the file cannot be read, the robot is nothing that a scene can hold, or an argument is
-            wrong; the message names link or joint and says what would be right.
+        SceneError: If the file cannot be read, a scene cannot represent the robot, or an argument is wrong;
+            the message names the link or joint and the remedy.
     """
     robot = read_robot(source)
     extra = None if spacecraft is None else _spacecraft(spacecraft)
@@ -113,7 +112,7 @@ def scene_from_urdf(
 
 
 class _Spacecraft(Model):
-    """What carries the arm, and is no part of the robot's file."""
+    """The spacecraft that carries the arm, and is not in the robot's file."""
 
     mass: Positive = Field(description="mass of the spacecraft, kg")
     inertia: Inertia = Field(
@@ -142,7 +141,7 @@ def _check_passive(arm: Arm, passive: Collection[str]) -> None:
     unknown = [name for name in passive if name not in joints]
     if unknown:
         raise SceneError(
-            f"passive: {unknown[0]!r} is no joint between base and tip, which are {', '.join(joints)}"
+            f"passive: {unknown[0]!r} is not a joint between base and tip, which are {', '.join(joints)}"
         )
 
 
@@ -160,7 +159,7 @@ def _messages(error: ValidationError) -> list[str]:
 
 
 def _warn(arm: Arm) -> None:
-    """Say what a scene cannot hold, and what only looks like a robot."""
+    """Warn of Coulomb friction, and of impossible inertias that fixed neighbors make up for."""
     rubbing = [part.joint.name for part in arm.joints if part.joint.friction]
     if rubbing:
         warnings.warn(
@@ -169,13 +168,13 @@ def _warn(arm: Arm) -> None:
         )
     for flaw in arm.flaws:
         warnings.warn(
-            f"URDF: {flaw}; it is used as it is, because what the link is fixed to makes up for it",
+            f"URDF: {flaw}; it is used as it is: the bodies that the link is fixed to make up for it",
             stacklevel=3,
         )
 
 
 def _torque_weight(arm: Arm) -> float:
-    """Weight of the joint torques with which the arm needs seconds, as a spacecraft's does.
+    """Weight of the joint torques with which the arm takes seconds.
 
     The optimal regulator of an inertia I with the cost a theta^2 + b tau^2 has the natural frequency
     (a / (b I^2))^(1/4). Turned by theta, a tip at distance d costs a = w (1 + d^2) / 4, w the pose's weight.
@@ -205,7 +204,7 @@ def _at_start(part: ArmJoint) -> Pose:
 
 
 def _motors(arm: Arm, joint_torque: float | None, passive: Collection[str]) -> dict[str, Any] | None:
-    """The scene's joint motors; every link has a limit of its own."""
+    """The scene's joint motors; each link also has its own limit."""
     driven = [part.joint for part in arm.joints if part.joint.name not in passive]
     unlimited = [joint.name for joint in driven if joint.effort is None]
     if unlimited and joint_torque is None:
@@ -246,7 +245,7 @@ def _start(joint: UrdfJoint) -> float:
 
 
 def _default_target(scene: Scene) -> dict[str, Any]:
-    """Where the tip is when every joint has moved a bit."""
+    """Pose of the tip with every joint moved by the offset."""
     start = scene.initial_state
     angles = [angle + _TARGET_OFFSET for angle in start.joint_angles]
     pose = kinematics.tip_pose(Chain.from_scene(scene), start.base_pose.dual_quaternion, angles, ())

@@ -1,6 +1,6 @@
-"""Motion over a long time, with steps as long as tolerances allow and a curve between them.
+"""Adaptive integration of one state over any time, with dense output.
 
-The steps are those of Dormand and Prince's pair, in machine code; their lengths are chosen here, by the
+The steps are those of the Dormand-Prince pair, in machine code; their lengths are chosen here, by the
 controller of Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, section II.4 (2nd ed.,
 1993), with the stabilization of Hairer & Wanner II, section IV.2.
 """
@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.kernels.bound import KernelCall
-
-if TYPE_CHECKING:
-    from dq_space_arm_env.kernels.kernels import Kernels
+from dq_space_arm_env.kernels.library import KernelLibrary
 
 Array = NDArray[Any]
 
@@ -29,30 +27,23 @@ STRETCH = 1.01
 
 
 class MotionCurve:
-    """A motion at any time: a polynomial of degree 4 in tangent coordinates for each step, of order 4."""
+    """The state at any time: per step a polynomial of degree 4 in tangent coordinates, of order 4."""
 
-    def __init__(self, kernels: Kernels, times: Array, states: Array, coefficients: Array) -> None:
-        """Take the steps.
-
-        Args:
-            kernels: Kernels of the scene.
-            times: Ends of the steps, the start first, shape (m + 1,), s.
-            states: States there, shape (m + 1, n_x).
-            coefficients: Tangent vectors of theta, ..., theta^4 of each step, shape (m, 4, n_t).
-        """
+    def __init__(self, kernels: KernelLibrary, times: Array, states: Array, coefficients: Array) -> None:
+        """Take m steps: their ends, states there, and coefficients of theta, ..., theta^4, (m, 4, n_t)."""
         self._kernels, self._times, self._states, self._coefficients = kernels, times, states, coefficients
 
     def __call__(self, t: ArrayLike) -> Array:
-        """States at given times.
+        """Evaluate the motion.
 
         Args:
             t: Times within the motion, a number or shape (k,), s.
 
         Returns:
-            States, shape (n_x,) or (k, n_x).
+            States, shape (n_x,) or (k, n_x), units of `layout.state`.
 
         Raises:
-            ValueError: If a time lies outside of the motion.
+            ValueError: If a time lies outside the motion.
         """
         times = np.asarray(t, dtype=np.float64)
         if times.ndim > 1:
@@ -70,32 +61,24 @@ class MotionCurve:
         change = np.zeros(())
         for power in reversed(range(4)):
             change = theta * (self._coefficients[step, power] + change)
-        return self._kernels.retract(self._states[step], change)
+        return self._kernels.call("retract", x=self._states[step], dx=change)[0]
 
 
 @dataclass(frozen=True, eq=False)
 class IntegratedMotion:
-    """What `Kernels.integrate` returns.
+    """Result of `Kernels.integrate`."""
 
-    Attributes:
-        t: Times, shape (k,), s: those asked for, or the ends of the steps, the start first.
-        x: States at these times, shape (k, n_x).
-        steps: Number of steps taken.
-        rejected: Number of steps tried in vain because their error was too large.
-        sol: The state at any time of the motion.
-    """
-
-    t: Array
-    x: Array
-    steps: int
-    rejected: int
-    sol: MotionCurve
+    t: Array  # times asked for, or ends of the steps, the start first, shape (k,), s
+    x: Array  # states at these times, shape (k, n_x), units of `layout.state`
+    steps: int  # taken
+    rejected: int  # steps whose error was too large
+    sol: MotionCurve  # the state at any time
 
 
 class _Stepper:
-    """A state on its way, with the length of the next step."""
+    """The current state and the length of the next step."""
 
-    def __init__(self, kernels: Kernels, x: Array, tolerances: Array, step: float) -> None:
+    def __init__(self, kernels: KernelLibrary, x: Array, tolerances: Array, step: float) -> None:
         self.x, self.step, self.error = x.copy(), step, 1e-4
         self.u, self._h = np.zeros(kernels.n_u, kernels.dtype), np.zeros(1, kernels.dtype)
         self.x_next, self.dense = np.zeros_like(x), np.zeros((4, kernels.n_t), kernels.dtype)
@@ -105,7 +88,7 @@ class _Stepper:
         self._run = KernelCall(kernels.kernel("measured_step", lanes=1), arrays).of_one_row()
 
     def attempt(self, h: float) -> bool:
-        """Try a step and choose the length of the next; tell whether its error is tolerable."""
+        """Try a step and choose the length of the next; returns whether the error is tolerable."""
         self._h[0] = h
         self._run()
         error = float(self._error[0])
@@ -120,7 +103,7 @@ class _Stepper:
 
 
 def integrate(
-    kernels: Kernels,
+    kernels: KernelLibrary,
     x: ArrayLike,
     u: ArrayLike,
     duration: float,
@@ -148,7 +131,7 @@ def integrate(
         stepper.u[:] = control
         t = begin
         while t != end:
-            # A little longer than was chosen, if a sliver would be left otherwise.
+            # Stretch the last step rather than leave a sliver.
             last = STRETCH * stepper.step >= abs(end - t)
             h = end - t if last else np.copysign(stepper.step, duration)
             if abs(h) < 16.0 * np.finfo(float).eps * abs(duration):
@@ -178,7 +161,7 @@ def _intervals(held: Array, duration: float) -> Iterator[tuple[float, float, Arr
     yield from zip(marks[:-1], marks[1:], held, strict=True)
 
 
-def _checked(kernels: Kernels, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+def _checked(kernels: KernelLibrary, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
     """The start, shape (n_x,), and the inputs of all intervals, shape (N, n_u)."""
     start, held = np.array(x, dtype=kernels.dtype), np.array(u, dtype=kernels.dtype)
     if start.shape != (kernels.n_x,):

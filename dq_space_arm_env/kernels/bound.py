@@ -1,11 +1,11 @@
-"""A compiled program together with the shapes of its arrays, and arguments in the form that it takes."""
+"""Native calls: compiled programs with the shapes of their arrays, and tables of the arrays' addresses."""
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -19,36 +19,23 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """An array of a kernel.
-
-    Attributes:
-        name: Its name.
-        stride: Numbers in a row.
-        shared: Whether it has a single row that all rows read.
-        dtype: Type of its elements.
-        by_column: Whether its shape is (stride, rows) rather than (rows, stride).
-    """
+    """An array of a kernel."""
 
     name: str
-    stride: int
-    shared: bool
+    stride: int  # numbers in a row
+    shared: bool  # has a single row that all rows read
     dtype: str
-    by_column: bool
+    by_column: bool  # has shape (stride, rows) rather than (rows, stride)
 
 
 class BoundKernel:
-    """A compiled program with what is known about its arrays.
+    """A compiled program and its arrays.
 
-    Attributes:
-        address: Address of the C function `void (int64 begin, int64 end, const int64 *buffers)`.
-        inputs: Arrays that it reads.
-        outputs: Arrays that it writes.
-        operation_count: Arithmetic operations per row.
-        indexed: Whether a list of rows (int64) comes before all other arrays.
+    `address` is that of the C function `void (int64 begin, int64 end, const int64 *buffers)`; `inputs` and
+    `outputs` are in the order of `buffers`; if `indexed`, a list of rows (int64) comes first.
     """
 
     def __init__(self, kernel: native.NativeKernel) -> None:
-        """Read the notes that the compiler left."""
         self.native = kernel
         self.address = kernel.address
         self.inputs = tuple(ArraySpec(*spec) for spec in kernel.metadata["inputs"])
@@ -57,31 +44,20 @@ class BoundKernel:
         self.indexed: bool = kernel.metadata["indexed"]
 
     def __call__(self, arrays: Sequence[Array], rows: int, threads: int = 1) -> None:
-        """Run on rows 0 .. rows - 1 of C-contiguous arrays.
-
-        Args:
-            arrays: Inputs, then outputs, each of the shape and element type that its `ArraySpec` says.
-            rows: Number of rows to work on.
-            threads: Threads to share the work among.
-        """
+        """Run on rows 0 .. rows - 1 of C-contiguous arrays, inputs then outputs, as in their `ArraySpec`s."""
         names = (spec.name for spec in (*self.inputs, *self.outputs))
         KernelCall(self, dict(zip(names, arrays, strict=True)))(rows, threads)
 
 
 class KernelCall:
-    """A kernel with the addresses of its arrays, for callers that call it again and again.
+    """A kernel with the addresses of its arrays, for repeated calls.
 
-    Arrays that stay are handed over once, and kept alive; others take their place before a call. All of them
-    must be C-contiguous, of the shape and element type that the kernel's `ArraySpec`s say.
+    Arrays given once are kept alive; others take their place before a call. All must be C-contiguous, with
+    the shape and element type of the kernel's `ArraySpec`s.
     """
 
     def __init__(self, kernel: BoundKernel, arrays: Mapping[str, Array]) -> None:
-        """Note the addresses of arrays.
-
-        Args:
-            kernel: The kernel.
-            arrays: Arrays by name; those of names that the kernel does not know are left out.
-        """
+        """Note the addresses of arrays by name; names unknown to the kernel are ignored."""
         self._kernel, self._function = kernel, kernel.native.function
         self._slots: dict[str, int] = {}
         position = 1 if kernel.indexed else 0
@@ -100,53 +76,41 @@ class KernelCall:
                     self._buffers[self._slots[spec.name] + 1] = array.shape[1] if array.ndim == 2 else 1
 
     def place(self, **arrays: Array) -> None:
-        """Take arrays in place of those of their names; each has the shape of the one before.
-
-        Args:
-            arrays: Arrays by name; the caller keeps them alive.
-        """
+        """Replace arrays by others of the same shape, which the caller keeps alive."""
         for name, array in arrays.items():
             self._buffers[self._slots[name]] = address_of(array)
 
     def __call__(self, rows: int, threads: int = 1) -> None:
-        """Run on rows 0 .. rows - 1.
-
-        Args:
-            rows: Number of rows to work on.
-            threads: Threads to share the work among.
-        """
+        """Run on rows 0 .. rows - 1."""
         run_shared(self._function, rows, self._pointer, threads)
 
     def on_rows(self, rows: NDArray[np.int64]) -> None:
-        """Run an indexed kernel on some rows.
-
-        Args:
-            rows: Numbers of the rows, shape (k,).
-        """
+        """Run an indexed kernel on the rows of a list, shape (k,)."""
         self._buffers[0] = address_of(rows)
         self._function(0, len(rows), self._pointer)
 
     def of_one_row(self) -> Callable[[], None]:
-        """A function that runs the kernel on row 0.
-
-        It keeps the interpreter to itself: the work is shorter than handing the interpreter over.
-        """
-        prototype = ctypes.PYFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
-        function: Any = prototype(self._kernel.address)
+        """Make a function that runs the kernel on row 0, see `one_row_call`; it keeps the arrays alive."""
+        call = one_row_call(self._kernel.address, self._pointer)
+        function: Any = call.func
         function.call = self  # keeps code and arrays alive
-        # Converted beforehand, arguments cost nothing.
-        return partial(function, ctypes.c_int64(0), ctypes.c_int64(1), ctypes.c_void_p(self._pointer))
+        return call
+
+
+_ONE_ROW = ctypes.PYFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
+
+
+def one_row_call(address: int, buffers: int) -> partial[None]:
+    """Make a function that runs the kernel at an address on row 0, given the address of its table of arrays.
+
+    It holds on to the interpreter: the work is shorter than releasing it. Arguments are converted beforehand,
+    so they cost nothing.
+    """
+    return partial(_ONE_ROW(address), ctypes.c_int64(0), ctypes.c_int64(1), ctypes.c_void_p(buffers))
 
 
 def address_of(array: Array) -> int:
-    """Address of a contiguous array.
-
-    Args:
-        array: The array.
-
-    Returns:
-        The address of its first element.
-    """
+    """Address of the first element of a contiguous array."""
     buffer: Any = array
     try:  # four times as fast as the other way, but not for what is read-only or empty
         return ctypes.addressof(ctypes.c_char.from_buffer(buffer))
@@ -154,18 +118,32 @@ def address_of(array: Array) -> int:
         return array.ctypes.data
 
 
+def buffer_table(*arrays: Array) -> NDArray[np.int64]:
+    """Addresses of C-contiguous float64 arrays, for a kernel called from compiled loops.
+
+    The table does not keep the arrays alive.
+    """
+    for position, array in enumerate(arrays):
+        if array.dtype != np.float64 or not array.flags.c_contiguous:
+            raise ValueError(
+                f"buffer {position} has dtype {array.dtype} and strides {array.strides}; "
+                "a kernel needs C-contiguous float64"
+            )
+    return np.array([address_of(array) for array in arrays], dtype=np.int64)
+
+
+def run_kernel(address: int, begin: int, end: int, buffers: NDArray[np.int64]) -> None:
+    """Run the kernel at an address on rows begin .. end - 1 of the arrays of a `buffer_table`."""
+    _function_at(address)(begin, end, address_of(buffers))
+
+
+_function_at = cache(native.KernelFunction)
+
+
 def rows_of(inputs: dict[str, ArrayLike | None], dtype: DTypeLike) -> tuple[int, bool, dict[str, Array]]:
-    """Bring arguments that may be one row or a batch to a common form.
+    """Broadcast inputs, (n,) or (B, n) by name, to rows; `h` is shared by all of them.
 
-    Args:
-        inputs: Arrays of shape (n,) or (B, n) by name; `h` is shared by all rows.
-        dtype: Type of the elements to convert to.
-
-    Returns:
-        Number of rows, whether there is a batch axis, and every input as an array of that many rows.
-
-    Raises:
-        ValueError: If an array has another number of axes, or batches differ in length.
+    Returns the number of rows, whether there is a batch axis, and the arrays.
     """
     arrays = {name: np.asarray(value, dtype=dtype) for name, value in inputs.items()}
     shared = {name: arrays.pop(name) for name in ("h",) if name in arrays}
@@ -179,3 +157,41 @@ def rows_of(inputs: dict[str, ArrayLike | None], dtype: DTypeLike) -> tuple[int,
     for name, array in arrays.items():
         arrays[name] = np.broadcast_to(array, (rows, array.shape[-1]))
     return rows, bool(batches), {**arrays, **shared}
+
+
+_ROWS = 256  # steps at a time: their states stay in a near cache
+
+
+def walk(
+    kernel: BoundKernel,
+    start: Array,
+    momentum: Array | None,
+    inputs: Array,
+    h: Array,
+    steps: int,
+    every: int,
+) -> Array:
+    """Take many steps in a row; machine code walks down rows that it has just written.
+
+    A kernel that hands on the momentum besides the state takes that of the start, (6,). Returns the start,
+    and the states after every so many steps, shape (steps // every + 1, n_x).
+    """
+    rows, dtype = min(steps, _ROWS), start.dtype
+    states, momenta = np.empty((rows + 1, len(start)), dtype), np.empty((rows + 1, 6), dtype)
+    states[0], held = start, np.empty((rows, inputs.shape[-1]), dtype)
+    # Each row's successor is the row below it.
+    arrays = {"x": states, "x_next": states[1:], "u": held, "h": h}
+    if momentum is not None:
+        momenta[0] = momentum
+        arrays |= {"momentum": momenta, "momentum_next": momenta[1:]}
+    call = KernelCall(kernel, arrays)
+    result = np.empty((steps // every + 1, len(start)), dtype)
+    result[0] = start
+    for done in range(0, steps, rows):
+        count = min(rows, steps - done)
+        held[:count] = inputs if inputs.ndim == 1 else inputs[done : done + count]
+        call(count)
+        kept = np.arange(done // every + 1, (done + count) // every + 1)
+        result[kept] = states[kept * every - done]
+        states[0], momenta[0] = states[count], momenta[count]
+    return result

@@ -1,8 +1,7 @@
 """Functions on states, compiled for one scene: dynamics, steps, derivatives, cost, kinematics.
 
-`compile_scene` returns the `Kernels` of a scene. Nothing is compiled until its first call; what was compiled
-once is kept on disk, and the next process loads it without tracing or compiling, without even importing
-CasADi.
+`compile_scene` returns the `Kernels` of a scene. Each function is compiled at its first call and kept on
+disk; the next process loads it without tracing, compiling or importing CasADi.
 """
 
 from __future__ import annotations
@@ -14,11 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.kernels.bound import rows_of
+from dq_space_arm_env.kernels.bound import walk
 from dq_space_arm_env.kernels.library import KernelLibrary
-from dq_space_arm_env.kernels.walk import walk
 from dq_space_arm_env.scene import Scene, load_scene
-from dq_space_arm_env.scene.layout import StateLayout
 
 if TYPE_CHECKING:
     from dq_space_arm_env.kernels.adaptive import IntegratedMotion
@@ -30,8 +27,9 @@ class Kernels(KernelLibrary):
     """The compiled functions of a scene, with its nominal target, masses and inertias.
 
     Every function takes one state (n_x,) or a batch (B, n_x), and returns results of the same form, arrays of
-    the scene's precision. Batches run on vector instructions, several states at a time, and give bit for bit
-    what the states give one by one.
+    the scene's precision. Batches run on vector instructions, several states at a time, and give the same
+    bits as the states one by one. Every function raises ValueError, naming the argument, where shapes do not
+    fit.
 
     Attributes:
         scene: The scene.
@@ -42,42 +40,6 @@ class Kernels(KernelLibrary):
         n_t: Number of tangent coordinates.
         n_u: Number of inputs.
     """
-
-    def __init__(self, scene: Scene, threads: int = 1) -> None:
-        """Prepare; nothing is compiled yet.
-
-        Args:
-            scene: A validated scene.
-            threads: Most threads that a batch is shared among.
-
-        Raises:
-            ValueError: If the number of threads is not positive.
-        """
-        if threads < 1:
-            raise ValueError(f"threads: {threads}, should be at least 1")
-        super().__init__(scene)
-        self.threads = threads
-        self.layout = StateLayout.of(scene)
-        self.n_x, self.n_t, self.n_u = self.layout.n_x, self.layout.n_t, self.layout.n_u
-
-    def _call(
-        self, name: str, integrator: str | None = None, **inputs: ArrayLike | None
-    ) -> tuple[Array, ...]:
-        """Run a program on one row or a batch, and give each output the same form as the inputs."""
-        rows, batched, arrays = rows_of(inputs, self.dtype)
-        kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)
-        ordered = []
-        for spec in kernel.inputs:
-            array = arrays[spec.name]
-            if array.shape[-1] != spec.stride:
-                raise ValueError(
-                    f"{name}: {spec.name} has {array.shape[-1]} entries per row, "
-                    f"scene {self.scene.name!r} has {spec.stride}"
-                )
-            ordered.append(np.ascontiguousarray(array))
-        results = [np.zeros((rows, spec.stride), self.dtype) for spec in kernel.outputs]
-        kernel([*ordered, *results], rows, self.threads)
-        return tuple(result if batched else result[0] for result in results)
 
     def step(
         self, x: ArrayLike, u: ArrayLike, dt: float | None = None, integrator: str | None = None
@@ -94,9 +56,9 @@ class Kernels(KernelLibrary):
             States, shape (n_x,) or (B, n_x).
 
         Raises:
-            ValueError: If shapes do not fit, dt is not a finite number, or the integrator is unknown.
+            ValueError: If dt is not a finite number, or the integrator is unknown.
         """
-        return self._call("step", self._integrator(integrator), x=x, u=u, h=self._time_step(dt))[0]
+        return self.call("step", self._integrator(integrator), x=x, u=u, h=self._time_step(dt))[0]
 
     def simulate(
         self,
@@ -107,11 +69,11 @@ class Kernels(KernelLibrary):
         integrator: str | None = None,
         every: int = 1,
     ) -> Array:
-        """Take many steps in a row, without coming back to Python in between.
+        """Take many steps in a row without returning to Python.
 
-        The results are those of `step` called again and again, but for the integrators that keep the
-        momentum (`momentum_...`): they hand it on from step to step besides the state, so that it does not
-        wander by the rounding errors of the states, however many steps there are.
+        The results are those of repeated calls of `step`, except for integrators that conserve the momentum
+        (`momentum_...`): they hand it on from step to step besides the state, so it does not wander with the
+        rounding errors of the states.
 
         Args:
             x: State at the start, shape (n_x,), units of `layout.state`.
@@ -119,14 +81,14 @@ class Kernels(KernelLibrary):
             steps: Number of steps.
             dt: Time step, s; the scene's by default.
             integrator: Name of the integrator; the scene's by default.
-            every: The state after every so many steps is returned.
+            every: Number of steps between the states returned.
 
         Returns:
             States, the start first, shape (steps // every + 1, n_x).
 
         Raises:
-            ValueError: If shapes do not fit, steps or every is not positive, dt is not a finite number, or
-                the integrator is unknown.
+            ValueError: If steps or every is not positive, dt is not a finite number, or the integrator is
+                unknown.
         """
         if steps < 1 or every < 1:
             raise ValueError(f"steps: {steps}, every: {every}, should be at least 1")
@@ -137,7 +99,9 @@ class Kernels(KernelLibrary):
                 f"({self.n_u},) or ({steps}, {self.n_u})"
             )
         kernel = self.kernel("walk", integrator=self._integrator(integrator), lanes=1)
-        return walk(self, kernel, start, inputs, self._time_step(dt).astype(self.dtype), steps, every)
+        carries_momentum = any(spec.name == "momentum" for spec in kernel.inputs)
+        momentum = self.momentum(start) if carries_momentum else None
+        return walk(kernel, start, momentum, inputs, self._time_step(dt).astype(self.dtype), steps, every)
 
     def linearize(
         self, x: ArrayLike, u: ArrayLike, dt: float | None = None, integrator: str | None = None
@@ -156,7 +120,7 @@ class Kernels(KernelLibrary):
         Raises:
             ValueError: As for `step`.
         """
-        a, b = self._call("linearize", self._integrator(integrator), x=x, u=u, h=self._time_step(dt))
+        a, b = self.call("linearize", self._integrator(integrator), x=x, u=u, h=self._time_step(dt))
         lead = a.shape[:-1]
         return a.reshape(*lead, self.n_t, self.n_t), b.reshape(*lead, self.n_t, self.n_u)
 
@@ -171,25 +135,25 @@ class Kernels(KernelLibrary):
         times: ArrayLike | None = None,
         max_steps: int = 100_000,
     ) -> IntegratedMotion:
-        """Follow one state over any time, in steps as long as tolerances allow, with a curve between them.
+        """Integrate one state over any time with adaptive steps and dense output.
 
         Args:
             x: State at time 0, shape (n_x,), units of `layout.state`.
             u: Input, shape (n_u,), or inputs held for equal parts of the duration, shape (N, n_u); not
                 clipped to the limits.
-            duration: Time to follow it for, s; backward in time if negative.
+            duration: Time to integrate over, s; backward in time if negative.
             rtol: Relative error tolerated in a step: of velocities; of pose and angles in rad and m, which
                 have no natural zero. The scene's, or 1e-8, by default (1e-5 in single precision).
-            atol: Error tolerated besides, rad, m, rad/s, m/s. The scene's, or 1e-10, by default (1e-6 in
-                single precision).
+            atol: Absolute error tolerated in addition, rad, m, rad/s, m/s. The scene's, or 1e-10, by default
+                (1e-6 in single precision).
             times: Times to return states at, shape (k,), s; the ends of the steps by default.
             max_steps: Most steps to try.
 
         Returns:
-            Times, states, numbers of steps, and the states at all times between as a function.
+            Times, states, numbers of steps, and the state at any time between as a function.
 
         Raises:
-            ValueError: If an argument has the wrong shape, or is not finite, or out of range.
+            ValueError: If an argument is not finite or out of range.
             RuntimeError: If the motion cannot be followed to its end within the tolerances or max_steps.
         """
         from dq_space_arm_env.kernels.adaptive import integrate
@@ -218,13 +182,10 @@ class Kernels(KernelLibrary):
         Returns:
             Dual acceleration of the base in base axes, angular [rad/s^2] then linear [m/s^2], then joint
             accelerations [rad/s^2], shape (6 + n,) or (B, 6 + n); (3 + n) for a planar base.
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
         if w_tip is None:
-            return self._call("forward_dynamics", x=x, u=u)[0]
-        return self._call("forward_dynamics_with_tip_wrench", x=x, u=u, w_tip=w_tip)[0]
+            return self.call("forward_dynamics", x=x, u=u)[0]
+        return self.call("forward_dynamics_with_tip_wrench", x=x, u=u, w_tip=w_tip)[0]
 
     def reaction_wrenches(self, x: ArrayLike, u: ArrayLike) -> Array:
         """The paper's T (21): wrenches of body i on body i+1, in joint axes about the joint origin.
@@ -235,11 +196,8 @@ class Kernels(KernelLibrary):
 
         Returns:
             fx, fy, fz [N], tx, ty [N m] joint by joint, shape (5 n,) or (B, 5 n).
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        return self._call("reaction_wrenches", x=x, u=u)[0]
+        return self.call("reaction_wrenches", x=x, u=u)[0]
 
     def tip_pose(self, x: ArrayLike) -> Array:
         """Pose of the tip q_{G/I}, eq. (27).
@@ -249,11 +207,8 @@ class Kernels(KernelLibrary):
 
         Returns:
             Unit dual quaternions, shape (8,) or (B, 8), real part dimensionless, dual part m.
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        return self._call("tip_pose", x=x)[0]
+        return self.call("tip_pose", x=x)[0]
 
     def frame_poses(self, x: ArrayLike) -> Array:
         """Poses of base, joint frames, wrist frame (if any) and tip with respect to the inertial frame.
@@ -263,11 +218,8 @@ class Kernels(KernelLibrary):
 
         Returns:
             Unit dual quaternions, shape (frames, 8) or (B, frames, 8), real part dimensionless, dual part m.
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        poses = self._call("frame_poses", x=x)[0]
+        poses = self.call("frame_poses", x=x)[0]
         return poses.reshape(*poses.shape[:-1], -1, 8)
 
     def momentum(self, x: ArrayLike) -> Array:
@@ -279,11 +231,8 @@ class Kernels(KernelLibrary):
         Returns:
             Linear momentum [kg m/s], then angular momentum about the system's center of mass [kg m^2/s],
             shape (6,) or (B, 6).
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        return self._call("momentum", x=x)[0]
+        return self.call("momentum", x=x)[0]
 
     def energy(self, x: ArrayLike) -> Any:
         """Kinetic energy and the potential energy of joint springs.
@@ -293,11 +242,8 @@ class Kernels(KernelLibrary):
 
         Returns:
             Energy, J, a number or shape (B,).
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        return self._call("energy", x=x)[0][..., 0]
+        return self.call("energy", x=x)[0][..., 0]
 
     def cost(self, x: ArrayLike, u: ArrayLike) -> Any:
         """Stage cost of the paper (section V), without a factor dt.
@@ -308,11 +254,8 @@ class Kernels(KernelLibrary):
 
         Returns:
             Cost, dimensionless, a number or shape (B,).
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        return self._call("cost", x=x, u=u)[0][..., 0]
+        return self.call("cost", x=x, u=u)[0][..., 0]
 
     def terminal_cost(self, x: ArrayLike) -> Any:
         """Terminal cost of the paper (section V).
@@ -322,11 +265,8 @@ class Kernels(KernelLibrary):
 
         Returns:
             Cost, dimensionless, a number or shape (B,).
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        return self._call("terminal_cost", x=x)[0][..., 0]
+        return self.call("terminal_cost", x=x)[0][..., 0]
 
     def difference(self, x_reference: ArrayLike, x: ArrayLike) -> Array:
         """Tangent coordinates of x seen from a reference: the inverse of `retract`.
@@ -337,11 +277,8 @@ class Kernels(KernelLibrary):
 
         Returns:
             Tangent states, shape (n_t,) or (B, n_t), units of `layout.tangent`.
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        return self._call("difference", x_reference=x_reference, x=x)[0]
+        return self.call("difference", x_reference=x_reference, x=x)[0]
 
     def retract(self, x: ArrayLike, dx: ArrayLike) -> Array:
         """Move a state along tangent coordinates; the base pose moves by q exp(dx / 2).
@@ -352,14 +289,11 @@ class Kernels(KernelLibrary):
 
         Returns:
             States, shape (n_x,) or (B, n_x).
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        return self._call("retract", x=x, dx=dx)[0]
+        return self.call("retract", x=x, dx=dx)[0]
 
     def observation(self, x: ArrayLike, time_left: ArrayLike) -> tuple[Array, Array]:
-        """What an agent sees of a state, and the tip's errors.
+        """Observation of a state, and the tip's errors.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
@@ -368,11 +302,8 @@ class Kernels(KernelLibrary):
         Returns:
             Observation, entries as documented in `DQSpaceArmEnv`, and (attitude error [rad], position error
             [m]), shape (2,) or (B, 2).
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        observation, errors = self._call("observation", x=x, time_left=time_left)
+        observation, errors = self.call("observation", x=x, time_left=time_left)
         return observation, errors
 
     def state_from_observation(self, observation: ArrayLike) -> Array:
@@ -380,21 +311,18 @@ class Kernels(KernelLibrary):
 
         Args:
             observation: Shape (n_x + 1,) or (B, n_x + 1), entries as documented in `DQSpaceArmEnv`; the error
-                pose need not be exactly of unit norm.
+                pose need not have exactly unit norm.
 
         Returns:
             States, shape (n_x,) or (B, n_x), units of `layout.state`.
-
-        Raises:
-            ValueError: If shapes do not fit.
         """
-        return self._call("state_from_observation", observation=observation)[0]
+        return self.call("state_from_observation", observation=observation)[0]
 
     def _integrator(self, name: str | None) -> str | None:
         from dq_space_arm_env.scene import INTEGRATORS
 
         if name is not None and name not in INTEGRATORS:
-            raise ValueError(f"integrator: {name!r} is unknown; there are {', '.join(INTEGRATORS)}")
+            raise ValueError(f"integrator: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
         return name
 
     def _time_step(self, dt: float | None) -> Array:
@@ -410,12 +338,12 @@ def _compiled(scene: Scene, threads: int) -> Kernels:
 
 
 def compile_scene(scene: Scene | str | Path, threads: int = 1) -> Kernels:
-    """Kernels of a scene; the same scene gives the same object within a process.
+    """Kernels of a scene; within a process, equal scenes share one object.
 
     Args:
         scene: A scene, the name of a shipped one, or a path to a YAML file.
-        threads: Most threads that a batch is shared among. One is best unless batches are large and a core
-            is idle.
+        threads: Most threads that a batch is shared among. One is best unless batches are large and cores
+            idle.
 
     Returns:
         The kernels. Each is compiled at its first use, or loaded from the disk cache.

@@ -1,6 +1,6 @@
-"""Where a scene's kernels come from: the process, the disk cache, or the compiler, in this order.
+"""The source of a scene's kernels: this process, the disk cache, or the compiler, in this order.
 
-A process that finds what it needs in the cache neither traces nor compiles, nor does it import CasADi.
+A process that finds its kernels in the cache neither traces nor compiles, nor does it import CasADi.
 """
 
 from __future__ import annotations
@@ -14,32 +14,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.common.host_machine import host_machine
 from dq_space_arm_env.compiler import native
-from dq_space_arm_env.kernels.bound import BoundKernel
+from dq_space_arm_env.kernels.bound import BoundKernel, rows_of
+from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.schema import Scene
 
 if TYPE_CHECKING:
     from dq_space_arm_env.compiler.program import Program
-    from dq_space_arm_env.kernels.environment_programs import EnvironmentPrograms
-    from dq_space_arm_env.kernels.programs import ScenePrograms
+    from dq_space_arm_env.kernels.programs.environment_programs import EnvironmentPrograms
+    from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
+
+
+Array = NDArray[Any]
 
 
 class KernelLibrary:
-    """The compiled programs of a scene, by name.
+    """The compiled programs of a scene, by name."""
 
-    Attributes:
-        scene: The scene.
-        dtype: Type of the numbers that they compute with.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        """Prepare; nothing is compiled yet.
-
-        Args:
-            scene: A validated scene.
-        """
-        self.scene = scene
+    def __init__(self, scene: Scene, threads: int = 1) -> None:
+        if threads < 1:
+            raise ValueError(f"threads: {threads}, should be at least 1")
+        self.scene, self.threads, self.layout = scene, threads, StateLayout.of(scene)
+        self.n_x, self.n_t, self.n_u = self.layout.n_x, self.layout.n_t, self.layout.n_u
         self.dtype = np.dtype(scene.simulation.precision)
         self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
         self._paper_kernels: dict[tuple[str, int], BoundKernel] = {}
@@ -47,34 +46,26 @@ class KernelLibrary:
 
     @cached_property
     def _programs(self) -> ScenePrograms:
-        from dq_space_arm_env.kernels.programs import ScenePrograms
+        from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
 
         return ScenePrograms(self.scene)
 
     @cached_property
     def _environment_programs(self) -> EnvironmentPrograms:
-        from dq_space_arm_env.kernels.environment_programs import EnvironmentPrograms
+        from dq_space_arm_env.kernels.programs.environment_programs import EnvironmentPrograms
 
         return EnvironmentPrograms(self.scene)
 
     @property
     def lanes(self) -> int:
-        """Rows that vector code works on at a time: numbers of the scene's precision in a vector register."""
-        return native.host_machine().lanes * 8 // self.dtype.itemsize
+        """Rows per vector: numbers of the scene's precision in a vector register."""
+        return host_machine().lanes * 8 // self.dtype.itemsize
 
     def kernel(self, name: str, *, integrator: str | None = None, lanes: int | None = None) -> BoundKernel:
-        """Compile a program, or load it from the cache.
+        """Compile a program of `ScenePrograms` or `EnvironmentPrograms`, or load it from the cache.
 
-        Args:
-            name: Name of the program (`ScenePrograms` or `EnvironmentPrograms`, both in `kernels`).
-            integrator: Integrator of programs that take a step; the scene's by default.
-            lanes: Rows that the code works on at a time: 1, or the processor's vector width (default).
-
-        Returns:
-            The kernel.
-
-        Raises:
-            ValueError: If there is no integrator of that name.
+        `integrator` is that of programs that take a step, the scene's by default; `lanes` the rows the code
+        works on at a time: 1, or the processor's vector width (default).
         """
         method = (integrator or self.scene.simulation.integrator) if name in _STEPS else ""
         key = (name, method, self.lanes if lanes is None else lanes)
@@ -89,21 +80,13 @@ class KernelLibrary:
         return self._kernels[key]
 
     def paper_kernel(self, name: str, *, lanes: int | None = None) -> BoundKernel:
-        """Compile a program of the paper's redundant formulation, or load it from the cache.
-
-        Args:
-            name: Name of the program (`kernels.paper_programs.PaperPrograms`).
-            lanes: Rows that the code works on at a time: 1, or the processor's vector width (default).
-
-        Returns:
-            The kernel.
-        """
+        """Compile a program of `PaperPrograms`, the redundant formulation, or load it from the cache."""
         width = self.lanes if lanes is None else lanes
         key = (name, width)
         if key not in self._paper_kernels:
 
             def trace() -> Program:
-                from dq_space_arm_env.kernels.paper_programs import PaperPrograms
+                from dq_space_arm_env.kernels.programs.paper_programs import PaperPrograms
 
                 return PaperPrograms(self.scene).build(name)
 
@@ -111,7 +94,7 @@ class KernelLibrary:
         return self._paper_kernels[key]
 
     def _load(self, name: str, variant: str, lanes: int, trace: Callable[[], Program]) -> BoundKernel:
-        """Load a kernel from the cache; trace and compile it if it is not there."""
+        """Load a kernel from the cache; trace and compile it if it is missing."""
         parts = (self.scene.content_hash(), _source_hash(), name, variant, str(lanes))
 
         def build() -> tuple[bytes, dict[str, Any]]:
@@ -123,19 +106,28 @@ class KernelLibrary:
         return BoundKernel(native.load_or_build(name, native.cache_key(*parts), build))
 
     def operation_count(self, name: str, *, integrator: str | None = None) -> int:
-        """Arithmetic operations of a program per state.
-
-        Args:
-            name: Name of the program.
-            integrator: Integrator of programs that take a step; the scene's by default.
-
-        Returns:
-            The count after folding constants and sharing subexpressions.
-        """
+        """Arithmetic operations of a program per state, after folding and sharing subexpressions."""
         return self.kernel(name, integrator=integrator).operation_count
 
+    def call(self, name: str, integrator: str | None = None, **inputs: ArrayLike | None) -> tuple[Array, ...]:
+        """Run a program on one row or a batch; outputs take the form of the inputs."""
+        rows, batched, arrays = rows_of(inputs, self.dtype)
+        kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)
+        ordered = []
+        for spec in kernel.inputs:
+            array = arrays[spec.name]
+            if array.shape[-1] != spec.stride:
+                raise ValueError(
+                    f"{name}: {spec.name} has {array.shape[-1]} entries per row, "
+                    f"scene {self.scene.name!r} has {spec.stride}"
+                )
+            ordered.append(np.ascontiguousarray(array))
+        results = [np.zeros((rows, spec.stride), self.dtype) for spec in kernel.outputs]
+        kernel([*ordered, *results], rows, self.threads)
+        return tuple(result if batched else result[0] for result in results)
+
     def _announce(self) -> None:
-        """Tell the user, once, why the first use of a scene takes a moment."""
+        """Explain, once, why the first use of a scene takes a moment."""
         if not self._announced:
             self._announced = True
             _logger().info(
@@ -146,7 +138,7 @@ class KernelLibrary:
 
 
 class _StandardError(logging.StreamHandler[TextIO]):
-    """Writes to whatever is the standard error now, not when the logger was made."""
+    """Writes to the present standard error, not the one at the logger's creation."""
 
     @property
     def stream(self) -> TextIO:
@@ -174,7 +166,7 @@ def _logger() -> logging.Logger:
 
 @cache
 def _source_hash() -> str:
-    """Hash of the source that kernels are made from, so that a changed model never meets an old kernel."""
+    """Hash of the source that kernels are made from: a changed model never meets an old kernel."""
     package = Path(__file__).parent.parent
     digest = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
@@ -183,7 +175,7 @@ def _source_hash() -> str:
     return digest.hexdigest()
 
 
-_MODEL_SOURCES = ("algebra", "compiler", "cost.py", "dynamics", "integrators", "kernels", "scene")
+_MODEL_SOURCES = ("algebra", "compiler", "dynamics", "integrators", "kernels", "scene", "task", "validation")
 
 _STEPS = (
     "step",

@@ -1,8 +1,8 @@
-"""Rows of a batch shared among threads, such that a slow thread never holds up a fast one.
+"""Rows of a batch shared among threads, such that a slow thread never delays a fast one.
 
-The calling thread works too, and takes blocks of rows until none is left; helpers take blocks when the
-operating system lets them run. A helper that has not begun by then is called off instead of waited for, and
-the wait for a block under way is passive: with one core taken by another process, two threads cost little
+The calling thread works too and takes blocks of rows until none is left; helpers take blocks when the
+operating system schedules them. A helper that has not started by then is cancelled instead of awaited, and
+the wait for a block in progress is passive: with one core taken by another process, two threads cost little
 more than one.
 """
 
@@ -17,7 +17,7 @@ from itertools import count
 # Rows that a thread takes at a time, a multiple of every vector width: some tens of microseconds of work,
 # beside which taking a block is small.
 _BLOCK = 256
-# Blocks for each thread below which waking it costs more than it can do.
+# Blocks for each thread too few to be worth waking a thread.
 _BLOCKS_PER_THREAD = 4
 
 KernelFunction = Callable[[int, int, int], None]
@@ -29,14 +29,7 @@ def _helpers(threads: int) -> ThreadPoolExecutor:
 
 
 def run_shared(function: KernelFunction, rows: int, buffers: int, threads: int = 1) -> None:
-    """Run a kernel on rows 0 .. rows - 1.
-
-    Args:
-        function: Kernel; releases the interpreter while it runs.
-        rows: Number of rows.
-        buffers: Address of the addresses of the kernel's arrays.
-        threads: Most threads to use, this one included; small batches use fewer.
-    """
+    """Run a kernel, which releases the interpreter, on rows 0 .. rows - 1 of `buffers`."""
     if threads == 1 or rows < 2 * _BLOCKS_PER_THREAD * _BLOCK:
         function(0, rows, buffers)
     else:
@@ -44,13 +37,9 @@ def run_shared(function: KernelFunction, rows: int, buffers: int, threads: int =
 
 
 def share_rows(work_on: Callable[[int, int], None], rows: int, threads: int, block: int = _BLOCK) -> None:
-    """Have threads work on rows 0 .. rows - 1.
+    """Share rows 0 .. rows - 1 among at most `threads` threads, this one included, in blocks.
 
-    Args:
-        work_on: Works on rows begin .. end - 1; releases the interpreter meanwhile.
-        rows: Number of rows.
-        threads: Most threads to use, this one included; few rows use fewer.
-        block: Rows that a thread takes at a time; they should take some tens of microseconds.
+    `work_on(begin, end)` releases the interpreter; a block should take some tens of microseconds.
     """
     threads = min(threads, rows // (_BLOCKS_PER_THREAD * block))
     if threads <= 1:

@@ -1,41 +1,27 @@
 """Scenes: validated descriptions of a spacecraft with an arm, and of the maneuver asked of it."""
 
-from dq_space_arm_env.scene._problems import SceneError
-from dq_space_arm_env.scene.layout import (
-    ControlEntries,
-    StateEntries,
-    StateLayout,
-    TangentEntries,
-    draw_initial_state,
-    initial_state,
-)
+from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
+from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
+from dq_space_arm_env.scene.layout import ControlEntries, StateEntries, StateLayout, TangentEntries
 from dq_space_arm_env.scene.loading import list_scenes, load_scene, scenes_directory
-from dq_space_arm_env.scene.schema import (
-    ADAPTIVE_INTEGRATORS,
-    CURVED_INTEGRATORS,
-    INTEGRATORS,
+from dq_space_arm_env.scene.maneuver import (
     Actuators,
-    AxisAngle,
     AxisLimits,
-    Base,
     Cost,
     InitialState,
     JointLimit,
-    Link,
-    Payload,
-    Pose,
-    Scene,
-    Simulation,
     Spread,
     Success,
     Target,
     TipWrench,
-    Wrist,
 )
+from dq_space_arm_env.scene.pose import AxisAngle, Pose
+from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.scene.simulation import Simulation
+from dq_space_arm_env.scene.start import draw_initial_state, initial_state
+from dq_space_arm_env.validation.problems import SceneError
 
 __all__ = [
-    "ADAPTIVE_INTEGRATORS",
-    "CURVED_INTEGRATORS",
     "INTEGRATORS",
     "Actuators",
     "AxisAngle",

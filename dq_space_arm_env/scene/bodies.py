@@ -1,15 +1,23 @@
-"""The bodies of a scene: base, links, wrist and payload, with the physics their numbers have to satisfy."""
+"""Bodies of a scene: base, links, wrist and payload, and the physics that constrains their numbers."""
 
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictBool, StrictStr
 
-from dq_space_arm_env.scene._fields import Finite, Limit, NonNegative, Positive, Three, Vector3, read_numbers
-from dq_space_arm_env.scene._problems import Model, problem
 from dq_space_arm_env.scene.pose import Matrix3, Pose
+from dq_space_arm_env.validation.fields import (
+    Finite,
+    Limit,
+    NonNegative,
+    Positive,
+    Three,
+    Vector3,
+    read_numbers,
+)
+from dq_space_arm_env.validation.problems import Model, problem
 
-_TOLERANCE = 1e-9
+_TOLERANCE = 1e-9  # fractions of the largest moment
 _SINGULAR = 1e-12
 _FORMS = "3 numbers (diagonal) or 3x3"
 
@@ -17,23 +25,25 @@ _FORMS = "3 numbers (diagonal) or 3x3"
 def _read_inertia(value: Any) -> Matrix3:
     """Read 3 numbers (the diagonal) or a 3x3 matrix, and check that a rigid body can have it."""
     matrix = _read_matrix(value)
-    size = float(np.abs(matrix).max())
-    if np.abs(matrix - matrix.T).max() > _TOLERANCE * size:
+    if np.abs(matrix - matrix.T).max() > _TOLERANCE * np.abs(matrix).max():
         raise problem("must be symmetric")
     matrix = 0.5 * (matrix + matrix.T)
-    principal = np.linalg.eigvalsh(matrix)
-    shown = ", ".join(f"{moment:.6g}" for moment in principal)
-    if principal[0] <= _SINGULAR * size:
-        raise problem(
-            f"must be positive definite: its principal moments are {shown}, all should be greater than 0"
-        )
-    if principal[0] + principal[1] < principal[2] * (1 - _TOLERANCE):
-        raise problem(
-            f"no rigid body has it: of the principal moments {shown} the two smaller must add up to at least "
-            "the largest"
-        )
+    if flaw := flaw_of(matrix):
+        raise problem(f"no rigid body has it: {flaw}")
     first, second, third = (_three(row) for row in matrix)
     return (first, second, third)
+
+
+def flaw_of(inertia: np.ndarray[Any, np.dtype[np.float64]], *, rods: bool = False) -> str:
+    """Say why no rigid body has an inertia, or nothing; `rods` allows a moment of 0, as of a thin rod."""
+    least, middle, largest = np.linalg.eigvalsh(inertia)
+    size = float(np.abs(inertia).max())
+    moments = f"principal moments {least:.6g}, {middle:.6g}, {largest:.6g} kg m^2"
+    if least < -_TOLERANCE * size or (not rods and least <= _SINGULAR * size):
+        return f"{moments}, all must be {'0 or greater' if rods else 'greater than 0'}"
+    if least + middle < largest * (1 - _TOLERANCE):
+        return f"{moments}, of which the two smaller must add up to at least the largest"
+    return ""
 
 
 def _read_matrix(value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -1,4 +1,4 @@
-"""Where everything lies in the state, the tangent and the controls of a scene, and where an episode starts.
+"""Layout of the state, the tangent and the controls of a scene.
 
 State: base pose, joint angles, wrist angles, base velocity, joint rates. Tangent: the same, with a twist
 increment of the base in base axes (rotation, then translation) in place of the pose. Controls: base force,
@@ -10,109 +10,61 @@ v_x, v_y.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from dq_space_arm_env.scene.maneuver import AxisLimits
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.scene.start import (
-    PLANAR_POSE,
-    Array,
-    draw_initial_state,
-    free_axes,
-    initial_state,
-    is_planar,
-)
-from dq_space_arm_env.scene.task import AxisLimits
-
-__all__ = [
-    "ControlEntries",
-    "StateEntries",
-    "StateLayout",
-    "TangentEntries",
-    "draw_initial_state",
-    "initial_state",
-]
+from dq_space_arm_env.scene.start import PLANAR_POSE, Array, free_axes, initial_state, is_planar
 
 _AXES = ("x", "y", "z")
 _EULER_ANGLES = ("psi", "theta", "phi")
 _POSE = tuple(f"base pose q_{part}{index}" for part in "rd" for index in range(4))
 
 
-@dataclass(frozen=True)
-class StateEntries:
-    """The entries of the state x; empty slices for what the scene does not have.
-
-    Attributes:
-        names: Name of each entry.
-        units: Unit of each entry, "1" for dimensionless.
-        pose: Base pose q_{e0/I}, 8 numbers (planar: q_r0, q_r3, q_d1, q_d2).
-        joint_angles: Joint angles, base to tip.
-        wrist_angles: Wrist angles psi, theta, phi.
-        base_velocity: Velocity of the base in base axes, 6 numbers (planar: omega_z, v_x, v_y).
-        angular_velocity: The angular part of `base_velocity`.
-        linear_velocity: The linear part of `base_velocity`.
-        joint_rates: Joint rates, base to tip.
-    """
-
+@dataclass(frozen=True, kw_only=True)
+class _Entries:
     names: tuple[str, ...]
-    units: tuple[str, ...]
-    pose: slice
-    joint_angles: slice
-    wrist_angles: slice
-    base_velocity: slice
-    angular_velocity: slice
-    linear_velocity: slice
-    joint_rates: slice
+    units: tuple[str, ...]  # "1" for dimensionless
 
 
-@dataclass(frozen=True)
-class TangentEntries:
-    """The entries of the tangent of the state; empty slices for what the scene does not have.
+@dataclass(frozen=True, kw_only=True)
+class _MotionEntries(_Entries):
+    """Slices that state and tangent have in common; empty for what the scene does not have."""
 
-    Attributes:
-        names: Name of each entry.
-        units: Unit of each entry.
-        rotation: Rotation increment of the base in base axes, 3 numbers (planar: z).
-        translation: Translation increment of the base in base axes, 3 numbers (planar: x, y).
-        joint_angles: Joint angles, base to tip.
-        wrist_angles: Wrist angles psi, theta, phi.
-        base_velocity: Velocity of the base in base axes, 6 numbers (planar: omega_z, v_x, v_y).
-        angular_velocity: The angular part of `base_velocity`.
-        linear_velocity: The linear part of `base_velocity`.
-        joint_rates: Joint rates, base to tip.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    rotation: slice
-    translation: slice
-    joint_angles: slice
-    wrist_angles: slice
-    base_velocity: slice
-    angular_velocity: slice
-    linear_velocity: slice
-    joint_rates: slice
+    joint_angles: slice  # base to tip
+    wrist_angles: slice  # psi, theta, phi
+    base_velocity: slice  # base axes, 6 numbers (planar: omega_z, v_x, v_y)
+    angular_velocity: slice  # part of base_velocity
+    linear_velocity: slice  # part of base_velocity
+    joint_rates: slice  # base to tip
 
 
-@dataclass(frozen=True)
-class ControlEntries:
-    """The entries of the controls u; empty slices for what the scene does not have.
+@dataclass(frozen=True, kw_only=True)
+class StateEntries(_MotionEntries):
+    """The entries of the state x."""
 
-    Attributes:
-        names: Name of each entry.
-        units: Unit of each entry.
-        base_force: Force on the base in base axes, 3 numbers (planar: x, y).
-        base_torque: Torque on the base in base axes, 3 numbers (planar: z).
-        joint_torque: Torques of the actuated joints, base to tip.
-        wrist_rate: Euler rates psi, theta, phi of the wrist.
-    """
+    pose: slice  # of the base, q_{e0/I}, 8 numbers (planar: q_r0, q_r3, q_d1, q_d2)
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    base_force: slice
-    base_torque: slice
-    joint_torque: slice
-    wrist_rate: slice
+
+@dataclass(frozen=True, kw_only=True)
+class TangentEntries(_MotionEntries):
+    """The entries of the tangent of the state."""
+
+    rotation: slice  # increment of the base in base axes, 3 numbers (planar: z)
+    translation: slice  # increment of the base in base axes, 3 numbers (planar: x, y)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlEntries(_Entries):
+    """The entries of the controls u; empty slices for what the scene does not have."""
+
+    base_force: slice  # base axes, 3 numbers (planar: x, y)
+    base_torque: slice  # base axes, 3 numbers (planar: z)
+    joint_torque: slice  # actuated joints, base to tip
+    wrist_rate: slice  # Euler rates psi, theta, phi
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,16 +110,31 @@ class StateLayout:
         """Number of controls."""
         return len(self.control.names)
 
-    @classmethod
-    def of(cls, scene: Scene) -> "StateLayout":
-        """Lay out a scene.
+    def to_control(self, action: ArrayLike) -> Array:
+        """Scale actions to controls.
 
         Args:
-            scene: A validated scene.
+            action: Fractions of the limits in [-1, 1], shape (..., n_u).
 
         Returns:
-            Its layout.
+            Controls, shape (..., n_u), N, N m, rad/s.
         """
+        return np.asarray(action, dtype=np.float64) * self.control_limit
+
+    def to_action(self, control: ArrayLike) -> Array:
+        """Scale controls to actions, the inverse of `to_control`.
+
+        Args:
+            control: Controls, shape (..., n_u), N, N m, rad/s.
+
+        Returns:
+            Fractions of the limits, shape (..., n_u); 0 where a control has no limit.
+        """
+        return np.asarray(control, dtype=np.float64) / self.control_limit
+
+    @classmethod
+    def of(cls, scene: Scene) -> "StateLayout":
+        """Lay out a scene."""
         control, limit, weight = _lay_out_controls(scene)
         return cls(
             planar=is_planar(scene),
@@ -183,76 +150,62 @@ class StateLayout:
         )
 
 
-class _Entries:
-    """Names, units and slices, collected part by part."""
+class _Collector:
+    """Names and units of entries, collected part by part."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
         self.units: list[str] = []
 
     def add(self, unit: str, names: Sequence[str]) -> slice:
-        """Append entries of one unit and return where they lie."""
+        """Append entries of one unit and return their place."""
         start = len(self.names)
         self.names += names
         self.units += [unit] * len(names)
         return slice(start, len(self.names))
 
+    def collected(self) -> dict[str, Any]:
+        return {"names": tuple(self.names), "units": tuple(self.units)}
+
+    def add_motion(self, scene: Scene) -> dict[str, Any]:
+        """Append what state and tangent have in common."""
+        turning, moving = free_axes(scene)
+        wrist = _EULER_ANGLES if scene.wrist else ()
+        joint_angles = self.add("rad", [f"{link.name} angle" for link in scene.links])
+        wrist_angles = self.add("rad", [f"wrist {angle}" for angle in wrist])
+        angular = self.add("rad/s", [f"base omega_{_AXES[axis]}" for axis in turning])
+        linear = self.add("m/s", [f"base v_{_AXES[axis]}" for axis in moving])
+        return {
+            "joint_angles": joint_angles,
+            "wrist_angles": wrist_angles,
+            "base_velocity": slice(angular.start, linear.stop),
+            "angular_velocity": angular,
+            "linear_velocity": linear,
+            "joint_rates": self.add("rad/s", [f"{link.name} rate" for link in scene.links]),
+        }
+
 
 def _lay_out_state(scene: Scene) -> StateEntries:
-    entries = _Entries()
+    entries = _Collector()
     pose = [_POSE[index] for index in PLANAR_POSE] if is_planar(scene) else _POSE
     real = entries.add("1", [name for name in pose if "q_r" in name])
     dual = entries.add("m", [name for name in pose if "q_d" in name])
-    joint_angles, wrist_angles, angular, linear, joint_rates = _add_joints_and_velocities(entries, scene)
-    return StateEntries(
-        names=tuple(entries.names),
-        units=tuple(entries.units),
-        pose=slice(real.start, dual.stop),
-        joint_angles=joint_angles,
-        wrist_angles=wrist_angles,
-        base_velocity=slice(angular.start, linear.stop),
-        angular_velocity=angular,
-        linear_velocity=linear,
-        joint_rates=joint_rates,
-    )
+    motion = entries.add_motion(scene)
+    return StateEntries(pose=slice(real.start, dual.stop), **motion, **entries.collected())
 
 
 def _lay_out_tangent(scene: Scene) -> TangentEntries:
-    entries = _Entries()
+    entries = _Collector()
     turning, moving = free_axes(scene)
     rotation = entries.add("rad", [f"base rotation {_AXES[axis]}" for axis in turning])
     translation = entries.add("m", [f"base translation {_AXES[axis]}" for axis in moving])
-    joint_angles, wrist_angles, angular, linear, joint_rates = _add_joints_and_velocities(entries, scene)
-    return TangentEntries(
-        names=tuple(entries.names),
-        units=tuple(entries.units),
-        rotation=rotation,
-        translation=translation,
-        joint_angles=joint_angles,
-        wrist_angles=wrist_angles,
-        base_velocity=slice(angular.start, linear.stop),
-        angular_velocity=angular,
-        linear_velocity=linear,
-        joint_rates=joint_rates,
-    )
-
-
-def _add_joints_and_velocities(entries: _Entries, scene: Scene) -> tuple[slice, slice, slice, slice, slice]:
-    """Append what state and tangent have in common."""
-    turning, moving = free_axes(scene)
-    wrist = _EULER_ANGLES if scene.wrist else ()
-    return (
-        entries.add("rad", [f"{link.name} angle" for link in scene.links]),
-        entries.add("rad", [f"wrist {angle}" for angle in wrist]),
-        entries.add("rad/s", [f"base omega_{_AXES[axis]}" for axis in turning]),
-        entries.add("m/s", [f"base v_{_AXES[axis]}" for axis in moving]),
-        entries.add("rad/s", [f"{link.name} rate" for link in scene.links]),
-    )
+    motion = entries.add_motion(scene)
+    return TangentEntries(rotation=rotation, translation=translation, **motion, **entries.collected())
 
 
 def _lay_out_controls(scene: Scene) -> tuple[ControlEntries, list[float], list[float]]:
     """Entries, limits and weights of the controls."""
-    entries, actuators, cost = _Entries(), scene.actuators, scene.cost
+    entries, actuators, cost = _Collector(), scene.actuators, scene.cost
     limits: list[float] = []
     weights: list[float] = []
 
@@ -270,12 +223,7 @@ def _lay_out_controls(scene: Scene) -> tuple[ControlEntries, list[float], list[f
     joint = add("N m", _joint_inputs(scene))
     rate = add("rad/s", _axis_inputs(rate_names, actuators.wrist_rate, cost.wrist_rate, range(3)))
     control = ControlEntries(
-        names=tuple(entries.names),
-        units=tuple(entries.units),
-        base_force=force,
-        base_torque=torque,
-        joint_torque=joint,
-        wrist_rate=rate,
+        base_force=force, base_torque=torque, joint_torque=joint, wrist_rate=rate, **entries.collected()
     )
     return control, limits, weights
 
@@ -313,7 +261,7 @@ def _actuated_joints(scene: Scene) -> tuple[int, ...]:
 
 
 def _constant(values: Sequence[float] | Array) -> Array:
-    """Array that cannot be written to: a layout is shared."""
+    """Make a read-only array: layouts are shared."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array

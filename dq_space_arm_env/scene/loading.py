@@ -1,4 +1,4 @@
-"""From a name or a file to a validated scene; finds the scenes that ship with the package."""
+"""Load and validate scenes by name, path or content."""
 
 import importlib.resources
 from collections.abc import Mapping
@@ -6,25 +6,18 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
-from dq_space_arm_env.scene._problems import SceneError, did_you_mean
-from dq_space_arm_env.scene._yaml import parse_yaml
+from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.validation.problems import SceneError
+from dq_space_arm_env.validation.yaml_text import YAMLError, parse_yaml, yaml_problem
 
 _SUFFIXES = (".yaml", ".yml")
 
 
 def scenes_directory() -> Traversable:
-    """Find the folder of the scenes that ship with the package.
-
-    Returns:
-        `configs/scenes` inside the installed package, or at the top of the source checkout.
-
-    Raises:
-        SceneError: If there is neither.
-    """
+    """Find the scenes that ship: in the installed package, or at the top of the checkout."""
     installed = importlib.resources.files("dq_space_arm_env") / "configs" / "scenes"
     checkout = Path(__file__).resolve().parents[2] / "configs" / "scenes"
     for directory in (installed, checkout):
@@ -66,13 +59,13 @@ def load_scene(source: str | Path | Mapping[str, Any] | Scene) -> Scene:
         return _validated(dict(source), f"scene {source.get('name')!r}")
     if not isinstance(source, str):
         raise SceneError(
-            f"{source!r} is no scene: give the name of a scene, the path of a YAML file, a mapping or a Scene"
+            f"{source!r} is not a scene: give a name, the path of a YAML file, a mapping or a Scene"
         )
     names = list_scenes()
     if source not in names:
         raise SceneError(
             f"no scene is named {source!r}; {did_you_mean(source, names)}The scenes are {', '.join(names)}; "
-            "a file of your own is given by its path, ending in .yaml"
+            "give your own file by its path, ending in .yaml"
         )
     return _read(scenes_directory() / f"{source}.yaml")
 
@@ -90,21 +83,13 @@ def _read(file: Traversable) -> Scene:
         raise SceneError(f"{file}: must be a text file in UTF-8: {error}") from error
     except OSError as error:
         raise SceneError(f"{file}: cannot be read: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        raise SceneError(f"{file}: not valid YAML: {_yaml_problem(error)}") from error
+    except YAMLError as error:
+        raise SceneError(f"{file}: not valid YAML: {yaml_problem(error)}") from error
     if data is None:
         raise SceneError(f"{file}: the file is empty; a scene needs at least name, base and target")
     if not isinstance(data, dict):
         raise SceneError(f"{file}: must be a mapping (key: value) at the top, not a {type(data).__name__}")
     return _validated(data, str(file))
-
-
-def _yaml_problem(error: yaml.YAMLError) -> str:
-    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
-        mark = error.problem_mark
-        said = ", ".join(part for part in (error.context, error.problem) if part)
-        return f"line {mark.line + 1}, column {mark.column + 1}: {said}"
-    return str(error)
 
 
 def _validated(data: object, origin: str) -> Scene:

@@ -7,8 +7,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from dq_space_arm_env.algebra import poses, rotations
-from dq_space_arm_env.scene._fields import Eight, Finite, Three, Vector3, read_numbers
-from dq_space_arm_env.scene._problems import Model, problem
+from dq_space_arm_env.validation.fields import Eight, Finite, Three, Vector3, read_numbers
+from dq_space_arm_env.validation.problems import Model, problem
 
 Quaternion = tuple[float, float, float, float]
 Matrix3 = tuple[Three, Three, Three]
@@ -21,7 +21,7 @@ _SNAP = 4e-16
 
 
 def _snap(number: float) -> float:
-    """Replace what is 0 or +-1 up to rounding by exactly that."""
+    """Round to 0 or +-1 what equals it up to rounding errors."""
     nearest = round(number)
     return float(nearest) if abs(number - nearest) < _SNAP else number
 
@@ -47,11 +47,7 @@ class AxisAngle(Model):
         return axis
 
     def quaternion(self) -> Quaternion:
-        """Write the rotation as a unit quaternion.
-
-        Returns:
-            Unit quaternion (cos a/2, n sin a/2), shape (4,), dimensionless.
-        """
+        """Write the rotation as a unit quaternion."""
         length = math.hypot(*self.axis)
         direction = [component / length for component in self.axis]
         # Whole turns are taken off in degrees, where that is exact; each changes the sign of the quaternion.

@@ -1,4 +1,4 @@
-"""The scene: one immutable, validated description of a spacecraft with an arm and of its maneuver.
+"""A scene: the immutable, validated description of a spacecraft with an arm and its maneuver.
 
 Units are SI (m, kg, s, N, N m, rad) unless a field says otherwise. Links go from the base to the tip,
 velocities have their angular part first, quaternions their scalar.
@@ -8,134 +8,26 @@ import hashlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field, StrictStr, ValidationInfo, field_validator
 
-from dq_space_arm_env.scene._fields import Count, Positive
-from dq_space_arm_env.scene._planar import planar_problems
-from dq_space_arm_env.scene._problems import Model, Problem, did_you_mean, problem, raise_problems
-from dq_space_arm_env.scene._yaml import dump_yaml
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
-from dq_space_arm_env.scene.pose import AxisAngle, Pose
-from dq_space_arm_env.scene.task import (
-    Actuators,
-    AxisLimits,
-    Cost,
-    InitialState,
-    JointLimit,
-    Spread,
-    Success,
-    Target,
-    TipWrench,
-)
+from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
+from dq_space_arm_env.scene.pose import Matrix3, Pose
+from dq_space_arm_env.scene.simulation import Simulation
+from dq_space_arm_env.validation.problems import Model, Problem, raise_problems
+from dq_space_arm_env.validation.yaml_text import dump_yaml
 
-__all__ = [
-    "ADAPTIVE_INTEGRATORS",
-    "CURVED_INTEGRATORS",
-    "INTEGRATORS",
-    "Actuators",
-    "AxisAngle",
-    "AxisLimits",
-    "Base",
-    "Cost",
-    "InitialState",
-    "JointLimit",
-    "Link",
-    "Payload",
-    "Pose",
-    "Scene",
-    "Simulation",
-    "Spread",
-    "Success",
-    "Target",
-    "TipWrench",
-    "Wrist",
-]
-
-INTEGRATORS = (
-    "symplectic_euler",
-    "rk4",
-    "rk6",
-    "rk8",
-    "dormand_prince",
-    "rodas4",
-    "rodas5p",
-    "momentum_rk4",
-    "momentum_rosenbrock",
-)
-CURVED_INTEGRATORS = ("symplectic_euler", "rk4")
-"""Those whose steps have second derivatives, which Newton's method for optimal control needs."""
-ADAPTIVE_INTEGRATORS = ("dormand_prince",)
-"""Those that divide a time step as far as tolerances ask for."""
-
-TOLERANCES = {"float64": (1e-8, 1e-10), "float32": (1e-5, 1e-6)}
-"""Relative and absolute tolerance of adaptive integrators where a scene gives none, by precision."""
-SMALLEST_SINGLE_RTOL = 1e-6
-"""Relative tolerance that rounding in single precision leaves within reach."""
-
-
-class Simulation(Model):
-    """How time is discretized."""
-
-    dt: Positive = Field(default=0.015, description="time step, s")
-    steps: Count = Field(default=1000, description="number of time steps of an episode")
-    integrator: StrictStr = Field(default="rk4", description="name of the integrator")
-    precision: Literal["float64", "float32"] = Field(
-        default="float64",
-        description="numbers that the machine code computes with: 'float64', or 'float32', about twice as "
-        "fast in batches and right to six digits",
-    )
-    formulation: Literal["articulated_body", "minimal_coordinates"] | None = Field(
-        default=None,
-        description="how accelerations are solved for: 'articulated_body', joint by joint, or "
-        "'minimal_coordinates', with the mass matrix, where a base lighter than its arm loses digits; "
-        "absent: the faster one, which is articulated_body unless the integrator keeps the momentum",
-    )
-    rtol: Positive | None = Field(
-        default=None,
-        description="relative tolerance of an adaptive integrator, of velocities and, in rad and m, of pose "
-        "and angles; absent: 1e-8, or 1e-5 in single precision",
-    )
-    atol: Positive | None = Field(
-        default=None,
-        description="absolute tolerance of an adaptive integrator, rad, m, rad/s, m/s; absent: 1e-10, or "
-        "1e-6 in single precision",
-    )
-
-    @field_validator("integrator")
-    @classmethod
-    def _is_known(cls, name: str) -> str:
-        if name not in INTEGRATORS:
-            raise problem(
-                f"unknown; {did_you_mean(name, INTEGRATORS)}It must be one of {', '.join(INTEGRATORS)}"
-            )
-        return name
-
-    def _problems(self) -> Iterator[Problem]:
-        """Find tolerances that nothing asks for, or that single precision cannot keep."""
-        for name in ("rtol", "atol"):
-            value = getattr(self, name)
-            if value is not None and self.integrator not in ADAPTIVE_INTEGRATORS:
-                adaptive = " or ".join(ADAPTIVE_INTEGRATORS)
-                sentence = f"{self.integrator} takes fixed steps: remove it, or set integrator to {adaptive}"
-                yield Problem((name,), value, sentence)
-        if self.precision == "float32" and self.rtol is not None and self.rtol < SMALLEST_SINGLE_RTOL:
-            sentence = f"must be at least {SMALLEST_SINGLE_RTOL:g} in single precision"
-            yield Problem(("rtol",), self.rtol, sentence)
-
-    @property
-    def tolerances(self) -> tuple[float, float]:
-        """Relative and absolute tolerance of an adaptive integrator."""
-        rtol, atol = TOLERANCES[self.precision]
-        return (rtol if self.rtol is None else self.rtol, atol if self.atol is None else self.atol)
+_PLANAR = 'base.motion is "planar"'
+_Location = tuple[str | int, ...]
 
 
 class Scene(Model):
     """A spacecraft with an arm, its actuators and its maneuver; equations and task are derived from it."""
 
     name: StrictStr = Field(min_length=1, description="name of the scene")
-    description: StrictStr = Field(default="", description="what the scene is for")
+    description: StrictStr = Field(default="", description="purpose of the scene")
     base: Base = Field(description="the spacecraft")
     links: tuple[Link, ...] = Field(default=(), description="links of the arm, base to tip")
     wrist: Wrist | None = Field(
@@ -147,19 +39,21 @@ class Scene(Model):
         "without links too: base frame)",
     )
     payload: Payload | None = Field(default=None, description="body held rigidly at the tip; absent: none")
-    actuators: Actuators = Field(default_factory=Actuators, description="what can be commanded")
+    actuators: Actuators = Field(default_factory=Actuators, description="thrusters, wheels and motors")
     tip_wrench: TipWrench | None = Field(
         default=None, description="constant wrench at the tip, tip axes; absent: none"
     )
-    target: Target = Field(description="where the tip should go")
+    target: Target = Field(description="pose that the tip is to reach")
     cost: Cost = Field(default_factory=Cost, description="weights of the quadratic cost")
     initial_state: InitialState = Field(
         default_factory=InitialState, validate_default=True, description="the nominal start"
     )
     spread: Spread = Field(
-        default_factory=Spread, description="half-widths of what is drawn at random for each episode"
+        default_factory=Spread, description="half-widths of the random draws of each episode"
     )
-    success: Success = Field(default_factory=Success, description="what counts as reaching the target")
+    success: Success = Field(
+        default_factory=Success, description="tolerances that count as reaching the target"
+    )
     simulation: Simulation = Field(
         default_factory=Simulation, description="time step, number of steps, integrator"
     )
@@ -167,7 +61,7 @@ class Scene(Model):
     @field_validator("initial_state")
     @classmethod
     def _complete_initial_state(cls, start: InitialState, info: ValidationInfo) -> InitialState:
-        """Fill in zeros where nothing was given, and check that there is one number per joint."""
+        """Fill in zeros, and check that there is one number per joint."""
         if "links" not in info.data or "wrist" not in info.data:
             return start  # they have problems of their own, which are reported
         lengths = {
@@ -191,10 +85,10 @@ class Scene(Model):
         yield from self._actuator_problems()
         yield from self._part_problems()
         if self.base.motion == "planar":
-            yield from planar_problems(self)
+            yield from self._planar_problems()
 
     def _actuator_problems(self) -> Iterator[Problem]:
-        """Find actuators without anything to act on, and limits without motors."""
+        """Find actuators without a part to act on, and limits without motors."""
         wrist_rate, joint_torque = self.actuators.wrist_rate, self.actuators.joint_torque
         if wrist_rate and not self.wrist:
             sentence = "the scene has no wrist: remove it or add a wrist"
@@ -237,8 +131,32 @@ class Scene(Model):
             if half_width and not part:
                 yield Problem(("spread", field), half_width, f"must be 0: the scene has no {part_name}")
 
+    def _planar_problems(self) -> Iterator[Problem]:
+        """Find what leaves the x-y plane or turns about another axis than z."""
+        if self.wrist is not None:
+            yield Problem(("wrist",), self.wrist, f"{_PLANAR}: remove the wrist, it turns out of the plane")
+        yield from _inertia_problems(("base", "inertia"), self.base.inertia)
+        for index, link in enumerate(self.links):
+            here: _Location = ("links", index)
+            yield from _pose_problems((*here, "joint"), link.joint)
+            yield from _height_problems((*here, "center_of_mass"), link.center_of_mass)
+            yield from _inertia_problems((*here, "inertia"), link.inertia)
+        yield from _pose_problems(("tip",), self.tip)
+        if self.payload is not None:
+            yield from _height_problems(("payload", "center_of_mass"), self.payload.center_of_mass)
+            yield from _inertia_problems(("payload", "inertia"), self.payload.inertia)
+        if self.tip_wrench is not None:
+            yield from _height_problems(("tip_wrench", "force"), self.tip_wrench.force)
+            if any(self.tip_wrench.torque[:2]):
+                sentence = f"{_PLANAR}: only the torque about z may be nonzero"
+                yield Problem(("tip_wrench", "torque"), self.tip_wrench.torque, sentence)
+        yield from _pose_problems(("target", "pose"), self.target.pose)
+        yield from _velocity_problems(("target", "base_velocity"), self.target.base_velocity)
+        yield from _pose_problems(("initial_state", "base_pose"), self.initial_state.base_pose)
+        yield from _velocity_problems(("initial_state", "base_velocity"), self.initial_state.base_velocity)
+
     def replace(self, **changes: Any) -> "Scene":
-        """Make a scene that differs in some fields, and validate it (`model_copy` does not).
+        """Copy the scene with some fields changed, and validate it (`model_copy` does not).
 
         Args:
             **changes: New values of top-level fields, as models or as plain data.
@@ -275,3 +193,26 @@ class Scene(Model):
         content = self.model_dump(exclude={"name", "description"})
         canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def _pose_problems(location: _Location, pose: Pose) -> Iterator[Problem]:
+    yield from _height_problems((*location, "position"), pose.position)
+    if any(pose.rotation[1:3]):
+        sentence = f"{_PLANAR}: only rotations about z are possible, so x and y of [w, x, y, z] must be 0"
+        yield Problem((*location, "rotation"), pose.rotation, sentence)
+
+
+def _height_problems(location: _Location, vector: tuple[float, float, float]) -> Iterator[Problem]:
+    if vector[2] != 0:
+        yield Problem(location, vector, f"{_PLANAR}: the z component must be 0")
+
+
+def _inertia_problems(location: _Location, inertia: Matrix3) -> Iterator[Problem]:
+    if inertia[0][2] != 0 or inertia[1][2] != 0:
+        yield Problem(location, inertia, f"{_PLANAR}: the products of inertia Ixz and Iyz must be 0")
+
+
+def _velocity_problems(location: _Location, velocity: tuple[float, ...]) -> Iterator[Problem]:
+    if any(velocity[index] for index in (0, 1, 5)):
+        sentence = f"{_PLANAR}: only wz, vx and vy (numbers 3, 4 and 5 of 6) may be nonzero"
+        yield Problem(location, velocity, sentence)

@@ -1,4 +1,4 @@
-"""What an episode starts from: the scene's nominal state, target and masses, or draws from its spread."""
+"""Start of an episode: nominal state, target and masses of the scene, or draws from its spread."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from dq_space_arm_env.scene.schema import Scene
 
 Array = NDArray[np.float64]
 
-# What a planar base keeps of its pose (q_r0, q_r3, q_d1, q_d2) and of its velocity (omega_z, v_x, v_y).
+# Entries that a planar base keeps of its pose (q_r0, q_r3, q_d1, q_d2) and velocity (omega_z, v_x, v_y).
 PLANAR_POSE = (0, 3, 5, 6)
 PLANAR_TWIST = (2, 3, 4)
 
@@ -26,20 +26,11 @@ Scalar = Any
 
 @dataclass(frozen=True)
 class MassFactors:
-    """What masses and inertias of the bodies are multiplied by; the inertias are those about centers of mass.
-
-    Attributes:
-        base_mass: Of the base.
-        base_inertia: Of the base.
-        link_masses: Of the links, base to tip.
-        link_inertias: Of the links, base to tip.
-        payload_mass: Of the payload; 1 without one.
-        payload_inertia: Of the payload; 1 without one.
-    """
+    """Factors of masses, and of inertias about centers of mass."""
 
     base_mass: Scalar
     base_inertia: Scalar
-    link_masses: tuple[Scalar, ...]
+    link_masses: tuple[Scalar, ...]  # base to tip
     link_inertias: tuple[Scalar, ...]
     payload_mass: Scalar = 1.0
     payload_inertia: Scalar = 1.0
@@ -47,13 +38,7 @@ class MassFactors:
 
 @dataclass(frozen=True)
 class EpisodeStart:
-    """What is drawn for an episode, over plain scalars: numbers, arrays, or symbols.
-
-    Attributes:
-        state: Initial state, n_x entries, units of the state.
-        target: Pose q_{D/I} of the target, 8 numbers.
-        masses: Factors of masses and inertias.
-    """
+    """Draws of an episode, over plain scalars: numbers, arrays, or symbols."""
 
     state: list[Scalar]
     target: tuple[Scalar, ...]
@@ -61,64 +46,27 @@ class EpisodeStart:
 
 
 def is_planar(scene: Scene) -> bool:
-    """Tell whether the base moves in its x-y plane only.
-
-    Args:
-        scene: A validated scene.
-
-    Returns:
-        True for a planar base.
-    """
+    """Tell whether the base only moves in its x-y plane."""
     return scene.base.motion == "planar"
 
 
 def free_axes(scene: Scene) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Tell about which axes the base turns and along which it moves.
-
-    Args:
-        scene: A validated scene.
-
-    Returns:
-        Indices of the axes of rotation, and of those of translation: (0, 1, 2) twice, or (2,) and (0, 1).
-    """
+    """Axes about which the base turns, and along which it moves."""
     return ((2,), (0, 1)) if is_planar(scene) else ((0, 1, 2), (0, 1, 2))
 
 
 def initial_state(scene: Scene) -> Array:
-    """Give the scene's nominal start, the sign of the base quaternion such that q_{G/I} starts near q_{D/I}.
-
-    Args:
-        scene: A validated scene.
-
-    Returns:
-        State, shape (n_x,), units of the state.
-    """
+    """Nominal state, shape (n_x,); the sign of the base quaternion puts q_{G/I} near q_{D/I}."""
     return start_from_draws(scene, np.zeros(number_of_draws(scene)))
 
 
 def draw_initial_state(scene: Scene, rng: np.random.Generator) -> Array:
-    """Draw a start: every component uniform around the nominal one, within the scene's spread.
-
-    Args:
-        scene: A validated scene.
-        rng: Source of random numbers.
-
-    Returns:
-        State, shape (n_x,), units of the state; the same sign rule as in `initial_state`.
-    """
+    """Draw a state, shape (n_x,), uniformly around the nominal one, within the scene's spread."""
     return start_from_draws(scene, rng.uniform(-1.0, 1.0, number_of_draws(scene)))
 
 
 def number_of_draws(scene: Scene) -> int:
-    """Tell how many random numbers an episode's start takes.
-
-    Args:
-        scene: A validated scene.
-
-    Returns:
-        The number. It does not depend on how wide the spread of states is; of target, masses and inertias
-        only what has a spread takes any.
-    """
+    """Count the random numbers that a start takes: all of the state, and whatever else has a spread."""
     turning, moving = free_axes(scene)
     start, spread = scene.initial_state, scene.spread
     base = len(turning) + len(moving)
@@ -130,42 +78,19 @@ def number_of_draws(scene: Scene) -> int:
 
 
 def has_target_spread(scene: Scene) -> bool:
-    """Tell whether the target is drawn for each episode.
-
-    Args:
-        scene: A validated scene.
-
-    Returns:
-        True if it has a spread.
-    """
+    """Tell whether the target is drawn for each episode."""
     return bool(scene.spread.target_rotation or scene.spread.target_position)
 
 
 def target_entries(scene: Scene) -> tuple[int, ...]:
-    """Tell which of the target's eight numbers may differ from episode to episode.
-
-    Args:
-        scene: A validated scene.
-
-    Returns:
-        Their indices: none without a spread of the target, otherwise all that are not zero for every pose.
-    """
+    """Indices of the target's eight numbers that may differ between episodes; none without a spread."""
     if not has_target_spread(scene):
         return ()
     return PLANAR_POSE if is_planar(scene) else tuple(range(8))
 
 
 def start_from_draws(scene: Scene, draws: Array) -> Array:
-    """Turn random numbers into initial states.
-
-    Args:
-        scene: A validated scene.
-        draws: Numbers in [-1, 1] in the order of `episode_start`, shape (number_of_draws,) or
-            (B, number_of_draws).
-
-    Returns:
-        States, shape (n_x,) or (B, n_x), units of the state.
-    """
+    """Turn draws, (number_of_draws,) or (B, number_of_draws), into states, (n_x,) or (B, n_x)."""
     # Columns of a batch are arrays, single draws plain floats.
     columns = list(np.transpose(draws)) if np.ndim(draws) == 2 else np.asarray(draws).tolist()
     entries = (np.asarray(entry, dtype=np.float64) for entry in episode_start(scene, columns).state)
@@ -173,7 +98,7 @@ def start_from_draws(scene: Scene, draws: Array) -> Array:
 
 
 def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
-    """Turn random numbers into what an episode starts from.
+    """Turn draws in [-1, 1] into state, target and masses.
 
     The draws come in this order, components in the order of the state, also where the spread is zero: base
     rotation vector (in base axes: q_{e0/I} = nominal * exp), base position (in inertial axes), joint angles,
@@ -181,13 +106,6 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     rotation vector of the target (in its axes) and its position (in inertial axes), mass and inertia of the
     base, masses of the links, inertias of the links, mass and inertia of the payload. A planar base, and its
     target, turn about z and move in x and y only.
-
-    Args:
-        scene: A validated scene.
-        draws: Numbers in [-1, 1], number_of_draws scalars.
-
-    Returns:
-        State, target and masses.
     """
     start, spread = scene.initial_state, scene.spread
     turning, moving = free_axes(scene)
@@ -245,17 +163,7 @@ def _drawn_masses(scene: Scene, draws: Iterator[Scalar]) -> MassFactors:
 
 
 def episode_scene(scene: Scene, draws: Sequence[float], target: Sequence[float] | None = None) -> Scene:
-    """Write what an episode starts from as a scene of its own, in which nothing is left to chance.
-
-    Args:
-        scene: A validated scene.
-        draws: Numbers in [-1, 1] in the order of `episode_start`, number_of_draws of them.
-        target: Pose q_{D/I} in place of the drawn one, 8 numbers.
-
-    Returns:
-        The scene with the drawn target, masses and inertias, and without a spread. Its initial state stays
-        the nominal one: the drawn state is what `start_from_draws` gives.
-    """
+    """Scene of one episode: drawn (or given) target, drawn masses, no spread, nominal initial state."""
     start = episode_start(scene, list(draws))
     masses = start.masses
     changes: dict[str, Any] = {
@@ -275,13 +183,13 @@ def episode_scene(scene: Scene, draws: Sequence[float], target: Sequence[float] 
 
 
 def _scaled(body: Base | Link | Payload, mass: float, inertia: float) -> dict[str, Any]:
-    """Fields of a body with mass and inertia multiplied."""
+    """Scale mass and inertia of a body."""
     rows = tuple(tuple(inertia * entry for entry in row) for row in body.inertia)
     return {**body.model_dump(), "mass": mass * body.mass, "inertia": rows}
 
 
 def _tip_rotation(scene: Scene, joint_angles: Sequence[Any], wrist_angles: Sequence[Any]) -> Sequence[Any]:
-    """Rotation of q_{G/e0}: the real parts of (27), without the base."""
+    """Rotation of q_{G/e0}: real parts of eq. (27), without the base."""
     q: Sequence[Any] = (1.0, 0.0, 0.0, 0.0)
     for link, angle in zip(scene.links, joint_angles, strict=True):
         q = multiply(multiply(q, link.joint.rotation), rotations.from_axis_angle(_Z, angle))

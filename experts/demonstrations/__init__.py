@@ -1,17 +1,17 @@
 """Demonstrations: optimal maneuvers from many starts, in files that agents learn from.
 
-A folder of demonstrations is made of shards, files with some dozens of problems each, `settings.json` with
-all that they follow from, and `manifest.json`, written last, with what became of every problem. Given the
-processor, its bytes follow from the settings alone: whatever interrupts the work, whoever goes on with it,
+A folder of demonstrations holds shards, files with some dozens of problems each; `settings.json`, all that
+they follow from; and `manifest.json`, written last, the outcome of every problem (`folder` draws the tree).
+On a given kind of processor its bytes follow from the settings alone: an interrupted run, resumed by anyone,
 ends with the same files.
 """
 
-from experts.demonstrations.errors import DemonstrationsError
 from experts.demonstrations.executors import Executor, ProcessExecutor, SerialExecutor
 from experts.demonstrations.generation import Advance, generate_demonstrations
 from experts.demonstrations.minari_export import export_to_minari
 from experts.demonstrations.ray_executor import RayExecutor
 from experts.demonstrations.reading import Batch, Demonstration, Demonstrations, load_demonstrations
+from experts.demonstrations.tensors import DemonstrationsError
 
 __all__ = [
     "Advance",

@@ -1,15 +1,17 @@
-"""A folder of demonstrations on the disk: what it is for, which shards it has, who is at work in it.
+"""A folder of demonstrations on disk.
 
-| file | content |
-|---|---|
-| `settings.json` | all that the data follow from; written first |
-| `shards/<number>-<sha256>.safetensors` | a shard, under the name of its content: what differs is damaged |
-| `manifest.json` | what became of every problem, and the shards with their hashes; written last |
-| `log/` | locks, and who took how long for what: this may differ from run to run |
-| `README.md`, `summary/` | a data card, and a page with times, from `experts.report.demonstrations` |
+    FOLDER
+    |-- settings.json                        all that the data follow from; written first
+    |-- shards
+    |   |-- 000000-<sha256>.safetensors      a shard, named after its content
+    |   `-- ...
+    |-- manifest.json                        outcome of every problem, hashes of the shards; written last
+    |-- log                                  locks, machines and times, which differ from run to run
+    |-- README.md                            data card
+    `-- summary                              page with distributions, times and sample trajectories
 
-A shard is written under another name, and renamed once the disk has it. So at any moment every file with its
-proper name is whole, and the rest is rubbish to be removed.
+A shard is written under a temporary name and renamed once it is on disk. Every file with its proper name is
+therefore complete at any moment; the rest is left over from a killed run and is removed.
 """
 
 import hashlib
@@ -23,76 +25,45 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experts.demonstrations.errors import DemonstrationsError
+from dq_space_arm_env.common.files import write_atomically
 from experts.demonstrations.outcomes import REASONS
 from experts.demonstrations.settings import Settings, differences
 from experts.demonstrations.shard import ShardResult
-from experts.demonstrations.tensors import map_tensors
-from experts.files import write_atomically
+from experts.demonstrations.tensors import DemonstrationsError, map_tensors
 
 SETTINGS, MANIFEST, SHARDS, LOG = "settings.json", "manifest.json", "shards", "log"
 _SHARD_NAME = re.compile(r"(\d{6,})-([0-9a-f]{64})\.safetensors")
 
 
 class Part(NamedTuple):
-    """One of several runs that share the work, on one machine or many.
-
-    Attributes:
-        number: From 1.
-        of: Number of parts.
-    """
+    """Part `number` (from 1) of several runs that share the work, on one machine or many."""
 
     number: int
     of: int
 
     def shards(self, n_shards: int) -> range:
-        """Shards of this part.
-
-        Args:
-            n_shards: Number of all shards.
-
-        Returns:
-            Every `of`-th shard.
-        """
+        """Return the numbers of this part's shards."""
         return range(self.number - 1, n_shards, self.of)
 
 
 class Folder:
-    """A folder that demonstrations are generated in.
-
-    Attributes:
-        path: Where it is.
-        settings: What it is for.
-        part: The part of the work that is done here.
-        shards: Numbers of the shards of this part.
-    """
+    """A folder that demonstrations are generated in; `shards` are the numbers of this part's."""
 
     def __init__(self, path: Path, settings: Settings, part: Part) -> None:
-        """Name the folder; nothing is written yet.
-
-        Args:
-            path: Where it is, or will be.
-            settings: What it is for.
-            part: The part of the work that is done here; 1 of 1 for all of it.
-        """
         self.path, self.settings, self.part = path, settings, part
         self.shards = part.shards(settings.n_shards)
 
     @contextmanager
     def opened(self) -> Iterator[None]:
-        """Make or find the folder, and keep others out of the same work inside a `with` block.
+        """Create or open the folder, and lock this part of the work inside a `with` block.
 
-        The locks are those of the operating system: they vanish with the process, however it ends.
-
-        Raises:
-            DemonstrationsError: If another run is at work on the same shards, or the folder is for other
-                settings.
+        The operating system releases the locks when the process ends, however it ends.
         """
         for folder in (self.path, self.path / SHARDS, self.path / LOG):
             folder.mkdir(parents=True, exist_ok=True)
         whole, part = self.path / LOG / "lock", self.path / LOG / f"lock-{self.part.number}-of-{self.part.of}"
         with _locked(whole, exclusive=self.part.of == 1), _locked(part, exclusive=True):
-            if self.part.of == 1:  # nobody else is writing
+            if self.part.of == 1:  # no other run is writing
                 for name in (SETTINGS, MANIFEST):
                     for unfinished in self.path.glob(f".{name}.*.part"):
                         unfinished.unlink()
@@ -107,20 +78,16 @@ class Folder:
             write_atomically(path, self.settings.to_json(), durable=True)
             return
         except ValueError as error:
-            raise DemonstrationsError(f"{path} is damaged ({error}); take a new folder") from error
+            raise DemonstrationsError(f"{path} is damaged ({error}); choose a new folder") from error
         found = differences(there, here)
         if found:
             raise DemonstrationsError(
-                f"{self.path} was begun with other settings: {'; '.join(found)}. Repeat them, or take a new "
-                "folder"
+                f"{self.path} was started with different settings: {'; '.join(found)}. Use those, or choose "
+                "a new folder"
             )
 
     def sound_shards(self) -> Iterator[tuple[int, Path | None]]:
-        """Check the shards of this part; remove what is damaged, left over, or there twice.
-
-        Yields:
-            The number of each shard, and its file, or None if it has to be made.
-        """
+        """Yield each shard of this part and its file, or None; remove damaged files and duplicates."""
         files: dict[int, list[Path]] = {}
         for path in sorted((self.path / SHARDS).iterdir()):
             name = path.name.removeprefix(".")
@@ -129,7 +96,7 @@ class Folder:
                 if path.name == match[0]:
                     files.setdefault(int(match[1]), []).append(path)
                 else:
-                    path.unlink(missing_ok=True)  # what a killed run has begun to write
+                    path.unlink(missing_ok=True)  # left over from a killed run
         for shard in self.shards:
             sound = None
             for path in files.get(shard, ()):
@@ -140,33 +107,17 @@ class Folder:
             yield shard, sound
 
     def write(self, result: ShardResult) -> None:
-        """Write a shard.
-
-        Args:
-            result: The shard.
-
-        Raises:
-            OSError: If that is impossible; the folder is as it was then.
-        """
         path = self.path / SHARDS / f"{result.shard:06d}-{result.sha256}.safetensors"
         write_atomically(path, result.content, durable=True)
 
     def log(self, entry: dict[str, Any]) -> None:
-        """Add a line to the log of this part.
-
-        Args:
-            entry: JSON values.
-        """
+        """Append a line to the log of this part."""
         name = f"part-{self.part.number}-of-{self.part.of}.jsonl"
         with (self.path / LOG / name).open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
 
     def complete(self) -> bool:
-        """Write the manifest if all shards are there, those of other parts included.
-
-        Returns:
-            Whether they are.
-        """
+        """Write the manifest if all shards exist, those of other parts included; tell whether they do."""
         paths = sorted(path for path in (self.path / SHARDS).iterdir() if _SHARD_NAME.fullmatch(path.name))
         shards = {int(path.name.partition("-")[0]): path for path in paths}
         if len(shards) < self.settings.n_shards:
@@ -177,20 +128,13 @@ class Folder:
 
 
 def sha256_of(path: Path) -> str:
-    """Hash a file.
-
-    Args:
-        path: The file.
-
-    Returns:
-        SHA-256, 64 hexadecimal digits.
-    """
+    """Hash a file: 64 hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _manifest(settings: Path, paths: list[Path]) -> dict[str, Any]:
-    """What became of every problem, and where; the same whoever writes it."""
+    """Outcomes and shards; the same whichever part writes it."""
     shards, failures = [], np.zeros(len(REASONS), dtype=np.int64)
     for path in paths:
         arrays = map_tensors(path).arrays
@@ -215,7 +159,7 @@ def _manifest(settings: Path, paths: list[Path]) -> dict[str, Any]:
 
 @contextmanager
 def _locked(path: Path, *, exclusive: bool) -> Iterator[None]:
-    """Hold a lock, together with others if it is not exclusive."""
+    """Hold an exclusive or a shared lock."""
     import fcntl  # not on Windows
 
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -224,7 +168,7 @@ def _locked(path: Path, *, exclusive: bool) -> Iterator[None]:
             fcntl.flock(descriptor, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise DemonstrationsError(
-                f"another run is at work in {path.parent.parent}: wait for it, or take another folder"
+                f"another run is writing to {path.parent.parent}: wait for it, or choose another folder"
             ) from error
         yield
     finally:

@@ -1,32 +1,32 @@
-"""Generating demonstrations: what is missing in a folder is made, and then the manifest is written."""
+"""Generate demonstrations: make the shards that a folder lacks, then write its manifest."""
 
 import math
 import os
 import platform
 from collections.abc import Callable
 from contextlib import closing
+from datetime import timedelta
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
 from dq_space_arm_env import Scene
-from experts.demonstrations.errors import DemonstrationsError
 from experts.demonstrations.executors import Executor, local_executor
 from experts.demonstrations.folder import Folder, Part
 from experts.demonstrations.reading import Demonstrations, load_demonstrations
 from experts.demonstrations.settings import SHARD_SIZE, Settings
 from experts.demonstrations.shard import ShardResult, Task
-from experts.demonstrations.tensors import map_tensors
+from experts.demonstrations.tensors import DemonstrationsError, map_tensors
 
 
 class Advance(NamedTuple):
-    """How far a run has come.
+    """Progress of a run.
 
     Attributes:
-        problems: Number of problems of this run.
-        done: Number of problems whose shards are written, found ones included.
-        found: Number of problems whose shards were there before.
-        demonstrations: Number of demonstrations in those that are written.
+        problems: Problems of this run.
+        done: Problems whose shards are written, found ones included.
+        found: Problems whose shards existed before.
+        demonstrations: Demonstrations among those done.
         seconds: Time since the run began to solve, s.
     """
 
@@ -43,15 +43,33 @@ class Advance(NamedTuple):
 
     @property
     def success_rate(self) -> float:
-        """Share of the problems that are demonstrations now, 0 to 1; 1 before the first ones."""
+        """Demonstrations per problem done, 0 to 1; 1 before the first ones."""
         return self.demonstrations / self.done if self.done else 1.0
 
     @property
     def seconds_left(self) -> float:
-        """Time that the rest takes at this rate, s; inf if it is not known."""
+        """Estimated remaining time, s; inf if unknown."""
         if self.done == self.problems:
             return 0.0
         return (self.problems - self.done) / self.rate if self.rate > 0.0 else math.inf
+
+    @property
+    def total(self) -> int:
+        """Problems of this run, as a progress display asks for it."""
+        return self.problems
+
+    def describe(self) -> str:
+        """Summarize in one line."""
+        line = f"{self.done} of {self.problems} problems"
+        if self.found:
+            line += f" ({self.found} found)"
+        if self.done:
+            line += f", {self.success_rate:.1%} demonstrations"
+        if self.rate > 0.0:
+            line += f", {self.rate:.2f} a second"
+        if 0.0 < self.seconds_left < math.inf:
+            line += f", {timedelta(seconds=round(self.seconds_left))} left"
+        return line
 
 
 def generate_demonstrations(
@@ -66,34 +84,33 @@ def generate_demonstrations(
     executor: Executor | None = None,
     progress: Callable[[Advance], None] | None = None,
 ) -> Demonstrations | None:
-    """Solve n problems drawn from the scene's spread, and write what agents learn from.
+    """Solve n problems drawn from the scene's spread, and write demonstrations for agents to learn from.
 
-    A run that was interrupted, in whatever way, is resumed by the same call: shards that are there are
-    checked, those that are missing or damaged are made. The final files are those of an uninterrupted run,
-    byte for byte.
+    Repeat the call to resume a run, however it was interrupted: existing shards are checked, and missing or
+    damaged ones are made. The final files are those of an uninterrupted run, byte for byte.
 
     Args:
         scene: A scene, the name of a shipped one, or a path to a YAML file. It is taken in double precision.
-        n: Number of problems. Those that the expert fails at are recorded, and are no demonstrations.
-        out: Folder to write; made if it does not exist.
-        seed: Seed of the data set; problem i has a seed of its own, which follows from it and i.
-        shard_size: Problems of a file.
-        part: (i, k) does part i of k, i from 1, for several runs in the same folder, at once or not;
-            whichever ends last, or any later one, completes the folder.
-        workers: Number of processes; one for each processor by default. With 1 the work is done here.
-        executor: Who makes the shards, in place of processes.
-        progress: Called at the beginning and after each shard.
+        n: Number of problems. Those that the expert fails to solve are recorded apart.
+        out: Folder to write; created if it does not exist.
+        seed: Seed of the data set; the seed of problem i follows from it and i.
+        shard_size: Problems per file.
+        part: (i, k) does part i of k, i from 1, for several runs in the same folder, concurrent or not;
+            the last one to end, or any later one, completes the folder.
+        workers: Number of processes; by default one per processor. 1 does the work in this process.
+        executor: Makes the shards, in place of processes.
+        progress: Called at the start and after each shard.
 
     Returns:
         The demonstrations; None if other parts are still missing.
 
     Raises:
         SceneError: If the scene cannot be loaded.
-        ValueError: If an argument is out of range, or the scene is not one for demonstrations.
-        DemonstrationsError: If another run is at work in the folder; if the folder is for other settings; if
-            the disk is full, or processes are killed again and again. What is there remains, and the same
-            call goes on with it.
-        KeyboardInterrupt: If the user interrupts it; likewise.
+        ValueError: If an argument is out of range, or the scene is unsuitable for demonstrations.
+        DemonstrationsError: If another run is writing to the folder, the folder was made with other settings,
+            the disk is full, or processes are killed repeatedly. Finished shards remain; repeat the call to
+            resume.
+        KeyboardInterrupt: If the user interrupts the run; finished shards remain likewise.
     """
     settings = Settings.of(scene, n, seed, shard_size)
     if not 1 <= part[0] <= part[1]:
@@ -106,15 +123,15 @@ def generate_demonstrations(
             complete = folder.complete()
     except OSError as error:
         raise DemonstrationsError(
-            f"{error.filename or folder.path} cannot be written: {error.strerror or error}. The shards "
-            "that are complete remain; the same command goes on with them"
+            f"{error.filename or folder.path} cannot be written: {error.strerror or error}. Finished "
+            "shards remain; run the same command again to resume"
         ) from error
     return load_demonstrations(folder.path) if complete else None
 
 
 def _fill(folder: Folder, executor: Executor, progress: Callable[[Advance], None]) -> None:
-    """Make the shards that are missing."""
-    from experts.report.provenance import provenance  # loads all that reports need
+    """Make the missing shards."""
+    from dq_space_arm_env.common.provenance import provenance  # slow to import
 
     settings, missing, demonstrations, found = folder.settings, [], 0, 0
     for shard, path in folder.sound_shards():

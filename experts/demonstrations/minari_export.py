@@ -1,15 +1,15 @@
-"""Demonstrations as a data set of Minari, the format in which offline reinforcement learning shares episodes.
+"""Export demonstrations to Minari, the format in which offline reinforcement learning shares episodes.
 
 An episode holds observations, actions, rewards and terminations. Its `infos` have a row for each observation:
-what the environment's `info` says about the tip, the state, and the feedback gain, which is zero at the end,
-where no action is taken. Its metadata have the seed, with which `env.reset(seed=seed)` starts where it does,
-the cost, and other numbers about it. `recover_environment()` makes the environment with the whole scene,
-wherever that came from.
+errors of the tip as in the environment's `info`, the state, and the feedback gain, which is zero at the end,
+where no action is taken. Its metadata hold the seed for `env.reset(seed=seed)`, the cost, and other numbers.
+`recover_environment()` makes the environment with the complete scene, wherever that came from.
 
-Actions are float64, and so is the data set's action space, though the environment's own is float32: it reads
-float64 at full precision, and only so an episode's actions give its rewards bit for bit.
+Actions are float64, and so is the data set's action space, although the environment's own is float32: it
+reads float64 at full precision, which reproduces an episode's rewards bit for bit.
 
-The data set is written under a hidden name and renamed, so that nobody sees half of one.
+The data set is written under a hidden name, a few episodes at a time, and renamed, so that nobody sees a
+partial one.
 """
 
 import os
@@ -25,16 +25,16 @@ import gymnasium
 import numpy as np
 
 import dq_space_arm_env
-from experts.demonstrations.errors import DemonstrationsError
 from experts.demonstrations.reading import Demonstration, Demonstrations
+from experts.demonstrations.tensors import DemonstrationsError
 
 ALGORITHM = "Control-limited differential dynamic programming (box-DDP)"
 CARD = "README.md"
 """Name of the data card beside the data."""
 PIECE = 16
-"""Episodes that are handed over at a time: some ten megabytes."""
+"""Episodes written at a time: some ten megabytes."""
 PADDING, MARGIN = 1.3, 2**25
-"""What HDF5 adds to the size of the arrays: a factor, and bytes."""
+"""Overhead of HDF5 on the size of the arrays: a factor, and bytes."""
 _ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")
 _FOLDER_VARIABLE = "MINARI_DATASETS_PATH"
 _DESCRIPTION = """\
@@ -61,29 +61,27 @@ def export_to_minari(
 ) -> Any:
     """Write demonstrations as a data set of Minari (HDF5), in `MINARI_DATASETS_PATH` or ~/.minari/datasets.
 
-    Memory holds a few episodes at a time.
-
     Args:
-        demonstrations: What to write, M of them.
+        demonstrations: Demonstrations to export.
         dataset_id: Name with a version, for example "space-arm/paper/expert-v0".
-        feedback_gains: Whether to write the gains, two thirds of the size.
-        author: Who made the data.
-        author_email: How to reach them.
+        feedback_gains: Whether to include the gains, two thirds of the size.
+        author: Author of the data.
+        author_email: Address of the author.
         code_permalink: Address of the code that made the data.
         card: Text of a README.md beside the data.
-        overwrite: Whether a data set of this name is replaced, once the new one is complete.
-        progress: Called with the number of episodes that are written.
+        overwrite: Whether to replace a data set of this name, once the new one is complete.
+        progress: Called with the number of episodes written.
 
     Returns:
         The `minari.MinariDataset`.
 
     Raises:
-        DemonstrationsError: If Minari is not installed; if there are no demonstrations; if a data set of this
-            name exists, or another process writes it; if the disk is full. Nothing is changed then.
-        ValueError: If the name is none of Minari's.
+        DemonstrationsError: If Minari is not installed, there are no demonstrations, a data set of this name
+            exists, another process is writing it, or the disk is full. Nothing is changed then.
+        ValueError: If the name does not follow Minari's pattern.
     """
     try:
-        # Minari asks for these two after it has begun to write.
+        # Minari imports these two only after it has begun to write.
         import h5py  # noqa: F401
         import minari
         import PIL  # noqa: F401
@@ -96,7 +94,7 @@ def export_to_minari(
             f"dataset_id: {dataset_id!r}, should be a name with a version, such as space-arm/paper/expert-v0"
         )
     if not len(demonstrations):
-        raise DemonstrationsError(f"{demonstrations.path}: there is no demonstration to export")
+        raise DemonstrationsError(f"{demonstrations.path} has no demonstration to export")
     origin = {"author": author, "author_email": author_email, "code_permalink": code_permalink}
     try:
         with _staging(dataset_id, overwrite) as folder:
@@ -113,10 +111,10 @@ def export_to_minari(
 
 @contextmanager
 def _staging(dataset_id: str, overwrite: bool) -> Iterator[Path]:
-    """A hidden folder to write a data set into, which gets its place at the end of a `with` block.
+    """Yield a hidden folder for a data set, and move the data set into place at the end of a `with` block.
 
-    Its name follows from that of the data set, so that what a killed process leaves there is removed by the
-    next one; the lock vanishes with the process.
+    The folder's name follows from that of the data set, so that the next process removes the leftovers of a
+    killed one; the lock vanishes with the process.
     """
     import fcntl  # not on Windows
 
@@ -124,10 +122,10 @@ def _staging(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     from minari.storage import get_dataset_path
 
     place = get_dataset_path(dataset_id)
-    # A folder without data is a namespace, with other data sets in it.
+    # A folder without data is a namespace that holds other data sets.
     if place.exists() and not (overwrite and (place / "data").is_dir()):
         raise DemonstrationsError(
-            f"there is a Minari data set {dataset_id} already: take another name or version, or have it "
+            f"the Minari data set {dataset_id} exists: choose another name or version, or allow it to be "
             "overwritten"
         )
     folder = get_dataset_path() / f".{dataset_id.replace('/', '-')}.part"
@@ -160,7 +158,7 @@ def _staging(dataset_id: str, overwrite: bool) -> Iterator[Path]:
 
 
 def _put_back(replaced: Path, place: Path) -> None:
-    """Undo the first of the two renames if the second has not been."""
+    """Undo the first of the two renames if the second did not happen."""
     if replaced.exists() and not place.exists():
         replaced.rename(place)
 
@@ -172,17 +170,17 @@ def _create(
     feedback_gains: bool,
     origin: dict[str, str | None],
 ) -> Any:
-    """An empty data set."""
+    """Create an empty data set."""
     import minari
 
-    # By its content, not by its name: a scene's name may mean something else elsewhere, or nothing.
+    # By its content: a scene's name may mean something else elsewhere, or nothing.
     environment = gymnasium.make("DQSpaceArm-v0", scene=demonstrations.settings["scene"])
     name, version = demonstrations.scene.name, dq_space_arm_env.__version__
     description = _DESCRIPTION.format(
         count=len(demonstrations), name=name, gains=_GAINS if feedback_gains else ""
     )
     with _datasets_in(folder), warnings.catch_warnings():
-        # Minari recommends all of them; whoever wants them named names them.
+        # Minari recommends all of them; they are up to the user.
         warnings.filterwarnings("ignore", f"`({'|'.join(origin)})` is set to None", UserWarning)
         dataset = minari.create_dataset_from_buffers(
             dataset_id,
@@ -205,7 +203,7 @@ def _create(
 
 @contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """Have Minari make data sets in a folder; it asks nobody but this variable."""
+    """Make Minari create data sets in a folder: an environment variable is the only way."""
     before = os.environ.get(_FOLDER_VARIABLE)
     os.environ[_FOLDER_VARIABLE] = str(folder)
     try:
@@ -225,7 +223,7 @@ def _fill(
         piece = list(demonstrations[begin : begin + PIECE])
         end = begin + len(piece)
         episodes = [_episode(demonstrations, demonstration, feedback_gains) for demonstration in piece]
-        # At the beginning for all, then only in case that others write there too.
+        # First for all of them, later in case others write to the disk too.
         remaining = len(demonstrations) if begin == 0 else len(piece)
         _check_space(dataset.storage.data_path, remaining * _size(episodes[0]))
         dataset.update_dataset_from_buffer(episodes)
@@ -258,16 +256,16 @@ def _size(episode: Any) -> int:
 
 
 def _check_space(folder: Path, size: int) -> None:
-    """Refuse what the disk has no room for: on a full disk the library of HDF5 ends the process."""
+    """Fail early where space is short: on a full disk the HDF5 library aborts the process."""
     needed, free = PADDING * size + MARGIN, shutil.disk_usage(folder).free
     if free < needed:
-        raise OSError(f"the disk has {free / 1e9:.1f} GB left, and {needed / 1e9:.1f} GB are needed")
+        raise OSError(f"the disk has {free / 1e9:.1f} GB left, but {needed / 1e9:.1f} GB are needed")
 
 
 def _infos(
     demonstrations: Demonstrations, demonstration: Demonstration, feedback_gains: bool
 ) -> dict[str, Any]:
-    """Arrays with N + 1 rows."""
+    """Return arrays with N + 1 rows."""
     states, success = demonstration.states, demonstrations.scene.success
     _, errors = demonstrations.kernels.observation(states, np.zeros((len(states), 1)))
     attitude, position = np.degrees(errors[:, 0]), errors[:, 1]
@@ -284,7 +282,7 @@ def _infos(
 
 
 def _metadata(demonstration: Demonstration) -> dict[str, Any]:
-    """Numbers about an episode: those that Minari's own collector writes, and ours."""
+    """Return the numbers that Minari's own collector writes, and ours."""
     rewards, facts = demonstration.rewards, demonstration.facts
     errors = {
         f"{when}_{what}_error": value

@@ -1,61 +1,64 @@
-"""What becomes of problems: solved, judged, and compared with their neighbors."""
+"""Outcomes of problems: solved, judged, and compared with their neighbors.
+
+A solver finds a local minimum, and nearby starts may end in different ones, with a joint wound up or the arm
+led the other way round. A neighbor's policy may know a better way: rolled out from this start,
+at a hundredth of the cost of a solve, it ends in the neighbor's valley. Where such a rollout is cheaper than
+the solution, or nearly as cheap but elsewhere, the problem is solved again from there, and the cheaper
+solution is kept. Where the solver failed, the best neighbor is tried in any case.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
+
 from dq_space_arm_env import Scene
-from experts.arm_problem import ArmProblem
-from experts.demonstrations.neighbors import Candidate, NeighborCheck
-from experts.guesses import GuidedDDP
-from experts.problem import FloatArray
-from experts.solution import Solution, StopReason
+from experts.ddp.rollout import Trajectory
+from experts.ddp.solution import Solution, StopReason
+from experts.guesses.guided import GuidedDDP
+from experts.problems.arm_problem import ArmProblem
+from experts.problems.shooting_problem import FloatArray
 
 MISSED_TARGET, REPLAY_DIFFERS = "missed_target", "replay_differs"
 REASONS = (*(reason.value for reason in StopReason), MISSED_TARGET, REPLAY_DIFFERS)
-"""Why a solve ended, and what else may be wrong: its end is outside of the tolerances, or the environment
-charges something else than what was planned."""
+"""Why a solve ended, or what else is wrong: the final errors exceed the tolerances, or the replay in the
+environment costs something else than planned."""
 NEIGHBOR = "neighbor"
 GUESSES = ("policy", "screw motion", "zero controls", NEIGHBOR)
-"""What a solve began with, see `experts.guesses`; a neighbor is another problem of the shard."""
+"""Initial guesses of a solve, see `experts.guesses.guided`; a neighbor is another problem of the shard."""
 LEAST_GAIN = 1e-6
-"""A second solution has to be cheaper by this share to take the place of the first."""
-
+"""Share by which a second solution must be cheaper to replace the first."""
 MOST_ITERATIONS = 25
 """Iterations after which a second solve is given up: from a good neighbor it takes a dozen."""
+NEIGHBORS = 4
+"""Policies that are rolled out from a start: those of the solved problems with the nearest starts."""
+CHEAPER = 0.999
+"""A rollout below this share of a solution's cost proves that there is a better minimum."""
+NEARLY_AS_CHEAP = 1.2
+"""Up to this share it may lie in a better valley: a policy followed from afar typically costs a fifth more
+than the floor of its valley."""
+ELSEWHERE = 2.0
+"""Distance of joint angles, rad, beyond which two trajectories lie in different valleys."""
 
 
 class Expert(NamedTuple):
-    """A solver and its problem.
-
-    Attributes:
-        problem: The scene as a problem.
-        solver: What solves it; its solutions depend on nothing but the start.
-    """
+    """A solver and its problem."""
 
     problem: ArmProblem
-    solver: GuidedDDP
+    solver: GuidedDDP  # its solutions depend on nothing but the start
 
 
 @dataclass(eq=False)
 class Outcome:
-    """A problem and what has become of it so far.
-
-    Attributes:
-        index: Number of the problem.
-        seed: Seed of its start.
-        start: State at stage 0, shape (n_x,), units of the state.
-        solution: What was found.
-        guess: One of `GUESSES`.
-        reason: One of `REASONS`.
-    """
+    """A problem and its solution so far."""
 
     index: int
     seed: int
-    start: FloatArray
+    start: FloatArray  # state at stage 0, shape (n_x,), units of the state
     solution: Solution
-    guess: str
-    reason: str
+    guess: str  # one of GUESSES
+    reason: str  # one of REASONS
 
     @property
     def is_good(self) -> bool:
@@ -64,27 +67,15 @@ class Outcome:
 
 
 class Retry(NamedTuple):
-    """A problem to be solved once more.
+    """A problem to be solved once more, starting with a neighbor's policy."""
 
-    Attributes:
-        position: Its place in the shard.
-        neighbor: Solution whose policy it is to begin with.
-    """
-
-    position: int
+    position: int  # in the shard
     neighbor: Solution
 
 
 @lru_cache(maxsize=1)
 def expert_of(scene: Scene) -> Expert:
-    """The expert of this process, ready to solve: kernels compiled or loaded, the nominal maneuver solved.
-
-    Args:
-        scene: The scene, in double precision.
-
-    Returns:
-        The expert.
-    """
+    """Return the expert of this process, ready to solve: kernels compiled, the nominal maneuver solved."""
     problem = ArmProblem(scene)
     solver = GuidedDDP(problem, remember=0)
     _ = solver.library
@@ -92,20 +83,7 @@ def expert_of(scene: Scene) -> Expert:
 
 
 def solve(expert: Expert, index: int, seed: int, start: FloatArray) -> Outcome:
-    """Solve a problem.
-
-    Args:
-        expert: Who solves it.
-        index: Number of the problem.
-        seed: Seed of its start.
-        start: State at stage 0, shape (n_x,), units of the state.
-
-    Returns:
-        The outcome.
-
-    Raises:
-        KeyboardInterrupt: If the user interrupts it.
-    """
+    """Solve a problem."""
     solution = expert.solver.solve(start)
     name = solution.metadata["guess"]
     guess = GUESSES[0] if name.startswith(GUESSES[0]) else name
@@ -113,32 +91,14 @@ def solve(expert: Expert, index: int, seed: int, start: FloatArray) -> Outcome:
 
 
 def find_better_ways(expert: Expert, outcomes: list[Outcome]) -> list[Retry]:
-    """Find out which problems are worth another solve.
-
-    Args:
-        expert: Who has solved them.
-        outcomes: What became of all problems of a shard.
-
-    Returns:
-        What to solve again.
-    """
-    candidates = [Candidate(outcome.start, outcome.solution, outcome.is_good) for outcome in outcomes]
-    check = NeighborCheck(expert.problem, candidates)
+    """Find the problems of a shard that are worth a second solve."""
+    check = _NeighborCheck(expert.problem, outcomes)
     ways = ((i, check.better_way(i)) for i in range(len(outcomes)))
     return [Retry(i, outcomes[neighbor].solution) for i, neighbor in ways if neighbor is not None]
 
 
 def solve_again(expert: Expert, outcomes: list[Outcome], retries: list[Retry]) -> None:
-    """Solve problems again, the way of a neighbor, and keep what is better.
-
-    Args:
-        expert: Who knows the problem.
-        outcomes: What became of all problems of a shard; better outcomes take their places.
-        retries: What to solve again.
-
-    Raises:
-        KeyboardInterrupt: If the user interrupts it.
-    """
+    """Solve problems again, starting with a neighbor's policy; better outcomes replace the old ones."""
     for retry in retries:
         old = outcomes[retry.position]
         guide = GuidedDDP(
@@ -157,8 +117,56 @@ def solve_again(expert: Expert, outcomes: list[Outcome], retries: list[Retry]) -
 
 
 def _judge(problem: ArmProblem, solution: Solution) -> str:
-    """The reason why a solution is what it is: `CONVERGED` if it is a demonstration."""
+    """Return the reason of an outcome: `CONVERGED` for a demonstration."""
     if solution.stop_reason is StopReason.INTERRUPTED:
         raise KeyboardInterrupt
     missed = solution.converged and not problem.is_success(solution.states[-1])
     return MISSED_TARGET if missed else solution.stop_reason.value
+
+
+class _NeighborCheck:
+    """Compares the solutions of a shard with rollouts of their neighbors' policies."""
+
+    def __init__(self, problem: ArmProblem, outcomes: list[Outcome]) -> None:
+        self._problem, self._outcomes = problem, outcomes
+        self._trial = Trajectory(problem)
+        names = ("difference", "step_with_cost", "terminal_cost")
+        self._kernels = {name: problem.kernel(name) for name in names}
+        self._good = [i for i, outcome in enumerate(outcomes) if outcome.is_good]
+        starts = np.array([outcome.start for outcome in outcomes])
+        nominal = np.broadcast_to(problem.initial_state, starts.shape)
+        tangents = problem.kernels.difference(nominal, starts)
+        spread = tangents.std(axis=0)
+        self._places = tangents / np.where(spread > 0.0, spread, 1.0)
+        self._joints = problem.kernels.layout.tangent.joint_angles
+
+    def better_way(self, i: int) -> int | None:
+        """Find the neighbor whose policy does best from start i, if that makes a second solve worthwhile."""
+        outcome, ways = self._outcomes[i], []
+        for j in self._nearest(i):
+            cost = self._follow(j, outcome.start)
+            if np.isfinite(cost) and (not outcome.is_good or self._is_better(cost, outcome.solution)):
+                ways.append((cost, j))
+        return min(ways)[1] if ways else None
+
+    def _nearest(self, i: int) -> list[int]:
+        others = np.array([j for j in self._good if j != i], dtype=np.int64)
+        distances = np.linalg.norm(self._places[others] - self._places[i], axis=1)
+        return [int(j) for j in others[np.argsort(distances, kind="stable")[:NEIGHBORS]]]
+
+    def _follow(self, j: int, start: FloatArray) -> float:
+        """Roll out a policy into the trial; return its cost, inf if it is not finite."""
+        solution = self._outcomes[j].solution
+        self._trial.states[0] = start
+        reference = solution.states, solution.controls
+        policy = np.zeros_like(solution.controls), solution.feedback_gains
+        return self._trial.follow(self._kernels, reference, policy, alpha=0.0)
+
+    def _is_better(self, cost: float, solution: Solution) -> bool:
+        """Whether the trial points to a better minimum than a solution."""
+        if cost > NEARLY_AS_CHEAP * solution.cost:
+            return False
+        if cost < CHEAPER * solution.cost:
+            return True
+        apart = self._problem.kernels.difference(solution.states, self._trial.states)
+        return bool(np.linalg.norm(apart[:, self._joints], axis=1).max() > ELSEWHERE)

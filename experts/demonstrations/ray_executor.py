@@ -1,12 +1,11 @@
-"""Shards made by the machines of a Ray cluster, and brought back as bytes: they need not share a disk.
+"""Shards made by the machines of a Ray cluster, and returned as bytes: no shared disk is needed.
 
-Ray runs the tasks again that were under way on a machine or in a process that is lost, and those whose shards
-were made there and not yet fetched; they end with the same bytes. Every machine needs the same version of
-this package and of those that it rests on, and says so if it has another one. Which kind of processor a
-machine has is up to the cluster: kinds of different instruction sets agree up to rounding only.
+If a process or machine is lost, Ray repeats its tasks, including those whose shards were not fetched yet;
+the bytes are the same. Every machine needs the same version of this package and its dependencies, and reports
+a difference. Processors with different instruction sets agree only up to rounding.
 
-The run itself, which writes the files, should be on a machine of the cluster. If that one is lost, or the
-one where the cluster was started, the run ends, and is resumed as any other.
+The run itself, which writes the files, should be on a machine of the cluster. If that machine or the head of
+the cluster is lost, the run ends and is resumed like any other.
 """
 
 import os
@@ -24,56 +23,45 @@ from typing import Any
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.compiler.native import cache_directory
-from experts.demonstrations.errors import DemonstrationsError
 from experts.demonstrations.outcomes import expert_of
 from experts.demonstrations.settings import differences, software
 from experts.demonstrations.shard import ShardResult, Task, make_shard
+from experts.demonstrations.tensors import DemonstrationsError
 
 AHEAD = 2
-"""Tasks given to the cluster for each of its processors: so none of them waits for this process, and a
-cluster that grows on demand sees the demand."""
+"""Tasks queued per processor of the cluster, so that none waits for this process, and an autoscaling cluster
+sees the demand."""
 WAITING = 2
-"""Tasks beyond those, which a cluster without any processor yet is given too."""
+"""Additional tasks, queued even while the cluster has no processor yet."""
 MOST_LOSSES = 10
-"""Times that a shard is made again after its process or its machine was lost."""
+"""Times that a shard is repeated after its process or machine was lost."""
 CONNECTION_SECONDS = 10.0
-"""Time after which a cluster counts as out of reach."""
+"""Time after which a cluster counts as unreachable."""
 
 RemoteTask = Callable[[dict[str, Any], bytes], ShardResult | str]
 
 
 class RayExecutor:
-    """The machines of a Ray cluster, one process for each of their processors."""
+    """Makes shards on a Ray cluster, one process per processor."""
 
     def __init__(self, address: str | None = None) -> None:
         """Choose the cluster.
 
         Args:
-            address: As `ray.init` takes it: "host:port" of the cluster's head, "auto" for the cluster that
-                this machine is part of, "local" for a new one of this machine alone, which ends with the
-                run. By default the one that RAY_ADDRESS names, else the one that this machine is part of,
-                else a new one. A connection that this process has already is used in any case, and kept.
+            address: As for `ray.init`: "host:port" of the cluster's head, "auto" for the cluster of this
+                machine, "local" for a new one on this machine alone, which ends with the run. By default that
+                of RAY_ADDRESS, else the cluster of this machine, else a new one. An existing connection of
+                this process takes precedence and is kept.
         """
         self.address = address
 
     def run(self, tasks: Iterable[Task]) -> Generator[ShardResult]:
-        """Make shards.
-
-        Args:
-            tasks: What to make.
-
-        Yields:
-            The shards, as they arrive.
-
-        Raises:
-            DemonstrationsError: If Ray is not installed; if the cluster cannot be reached; if a machine has
-                other software; if one shard is lost again and again.
-        """
+        """Make shards."""
         try:
             import ray
         except ModuleNotFoundError as error:
             raise DemonstrationsError(
-                "a cluster needs Ray: pip install 'dq-space-arm[ray]', on all of its machines"
+                "a cluster needs Ray: pip install 'dq-space-arm[ray]' on all of its machines"
             ) from error
         with _connected(ray, self.address):
             yield from _run_on(ray, tasks)
@@ -81,7 +69,7 @@ class RayExecutor:
 
 @contextmanager
 def _connected(ray: Any, address: str | None) -> Iterator[None]:
-    """Be connected to a cluster inside a `with` block, and leave the process as it was."""
+    """Connect to a cluster inside a `with` block, and restore the process afterwards."""
     if ray.is_initialized():
         yield
         return
@@ -100,7 +88,7 @@ def _connected(ray: Any, address: str | None) -> Iterator[None]:
 
 
 def _check_reachable(address: str | None) -> None:
-    """Try a connection where a host and a port are given: Ray itself tries for minutes."""
+    """Try host and port first: Ray itself keeps trying for minutes."""
     match = re.fullmatch(r"([\w.-]+):(\d+)", address or "")
     if match:
         socket.create_connection((match[1], int(match[2])), CONNECTION_SECONDS).close()
@@ -108,9 +96,9 @@ def _check_reachable(address: str | None) -> None:
 
 @contextmanager
 def _quiet(ray: Any) -> Iterator[None]:
-    """Keep messages off the terminal that Ray prints for each task of a lost machine.
+    """Suppress Ray's messages about each task of a lost machine.
 
-    There is no public switch for them; this one is what Ray's debugger uses.
+    There is no public switch for them; Ray's debugger uses this one.
     """
     worker = ray._private.worker
     worker._worker_logs_enabled = False
@@ -122,7 +110,7 @@ def _quiet(ray: Any) -> Iterator[None]:
 
 @contextmanager
 def _same_signals() -> Iterator[None]:
-    """Restore what SIGTERM does, which Ray changes for good."""
+    """Restore the handler of SIGTERM, which Ray replaces for good."""
     handler = signal.getsignal(signal.SIGTERM)
     try:
         yield
@@ -132,7 +120,7 @@ def _same_signals() -> Iterator[None]:
 
 
 def _run_on(ray: Any, tasks: Iterable[Task]) -> Generator[ShardResult]:
-    """Run tasks on the cluster that this process is connected to."""
+    """Run tasks on the connected cluster."""
     under_way: list[Any] = []
     here, remaining = software(), iter(tasks)
     make = ray.remote(num_cpus=1, max_retries=MOST_LOSSES)(remote_task())
@@ -145,7 +133,7 @@ def _run_on(ray: Any, tasks: Iterable[Task]) -> Generator[ShardResult]:
                 return
             (ready,), under_way = ray.wait(under_way)
             result = _fetch(ray, ready)
-            del ready  # and the cluster's copy with it
+            del ready  # frees the cluster's copy
             yield result
     finally:
         for reference in under_way:
@@ -153,12 +141,11 @@ def _run_on(ray: Any, tasks: Iterable[Task]) -> Generator[ShardResult]:
 
 
 def _fetch(ray: Any, reference: Any) -> ShardResult:
-    """Take a result from the cluster."""
     failures = ray.exceptions
     try:
         result: ShardResult | str = ray.get(reference)
     except failures.RayTaskError:
-        raise  # a mistake in the code, with the traceback of where it happened
+        raise  # a bug, with its remote traceback
     except failures.RayError as error:
         reason = str(error).partition("\n")[0]
         raise DemonstrationsError(
@@ -170,23 +157,21 @@ def _fetch(ray: Any, reference: Any) -> ShardResult:
 
 
 def remote_task() -> RemoteTask:
-    """Get what runs on the machines of a cluster.
+    """Return the function that machines of the cluster run.
 
-    Returns:
-        A function of the software of the machine that asks, see `software`, and a pickled task. It gives the
-        shard, or a sentence why this machine cannot make it. Being local, it is pickled with its code, so
-        that it runs, and can complain, where this package is missing or another version is installed.
+    Being local, it is pickled with its code, so that it runs, and can complain, where this package is missing
+    or has another version.
     """
 
     def make(expected: dict[str, Any], packed: bytes) -> ShardResult | str:
-        # Before NumPy is loaded, which looks at it only then.
+        # NumPy reads these when it is imported.
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
         try:
             from experts.demonstrations import ray_executor
         except ImportError as error:
             return (
                 f"machine {platform.node()} of the cluster cannot load this version of dq-space-arm "
-                f"({error}): install the same one on all machines"
+                f"({error}): install the same version on all machines"
             )
         return ray_executor.make_here(expected, packed)
 
@@ -194,15 +179,7 @@ def remote_task() -> RemoteTask:
 
 
 def make_here(expected: dict[str, Any], packed: bytes) -> ShardResult | str:
-    """Make a shard on this machine, if it has the software for that.
-
-    Args:
-        expected: Software of the machine that asks.
-        packed: Pickled task; it is opened only if the software is the same.
-
-    Returns:
-        The shard, or a sentence why there is none.
-    """
+    """Make a shard on this machine if it has the same software, else say what differs."""
     differing = differences(software(), expected)
     if differing:
         return (
@@ -218,8 +195,8 @@ def make_here(expected: dict[str, Any], packed: bytes) -> ShardResult | str:
 def _prepare(scene: Scene) -> None:
     """Compile or load the expert of this process.
 
-    One process of a fresh machine compiles, and the others wait and load what it has compiled: dozens of
-    compilers at once take more memory than dozens of solvers.
+    One process of a fresh machine compiles while the others wait for the cache: dozens of compilers at once
+    take more memory than dozens of solvers.
     """
     with _first_alone():
         expert_of(scene)
@@ -227,11 +204,11 @@ def _prepare(scene: Scene) -> None:
 
 @contextmanager
 def _first_alone() -> Iterator[None]:
-    """Let the first process that enters do its work alone; those that come meanwhile follow all at once."""
+    """Let the first process work alone; those that wait for it then continue together."""
     import fcntl  # not on Windows
 
     descriptor = None
-    # Without a folder that can be locked, as on some network disks, all of them compile.
+    # All compile where the folder cannot be locked, as on some network disks.
     with suppress(OSError):
         cache_directory().mkdir(parents=True, exist_ok=True)
         descriptor = os.open(cache_directory(), os.O_RDONLY)

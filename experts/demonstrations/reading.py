@@ -1,6 +1,6 @@
-"""Reading demonstrations: views of mapped files, batches of time steps, splits by problem.
+"""Read demonstrations: views of mapped files, batches of time steps, splits by problem.
 
-Nothing is read before it is looked at, and nothing is kept: a data set may be far larger than the memory.
+Files are read on access and not kept: a data set may be far larger than memory.
 """
 
 import json
@@ -18,16 +18,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.kernels import Kernels
-from experts.demonstrations.columns import FAILURES, SUMMARIES, TRAJECTORIES
-from experts.demonstrations.errors import DemonstrationsError
 from experts.demonstrations.folder import MANIFEST, SETTINGS, SHARDS, sha256_of
 from experts.demonstrations.outcomes import GUESSES, REASONS
 from experts.demonstrations.settings import FORMAT
-from experts.demonstrations.tensors import Tensors, map_tensors
-from experts.problem import FloatArray
+from experts.demonstrations.shard import FAILURES, SUMMARIES, TRAJECTORIES
+from experts.demonstrations.tensors import DemonstrationsError, Tensors, map_tensors
+from experts.problems.shooting_problem import FloatArray
 
 OPEN_SHARDS = 64
-"""Files that are mapped at a time, each for as long as it is among those used last."""
+"""Files mapped at a time, the least recently used one is closed."""
 MIXED = 64
 """Demonstrations whose time steps are shuffled together."""
 
@@ -38,16 +37,15 @@ class Demonstration:
 
     Attributes:
         index: Number of its problem.
-        seed: `env.reset(seed=seed)` starts where it does.
+        seed: `env.reset(seed=seed)` starts at the same state.
         cost: J; the sum of the rewards is -J.
         states: Shape (N + 1, n_x), units of the state.
-        observations: Shape (N + 1, n_obs), as the environment gives them.
+        observations: Observations of the environment, shape (N + 1, n_obs).
         actions: Inputs as fractions of their limits, shape (N, n_u).
         rewards: Shape (N,).
         feedback_gains: G of a = clip(a_k + G_k (x (-) x_k)) for actions a, float32, shape (N, n_u, n_t); zero
             in the rows of inputs at a limit.
-        facts: The other numbers about it, by the names of `columns.SUMMARIES`; the guess and the stop reason
-            in words.
+        facts: The other numbers about it, by the names of `shard.SUMMARIES`; guess and stop reason in words.
     """
 
     index: int
@@ -66,9 +64,9 @@ class Batch:
     """Time steps of several demonstrations, B of them.
 
     Attributes:
-        demonstration: Place of each one's demonstration in the data set, shape (B,).
+        demonstration: Position of each one's demonstration in the data set, shape (B,).
         stage: Stage of each, in [0, N), shape (B,).
-        arrays: What was asked for, by name, each of shape (B, ...).
+        arrays: The requested arrays by name, each of shape (B, ...).
     """
 
     demonstration: NDArray[np.int64]
@@ -88,13 +86,13 @@ class _Files:
         return map_tensors(self.paths[shard])
 
     def locate(self, place: int) -> tuple[Tensors, int]:
-        """The shard of a demonstration, and its row there."""
+        """Return the shard of a demonstration, and its row there."""
         shard = bisect_right(self.ends, place)
         return self.mapped(shard), place - (self.ends[shard - 1] if shard else 0)
 
     def column(self, name: str) -> NDArray[Any]:
-        """An array of all shards, joined and in memory."""
-        # Past the cache: in one pass over all shards it would only drop what is in use.
+        """Return an array of all shards, concatenated in memory."""
+        # Bypasses the cache: one pass over all shards would evict those in use.
         return np.concatenate([self._map(shard).arrays[name] for shard in range(len(self.paths))])
 
 
@@ -103,8 +101,8 @@ class Demonstrations(Sequence[Demonstration]):
 
     Attributes:
         path: The folder.
-        settings: What they follow from, as in `settings.json`.
-        manifest: What became of every problem, as in `manifest.json`.
+        settings: Content of `settings.json`, all that they follow from.
+        manifest: Content of `manifest.json`, the outcome of every problem.
         scene: The scene, in double precision.
     """
 
@@ -116,13 +114,13 @@ class Demonstrations(Sequence[Demonstration]):
         *,
         selection: tuple[_Files, NDArray[np.int64]] | None = None,
     ) -> None:
-        """Take a folder's descriptions; `load_demonstrations` reads and checks them.
+        """Wrap a folder's descriptions; `load_demonstrations` reads and checks them.
 
         Args:
             path: The folder.
             settings: Content of its `settings.json`.
             manifest: Content of its `manifest.json`.
-            selection: The files, and places of demonstrations among all of the folder; None for all.
+            selection: The files, and positions of the demonstrations in the folder; None for all.
         """
         self.path, self.settings, self.manifest = path, settings, manifest
         self.scene = Scene.model_validate(settings["scene"])
@@ -133,7 +131,7 @@ class Demonstrations(Sequence[Demonstration]):
 
     @property
     def kernels(self) -> Kernels:
-        """The compiled functions of the scene: layout of states, difference, retraction, observation."""
+        """Compiled functions of the scene: layout of states, difference, retraction, observation."""
         return compile_scene(self.scene)
 
     def __len__(self) -> int:
@@ -155,13 +153,13 @@ class Demonstrations(Sequence[Demonstration]):
         return Demonstration(**named, **{name: arrays[name][row] for name in TRAJECTORIES}, facts=facts)
 
     def select(self, positions: ArrayLike) -> Self:
-        """Choose some demonstrations.
+        """Select demonstrations.
 
         Args:
             positions: Their positions in this sequence, shape (M,).
 
         Returns:
-            Those, in this order.
+            The selection, in this order.
 
         Raises:
             IndexError: If there is no such position.
@@ -170,10 +168,10 @@ class Demonstrations(Sequence[Demonstration]):
         return type(self)(self.path, self.settings, self.manifest, selection=(self._files, chosen))
 
     def column(self, name: str) -> NDArray[Any]:
-        """Numbers about every demonstration, read into memory.
+        """Read one number about every demonstration into memory.
 
         Args:
-            name: One of `columns.SUMMARIES`, for example "cost" or "seed".
+            name: One of `shard.SUMMARIES`, for example "cost" or "seed".
 
         Returns:
             Shape (len(self),), or (len(self), 2) for the tip's errors.
@@ -185,18 +183,18 @@ class Demonstrations(Sequence[Demonstration]):
         return self._files.column(name)[self._places]
 
     def failures(self) -> dict[str, NDArray[Any]]:
-        """The problems of the folder that led to no demonstration, F of them.
+        """Read about the folder's problems without a demonstration, F of them.
 
         Returns:
-            `index`, `seed`, `cost`, each of shape (F,); `reason`, words, shape (F,); `start`, states at stage
-            0, shape (F, n_x); `final_errors` of the tip, attitude [deg] and position [m], shape (F, 2).
+            `index`, `seed`, `cost` and, in words, `reason`, each of shape (F,); `start`, states at stage 0,
+            shape (F, n_x); `final_errors` of the tip, attitude [deg] and position [m], shape (F, 2).
         """
         columns = {name: self._files.column(f"failures.{name}") for name in FAILURES}
         reasons = columns.pop("stop_reason")
         return {**columns, "reason": np.array(REASONS)[reasons]}
 
     def split(self, *fractions: float, seed: int = 0) -> tuple[Self, ...]:
-        """Split by problem: no two parts share a demonstration, so none knows another's time steps.
+        """Split by problem: no two parts share a demonstration, or time steps of one.
 
         Args:
             *fractions: Share of each part; together at most 1.
@@ -206,7 +204,7 @@ class Demonstrations(Sequence[Demonstration]):
             The parts, each in the order of the problems.
 
         Raises:
-            ValueError: If the fractions are none.
+            ValueError: If a fraction is negative, or they exceed 1 together.
         """
         ends = np.cumsum(fractions)
         if not fractions or min(fractions) < 0.0 or ends[-1] > 1.0 + 1e-9:
@@ -223,17 +221,17 @@ class Demonstrations(Sequence[Demonstration]):
         seed: int | None = None,
         drop_last: bool = False,
     ) -> Iterator[Batch]:
-        """Go through all time steps once.
+        """Iterate over all time steps once.
 
-        With a seed they come shuffled: demonstrations in a random order, and the time steps of some dozens of
-        them mixed with each other, so that memory holds no more than those.
+        With a seed they are shuffled: demonstrations in a random order, and the time steps of some dozens of
+        them mixed, so that memory holds no more than those.
 
         Args:
             size: Time steps of a batch.
-            names: What to read, of `columns.TRAJECTORIES`; of states and observations those at which an
-                action is taken, without the last.
-            seed: Seed of the order; None for that of the problems and stages.
-            drop_last: Whether to leave out the last batch if it is smaller.
+            names: Arrays to read, of `shard.TRAJECTORIES`; states and observations without the last, at which
+                no action is taken.
+            seed: Seed of the order; None for the order of problems and stages.
+            drop_last: Whether to omit a smaller last batch.
 
         Yields:
             Batches, copies in memory.
@@ -264,7 +262,7 @@ class Demonstrations(Sequence[Demonstration]):
             yield self._gather(rest, names)
 
     def _gather(self, steps: NDArray[np.int64], names: tuple[str, ...]) -> Batch:
-        """Copy time steps, given as demonstration and stage, out of the files."""
+        """Copy time steps, pairs of demonstration and stage, out of the files."""
         positions, stages = steps[:, 0].copy(), steps[:, 1].copy()
         arrays: dict[str, NDArray[Any]] = {}
         for position in np.unique(positions):
@@ -278,11 +276,11 @@ class Demonstrations(Sequence[Demonstration]):
         return Batch(positions, stages, arrays)
 
     def tangent(self, reference: ArrayLike, states: ArrayLike) -> FloatArray:
-        """Deviations from reference states in tangent coordinates, where feedback gains act.
+        """Compute deviations from reference states in tangent coordinates, for the feedback gains.
 
         Args:
             reference: States of a demonstration, shape (..., n_x), units of the state.
-            states: States to be compared with them, shape (..., n_x); the two are broadcast.
+            states: States to compare with them, shape (..., n_x); the two are broadcast.
 
         Returns:
             x (-) x_reference, shape (..., n_t), units of `kernels.layout.tangent`. The optimal action there
@@ -298,15 +296,14 @@ class Demonstrations(Sequence[Demonstration]):
 
 
 def load_demonstrations(path: str | os.PathLike[str], *, verify: bool = False) -> Demonstrations:
-    """Open a folder that `generate_demonstrations` has completed.
+    """Open a folder that `generate_demonstrations` completed.
 
     Args:
         path: The folder.
-        verify: Whether to read every file and compare its hash with the manifest's; without, their sizes are
-            compared.
+        verify: Whether to compare the hash of every file with the manifest, rather than its size.
 
     Returns:
-        The demonstrations; their files are mapped when they are looked at.
+        The demonstrations; their files are mapped on access.
 
     Raises:
         DemonstrationsError: If there is no such folder, it is not complete, or a file is damaged.
@@ -316,7 +313,7 @@ def load_demonstrations(path: str | os.PathLike[str], *, verify: bool = False) -
         raise DemonstrationsError(f"{folder} holds no demonstrations: it has no {SETTINGS}")
     if not (folder / MANIFEST).is_file():
         raise DemonstrationsError(
-            f"{folder} is not complete: it has no {MANIFEST}; the command that began it goes on with it"
+            f"{folder} is not complete: it has no {MANIFEST}; run the command that began it again to resume"
         )
     settings, manifest = (_read_json(folder / name) for name in (SETTINGS, MANIFEST))
     if settings.get("format") != FORMAT:
@@ -337,7 +334,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _check_file(path: Path, shard: Mapping[str, Any], verify: bool) -> None:
-    remedy = "the command that made the folder makes it anew"
+    remedy = "run the command that made the folder again to repair it"
     if not path.is_file():
         raise DemonstrationsError(f"{path} is missing; {remedy}")
     size = path.stat().st_size
@@ -350,4 +347,4 @@ def _check_file(path: Path, shard: Mapping[str, Any], verify: bool) -> None:
 def _check_names(names: Sequence[str], known: Sequence[str]) -> None:
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise ValueError(f"{', '.join(unknown)}: unknown; there are {', '.join(known)}")
+        raise ValueError(f"{', '.join(unknown)}: unknown; choose from {', '.join(known)}")

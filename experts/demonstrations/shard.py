@@ -1,13 +1,44 @@
-"""One shard: some dozens of problems drawn, solved, checked against each other, replayed, and packed."""
+"""One shard: some dozens of problems drawn, solved, checked against each other, replayed, and packed.
+
+Arrays of a shard with M demonstrations and F failures, N stages:
+
+| array | shape | meaning |
+|---|---|---|
+| `states` | (M, N + 1, n_x) | states of the environment, units of the state |
+| `observations` | (M, N + 1, n_obs) | its observations of them |
+| `actions` | (M, N, n_u) | inputs as fractions of their limits, in [-1, 1] |
+| `rewards` | (M, N) | rewards of the environment; their sum is minus the cost |
+| `feedback_gains` | (M, N, n_u, n_t) | float32: change of the action per deviation in tangent coordinates |
+| `index`, `seed` | (M,) | number of the problem; `env.reset(seed=seed)` starts there |
+| `cost` | (M,) | J, dimensionless |
+| `iterations`, `stop_reason` | (M,) | of the solve; the latter is an index into `REASONS` |
+| `guess` | (M,) | initial guess of the solve, an index into `GUESSES` |
+| `emphasis` | (M,) | factor of the final pose's weights, see `experts.guesses.reaching` |
+| `start_errors`, `final_errors` | (M, 2) | of the tip: attitude [deg] and position [m] |
+| `clamped_share` | (M,) | share of the inputs, over all stages, at a limit |
+| `failures.index`, `.seed`, `.stop_reason`, `.cost` | (F,) | of the problems that failed |
+| `failures.start` | (F, n_x) | state at stage 0, units of the state |
+| `failures.final_errors` | (F, 2) | as planned |
+
+Gains are control-limited: rows of inputs at a limit are zero.
+"""
 
 import hashlib
 import platform
+from collections.abc import Sequence
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from experts.demonstrations.columns import NOTES, actions_of, demonstration_arrays, failure_arrays
-from experts.demonstrations.episodes import Episodes, draw_starts, play
+import numpy as np
+from numpy.typing import NDArray
+
+from dq_space_arm_env import Scene
+from dq_space_arm_env.environment import DQSpaceArmVectorEnv
+from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
+from dq_space_arm_env.kernels import Kernels
 from experts.demonstrations.outcomes import (
+    GUESSES,
+    REASONS,
     REPLAY_DIFFERS,
     Expert,
     Outcome,
@@ -18,57 +49,62 @@ from experts.demonstrations.outcomes import (
 )
 from experts.demonstrations.settings import Settings
 from experts.demonstrations.tensors import pack
-from experts.problem import FloatArray
+from experts.problems.arm_problem import ArmProblem
+from experts.problems.shooting_problem import FloatArray
 
+TRAJECTORIES = ("states", "observations", "actions", "rewards", "feedback_gains")
+"""Arrays with a row for each stage."""
+SUMMARIES = (
+    "index",
+    "seed",
+    "cost",
+    "iterations",
+    "stop_reason",
+    "guess",
+    "emphasis",
+    "start_errors",
+    "final_errors",
+    "clamped_share",
+)
+"""Arrays with a few numbers for each demonstration."""
+FAILURES = ("index", "seed", "stop_reason", "cost", "start", "final_errors")
+"""Arrays with a few numbers for each failure."""
+NOTES = {"guesses": GUESSES, "reasons": REASONS}
 REPLAY_TOLERANCE = 1e-9
 """Largest difference between cost and return, relative to the cost."""
 
+Arrays = dict[str, NDArray[Any]]
+
 
 class Task(NamedTuple):
-    """A shard to be made; all that whoever makes it has to know.
-
-    Attributes:
-        settings: Those of the data set.
-        shard: Number of the shard.
-    """
+    """A shard to make: all that a worker has to know."""
 
     settings: Settings
     shard: int
 
 
 class ShardResult(NamedTuple):
-    """A shard that has been made, not yet written.
-
-    Attributes:
-        shard: Its number.
-        content: Bytes of the file.
-        sha256: Their SHA-256, 64 hexadecimal digits.
-        host: Name of the machine that made it.
-        demonstrations: Number of demonstrations in it.
-        failures: Number of problems that led to none.
-        solve_seconds: Wall-clock time of the first solve of each problem, s.
-        seconds: Wall-clock time of each part of the work, s.
-    """
+    """A shard that has been made, not yet written."""
 
     shard: int
-    content: bytes
-    sha256: str
-    host: str
+    content: bytes  # of the file
+    sha256: str  # of the content, 64 hexadecimal digits
+    host: str  # name of the machine that made it
     demonstrations: int
     failures: int
-    solve_seconds: list[float]
-    seconds: dict[str, float]
+    solve_seconds: list[float]  # wall-clock time of the first solve of each problem, s
+    seconds: dict[str, float]  # wall-clock time of each part of the work, s
 
 
 class _Clock:
-    """Adds up what the parts of the work take."""
+    """Adds up the durations of the parts of the work."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._last = perf_counter()
 
     def lap(self, part: str) -> float:
-        """Count the time since the last lap for a part, and return it."""
+        """Credit the time since the last lap to a part, and return it."""
         now = perf_counter()
         elapsed, self._last = now - self._last, now
         self.seconds[part] = self.seconds.get(part, 0.0) + elapsed
@@ -76,17 +112,7 @@ class _Clock:
 
 
 def make_shard(task: Task) -> ShardResult:
-    """Make a shard. Its bytes depend on nothing but the task and the kind of processor.
-
-    Args:
-        task: Which one.
-
-    Returns:
-        The shard.
-
-    Raises:
-        KeyboardInterrupt: If the user interrupts it.
-    """
+    """Make a shard. Its bytes depend on nothing but the task and the kind of processor."""
     settings = task.settings
     expert = expert_of(settings.scene)
     clock, solve_seconds, outcomes = _Clock(), [], []
@@ -101,37 +127,102 @@ def make_shard(task: Task) -> ShardResult:
     clock.lap("neighbors")
     solve_again(expert, outcomes, retries)
     clock.lap("solves again")
-    actions, episodes = _replay(expert, outcomes)
+    actions, episodes = _verified_episodes(expert, outcomes)
     clock.lap("replay")
     good = [outcome for outcome in outcomes if outcome.is_good]
     failed = [outcome for outcome in outcomes if not outcome.is_good]
-    arrays = demonstration_arrays(expert.problem, good, actions, episodes)
-    content = pack(arrays | failure_arrays(expert.problem, failed), NOTES)
+    arrays = _demonstration_arrays(expert.problem, good, actions, episodes)
+    content = pack(arrays | _failure_arrays(expert.problem, failed), NOTES)
     digest = hashlib.sha256(content).hexdigest()
     clock.lap("packing")
     counts = len(good), len(failed)
     return ShardResult(task.shard, content, digest, platform.node(), *counts, solve_seconds, clock.seconds)
 
 
-def _replay(expert: Expert, outcomes: list[Outcome]) -> tuple[FloatArray, Episodes]:
-    """Carry out what is good in the environment; what it charges otherwise than planned is so no more.
+def draw_starts(scene: Scene, seeds: Sequence[int]) -> FloatArray:
+    """Return the states that `env.reset(seed=...)` starts at, shape (len(seeds), n_x)."""
+    environment = DQSpaceArmVectorEnv(len(seeds), scene)
+    environment.reset(seed=list(seeds))
+    return environment.states
 
-    Returns the actions and episodes of all that is good in the end.
+
+def replay(scene: Scene, seeds: Sequence[int], actions: FloatArray) -> Rollout:
+    """Apply actions, shape (M, N, n_u), in the vector environment, bit for bit as in single ones."""
+    return rollout(StateFeedback(lambda states, step: actions[:, step]), scene, seeds, record=True)
+
+
+def _verified_episodes(expert: Expert, outcomes: list[Outcome]) -> tuple[FloatArray, Rollout]:
+    """Replay the good outcomes; one whose replay fails, or costs something else, becomes a failure.
+
+    Returns actions and episodes of the outcomes that remain good; some episode if none does.
     """
+    problem = expert.problem
     while True:
         good = [outcome for outcome in outcomes if outcome.is_good]
-        actions = actions_of(expert.problem, good)
-        episodes = play(expert.problem.scene, [outcome.seed for outcome in good], actions)
-        differing = [
-            outcome
-            for i, outcome in enumerate(good)
-            if not (episodes.is_success[i] and _agrees(episodes.total_reward(i), outcome.solution.cost))
-        ]
-        if not differing:
+        actions = np.empty((len(good), problem.horizon, problem.n_controls))
+        for row, outcome in zip(actions, good, strict=True):
+            np.divide(outcome.solution.controls, problem.control_upper, out=row)
+        if not good:
+            return actions, replay(problem.scene, [0], np.zeros((1, *actions.shape[1:])))
+        episodes = replay(problem.scene, [outcome.seed for outcome in good], actions)
+        planned = np.array([outcome.solution.cost for outcome in good])
+        agrees = np.abs(planned - episodes.cost) <= REPLAY_TOLERANCE * np.abs(planned)
+        differing = np.flatnonzero(~(episodes.is_success & agrees))
+        if not len(differing):
             return actions, episodes
-        for outcome in differing:
-            outcome.reason = REPLAY_DIFFERS
+        for i in differing:
+            good[i].reason = REPLAY_DIFFERS
 
 
-def _agrees(total_reward: float, cost: float) -> bool:
-    return abs(total_reward + cost) <= REPLAY_TOLERANCE * abs(cost)
+def _demonstration_arrays(
+    problem: ArmProblem, outcomes: Sequence[Outcome], actions: FloatArray, episodes: Rollout
+) -> Arrays:
+    gains = np.empty((*actions.shape, problem.n_tangent), dtype=np.float32)
+    for row, outcome in zip(gains, outcomes, strict=True):
+        limits = problem.control_upper[:, None]
+        np.divide(outcome.solution.feedback_gains, limits, out=row, casting="same_kind")
+    count = len(outcomes)
+    assert episodes.states is not None
+    assert episodes.observations is not None
+    final_errors = np.stack([episodes.attitude_error, episodes.position_error], axis=1)
+    return {
+        "states": episodes.states[:count],
+        "observations": episodes.observations[:count],
+        "actions": actions,
+        "rewards": episodes.rewards[:count],
+        "feedback_gains": gains,
+        **_common(outcomes),
+        "iterations": np.array([outcome.solution.iterations for outcome in outcomes], dtype=np.int64),
+        "guess": np.array([GUESSES.index(outcome.guess) for outcome in outcomes], dtype=np.uint8),
+        "emphasis": np.array(
+            [outcome.solution.metadata["emphasis"] for outcome in outcomes], dtype=np.float64
+        ),
+        "start_errors": episodes.initial_errors[:count],
+        "final_errors": final_errors[:count],
+        "clamped_share": np.mean(np.abs(actions) == 1.0, axis=(1, 2)),
+    }
+
+
+def _failure_arrays(problem: ArmProblem, outcomes: Sequence[Outcome]) -> Arrays:
+    ends = np.array([outcome.solution.states[-1] for outcome in outcomes]).reshape(-1, problem.n_states)
+    starts = np.array([outcome.start for outcome in outcomes]).reshape(-1, problem.n_states)
+    errors = tip_errors(problem.kernels, ends)
+    arrays = {**_common(outcomes), "start": starts, "final_errors": errors}
+    return {f"failures.{name}": array for name, array in arrays.items()}
+
+
+def tip_errors(kernels: Kernels, states: FloatArray) -> FloatArray:
+    """Return attitude error [deg] and position error [m] of states, shape (n, 2)."""
+    if not len(states):
+        return np.zeros((0, 2))
+    _, errors = kernels.observation(states, np.zeros((len(states), 1)))
+    return np.stack([np.degrees(errors[:, 0]), errors[:, 1]], axis=1)
+
+
+def _common(outcomes: Sequence[Outcome]) -> Arrays:
+    return {
+        "index": np.array([outcome.index for outcome in outcomes], dtype=np.int64),
+        "seed": np.array([outcome.seed for outcome in outcomes], dtype=np.int64),
+        "cost": np.array([outcome.solution.cost for outcome in outcomes], dtype=np.float64),
+        "stop_reason": np.array([REASONS.index(outcome.reason) for outcome in outcomes], dtype=np.uint8),
+    }

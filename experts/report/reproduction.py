@@ -1,40 +1,40 @@
-"""The paper's maneuver as a command: solved, replayed, printed and drawn."""
+"""The paper's maneuver, solved, replayed, printed and drawn."""
 
 import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from dq_space_arm_env import Scene, load_scene
-from experts import StopReason
-from experts.report import (
-    ManeuverRun,
-    SolveProgress,
-    print_tables,
-    run_maneuver,
-    summarize,
-    to_json,
-    write_atomically,
-)
-from experts.report.command import INACCURATE, INTERRUPTED, SUCCESS, Destination, complain
+from dq_space_arm_env.command_line.verb import Interrupted, print_document
+from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, table_console
+from dq_space_arm_env.common.files import to_json, write_atomically
+from dq_space_arm_env.scene import Scene
+from experts.ddp.solution import StopReason
+from experts.report.maneuver_run import ManeuverRun, run_maneuver
+from experts.report.maneuver_summary import print_tables, summarize
+from experts.report.solve_progress import SolveProgress
 
 
 def run(
-    destination: Destination,
     scene: Scene,
+    folder: Path,
     *,
     max_iterations: int | None = None,
+    figures: bool = True,
     pdf: bool = False,
     readme_picture: Path | None = None,
+    as_json: bool = False,
 ) -> int:
-    """Solve and replay a scene; the best trajectory is saved in any case, and said to be no more.
+    """Solve and replay a scene; the best trajectory is always saved, flagged if not converged.
 
     Args:
-        destination: Gets solution.npz, scene.yaml and summary.json; with a picture, the figures too.
         scene: The scene.
+        folder: Gets solution.npz, scene.yaml, summary.json and figures; it need not exist.
         max_iterations: Largest number of iterations; the solver's default if None.
-        pdf: Whether to draw the figures also as PDF.
+        figures: Whether to draw figures.
+        pdf: Whether to draw them also as PDF.
         readme_picture: File for a picture with snapshots and errors; None for none.
+        as_json: Whether to print the summary as JSON, and tables to standard error.
 
     Returns:
         Exit status: 0 if the solve converged and the environment charges what was planned; 1 if not; 130 if
@@ -44,57 +44,31 @@ def run(
         KeyboardInterrupt: If interrupted before there is anything to save.
         ValueError: If the scene cannot be solved or replayed, or figures are wanted without Matplotlib.
     """
-    if destination.picture and find_spec("matplotlib") is None:
+    if figures and find_spec("matplotlib") is None:
         raise ValueError('figures need matplotlib: pip install "dq-space-arm[plots]", or give --no-figures')
-    console, folder = destination.console(), destination.folder
+    console = table_console(stderr=as_json)
     folder.mkdir(parents=True, exist_ok=True)
     with SolveProgress(console) as progress:
         maneuver = run_maneuver(scene, max_iterations, progress.start, progress.update)
     try:
         files = _save(maneuver, folder)
         print_tables(console, maneuver)
-        if destination.picture:
+        if figures and maneuver.is_finite:  # a diverged trajectory cannot be drawn
             files += _draw(maneuver, folder, ("png", "pdf") if pdf else ("png",), readme_picture)
-    except KeyboardInterrupt:
-        complain([f"Interrupted; what there is lies in {folder}."])
-        return INTERRUPTED
+    except KeyboardInterrupt as error:
+        raise Interrupted(f"files already written are in {folder}") from error
     console.print(_verdict(maneuver), markup=False)
     written = ", ".join(file.name if file.parent == folder else str(file) for file in files)
     console.print(f"{folder}: {written}", markup=False)
-    if destination.document:
-        destination.print(summarize(maneuver))
-    return _status(maneuver)
-
-
-def scene_with(source: str, integrator: str | None) -> Scene:
-    """Load a scene, with another integrator if one is named.
-
-    Args:
-        source: Name or path.
-        integrator: Its name; None for the scene's own.
-
-    Returns:
-        The scene.
-
-    Raises:
-        SceneError: If it cannot be loaded.
-    """
-    scene = load_scene(source)
-    if integrator is None:
-        return scene
-    return scene.replace(simulation={**scene.simulation.model_dump(), "integrator": integrator})
+    if as_json:
+        print_document(summarize(maneuver))
+    if maneuver.solution.stop_reason is StopReason.INTERRUPTED:
+        return INTERRUPTED
+    return SUCCESS if maneuver.solution.converged and maneuver.replay_agrees else FAILURE
 
 
 def results_folder(scene: Scene, *parents: str) -> Path:
-    """Name the folder of a scene's results.
-
-    Args:
-        scene: The scene.
-        *parents: Folders in between.
-
-    Returns:
-        results/<parents>/<name of the scene>, with characters that a path may have.
-    """
+    """The folder of a scene's results: results/<parents>/<name of the scene>, safe as a path."""
     return Path("results", *parents) / re.sub(r"[^\w.-]+", "-", scene.name)
 
 
@@ -107,14 +81,13 @@ def _save(run: ManeuverRun, folder: Path) -> list[Path]:
 
 
 def _draw(run: ManeuverRun, folder: Path, formats: Sequence[str], readme_picture: Path | None) -> list[Path]:
-    """Draw the figures; a trajectory that is not finite cannot be drawn."""
-    if not run.is_finite:
-        return []
-    from experts.report.figures import write_figures, write_readme_picture
+    from experts.figures import write_figures, write_readme_picture
+    from experts.figures.maneuver_curves import convergence_figure
 
-    files = write_figures(run, folder, formats)
+    solve = run.solution, run.zero_control_cost, run.tolerance, run.solve_seconds
+    files = write_figures(run.maneuver, folder, formats, convergence=lambda: convergence_figure(*solve))
     if readme_picture is not None:
-        write_readme_picture(run, readme_picture)
+        write_readme_picture(run.maneuver, readme_picture)
         files.append(readme_picture)
     return files
 
@@ -128,11 +101,5 @@ def _verdict(run: ManeuverRun) -> str:
     if not solution.converged:
         return f"NOT CONVERGED: {solution.message}. This is the best trajectory so far."
     if not run.replay_agrees:
-        return "The environment does not charge what the solver has planned: one of them is wrong."
-    return "Converged; the environment charges what the solver has planned."
-
-
-def _status(run: ManeuverRun) -> int:
-    if run.solution.stop_reason is StopReason.INTERRUPTED:
-        return INTERRUPTED
-    return SUCCESS if run.solution.converged and run.replay_agrees else INACCURATE
+        return "The environment does not charge what the solver planned: one of them is wrong."
+    return "Converged; the environment charges what the solver planned."

@@ -1,9 +1,9 @@
-"""Two integrators on one motion: how far off they end, and how long they take, for several time steps.
+"""Compare two integrators on one motion: error and run time for several time steps.
 
-An arm with turning joints is followed for three seconds, without inputs, by symplectic Euler and by
-Runge-Kutta-Munthe-Kaas of order 4. The truth comes from the adaptive method with tight tolerances.
-Expect: half the step, half the error of symplectic Euler and a sixteenth of that of rk4; a step of rk4 takes
-about three times as long, so for the same error it is faster by orders of magnitude.
+Symplectic Euler and Runge-Kutta-Munthe-Kaas of order 4 follow an arm with turning joints for three seconds,
+without inputs. The reference is the adaptive method with tight tolerances.
+Expect: halving the step halves the error of symplectic Euler and divides that of rk4 by sixteen. A step of
+rk4 takes about three times as long, so at equal error rk4 is faster by orders of magnitude.
 
     python scripts/examples/compare_integrators.py [--scene paper] [--out results/examples]
 """
@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
         rows: list[tuple[float, float]] = []
         for steps in (50, 100, 200, 400, 800):
             times = []
-            for _ in range(5):  # the fastest of five: others use this machine too
+            for _ in range(5):  # fastest of five: the machine may be shared
                 begin = perf_counter()
                 end = kernels.simulate(start, nothing, steps, DURATION / steps, integrator, every=steps)[-1]
                 times.append(perf_counter() - begin)
@@ -53,7 +53,7 @@ def main(arguments: list[str] | None = None) -> None:
         curves[integrator] = np.array(rows)
 
     if find_spec("matplotlib") is None:
-        print('no picture without matplotlib: pip install "dq-space-arm[plots]"')
+        print('no picture: it needs matplotlib (pip install "dq-space-arm[plots]")')
         return
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator

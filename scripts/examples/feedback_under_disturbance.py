@@ -1,8 +1,8 @@
-"""What feedback is worth: the same plan flown blindly, with its gains, and planned anew at every step.
+"""Measure what feedback is worth: one plan flown open loop, with its gains, and replanned at every step.
 
-Three times the base is pushed: its twist jumps by up to 0.02 rad/s and m/s. The expert's feedback gains,
-u = u_k + K_k (x (-) x_k), correct for it; the receding horizon plans the next 1.5 s anew at every step.
-Expect: the plan alone misses from 0.005 on; its gains arrive up to 0.01; the receding horizon in all cases.
+Three pushes change the base's twist by up to 0.02 rad/s and m/s. The expert's feedback gains,
+u = u_k + K_k (x (-) x_k), correct for them; the receding horizon replans the next 1.5 s at every step.
+Expect: the open loop misses from 0.005 on, the gains arrive up to 0.01, the receding horizon always arrives.
 
     python scripts/examples/feedback_under_disturbance.py [--scene paper] [--out results/examples]
 """
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env import compile_scene
 from experts import BoxDDP, RecedingHorizonExpert
-from experts.report.maneuver import Maneuver
+from experts.maneuver import Maneuver
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -32,11 +32,11 @@ def main(arguments: list[str] | None = None) -> None:
     kernels = compile_scene(options.scene)
     solution = BoxDDP(options.scene).solve()
     horizon = RecedingHorizonExpert(options.scene)
-    limit, twist = kernels.layout.control_limit, kernels.layout.tangent.base_velocity
+    layout, twist = kernels.layout, kernels.layout.tangent.base_velocity
     controllers: dict[str, Callable[[NDArray[np.float64], int], NDArray[np.float64]]] = {
         "plan alone": lambda x, k: solution.controls[k],
         "with gains": solution.policy(),
-        "receding horizon": lambda x, k: horizon(x) * limit,
+        "receding horizon": lambda x, k: layout.to_control(horizon(x)),
     }
     steps, success = len(solution.controls), kernels.scene.success
     flights: dict[str, Maneuver] = {}
@@ -63,7 +63,7 @@ def main(arguments: list[str] | None = None) -> None:
             print(f"{push:6g}  {name:16} {facts}  {'arrives' if arrives else 'misses'}")
 
     if find_spec("matplotlib") is None:
-        print('no picture without matplotlib: pip install "dq-space-arm[plots]"')
+        print('no picture: it needs matplotlib (pip install "dq-space-arm[plots]")')
         return
     from matplotlib.figure import Figure
 

@@ -1,9 +1,9 @@
-"""First steps: a flight with the arm let go, and the best one that there is, from the same start.
+"""First steps: an episode without any input, and the optimal one from the same start.
 
-Shows how an environment is made, how the expert solves its scene, and how the solution is flown step by step.
-Expect: doing nothing leaves the tip far from its target; the expert's controls bring it there, within the
-scene's tolerances, and the rewards of that flight sum to minus the solution's cost. Machine code is compiled
-on the first run, in a minute or so, and kept for the next.
+Shows how to create an environment, solve its scene with the expert, and fly the solution step by step.
+Expect: doing nothing leaves the tip far from its target. The expert's controls bring it there, within the
+scene's tolerances, and that episode's rewards sum to minus the solution's cost. The first run compiles
+machine code, which takes about a minute; later runs load it from the cache.
 
     python scripts/examples/first_steps.py [--scene paper] [--out results/examples]
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-from dq_space_arm_env import compile_scene  # and register the environment
+from dq_space_arm_env import compile_scene  # importing it registers the environment
 from experts import BoxDDP
 
 
@@ -29,9 +29,9 @@ def main(arguments: list[str] | None = None) -> None:
     solution = BoxDDP(options.scene).solve()
     env = gymnasium.make("DQSpaceArm-v0", scene=options.scene)
     kernels = compile_scene(options.scene)
-    limit = kernels.layout.control_limit  # N, N m, rad/s; actions are fractions of it
+    planned = kernels.layout.to_action(solution.controls)  # from N, N m, rad/s to fractions of the limits
 
-    flights = {"nothing": np.zeros_like(solution.controls), "expert": solution.controls / limit}
+    flights = {"nothing": np.zeros_like(planned), "expert": planned}
     curves = {}
     print(f"{'who flies':10} {'return':>10} {'attitude, deg':>14} {'position, m':>12}  success")
     for name, actions in flights.items():
@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"the expert: {solution.message}; J = {solution.cost:.1f} after {solution.iterations} iterations")
 
     if find_spec("matplotlib") is None:
-        print('no picture without matplotlib: pip install "dq-space-arm[plots]"')
+        print('no picture: it needs matplotlib (pip install "dq-space-arm[plots]")')
         return
     from matplotlib.figure import Figure
 

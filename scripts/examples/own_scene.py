@@ -1,8 +1,8 @@
-"""A scene of your own: a robot in a few lines of YAML, or your URDF, from description to solved maneuver.
+"""Bring your own robot: a few lines of YAML, or your URDF, from description to solved maneuver.
 
-Expect: a mistake is refused with a sentence; the robot of this file, compiled first, reaches its target.
-With --urdf, your arm, on 100 kg, goes to where its joints are 0.3 rad further; six joints take a minute,
-and the last iterations hardly lower the cost: the table says whether the end is good enough.
+Expect: a mistake is refused with a sentence; the robot in this file reaches its target. With --urdf, your
+arm, on a base of 100 kg, moves every joint by 0.3 rad. Six joints take a minute, and the last iterations
+barely lower the cost: the table shows whether the end is within the tolerances.
 
     python scripts/examples/own_scene.py [--urdf scripts/examples/small-arm.urdf --tip hand] [--out FOLDER]
 """
@@ -13,14 +13,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import gymnasium
-import yaml
+from ruamel.yaml import YAML
 
 from dq_space_arm_env import SceneError, load_scene, scene_from_urdf
 from experts import GuidedDDP
-from experts.report.maneuver import Maneuver
+from experts.maneuver import Maneuver
 
 ROBOT = """
-name: inspector # a small satellite that moves in the plane, with two links
+name: inspector # a small planar satellite with a two-link arm
 base: {motion: planar, mass: 40, inertia: [3, 3, 2]} # kg, kg m^2
 links:
   - name: upper arm
@@ -40,12 +40,12 @@ target: {pose: {position: [0.75, 0.65, 0], rotation: {axis: [0, 0, 1], angle: 80
 def main(arguments: list[str] | None = None) -> None:
     """Run the example."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--urdf", type=Path, help="a robot of yours")
-    parser.add_argument("--tip", default="tool0", help="its link that reaches for the target")
+    parser.add_argument("--urdf", type=Path, help="your robot")
+    parser.add_argument("--tip", default="tool0", help="link that should reach the target")
     parser.add_argument("--out", type=Path, default=Path("results/examples"))
     options = parser.parse_args(arguments)
     if options.urdf is None:
-        data = yaml.safe_load(ROBOT)
+        data = YAML(typ="safe").load(ROBOT)
         try:
             load_scene({**data, "base": {**data["base"], "mass": -40}})
         except SceneError as error:
@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"{name:6} {math.degrees(flown.angle[k]):14.2f} {flown.distance[k]:12.4f}")
     print(f"{'asked':6} {scene.success.attitude_error_deg:14.2f} {scene.success.position_error:12.4f}")
     if find_spec("matplotlib") is None:
-        print('no picture without matplotlib: pip install "dq-space-arm[plots]"')
+        print('no picture: it needs matplotlib (pip install "dq-space-arm[plots]")')
         return
     from matplotlib.figure import Figure
 

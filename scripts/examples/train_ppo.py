@@ -1,11 +1,11 @@
-"""PPO in five minutes: an agent that learns the paper's maneuver from nothing, watched while it does.
+"""PPO in five minutes: train an agent on the paper's maneuver from scratch and watch its learning curve.
 
-Trains with the shipped configuration `ppo`, for as many minutes as you give it. Its practice holds each
-action for 0.3 s and has its own scales of actions and rewards, without which PPO learns next to nothing here.
-Now and then the agent flies validation starts without noise; that curve is printed and drawn. Needs the extra
-`agents`. The same command goes on where an interrupted run was; another --out begins anew.
-Expect: a tenth of the flights succeed after 5 million steps, and 82 to 95 % after all 60 million (three
-seeds, 4 to 6 minutes on one core).
+Trains the shipped configuration `ppo` for as many minutes as you allow. It holds each action for 0.3 s and
+scales actions and rewards; without that, PPO learns next to nothing here. At intervals the agent flies
+validation starts without noise; that curve is printed and plotted. Needs the extra `agents`. Re-run the
+command to resume an interrupted run; another --out starts afresh.
+Expect: one in ten episodes succeeds after 5 million steps, and 82 to 95 % after all 60 million (three seeds,
+4 to 6 minutes on one core).
 
     python scripts/examples/train_ppo.py [--minutes 5] [--out results/examples/ppo]
 """
@@ -19,7 +19,7 @@ from rich.console import Console
 
 from agents import train
 from agents.configuration import load_configuration
-from agents.progress import ProgressDisplay
+from dq_space_arm_env.common.progress import ProgressDisplay
 
 MILLION = 1_000_000
 
@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the example."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--minutes", type=float, default=5.0)
-    parser.add_argument("--steps", type=int, default=60 * MILLION, help="environment steps, at most")
+    parser.add_argument("--steps", type=int, default=60 * MILLION, help="maximum number of environment steps")
     parser.add_argument("--scene", default="paper")
     parser.add_argument("--out", type=Path, default=Path("results/examples/ppo"))
     options = parser.parse_args(arguments)
@@ -58,12 +58,12 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"watch the agent: dq-space-arm evaluate show {options.out} --gif agent.gif")
 
     if find_spec("matplotlib") is None:
-        print('no picture without matplotlib: pip install "dq-space-arm[plots]"')
+        print('no picture: it needs matplotlib (pip install "dq-space-arm[plots]")')
         return
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 3.2), layout="constrained")
-    names = {"success_rate": "share of successes", "position_error": "median position error, m"}
+    names = {"success_rate": "success rate", "position_error": "median position error, m"}
     for axes, (key, label) in zip(figure.subplots(1, 2), names.items(), strict=True):
         axes.plot([p["environment_steps"] / MILLION for p in curve], [p[key] for p in curve], marker="o")
         axes.set(xlabel="million environment steps", ylabel=label, ylim=(0, None))

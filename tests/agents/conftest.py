@@ -1,5 +1,10 @@
 """A small scene whose problems are solved in hundredths of a second, and demonstrations of it."""
 
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
 import pytest
 
 from dq_space_arm_env import Scene, load_scene
@@ -7,11 +12,40 @@ from experts import generate_demonstrations
 from experts.demonstrations import Demonstrations, SerialExecutor
 
 N, SHARD_SIZE, SEED = 24, 8, 5
+ROOT = Path(__file__).parents[2]
+HIDE = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {packages}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Missing())
+"""
+
+
+@pytest.fixture(scope="session")
+def run_without():
+    """Run code in a process that cannot import some packages."""
+
+    def run(packages, code, *arguments):
+        command = [sys.executable, "-c", HIDE.format(packages=packages) + code, *map(str, arguments)]
+        return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+
+    return run
 
 
 @pytest.fixture(scope="session")
 def small_scene() -> Scene:
     return load_scene("planar").replace(name="small", simulation={"dt": 0.1, "steps": 150})
+
+
+@pytest.fixture(scope="session")
+def small_file(small_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "small.yaml"
+    small_scene.to_yaml(path)
+    return path
 
 
 @pytest.fixture(scope="session")
@@ -23,3 +57,12 @@ def demonstrations(small_scene: Scene, tmp_path_factory: pytest.TempPathFactory)
     )
     assert made is not None
     return made
+
+
+@pytest.fixture(scope="module", autouse=True)
+def results_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A cache of evaluations for each file of tests; compiled kernels stay in theirs."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("agents.evaluation.kept_results.cache_directory", lambda: folder)
+        yield folder

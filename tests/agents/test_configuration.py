@@ -1,7 +1,6 @@
 """Configurations of agents: what ships is valid, what is wrong is named, nothing unknown is taken."""
 
 import pytest
-import yaml
 
 from agents.configuration import (
     Configuration,
@@ -11,6 +10,7 @@ from agents.configuration import (
     load_configuration,
 )
 from dq_space_arm_env import load_scene
+from dq_space_arm_env.validation import dump_yaml
 
 MINIMAL = {"name": "small", "algorithm": {"name": "PPO"}, "schedule": {"total_steps": 1000}}
 
@@ -41,7 +41,7 @@ def test_files_mappings_and_configurations_are_one(tmp_path):
     assert isinstance(configuration, Configuration)
     assert load_configuration(configuration) == configuration
     path = tmp_path / "small.yaml"
-    path.write_text(yaml.safe_dump(MINIMAL))
+    path.write_text(dump_yaml(MINIMAL))
     assert load_configuration(path) == load_configuration(str(path)) == configuration
     resolved = configuration.model_dump(mode="json", exclude_none=True)
     assert resolved["algorithm"]["clip_range"] == 0.2
@@ -52,8 +52,8 @@ def test_unknown_keys_are_refused_with_a_suggestion():
     assert "seeds: unknown key; did you mean 'seed'?" in refusal(seeds=3)
     message = refusal(algorithm={"name": "PPO", "learning_rat": 1e-3})
     assert "learning_rat: unknown key; did you mean 'learning_rate'?" in message
-    message = refusal(algorithm={"name": "SAC", "clip_range": 0.2})
-    assert "clip_range: unknown key" in message
+    assert "clip_range: unknown key" in refusal(algorithm={"name": "SAC", "clip_range": 0.2})
+    assert refusal(seeds=1, schedule={"total_steps": 0}).startswith("configuration 'small': 2 problems")
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,6 @@ def test_unknown_keys_are_refused_with_a_suggestion():
     [
         ({"algorithm": {"name": "DQN"}}, "it must be one of PPO, SAC, TQC, TD3, cloning, dagger"),
         ({"algorithm": {"name": "PPO", "gamma": 1.5}}, "gamma = 1.5: must be a fraction"),
-        ({"algorithm": {"name": "PPO", "batch_size": 0}}, "batch_size = 0: must be a whole number"),
         (
             {"algorithm": {"name": "SAC", "buffer_size": 10, "learning_starts": 20}},
             "learning_starts = 20: must be at most buffer_size, which is 10",
@@ -70,32 +69,19 @@ def test_unknown_keys_are_refused_with_a_suggestion():
             {"algorithm": {"name": "TQC", "n_quantiles": 2, "top_quantiles_to_drop_per_net": 2}},
             "top_quantiles_to_drop_per_net = 2: must be less than n_quantiles",
         ),
-        (
-            {"environment": {"action_scale": {"base_force": 2.0}}},
-            "environment.action_scale.base_force = 2.0: must be at most 1",
-        ),
-        ({"environment": {"cost_power": 2}}, "environment.cost_power = 2.0: must be at most 1"),
+        ({"environment": {"action_scale": {"base_force": 2.0}}}, "base_force = 2.0: must be at most 1"),
         ({"network": {"activation": "sigmoid"}}, "network.activation = 'sigmoid': must be"),
         ({"schedule": {}}, "schedule.total_steps: missing"),
-        ({"name": "a/b"}, "name = 'a/b'"),
         ({"seed": -1}, "seed = -1"),
-        ({"seed": 2**31}, "seed = 2147483648"),
         ({"algorithm": {"name": "PPO", "batch_size": 1}}, "batch_size = 1: must be at least 2"),
         (
             {"algorithm": {"name": "SAC", "layer_norm": True}, "network": {"hidden": []}},
             "network.hidden = []: must have a layer for algorithm.layer_norm",
         ),
-        ({"environment": {"reward_scale": float("nan")}}, "environment.reward_scale = nan"),
         ({"algorithm": {"name": "PPO", "learning_rate": float("inf")}}, "learning_rate = inf"),
-        ({"environment": {"copies": 1.5}}, "environment.copies = 1.5"),
-        ({"network": {"hidden": 64}}, "network.hidden = 64"),
         (
             {"algorithm": {"name": "SAC", "hindsight": {}}, "environment": {"reward_scale": 0.01}},
             "environment.reward_scale = 0.01: must be 1 with hindsight",
-        ),
-        (
-            {"algorithm": {"name": "TD3", "hindsight": {}}, "environment": {"success_reward": 0.5}},
-            "environment.success_reward = 0.5: must be 0 with hindsight",
         ),
         (
             {"algorithm": {"name": "SAC", "batch_size": 4, "demonstrations": {"share": 0.1}}},
@@ -114,9 +100,6 @@ def test_the_algorithm_decides_about_the_class():
     configuration = load_configuration(IMITATION)
     assert isinstance(configuration, ImitationConfiguration)
     assert configuration.cloning is configuration.algorithm
-    assert load_configuration(configuration) == configuration
-    resolved = configuration.model_dump(mode="json", exclude_none=True)
-    assert load_configuration(resolved) == configuration
     algorithm = {"name": "dagger", "cloning": {"validate_every": 7}}
     dagger = load_configuration(IMITATION | {"algorithm": algorithm})
     assert isinstance(dagger, ImitationConfiguration)
@@ -128,28 +111,16 @@ def test_the_algorithm_decides_about_the_class():
     [
         ({"network": {"activation": "relu"}}, "network.activation = 'relu': must be one of tanh, silu"),
         ({"algorithm": {"name": "clonin"}}, "algorithm.name = 'clonin': did you mean 'cloning'"),
-        ({"algorithm": None}, "algorithm.name = None: it must be one of PPO"),
         ({"algorithm": {"name": ["cloning"]}}, "algorithm.name = ['cloning']: it must be one of PPO"),
-        (
-            {"algorithm": {"name": "cloning", "validation_share": 1.0}},
-            "validation_share = 1.0: must be less than 1",
-        ),
         ({"algorithm": {"name": "dagger", "share": 1.0}}, "share = 1.0: must be less than 1"),
-        ({"algorithm": {"name": "dagger", "labels": "guess"}}, "labels = 'guess': must be"),
         ({"algorithm": {"name": "cloning", "optimization": {"update": 5}}}, "did you mean 'updates'"),
         ({"demonstrations": {"tolerance_scale": 2}}, "tolerance_scale = 2.0: must be at most 1"),
-        ({"schedule": {"total_steps": 5}}, "schedule: unknown key"),
     ],
 )
 def test_wrong_values_for_imitation_are_named(changes, sentence):
     with pytest.raises(ConfigurationError) as error:
         load_configuration(IMITATION | changes)
     assert sentence in str(error.value)
-
-
-def test_all_problems_are_listed():
-    message = refusal(seeds=1, schedule={"total_steps": 0})
-    assert message.startswith("configuration 'small': 2 problems")
 
 
 def test_what_cannot_be_found_or_read_is_named(tmp_path):
@@ -161,9 +132,3 @@ def test_what_cannot_be_found_or_read_is_named(tmp_path):
         (tmp_path / "odd.yaml").write_text(content)
         with pytest.raises(ConfigurationError, match=sentence):
             load_configuration(tmp_path / "odd.yaml")
-
-
-def test_steps_of_held_actions_are_decisions():
-    configuration = load_configuration(MINIMAL | {"environment": {"action_repeat": 20}})
-    assert configuration.decisions(1000) == 50
-    assert configuration.decisions(1001) == 51

@@ -24,7 +24,7 @@ ANGLES = sorted(
     {*TINY, 0.5, 1.5, 2.5, 3.0, *(c + side * d for c in CRITICAL for d in NEIGHBORS for side in (-1.0, 1.0))}
 )
 SHORT_ANGLES = [angle for angle in ANGLES if angle <= math.pi]
-DIRECTIONS = [(1.0, 0.0, 0.0), (0.0, -0.6, 0.8), (0.48, 0.6, -0.64)]
+DIRECTIONS = [(1.0, 0.0, 0.0), (0.0, -0.8, 0.6), (0.48, 0.6, -0.64)]  # each has another largest component
 TRANSLATIONS = [
     (0.0, 0.0, 0.0),
     (1e-300, 2e-300, 0.0),
@@ -159,18 +159,6 @@ def test_right_jacobian():
             assert error(actual[row + 3][:3], dual[row], length(exact(twist[3:])) or 1.0) <= 16.0, twist
 
 
-def test_dexp_inverse():
-    """J times the result is the velocity; only towards 2 pi, where J is singular, would the error grow."""
-    w, v = np.array(exact((0.3, -0.5, 0.7))), np.array(exact((1.0, 2.0, -1.5)))
-    for twist in twists(SHORT_ANGLES[::2], TRANSLATIONS[::2]):
-        actual, (real, dual) = (
-            screw.dexp_inverse(twist, (*w.astype(float), *v.astype(float))),
-            exact_right_jacobian(twist),
-        )
-        assert error(real @ actual[:3], w, 1.0) <= 16.0, twist
-        assert error(dual @ actual[:3] + real @ actual[3:], v, 1.0 + length(exact(twist[3:]))) <= 16.0, twist
-
-
 def test_rotation_matrix_round_trip():
     """Shepperd's method from the exactly rounded matrix: 2 units, and half turns need no special case."""
     for twist in twists(SHORT_ANGLES):
@@ -187,9 +175,7 @@ def test_axis_angle():
     for angle in SHORT_ANGLES:
         for direction in DIRECTIONS:
             v = exact([angle * component for component in direction])
-            q = tuple(
-                float(component) for component in exact_exponential((*map(float, v), 0.0, 0.0, 0.0))[:4]
-            )
+            q = tuple(map(float, exact_exponential((*map(float, v), 0.0, 0.0, 0.0))[:4]))
             axis, measured = rotations.to_axis_angle(q)
             assert error([measured], [length(v)], length(v)) <= 4.0, v
             assert error(axis, [component / length(v) for component in v], 1.0) <= 4.0, v
@@ -212,8 +198,6 @@ def test_normalize():
         real, dual = b[:4], b[4:]
         norm = length(real)
         along = mpmath.fsum(r * d for r, d in zip(real, dual, strict=True)) / norm**3
-        expected = (
-            *(r / norm for r in real),
-            *(d / norm - along * r for r, d in zip(real, dual, strict=True)),
-        )
+        expected = [r / norm for r in real]
+        expected += [d / norm - along * r for r, d in zip(real, dual, strict=True)]
         assert error(dual_quaternion.normalize(a), expected, length(dual) / norm + 1.0) <= 4.0

@@ -1,7 +1,5 @@
 """Tables I and II of the paper, its operators and identities (1)-(8), and the dual inertia matrix (10)."""
 
-import itertools
-
 import numpy as np
 import pytest
 from algebra_strategies import (
@@ -44,17 +42,6 @@ class TestTableI:
             assert qn.multiply(one, unit) == qn.multiply(unit, one) == tuple(unit)
 
     @REPRODUCIBLE
-    @given(QUATERNIONS, QUATERNIONS, QUATERNIONS, NUMBERS)
-    def test_product_is_bilinear_and_associative(self, a, b, c, factor):
-        combination = qn.add(qn.scale(factor, a), b)
-        scale = size(a, b, c, [factor])
-        expected = qn.add(qn.scale(factor, qn.multiply(a, c)), qn.multiply(b, c))
-        assert_equal(qn.multiply(combination, c), expected, scale)
-        expected = qn.add(qn.scale(factor, qn.multiply(c, a)), qn.multiply(c, b))
-        assert_equal(qn.multiply(c, combination), expected, scale)
-        assert_equal(qn.multiply(qn.multiply(a, b), c), qn.multiply(a, qn.multiply(b, c)), scale)
-
-    @REPRODUCIBLE
     @given(QUATERNIONS, QUATERNIONS)
     def test_definitions(self, a, b):
         """Every row of the table, in terms of 3-vectors."""
@@ -73,14 +60,6 @@ class TestTableI:
 
     @REPRODUCIBLE
     @given(QUATERNIONS, QUATERNIONS)
-    def test_conjugate_and_norm_of_a_product(self, a, b):
-        scale = size(a, b)
-        product = qn.multiply(a, b)
-        assert_equal(qn.conjugate(product), qn.multiply(qn.conjugate(b), qn.conjugate(a)), scale)
-        assert_equal(qn.norm(product), qn.norm(a) * qn.norm(b), scale)
-
-    @REPRODUCIBLE
-    @given(QUATERNIONS, QUATERNIONS)
     def test_matrices(self, a, b):
         """(1), and the 4 x 4 blocks of [.]_L and [.]_R."""
         scale = size(a, b)
@@ -93,20 +72,6 @@ class TestTableI:
 
 
 class TestTableII:
-    def test_dual_unit(self):
-        """(a_r + eps a_d) with eps^2 = 0, and eps commutes with i, j, k."""
-        basis = np.eye(8)
-        for a, b in itertools.product(basis, basis):
-            product = dq.multiply(a, b)
-            real, dual = (
-                qn.multiply(a[:4], b[:4]),
-                qn.add(qn.multiply(a[4:], b[:4]), qn.multiply(a[:4], b[4:])),
-            )
-            assert product == real + dual
-            if a[4:].any() and b[4:].any():
-                assert product == dq.ZERO
-        assert dq.multiply(dq.IDENTITY, basis[5]) == tuple(basis[5])
-
     @REPRODUCIBLE
     @given(DUAL_QUATERNIONS, DUAL_QUATERNIONS, NUMBERS)
     def test_definitions(self, a, b, factor):
@@ -125,17 +90,6 @@ class TestTableII:
         assert dq.swap(a) == ad + ar
         assert_equal(dq.norm(a), np.linalg.norm(a), scale)
         assert dq.vector_part(a) == (0.0, *a[1:4], 0.0, *a[5:]) == dq.from_vector(dq.to_vector(a))
-
-    @REPRODUCIBLE
-    @given(DUAL_QUATERNIONS, DUAL_QUATERNIONS, DUAL_QUATERNIONS)
-    def test_product_is_associative(self, a, b, c):
-        assert_equal(dq.multiply(dq.multiply(a, b), c), dq.multiply(a, dq.multiply(b, c)), size(a, b, c))
-
-    @REPRODUCIBLE
-    @given(unit_dual_quaternions())
-    def test_norm_of_a_pose(self, q):
-        """Table II's norm of a unit dual quaternion is sqrt(1 + |r|^2 / 4)."""
-        assert_equal(dq.norm(q), np.sqrt(1.0 + np.dot(poses.position(q), poses.position(q)) / 4.0), size(q))
 
 
 class TestIdentities:
@@ -165,10 +119,6 @@ class TestIdentities:
         expected = dq.circle(a, dq.cross(b, c))
         assert_equal(dq.circle(dq.swap(b), dq.cross(c, dq.swap(a))), expected, scale)
         assert_equal(dq.circle(dq.swap(c), dq.cross(dq.swap(a), b)), expected, scale)
-
-    def test_5_needs_vector_dual_quaternions(self):
-        a, b, c = (1.0,) * 8, (1.0, 2.0) * 4, (3.0, 0.0, 1.0, 2.0) * 2
-        assert dq.circle(a, dq.cross(b, c)) != dq.circle(dq.swap(b), dq.cross(c, dq.swap(a)))
 
 
 class TestDualMatrices:
@@ -292,13 +242,6 @@ class TestNormalization:
         assert_equal(dq.multiply(dq.conjugate(unit), unit), dq.IDENTITY, size(unit, unit))
         assert_equal(dq.normalize(unit), unit, size(unit))
 
-    @REPRODUCIBLE
-    @given(unit_dual_quaternions())
-    def test_it_divides_by_a_dual_number(self, q):
-        """A unit dual quaternion times a + eps b is sent back to itself."""
-        scaled = dq.multiply(q, (2.0, 0.0, 0.0, 0.0, -3.0, 0.0, 0.0, 0.0))
-        assert_equal(dq.normalize(scaled), q, 10.0 * size(q))
-
     @pytest.mark.parametrize(
         ("q", "expected"),
         [
@@ -319,9 +262,8 @@ def test_dual_vectors_are_vector_dual_quaternions():
     assert_equal(dual_vectors.add(a, b), a + b)
     assert_equal(dual_vectors.subtract(a, b), a - b)
     assert_equal(dual_vectors.scale(-3.0, a), -3.0 * a, 10.0)
-    assert_equal(
-        dq.from_vector(dual_vectors.cross(a, b)), dq.cross(dq.from_vector(a), dq.from_vector(b)), 10.0
-    )
+    expected = dq.cross(dq.from_vector(a), dq.from_vector(b))
+    assert_equal(dq.from_vector(dual_vectors.cross(a, b)), expected, 10.0)
     assert dual_vectors.from_parts(dual_vectors.real_part(a), dual_vectors.dual_part(a)) == tuple(a)
 
 

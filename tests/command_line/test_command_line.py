@@ -1,12 +1,13 @@
 """The program as a whole: how soon it is there, how it helps, and how every run ends."""
 
+import errno
+import importlib.metadata
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -15,38 +16,37 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from agents.command_line import info as info_module
-from agents.command_line import main
-from agents.command_line.comparing import compare
-from agents.command_line.learning import evaluate
-from agents.command_line.names import configuration_files, description_of, scene_files
-from agents.command_line.program import program, run_to_end
-from agents.command_line.verb import (
-    FAILURE,
-    INTERNAL,
-    INTERRUPTED,
-    SUCCESS,
-    UNUSABLE,
-    Session,
-    VerbsWithDefault,
-)
+from agents.command_line.agent_policies import configuration_files
+from agents.command_line.compare import compare
+from agents.command_line.evaluate import evaluate
 from agents.configuration import list_configurations
 from dq_space_arm_env import __version__, list_scenes, load_scene
+from dq_space_arm_env.command_line import info as info_module
+from dq_space_arm_env.command_line import main
+from dq_space_arm_env.command_line.names import description_of, scene_files
+from dq_space_arm_env.command_line.verb import DefaultGroup
+from dq_space_arm_env.command_line.verb_program import program, run_to_end
+from dq_space_arm_env.common.console import FAILURE, INTERNAL, INTERRUPTED, SUCCESS, UNUSABLE
+from dq_space_arm_env.common.entry_points import entry_points
 
 ROOT = Path(__file__).parents[2]
-HEAVY = ["casadi", "gymnasium", "matplotlib", "numba", "numpy", "pydantic", "rich", "torch", "yaml"]
+FLIGHT = ["simulate", "planar", "--policy", "zero"]
+HEAVY = ["casadi", "gymnasium", "matplotlib", "numba", "numpy", "pydantic", "rich", "ruamel.yaml", "torch"]
 
 
 def walk(command: click.Command, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
     """Every verb, with those above it."""
     if not isinstance(command, click.Group):
         return [path]
-    return [path, *(found for name, sub in command.commands.items() for found in walk(sub, (*path, name)))]
+    context = click.Context(command)
+    names = command.list_commands(context)
+    inner = {name: command.get_command(context, name) for name in names}
+    return [path, *(found for name, sub in inner.items() if sub for found in walk(sub, (*path, name)))]
 
 
 def process(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run Python code in a new process."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), **variables}
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
 
 
@@ -54,7 +54,7 @@ def process(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
 def test_it_starts_without_loading_anything_heavy(arguments: list[str]) -> None:
     result = process(
         "import sys\n"
-        "from agents.command_line import main\n"
+        "from dq_space_arm_env.command_line import main\n"
         f"status = main({arguments})\n"
         f"print([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)\n"
         "sys.exit(status)"
@@ -68,7 +68,7 @@ def test_completion_loads_nothing_heavy_and_knows_the_names() -> None:
     code = (
         "import sys, atexit\n"
         f"atexit.register(lambda: print([n for n in {HEAVY} if n in sys.modules], file=sys.stderr))\n"
-        "from agents.command_line import main\n"
+        "from dq_space_arm_env.command_line import main\n"
         "sys.exit(main([]))"
     )
 
@@ -112,68 +112,40 @@ def test_every_verb_helps_with_examples_that_it_understands(path: tuple[str, ...
         first, *words = takewhile(lambda word: word != "|", shlex.split(line, comments=True))
         assert first == "dq-space-arm"
         command: Any = program
-        while isinstance(command, click.Group) and words and words[0] in command.commands:
-            command, words = command.commands[words[0]], words[1:]
-        if isinstance(command, VerbsWithDefault):
+        while isinstance(command, click.Group) and words:
+            inner = command.get_command(click.Context(command, resilient_parsing=True), words[0])
+            if inner is None:
+                break
+            command, words = inner, words[1:]
+        if isinstance(command, DefaultGroup):
             command = command.default
-        options = {
-            name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)
-        }
+        options = {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
         assert {word for word in words if word.startswith("--")} <= options
-
-
-def test_a_number_sign_within_a_word_begins_no_comment() -> None:
-    result = CliRunner().invoke(program, ["replay", "--help"], terminal_width=120)
-    assert 'dq-space-arm replay "results/demonstrations/paper#3" --open ' in result.stdout
-    assert "# a demonstration\n" in result.stdout
-
-
-@pytest.mark.parametrize(
-    "arguments", [["work-precision"], ["stability"], ["--part", "stability"]], ids=" ".join
-)
-def test_reports_name_the_extra_that_their_references_need(arguments: list[str], tmp_path: Path) -> None:
-    code = (
-        "import sys\n"
-        "sys.modules['mpmath'] = None  # as if it were not installed\n"
-        "from agents.command_line import main\n"
-        f"sys.exit(main(['report', *{arguments!r}, '--out', {str(tmp_path / 'out')!r}]))"
-    )
-    result = process(code)
-    assert result.returncode == UNUSABLE
-    assert result.stderr.strip() == 'Error: the references need mpmath: pip install "dq-space-arm[test]"'
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         (["solv", "paper"], "No such command 'solv'. Did you mean 'solve'?"),
-        (["scenes", "shwo"], "Did you mean 'show'?"),
         (["solve", "paper", "--sed", "1"], "Did you mean one of: '--seed'"),
         (["solve", "papr"], "no scene is named 'papr'; did you mean 'paper'?"),
         (["solve", "nowhere.yaml"], "nowhere.yaml: there is no such file"),
-        (
-            ["simulate", "paper", "--policy", "gians"],
-            "there is no such file; did you mean 'gains'?",
-        ),
-        (["report", "--part", "stabilty"], "'stabilty' is unknown; did you mean 'stability'?"),
-        (["report", "--quick", "expert"], "options go behind expert"),
-        (["report", "expert", "--quick", "--full"], "--quick and --full exclude each other"),
-        (["demonstrations", "generate", "--shard", "3/2"], "it should be I/K"),
+        (["simulate", "paper", "--policy", "gians"], "there is no such file; did you mean 'gains'?"),
+        (["simulate", "planar", "--seed", "1", "--start", "0,0"], "--seed and --start exclude each other"),
+        (["simulate", "planar", "--seed", "-1"], "-1 is not in the range x>=0"),
+        ([*FLIGHT, "--start", "1,2,3"], "--start: has shape (3,), should be the scene's (13,)"),
+        ([*FLIGHT, "--start", "one"], "should be 13 numbers separated by commas"),
+        ([*FLIGHT, "--noise", "-1"], "--noise is -1.0"),
+        (["demonstrations", "generate", "--shard", "3/2"], "use I/K"),
         (["replay", "a.npz", "--label", "one", "--label", "two"], "2 labels for 1 flights"),
         (["train"], "give one configuration: a YAML file, or one of cloning,"),
-        (["train", "pppo"], "did you mean 'ppo'"),
         (["evaluate"], "name a policy to evaluate"),
-        (
-            ["evaluate", "a.npz", "--condition", "training", "spinn"],
-            "'spinn' is unknown; did you mean 'spin'?",
-        ),
+        (["evaluate", "a.npz", "--condition", "training", "spinn"], "did you mean 'spin'?"),
         (["evaluate", "show", "nobody"], "the zoo has no policy 'nobody'"),
         (["compare", "--controller", "gain"], "'gain' is unknown; did you mean 'gains'?"),
-        (["evaluate", "show"], "name one policy"),
-        (["compare", "residual", "nobody"], "the zoo has no policy 'nobody'"),
     ],
 )
-def test_a_mistake_ends_with_one_sentence(
+def test_mistakes_end_with_one_sentence(
     arguments: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments) == UNUSABLE
@@ -184,24 +156,20 @@ def test_a_mistake_ends_with_one_sentence(
     assert captured.err.count("\n") == 1
 
 
-def test_debug_shows_the_traceback(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_debug_shows_tracebacks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenes", "show", "papr", "--debug"]) == UNUSABLE
     assert "Traceback" in capsys.readouterr().err
-    monkeypatch.setenv("DQ_SPACE_ARM_DEBUG", "1")
-    assert main(["scenes", "show", "papr"]) == UNUSABLE
-    assert "Traceback" in capsys.readouterr().err
-    monkeypatch.setenv("DQ_SPACE_ARM_DEBUG", "0")
-    assert main(["scenes", "show", "papr"]) == UNUSABLE
-    assert "Traceback" not in capsys.readouterr().err
+    for value, is_shown in (("1", True), ("0", False)):
+        monkeypatch.setenv("DQ_SPACE_ARM_DEBUG", value)
+        assert main(["scenes", "show", "papr"]) == UNUSABLE
+        assert ("Traceback" in capsys.readouterr().err) == is_shown
 
 
-def raising(error: BaseException) -> Callable[[], Any]:
+def end_with(error: BaseException) -> int:
     def run() -> None:
         raise error
 
-    return run
+    return run_to_end(run)
 
 
 class OurError(Exception):
@@ -216,6 +184,9 @@ class OurError(Exception):
         (ValueError("dt is -1"), UNUSABLE, "Error: dt is -1\n"),
         (ImportError("it needs torch"), UNUSABLE, "Error: it needs torch\n"),
         (OurError("the disk is full"), FAILURE, "Error: the disk is full\n"),
+        (OSError(errno.ENOSPC, "No space left", "a.npz"), FAILURE, "Error: a.npz: No space left\n"),
+        (OSError(errno.ENOSPC, "No space left"), FAILURE, "Error: No space left\n"),
+        (FileNotFoundError(errno.ENOENT, "No such file", "a.npz"), UNUSABLE, "Error: a.npz: No such file\n"),
         (KeyboardInterrupt(), INTERRUPTED, "Interrupted: nothing is saved.\n"),
         (SystemExit(7), 7, ""),
         (SystemExit(None), SUCCESS, ""),
@@ -224,12 +195,12 @@ class OurError(Exception):
 def test_every_end_has_its_status(
     error: BaseException, status: int, sentence: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run_to_end(raising(error), Session()) == status
+    assert end_with(error) == status
     assert capsys.readouterr().err == sentence
 
 
 def test_a_mistake_of_our_own_asks_for_a_report(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_to_end(raising(KeyError("mass")), Session()) == INTERNAL
+    assert end_with(KeyError("mass")) == INTERNAL
     error = capsys.readouterr().err
     assert "KeyError: 'mass'" in error
     assert "dq-space-arm info" in error
@@ -239,17 +210,12 @@ def test_a_mistake_of_our_own_asks_for_a_report(capsys: pytest.CaptureFixture[st
 def test_colors_only_on_a_terminal_that_wants_them(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for variable in ("NO_COLOR", "FORCE_COLOR"):
-        monkeypatch.delenv(variable, raising=False)
-    assert main(["solv"]) == UNUSABLE
-    assert "\x1b" not in capsys.readouterr().err  # no terminal
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("TERM", "xterm-256color")
-    assert main(["solv"]) == UNUSABLE
-    assert "\x1b[1;31mError" in capsys.readouterr().err
-    monkeypatch.setenv("NO_COLOR", "1")
-    assert main(["solv"]) == UNUSABLE
-    assert "\x1b[1;31m" not in capsys.readouterr().err
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    for variable, is_red in (("TERM", False), ("FORCE_COLOR", True), ("NO_COLOR", False)):
+        monkeypatch.setenv(variable, "xterm-256color")
+        assert main(["solv"]) == UNUSABLE
+        assert ("\x1b[1;31mError" in capsys.readouterr().err) == is_red
 
 
 def test_a_closed_pipe_ends_it_quietly() -> None:
@@ -258,7 +224,7 @@ def test_a_closed_pipe_ends_it_quietly() -> None:
         "reader, writer = os.pipe()\n"
         "os.close(reader)\n"
         "os.dup2(writer, 1)\n"
-        "from agents.command_line import main\n"
+        "from dq_space_arm_env.command_line import main\n"
         "sys.exit(main(['scenes', 'list']))"
     )
     result = process(code)
@@ -269,14 +235,14 @@ def test_a_closed_pipe_ends_it_quietly() -> None:
 def test_ctrl_c_says_what_is_kept() -> None:
     code = (
         "import os, signal, sys\n"
-        "from agents.command_line import main\n"
-        "from agents.command_line.program import program\n"
-        "from agents.command_line.verb import keeping\n"
+        "from dq_space_arm_env.command_line import main\n"
+        "from dq_space_arm_env.command_line.completion import completion\n"
+        "from dq_space_arm_env.command_line.verb import keeping\n"
         "def interrupted(**_):\n"
         "    with keeping('the first part remains'):\n"
         "        os.kill(os.getpid(), signal.SIGINT)\n"
         "        import time; time.sleep(10)\n"
-        "program.commands['completion'].callback = interrupted\n"
+        "completion.callback = interrupted\n"
         "sys.exit(main(['completion', 'bash']))"
     )
     result = process(code)
@@ -286,24 +252,42 @@ def test_ctrl_c_says_what_is_kept() -> None:
 
 def test_info_is_one_document(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", "--json"]) == SUCCESS
-    captured = capsys.readouterr()
-    found = json.loads(captured.out)
+    found = json.loads(capsys.readouterr().out)
     assert found["dq-space-arm"]["version"] == __version__
     assert found["versions"]["numpy"]
-    assert {"folder", "writable", "compiled kernels"} <= set(found["caches"])
-    assert set(found["extras"]) == set(info_module.EXTRAS)
-    assert captured.err == ""
+    assert {"agents", "plots", "ray", "render"} <= set(found["extras"])
     assert main(["info"]) == SUCCESS
     assert re.search(r"python +\d+\.\d+", capsys.readouterr().out)
 
 
-def test_python_m_and_scripts_are_the_same_program() -> None:
-    script = str(ROOT / "scripts" / "report.py")
-    for arguments in (["-m", "dq_space_arm_env", "--version"], [script, "--help"]):
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        result = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=environment)
+def test_another_package_adds_a_verb(tmp_path: Path) -> None:
+    (tmp_path / "other.py").write_text(
+        "import click\n@click.command()\ndef greet(): 'Greet.'; click.echo('hello')\n"
+    )
+    metadata = tmp_path / "other-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "entry_points.txt").write_text("[dq_space_arm.verbs]\ngreet = other:greet\n\n[x]\ny = z\n")
+    found = importlib.metadata.entry_points(group="dq_space_arm.verbs")
+    assert entry_points("dq_space_arm.verbs") == {each.name: each.value for each in found}
+    run = "import sys; from dq_space_arm_env.command_line import main; sys.exit(main(sys.argv[1:]))"
+    for words, expected in ((["greet"], "hello\n"), (["greet", "--help"], "--debug"), (["--help"], "Greet.")):
+        result = process(f"import sys; sys.path.append({str(tmp_path)!r}); sys.argv[1:] = {words}; {run}")
         assert result.returncode == SUCCESS
-        assert "dq-space-arm" in result.stdout
+        assert expected in result.stdout
+
+
+@pytest.mark.parametrize("order", ["gymnasium, dq_space_arm_env", "dq_space_arm_env, gymnasium"])
+def test_the_environments_are_registered_in_either_order(order: str) -> None:
+    code = f"import {order}; print(*(name for name in gymnasium.registry if name.startswith('DQ')))"
+    assert process(code).stdout == "DQSpaceArm-v0 DQSpaceArmGoal-v0\n"
+
+
+def test_python_m_runs_the_program() -> None:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    command = [sys.executable, "-m", "dq_space_arm_env", "--version"]
+    result = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert result.returncode == SUCCESS
+    assert "dq-space-arm" in result.stdout
 
 
 @pytest.mark.parametrize(

@@ -6,43 +6,28 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from agents.command_line import main
-from agents.command_line.simulating import RecordedFlight, fly
-from agents.command_line.starts import begin, read_state
-from agents.command_line.verb import FAILURE, INTERRUPTED, SUCCESS, UNUSABLE
 from dq_space_arm_env import DQSpaceArmEnv, Scene, load_scene
+from dq_space_arm_env.command_line import main
+from dq_space_arm_env.command_line.policy_sources import load_policy
+from dq_space_arm_env.command_line.simulated_episode import begin, fly, read_state
+from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, UNUSABLE
+from dq_space_arm_env.task.trajectory import Trajectory
 from experts import Solution
 from experts.report import SolveProgress
 
-# Compiles and solves in seconds; by its content the one of the tests of reports, and as such in the cache.
-SCENE = """
-name: short
-base: {motion: planar, mass: 20, inertia: [1, 1, 1]}
-links:
-  - name: link
-    mass: 2
-    inertia: [0.01, 0.05, 0.05]
-    center_of_mass: [0.3, 0, 0]
-    joint: {position: [0.3, 0, 0]}
-tip: {position: [0.6, 0, 0]}
-actuators: {base_torque: {limit: 2}, joint_torque: {limit: 0.5}}
-target: {pose: {position: [0.6, 0.5, 0], rotation: {axis: [0, 0, 1], angle: 60}}}
-simulation: {dt: 0.05, steps: 60}
-spread: {joint_angles: 0.5, base_position: 0.1, base_rotation: 0.1}
-"""
+
+@pytest.fixture(scope="module")
+def scene(spread_scene: Scene) -> Scene:
+    return spread_scene
 
 
 @pytest.fixture(scope="module")
-def scene_file(tmp_path_factory: pytest.TempPathFactory) -> str:
+def scene_file(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> str:
     file = tmp_path_factory.mktemp("scene") / "short.yaml"
-    file.write_text(SCENE)
+    scene.to_yaml(file)
     return str(file)
-
-
-@pytest.fixture(scope="module")
-def scene(scene_file: str) -> Scene:
-    return load_scene(scene_file)
 
 
 def documents(capsys: pytest.CaptureFixture[str]) -> Any:
@@ -63,18 +48,16 @@ def test_solve_writes_what_it_says(solved: Path, scene: Scene) -> None:
     assert summary["cost"] == solution.cost
     assert summary["converged"] is True
     assert summary["solver"] == "GuidedDDP"
-    assert summary["versions"]["numpy"]
     assert load_scene(solved / "scene.yaml") == scene
     env = DQSpaceArmEnv(scene)
     env.reset(seed=3)
     assert solution.states[0].tolist() == env.state.tolist()
-    env.reset(options={"initial_state": solution.states[-1]})
     _, info = env.reset(options={"initial_state": solution.states[-1]})
     assert info["attitude_error"] == pytest.approx(summary["final_attitude_error_deg"])
     assert info["position_error"] == pytest.approx(summary["final_position_error_m"])
 
 
-def test_solve_prints_a_table_or_a_document(
+def test_solve_prints_table_or_json(
     scene_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["solve", scene_file, "--solver", "box", "--out", str(tmp_path)]
@@ -131,21 +114,17 @@ def test_zero_and_random_inputs(scene_file: str, tmp_path: Path, capsys: pytest.
     assert costs[0] == costs[1] != zero["cost"]
 
 
-def test_a_solution_is_flown_as_planned(
-    solved: Path, scene_file: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_solutions_fly_as_planned(solved: Path, scene_file: str, capsys: pytest.CaptureFixture[str]) -> None:
     cost = Solution.load(solved / "solution.npz").cost
-    policies = ["plan", "gains", "receding", str(solved / "solution.npz")]
-    for policy in policies:
+    for policy in ("plan", "gains", "receding", str(solved / "solution.npz")):
         assert main(["simulate", scene_file, "--seed", "3", "--policy", policy, "--json"]) == SUCCESS
         assert documents(capsys)["cost"] == pytest.approx(cost, rel=1e-9)
 
 
 def test_noise_is_recorded_and_feedback_makes_up_for_it(scene: Scene) -> None:
-    from rich.console import Console
-
-    def flight(policy: str) -> RecordedFlight:
-        return fly(scene, policy, Console(quiet=True), seed=3, noise=0.2)
+    def flight(policy: str) -> Trajectory:
+        start = begin(scene, 3)
+        return fly(scene, start, load_policy(policy, start, Console(quiet=True), 3), seed=3, noise=0.2)
 
     plan, gains, receding = flight("plan"), flight("gains"), flight("receding")
     assert plan.noise.std() == pytest.approx(gains.noise.std(), rel=0.2)
@@ -160,28 +139,11 @@ def test_noise_is_recorded_and_feedback_makes_up_for_it(scene: Scene) -> None:
     assert receding.cost < plan.cost
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["--seed", "1", "--start", "0,0"], "--seed and --start exclude each other"),
-        (["--seed", "-1"], "-1 is not in the range x>=0"),
-        (["--start", "1,2,3"], "--start: has shape (3,), should be the scene's (9,)"),
-        (["--start", "one"], "should be 9 numbers with commas between"),
-        (["--noise", "-1"], "--noise is -1.0"),
-    ],
-)
-def test_unusable_starts_and_noise(
-    arguments: list[str], sentence: str, scene_file: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["simulate", scene_file, "--policy", "zero", *arguments]) == UNUSABLE
-    assert sentence in capsys.readouterr().err
-
-
 def test_a_solution_of_another_length_is_refused(
-    solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    solved: Path, scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "longer.yaml"
-    file.write_text(SCENE.replace("steps: 60", "steps: 61"))
+    scene.replace(simulation={"dt": 0.05, "steps": 61}).to_yaml(file)
     policy = str(solved / "solution.npz")
     assert main(["simulate", str(file), "--policy", policy]) == UNUSABLE
     assert "the solution has 60 steps, the scene 61" in capsys.readouterr().err
@@ -192,25 +154,18 @@ def test_states_are_read_from_text_and_files(tmp_path: Path) -> None:
     np.save(tmp_path / "state.npy", state)
     np.savez(tmp_path / "flight.npz", states=np.stack([state, 2 * state]))
     (tmp_path / "state.json").write_text(json.dumps(state.tolist()))
-    for source in (
-        "1,-2.5,3e-4",
-        *(str(tmp_path / name) for name in ("state.npy", "flight.npz", "state.json")),
-    ):
+    files = [str(tmp_path / name) for name in ("state.npy", "flight.npz", "state.json")]
+    for source in ("1,-2.5,3e-4", *files):
         assert read_state(source, 3).tolist() == state.tolist()
 
 
-def test_an_own_start_is_that_of_the_scene(scene: Scene) -> None:
-    start = begin(scene, None, None)
+def test_a_start_is_that_of_the_environment_with_its_drawn_target(scene: Scene) -> None:
     env = DQSpaceArmEnv(scene)
     env.reset(options={"nominal": True})
-    assert start.state.tolist() == env.state.tolist()
-    assert start.scene is scene
-
-
-def test_a_drawn_target_is_part_of_the_scene_that_is_solved() -> None:
+    assert begin(scene).state.tolist() == env.state.tolist()
+    assert begin(scene).scene is scene
     scene = load_scene("random-target")
-    start = begin(scene, 1, None)
     env = DQSpaceArmEnv(scene)
     env.reset(seed=1)
-    assert start.scene == env.episode_scene
-    assert start.scene.target != scene.target
+    assert begin(scene, 1).scene == env.episode_scene
+    assert env.episode_scene.target != scene.target

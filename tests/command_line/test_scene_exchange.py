@@ -8,12 +8,13 @@ from pathlib import Path
 import click
 import pytest
 
-from agents.command_line import main
-from agents.command_line.names import PartOf
-from agents.command_line.verb import SUCCESS, UNUSABLE
 from dq_space_arm_env import load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
+from dq_space_arm_env.command_line import main
+from dq_space_arm_env.command_line.names import PartOf
+from dq_space_arm_env.common.console import SUCCESS, UNUSABLE
 
 ARM = str(Path(__file__).parents[2] / "scripts" / "examples" / "small-arm.urdf")
+HAND = ["import", ARM, "--tip", "hand"]
 CARRIED = ["--spacecraft-mass", "80", "--spacecraft-inertia", "8", "8", "6"]
 SPACECRAFT = {"mass": 80, "inertia": [8, 8, 6]}
 
@@ -25,18 +26,11 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_an_imported_file_is_the_scene_with_comments(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["scenes", "import", ARM, "--tip", "hand", *CARRIED]) == SUCCESS
+    assert main(["scenes", *HAND, *CARRIED]) == SUCCESS
     printed = capsys.readouterr().out
     assert load_scene("small-arm.yaml") == scene_from_urdf(ARM, "hand", spacecraft=SPACECRAFT)
     assert "# mass of the base, kg" in (here / "small-arm.yaml").read_text(encoding="utf-8")
-    for part in (
-        "upper arm 4 kg",
-        "base    80 kg\n",
-        "joints 2 N m",
-        "34.4 degrees and 0.415 m",
-        "solve small-",
-    ):
-        assert part in printed
+    assert "34.4 degrees and 0.415 m" in printed
     assert main(["scenes", "validate", "small-arm.yaml"]) == SUCCESS
 
 
@@ -44,22 +38,13 @@ def test_every_argument_has_an_option(here: Path) -> None:
     options = ["--base-force", "0", "--base-torque", "3", "--passive", "elbow", "--joint-torque", "7"]
     words = ["--name", "mine", "--out", "deep/mine.yaml", *options, *CARRIED]
     assert main(["scenes", "import", ARM, "--tip", "forearm", "--base", "mount", *words]) == SUCCESS
-    expected = scene_from_urdf(
-        ARM,
-        "forearm",
-        "mount",
-        name="mine",
-        spacecraft=SPACECRAFT,
-        base_force=None,
-        base_torque=3,
-        joint_torque=7,
-        passive=["elbow"],
-    )
+    forces = {"base_force": None, "base_torque": 3, "joint_torque": 7, "passive": ["elbow"]}
+    expected = scene_from_urdf(ARM, "forearm", "mount", name="mine", spacecraft=SPACECRAFT, **forces)
     assert load_scene("deep/mine.yaml") == expected
 
 
 def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["scenes", "import", ARM, "--tip", "hand", *CARRIED]
+    words = ["scenes", *HAND, *CARRIED]
     (here / "small-arm.yaml").write_text("mine")
     assert main(words) == UNUSABLE
     assert "small-arm.yaml exists: give another name, or --force" in capsys.readouterr().err
@@ -76,26 +61,23 @@ def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (
-            [ARM],
-            "--tip LINK is missing, .* links at the end of .*small-arm.urdf are hand; the others mount, ",
-        ),
-        ([ARM, "--tip", "hnd"], "--tip: 'hnd' is no link of 'small arm'; did you mean 'hand'"),
-        ([ARM, "--tip", "elbow"], "it is a joint, which carries link 'forearm'"),
-        ([ARM, "--tip", "hand"], "give the spacecraft .*, --spacecraft-mass and --spacecraft-inertia$"),
-        ([ARM, "--tip", "hand", "--spacecraft-mass", "80"], "--spacecraft-inertia need each other"),
-        ([ARM, "--tip", "hand", *CARRIED, "--passive", "j"], "--passive: 'j' is no joint .* shoulder, elbow"),
-        ([ARM, "--tip", "hand", *CARRIED, "--joint-torque", "0"], "--joint-torque = 0.0: must be a number"),
-        ([ARM, "--tip", "mount", "--base", "hand"], "choose link '.*', or one above it, as --base$"),
-        (["nowhere.urdf", "--tip", "hand"], "nowhere.urdf cannot be read: No such file"),
-        (["nowhere.urdf"], "nowhere.urdf cannot be read: No such file"),
-        ([".", "--tip", "hand"], "cannot be read: Is a directory"),
+        (["import", ARM], "--tip LINK is missing, .* links at the end of .* are hand; the others mount, "),
+        (["import", ARM, "--tip", "hnd"], "--tip: 'hnd' is not a link of 'small arm'; did you mean 'hand'"),
+        (HAND, "give the spacecraft .*, --spacecraft-mass and --spacecraft-inertia$"),
+        ([*HAND, "--spacecraft-mass", "80"], "--spacecraft-inertia need each other"),
+        ([*HAND, *CARRIED, "--passive", "j"], "--passive: 'j' is not .* shoulder, elbow"),
+        ([*HAND, *CARRIED, "--joint-torque", "0"], "--joint-torque = 0.0: must be a number"),
+        (["import", ARM, "--tip", "mount", "--base", "hand"], "choose link '.*', or .* above it, as --base$"),
+        (["import", "nowhere.urdf", "--tip", "hand"], "nowhere.urdf cannot be read: No such file"),
+        (["export", "paper"], "would be infinite: --wrist fixed writes it at its initial angles"),
+        (["export", "planar"], "no base that moves in a plane"),
+        (["export", "papr"], "did you mean 'paper'"),
     ],
 )
 def test_mistakes_are_told_in_options(
     words: list[str], sentence: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["scenes", "import", *words, "--out", "arm.yaml"]) == UNUSABLE
+    assert main(["scenes", *words, "--out", "arm.yaml"]) == UNUSABLE
     message = capsys.readouterr().err.partition(" (see ")[0].strip()
     assert re.search(sentence, message)
     assert not (here / "arm.yaml").exists()
@@ -112,9 +94,7 @@ def test_warnings_and_the_options_that_help(here: Path, capsys: pytest.CaptureFi
     assert main(words) == UNUSABLE
     assert "a scene has no branches: --lock-branches holds such joints" in capsys.readouterr().err
     assert main([*words, "--lock-branches"]) == UNUSABLE
-    message = capsys.readouterr().err
-    assert "no effort limit for joint elbow: give --joint-torque, N m, for all joints without one" in message
-    assert "or name those without a motor with --passive" in message
+    assert "no effort limit for joint elbow: give --joint-torque, N m, for all" in capsys.readouterr().err
     assert main([*words, "--lock-branches", "--joint-torque", "1"]) == SUCCESS
     assert "Warning: Coulomb friction of elbow is left out" in capsys.readouterr().err
     assert load_scene("gripper.yaml").links[1].mass == 6.0
@@ -135,15 +115,6 @@ def test_export_writes_the_robot(name: str, here: Path, capsys: pytest.CaptureFi
     Path("again.urdf").write_text(text, encoding="utf-8")
     assert main(["scenes", "import", "again.urdf", "--tip", "tip"]) == SUCCESS
     assert [link.name for link in load_scene("again.yaml").links] == [link.name for link in scene.links]
-
-
-def test_what_a_format_cannot_say_is_told_in_options(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["scenes", "export", "paper"]) == UNUSABLE
-    assert "would be infinite: --wrist fixed writes it at its initial angles" in capsys.readouterr().err
-    assert main(["scenes", "export", "planar"]) == UNUSABLE
-    assert "no base that moves in a plane" in capsys.readouterr().err
-    assert main(["scenes", "export", "papr"]) == UNUSABLE
-    assert "did you mean 'paper'" in capsys.readouterr().err
 
 
 def test_links_and_joints_are_completed() -> None:
@@ -176,6 +147,6 @@ def test_the_maneuver_to_begin_with_is_solved_and_flown(
     solved = json.loads(capsys.readouterr().out)
     assert solved["converged"]
     assert solved["is_success"]
-    plan = f"{Path(solved['files'][0])}"
+    plan = str(Path(solved["files"][0]))
     assert main(["simulate", "arm.yaml", "--policy", plan, "--json"]) == SUCCESS
     assert json.loads(capsys.readouterr().out)["is_success"]

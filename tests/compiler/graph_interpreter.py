@@ -5,11 +5,6 @@ import numpy as np
 from dq_space_arm_env.compiler.graph import Graph
 from dq_space_arm_env.compiler.program import Program
 
-
-def _real(value):
-    return np.real(value)
-
-
 _OPERATIONS = {
     "add": lambda a, b: a + b,
     "subtract": lambda a, b: a - b,
@@ -26,10 +21,10 @@ _OPERATIONS = {
     "absolute": np.abs,
     "minimum": np.minimum,
     "maximum": np.maximum,
-    "less": lambda a, b: _real(a) < _real(b),
-    "less_equal": lambda a, b: _real(a) <= _real(b),
-    "equal": lambda a, b: _real(a) == _real(b),
-    "not_equal": lambda a, b: _real(a) != _real(b),
+    "less": lambda a, b: np.real(a) < np.real(b),
+    "less_equal": lambda a, b: np.real(a) <= np.real(b),
+    "equal": lambda a, b: np.real(a) == np.real(b),
+    "not_equal": lambda a, b: np.real(a) != np.real(b),
     "not": np.logical_not,
     "and": np.logical_and,
     "or": np.logical_or,
@@ -66,8 +61,7 @@ def evaluate_program(
     buffers = {name: np.zeros((size, *lanes), dtype=dtype) for name, size in program.scratch_sizes().items()}
     for name, value in arrays.items():
         buffers[name] = value if value.shape[1:] == lanes else np.repeat(value[:, None], lanes[0], axis=1)
-    begins = {loop.end: loop.begin for loop in program.loops}
-    conditions = {loop.end: loop.condition for loop in program.loops}
+    loops = {loop.end: loop for loop in program.loops}
     position = 0
     while position < len(program.calls):
         call = program.calls[position]
@@ -77,6 +71,6 @@ def evaluate_program(
             buffer = call.bindings.get(name, name)
             buffers[buffer] = result.real.astype(dtype) if buffer in frozen else result
         position += 1
-        if position in begins and np.any(buffers[conditions[position]]):
-            position = begins[position]
+        if position in loops and np.any(buffers[loops[position].condition]):
+            position = loops[position].begin
     return buffers

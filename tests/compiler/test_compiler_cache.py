@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -54,34 +55,32 @@ def test_a_second_load_builds_nothing(cache):
     assert value(load(builder)) == 6.0
     assert value(load(builder)) == 6.0
     assert builder.calls == 1
+    assert value(load(Builder(5.0), "another key")) == 15.0
 
 
-def test_another_key_is_another_kernel(cache):
-    assert value(load(Builder(2.0), "a")) == 6.0
-    assert value(load(Builder(5.0), "b")) == 15.0
+def flip(position):
+    def flipped(content):
+        content = bytearray(content)
+        content[position] ^= 1
+        return content
+
+    return flipped
 
 
-@pytest.mark.parametrize("position", [0, 40, -1])
-def test_a_flipped_bit_is_found_and_rebuilt(cache, position):
+FOREIGN = [b"", b"DQSpaceArm native kernel 1\n", b"\x7fELF" + bytes(1000)]
+
+
+@pytest.mark.parametrize(
+    "damage", [flip(0), flip(40), flip(-1), *(lambda _, content=content: content for content in FOREIGN)]
+)
+def test_a_damaged_or_foreign_file_is_rebuilt_once(cache, damage):
     builder = Builder()
     load(builder)
     path = the_file(cache)
-    content = bytearray(path.read_bytes())
-    content[position] ^= 1
-    path.write_bytes(content)
-    assert value(load(builder)) == 6.0
-    assert builder.calls == 2
-    assert value(load(builder)) == 6.0
-    assert builder.calls == 2
-
-
-@pytest.mark.parametrize("content", [b"", b"DQSpaceArm native kernel 1\n", b"\x7fELF" + bytes(1000)])
-def test_a_truncated_or_foreign_file_is_rebuilt(cache, content):
-    builder = Builder()
-    load(builder)
-    the_file(cache).write_bytes(content)
-    assert value(load(builder)) == 6.0
-    assert builder.calls == 2
+    path.write_bytes(damage(path.read_bytes()))
+    for _ in range(2):
+        assert value(load(builder)) == 6.0
+        assert builder.calls == 2
 
 
 def test_a_sound_file_under_the_wrong_name_is_rebuilt(cache):
@@ -136,25 +135,13 @@ def test_a_second_process_neither_traces_nor_compiles(cache):
 def test_a_first_use_says_that_it_compiles_and_where_the_result_is(cache):
     code = SECOND_PROCESS + "kernels.linearize(kernels.layout.initial_state, [0.0] * kernels.n_u)\n"
     first, second = (run_process(cache, code).stderr for _ in range(2))
-    assert first == (
-        "dq_space_arm_env: compiling scene 'planar' for its first use, which takes seconds; "
-        f"the result is kept in {cache}\n"
-    )
+    assert "compiling scene 'planar' for its first use" in first
+    assert str(cache) in first
     assert second == ""
 
 
-def test_the_message_can_be_silenced(cache):
-    quiet = "import logging; logging.getLogger('dq_space_arm_env').setLevel(logging.WARNING)\n"
-    assert run_process(cache, quiet + SECOND_PROCESS).stderr == ""
-
-
 def test_two_processes_at_once_agree(cache):
-    environment = {**os.environ, "DQ_SPACE_ARM_CACHE": str(cache)}
-    command = [sys.executable, "-c", SECOND_PROCESS]
-    running = [
-        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)
-    ]
-    outputs = [process.communicate()[0].split("\n")[0] for process in running]
-    assert [process.returncode for process in running] == [0, 0, 0]
-    assert len(set(outputs)) == 1
+    with ThreadPoolExecutor() as pool:
+        outputs = pool.map(run_process, [cache] * 3)
+    assert len({output.stdout.split("\n")[0] for output in outputs}) == 1
     assert not list(cache.glob("*.tmp"))

@@ -3,7 +3,6 @@
 import casadi
 import numpy as np
 import pytest
-from graph_interpreter import evaluate_program
 
 from dq_space_arm_env.compiler import native
 from dq_space_arm_env.compiler.build import build_program
@@ -30,8 +29,7 @@ def divisor():
         program.call(trace("divisor_subtract", {"values": 2, "count": 1}, subtract))
         program.call(trace("divisor_move", {"moved": 2, "counted": 1}, move))
     sizes = {"values": 2, "count": 1}
-    end = trace("divisor_end", sizes, lambda values, count: {"passes": count, "common": values})
-    program.call(end)
+    program.call(trace("divisor_end", sizes, lambda values, count: {"passes": count, "common": values}))
     return program
 
 
@@ -48,23 +46,11 @@ PASSES = [expected_passes(*pair) for pair in PAIRS]
 
 
 @pytest.mark.parametrize("lanes", [1, 4, 8])
-def test_lanes_leave_a_loop_when_they_are_done(lanes, tmp_path, monkeypatch):
-    monkeypatch.setenv("DQ_SPACE_ARM_CACHE", str(tmp_path))
+def test_lanes_leave_a_loop_when_they_are_done(lanes):
     assert max(PASSES) > 10 * min(PASSES)
-    kernel = native.load_or_build("divisor", f"divisor-{lanes}", lambda: build_program(divisor(), lanes))
+    kernel = native.NativeKernel("divisor", *build_program(divisor(), lanes))
     passes, common = np.zeros(len(PAIRS)), np.zeros_like(PAIRS)
     buffers = np.array([array.ctypes.data for array in (PAIRS, passes, common)], dtype=np.int64)
     kernel.function(0, len(PAIRS), buffers.ctypes.data)
     np.testing.assert_array_equal(passes, PASSES)
     np.testing.assert_array_equal(common, np.gcd(*PAIRS.astype(int).T)[:, None] * [1, 1])
-
-
-def test_the_interpreter_of_the_tests_loops_as_well():
-    result = evaluate_program(divisor(), {"pair": PAIRS.T})
-    np.testing.assert_array_equal(result["passes"][0], PASSES)
-
-
-def test_a_loop_counts_once_among_the_operations():
-    program = divisor()
-    assert program.operation_count == sum(call.graph.operation_count for call in program.calls)
-    assert [(loop.begin, loop.end, loop.condition) for loop in program.loops] == [(1, 3, "unfinished")]

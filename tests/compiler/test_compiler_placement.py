@@ -9,8 +9,7 @@ from graph_interpreter import evaluate_program
 from dq_space_arm_env.compiler import native
 from dq_space_arm_env.compiler.build import assembly, build_program
 from dq_space_arm_env.compiler.graph import trace
-from dq_space_arm_env.compiler.placement import Lifetime, place
-from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.compiler.program import Buffer, Lifetime, Program, place
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -34,20 +33,11 @@ def test_a_chain_of_calls_needs_room_for_two_links():
     assert place(program.scratch_sizes(), program.lifetimes())[1] == 10
 
 
-def test_what_starts_as_zero_keeps_its_memory():
-    step = trace("step", {"a": 1, "old": 1}, lambda a, old: {"new": [a[0] + old[0]]})
-    program = Program("keeping", [Buffer("a", 1)], [Buffer("sum", 1)])
-    program.call(step, old="zero", new="b")
-    program.call(step, old="b", new="sum")
-    lifetimes = program.lifetimes()
-    assert all(lifetimes["zero"].overlaps(lifetimes[name]) for name in ("a", "b", "sum"))
-
-
 # What a call must not find --------------------------------------------------------------------------------
 
 
-def doubled(name="doubled"):
-    return trace(name, {"a": 3}, lambda a: {"b": [2.0 * entry for entry in a]})
+def doubled():
+    return trace("doubled", {"a": 3}, lambda a: {"b": [2.0 * entry for entry in a]})
 
 
 def build(program):
@@ -59,9 +49,7 @@ def test_a_call_must_not_write_what_it_reads():
     program = Program("in_place", [Buffer("x", 3)], [Buffer("x_next", 3)])
     program.call(doubled(), a="x", b="x_next")
     program.call(doubled(), a="x_next", b="x_next")
-    with pytest.raises(
-        ValueError, match=r"'in_place': call 1 of graph 'doubled' writes buffer 'x_next', whi"
-    ):
+    with pytest.raises(ValueError, match="'in_place': call 1 of graph 'doubled' writes buffer 'x_next'"):
         build(program)
 
 
@@ -73,32 +61,19 @@ def test_a_call_must_not_write_a_buffer_twice():
         build(program)
 
 
-def test_a_call_may_read_a_buffer_twice():
-    product = trace(
-        "product", {"a": 3, "b": 3}, lambda a, b: {"c": [p * q for p, q in zip(a, b, strict=True)]}
-    )
-    program = Program("squares", [Buffer("x", 3)], [Buffer("y", 3)])
-    program.call(product, a="x", b="x", c="y")
-    assert "noalias" in build(program)
-
-
 def test_buffers_of_different_names_must_lie_apart_too():
     """A wrong lifetime would be found out, whatever became of the names."""
     program = Program("chain", [Buffer("x", 3)], [Buffer("z", 3)])
     program.call(doubled(), a="x", b="y")
     program.call(doubled(), a="y", b="z")
     program.check_memory({"x": 0, "y": 3, "z": 0})
-    with pytest.raises(
-        ValueError, match="call 1 of graph 'doubled' writes buffer 'z', which shares memory w"
-    ):
+    with pytest.raises(ValueError, match="graph 'doubled' writes buffer 'z', which shares memory with"):
         program.check_memory({"x": 0, "y": 3, "z": 5})
 
 
 def test_what_starts_as_zero_must_stay_zero():
     """Memory is cleared once, not for every block of rows."""
-    step = trace(
-        "step", {"a": 3, "old": 3}, lambda a, old: {"new": [p + q for p, q in zip(a, old, strict=True)]}
-    )
+    step = trace("step", {"a": 3, "old": 3}, lambda a, old: {"new": [a[i] + old[i] for i in range(3)]})
     program = Program("sum", [Buffer("a", 3)], [Buffer("sum", 3)])
     program.call(step, old="zero", new="sum")
     program.call(doubled(), a="sum", b="zero")
@@ -120,14 +95,13 @@ def test_a_loop_inside_a_loop_is_refused():
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_random_programs_with_loops_compute_what_their_calls_say(seed, tmp_path, monkeypatch):
+def test_random_programs_with_loops_compute_what_their_calls_say(seed):
     """Memory is reused wherever lifetimes allow; a buffer given up too early would change the numbers."""
-    monkeypatch.setenv("DQ_SPACE_ARM_CACHE", str(tmp_path))
     rng = np.random.default_rng(seed)
     program = random_program(rng)
     x = rng.normal(size=(11, 3))
     wanted = evaluate_program(program, {"x": x.T})["result"]
-    kernel = native.load_or_build(program.name, f"{program.name}-{seed}", lambda: build_program(program, 4))
+    kernel = native.NativeKernel(program.name, *build_program(program, 4))
     result = np.zeros_like(x)
     buffers = np.array([array.ctypes.data for array in (x, result)], dtype=np.int64)
     kernel.function(0, len(x), buffers.ctypes.data)

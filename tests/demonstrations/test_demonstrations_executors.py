@@ -11,7 +11,7 @@ from demonstration_files import contents
 from dq_space_arm_env import Scene
 from experts import generate_demonstrations
 from experts.demonstrations import Demonstrations, DemonstrationsError, ProcessExecutor
-from experts.demonstrations import worker as worker_module
+from experts.demonstrations import executors as worker_module
 from experts.demonstrations.settings import Settings
 from experts.demonstrations.shard import Task
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 def children() -> list[int]:
     """Workers that this process has started."""
     found = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
-    return [int(pid) for pid in found if b"worker" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    return [int(pid) for pid in found if b"executors" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="Linux")
@@ -53,7 +53,7 @@ def test_workers_that_end_again_and_again_end_the_run_with_a_sentence(
     monkeypatch.setattr(worker_module, "_BEGIN", "import os, sys; sys.stdin.buffer.read(1); os._exit(1)")
     settings = Settings.of(quick_scene, 18, 3, 4)
     tasks = [Task(settings, shard) for shard in range(5)]
-    with pytest.raises(DemonstrationsError, match=r"4 processes have ended .* take fewer than 2"):
+    with pytest.raises(DemonstrationsError, match=r"4 processes in a row ended .* use fewer than 2"):
         list(ProcessExecutor(2).run(tasks))
 
 

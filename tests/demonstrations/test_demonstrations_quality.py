@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import Scene
+from dq_space_arm_env.environment.rollouts import Rollout
 from experts import BoxDDP, StopReason, generate_demonstrations
 from experts.demonstrations import Demonstrations, SerialExecutor, shard
-from experts.demonstrations.episodes import Episodes, draw_starts, play
 from experts.demonstrations.outcomes import (
     MISSED_TARGET,
     NEIGHBOR,
@@ -20,8 +20,8 @@ from experts.demonstrations.outcomes import (
     solve_again,
 )
 from experts.demonstrations.settings import Settings
-from experts.demonstrations.shard import Task, make_shard
-from experts.problem import FloatArray
+from experts.demonstrations.shard import Task, draw_starts, make_shard, replay
+from experts.problems.shooting_problem import FloatArray
 
 
 @pytest.fixture
@@ -105,14 +105,14 @@ def test_what_the_environment_charges_otherwise_is_a_failure(
     settings = Settings.of(quick_scene, 3, 0, 3)
     odd = settings.problem_seed(1)
 
-    def cheat(scene: Scene, seeds: list[int], actions: FloatArray) -> Episodes:
-        episodes = play(scene, seeds, actions)
+    def cheat(scene: Scene, seeds: list[int], actions: FloatArray) -> Rollout:
+        episodes = replay(scene, seeds, actions)
         if odd in seeds:
             episodes.rewards[seeds.index(odd), 10] *= 1.0 + 1e-5
         return episodes
 
     honest = make_shard(Task(settings, 0))
-    monkeypatch.setattr(shard, "play", cheat)
+    monkeypatch.setattr(shard, "replay", cheat)
     assert (honest.demonstrations, honest.failures) == (3, 0)
     made = generate_demonstrations(settings.scene, 3, tmp_path, shard_size=3, executor=SerialExecutor())
     assert made is not None
@@ -123,7 +123,7 @@ def test_what_the_environment_charges_otherwise_is_a_failure(
 def test_a_shard_may_have_no_demonstration(
     quick_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(shard, "_agrees", lambda total_reward, cost: False)
+    monkeypatch.setattr(shard, "REPLAY_TOLERANCE", -1.0)
     made = generate_demonstrations(quick_scene, 4, tmp_path, shard_size=2, executor=SerialExecutor())
     assert made is not None
     assert len(made) == 0

@@ -1,7 +1,6 @@
 """The machines of a Ray cluster give what this process gives, also when one of them is lost."""
 
 import os
-import pickle
 import shutil
 import signal
 import socket
@@ -78,6 +77,8 @@ def machines() -> Iterator[LocalCluster]:
     pytest.importorskip("ray")
     # The paths of its sockets have to be short.
     folder = tempfile.mkdtemp(prefix="ray-", dir="/tmp")
+    # Ray notes the address of a cluster here, whatever its own folder, and expects the folder to exist.
+    Path("/tmp/ray").mkdir(exist_ok=True)
     cluster = LocalCluster(folder)
     try:
         yield cluster
@@ -218,7 +219,7 @@ def test_ctrl_c_ends_the_script_and_its_tasks(cluster: LocalCluster, quick_scene
 
     quick_scene.to_yaml(tmp_path / "quick.yaml")
     out, root = tmp_path / "data", Path(__file__).parents[2]
-    command = [sys.executable, str(root / "scripts" / "generate_demonstrations.py"), "--out", str(out)]
+    command = [sys.executable, "-m", "dq_space_arm_env", "demonstrations", "generate", "--out", str(out)]
     command += ["--scene", str(tmp_path / "quick.yaml"), "-n", "100000", "--ray", cluster.address]
     with subprocess.Popen(
         command,
@@ -232,7 +233,7 @@ def test_ctrl_c_ends_the_script_and_its_tasks(cluster: LocalCluster, quick_scene
         os.killpg(process.pid, signal.SIGINT)
         output, _ = process.communicate(timeout=60)
     assert process.returncode == 130, output
-    assert "Interrupted: the shards that are complete remain" in " ".join(output.split())
+    assert "Interrupted: complete shards remain" in " ".join(output.split())
     assert "Traceback" not in output
     ray.init(cluster.address, log_to_driver=False, logging_level="ERROR")
     try:
@@ -254,23 +255,11 @@ def test_machines_with_other_software_are_refused(
     assert not ray.is_initialized()
 
 
-def test_a_task_is_not_even_opened_by_other_software():
-    expected: dict[str, Any] = {**software(), "versions": {**software()["versions"], "numpy": "1.0"}}
-    sentence = ray_executor.remote_task()(expected, b"not a pickle")
-    assert "versions.numpy is" in sentence
-    assert 'and "1.0" here. Install the same on all machines' in sentence
-
-
 def test_a_machine_without_this_package_says_so(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delattr("experts.demonstrations.ray_executor")
     monkeypatch.setitem(sys.modules, "experts.demonstrations.ray_executor", None)
     sentence = ray_executor.remote_task()(software(), b"")
     assert "cannot load this version of dq-space-arm" in sentence
-
-
-def test_a_machine_with_the_same_software_makes_the_shard(whole: Demonstrations, tasks: list[Task]):
-    result = ray_executor.make_here(software(), pickle.dumps(tasks[1]))
-    assert result.sha256 == whole.manifest["shards"][1]["sha256"]
 
 
 def test_without_ray_a_sentence_tells_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tasks: list[Task]):
@@ -310,10 +299,3 @@ def test_one_process_compiles_and_those_that_come_meanwhile_follow_together(
     together.wait(30.0)
     for follower in followers:
         follower.join()
-
-
-def test_where_no_cache_can_be_kept_each_process_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("DQ_SPACE_ARM_CACHE", str(tmp_path / "file" / "cache"))
-    with ray_executor._first_alone(), ray_executor._first_alone():
-        pass

@@ -8,7 +8,7 @@ import pytest
 from experts import load_demonstrations
 from experts.demonstrations import Demonstrations, DemonstrationsError
 from experts.demonstrations import reading as reading_module
-from experts.demonstrations.columns import SUMMARIES
+from experts.demonstrations.shard import SUMMARIES
 from experts.demonstrations.tensors import map_tensors, pack
 
 
@@ -95,9 +95,9 @@ def test_shuffled_batches_repeat_with_their_seed_and_mix_demonstrations(whole: D
 def test_batches_refuse_nonsense(whole: Demonstrations):
     with pytest.raises(ValueError, match="size: 0"):
         whole.batches(0)
-    with pytest.raises(ValueError, match="velocities: unknown; there are states"):
+    with pytest.raises(ValueError, match="velocities: unknown; choose from states"):
         whole.batches(10, ("states", "velocities"))
-    with pytest.raises(ValueError, match="price: unknown; there are index"):
+    with pytest.raises(ValueError, match="price: unknown; choose from index"):
         whole.column("price")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio_twin as twin
 import pytest
 
-from dq_space_arm_env.algebra import poses, vectors
+from dq_space_arm_env.algebra import dual_quaternion, poses, screw, vectors
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
 from dq_space_arm_env.dynamics.articulated_body import ArticulatedBodies
 from dq_space_arm_env.dynamics.forward import forward_dynamics
@@ -31,11 +31,12 @@ def random_case(joints, seed, wrench=False):
     chain = twin.random_chain(rng, joints)
     tip_wrench = tuple(rng.normal(size=6).tolist()) if wrench else None
     chain = replace(chain, tip_wrench=tip_wrench)
-    base_pose = twin.random_placement(rng).dual_quaternion
-    return SimpleNamespace(
+    model = twin.pinocchio_model(chain)
+    case = SimpleNamespace(
         chain=chain,
-        model=twin.pinocchio_model(chain),
-        base_pose=base_pose,
+        model=model,
+        data=model.createData(),
+        base_pose=twin.random_placement(rng).dual_quaternion,
         angles=rng.uniform(-3.0, 3.0, joints).tolist(),
         wrist=rng.uniform(-3.0, 3.0, 3).tolist(),
         angular=tuple(rng.normal(size=3).tolist()),
@@ -45,6 +46,9 @@ def random_case(joints, seed, wrench=False):
         torque=tuple(rng.normal(size=3).tolist()),
         motors=rng.normal(size=joints).tolist(),
     )
+    case.q = twin.configuration(case.base_pose, case.angles)
+    case.v = twin.velocity(case.angular, case.linear, case.rates)
+    return case
 
 
 def external_forces(case):
@@ -61,10 +65,8 @@ def external_forces(case):
 
 
 def pinocchio_accelerations(case):
-    q = twin.configuration(case.base_pose, case.angles)
-    v = twin.velocity(case.angular, case.linear, case.rates)
     tau = np.array([*case.force, *case.torque, *case.motors])
-    a = pin.aba(case.model, case.model.createData(), q, v, tau, external_forces(case))
+    a = pin.aba(case.model, case.data, case.q, case.v, tau, external_forces(case))
     return np.array([*a[3:6], *a[:3], *a[6:]])
 
 
@@ -80,10 +82,6 @@ def accelerations(case, inertia_at):
     solved = forward_dynamics(chain, inertia, rotations, case.angular, case.rates, acting, case.motors)
     linear = vectors.subtract(solved.linear, vectors.cross(case.angular, case.linear))
     return np.array([*solved.angular, *linear, *solved.joints], dtype=float)
-
-
-def minimal_accelerations(case):
-    return accelerations(case, MassMatrix)
 
 
 def paper_state(case):
@@ -103,10 +101,11 @@ def paper_rates(case):
     return newton_euler.paper_rates(case.chain, paper_state(case), base_wrench, case.motors, [0.0] * 3)
 
 
-def joint_accelerations_from_paper(case, accelerations):
+def newton_euler_accelerations(case):
     """Base and joint accelerations that the paper's dual accelerations imply: the rate of (12)."""
     frames = newton_euler.joint_frames(case.chain, case.angles, case.wrist)
-    bodies = np.reshape(accelerations, (-1, 8))
+    rates, _ = paper_rates(case)
+    bodies = np.reshape(rates[-8 * (len(case.chain.links) + 1) :], (-1, 8))
     joints = [
         newton_euler.joint_velocity(frames, j, [tuple(body) for body in bodies])[3]
         for j in range(len(case.chain.links))
@@ -116,37 +115,16 @@ def joint_accelerations_from_paper(case, accelerations):
 
 @pytest.mark.parametrize("wrench", [False, True])
 @pytest.mark.parametrize("joints", range(8))
-def test_minimal_coordinates_agree_with_pinocchio(joints, wrench):
-    errors = []
-    for seed in range(SAMPLES):
-        case = random_case(joints, seed, wrench and joints > 0)
-        errors.append(relative_error(minimal_accelerations(case), pinocchio_accelerations(case)))
-    assert max(errors) < 1e-12
-
-
-@pytest.mark.parametrize("wrench", [False, True])
-@pytest.mark.parametrize("joints", range(8))
-def test_articulated_bodies_agree_with_pinocchio_from_every_root(joints, wrench):
+def test_all_formulations_agree_with_pinocchio_13_to_22(joints, wrench):
+    """The mass matrix, articulated bodies from every root, and the paper's Newton-Euler system."""
     for seed in range(SAMPLES):
         case = random_case(joints, seed, wrench and joints > 0)
         expected = pinocchio_accelerations(case)
+        assert relative_error(accelerations(case, MassMatrix), expected) < 1e-12
+        assert relative_error(newton_euler_accelerations(case), expected) < 1e-12
         for root in range(joints + 1):
             found = accelerations(case, partial(ArticulatedBodies, root=root))
             assert relative_error(found, expected) < 1e-12
-
-
-@pytest.mark.parametrize("wrench", [False, True])
-@pytest.mark.parametrize("joints", range(8))
-def test_newton_euler_system_agrees_with_pinocchio_13_to_22(joints, wrench):
-    errors = []
-    for seed in range(SAMPLES):
-        case = random_case(joints, seed, wrench and joints > 0)
-        rates, _ = paper_rates(case)
-        accelerations = rates[-8 * (joints + 1) :]
-        errors.append(
-            relative_error(joint_accelerations_from_paper(case, accelerations), pinocchio_accelerations(case))
-        )
-    assert max(errors) < 1e-12
 
 
 @pytest.mark.parametrize("joints", [1, 3, 6])
@@ -155,14 +133,10 @@ def test_reaction_wrenches_agree_with_pinocchio_21(joints):
         case = random_case(joints, seed, wrench=True)
         _, reactions = paper_rates(case)
         a = pinocchio_accelerations(case)
-        data = case.model.createData()
-        q = twin.configuration(case.base_pose, case.angles)
-        v = twin.velocity(case.angular, case.linear, case.rates)
         acceleration = np.array([*a[3:6], *a[:3], *a[6:]])
-        pin.rnea(case.model, data, q, v, acceleration, external_forces(case))
-        expected = [
-            entry for j in range(joints) for entry in (*data.f[j + 2].linear, *data.f[j + 2].angular[:2])
-        ]
+        pin.rnea(case.model, case.data, case.q, case.v, acceleration, external_forces(case))
+        forces = list(case.data.f)[2:]
+        expected = [entry for force in forces for entry in (*force.linear, *force.angular[:2])]
         assert relative_error(reactions, expected) < 1e-12
 
 
@@ -171,9 +145,8 @@ def test_schur_complement_solves_the_full_system_20():
         case = random_case(joints, 0, wrench=True)
         state = paper_state(case)
         frames = newton_euler.joint_frames(case.chain, case.angles, case.wrist)
-        system = newton_euler.assemble(
-            case.chain, frames, state.velocities, (0.0, *case.force, 0.0, *case.torque), case.motors
-        )
+        wrench = (0.0, *case.force, 0.0, *case.torque)
+        system = newton_euler.assemble(case.chain, frames, state.velocities, wrench, case.motors)
         size = 8 * (joints + 1)
         full = np.zeros((size + 5 * joints, size + 5 * joints))
         full[:size, :size], full[:size, size:], full[size:, :size] = system.s11, system.s12, system.s21
@@ -187,20 +160,16 @@ def test_tip_pose_27_and_its_rate_30():
         case = random_case(joints, 1)
         twist, wrist_rates = (*case.angular, *case.linear), (0.3, -0.4, 0.5)
         arguments = (case.chain, case.base_pose, case.angles, case.wrist)
-        data = case.model.createData()
-        pin.forwardKinematics(case.model, data, twin.configuration(case.base_pose, case.angles))
-        last = data.oMi[joints + 1]
+        pin.forwardKinematics(case.model, case.data, case.q)
+        last = case.data.oMi[joints + 1]
         rotation, position = twin.tip_in_last_link(case.chain, case.wrist)
         matrix, origin = poses.to_matrix(kinematics.tip_pose(*arguments))
         np.testing.assert_allclose(matrix, last.rotation @ rotation, atol=1e-13)
         np.testing.assert_allclose(origin, last.translation + last.rotation @ position, atol=1e-12)
-        np.testing.assert_allclose(
-            kinematics.frame_poses(*arguments)[-1], kinematics.tip_pose(*arguments), atol=1e-13
-        )
+        frames = kinematics.frame_poses(*arguments)
+        np.testing.assert_allclose(frames[-1], kinematics.tip_pose(*arguments), atol=1e-13)
 
         def moved(h, case=case, twist=twist, wrist_rates=wrist_rates):
-            from dq_space_arm_env.algebra import dual_quaternion, screw
-
             base = dual_quaternion.multiply(case.base_pose, screw.exponential([h * w for w in twist]))
             angles = [a + h * r for a, r in zip(case.angles, case.rates, strict=True)]
             wrist = [a + h * r for a, r in zip(case.wrist, wrist_rates, strict=True)]
@@ -219,19 +188,16 @@ def test_momentum_and_energy_agree_with_pinocchio():
     for joints in range(8):
         case = random_case(joints, 2)
         rotations = minimal.joint_rotations(case.chain, case.angles)
-        velocities = kinematics.body_velocities(
-            case.chain, rotations, (*case.angular, *case.linear), case.rates
-        )
+        twist = (*case.angular, *case.linear)
+        velocities = kinematics.body_velocities(case.chain, rotations, twist, case.rates)
         linear, angular, _ = kinematics.momentum(case.chain, rotations, velocities)
         kinetic, potential = kinematics.energy(case.chain, case.angles, velocities)
-        data = case.model.createData()
-        q = twin.configuration(case.base_pose, case.angles)
-        v = twin.velocity(case.angular, case.linear, case.rates)
-        centroidal = pin.computeCentroidalMomentum(case.model, data, q, v)
+        arguments = (case.model, case.data, case.q, case.v)
+        centroidal = pin.computeCentroidalMomentum(*arguments)
         attitude, _ = poses.to_matrix(case.base_pose)
         assert relative_error(np.array(attitude) @ linear, centroidal.linear) < 1e-12
         assert relative_error(np.array(attitude) @ angular, centroidal.angular) < 1e-12
-        assert kinetic == pytest.approx(pin.computeKineticEnergy(case.model, data, q, v), rel=1e-12)
+        assert kinetic == pytest.approx(pin.computeKineticEnergy(*arguments), rel=1e-12)
         assert potential == 0.0
 
 
@@ -239,18 +205,9 @@ def test_inverse_dynamics_undoes_forward_dynamics():
     for joints in range(8):
         case = random_case(joints, 3)
         rotations = minimal.joint_rotations(case.chain, case.angles)
-        a = minimal_accelerations(case)
+        a = accelerations(case, MassMatrix)
         linear = vectors.add(tuple(a[3:6]), vectors.cross(case.angular, case.linear))
-        found = minimal.inverse_dynamics(
-            case.chain,
-            rotations,
-            case.angular,
-            case.rates,
-            Accelerations(tuple(a[:3]), linear, a[6:].tolist()),
-        )
-        assert (
-            relative_error(
-                [*found.force, *found.torque, *found.joints], [*case.force, *case.torque, *case.motors]
-            )
-            < 1e-12
-        )
+        solved = Accelerations(tuple(a[:3]), linear, a[6:].tolist())
+        found = minimal.inverse_dynamics(case.chain, rotations, case.angular, case.rates, solved)
+        given = [*case.force, *case.torque, *case.motors]
+        assert relative_error([*found.force, *found.torque, *found.joints], given) < 1e-12

@@ -10,7 +10,8 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
-from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.utils.env_checker import check_env
+from short_scenes import diverging, short
 
 import dq_space_arm_env
 from dq_space_arm_env import list_scenes, load_scene
@@ -23,20 +24,20 @@ def make(scene="paper", **arguments):
     return gymnasium.make("DQSpaceArm-v0", scene=scene, **arguments)
 
 
-def short(scene="paper", steps=20):
-    scene = load_scene(scene)
-    return scene.replace(simulation=scene.simulation.model_copy(update={"steps": steps}))
-
-
-def test_importing_the_environment_loads_nothing_heavy():
-    heavy = ["torch", "stable_baselines3", "matplotlib", "numba", "pygame", "rich"]
-    code = (
-        "import sys, gymnasium, dq_space_arm_env\n"
-        "env = gymnasium.make('DQSpaceArm-v0'); env.reset(seed=0); env.step(env.action_space.sample())\n"
-        f"print([name for name in {heavy} if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+def test_the_environment_and_its_pictures_load_nothing_heavy():
+    make()  # compiled, with CasADi, for the first use
+    code = """
+import os, sys, gymnasium, dq_space_arm_env
+before = dict(os.environ)
+env = gymnasium.make("DQSpaceArm-v0", render_mode="rgb_array")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+env.render()
+assert dict(os.environ) == before
+heavy = {"torch", "stable_baselines3", "matplotlib", "numba", "casadi", "pygame", "rich"}
+assert not heavy & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("scene", list_scenes())
@@ -71,18 +72,6 @@ def test_a_thousand_random_steps(scene):
             observation, _ = env.reset()
 
 
-def test_same_seed_same_episode_to_the_bit():
-    episodes = []
-    for _ in range(2):
-        env = make(short())
-        env.action_space.seed(3)
-        record = [env.reset(seed=7)]
-        record += [env.step(env.action_space.sample()) for _ in range(20)]
-        episodes.append(record)
-    assert data_equivalence(*episodes, exact=True)
-    assert not data_equivalence(env.reset(seed=8)[0], episodes[0][0][0])
-
-
 def test_reward_is_the_papers_formula_step_by_step():
     env = make(short())
     env.reset(seed=1)
@@ -106,14 +95,13 @@ def test_reward_is_the_papers_formula_step_by_step():
         else:
             assert info["terminal_cost_pose"] == info["terminal_cost_base_velocity"] == 0.0
         assert reward == pytest.approx(expected, rel=1e-12)
-        assert [info["cost_pose"], info["cost_base_velocity"], info["cost_control"]] == pytest.approx(
-            terms, rel=1e-12
-        )
+        charged = [info["cost_pose"], info["cost_base_velocity"], info["cost_control"]]
+        assert charged == pytest.approx(terms, rel=1e-12)
 
 
 @pytest.mark.parametrize("scene", list_scenes())
 def test_observation_is_what_the_documentation_says(scene):
-    env = make(short(scene))
+    env = make(short(scene, steps=20))
     env.reset(seed=2)
     observation, *_, info = env.step(env.action_space.sample())
     kernels, x = env.unwrapped.kernels, env.unwrapped.state
@@ -122,27 +110,12 @@ def test_observation_is_what_the_documentation_says(scene):
     if kernels.layout.planar:
         np.testing.assert_allclose(error[[1, 2, 4, 7]], 0.0, atol=1e-15)
         error = error[[0, 3, 5, 6]]
-    parts = [
-        error,
-        *(
-            x[part]
-            for part in (layout.base_velocity, layout.joint_angles, layout.wrist_angles, layout.joint_rates)
-        ),
-    ]
-    np.testing.assert_allclose(observation, np.concatenate([*parts, [19 * 0.015]]), atol=1e-14)
-    assert info["attitude_error"] == pytest.approx(
-        np.degrees(poses.error_angle(tuple(kernels.tip_pose(x)), target))
-    )
-    assert info["position_error"] == pytest.approx(poses.error_distance(tuple(kernels.tip_pose(x)), target))
-
-
-def test_the_documented_tables_have_the_sizes_of_the_spaces():
-    env = make()
-    assert env.observation_space.shape == (24,)
-    assert env.action_space.shape == (12,)
-    assert env.action_space.dtype == np.float32
-    assert (env.action_space.low == -1).all()
-    assert (env.action_space.high == 1).all()
+    parts = (layout.base_velocity, layout.joint_angles, layout.wrist_angles, layout.joint_rates)
+    expected = np.concatenate([error, *(x[part] for part in parts), [19 * 0.015]])
+    np.testing.assert_allclose(observation, expected, atol=1e-14)
+    tip = tuple(kernels.tip_pose(x))
+    assert info["attitude_error"] == pytest.approx(np.degrees(poses.error_angle(tip, target)))
+    assert info["position_error"] == pytest.approx(poses.error_distance(tip, target))
 
 
 def test_the_sign_of_the_error_is_fixed_at_reset_and_carried_along():
@@ -168,6 +141,8 @@ def test_starts():
     assert not np.array_equal(drawn, nominal)
     env.reset(options={"initial_state": drawn})
     np.testing.assert_allclose(env.unwrapped.state, drawn, atol=1e-15)
+    env.reset(seed=1)
+    assert not np.array_equal(env.unwrapped.state, drawn)
     assert env.reset(options={"nominal": True})[1].keys() == env.step(env.action_space.sample())[4].keys()
 
 
@@ -176,25 +151,15 @@ def test_starts():
     [
         (lambda x: x[:-1], r"shape \(22,\), should be finite numbers of shape \(23,\)"),
         (lambda x: np.where(np.arange(23) == 9, np.nan, x), "should be finite"),
-        (lambda x: np.where(np.arange(23) == 9, np.inf, x), "should be finite"),
-        (
-            lambda x: np.where(np.arange(23) == 0, 1.1, x),
-            r"\|q_r\| = 1\.1.*a unit dual quaternion has 1 and 0",
-        ),
+        (lambda x: np.where(np.arange(23) == 0, 1.1, x), r"\|q_r\| = 1\.1.*unit dual quaternion has 1 and 0"),
         (lambda x: np.where(np.arange(23) == 4, 0.1, x), r"q_r \. q_d = 0\.1"),
     ],
 )
-def test_bad_initial_states_are_refused(change, message):
+def test_bad_options_are_refused(change, message):
     env = make()
-    with pytest.raises(ValueError, match=message):
-        env.reset(options={"initial_state": change(env.unwrapped.kernels.layout.initial_state)})
-
-
-def test_bad_options_are_refused():
-    env = make()
-    with pytest.raises(ValueError, match=r"\['nominel'\] unknown; there are nominal, initial_state"):
-        env.reset(options={"nominel": True})
     x = env.unwrapped.kernels.layout.initial_state
+    with pytest.raises(ValueError, match=message):
+        env.reset(options={"initial_state": change(x)})
     with pytest.raises(ValueError, match="exclude each other"):
         env.reset(options={"nominal": True, "initial_state": x})
 
@@ -210,21 +175,11 @@ def test_bad_actions_are_refused_and_large_ones_clipped():
     with pytest.raises(ValueError, match=r"shape \(11,\), should be \(12,\)"):
         env.step(np.zeros(11))
     results = []
-    for action in (np.full(12, 1.0), np.full(12, 50.0), np.full(12, np.inf)):
+    for value in (1.0, 50.0, np.inf, 0.1, np.float32(0.1)):
         env.reset(seed=0)
-        results.append(env.step(action)[0])
-    np.testing.assert_array_equal(results[0], results[1])
-    np.testing.assert_array_equal(results[0], results[2])
-
-
-def test_float64_actions_are_used_at_full_precision():
-    env = make().unwrapped
-    action = np.full(12, 0.1)
-    results = []
-    for values in (action, action.astype(np.float32)):
-        env.reset(seed=0)
-        results.append(env.step(values)[0])
-    assert not np.array_equal(*results)
+        results.append(env.step(np.full(12, value))[0])
+    np.testing.assert_array_equal(results[1:3], results[:1] * 2)
+    assert not np.array_equal(results[3], results[4])  # float64 is used at full precision
 
 
 def test_order_of_calls_is_enforced():
@@ -240,11 +195,7 @@ def test_order_of_calls_is_enforced():
 
 
 def test_a_diverged_state_ends_the_episode_and_says_so():
-    """A stiff spring with symplectic Euler and a long step blows up within the episode."""
-    scene = load_scene("paper")
-    links = [link.model_dump() | {"stiffness": 1e6} for link in scene.links]
-    simulation = {"dt": 0.1, "steps": 500, "integrator": "symplectic_euler"}
-    env = make(scene.replace(links=links, simulation=simulation))
+    env = make(diverging(steps=500))
     _, info = env.reset(seed=0)
     assert not info["diverged"]
     total, steps, terminated = 0.0, 0, False

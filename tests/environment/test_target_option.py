@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from short_scenes import short
 
 from dq_space_arm_env import DQSpaceArmVectorEnv, load_scene
 from dq_space_arm_env.algebra import poses, rotations
@@ -16,6 +17,7 @@ def pose(vector, position):
     return np.array(poses.from_rotation_and_position(rotations.exponential(vector), position))
 
 
+PLANAR = load_scene("planar").replace(spread={"target_position": 0.1})
 TARGET = pose((0.3, -1.0, 0.5), (0.5, -3.0, 4.8))
 
 
@@ -53,9 +55,7 @@ def test_only_the_target_is_given_and_only_for_one_episode():
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_the_tip_has_the_sign_of_the_target(precision):
-    scene = load_scene("random-target")
-    simulation = scene.simulation.model_copy(update={"precision": precision})
-    env = make(scene.replace(simulation=simulation))
+    env = make(short("random-target", precision=precision))
     for sign in (1.0, -1.0):
         for options in ({}, {"nominal": True}):
             observation, _ = env.reset(seed=0, options=options | {"target": sign * TARGET})
@@ -97,40 +97,13 @@ def test_copies_are_single_environments_with_the_same_targets(rows, started):
 @pytest.mark.parametrize(
     ("scene", "target", "message"),
     [
-        (
-            "paper",
-            TARGET,
-            "scene 'paper' has the same in every episode.*give the scene a spread of target_pos",
-        ),
+        ("paper", TARGET, "has the same in every episode.*give the scene a spread of target_pos"),
         ("random-target", TARGET[:7], r"shape \(7,\), should be finite numbers of shape \(8,\)"),
-        ("random-target", TARGET * np.nan, "should be finite numbers"),
         ("random-target", 1.1 * TARGET, r"target is a pose with \|q_r\| = 1\.1"),
-        ("random-target", np.arange(8) == 0 + 4, r"target is a pose with \|q_r\| = 0"),
+        (PLANAR, TARGET, r"leaves the plane, its entries \[1, 2, 4, 7\] should be 0"),
     ],
 )
 def test_bad_targets_are_refused(scene, target, message):
     env = make(scene)
     with pytest.raises(ValueError, match=message):
         env.reset(options={"target": target})
-
-
-def test_a_target_outside_the_plane_is_refused():
-    env = make(load_scene("planar").replace(spread={"target_position": 0.1}))
-    with pytest.raises(ValueError, match=r"leaves the plane, its entries \[1, 2, 4, 7\] should be 0"):
-        env.reset(options={"target": TARGET})
-
-
-def test_pictures_show_the_target_of_the_episode():
-    from dq_space_arm_env.environment.rendering import Renderer
-
-    env = make(render_mode="rgb_array")
-    renderer, pictures = Renderer(env.scene), []
-    for target in (TARGET, pose((1.0, 0.0, 0.0), (0.0, -3.5, 5.2))):
-        env.reset(options={"nominal": True, "target": target})
-        pictures.append(env.render())
-        renderer.aim_at(env.target)
-        tip = np.array(poses.position(env.kernels.tip_pose(env.state)))
-        np.testing.assert_array_equal(
-            pictures[-1], renderer.draw(env.kernels.frame_poses(env.state), tip[None])
-        )
-    assert (pictures[0] != pictures[1]).any()

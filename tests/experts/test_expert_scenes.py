@@ -7,9 +7,9 @@ import pytest
 import dq_space_arm_env  # noqa: F401 - registers the environment
 from dq_space_arm_env import compile_scene, list_scenes, load_scene
 from experts import BoxDDP, GuidedDDP, StopReason
-from experts.arm_problem import ArmProblem
-from experts.paper_problem import PaperProblem
-from experts.report.stability.expert import at_target
+from experts.problems.arm_problem import ArmProblem
+from experts.problems.paper_problem import PaperProblem
+from scripts.benchmarks.stability.expert import at_target
 
 COMPILED_ANYWAY = ("no-wrist", "paper", "planar")
 EVERY_SCENE = [
@@ -121,8 +121,8 @@ def best_gradient_step(scene, solution):
     kernels = compile_scene(scene)
     states, controls, limit = solution.states, solution.controls, kernels.layout.control_limit
     a, b = kernels.linearize(states[:-1], controls)
-    lx, lu, _, luu = kernels._call("cost_derivatives", x=states[:-1], u=controls)
-    adjoint = kernels._call("terminal_cost_derivatives", x=states[-1], emphasis=[1.0])[0]
+    lx, lu, _, luu = kernels.call("cost_derivatives", x=states[:-1], u=controls)
+    adjoint = kernels.call("terminal_cost_derivatives", x=states[-1], emphasis=[1.0])[0]
     gradient = np.zeros_like(controls)
     for k in reversed(range(len(controls))):
         gradient[k] = lu[k] + b[k].T @ adjoint
@@ -138,20 +138,6 @@ def best_gradient_step(scene, solution):
     return 1.0 - (cost + kernels.terminal_cost(x)).min() / solution.cost
 
 
-def test_an_initial_state_and_a_guess_can_be_given(paper_solution):
-    again = BoxDDP("paper").solve(x0=paper_solution.states[0], u_init=paper_solution.controls)
-    assert again.converged
-    assert again.iterations <= 2
-    assert again.cost == pytest.approx(paper_solution.cost, rel=1e-6)
-
-
-def test_a_scene_or_an_integrator_by_name():
-    problem = ArmProblem("paper", integrator="symplectic_euler")
-    assert problem.scene.simulation.integrator == "symplectic_euler"
-    with pytest.raises(ValueError, match="rk5"):
-        ArmProblem("paper", integrator="rk5")
-
-
 def test_the_papers_state_starts_where_the_minimal_one_does():
     problem, kernels = PaperProblem(), compile_scene("paper")
     x = kernels.layout.initial_state
@@ -161,6 +147,7 @@ def test_the_papers_state_starts_where_the_minimal_one_does():
     np.testing.assert_allclose(redundant[46:], kernels.tip_pose(x), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_symplectic_euler_at_15_ms_is_off_by_degrees():
     """Why the default is RK4: an optimal plan made with the cheap method misses in accurate dynamics."""
     plan = BoxDDP(ArmProblem("paper", integrator="symplectic_euler")).solve()

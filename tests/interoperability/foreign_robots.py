@@ -8,58 +8,30 @@ import pytest
 
 from dq_space_arm_env import scene_from_urdf
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.kernels.equations import SceneEquations
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.task.equations import SceneEquations
 
-_EXAMPLES = "cmeel.prefix/share/example-robot-data/robots"
+AIRO, RTB, EXAMPLES = "airo-models", "rtb-data", "example-robot-data"
+FOLDERS = {
+    AIRO: "airo_models/arms",
+    RTB: "rtbdata/xacro/kuka_description",
+    EXAMPLES: "cmeel.prefix/share/example-robot-data/robots",
+}
+KINOVA_TIP = "j2s6s200_end_effector"
+LOCKED = {"lock_branches": True}
 
-# Name: package, path of the URDF in it, tip link, and arguments besides.
+# Name: package, path of the URDF in its folder, tip link, and arguments besides.
 ROBOTS = {
-    "ur3e": ("airo-models", "airo_models/arms/ur3e/ur3e.urdf", "tool0", {}),
-    "ur5e": ("airo-models", "airo_models/arms/ur5e/ur5e.urdf", "tool0", {}),
-    "kuka-kr16": (
-        "rtb-data",
-        "rtbdata/xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf",
-        "tool0",
-        {"joint_torque": 500.0},
-    ),
-    "panda": (
-        "example-robot-data",
-        f"{_EXAMPLES}/panda_description/urdf/panda.urdf",
-        "panda_hand_tcp",
-        {"lock_branches": True},
-    ),
-    "kinova": (
-        "example-robot-data",
-        f"{_EXAMPLES}/kinova_description/robots/kinova.urdf",
-        "j2s6s200_end_effector",
-        {},
-    ),
-    "ur5": (
-        "example-robot-data",
-        f"{_EXAMPLES}/ur_description/urdf/ur5_robot.urdf",
-        "ee_link",
-        {},
-    ),
-    "xarm7": ("example-robot-data", f"{_EXAMPLES}/xarm_description/urdf/xarm7.urdf", "link_eef", {}),
-    "talos-left-arm": (
-        "example-robot-data",
-        f"{_EXAMPLES}/talos_data/robots/talos_left_arm.urdf",
-        "gripper_left_base_link",
-        {"lock_branches": True},
-    ),
-    "anymal-kinova": (
-        "example-robot-data",
-        f"{_EXAMPLES}/anymal_b_simple_description/robots/anymal-kinova.urdf",
-        "j2s6s200_end_effector",
-        {"lock_branches": True},
-    ),
-    "borinot": (
-        "example-robot-data",
-        f"{_EXAMPLES}/borinot_description/urdf/borinot_flying_arm_2.urdf",
-        "flying_arm_2__ee",
-        {},
-    ),
+    "ur3e": (AIRO, "ur3e/ur3e.urdf", "tool0", {}),
+    "ur5e": (AIRO, "ur5e/ur5e.urdf", "tool0", {}),
+    "kuka-kr16": (RTB, "kuka_kr16/urdf/kr16_2.urdf", "tool0", {"joint_torque": 500.0}),
+    "panda": (EXAMPLES, "panda_description/urdf/panda.urdf", "panda_hand_tcp", LOCKED),
+    "kinova": (EXAMPLES, "kinova_description/robots/kinova.urdf", KINOVA_TIP, {}),
+    "ur5": (EXAMPLES, "ur_description/urdf/ur5_robot.urdf", "ee_link", {}),
+    "xarm7": (EXAMPLES, "xarm_description/urdf/xarm7.urdf", "link_eef", {}),
+    "talos-left-arm": (EXAMPLES, "talos_data/robots/talos_left_arm.urdf", "gripper_left_base_link", LOCKED),
+    "anymal-kinova": (EXAMPLES, "anymal_b_simple_description/robots/anymal-kinova.urdf", KINOVA_TIP, LOCKED),
+    "borinot": (EXAMPLES, "borinot_description/urdf/borinot_flying_arm_2.urdf", "flying_arm_2__ee", {}),
 }
 
 
@@ -67,7 +39,7 @@ def robot_file(name):
     """Path, tip and arguments of a robot; skips the test where its package is not installed."""
     package, path, tip, arguments = ROBOTS[name]
     try:
-        file = distribution(package).locate_file(path)
+        file = distribution(package).locate_file(f"{FOLDERS[package]}/{path}")
     except PackageNotFoundError:
         pytest.skip(f"needs {package}")
     return str(file), tip, arguments
@@ -81,8 +53,8 @@ def foreign_scene(name):
         return scene_from_urdf(file, tip, **arguments)
 
 
-def random_state(scene, rng):
-    """Any attitude, positions of meters, joint angles of radians, rates of about 1 rad/s."""
+def drawn(scene, rng):
+    """A random state (any attitude, meters, radians, about 1 rad/s) and random inputs."""
     layout = StateLayout.of(scene)
     x = rng.normal(size=layout.n_x)
     rotation, position = rng.normal(size=4), rng.normal(size=3)
@@ -92,11 +64,7 @@ def random_state(scene, rng):
     rotation /= np.linalg.norm(rotation)
     pose = np.array(poses.from_rotation_and_position(tuple(rotation), tuple(position)))
     x[layout.state.pose] = pose[[0, 3, 5, 6]] if layout.planar else pose
-    return x
-
-
-def random_inputs(scene, rng):
-    return rng.normal(size=StateLayout.of(scene).n_u)
+    return x, rng.normal(size=layout.n_u)
 
 
 def accelerations(scene, x, u):

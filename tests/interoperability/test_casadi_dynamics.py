@@ -3,29 +3,23 @@
 import casadi
 import numpy as np
 import pytest
-from foreign_robots import random_inputs, random_state, relative_error
+from foreign_robots import drawn, relative_error
 from graph_interpreter import evaluate_program
 
 from dq_space_arm_env import casadi_dynamics, compile_scene, load_scene
-from dq_space_arm_env.integrators import INTEGRATORS
-from dq_space_arm_env.kernels.programs import ScenePrograms
-from dq_space_arm_env.scene import ADAPTIVE_INTEGRATORS
+from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
+from dq_space_arm_env.scene import INTEGRATORS
 
 
 def value(function, *arguments):
     return np.array(function(*arguments)).ravel()
 
 
-def drawn(scene, seed=0):
-    rng = np.random.default_rng(seed)
-    return random_state(scene, rng), random_inputs(scene, rng)
-
-
 @pytest.mark.parametrize("name", ["paper", "planar", "tip-load"])
 def test_functions_give_what_the_kernels_give(name):
     scene = load_scene(name)
     dynamics, kernels = casadi_dynamics(scene), compile_scene(scene)
-    x, u = drawn(scene)
+    x, u = drawn(scene, np.random.default_rng(0))
     for function in ("forward_dynamics", "cost"):
         expected = np.ravel(getattr(kernels, function)(x, u))
         assert relative_error(value(getattr(dynamics, function), x, u), expected) < 1e-14
@@ -36,10 +30,10 @@ def test_functions_give_what_the_kernels_give(name):
     assert relative_error(found, kernels.step(x, u)) < 1e-14
 
 
-@pytest.mark.parametrize("integrator", [name for name in INTEGRATORS if name not in ADAPTIVE_INTEGRATORS])
+@pytest.mark.parametrize("integrator", [name for name, entry in INTEGRATORS.items() if not entry.is_adaptive])
 def test_every_integrator_of_fixed_stages_takes_the_same_step(integrator):
     scene = load_scene("planar")
-    x, u = drawn(scene)
+    x, u = drawn(scene, np.random.default_rng(0))
     program = ScenePrograms(scene).build("step", integrator)
     expected = evaluate_program(program, {"x": x, "u": u, "h": [0.05]})["x_next"]
     found = value(casadi_dynamics(scene, integrator).step, x, u, 0.05)
@@ -49,7 +43,7 @@ def test_every_integrator_of_fixed_stages_takes_the_same_step(integrator):
 @pytest.mark.parametrize("name", ["paper", "planar"])
 def test_the_state_derivative_is_that_of_the_flow(name):
     dynamics = casadi_dynamics(load_scene(name), "rk8")
-    x, u = drawn(dynamics.scene)
+    x, u = drawn(dynamics.scene, np.random.default_rng(0))
     h = 2e-3
     slope = sum(
         weight * (value(dynamics.step, x, u, k * h) - value(dynamics.step, x, u, -k * h))
@@ -64,7 +58,7 @@ def test_derivatives_are_those_of_the_kernels(start):
     scene = load_scene("planar")
     dynamics, kernels, h = casadi_dynamics(scene), compile_scene(scene), scene.simulation.dt
     layout = dynamics.layout
-    x, u = drawn(scene)
+    x, u = drawn(scene, np.random.default_rng(0))
     if start == "at rest":
         x, u = layout.initial_state, np.zeros(layout.n_u)
     free_x, free_u = casadi.SX.sym("x", layout.n_x), casadi.SX.sym("u", layout.n_u)

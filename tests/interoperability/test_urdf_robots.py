@@ -4,16 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_robots import (
-    ROBOTS,
-    accelerations,
-    foreign_scene,
-    random_inputs,
-    random_state,
-    relative_error,
-    robot_file,
-    tip_pose,
-)
+from foreign_robots import ROBOTS, accelerations, drawn, foreign_scene, relative_error, robot_file, tip_pose
 
 from dq_space_arm_env import DQSpaceArmEnv, compile_scene, scene_from_urdf, scene_to_urdf
 from dq_space_arm_env.algebra import poses
@@ -96,9 +87,8 @@ class Reference:
         self.model = pin.buildReducedModel(full, locked, pin.neutral(full))
         self.model.gravity = pin.Motion.Zero()
         assert list(self.model.names)[2:] == joints
-        turned = (
-            pin.SE3.Identity() if base is None else self.model.frames[self.model.getFrameId(base)].placement
-        )
+        frames, root = self.model.frames, pin.SE3.Identity()
+        turned = root if base is None else frames[self.model.getFrameId(base)].placement
         if spacecraft is not None:
             self.model.inertias[1] += turned.act(pin.Inertia(*spacecraft))
         self.e0 = pin.SE3(turned.rotation, self.model.inertias[1].lever)
@@ -133,7 +123,7 @@ class Reference:
 def check(scene, reference, tip, samples=5):
     rng = np.random.default_rng(0)
     for _ in range(samples):
-        x, u = random_state(scene, rng), random_inputs(scene, rng)
+        x, u = drawn(scene, rng)
         assert relative_error(accelerations(scene, x, u), reference.accelerations(scene, x, u)) < 1e-12
         rotation, position = tip_pose(scene, x)
         placement = reference.tip(scene, x, tip)
@@ -165,70 +155,55 @@ def test_robots_of_others_survive_the_way_out_and_in_again(name):
     again = scene_from_urdf(text, "tip")
     assert [link.name for link in again.links] == [link.name for link in scene.links]
     rng = np.random.default_rng(1)
-    x, u = random_state(scene, rng), random_inputs(scene, rng)
+    x, u = drawn(scene, rng)
     assert relative_error(accelerations(again, x, u), accelerations(scene, x, u)) < 1e-12
     layouts = [StateLayout.of(one) for one in (scene, again)]
     np.testing.assert_array_equal(layouts[0].control_limit, layouts[1].control_limit)
 
 
-def test_the_odd_robot_moves_as_pinocchio_says():
-    scene = scene_from_urdf(ODD_ROBOT, "grasp", "bus", lock_branches=True)
-    check(scene, Reference(ODD_ROBOT, ["shoulder", "elbow", "wrist"], "bus"), "grasp")
+@pytest.fixture(scope="module")
+def odd_scene():
+    return scene_from_urdf(ODD_ROBOT, "grasp", "bus", lock_branches=True)
+
+
+def test_the_odd_robot_moves_as_pinocchio_says(odd_scene):
+    check(odd_scene, Reference(ODD_ROBOT, ["shoulder", "elbow", "wrist"], "bus"), "grasp")
 
 
 def test_a_spacecraft_is_fixed_to_the_base_link():
-    mass, center, inertia = (
-        150.0,
-        np.array([0.2, -0.3, 0.4]),
-        np.array([[30, 1, 2], [1, 25, 3], [2, 3, 20.0]]),
-    )
-    scene = scene_from_urdf(
-        ODD_ROBOT,
-        "hand",
-        "bus",
-        lock_branches=True,
-        spacecraft={"mass": mass, "inertia": inertia, "center_of_mass": center},
-    )
+    mass, center = 150.0, np.array([0.2, -0.3, 0.4])
+    inertia = np.array([[30, 1, 2], [1, 25, 3], [2, 3, 20.0]])
+    spacecraft = {"mass": mass, "inertia": inertia, "center_of_mass": center}
+    scene = scene_from_urdf(ODD_ROBOT, "hand", "bus", lock_branches=True, spacecraft=spacecraft)
     assert scene.base.mass == pytest.approx(173.0, rel=1e-15)
     reference = Reference(ODD_ROBOT, ["shoulder", "elbow", "wrist"], "bus", (mass, center, inertia))
     check(scene, reference, "hand")
 
 
-def test_start_limits_and_names_come_from_the_file():
-    scene = scene_from_urdf(ODD_ROBOT, "grasp", "bus", lock_branches=True)
-    assert scene.name == "odd"
-    assert [link.name for link in scene.links] == ["upper", "fore", "hand"]
+def test_start_limits_and_names_come_from_the_file(odd_scene):
+    assert odd_scene.name == "odd"
+    assert [link.name for link in odd_scene.links] == ["upper", "fore", "hand"]
     # Zero where the limits allow it, otherwise the middle.
-    assert scene.initial_state.joint_angles == (0.0, 0.0, 0.5)
-    assert StateLayout.of(scene).control_limit.tolist() == [10.0] * 3 + [5.0] * 3 + [7.0, 3.0, 1.5]
-    assert [link.damping for link in scene.links] == [0.2, 0.0, 0.0]
-    text = scene.description
-    center = np.array(text[text.index("(") + 1 : text.index(")")].split(","), dtype=float)
-    expected = Reference(ODD_ROBOT, ["shoulder", "elbow", "wrist"], "bus")
-    in_bus = expected.model.frames[expected.model.getFrameId("bus")].placement.actInv(
-        expected.model.inertias[1].lever
-    )
-    np.testing.assert_allclose(center, in_bus, atol=1e-8)
+    assert odd_scene.initial_state.joint_angles == (0.0, 0.0, 0.5)
+    assert StateLayout.of(odd_scene).control_limit.tolist() == [10.0] * 3 + [5.0] * 3 + [7.0, 3.0, 1.5]
+    assert [link.damping for link in odd_scene.links] == [0.2, 0.0, 0.0]
 
 
-def test_the_default_target_is_the_tip_with_every_joint_further():
-    scene = scene_from_urdf(ODD_ROBOT, "grasp", "bus", lock_branches=True)
-    x = StateLayout.of(scene).initial_state.copy()
-    x[StateLayout.of(scene).state.joint_angles] += 0.3
-    rotation, position = tip_pose(scene, x)
-    np.testing.assert_allclose(scene.target.pose.position, position, atol=1e-14)
-    np.testing.assert_allclose(scene.target.pose.rotation_matrix, rotation, atol=1e-14)
+def test_the_default_target_is_the_tip_with_every_joint_further(odd_scene):
+    x = StateLayout.of(odd_scene).initial_state.copy()
+    x[StateLayout.of(odd_scene).state.joint_angles] += 0.3
+    rotation, position = tip_pose(odd_scene, x)
+    np.testing.assert_allclose(odd_scene.target.pose.position, position, atol=1e-14)
+    np.testing.assert_allclose(odd_scene.target.pose.rotation_matrix, rotation, atol=1e-14)
 
 
-def test_a_robot_of_others_flies_in_the_environment():
+def test_a_robot_of_others_flies_in_the_environment(odd_scene):
     """What was read from a file compiles, steps, and agrees with the equations it was made of."""
-    scene = scene_from_urdf(ODD_ROBOT, "grasp", "bus", lock_branches=True)
     rng = np.random.default_rng(2)
-    x, u = random_state(scene, rng), random_inputs(scene, rng)
-    found = compile_scene(scene).forward_dynamics(x, u)
-    assert relative_error(found, accelerations(scene, x, u)) < 1e-12
-    environment = DQSpaceArmEnv(scene)
+    x, u = drawn(odd_scene, rng)
+    found = compile_scene(odd_scene).forward_dynamics(x, u)
+    assert relative_error(found, accelerations(odd_scene, x, u)) < 1e-12
+    environment = DQSpaceArmEnv(odd_scene)
     environment.reset(seed=0)
     observation, reward, *_ = environment.step(environment.action_space.sample())
-    assert np.isfinite(observation).all()
-    assert np.isfinite(reward)
+    assert np.isfinite([*observation, reward]).all()

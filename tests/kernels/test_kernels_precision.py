@@ -11,10 +11,6 @@ def in_single_precision(scene):
     return scene.replace(simulation={**scene.simulation.model_dump(), "precision": "float32"})
 
 
-def test_double_precision_is_the_default():
-    assert compile_scene("paper").dtype == np.float64
-
-
 @pytest.mark.parametrize("scene", list_scenes())
 def test_results_are_single_and_near_those_in_double_precision(scene, draw):
     kernels, states, inputs = draw(scene, 40)
@@ -47,8 +43,3 @@ def test_the_papers_maneuver_of_15_s_keeps_four_digits(draw):
 
 def test_vectors_hold_twice_as_many_numbers():
     assert compile_scene(in_single_precision("paper")).lanes == 2 * compile_scene("paper").lanes
-
-
-def test_another_precision_is_refused():
-    with pytest.raises(ValueError, match=r"simulation.precision = 'float16'.*'float64' or 'float32'"):
-        load_scene("paper").replace(simulation={"precision": "float16"})

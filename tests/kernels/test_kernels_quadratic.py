@@ -15,7 +15,7 @@ def quadratic(request, draw):
 
 def evaluate(name, kernels, x, reference, gradient, hessian):
     inputs = {"x": x, "x_reference": reference, "gradient": gradient, "hessian": hessian.ravel()}
-    return kernels._call(name, **inputs)
+    return kernels.call(name, **inputs)
 
 
 def test_near_the_reference_it_is_the_quadratic_in_tangent_coordinates(quadratic):

@@ -1,22 +1,18 @@
 """Exact second derivatives: differences of the exact first derivatives along retractions, for every scene."""
 
-import casadi
 import numpy as np
 import pytest
 from test_kernels_odd_scenes import ODD
 
-from dq_space_arm_env import list_scenes, load_scene
-from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env import list_scenes
 from dq_space_arm_env.algebra import screw
-from dq_space_arm_env.compiler.symbols import column, symbols
-from dq_space_arm_env.integrators import INTEGRATORS
-from dq_space_arm_env.kernels.programs import ScenePrograms
-from dq_space_arm_env.scene import CURVED_INTEGRATORS
+from dq_space_arm_env.scene import INTEGRATORS
 
 STEP = 5e-4
 
 # Each of the others takes seconds to compile.
 QUICK = ("paper", "planar")
+CURVED = [name for name, entry in INTEGRATORS.items() if entry.has_curvature]
 SCENES = [s if s in QUICK else pytest.param(s, marks=pytest.mark.slow) for s in list_scenes()]
 ODD_SCENES = [s if s in ("base", "wrist") else pytest.param(s, marks=pytest.mark.slow) for s in ODD]
 
@@ -38,7 +34,7 @@ def lagrangian_gradient(kernels, integrator, x, u, multiplier, successor):
     def gradient(z, v):
         moved = kernels.retract(x, z)
         a, b = kernels.linearize(moved, v, integrator=integrator)
-        lx, lu, *_ = kernels._call("cost_derivatives", x=moved, u=v)
+        lx, lu, *_ = kernels.call("cost_derivatives", x=moved, u=v)
         image = kernels.difference(successor, kernels.step(moved, v, integrator=integrator))
         weights = np.linalg.solve(right_jacobian(kernels, image).T, multiplier)
         return np.concatenate([right_jacobian(kernels, z).T @ (lx + a.T @ weights), lu + b.T @ weights])
@@ -57,7 +53,7 @@ def differences(gradient, size):
 
 def lagrangian_hessian(kernels, integrator, x, u, multiplier):
     h = np.array([kernels.scene.simulation.dt])
-    blocks = kernels._call("lagrangian_hessian", integrator, x=x, u=u, multiplier=multiplier, h=h)
+    blocks = kernels.call("lagrangian_hessian", integrator, x=x, u=u, multiplier=multiplier, h=h)
     n_t, n_u = kernels.n_t, kernels.n_u
     lux = blocks[1].reshape(n_u, n_t)
     return np.block([[blocks[0].reshape(n_t, n_t), lux.T], [lux, blocks[2].reshape(n_u, n_u)]])
@@ -73,7 +69,7 @@ def check_lagrangian(kernels, integrator, x, u, seed):
     np.testing.assert_allclose(hessian, expected, atol=1e-8 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("integrator", CURVED_INTEGRATORS)
+@pytest.mark.parametrize("integrator", CURVED)
 @pytest.mark.parametrize("scene", SCENES)
 def test_lagrangian_hessian_agrees_with_differences_of_the_gradient(scene, integrator, draw):
     kernels, states, inputs = draw(scene, 2)
@@ -81,7 +77,7 @@ def test_lagrangian_hessian_agrees_with_differences_of_the_gradient(scene, integ
         check_lagrangian(kernels, integrator, x, u, seed)
 
 
-@pytest.mark.parametrize("integrator", CURVED_INTEGRATORS)
+@pytest.mark.parametrize("integrator", CURVED)
 @pytest.mark.parametrize("scene", ODD_SCENES)
 def test_lagrangian_hessian_of_odd_scenes(scene, integrator, draw):
     kernels, states, inputs = draw(ODD[scene], 1)
@@ -95,46 +91,10 @@ def test_terminal_cost_hessian_agrees_with_differences_of_the_gradient(scene, dr
 
         def gradient(z, x=x):
             moved = kernels.retract(x, z)
-            slope = kernels._call("terminal_cost_derivatives", x=moved, emphasis=[3.0])[0]
+            slope = kernels.call("terminal_cost_derivatives", x=moved, emphasis=[3.0])[0]
             return right_jacobian(kernels, z).T @ slope
 
         expected = differences(gradient, kernels.n_t)
-        hessian = kernels._call("terminal_cost_hessian", x=x, emphasis=[3.0])[0]
+        hessian = kernels.call("terminal_cost_hessian", x=x, emphasis=[3.0])[0]
         hessian = hessian.reshape(kernels.n_t, kernels.n_t)
         np.testing.assert_allclose(hessian, expected, atol=1e-8 * np.abs(expected).max())
-
-
-def test_symplectic_euler_agrees_with_the_hessian_of_one_graph(draw):
-    """CasADi's own Hessian of a step through the exponential and the logarithm."""
-    programs = ScenePrograms(load_scene("no-wrist"))
-    field, pose = programs.field, programs.field.pose
-    z, u, h = symbols("z", field.n_t), symbols("u", field.n_u), casadi.SX.sym("h")
-    x, multiplier = symbols("x", field.n_x), symbols("l", field.n_t)
-    n = len(pose.directions)
-    q = dq.multiply(pose.full(x[: field.n_x - field.n_y]), screw.exponential(pose.full_twist(z[:n])))
-    y = [a + b for a, b in zip(x[field.n_x - field.n_y :], z[n:], strict=True)]
-    method = INTEGRATORS["symplectic_euler"]
-    moved = method._advance(field, y, u, h, field.rates(y, u))
-    end = dq.multiply(q, screw.exponential(method._increment(pose, moved, h)))
-    start = symbols("end", 8)
-    twist = screw.logarithm(dq.multiply(dq.conjugate(start), end))
-    image = column(*(twist[i] for i in pose.directions), *moved)
-    variables, weights = column(*z, *u), column(*multiplier)
-    hessian = casadi.hessian(casadi.dot(weights, image), variables)[0]
-    at = casadi.Function("hessian", [column(*x), variables, column(*start), weights, h], [hessian])
-    kernels, states, inputs = draw("no-wrist", 3)
-    dt, rng = kernels.scene.simulation.dt, np.random.default_rng(2)
-    for state, control in zip(states, inputs, strict=True):
-        m = rng.normal(size=field.n_t)
-        successor = kernels.step(state, control, integrator="symplectic_euler")
-        expected = np.array(at(state, np.r_[np.zeros(field.n_t), control], successor[:8], m, dt))
-        expected[: field.n_t, : field.n_t] += stage_cost_hessian(kernels, state)
-        expected[field.n_t :, field.n_t :] += np.diag(2.0 * kernels.layout.control_weight)
-        computed = lagrangian_hessian(kernels, "symplectic_euler", state, control, m)
-        np.testing.assert_allclose(computed, expected, atol=1e-11 * np.abs(expected).max())
-
-
-def stage_cost_hessian(kernels, x):
-    """The state's block without a multiplier: nothing of the step is left in it."""
-    hessian = lagrangian_hessian(kernels, "symplectic_euler", x, np.zeros(kernels.n_u), np.zeros(kernels.n_t))
-    return hessian[: kernels.n_t, : kernels.n_t]

@@ -34,9 +34,8 @@ def test_a_helper_that_has_not_begun_is_not_waited_for():
     blocked = threads._helpers(2).submit(release.wait)
     try:
         done = []
-        worker = threading.Thread(
-            target=threads.run_shared, args=(lambda *block: done.append(block), 3000, 0, 2)
-        )
+        arguments = (lambda *block: done.append(block), 3000, 0, 2)
+        worker = threading.Thread(target=threads.run_shared, args=arguments)
         worker.start()
         worker.join(timeout=30)
         assert not worker.is_alive()

@@ -16,8 +16,8 @@ import experts
 from agents.configuration import list_configurations, load_configuration
 from agents.zoo import list_policies, load_policy
 from dq_space_arm_env import list_scenes, load_scene, scene_from_urdf
+from dq_space_arm_env.viewing.replay import Trajectory, write_replay
 from experts import BoxDDP
-from experts.replay import Flight, write_replay
 
 ROBOT = """<robot name="stick"><link name="hull"/>
 <joint name="shoulder" type="continuous"><parent link="hull"/><child link="arm"/><origin xyz="0.4 0 0"/>
@@ -47,7 +47,7 @@ def main() -> None:
 
     solution = BoxDDP("planar").solve()
     assert solution.converged, solution.message
-    flight = Flight("expert", solution.states, solution.controls)
+    flight = Trajectory("expert", solution.states, solution.controls)
     write_replay(Path("replay.html"), [flight], load_scene("planar"))
 
     robot = scene_from_urdf(ROBOT, "arm", spacecraft={"mass": 100, "inertia": [10, 10, 10]})

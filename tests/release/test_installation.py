@@ -25,9 +25,7 @@ pytestmark = pytest.mark.slow
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 VERSION = dq_space_arm_env.__version__
-NOT_SOURCE = shutil.ignore_patterns(
-    ".git", ".venv", "__pycache__", "*_cache", "results", "dist", "build", "*.egg-info"
-)
+NOT_SOURCE = (".git", ".venv", "__pycache__", "*_cache", "results", "dist", "build", "*.egg-info")
 
 
 def run(*command: str | Path, cwd: Path, environment: Mapping[str, str] | None = None) -> str:
@@ -49,7 +47,7 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def distributions(python: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the source distribution, and the wheel that was built from it."""
     folder = tmp_path_factory.mktemp("distributions")
-    shutil.copytree(ROOT, folder / "source", ignore=NOT_SOURCE)
+    shutil.copytree(ROOT, folder / "source", ignore=shutil.ignore_patterns(*NOT_SOURCE))
     builder = folder / "builder"
     run(sys.executable, "-m", "venv", builder, cwd=folder)
     run(builder / "bin" / "python", "-m", "pip", "install", "--retries", "10", "build", cwd=folder)
@@ -86,16 +84,9 @@ def test_distributions_have_their_files(distributions: Path) -> None:
     assert {name for name in names if not name.startswith(information)} == files
     with tarfile.open(distributions / f"dq_space_arm-{VERSION}.tar.gz") as archive:
         paths = {Path(*Path(name).parts[1:]) for name in archive.getnames()}
-    for path in (
-        "README.md",
-        "LICENSE",
-        "CITATION.cff",
-        "requirements.lock",
-        ".github/pictures/maneuver.png",
-    ):
-        assert Path(path) in paths
+    needed = ["README.md", "LICENSE", "CITATION.cff", "requirements.lock", ".github/pictures/maneuver.png"]
+    assert set(map(Path, [*needed, "configs/scenes/paper.yaml"])) <= paths
     assert {path for path in paths if path.match("tests/**/test_*.py")}
-    assert Path("configs/scenes/paper.yaml") in paths
 
 
 def test_first_use(installed: Path, tmp_path: Path) -> None:

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import compile_scene, load_scene
-from dq_space_arm_env.environment.picture_format import PictureFormat
-from dq_space_arm_env.environment.rendering import Renderer
-from experts.report.animation import check_gif, draw_maneuver, encode_gif
-from experts.report.maneuver import Maneuver
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.viewing.picture_format import PictureFormat
+from dq_space_arm_env.viewing.rendering import Renderer
+from experts.figures.animation import check_gif, draw_maneuver, encode_gif
+from experts.maneuver import Maneuver
 
 SMALL = PictureFormat(64, 48)
 
@@ -33,24 +34,9 @@ def test_pictures_are_those_of_the_states_at_their_times(maneuver):
     renderer = Renderer(maneuver.scene, SMALL)
     kernels = compile_scene(maneuver.scene)
     for number, stage in ((0, 0), (3, 20), (15, 100)):
-        tips = maneuver.frames[: stage + 1, -1]
-        from_half = [2.0 * _imaginary_product(tip[4:], tip[:4]) for tip in tips]
-        expected = renderer.draw(kernels.frame_poses(maneuver.states[stage]), np.array(from_half))
+        trail = np.transpose(poses.position(maneuver.frames[: stage + 1, -1].T))
+        expected = renderer.draw(kernels.frame_poses(maneuver.states[stage]), trail)
         np.testing.assert_array_equal(pictures[number], expected)
-
-
-def _imaginary_product(dual, real):
-    """Vector part of q_d q_r*: half the position of a pose."""
-    return dual[1:] * real[0] - dual[0] * real[1:] - np.cross(dual[1:], real[1:])
-
-
-def test_nonsense_is_refused(maneuver):
-    with pytest.raises(ValueError, match="fps: 0, should be positive"):
-        draw_maneuver(maneuver, SMALL, fps=0, seconds=1.0)
-    with pytest.raises(ValueError, match=r"seconds: -1\.0, should be positive"):
-        draw_maneuver(maneuver, SMALL, fps=10, seconds=-1.0)
-    with pytest.raises(ValueError, match="fps: inf, should be finite"):
-        draw_maneuver(maneuver, SMALL, fps=math.inf, seconds=1.0)
 
 
 @pytest.mark.parametrize(
@@ -58,13 +44,13 @@ def test_nonsense_is_refused(maneuver):
     [
         (50.1, 0.0, 2, r"fps: 50\.1, should be positive and at most 50"),
         (math.nan, 0.0, 2, "fps: nan"),
-        (10.0, -0.1, 2, r"hold: -0\.1, should be 0 to 600 s"),
-        (10.0, math.inf, 2, "hold: inf"),
-        (10.0, 0.0, 1, "colors: 1, should be 2 to 255"),
-        (10.0, 0.0, 256, "colors: 256"),
+        (10.0, math.inf, 2, "hold: inf, should be 0 to 600 s"),
+        (10.0, 0.0, 256, "colors: 256, should be 2 to 255"),
     ],
 )
-def test_gif_that_cannot_be_is_refused(fps, hold, colors, sentence):
+def test_impossible_pictures_are_refused(maneuver, fps, hold, colors, sentence):
+    with pytest.raises(ValueError, match=r"seconds: -1\.0, should be positive"):
+        draw_maneuver(maneuver, SMALL, fps=10, seconds=-1.0)
     check_gif(50.0, 0.0, 255)
     with pytest.raises(ValueError, match=sentence):
         encode_gif([np.zeros((4, 4, 3), dtype=np.uint8)], fps, hold, colors)

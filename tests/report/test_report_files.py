@@ -8,16 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from experts.report import ManeuverRun, summarize, to_json, write_atomically
+from dq_space_arm_env.common.files import to_json, write_atomically
+from experts.report import ManeuverRun, summarize
 
 
 def test_file_is_replaced_and_nothing_is_left_over(tmp_path: Path) -> None:
     file = tmp_path / "a.txt"
-    write_atomically(file, "old")
-    write_atomically(file, "Δt")
-    assert file.read_text(encoding="utf-8") == "Δt"
-    write_atomically(file, b"\x00\xff")
-    assert file.read_bytes() == b"\x00\xff"
+    for content in ("old", "Δt", b"\x00\xff"):
+        write_atomically(file, content)
+        assert file.read_bytes() == (content if isinstance(content, bytes) else content.encode())
     assert list(tmp_path.iterdir()) == [file]
 
 
@@ -49,19 +48,11 @@ def test_summary_has_the_numbers_of_the_run(short_run: ManeuverRun) -> None:
     result = summary["result"]
     assert result["cost"] == short_run.solution.cost
     assert result["initial_attitude_error_deg"] == pytest.approx(60.0)
-    assert result["final_position_error_m"] == pytest.approx(short_run.maneuver.distance[-1])
-    assert result["converged"] is True
     assert summary["replay"]["return"] == pytest.approx(-result["cost"], rel=1e-12)
-    assert summary["actuators"]["joint_torque"]["limits"] == [0.5]
+    efforts = sum(actuator["cost"] for actuator in summary["actuators"].values())
+    assert efforts == pytest.approx(result["cost_terms"]["cost_control"], rel=1e-9)
     assert summary["resolved_scene"] == short_run.scene.model_dump(mode="json")
     assert set(summary["versions"]) >= {"dq-space-arm", "python", "numpy", "numba", "casadi"}
-    assert summary["machine"]["processor"]
-
-
-def test_efforts_in_the_summary_add_up(short_run: ManeuverRun) -> None:
-    summary = summarize(short_run)
-    efforts = sum(actuator["cost"] for actuator in summary["actuators"].values())
-    assert efforts == pytest.approx(summary["result"]["cost_terms"]["cost_control"], rel=1e-9)
 
 
 def test_what_is_not_finite_becomes_null(short_run: ManeuverRun) -> None:

@@ -8,7 +8,7 @@ import pytest
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.algebra import dual_quaternion
 from experts.report import Maneuver, ManeuverRun, replay
-from experts.report.replay import errors_with_finer_steps
+from experts.report.maneuver_run import errors_with_finer_steps
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
@@ -16,11 +16,6 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
     w, v = quaternion[0], quaternion[1:]
     skew = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
     return np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew
-
-
-def test_paper_starts_as_far_from_the_target_as_its_scene_says(paper_maneuver: Maneuver) -> None:
-    assert math.degrees(paper_maneuver.angle[0]) == pytest.approx(74.4, abs=0.05)
-    assert paper_maneuver.distance[0] == pytest.approx(1.330, abs=5e-4)
 
 
 def test_tip_times_error_is_target(paper_maneuver: Maneuver) -> None:
@@ -33,10 +28,8 @@ def test_tip_times_error_is_target(paper_maneuver: Maneuver) -> None:
 def test_position_error_is_in_tip_axes(paper_maneuver: Maneuver) -> None:
     target = np.array([0.0, -4.0, 5.0])  # the paper's
     for tip, error in zip(paper_maneuver.frames[:, -1], paper_maneuver.position_error, strict=True):
-        conjugate = tip[:4] * [1.0, -1.0, -1.0, -1.0]
-        position = (
-            2.0 * np.array(dual_quaternion.multiply((*tip[4:], 0, 0, 0, 0), (*conjugate, 0, 0, 0, 0)))[1:4]
-        )
+        (w, *v), (dual_w, *dual_v) = tip[:4], tip[4:]  # r = 2 q_d q_r*
+        position = 2.0 * (w * np.array(dual_v) - dual_w * np.array(v) - np.cross(dual_v, v))
         assert rotation_matrix(tip[:4]) @ error == pytest.approx(target - position, abs=1e-13)
     assert paper_maneuver.distance == pytest.approx(np.linalg.norm(paper_maneuver.position_error, axis=1))
 
@@ -46,27 +39,13 @@ def test_angle_is_twice_the_arc_cosine_of_the_scalar_part(paper_maneuver: Maneuv
     assert paper_maneuver.angle == pytest.approx(expected, abs=1e-7)
 
 
-def test_time_ends_with_the_maneuver(short_run: ManeuverRun) -> None:
-    assert short_run.maneuver.time[[0, 1, -1]] == pytest.approx([0.0, 0.05, 3.0])
-
-
-def test_actuators_share_out_the_controls(paper_maneuver: Maneuver) -> None:
-    names = [actuator.name for actuator in paper_maneuver.actuators]
-    assert names == ["base_force", "base_torque", "joint_torque", "wrist_rate"]
-    values = np.hstack([actuator.values for actuator in paper_maneuver.actuators])
-    assert np.array_equal(values, paper_maneuver.controls)
-    assert [actuator.unit for actuator in paper_maneuver.actuators] == ["N", "N m", "N m", "rad/s"]
-
-
 def test_actuator_counts_what_is_at_the_limit(paper_maneuver: Maneuver) -> None:
     joints = paper_maneuver.actuator("joint_torque")
-    assert joints is not None
     assert joints.clamped_share == pytest.approx(4 / (40 * 3))
     assert joints.largest[0] == 2.0
     assert joints.largest[1:].max() < 2.0
-    torque = paper_maneuver.actuator("base_torque")
-    assert torque is not None
-    assert torque.clamped_share == 0.0
+    shares = [actuator.clamped_share > 0.0 for actuator in paper_maneuver.actuators]
+    assert shares == [False, False, True, False]
 
 
 def test_efforts_add_up_to_the_input_part_of_the_cost(paper_maneuver: Maneuver) -> None:
@@ -74,37 +53,27 @@ def test_efforts_add_up_to_the_input_part_of_the_cost(paper_maneuver: Maneuver) 
     states, controls = paper_maneuver.states[:-1], paper_maneuver.controls
     effort = np.sum(kernels.cost(states, controls) - kernels.cost(states, 0.0 * controls))
     assert sum(actuator.effort for actuator in paper_maneuver.actuators) == pytest.approx(effort, rel=1e-9)
+    values = np.hstack([actuator.values for actuator in paper_maneuver.actuators])
+    assert np.array_equal(values, controls)
 
 
 def test_absent_actuators_are_left_out(short_run: ManeuverRun) -> None:
     assert [actuator.name for actuator in short_run.maneuver.actuators] == ["base_torque", "joint_torque"]
     assert short_run.maneuver.actuator("base_force") is None
+    assert short_run.maneuver.time[[0, 1, -1]] == pytest.approx([0.0, 0.05, 3.0])
 
 
-def test_replay_charges_what_the_solver_planned(short_run: ManeuverRun) -> None:
+def test_replay_flies_and_charges_what_the_solver_planned(short_run: ManeuverRun) -> None:
+    planned = [math.degrees(short_run.maneuver.angle[-1]), short_run.maneuver.distance[-1]]
     assert short_run.solution.converged
+    assert short_run.replay.is_success[0]
+    flown = [short_run.replay.attitude_error[0], short_run.replay.position_error[0]]
+    assert flown == pytest.approx(planned, rel=1e-9)
+    whole = errors_with_finer_steps(short_run.scene, short_run.solution.controls, substeps=1)
+    assert whole == pytest.approx(planned, rel=1e-9)
     assert short_run.replay_difference < 1e-12
     assert short_run.replay_agrees
-    assert sum(short_run.replay.cost_terms.values()) == pytest.approx(short_run.solution.cost, rel=1e-12)
-
-
-def test_replay_ends_where_the_plan_ends(short_run: ManeuverRun) -> None:
-    assert short_run.replay.attitude_error == pytest.approx(
-        math.degrees(short_run.maneuver.angle[-1]), rel=1e-9
-    )
-    assert short_run.replay.position_error == pytest.approx(short_run.maneuver.distance[-1], rel=1e-9)
-    assert short_run.replay.is_success
-
-
-def test_replay_of_other_controls_does_not_agree(short_run: ManeuverRun) -> None:
-    other = replay(short_run.scene, 0.99 * short_run.solution.controls)
-    assert abs(other.total_reward + short_run.solution.cost) > 1e-6 * short_run.solution.cost
-
-
-def test_finer_steps_with_one_substep_are_the_plan(short_run: ManeuverRun) -> None:
-    angle, distance = errors_with_finer_steps(short_run.scene, short_run.solution.controls, substeps=1)
-    assert angle == pytest.approx(math.degrees(short_run.maneuver.angle[-1]), rel=1e-9)
-    assert distance == pytest.approx(short_run.maneuver.distance[-1], rel=1e-9)
+    assert sum(short_run.cost_terms.values()) == pytest.approx(short_run.solution.cost, rel=1e-12)
 
 
 def test_finer_steps_show_the_error_of_a_poor_integrator(short_scene: Scene) -> None:
@@ -114,7 +83,7 @@ def test_finer_steps_show_the_error_of_a_poor_integrator(short_scene: Scene) -> 
     planned = replay(poor, controls)
     angle, distance = errors_with_finer_steps(poor, controls)
     finer_angle, finer_distance = errors_with_finer_steps(poor, controls, substeps=8)
-    assert abs(planned.attitude_error - angle) > 1e-2  # degrees
+    assert abs(planned.attitude_error[0] - angle) > 1e-2  # degrees
     assert abs(finer_angle - angle) < 1e-6
     assert abs(finer_distance - distance) < 1e-6
 

@@ -9,15 +9,7 @@ from pydantic import ValidationError
 from dq_space_arm_env.scene import Scene
 
 REMOVED = object()
-
-
-def _changed(data: Any, path: list[str | int], value: Any) -> None:
-    for key in path[:-1]:
-        data = data.setdefault(key, {}) if isinstance(data, dict) else data[key]
-    if value is REMOVED:
-        del data[path[-1]]
-    else:
-        data[path[-1]] = value
+BODY = {"inertia": [0.1, 0.2, 0.2], "center_of_mass": [0.3, 0, 0]}
 
 
 @pytest.fixture
@@ -27,20 +19,8 @@ def data() -> dict[str, Any]:
         "name": "small",
         "base": {"mass": 100, "inertia": [10, 11, 12]},
         "links": [
-            {
-                "name": "upper",
-                "mass": 5,
-                "inertia": [0.1, 0.2, 0.2],
-                "center_of_mass": [0.3, 0, 0],
-                "joint": {},
-            },
-            {
-                "name": "lower",
-                "mass": 4,
-                "inertia": [0.1, 0.2, 0.2],
-                "center_of_mass": [0.3, 0, 0],
-                "joint": {"position": [0.6, 0, 0]},
-            },
+            {"name": "upper", "mass": 5, **BODY, "joint": {}},
+            {"name": "lower", "mass": 4, **BODY, "joint": {"position": [0.6, 0, 0]}},
         ],
         "wrist": {"frame": {"position": [0.6, 0, 0]}},
         "actuators": {
@@ -59,9 +39,7 @@ def planar_data() -> dict[str, Any]:
     return {
         "name": "planar",
         "base": {"mass": 100, "inertia": [10, 11, 12], "motion": "planar"},
-        "links": [
-            {"name": "arm", "mass": 5, "inertia": [0.1, 0.2, 0.2], "center_of_mass": [0.3, 0, 0], "joint": {}}
-        ],
+        "links": [{"name": "arm", "mass": 5, **BODY, "joint": {}}],
         "actuators": {"base_force": {"limit": [1, 2, 3]}, "base_torque": {"limit": [4, 5, 6]}},
         "target": {"pose": {"position": [1, 0, 0]}},
     }
@@ -75,8 +53,14 @@ def change() -> Change:
     """Function that sets the value at a path like "links.0.mass"; without a value, it removes the key."""
 
     def function(data: dict[str, Any], path: str, value: Any = REMOVED) -> dict[str, Any]:
-        keys: list[str | int] = [int(key) if key.isdigit() else key for key in path.split(".")]
-        _changed(data, keys, value)
+        *keys, last = (int(key) if key.isdigit() else key for key in path.split("."))
+        inner: Any = data
+        for key in keys:
+            inner = inner.setdefault(key, {}) if isinstance(inner, dict) else inner[key]
+        if value is REMOVED:
+            del inner[last]
+        else:
+            inner[last] = value
         return data
 
     return function

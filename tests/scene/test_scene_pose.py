@@ -11,7 +11,6 @@ from pydantic import ValidationError
 
 from dq_space_arm_env.scene import Pose
 
-HALF = math.sqrt(0.5)
 PAPER_TARGET = (0.5, 0.5, -0.5, -0.5, 0.25, 2.25, 0.25, 2.25)
 
 components = st.floats(-1, 1).filter(lambda number: abs(number) > 1e-3)
@@ -21,23 +20,13 @@ quaternions = st.tuples(components, components, components, components).map(
 positions = st.tuples(*[st.floats(-100, 100)] * 3)
 
 
-def test_the_default_is_the_identity() -> None:
-    pose = Pose()
-    assert pose == Pose.model_validate({})
-    assert pose.dual_quaternion == (1, 0, 0, 0, 0, 0, 0, 0)
-    assert pose.rotation_matrix == ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-
-
 @pytest.mark.parametrize("form", [{"dual_quaternion": PAPER_TARGET}, PAPER_TARGET, list(PAPER_TARGET)])
 def test_target_of_the_paper(form: Any) -> None:
     pose = Pose.model_validate(form)
     assert pose.position == (0, -4, 5)
     assert pose.rotation == (0.5, 0.5, -0.5, -0.5)
     assert pose.dual_quaternion == PAPER_TARGET
-    x_axis, y_axis, z_axis = np.array(pose.rotation_matrix).T
-    assert (x_axis == (0, -1, 0)).all()
-    assert (y_axis == (0, 0, 1)).all()
-    assert (z_axis == (-1, 0, 0)).all()
+    assert pose.rotation_matrix == ((0, 0, -1), (-1, 0, 0), (0, 1, 0))
 
 
 def test_the_sign_of_the_quaternion_is_kept() -> None:
@@ -55,12 +44,6 @@ def test_rotations_of_the_cube_have_exact_entries(axis: list[int], turns: int) -
     assert round(np.linalg.det(matrix)) == 1
 
 
-def test_rotation_about_x() -> None:
-    pose = Pose.model_validate({"rotation": {"axis": [2, 0, 0], "angle": 90}})
-    assert pose.rotation == pytest.approx((HALF, HALF, 0, 0), abs=1e-15)
-    assert pose.rotation_matrix == ((1, 0, 0), (0, 0, -1), (0, 1, 0))
-
-
 def test_a_whole_turn_changes_the_sign_only() -> None:
     for turns in range(-3, 4):
         rotation = Pose.model_validate({"rotation": {"axis": [0, 0, 1], "angle": 30 + 360 * turns}}).rotation
@@ -76,9 +59,7 @@ def test_small_angles_are_not_taken_for_zero() -> None:
 
 @settings(derandomize=True)
 @given(quaternions, positions)
-def test_dual_quaternion_and_position_say_the_same(
-    rotation: tuple[float, ...], position: tuple[float, ...]
-) -> None:
+def test_dual_quaternion_gives_position(rotation: tuple[float, ...], position: tuple[float, ...]) -> None:
     pose = Pose.model_validate({"rotation": rotation, "position": position})
     again = Pose.model_validate({"dual_quaternion": pose.dual_quaternion})
     np.testing.assert_allclose(again.position, position, atol=1e-13)
@@ -123,31 +104,14 @@ def test_dual_quaternions_within_the_tolerance_are_normalized() -> None:
         ([2, 0, 0, 0, 0, 0, 0, 0], r"not a unit dual quaternion: \|q_r\| = 2, should be 1"),
         ([1, 0, 0, 0, 3, 0, 0, 0], "not a unit dual quaternion: q_r . q_d = 3, should be 0"),
         ([1, 0, 0, 0, 0, math.nan, 0, 0], "must be 8 finite numbers"),
-        (
-            {"dual_quaternion": [1, 0, 0, 0, 3, 0, 0, 0]},
-            "dual_quaternion = .*: not a unit dual quaternion: q_r . q_d",
-        ),
-        ({"dual_quaternion": [1.1, 0, 0, 0, 0, 0, 0, 0]}, r"\|q_r\| = 1.1, should be 1"),
-        ({"dual_quaternion": 7}, "dual_quaternion = 7: must be 8 finite numbers"),
-        (
-            {"dual_quaternion": PAPER_TARGET, "position": [0, 0, 0]},
-            "either dual_quaternion or position and .*remove pos",
-        ),
-        ({"dual_quaternion": PAPER_TARGET, "rotation": [1, 0, 0, 0]}, "remove rotation"),
+        ({"dual_quaternion": [1.1, 0, 0, 0, 0, 0, 0, 0]}, r"dual_quaternion = .*\|q_r\| = 1.1, should be 1"),
+        ({"dual_quaternion": PAPER_TARGET, "position": [0, 0, 0]}, "either dual_quaternion or .*remove pos"),
         ({"dual_quaternion": PAPER_TARGET, "scale": 1}, "scale: unknown key"),
-        (
-            {"rotation": [1, 1, 0, 0]},
-            r"rotation = \[1, 1, 0, 0\]: must be a unit quaternion .*1.41421356, should be 1",
-        ),
+        ({"rotation": [1, 1, 0, 0]}, r"rotation = .*: must be a unit quaternion .*1.41421356, should be 1"),
         ({"rotation": [1, 0, 0]}, r"rotation = \[1, 0, 0\]: must be 4 finite numbers; it has 3"),
-        ({"rotation": [math.inf, 0, 0, 0]}, "must be 4 finite numbers"),
         ({"rotation": "x"}, "rotation = 'x': must be a unit quaternion .* or {axis"),
         ({"rotation": {"axis": [0, 0, 0], "angle": 3}}, r"rotation.axis = .*: must not have zero"),
-        (
-            {"rotation": {"axis": [1.5e308, 1.5e308, 0], "angle": 3}},
-            "must not have zero [(]or infinite[)] length",
-        ),
-        ({"rotation": {"axis": [0, 0, 1]}}, "rotation.angle: missing"),
+        ({"rotation": {"axis": [1.5e308, 1.5e308, 0], "angle": 3}}, "must not have zero [(]or infinite"),
         ({"rotation": {"axis": [0, 0, 1], "angle": "90"}}, "rotation.angle = '90': must be a finite number"),
         ({"position": [0, 0]}, r"position = \[0, 0\]: must be 3 finite numbers; it has 2"),
         (3, "must be a mapping"),

@@ -1,5 +1,6 @@
 """A scene survives its own YAML exactly: shipped scenes, and random valid ones."""
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -40,16 +41,11 @@ def inertias(draw: st.DrawFn) -> Any:
     return [[b + c, coupling, 0], [coupling, a + c, 0], [0, 0, a + b]]
 
 
+turns = st.fixed_dictionaries({"axis": vector(st.floats(1, 2), 3), "angle": st.floats(-720, 720)})
 poses: st.SearchStrategy[dict[str, Any]] = st.one_of(
     st.just({}),
     st.fixed_dictionaries({"position": vector(numbers, 3), "rotation": quaternions()}),
-    st.fixed_dictionaries(
-        {
-            "rotation": st.fixed_dictionaries(
-                {"axis": vector(st.floats(1, 2), 3), "angle": st.floats(-720, 720)}
-            )
-        }
-    ),
+    st.fixed_dictionaries({"rotation": turns}),
 )
 bodies = {"mass": positive, "inertia": inertias(), "center_of_mass": vector(numbers, 3)}
 
@@ -67,10 +63,9 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
     if motors:
         link["torque_limit"] = limits
     actuators: dict[str, st.SearchStrategy[Any]] = {}
-    if draw(st.booleans()):
-        actuators["base_force"] = st.fixed_dictionaries({"limit": one_or(limits, 3)})
-    if draw(st.booleans()):
-        actuators["base_torque"] = st.fixed_dictionaries({"limit": one_or(limits, 3)})
+    for kind in ("base_force", "base_torque"):
+        if draw(st.booleans()):
+            actuators[kind] = st.fixed_dictionaries({"limit": one_or(limits, 3)})
     if motors:
         actuators["joint_torque"] = st.fixed_dictionaries({"limit": limits})
     if wrist:
@@ -96,7 +91,7 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
         "spread": st.fixed_dictionaries({"base_rotation": non_negative, "base_position": non_negative}),
         "success": st.fixed_dictionaries({"position_error": positive}),
         "simulation": st.fixed_dictionaries(
-            {"dt": positive, "steps": st.integers(1, 10**6), "integrator": st.sampled_from(INTEGRATORS)}
+            {"dt": positive, "steps": st.integers(1, 10**6), "integrator": st.sampled_from([*INTEGRATORS])}
         ),
         "tip_wrench": st.none() | st.fixed_dictionaries({"force": vector(numbers, 3)}),
     }
@@ -116,6 +111,7 @@ def test_shipped_scenes(name: str, tmp_path: Path) -> None:
     assert again == scene
     assert hash(again) == hash(scene)
     assert again.content_hash() == scene.content_hash()
+    assert load_scene(json.loads(json.dumps(scene.model_dump(mode="json", exclude_none=True)))) == scene
 
 
 @settings(derandomize=True, max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])

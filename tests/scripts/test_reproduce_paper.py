@@ -4,57 +4,34 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from agents.command_line import main
-from dq_space_arm_env import load_scene
+from dq_space_arm_env import Scene, load_scene
 from experts import Solution
 from experts.report import SolveProgress, reproduction
+from scripts.reproduce_paper import main
 
 pytest.importorskip("matplotlib")
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "scripts" / "reproduce_paper.py"
-FIGURES = {
-    "figure-2-snapshots.png",
-    "figure-3-pose-error.png",
-    "figure-4-error-norms.png",
-    "figure-5-base-inputs.png",
-    "figure-6-arm-inputs.png",
-    "convergence.png",
-}
+DRAWN = ("2-snapshots", "3-pose-error", "4-error-norms", "5-base-inputs", "6-arm-inputs")
+FIGURES = {*(f"figure-{name}.png" for name in DRAWN), "convergence.png"}
 DATA = {"solution.npz", "scene.yaml", "summary.json"}
-
-# Compiles and solves in seconds.
-SCENE = """
-name: short
-base: {motion: planar, mass: 20, inertia: [1, 1, 1]}
-links:
-  - name: "[red]link"
-    mass: 2
-    inertia: [0.01, 0.05, 0.05]
-    center_of_mass: [0.3, 0, 0]
-    joint: {position: [0.3, 0, 0]}
-tip: {position: [0.6, 0, 0]}
-actuators: {base_torque: {limit: 2}, joint_torque: {limit: 0.5}}
-target: {pose: {position: [0.6, 0.5, 0], rotation: {axis: [0, 0, 1], angle: 60}}}
-simulation: {dt: 0.05, steps: 60}
-"""
-
-
-def run(arguments: Sequence[str]) -> int:
-    return main(["report", "paper", *arguments])
 
 
 @pytest.fixture
-def scene_file(tmp_path: Path) -> Path:
-    file = tmp_path / "short.yaml"
-    file.write_text(SCENE)
-    return file
+def scene_file(short_scene: Scene, tmp_path: Path) -> Path:
+    (link,) = short_scene.links
+    short_scene.replace(links=[{**link.model_dump(), "name": "[red]link"}]).to_yaml(tmp_path / "short.yaml")
+    return tmp_path / "short.yaml"
+
+
+def run(scene_file: Path, out: Path, *arguments: str) -> int:
+    return main(["--scene", str(scene_file), "--out", str(out), *arguments])
 
 
 def names(folder: Path) -> set[str]:
@@ -93,32 +70,24 @@ def test_no_color_is_respected_on_a_terminal(
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("NO_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm-256color")
-    assert run(["--scene", str(scene_file), "--out", str(scene_file.parent), "--no-figures"]) == 0
+    assert run(scene_file, scene_file.parent, "--no-figures") == 0
     output = capsys.readouterr().out
     assert "\x1b[2K" in output  # the line of progress is rewritten
     assert "\x1b[3" not in output
     assert "\x1b[9" not in output
 
 
-def test_no_figures(scene_file: Path, tmp_path: Path) -> None:
-    out = tmp_path / "deep" / "out"
-    assert run(["--scene", str(scene_file), "--out", str(out), "--no-figures"]) == 0
-    assert names(out) == DATA
-
-
 def test_integrator_is_in_the_saved_scene(scene_file: Path, tmp_path: Path) -> None:
-    arguments = ["--scene", str(scene_file), "--out", str(tmp_path), "--integrator", "symplectic_euler"]
-    assert run([*arguments, "--no-figures"]) == 0
+    assert run(scene_file, tmp_path, "--integrator", "symplectic_euler", "--no-figures") == 0
+    assert names(tmp_path) == {*DATA, scene_file.name}
     assert load_scene(tmp_path / "scene.yaml").simulation.integrator == "symplectic_euler"
-    assert load_scene(tmp_path / "scene.yaml").simulation.steps == 60
 
 
 def test_unconverged_solve_is_reported_and_fails(
     scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    status = run(["--scene", str(scene_file), "--out", str(out), "--max-iterations", "2"])
-    assert status == 1
+    assert run(scene_file, out, "--max-iterations", "2") == 1
     assert names(out) == DATA | FIGURES
     assert "NOT CONVERGED" in capsys.readouterr().out
     result = json.loads((out / "summary.json").read_text())["result"]
@@ -126,10 +95,7 @@ def test_unconverged_solve_is_reported_and_fails(
 
 
 def test_interrupted_solve_saves_the_best_so_far(
-    scene_file: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     costs = []
 
@@ -140,7 +106,7 @@ def test_interrupted_solve_saves_the_best_so_far(
 
     monkeypatch.setattr(SolveProgress, "update", interrupt)
     out = tmp_path / "out"
-    assert run(["--scene", str(scene_file), "--out", str(out), "--no-figures"]) == 130
+    assert run(scene_file, out, "--no-figures") == 130
     assert "INTERRUPTED after 3 iterations" in capsys.readouterr().out
     solution = Solution.load(out / "solution.npz")
     assert solution.stop_reason == "interrupted"
@@ -149,70 +115,42 @@ def test_interrupted_solve_saves_the_best_so_far(
     assert summary["replay"]["agrees"] is True
 
 
-def test_interrupt_before_the_solve_saves_nothing(
-    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(reproduction, "run_maneuver", interrupt)
-    out = tmp_path / "out"
-    assert run(["--scene", str(scene_file), "--out", str(out)]) == 130
-    assert names(out) == set()
-
-
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         (["--scene", "papr"], "did you mean 'paper'?"),
-        (["--scene", "nowhere.yaml"], "there is no such file"),
+        (["--scene", "{folder}/infinite.yaml"], "give each actuator a finite limit"),
         (["--max-iterations", "-1"], "max_iterations is -1"),
     ],
 )
 def test_unusable_input_is_one_sentence(
-    arguments: list[str],
-    sentence: str,
-    scene_file: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    arguments: list[str], sentence: str, scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    defaults = ["--scene", str(scene_file), "--out", str(tmp_path)]
-    assert run([*defaults, *arguments]) == 2
-    assert sentence in capsys.readouterr().err
-
-
-def test_scene_that_the_environment_refuses(
-    scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene_file.write_text(SCENE.replace("{limit: 2}", "{limit: .inf}"))
-    assert run(["--scene", str(scene_file), "--out", str(tmp_path)]) == 2
-    assert "give each actuator a finite limit" in " ".join(capsys.readouterr().err.split())
+    infinite = load_scene(scene_file).replace(actuators={"base_torque": {"limit": float("inf")}})
+    infinite.to_yaml(tmp_path / "infinite.yaml")
+    assert run(scene_file, tmp_path, *(word.format(folder=tmp_path) for word in arguments)) == 2
+    assert sentence in " ".join(capsys.readouterr().err.split())
 
 
 def test_missing_matplotlib_is_told_before_the_solve(
-    scene_file: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(reproduction, "find_spec", lambda name: None)
-    arguments = ["--scene", str(scene_file), "--out", str(tmp_path / "out")]
-    assert run(arguments) == 2
+    assert run(scene_file, tmp_path / "out") == 2
     assert 'pip install "dq-space-arm[plots]"' in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
-    assert run([*arguments, "--no-figures"]) == 0
+    assert run(scene_file, tmp_path / "out", "--no-figures") == 0
 
 
 def test_diverged_solve_draws_nothing_and_says_so(
     scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # At this rate and with this step, the explicit integration of a stiff spring blows up.
-    stiff = (
-        SCENE.replace("joint: {", "stiffness: 1.0e+6\n    joint: {") + "initial_state: {joint_angles: [1]}\n"
-    )
-    scene_file.write_text(stiff)
+    scene = load_scene(scene_file)
+    stiff = [{**link.model_dump(), "stiffness": 1e6} for link in scene.links]
+    scene.replace(links=stiff, initial_state={"joint_angles": [1.0]}).to_yaml(scene_file)
     out = tmp_path / "out"
-    assert run(["--scene", str(scene_file), "--out", str(out)]) == 1
+    assert run(scene_file, out) == 1
     assert "DIVERGED" in capsys.readouterr().out
     assert names(out) == DATA
     summary = json.loads((out / "summary.json").read_text())

@@ -1,0 +1,132 @@
+"""What `dq-space-arm evaluate` and `compare` print and write."""
+
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from agents.evaluation.comparing import RECEDING_STARTS, Comparison, compare
+from agents.evaluation.comparison_tables import (
+    comparison_tables,
+    evaluation_table,
+    groups_table,
+    markdown,
+    notes,
+    record,
+    remarks,
+)
+from agents.evaluation.conditions import CONDITIONS
+from agents.evaluation.evaluating import Advance, evaluate
+from agents.evaluation.expert_costs import EVALUATION_SEEDS
+from agents.evaluation.plan_followers import CONTROLLERS
+from agents.evaluation.training_runs import groups
+from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.progress import ProgressDisplay
+from dq_space_arm_env.common.provenance import provenance
+from dq_space_arm_env.common.results import Destination
+from dq_space_arm_env.common.tables import TextTable
+
+ALL, NONE = "all", "none"
+"""In place of the names of conditions and of controllers."""
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[Advance], None]]:
+    """Show the progress of an evaluation on standard error; yields the callback."""
+    with ProgressDisplay(Console(stderr=True, highlight=False)) as display:
+        yield display.update
+
+
+def evaluate_policies(
+    console: Console,
+    policies: Sequence[str],
+    scene: str = "paper",
+    n: int = EVALUATION_SEEDS,
+    *,
+    conditions: Sequence[str] = ("training",),
+    expert: bool = True,
+    workers: int | None = None,
+    out: Path | None = None,
+) -> list[dict[str, Any]]:
+    """Evaluate policies, print a table for each condition, and return the summaries.
+
+    A folder `out` receives a JSON file for each evaluation, with its episodes.
+    """
+    summaries = []
+    for condition in CONDITIONS if ALL in conditions else conditions:
+        with progress_bar() as show:
+            evaluations = [
+                evaluate(policy, scene, n, condition=condition, expert=expert, workers=workers, progress=show)
+                for policy in policies
+            ]
+        summaries += [evaluation.summary() for evaluation in evaluations]
+        console.print(evaluation_table(evaluations).for_terminal())
+        if together := groups(evaluations):
+            console.print(groups_table(together).for_terminal())
+        for sentence in remarks(evaluations):
+            console.print(sentence, markup=False)
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            for number, evaluation in enumerate(evaluations, 1):
+                name = f"{number}-{Path(evaluation.policy).stem}-{condition}"
+                content = json.dumps({**evaluation.record(), "provenance": provenance()})
+                write_atomically(out / (re.sub(r"[^\w.-]+", "-", name) + ".json"), content + "\n")
+    return summaries
+
+
+def compare_controllers(
+    destination: Destination,
+    policies: Sequence[str] = (),
+    scene: str = "paper",
+    n: int = EVALUATION_SEEDS,
+    *,
+    conditions: Sequence[str] = ("training",),
+    controllers: Sequence[str] = tuple(CONTROLLERS),
+    receding_starts: int = RECEDING_STARTS,
+    workers: int | None = None,
+) -> None:
+    """Compare, print the tables, and write the files; finished rows are read from the folder."""
+    with progress_bar() as show:
+        found = compare(
+            policies,
+            scene,
+            n,
+            controllers=() if NONE in controllers else controllers,
+            conditions=CONDITIONS if ALL in conditions else conditions,
+            receding_starts=receding_starts,
+            out=destination.folder,
+            workers=workers,
+            progress=show,
+        )
+
+    def draw() -> bytes:
+        from agents.evaluation.comparison_figure import comparison_figure
+        from experts.figures.style import as_png
+
+        return as_png(lambda: comparison_figure(found))
+
+    save_comparison(destination, "Controllers and agents", comparison_tables(found), found, draw)
+
+
+def save_comparison(
+    destination: Destination,
+    title: str,
+    tables: Sequence[TextTable],
+    found: Comparison,
+    draw: Callable[[], bytes],
+) -> None:
+    """Print a comparison, and write it as Markdown, as JSON, and as a picture."""
+    console = destination.console(180)
+    for table in tables:
+        console.print(table.for_terminal())
+    for sentence in notes(found):
+        console.print(sentence, markup=False)
+    console.print("Commands that reproduce the rows:")
+    for command in found.commands:
+        console.print(f"  {command}", markup=False, soft_wrap=True)
+    write_atomically(destination.folder / "table.md", markdown(title, tables, found))
+    destination.save(console, "comparison", {**record(found), **provenance()}, draw)

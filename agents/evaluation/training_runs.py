@@ -1,0 +1,137 @@
+"""Training runs: learning curves, commands that reproduce them, and runs of one agent taken together."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from agents.configuration import ConfigurationError, list_configurations, load_configuration
+from agents.evaluation.evaluating import Evaluation
+from agents.evaluation.statistics import FEWEST_RUNS, Runs, compare_runs
+from agents.zoo.shelf import SHELF
+
+CONFIGURATION, EVALUATIONS = "config.yaml", "evaluations.jsonl"
+_BUDGET = {"total_steps": "--total-steps", "minutes": "--minutes"}
+
+
+class Group(NamedTuple):
+    """Training runs of one agent that differ in their seeds."""
+
+    name: str
+    condition: str
+    seeds: tuple[int, ...]
+    runs: Runs
+
+
+def groups(evaluations: Sequence[Evaluation]) -> list[Group]:
+    """Aggregate agents with at least 3 training runs, condition by condition."""
+    found: dict[tuple[str, str], dict[int, Evaluation]] = {}
+    for evaluation in evaluations:
+        agent, seed = agent_of(evaluation.metadata), seed_of(evaluation.metadata)
+        if agent is not None and seed is not None:
+            found.setdefault((evaluation.condition, agent), {})[seed] = evaluation
+    return [
+        Group(
+            str(next(iter(members.values())).metadata.get("agent")),
+            condition,
+            tuple(members),
+            compare_runs(
+                [evaluation.flights.is_success for evaluation in members.values()],
+                [evaluation.cost_gaps for evaluation in members.values()],
+            ),
+        )
+        for (condition, _), members in found.items()
+        if len(members) >= FEWEST_RUNS
+    ]
+
+
+def learning_curve(policy: Path) -> list[dict[str, Any]]:
+    """Read the learning curve in the folder of a policy, in the order of time.
+
+    A point has `seconds` of training, `environment_steps`, and `success_rate` and `median_cost` (None if
+    unknown) of the flights from validation starts.
+    """
+    file = policy.parent / EVALUATIONS
+    if not file.is_file():
+        return []
+    points = []
+    for line in file.read_text(encoding="utf-8").splitlines():
+        try:
+            found = json.loads(line)
+            cost = found.get("median_cost")
+            point = {
+                "seconds": float(found["seconds"]),
+                "environment_steps": int(found.get("environment_steps", 0)),
+                "success_rate": float(found["success_rate"]),
+                "median_cost": None if cost is None or math.isnan(cost) else float(cost),
+            }
+        except (ValueError, KeyError, TypeError, AttributeError):
+            continue  # not a point of a learning curve
+        points.append(point)
+    return sorted(points, key=lambda point: point["seconds"])
+
+
+def agent_of(metadata: Mapping[str, Any]) -> str | None:
+    """A key shared by training runs that differ only in their seeds; None if the metadata lack it."""
+    configuration = metadata.get("configuration")
+    if not isinstance(configuration, Mapping):
+        return None
+    return json.dumps([metadata.get("scene_hash"), _without(configuration, "seed")], sort_keys=True)
+
+
+def seed_of(metadata: Mapping[str, Any]) -> int | None:
+    """The seed of a training run; None if the metadata lack it."""
+    configuration = metadata.get("configuration")
+    seed = configuration.get("seed") if isinstance(configuration, Mapping) else None
+    return None if seed is None else int(seed)
+
+
+def training_command(metadata: Mapping[str, Any], policy: Path | None = None) -> str | None:
+    """The command that trains a policy again, from a shipped configuration or that of its folder; or None."""
+    configuration = metadata.get("configuration")
+    if not isinstance(configuration, Mapping):
+        return None
+    options = _shipped(configuration)
+    if options is None:
+        if policy is None or not (policy.parent / CONFIGURATION).is_file():
+            return None
+        options = [str(policy.parent / CONFIGURATION)]
+    return shlex.join(["dq-space-arm", "train", *options])
+
+
+def evaluation_command(policy: Path, scene: str, n: int) -> str:
+    """The command that evaluates a policy again; append the conditions."""
+    name = policy.stem if policy.parent == SHELF else str(policy)
+    options = [name, "--scene", scene, "-n", str(n), "--condition"]
+    return shlex.join(["dq-space-arm", "evaluate", *options])
+
+
+def _shipped(configuration: Mapping[str, Any]) -> list[str] | None:
+    """Options that turn a shipped configuration into this one; None if there are none."""
+    name = configuration.get("name")
+    if name not in list_configurations():
+        return None
+    try:
+        shipped = load_configuration(name).model_dump(mode="json", exclude_none=True)
+    except ConfigurationError:
+        return None
+    options = [str(name), "--seed", str(configuration.get("seed", 0))]
+    here, there = configuration.get("schedule"), shipped.get("schedule")
+    if isinstance(here, Mapping) and isinstance(there, Mapping):
+        for key, option in _BUDGET.items():
+            if here.get(key) != there.get(key):
+                if here.get(key) is None:
+                    return None
+                options += [option, f"{here[key]}"]
+        configuration = {**configuration, "schedule": _without(here, *_BUDGET)}
+        shipped = {**shipped, "schedule": _without(there, *_BUDGET)}
+    left_out = ("seed", "description")
+    return options if _without(configuration, *left_out) == _without(shipped, *left_out) else None
+
+
+def _without(content: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    return {name: value for name, value in content.items() if name not in names}

@@ -1,0 +1,110 @@
+"""Train an agent by imitation: configuration -> demonstrations -> clone -> aggregate -> exported policy."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from torch.utils.tensorboard import SummaryWriter
+
+from agents.configuration.imitation import Dagger, ImitationConfiguration
+from agents.demonstrations import expert_seconds, prepare_demonstrations
+from agents.imitation.aggregation import Aggregated, aggregate
+from agents.imitation.cloning import Cloned, Making, clone
+from agents.imitation.trainer import Record
+from agents.policies import ExportedPolicy
+from agents.policies.network import PolicyNetwork
+from agents.run_folder import (
+    CHECKPOINTS,
+    DEMONSTRATIONS,
+    POLICY,
+    TENSORBOARD,
+    RunFolder,
+    validate,
+    validation_seeds,
+)
+from dq_space_arm_env import Scene, load_scene
+from dq_space_arm_env.common.progress import Advance
+
+
+class Imitated(NamedTuple):
+    """Result of a training run: its folder, the network, and the exported policy."""
+
+    folder: Path
+    network: PolicyNetwork
+    policy: ExportedPolicy
+
+
+def train_by_imitation(
+    configuration: ImitationConfiguration,
+    out: str | os.PathLike[str],
+    report: Callable[[Advance], None] = lambda advance: None,
+) -> Imitated:
+    """Train an agent in a run folder, resuming from its last checkpoint."""
+    scene = load_scene(configuration.scene)
+    folder = RunFolder(Path(out), configuration)
+    demonstrations = prepare_demonstrations(
+        configuration.demonstrations, scene, folder.path / DEMONSTRATIONS, progress=report
+    )
+    making = Making(configuration.network, configuration.seed, configuration.threads)
+    algorithm, place = configuration.algorithm, folder.path / CHECKPOINTS
+    solved_in, solves = expert_seconds(demonstrations), demonstrations.settings["problems"]
+    with SummaryWriter(str(folder.path / TENSORBOARD)) as writer:
+        watch = _Curve(configuration, scene, folder, solved_in, writer).add
+        cloned = clone(
+            demonstrations,
+            configuration.cloning,
+            place / "cloning",
+            making=making,
+            scene=scene,
+            progress=report,
+            watch=watch,
+        )
+        learned: Cloned | Aggregated = cloned
+        if isinstance(algorithm, Dagger):
+            learned = aggregate(
+                cloned, demonstrations, algorithm, place, making=making, progress=report, watch=watch
+            )
+            solves += sum(each.solves for each in learned.rounds)
+    spent = learned.history[-1]
+    effort = {
+        "environment_steps": int(spent["environment_steps"]),
+        "updates": int(spent["updates"]),
+        "seconds": spent["seconds"] + solved_in,
+        "expert_solves": solves,
+        "demonstrations": len(demonstrations),
+    }
+    policy = learned.network.export(folder.metadata(configuration, scene, effort))
+    policy.save(folder.path / POLICY)
+    return Imitated(folder.path, learned.network, policy)
+
+
+class _Curve:
+    """Flies the network now and then, and keeps the learning curve."""
+
+    def __init__(
+        self,
+        configuration: ImitationConfiguration,
+        scene: Scene,
+        folder: RunFolder,
+        solved_in: float,
+        writer: SummaryWriter,
+    ) -> None:
+        self._every, self._scene, self._folder = configuration.curve.every, scene, folder
+        self._seeds = validation_seeds(configuration.curve.episodes)
+        self._solved_in, self._writer = solved_in, writer
+
+    def add(self, network: PolicyNetwork, record: Record, is_last: bool) -> Record:
+        """Fly if it is time to, add a line to the curve, and return the results of the flights."""
+        # A resumed run repeats what came after its checkpoint.
+        lines = [line for line in self._folder.evaluations() if line["updates"] < record["updates"]]
+        flown = lines[-1]["updates"] if lines else 0.0
+        found: Record = {}
+        if is_last or record["updates"] - flown >= self._every:
+            found = validate(network.export({}), self._scene, self._seeds)
+            line = {**record, **found, "seconds": round(record["seconds"] + self._solved_in, 3)}
+            self._folder.write_evaluations([*lines, line])
+        for name, value in {**record, **found}.items():
+            if name != "updates":
+                self._writer.add_scalar(name, value, int(record["updates"]))
+        return found

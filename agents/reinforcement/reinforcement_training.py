@@ -1,0 +1,316 @@
+"""Train an agent by reinforcement: configuration -> environment -> learner -> learn -> exported policy."""
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from traceback import walk_tb
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from sb3_contrib import TQC
+from stable_baselines3 import TD3, HerReplayBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from agents import configuration as c
+from agents.demonstrations import expert_seconds, prepare_demonstrations
+from agents.policies import ExportedPolicy
+from agents.reinforcement.callback import Advance, Progress, TrainingCallback, read_checkpoint
+from agents.reinforcement.held_actions import HeldActions, action_limits
+from agents.reinforcement.networks import ACTIVATIONS, ScaledActionsPolicy, ScaledObservations
+from agents.reinforcement.ppo import ProximalPolicyOptimization
+from agents.reinforcement.sac import DemonstrationBuffer, LayerNormalizedPolicy, SoftActorCritic
+from agents.reinforcement.warm_start import fly_again, load_start, set_actor, spent_before
+from agents.run_folder import DEMONSTRATIONS, MODEL, POLICY, TENSORBOARD, RunFolder
+from agents.vec_env import DQSpaceArmVecEnv
+from dq_space_arm_env import Scene, compile_scene, load_scene
+
+LEARNERS: Mapping[str, type[BaseAlgorithm]] = {
+    "PPO": ProximalPolicyOptimization,
+    "SAC": SoftActorCritic,
+    "TQC": TQC,
+    "TD3": TD3,
+}
+TRIAL_ACTIONS = 0.3
+"""Standard deviation of the random actions that measure the spread of observations, in action scales."""
+
+
+class Trained(NamedTuple):
+    """Result of a training run: its folder, the Stable-Baselines3 model, and the exported policy."""
+
+    folder: Path
+    model: BaseAlgorithm
+    policy: ExportedPolicy
+
+
+def train_by_reinforcement(
+    configuration: c.Configuration,
+    out: str | os.PathLike[str],
+    report: Callable[[Advance], None] = lambda advance: None,
+) -> Trained:
+    """Train an agent in a run folder, resuming from its last checkpoint."""
+    scene = load_scene(configuration.scene)
+    folder = RunFolder(Path(out), configuration)
+    environment = make_environment(configuration, scene)
+    return train_learner(
+        configuration,
+        folder,
+        environment,
+        lambda: _begin(configuration, scene, folder, environment),
+        lambda before: TrainingCallback(configuration, scene, folder, before, report),
+    )
+
+
+def train_learner(
+    configuration: c.Configuration,
+    folder: RunFolder,
+    environment: HeldActions,
+    begin: Callable[[], tuple[BaseAlgorithm, Progress]],
+    watch: Callable[[Progress], TrainingCallback],
+) -> Trained:
+    """Train a new or resumed learner to the end of its schedule; closes the environment.
+
+    Raises `DivergedError` where the network yields NaN; the last checkpoint remains.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(configuration.threads)
+    try:
+        checkpoint = folder.checkpoint()
+        if checkpoint is None:
+            model, before = begin()
+        else:
+            learner = LEARNERS[configuration.algorithm.name]
+            model, before = read_checkpoint(checkpoint, learner, environment, configuration.seed)
+        model.set_logger(configure(str(folder.path / TENSORBOARD), ["tensorboard"]))
+        callback = watch(before)
+        _learn(model, callback, configuration)
+        policy = callback.export()
+    finally:
+        torch.set_num_threads(threads)
+        environment.close()
+    policy.save(folder.path / POLICY)
+    model.save(folder.path / MODEL)
+    return Trained(folder.path, model, policy)
+
+
+# --- environment ---
+
+
+def make_environment(configuration: c.Configuration, scene: Scene) -> HeldActions:
+    """Make the training environment: native copies, or goal environments for hindsight, with held actions."""
+    _check_lengths(configuration, scene)
+    practice, hindsight = configuration.environment, configuration.hindsight
+    environment: VecEnv
+    if hindsight is None:
+        environment = DQSpaceArmVecEnv(practice.copies, scene)
+    else:
+        reward_type = hindsight.reward_type
+
+        def make() -> gymnasium.Env[Any, Any]:
+            goal = gymnasium.make("DQSpaceArmGoal-v0", scene=scene, reward_type=reward_type)
+            monitored: gymnasium.Env[Any, Any] = Monitor(goal)
+            return monitored
+
+        environment = DummyVecEnv([make] * practice.copies)
+    return HeldActions(
+        environment,
+        repeat=practice.action_repeat,
+        action_scale=action_scale(practice.action_scale, scene),
+        reward_scale=practice.reward_scale,
+        cost_power=practice.cost_power,
+        success_reward=practice.success_reward,
+        end_error_cost=practice.end_error_cost,
+        tolerances=(scene.success.attitude_error_deg, scene.success.position_error),
+        add_rewards=hindsight is None,
+    )
+
+
+def _check_lengths(configuration: c.Configuration, scene: Scene) -> None:
+    practice, steps = configuration.environment, scene.simulation.steps
+    if practice.action_repeat > steps:
+        raise c.ConfigurationError(
+            f"environment.action_repeat = {practice.action_repeat}: must be at most {steps}, the steps of an "
+            f"episode of scene {scene.name!r}"
+        )
+    algorithm = configuration.algorithm
+    if not isinstance(algorithm, c.OffPolicy) or algorithm.hindsight is None:
+        return
+    episodes = practice.copies * configuration.decisions(steps)
+    if algorithm.learning_starts < episodes:
+        raise c.ConfigurationError(
+            f"algorithm.learning_starts = {algorithm.learning_starts}: must be at least {episodes}, one "
+            "episode of each copy; there is no hindsight before that"
+        )
+
+
+def action_scale(scale: c.ActionScale, scene: Scene) -> NDArray[np.float32]:
+    """Expand the scale of each actuator to its inputs, shape (n_u,), fractions of the limits."""
+    layout = compile_scene(scene).layout
+    values = np.ones(layout.n_u, dtype=np.float32)
+    for name, value in scale:
+        values[getattr(layout.control, name)] = value
+    return values
+
+
+# --- learner ---
+
+
+def _begin(
+    configuration: c.Configuration, scene: Scene, folder: RunFolder, environment: HeldActions
+) -> tuple[BaseAlgorithm, Progress]:
+    """Make a learner, with demonstrations in its replay buffer where the configuration asks for them."""
+    model, spent = make_learner(configuration, environment), spent_before(configuration)
+    algorithm = configuration.algorithm
+    if not isinstance(algorithm, c.SAC) or algorithm.demonstrations is None:
+        return model, spent
+    given = algorithm.demonstrations
+    demonstrations = prepare_demonstrations(given.source, scene, folder.path / DEMONSTRATIONS)
+    flown = fly_again(demonstrations, scene, environment)
+    assert isinstance(model, SoftActorCritic)
+    assert isinstance(model.replay_buffer, DemonstrationBuffer)
+    model.replay_buffer.demonstrate(flown, action_limits(environment), given.share)
+    if configuration.environment.normalize_observations:
+        # Good flights cover a narrower range of observations than random ones.
+        for module in model.policy.modules():
+            if isinstance(module, ScaledObservations):
+                module.set_units(*units_of(flown.observations))
+    return model, spent._replace(
+        expert_solves=spent.expert_solves + demonstrations.settings["problems"],
+        seconds_before=spent.seconds_before + expert_seconds(demonstrations),
+    )
+
+
+def make_learner(configuration: c.Configuration, environment: HeldActions) -> BaseAlgorithm:
+    """Make an untrained algorithm; PPO's actor starts from `start_from` if given.
+
+    Flies one random episode in the environment to measure the spread of observations.
+    """
+    algorithm, network = configuration.algorithm, configuration.network
+    options = algorithm.model_dump(
+        exclude={"name", "final_learning_rate", "hindsight", "log_std_init", "layer_norm", "demonstrations"}
+    )
+    first, last = algorithm.learning_rate, algorithm.final_learning_rate
+    options["learning_rate"] = LinearSchedule(first, first if last is None else last, 1.0)
+    sizes = spaces.flatdim(environment.observation_space), len(action_limits(environment))
+    start = load_start(configuration, *sizes)
+    units = (
+        _units(configuration, environment) if start is None else (start.mean.tolist(), start.scale.tolist())
+    )
+    policy_options: dict[str, Any] = {
+        "net_arch": list(network.hidden),
+        "activation_fn": ACTIVATIONS[network.activation],
+        "features_extractor_class": ScaledObservations,
+        "features_extractor_kwargs": dict(zip(("mean", "scale"), units, strict=True)),
+    }
+    policy: Any = "MlpPolicy"
+    if isinstance(algorithm, c.PPO):
+        policy = ScaledActionsPolicy
+        policy_options["log_std_init"] = algorithm.log_std_init
+    else:
+        _set_off_policy_options(algorithm, options, policy_options, environment)
+        policy = "MlpPolicy" if algorithm.hindsight is None else "MultiInputPolicy"
+        if isinstance(algorithm, c.SAC) and algorithm.layer_norm:
+            policy = LayerNormalizedPolicy
+    model = LEARNERS[algorithm.name](
+        policy, environment, policy_kwargs=policy_options, seed=configuration.seed, device="cpu", **options
+    )
+    if start is not None:
+        set_actor(model, start)
+    return model
+
+
+def _set_off_policy_options(
+    algorithm: c.OffPolicy, options: dict[str, Any], policy_options: dict[str, Any], environment: VecEnv
+) -> None:
+    """Put the options of algorithms with a replay buffer where Stable-Baselines3 expects them."""
+    policy_options["n_critics"] = options.pop("n_critics")
+    if isinstance(algorithm, c.TQC):
+        policy_options["n_quantiles"] = options.pop("n_quantiles")
+    if isinstance(algorithm, c.SAC | c.TQC):
+        first = options.pop("ent_coef_init")
+        if algorithm.ent_coef == "auto":
+            options["ent_coef"] = f"auto_{first}"
+    if isinstance(algorithm, c.SAC) and algorithm.demonstrations is not None:
+        options["replay_buffer_class"] = DemonstrationBuffer
+        options["cloning_weight"] = algorithm.demonstrations.cloning_weight
+    if isinstance(algorithm, c.TD3):
+        assert environment.action_space.shape is not None
+        deviation = np.full(environment.action_space.shape, options.pop("action_noise"))
+        options["action_noise"] = NormalActionNoise(np.zeros_like(deviation), deviation)
+    if algorithm.hindsight is not None:
+        options["replay_buffer_class"] = HerReplayBuffer
+        options["replay_buffer_kwargs"] = algorithm.hindsight.model_dump(exclude={"reward_type"})
+
+
+def _units(configuration: c.Configuration, environment: HeldActions) -> tuple[list[float], list[float]]:
+    """Mean and inverse standard deviation of observations over one episode of each copy.
+
+    The random actions are gentle: full ones would show how the arm whirls, not how it works. A goal takes
+    the units of what is achieved, since hindsight varies it even where the scene does not.
+    """
+    rng = np.random.default_rng(configuration.seed)
+    environment.seed(int(rng.integers(2**31)))
+    seen = [_joined(environment.reset())]
+    high = action_limits(environment)
+    done = np.zeros(environment.num_envs, dtype=np.bool_)
+    while not done.any():
+        actions = high * (TRIAL_ACTIONS * rng.standard_normal((environment.num_envs, len(high))))
+        observations, _, done, _ = environment.step(actions.astype(np.float32))
+        if not done.any():
+            seen.append(_joined(observations))
+    samples = np.concatenate(seen)
+    if not configuration.environment.normalize_observations:
+        return [0.0] * samples.shape[1], [1.0] * samples.shape[1]
+    return units_of(samples)
+
+
+def _joined(observations: Any) -> NDArray[Any]:
+    """Observations as networks take them, parts in alphabetical order, with the achieved goal desired."""
+    if isinstance(observations, dict):
+        observations = observations | {"desired_goal": observations["achieved_goal"]}
+        return np.concatenate([observations[key] for key in sorted(observations)], axis=1)
+    return np.asarray(observations)
+
+
+def units_of(observations: NDArray[Any]) -> tuple[list[float], list[float]]:
+    """Mean and inverse standard deviation of each entry (0 if constant) of observations, shape (N, n_obs)."""
+    samples = observations.astype(np.float64)
+    deviation = samples.std(axis=0)
+    varies = deviation > 1e-6
+    scale = np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
+    return samples.mean(axis=0).tolist(), scale.tolist()
+
+
+# --- learning ---
+
+
+def _learn(model: BaseAlgorithm, callback: TrainingCallback, configuration: c.Configuration) -> None:
+    """Run the rest of the schedule."""
+    left = configuration.decisions(configuration.schedule.total_steps) - model.num_timesteps
+    callback.init_callback(model)
+    if left <= 0 or callback.is_time_up:
+        return
+    # Stable-Baselines3 adds the requested steps to those done, and runs schedules over the sum.
+    try:
+        model.learn(left, callback=callback, reset_num_timesteps=model.num_timesteps == 0)
+    except (ValueError, RuntimeError) as error:
+        if _is_rejected_by_torch(error):
+            raise callback.diverged() from error
+        raise
+    callback.check_network()
+    callback.evaluate()
+    callback.write_checkpoint()
+
+
+def _is_rejected_by_torch(error: BaseException) -> bool:
+    """Whether PyTorch's distributions reject the network's output, or its optimizers the step size."""
+    origin = [frame for frame, _ in walk_tb(error.__traceback__)][-1].f_globals.get("__name__", "")
+    return str(origin).startswith(("torch.distributions.", "torch.optim."))

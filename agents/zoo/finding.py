@@ -1,0 +1,196 @@
+"""Find and load any agent: by name in the zoo, by path, as a model of Stable-Baselines3, or as a function."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.policies import ExportedPolicy
+from agents.policies.flying import Policy
+from agents.zoo.shelf import ZooError, policy_file
+from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
+
+POLICY_OF_A_RUN = "policy.npz"
+
+
+class PolicyError(ValueError):
+    """Not a policy that can act."""
+
+
+class ActingPolicy(NamedTuple):
+    """A policy ready to fly."""
+
+    label: str  # its name in tables
+    act: Policy  # batches of observations -> actions; may have `begin(environment)`
+    act_once: Policy  # for timing single actions: takes an observation without a batch if it can, else `act`
+    batched: bool  # whether `act_once` wants a batch nevertheless
+    metadata: Mapping[str, Any]  # JSON values; empty if unknown
+    sizes: tuple[int, int] | None = None  # entries of observations and actions, if known
+
+
+def as_policy(policy: Any, label: str | None = None) -> ActingPolicy:
+    """Make a policy ready to fly, whatever it is.
+
+    Args:
+        policy: Name in the zoo; path of an exported policy (.npz), of a model of Stable-Baselines3 (.zip), or
+            of a run folder; an `ExportedPolicy`; a model; or a function from observations, shape (B, n_obs),
+            to actions, shape (B, n_u).
+        label: Its name in tables; the file or class by default.
+
+    Returns:
+        The policy.
+
+    Raises:
+        PolicyError: If it is none of these, or cannot be read.
+        PolicyFileError: If an exported policy cannot be read.
+        ImportError: If a model is given and the extra `agents` is not installed.
+    """
+    if isinstance(policy, str | Path):
+        path = policy_path(policy)
+        return as_policy(read_policy(path), label or _label(policy))
+    if isinstance(policy, ExportedPolicy):
+        name = label or str(policy.metadata.get("agent", "exported policy"))
+        sizes = policy.n_observation, policy.n_action
+        if sees_goals(policy):
+            act = _OnGoals(policy, joined=True)
+            return ActingPolicy(name, act, act, True, policy.metadata, sizes)
+        return ActingPolicy(name, policy, policy, False, policy.metadata, sizes)
+    if callable(getattr(policy, "predict", None)):
+        predict = _predictor(policy)
+        return ActingPolicy(label or type(policy).__name__, predict, predict, True, {})
+    if callable(policy):
+        name = label or str(getattr(policy, "__name__", type(policy).__name__))
+        return ActingPolicy(name, policy, policy, True, {})
+    raise PolicyError(
+        f"policy: {policy!r}, should be a path, an ExportedPolicy, a model of Stable-Baselines3, or a "
+        "function of observations"
+    )
+
+
+def policy_path(policy: str | Path) -> Path:
+    """Resolve a name in the zoo, a run folder or a path to a file."""
+    path = Path(policy)
+    if path.is_dir():
+        return path / POLICY_OF_A_RUN
+    if isinstance(policy, str) and not path.suffix and len(path.parts) == 1:
+        try:
+            return policy_file(policy)
+        except ZooError as error:
+            raise PolicyError(str(error)) from error
+    return path
+
+
+def check_fit(policy: ActingPolicy, scene: Scene) -> None:
+    """Refuse a policy whose observations or actions are not those of the scene."""
+    kind = policy.metadata.get("observation", "plain")
+    if kind == "residual":
+        raise PolicyError(
+            f"{policy.label} corrects a plan and cannot fly alone: use `dq-space-arm compare residual`"
+        )
+    if kind not in ("plain", "goal"):
+        raise PolicyError(f"{policy.label} needs {kind!r} observations, which no environment has")
+    if policy.sizes is None:
+        return
+    environment = DQSpaceArmVectorEnv(1, scene)
+    space, layout = environment.single_observation_space, environment.kernels.layout
+    assert space.shape is not None
+    seen = layout.n_x + 16 if kind == "goal" else space.shape[0]
+    if policy.sizes != (seen, layout.n_u):
+        origin = policy.metadata.get("scene")
+        made = f" (it was trained for scene {origin!r})" if origin else ""
+        raise PolicyError(
+            f"{policy.label} maps {policy.sizes[0]} observations to {policy.sizes[1]} inputs{made}; scene "
+            f"{scene.name!r} has {seen} and {layout.n_u}: evaluate it on its own scene"
+        )
+
+
+def sees_goals(policy: ExportedPolicy) -> bool:
+    """Whether a policy takes the observations of the goal environment."""
+    return bool(policy.metadata.get("observation") == "goal")
+
+
+def _label(policy: str | Path) -> str:
+    path = Path(policy)
+    if path.name == POLICY_OF_A_RUN:
+        path = path.parent
+    return path.name if path.suffix != ".npz" else "/".join(path.parts[-2:])
+
+
+def _predictor(model: Any) -> Policy:
+    """Deterministic actions of a model of Stable-Baselines3."""
+
+    def act(observations: Any) -> NDArray[Any]:
+        return np.asarray(model.predict(observations, deterministic=True)[0])
+
+    if hasattr(getattr(model, "observation_space", None), "spaces"):
+        return _OnGoals(act, joined=False)
+
+    def act_in_single_precision(observations: NDArray[Any]) -> NDArray[Any]:
+        return act(observations.astype(np.float32))  # as in training
+
+    return act_in_single_precision
+
+
+class _OnGoals:
+    """A policy of the goal environment, flown in the ordinary one."""
+
+    def __init__(self, act: Callable[[Any], NDArray[Any]], *, joined: bool) -> None:
+        self._act, self._joined = act, joined
+        self._environment: DQSpaceArmVectorEnv | None = None
+
+    def begin(self, environment: DQSpaceArmVectorEnv) -> None:
+        self._environment = environment
+
+    def __call__(self, observations: NDArray[Any]) -> NDArray[Any]:
+        environment = self._environment
+        assert environment is not None
+        states = environment.states
+        parts = {
+            "achieved_goal": np.reshape(environment.kernels.tip_pose(states), (len(states), 8)),
+            "desired_goal": environment.targets,
+            "observation": states,
+        }
+        single = {name: np.asarray(part, dtype=np.float32) for name, part in parts.items()}
+        return self._act(np.concatenate(list(single.values()), axis=1) if self._joined else single)
+
+
+def read_policy(path: Path) -> Any:
+    """Read an exported policy or a model of Stable-Baselines3."""
+    if not path.exists():
+        raise PolicyError(f"{path}: there is no such file or folder")
+    if path.suffix == ".npz":
+        return ExportedPolicy.load(path)
+    if path.suffix == ".zip":
+        return _read_model(path)
+    raise PolicyError(
+        f"{path}: should be an exported policy (.npz), a model of Stable-Baselines3 (.zip), a run folder, "
+        "or a name in the zoo"
+    )
+
+
+def _read_model(path: Path) -> Any:
+    """Load a model to act, without a replay buffer; its file's policy class names the algorithm."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            home = json.loads(archive.read("data"))["policy_class"]["__module__"]
+    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+        raise PolicyError(f"{path} is not a model of Stable-Baselines3 ({error})") from error
+    try:
+        from sb3_contrib import TQC
+        from stable_baselines3 import PPO, SAC, TD3
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f'{path} needs {error.name}: pip install "dq-space-arm[agents]". An exported policy needs neither'
+        ) from error
+    off_policy = (SAC, TQC, TD3)
+    learner = next((each for each in off_policy if f".{each.__name__.lower()}." in f".{home}."), PPO)
+    options: dict[str, Any] = {}
+    if learner in off_policy:
+        options = {"buffer_size": 1, "replay_buffer_class": None, "replay_buffer_kwargs": {}}
+    return learner.load(path, device="cpu", **options)

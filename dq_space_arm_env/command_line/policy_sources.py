@@ -1,0 +1,81 @@
+"""Policies that verbs fly: the built-in ones, and those that packages bring by entry points.
+
+An entry point of the group `dq_space_arm.policies` names a module with three functions:
+
+    policy_names() -> dict[str, str]                    descriptions by name; fast, for completion
+    owns_policy(policy: str) -> bool                        whether it can load this name or path
+    load_policy(policy, start, console, seed) -> Pilot  for an episode that begins at `start`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dq_space_arm_env.command_line.names import Named
+from dq_space_arm_env.common.entry_points import entry_points, load
+from dq_space_arm_env.common.suggestions import did_you_mean
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from dq_space_arm_env.command_line.simulated_episode import Pilot, Start
+
+GROUP = "dq_space_arm.policies"
+_RANDOM = 2  # stream of random numbers that belongs to a seed
+_BUILT_IN = {"zero": "no input", "random": "uniformly random inputs within their limits"}
+
+
+def policy_names() -> dict[str, str]:
+    """List all named policies, descriptions by name."""
+    names = dict(_BUILT_IN)
+    for source in _sources():
+        names |= source.policy_names()
+    return names
+
+
+def load_policy(policy: str, start: Start, console: Console, seed: int | None) -> Pilot:
+    """Load a policy by name or path; `console` shows the progress of a solve."""
+    if policy.lower() in _BUILT_IN:
+        return _built_in(policy.lower(), start, seed)
+    for source in _sources():
+        if source.owns_policy(policy):
+            pilot: Pilot = source.load_policy(policy, start, console, seed)
+            return pilot
+    known = list(policy_names())
+    if Path(policy).exists():
+        raise ValueError(
+            f"{policy} is not a policy: give a solution (.npz), an exported policy (.npz), a model (.zip), "
+            f"the folder of a training run, or one of {', '.join(known)}"
+        )
+    raise ValueError(
+        f"no policy is named {policy!r}, and there is no such file; {did_you_mean(policy, known)}The "
+        f"policies are {', '.join(known)}; give your own as a file (.npz, .zip) or the folder of its run"
+    )
+
+
+def owns_policy(policy: str) -> bool:
+    """Tell whether a name or a path is a policy, rather than a recorded flight."""
+    return policy in _BUILT_IN or any(source.owns_policy(policy) for source in _sources())
+
+
+def _built_in(name: str, start: Start, seed: int | None) -> Pilot:
+    import numpy as np
+
+    from dq_space_arm_env.command_line.simulated_episode import Pilot
+    from dq_space_arm_env.scene import StateLayout
+
+    shape = (1, StateLayout.of(start.scene).n_u)
+    if name == "zero":
+        return Pilot("zero inputs", lambda observations: np.zeros(shape))
+    generator = np.random.default_rng([seed or 0, _RANDOM])
+    return Pilot("random inputs", lambda observations: generator.uniform(-1.0, 1.0, shape))
+
+
+def _sources() -> Iterator[Any]:
+    for reference in entry_points(GROUP).values():
+        yield load(reference)
+
+
+POLICY = Named("policy", policy_names)

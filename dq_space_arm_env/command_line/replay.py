@@ -1,0 +1,87 @@
+"""`dq-space-arm replay`: a solution or a rollout as a page for the browser."""
+
+from pathlib import Path
+
+import click
+
+from dq_space_arm_env.command_line.names import SCENE
+from dq_space_arm_env.command_line.verb import json_option, print_document
+from dq_space_arm_env.common.console import message_console, table_console
+from dq_space_arm_env.common.files import check_writable
+
+
+@click.command(
+    short_help="Show flights in 3-D, on a page for the browser.",
+    epilog="""\b
+        Examples:
+          dq-space-arm replay results/solutions/paper/solution.npz             # replay.html
+          dq-space-arm replay results/solutions/paper/solution.npz flight.npz  # the second as a ghost
+          dq-space-arm replay results/solutions/paper/solution.npz agent=results/agents/ppo-0
+          dq-space-arm replay "results/demonstrations/paper#3" --open          # a demonstration
+    """,
+)
+@click.argument("flights", nargs=-1, required=True, metavar="FLIGHT...")
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    default=Path("replay.html"),
+    show_default=True,
+    help="Page to write.",
+)
+@click.option(
+    "--label", "labels", multiple=True, help="Name of a flight on the page; one for each, in order."
+)
+@click.option("--scene", type=SCENE, help="Scene of flights whose file does not name one.")
+@click.option("--seed", type=click.IntRange(min=0), help="Start policies where env.reset(seed=...) does.")
+@click.option("--open", "show", is_flag=True, help="Open the page in the browser.")
+@json_option
+def replay(
+    flights: tuple[str, ...],
+    out: Path,
+    labels: tuple[str, ...],
+    scene: str | None,
+    seed: int | None,
+    show: bool,
+    as_json: bool,
+) -> None:
+    """Show flights in 3-D and as curves, on one page that works offline.
+
+    FLIGHT is a solution (the file or folder from `solve`), a rollout (from `simulate`), a folder of
+    demonstrations, with #3 for demonstration 3, or a policy (a file, the folder of a training run, or a name
+    of the zoo), which flies from where the first flight starts. LABEL=FLIGHT names it. The first flight is
+    drawn solid, the others as ghosts.
+    """
+    if len(labels) > len(flights):
+        raise click.UsageError(
+            f"{len(labels)} labels for {len(flights)} flights: give at most one each",
+            click.get_current_context(),
+        )
+    from dq_space_arm_env import load_scene
+    from dq_space_arm_env.command_line.replaying import collect_flights
+    from dq_space_arm_env.viewing.replay import write_replay
+
+    check_writable(out.parent)
+    sources = [_labeled(flight) for flight in flights]
+    for place, label in enumerate(labels):
+        sources[place] = label, sources[place][1]
+    shown, robot = collect_flights(
+        sources, None if scene is None else load_scene(scene), message_console(), seed=seed
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    size = write_replay(out, shown, robot).stat().st_size / 1e6
+    if show:
+        import webbrowser
+
+        webbrowser.open(out.resolve().as_uri())
+    if as_json:
+        print_document({"page": str(out), "scene": robot.name, "flights": len(shown)})
+        return
+    noun = "flight" if len(shown) == 1 else "flights"
+    sentence = f"{out}: {len(shown)} {noun} of scene {robot.name}, {size:.1f} MB; open it in a browser"
+    table_console().print(sentence, markup=False, soft_wrap=True)
+
+
+def _labeled(text: str) -> tuple[str | None, str]:
+    """Split LABEL=FLIGHT; a file may have "=" in its name."""
+    label, mark, source = text.partition("=")
+    return (None, text) if not mark or Path(text).exists() else (label, source)

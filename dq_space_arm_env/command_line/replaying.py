@@ -1,0 +1,58 @@
+"""Flights to show side by side: recorded ones, and episodes that policies fly for the occasion."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from dq_space_arm_env import Scene
+from dq_space_arm_env.command_line.policy_sources import load_policy, owns_policy
+from dq_space_arm_env.command_line.simulated_episode import (
+    begin,
+    fly,
+)
+from dq_space_arm_env.common.files import archive_members
+from dq_space_arm_env.viewing.replay import Trajectory, common_scene, read_flight
+
+
+def collect_flights(
+    sources: Sequence[tuple[str | None, str]],
+    scene: Scene | None,
+    console: Console,
+    *,
+    seed: int | None = None,
+) -> tuple[list[Trajectory], Scene]:
+    """Read flights, and let policies fly from where the first one starts, or where `seed` does.
+
+    `sources` are pairs of a label, or None, and a recording or a policy; `scene` is by default the first that
+    a recording names.
+    """
+    sources = [(label, _file_of(source)) for label, source in sources]
+    recordings: dict[int, Trajectory] = {}
+    for place, (label, source) in enumerate(sources):
+        if not _is_policy(source):
+            recordings[place] = read_flight(source, label)
+    if scene is None:
+        scene = next((item.scene for item in recordings.values() if item.scene is not None), None)
+    if len(recordings) < len(sources):
+        if scene is None:
+            raise ValueError("no file says which scene the policy should fly: give --scene")
+        first = min(recordings, default=None)
+        state = None if first is None or seed is not None else recordings[first].states[0]
+        begun = begin(scene, seed, state)
+        for place, (label, source) in enumerate(sources):
+            if place not in recordings:
+                pilot = load_policy(source, begun, console, seed)
+                recordings[place] = fly(scene, begun, pilot, seed=seed, label=label)
+    return common_scene([recordings[place] for place in range(len(sources))], scene)
+
+
+def _is_policy(source: str) -> bool:
+    """Tell a policy from a recorded flight; a solution is both, and shown as planned."""
+    return owns_policy(source) and "states" not in archive_members(Path(source))
+
+
+def _file_of(source: str) -> str:
+    """Find the solution in the folder that `solve` writes."""
+    solution = Path(source) / "solution.npz"
+    return str(solution) if solution.is_file() else source

@@ -1,0 +1,137 @@
+"""Import and export of scenes, for `scenes import` and `scenes export`."""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from shlex import quote
+from typing import Any, Literal
+
+from dq_space_arm_env import Scene, SceneError, load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
+from dq_space_arm_env.algebra import dual_quaternion, poses
+from dq_space_arm_env.dynamics import kinematics
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.interoperability.urdf_elements import read_robot
+
+_OPTIONS = {
+    r"spacecraft=\{'mass': \.\.\., 'inertia': \.\.\.\}": "--spacecraft-mass and --spacecraft-inertia",
+    r"lock_branches=True": "--lock-branches",
+    r"wrist='fixed'": "--wrist fixed",
+    r"give joint_torque, N m,": "give --joint-torque, N m,",
+    r"in passive$": "with --passive",
+    r"^(tip|base|passive)(?=: )": r"--\1",
+    r"^joint_torque(?= = )": "--joint-torque",
+    r"as base$": "as --base",
+}
+"""Options for the Python arguments that messages mention."""
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """A scene from a URDF file."""
+
+    scene: Scene
+    warnings: tuple[str, ...]
+
+
+@contextmanager
+def in_options() -> Iterator[None]:
+    """Name options instead of Python arguments in error messages."""
+    try:
+        yield
+    except SceneError as error:
+        message = str(error)
+        for argument, option in _OPTIONS.items():
+            message = re.sub(argument, option, message)
+        raise SceneError(message) from error
+
+
+def import_urdf(file: str, tip: str | None, arguments: Mapping[str, Any]) -> Imported:
+    """Make a scene of a URDF file; `arguments` are those of `scene_from_urdf`."""
+    path = Path(file)
+    if tip is None:
+        raise SceneError(f"--tip LINK is missing, the link that is to reach the target; {_tips(path)}")
+    with warnings.catch_warnings(record=True) as caught, in_options():
+        warnings.simplefilter("always")
+        scene = scene_from_urdf(path, tip, **arguments)
+    return Imported(scene, tuple(str(each.message).removeprefix("URDF: ") for each in caught))
+
+
+def _tips(path: Path) -> str:
+    robot = read_robot(path)
+    parents = {joint.parent for joint in robot.joints.values()}
+    ends = [name for name in robot.links if name not in parents]
+    others = [name for name in robot.links if name in parents]
+    return f"links at the end of {path} are {', '.join(ends)}; the others {', '.join(others)}"
+
+
+def record(imported: Imported, file: str, source: str) -> dict[str, Any]:
+    """Describe an imported scene for programs."""
+    scene = imported.scene
+    degrees, meters = _way(scene)
+    return {
+        "file": file,
+        "name": scene.name,
+        "from": source,
+        "base_mass_kg": scene.base.mass,
+        "links": [link.name for link in scene.links],
+        "start_attitude_error_deg": degrees,
+        "start_position_error_m": meters,
+        "warnings": list(imported.warnings),
+    }
+
+
+def summary(imported: Imported, file: str, added: bool) -> Iterator[str]:
+    """Summarize an imported scene, and what its user will want to change."""
+    scene = imported.scene
+    degrees, meters = _way(scene)
+    links = ", ".join(f"{link.name} {link.mass:.4g} kg" for link in scene.links)
+    joints = "1 joint" if len(scene.links) == 1 else f"{len(scene.links)} joints"
+    yield f"{file}: {scene.name}, {joints}"
+    more = "" if added else "; --spacecraft-mass adds the spacecraft"
+    yield f"  base    {scene.base.mass:.4g} kg{more}"
+    yield f"  links   {links}"
+    yield f"  limits  {'; '.join(_limits(scene)) or 'no motors'}; edit actuators and links"
+    yield f"  start   at rest, joints at {_numbers(scene.initial_state.joint_angles)} rad; edit initial_state"
+    yield f"  target  {degrees:.3g} degrees and {meters:.3g} m from the start; edit target"
+    yield "  spread  every episode is the same; edit spread before an agent is trained"
+    word = quote(file)
+    yield f"Next: `dq-space-arm solve {word}`; after edits first `dq-space-arm scenes validate {word}`"
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    """The numbers, or the one that they all are."""
+    return ", ".join(f"{value:.3g}" for value in (values if len(set(values)) > 1 else values[:1]))
+
+
+def _limits(scene: Scene) -> Iterator[str]:
+    actuators = scene.actuators
+    if actuators.base_force is not None:
+        yield f"thrusters {_numbers(actuators.base_force.limit)} N"
+    if actuators.base_torque is not None:
+        yield f"wheels {_numbers(actuators.base_torque.limit)} N m"
+    if actuators.joint_torque is not None:
+        torques = [f"{link.torque_limit:.3g}" if link.torque_limit else "passive" for link in scene.links]
+        yield f"joints {', '.join(torques if len(set(torques)) > 1 else torques[:1])} N m"
+
+
+def _way(scene: Scene) -> tuple[float, float]:
+    """Attitude [deg] and distance [m] from the tip at the start to the target."""
+    start = scene.initial_state
+    base = start.base_pose.dual_quaternion
+    tip = kinematics.tip_pose(Chain.from_scene(scene), base, start.joint_angles, start.wrist_angles)
+    way = dual_quaternion.multiply(dual_quaternion.conjugate(tip), scene.target.pose.dual_quaternion)
+    rotation, position = poses.to_rotation_and_position(way)
+    return math.degrees(2.0 * math.atan2(math.hypot(*rotation[1:]), abs(rotation[0]))), math.hypot(*position)
+
+
+def export(scene: str, language: str, wrist: Literal["refuse", "fixed"]) -> str:
+    """Write a scene's robot in another language."""
+    loaded = load_scene(scene)
+    with in_options():
+        return (scene_to_urdf if language == "urdf" else scene_to_mjcf)(loaded, wrist=wrist)

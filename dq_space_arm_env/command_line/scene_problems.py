@@ -1,0 +1,41 @@
+"""Every problem of a scene file, with its line."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from pydantic import ValidationError
+from ruamel.yaml.error import MarkedYAMLError
+
+from dq_space_arm_env.scene import SceneError, load_scene
+from dq_space_arm_env.validation import line_of
+
+
+class LocatedProblem(NamedTuple):
+    """A problem in a file."""
+
+    line: int | None
+    field: str | None
+    message: str
+
+
+def check(source: str) -> list[LocatedProblem]:
+    """Find the problems of a scene."""
+    try:
+        load_scene(source)
+    except SceneError as error:
+        cause = error.__cause__
+        if isinstance(cause, ValidationError):
+            return _located(cause, Path(source))
+        mark = cause.problem_mark if isinstance(cause, MarkedYAMLError) else None
+        line = None if mark is None else int(mark.line) + 1
+        return [LocatedProblem(line, None, str(error).removeprefix(f"{source}: "))]
+    return []
+
+
+def _located(error: ValidationError, file: Path) -> list[LocatedProblem]:
+    text = file.read_text(encoding="utf-8") if file.is_file() else None
+    found = []
+    for detail in error.errors(include_url=False):
+        line = None if text is None else line_of(text, detail["loc"])
+        found.append(LocatedProblem(line, detail.get("ctx", {}).get("path"), detail["msg"]))
+    return sorted(found, key=lambda problem: problem.line or 0)

@@ -1,0 +1,189 @@
+"""Summary of a scene: bodies, state, inputs, task, and the parts that it leaves out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from dq_space_arm_env.common.tables import TextTable
+from dq_space_arm_env.scene import Scene, StateLayout
+
+_ACTUATORS = {
+    "base_force": "thrusters: no force on the base",
+    "base_torque": "wheels: no torque on the base",
+    "joint_torque": "joint motors: all joints are passive",
+    "wrist_rate": "motors of the wrist: its angles are constant",
+}
+
+
+def record(scene: Scene) -> dict[str, Any]:
+    """Describe a scene for programs."""
+    layout = StateLayout.of(scene)
+    return {
+        "name": scene.name,
+        "description": scene.description,
+        "content_hash": scene.content_hash(),
+        "bodies": [dict(zip(("name", "mass_kg", "role"), body, strict=True)) for body in _bodies(scene)],
+        "states": _entries(layout.state.names, layout.state.units),
+        "tangent": _entries(layout.tangent.names, layout.tangent.units),
+        "inputs": [
+            {**entry, "limit": float(limit), "weight": float(weight)}
+            for entry, limit, weight in zip(
+                _entries(layout.control.names, layout.control.units),
+                layout.control_limit,
+                layout.control_weight,
+                strict=True,
+            )
+        ],
+        "left_out": list(left_out(scene)),
+        "scene": scene.model_dump(mode="json"),
+    }
+
+
+def print_scene(console: Console, scene: Scene) -> None:
+    """Describe a scene for people."""
+    layout = StateLayout.of(scene)
+    console.print(
+        Text(f"{scene.name}: {scene.description}" if scene.description else scene.name, style="bold")
+    )
+    bodies = [(name, f"{mass:g}", role) for name, mass, role in _bodies(scene)]
+    _print(console, "Bodies", ("", "kg", ""), bodies, right=(1,))
+    states = [
+        (_range(part), title, str(part.stop - part.start), unit)
+        for title, part, unit in _state_parts(layout)
+        if part.stop > part.start
+    ]
+    title = f"State, {layout.n_x} numbers; tangent, {layout.n_t}"
+    _print(console, title, ("entries", "", "numbers", "unit"), states, right=(2,))
+    inputs = [
+        (str(i), name, _limit(float(limit)), unit, f"{weight:g}")
+        for i, (name, unit, limit, weight) in enumerate(
+            zip(
+                layout.control.names,
+                layout.control.units,
+                layout.control_limit,
+                layout.control_weight,
+                strict=True,
+            )
+        )
+    ]
+    heading = ("entry", "", "limit", "unit", "weight")
+    _print(console, f"Inputs, {layout.n_u} numbers", heading, inputs, right=(2, 4))
+    _print(console, "Task", ("", ""), list(_task(scene)))
+    absent = [(part,) for part in left_out(scene)] or [("nothing",)]
+    _print(console, "Not in this scene: no states, no operations", ("",), absent)
+
+
+def left_out(scene: Scene) -> Iterator[str]:
+    """List the parts that a scene could have and does not."""
+    if scene.base.motion == "planar":
+        yield "three degrees of freedom of the base: it moves in the plane"
+    if not scene.links:
+        yield "links: the tip is fixed to the base"
+    if scene.wrist is None:
+        yield "wrist"
+    if scene.payload is None:
+        yield "payload"
+    if scene.tip_wrench is None:
+        yield "wrench at the tip"
+    for name, meaning in _ACTUATORS.items():
+        needs = {"joint_torque": bool(scene.links), "wrist_rate": scene.wrist is not None}
+        if getattr(scene.actuators, name) is None and needs.get(name, True):
+            yield meaning
+    passive = [link.name for link in scene.links if not link.actuated]
+    if passive:
+        yield f"motors of {', '.join(passive)}"
+    if scene.links and not any(link.stiffness or link.damping for link in scene.links):
+        yield "springs and dampers of the joints"
+    spread = scene.spread.model_dump()
+    fixed = {
+        "start": not any(spread[name] for name in _START),
+        "target": not (spread["target_rotation"] or spread["target_position"]),
+        "masses and inertias": not any(
+            value for name, value in spread.items() if "mass" in name or "inertia" in name
+        ),
+    }
+    same = [name for name, is_fixed in fixed.items() if is_fixed]
+    if same:
+        yield f"random draws of {' and of '.join(same)}: the same in every episode"
+
+
+_START = (
+    "base_rotation",
+    "base_position",
+    "joint_angles",
+    "wrist_angles",
+    "base_angular_velocity",
+    "base_linear_velocity",
+    "joint_rates",
+)
+
+
+def _bodies(scene: Scene) -> Iterator[tuple[str, float, str]]:
+    yield "base", scene.base.mass, "floats freely" if scene.base.motion == "spatial" else "moves in the plane"
+    for link in scene.links:
+        drive = "driven joint" if link.actuated and scene.actuators.joint_torque else "passive joint"
+        spring = f", spring of {link.stiffness:g} N m/rad" if link.stiffness else ""
+        damper = f", damper of {link.damping:g} N m s/rad" if link.damping else ""
+        yield link.name, link.mass, f"{drive}{spring}{damper}"
+    if scene.wrist is not None:
+        yield "wrist", 0.0, "spherical joint, commanded by its Euler rates"
+    if scene.payload is not None:
+        yield "payload", scene.payload.mass, "held rigidly at the tip"
+
+
+def _state_parts(layout: StateLayout) -> list[tuple[str, slice, str]]:
+    state = layout.state
+    return [
+        ("pose of the base q_{e0/I}", state.pose, "1, m"),
+        ("joint angles", state.joint_angles, "rad"),
+        ("wrist angles psi, theta, phi", state.wrist_angles, "rad"),
+        ("angular velocity of the base, base axes", state.angular_velocity, "rad/s"),
+        ("linear velocity of the base, base axes", state.linear_velocity, "m/s"),
+        ("joint rates", state.joint_rates, "rad/s"),
+    ]
+
+
+def _task(scene: Scene) -> Iterator[tuple[str, str]]:
+    simulation, success = scene.simulation, scene.success
+    seconds = simulation.steps * simulation.dt
+    yield "duration", f"{seconds:g} s: {simulation.steps} steps of {simulation.dt:g} s"
+    yield "integrator", f"{simulation.integrator}, {simulation.precision}"
+    position, rotation = scene.target.pose.position, scene.target.pose.rotation
+    yield "target", f"{_vector(position)} m, rotation {_vector(rotation)}"
+    yield (
+        "success",
+        f"within {success.attitude_error_deg:g} degrees and {success.position_error:g} m at the end",
+    )
+
+
+def _range(part: slice) -> str:
+    first, last = part.start, part.stop - 1
+    return str(first) if first == last else f"{first}-{last}"
+
+
+def _vector(values: Sequence[float]) -> str:
+    return f"({', '.join(f'{value:.6g}' for value in values)})"
+
+
+def _limit(limit: float) -> str:
+    return "unlimited" if math.isinf(limit) else f"{limit:g}"
+
+
+def _entries(names: Sequence[str], units: Sequence[str]) -> list[dict[str, str]]:
+    return [{"name": name, "unit": unit} for name, unit in zip(names, units, strict=True)]
+
+
+def _print(
+    console: Console,
+    title: str,
+    headings: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    right: Sequence[int] = (),
+) -> None:
+    table = TextTable(title, tuple(headings), tuple(map(tuple, rows)), right)
+    console.print(table.for_terminal())

@@ -1,0 +1,284 @@
+"""`dq-space-arm scenes`: list, show, validate, write, import and export scenes."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+from dq_space_arm_env.command_line.names import SCENE, PartOf, description_of, given, scene_files
+from dq_space_arm_env.command_line.verb import json_option, print_document
+from dq_space_arm_env.common.console import FAILURE, SUCCESS, complain, message_console, table_console
+from dq_space_arm_env.common.files import check_writable
+
+
+@click.group(
+    short_help="List, show, check, write, import and export scenes.",
+    epilog="""\b
+        Examples:
+          dq-space-arm scenes list                       # the scenes that ship
+          dq-space-arm scenes show planar                # bodies, states, inputs, absent parts
+          dq-space-arm scenes new my.yaml --from planar  # a commented file to edit
+          dq-space-arm scenes validate my.yaml           # every problem, with its line
+          dq-space-arm scenes import robot.urdf --tip hand
+    """,
+)
+def scenes() -> None:
+    """List, show, check, write, import and export scenes: a robot and its maneuver."""
+
+
+@scenes.command(
+    "list",
+    epilog="""\b
+        Examples:
+          dq-space-arm scenes list
+          dq-space-arm scenes list --json
+    """,
+)
+@json_option
+def list_(as_json: bool) -> None:
+    """List the scenes that ship with the package."""
+    found = {name: description_of(path) for name, path in scene_files().items()}
+    if as_json:
+        paths = scene_files()
+        print_document(
+            [{"name": name, "description": text, "file": str(paths[name])} for name, text in found.items()]
+        )
+        return
+    # Click's own list, which appears before rich would be imported.
+    formatter = click.HelpFormatter(max_width=110)
+    formatter.write_dl(list(found.items()))
+    click.echo(formatter.getvalue(), nl=False)
+
+
+@scenes.command(
+    "show",
+    epilog="""\b
+        Examples:
+          dq-space-arm scenes show paper
+          dq-space-arm scenes show my.yaml --json
+    """,
+)
+@click.argument("scene", type=SCENE)
+@json_option
+def show(scene: str, as_json: bool) -> None:
+    """Show bodies, states and inputs of SCENE, a name or a file, and the parts it leaves out."""
+    from dq_space_arm_env import load_scene
+    from dq_space_arm_env.command_line import scene_summary
+
+    loaded = load_scene(scene)
+    if as_json:
+        print_document(scene_summary.record(loaded))
+    else:
+        scene_summary.print_scene(table_console(), loaded)
+
+
+@scenes.command(
+    "validate",
+    epilog="""\b
+        Examples:
+          dq-space-arm scenes validate my.yaml
+          dq-space-arm scenes validate scenes/*.yaml --json
+    """,
+)
+@click.argument("files", nargs=-1, required=True, type=SCENE, metavar="FILE...")
+@json_option
+def validate(files: tuple[str, ...], as_json: bool) -> int:
+    """Check scene files; list every problem with its line and field. Exit status 1: problems found."""
+    from dq_space_arm_env.command_line.scene_problems import check
+
+    found: list[dict[str, Any]] = []
+    for file in files:
+        problems = check(file)
+        found.append({"file": file, "valid": not problems, "problems": [each._asdict() for each in problems]})
+        if as_json:
+            continue
+        for problem in problems:
+            where = file if problem.line is None else f"{file}:{problem.line}"
+            click.echo(f"{where}: {problem.message}")
+        if not problems:
+            click.echo(f"{file}: valid")
+    if as_json:
+        print_document(found)
+    return SUCCESS if all(each["valid"] for each in found) else FAILURE
+
+
+@scenes.command(
+    "new",
+    epilog="""\b
+        Examples:
+          dq-space-arm scenes new my.yaml                  # from scene paper
+          dq-space-arm scenes new arm.yaml --from six-joint
+          dq-space-arm scenes new - --from payload | less  # to standard output
+    """,
+)
+@click.argument("file", type=click.Path(dir_okay=False, allow_dash=True))
+@click.option("--from", "source", type=SCENE, default="paper", show_default=True, help="Scene to start from.")
+@click.option("--name", help="Name of the scene.  [default: that of the file]")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
+@json_option
+def new(file: str, source: str, name: str | None, force: bool, as_json: bool) -> None:
+    """Write FILE, a scene with a comment at every key, for you to edit."""
+    from dq_space_arm_env import load_scene
+    from dq_space_arm_env.command_line.scene_template import commented_yaml
+
+    scene = load_scene(source)
+    if file == "-":
+        if as_json:
+            raise click.UsageError(
+                "--json needs standard output for itself: name a file", click.get_current_context()
+            )
+        sys.stdout.write(commented_yaml(scene.replace(name=name or scene.name)))
+        return
+    path = _scene_file(file, force)
+    _write(path, commented_yaml(scene.replace(name=name or path.stem)))
+    if as_json:
+        print_document({"file": str(path), "name": name or path.stem, "from": source})
+    else:
+        message_console().print(
+            f"{path}: edit it, then `dq-space-arm scenes validate {path}`", markup=False, soft_wrap=True
+        )
+
+
+def _scene_file(file: str, force: bool) -> Path:
+    """Check the path of a scene to write."""
+    path = Path(file)
+    if path.suffix not in (".yaml", ".yml"):
+        raise click.UsageError(
+            f"{file}: the name of a scene file must end in .yaml", click.get_current_context()
+        )
+    _check_free(path, force)
+    return path
+
+
+def _check_free(path: Path, force: bool) -> None:
+    if path.exists() and not force:
+        raise click.UsageError(f"{path} exists: give another name, or --force", click.get_current_context())
+
+
+def _write(path: Path, text: str) -> None:
+    from dq_space_arm_env.common.files import write_atomically
+
+    check_writable(path.parent)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, text)
+
+
+@scenes.command(
+    "import",
+    epilog="""\b
+        Examples:
+          dq-space-arm scenes import robot.urdf --tip hand  # robot.yaml
+          dq-space-arm scenes import arm.urdf --tip tool0 --spacecraft-mass 80 --spacecraft-inertia 8 8 6
+          dq-space-arm scenes import robot.urdf             # which links there are
+          dq-space-arm scenes import panda.urdf --tip panda_hand --lock-branches --out free-panda.yaml
+    """,
+)
+@click.argument("robot", type=click.Path())
+@click.option("--tip", type=PartOf("link", "robot"), help="Link that is to reach the target.")
+@click.option("--base", type=PartOf("link", "robot"), help="Link that floats.  [default: the root]")
+@click.option("--out", type=click.Path(dir_okay=False), help="Scene file.  [default: as ROBOT, .yaml]")
+@click.option("--name", help="Name of the scene.  [default: the robot's]")
+@click.option("--spacecraft-mass", type=float, help="Mass of a body fixed to the base link, kg.")
+@click.option(
+    "--spacecraft-inertia",
+    type=float,
+    nargs=3,
+    metavar="XX YY ZZ",
+    help="Its inertia about its center of mass, which is the base link's origin, kg m^2.",
+)
+@click.option(
+    "--base-force", type=float, default=10.0, show_default=True, help="Limit of the thrusters, N; 0 for none."
+)
+@click.option(
+    "--base-torque", type=float, default=5.0, show_default=True, help="Limit of the wheels, N m; 0 for none."
+)
+@click.option("--joint-torque", type=float, help="Limit of joints without an effort in ROBOT, N m.")
+@click.option(
+    "--passive", type=PartOf("joint", "robot"), multiple=True, help="Joint without a motor; may be repeated."
+)
+@click.option(
+    "--lock-branches", is_flag=True, help="Hold joints beside the arm, such as a gripper's, at zero."
+)
+@click.option("--force", is_flag=True, help="Replace an existing file.")
+@json_option
+def import_(
+    robot: str,
+    tip: str | None,
+    out: str | None,
+    spacecraft_mass: float | None,
+    spacecraft_inertia: tuple[float, float, float] | None,
+    base_force: float,
+    base_torque: float,
+    force: bool,
+    as_json: bool,
+    **arguments: Any,
+) -> None:
+    """Write a scene of ROBOT, a URDF file: its arm, from the base link to the tip, free in space.
+
+    The default target is reached with every joint 0.3 rad further. The file has a comment at every key.
+    """
+    from dq_space_arm_env.command_line import scene_exchange
+    from dq_space_arm_env.command_line.scene_template import commented_yaml
+
+    path = _scene_file(out or f"{Path(robot).stem}.yaml", force)
+    spacecraft = given(mass=spacecraft_mass, inertia=spacecraft_inertia)
+    if len(spacecraft) == 1:
+        raise click.UsageError(
+            "--spacecraft-mass and --spacecraft-inertia need each other; a solid cube of 1 m has mass / 6, "
+            "kg m^2, about each axis",
+            click.get_current_context(),
+        )
+    arguments |= {
+        "spacecraft": spacecraft or None,
+        "base_force": base_force or None,
+        "base_torque": base_torque or None,
+    }
+    imported = scene_exchange.import_urdf(robot, tip, arguments)
+    _write(path, commented_yaml(imported.scene))
+    for warning in imported.warnings:
+        complain(warning, label="Warning: ")
+    if as_json:
+        print_document(scene_exchange.record(imported, str(path), robot))
+        return
+    for line in scene_exchange.summary(imported, str(path), bool(spacecraft)):
+        click.echo(line)
+
+
+@scenes.command(
+    "export",
+    epilog="""\b
+        Examples:
+          dq-space-arm scenes export no-wrist > no-wrist.urdf
+          dq-space-arm scenes export paper --format mjcf --wrist fixed --out paper.xml
+    """,
+)
+@click.argument("scene", type=SCENE)
+@click.option("--format", "language", type=click.Choice(["urdf", "mjcf"]), default="urdf", show_default=True)
+@click.option(
+    "--wrist",
+    type=click.Choice(["refuse", "fixed"]),
+    default="refuse",
+    show_default=True,
+    help="fixed: write the massless wrist, which other tools lack, at its initial angles.",
+)
+@click.option(
+    "--out", type=click.Path(dir_okay=False, path_type=Path), help="File.  [default: standard output]"
+)
+@click.option("--force", is_flag=True, help="Replace an existing file.")
+def export(
+    scene: str, language: str, wrist: Literal["refuse", "fixed"], out: Path | None, force: bool
+) -> None:
+    """Write the robot of SCENE, a name or a file, as URDF, or as MJCF for MuJoCo."""
+    from dq_space_arm_env.command_line import scene_exchange
+
+    if out is not None:
+        _check_free(out, force)
+    text = scene_exchange.export(scene, language, wrist)
+    if out is None:
+        sys.stdout.write(text)
+    else:
+        _write(out, text)
+        message_console().print(str(out), markup=False, soft_wrap=True)

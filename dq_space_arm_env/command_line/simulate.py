@@ -1,0 +1,119 @@
+"""`dq-space-arm simulate`: one episode under any policy, written to a file for the replay."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dq_space_arm_env.command_line.names import SCENE, seed_option, start_option
+from dq_space_arm_env.command_line.policy_sources import POLICY, load_policy
+from dq_space_arm_env.command_line.verb import json_option, print_document
+from dq_space_arm_env.common.console import message_console, table_console
+from dq_space_arm_env.common.files import check_writable
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from dq_space_arm_env import Scene
+    from dq_space_arm_env.task.trajectory import Trajectory
+
+
+@click.command(
+    short_help="Fly one episode: plan, feedback, or a trained policy.",
+    epilog="""\b
+        Examples:
+          dq-space-arm simulate paper                                         # the expert's plan
+          dq-space-arm simulate paper --policy gains --noise 0.05 --out a.npz  # disturbed inputs, feedback
+          dq-space-arm simulate paper --policy receding --noise 0.05          # replanned at every step
+          dq-space-arm simulate paper --policy results/agents/ppo-0 --seed 3  # a trained agent
+          dq-space-arm simulate my.yaml --policy results/solutions/my/solution.npz
+    """,
+)
+@click.argument("scene", type=SCENE)
+@click.option(
+    "--policy",
+    type=POLICY,
+    default="plan",
+    show_default=True,
+    help="zero: no input; random: random inputs; plan: the expert's plan from this start, open loop; gains: "
+    "the plan with its feedback gains; receding: the expert, replanning at every step; or the name of a "
+    "policy of the zoo, a solution (.npz), an exported policy (.npz), a model (.zip), or the folder of a "
+    "training run.",
+)
+@start_option
+@seed_option
+@click.option(
+    "--noise",
+    type=float,
+    default=0.0,
+    show_default=True,
+    help="Standard deviation of the disturbance of the inputs, as a fraction of their limits.",
+)
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="File for the flight (.npz), which `replay` shows.",
+)
+@click.option("--label", help="Name of the flight in a replay.")
+@json_option
+def simulate(
+    scene: str,
+    policy: str,
+    start: str | None,
+    seed: int | None,
+    noise: float,
+    out: Path | None,
+    label: str | None,
+    as_json: bool,
+) -> None:
+    """Fly one episode of SCENE, a name or a file, and report the outcome.
+
+    Without --seed and --start it begins at the scene's own start. --seed determines start, noise and random
+    inputs.
+    """
+    from dq_space_arm_env import load_scene
+    from dq_space_arm_env.command_line.simulated_episode import (
+        begin,
+        fly,
+    )
+
+    loaded = load_scene(scene)
+    if out is not None:
+        check_writable(out.parent)
+    begun = begin(loaded, seed, start)
+    pilot = load_policy(policy, begun, message_console(), seed)
+    flight = fly(loaded, begun, pilot, seed=seed, noise=noise, label=label)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        flight.save(out)
+    if as_json:
+        print_document({**flight.facts(), "file": None if out is None else str(out)})
+        return
+    console = table_console()
+    console.print(_table(loaded, flight))
+    if out is not None:
+        console.print(f"{out}: watch it with `dq-space-arm replay {out}`", markup=False, soft_wrap=True)
+
+
+def _table(scene: Scene, flight: Trajectory) -> Table:
+    from dq_space_arm_env.common.tables import plain_table
+
+    success = scene.success
+    verdict = (
+        "DIVERGED" if flight.diverged else "success" if flight.is_success else "NOT within the tolerance"
+    )
+    rows = (
+        ("start", flight.start, ""),
+        ("cost J", f"{flight.cost:.6f}", "minus the sum of the rewards"),
+        ("steps", str(len(flight.controls)), f"{1e6 * flight.action_seconds:.0f} us for an action"),
+        (
+            "attitude error",
+            f"{flight.attitude_error:.3g} deg",
+            f"tolerance {success.attitude_error_deg:g} deg",
+        ),
+        ("position error", f"{flight.position_error:.3g} m", f"tolerance {success.position_error:g} m"),
+        ("end", verdict, ""),
+    )
+    return plain_table(f"Scene {scene.name}, {flight.label}", ("", "", ""), rows)

@@ -1,0 +1,118 @@
+"""One episode: its start, from the options of a verb, and its flight."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+import zlib
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dq_space_arm_env.environment import DQSpaceArmEnv
+from dq_space_arm_env.environment.disturbances import Disturbances
+from dq_space_arm_env.environment.rollouts import Policy, StateFeedback, rollout
+from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.task.trajectory import Trajectory
+
+FILES = (".npy", ".json", ".npz")  # that a state is read from
+_NOISE = 1  # stream of random numbers that belongs to a seed
+OWN = "the scene's own"
+_UNREADABLE = (TypeError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What reading numbers from a text or a file raises."""
+_PARTS_OF_SCENE = ("target", "base_mass", "base_inertia", "link_", "payload")
+
+
+class Pilot(NamedTuple):
+    """A policy, ready to fly an episode with `rollout`."""
+
+    label: str
+    policy: Policy | StateFeedback
+
+
+class Start(NamedTuple):
+    """The beginning of an episode."""
+
+    state: NDArray[np.float64]  # shape (n_x,), units of the state
+    scene: Scene  # with the target and the masses of this episode, where they are drawn
+    title: str  # for tables
+
+
+def begin(scene: Scene, seed: int | None = None, given: str | NDArray[np.float64] | None = None) -> Start:
+    """Begin an episode at the scene's own start, at one drawn as `env.reset(seed=seed)` does, or at a state.
+
+    `given` is a state, shape (n_x,), or its text or file, see `read_state`.
+    """
+    if seed is not None and given is not None:
+        raise ValueError("--seed and --start exclude each other: a start is drawn, or given")
+    # Masses, inertias and targets, unlike states, are part of the scene that an expert solves.
+    draws_scene = any(
+        width for name, width in scene.spread.model_dump().items() if name.startswith(_PARTS_OF_SCENE)
+    )
+    if seed is None and given is None and not draws_scene:
+        return Start(np.array(StateLayout.of(scene).initial_state), scene, OWN)
+    env = DQSpaceArmEnv(scene)
+    if seed is not None:
+        env.reset(seed=seed)
+        title = f"drawn with seed {seed}"
+    elif given is not None:
+        state = read_state(given, env.kernels.n_x) if isinstance(given, str) else given
+        env.reset(options={"initial_state": state})
+        title = "given"
+    else:
+        env.reset(options={"nominal": True})
+        title = OWN
+    # Where nothing of the scene is drawn, the scene itself: its machine code is in the cache.
+    return Start(np.asarray(env.state, dtype=np.float64), env.episode_scene if draws_scene else scene, title)
+
+
+def fly(
+    scene: Scene,
+    start: Start,
+    pilot: Pilot,
+    *,
+    seed: int | None,
+    noise: float = 0.0,
+    label: str | None = None,
+) -> Trajectory:
+    """Fly from a start; `noise` is the standard deviation of the inputs, as a fraction of their limits."""
+    if not 0.0 <= noise < math.inf:
+        raise ValueError(f"--noise is {noise}; it must be at least 0, a fraction of the limits")
+    seeds, starts = (None, start.state[None]) if seed is None else ([seed], None)
+    disturbances = None
+    if noise:
+        disturbances = Disturbances(scene, np.random.default_rng([seed or 0, _NOISE]), inputs=noise)
+    flown = rollout(pilot.policy, scene, seeds, starts=starts, disturbances=disturbances, record=True)
+    return flown.trajectory(0, label or pilot.label, start.title)
+
+
+def read_state(text: str, size: int) -> NDArray[np.float64]:
+    """Read a state, shape (size,), units of the state, from text or a file.
+
+    Text is numbers separated by commas. A file is .npy, .json with a list, or .npz, the first row of its
+    `states`.
+    """
+    path = Path(text)
+    if path.suffix in FILES and not path.is_file():
+        raise ValueError(f"--start {text}: there is no such file")
+    try:
+        values = np.asarray(_from_file(path) if path.suffix in FILES else text.split(","), dtype=np.float64)
+    except _UNREADABLE as error:
+        raise ValueError(
+            f"--start {text}: should be {size} numbers separated by commas, or a file ({', '.join(FILES)})"
+        ) from error
+    if values.shape != (size,):
+        raise ValueError(f"--start: has shape {values.shape}, should be the scene's ({size},)")
+    return values
+
+
+def _from_file(path: Path) -> Any:
+    if path.suffix == ".json":
+        return json.loads(path.read_text(encoding="utf-8"))
+    # Read first: of a file that is no archive, NumPy would leave the descriptor open.
+    content = np.load(BytesIO(path.read_bytes()), allow_pickle=False)
+    return content["states"][0] if path.suffix == ".npz" else content

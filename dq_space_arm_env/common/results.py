@@ -1,0 +1,47 @@
+"""Destination of the results of a measuring command."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from dq_space_arm_env.common.console import table_console
+from dq_space_arm_env.common.files import to_json, write_atomically
+from dq_space_arm_env.common.report_page import NO_PICTURE
+
+
+@dataclass(frozen=True)
+class Destination:
+    """Where the results of a measurement go; `document` prints JSON, and tables to standard error."""
+
+    folder: Path
+    picture: bool = True
+    document: bool = False
+
+    def console(self, width: int = 110) -> Console:
+        """Make the console for tables."""
+        return table_console(width, stderr=self.document)
+
+    def save(
+        self, console: Console, name: str, record: dict[str, Any], draw: Callable[[], bytes] | None
+    ) -> None:
+        """Write a record as JSON, draw its picture as PNG, and print the names of the files."""
+        files = [f"{name}.json"]
+        write_atomically(self.folder / files[0], to_json(record))
+        if draw is not None and self.picture:
+            if find_spec("matplotlib") is None:
+                console.print(NO_PICTURE, markup=False)
+            else:
+                files.append(f"{name}.png")
+                write_atomically(self.folder / files[1], draw())
+        console.print(f"{self.folder}: {', '.join(files)}", markup=False)
+        self.print(record)
+
+    def print(self, record: dict[str, Any]) -> None:
+        """Print the document, if one is wanted."""
+        if self.document:
+            sys.stdout.write(to_json(record))

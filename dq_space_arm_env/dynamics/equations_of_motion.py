@@ -1,0 +1,199 @@
+"""The equations of motion of a scene over plain scalars: accelerations and reactions from state and input."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra.vectors import add, cross, subtract
+from dq_space_arm_env.dynamics import minimal
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of
+from dq_space_arm_env.dynamics.kinematics import wrist_rotation
+from dq_space_arm_env.dynamics.minimal import Accelerations, Wrenches
+from dq_space_arm_env.dynamics.vector_field import PoseCoordinates, spread
+from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
+
+Scalar = Any
+
+ZERO = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The state without the pose."""
+
+    joint_angles: Sequence[Scalar]  # n, rad
+    wrist_angles: Sequence[Scalar]  # psi, theta, phi, rad; empty without a wrist
+    angular: Sequence[Scalar]  # of the base, base axes, rad/s
+    linear: Sequence[Scalar]  # of the base's center of mass, base axes, m/s
+    joint_rates: Sequence[Scalar]  # n, rad/s
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Commanded forces and rates; zero where a scene has no actuator."""
+
+    force: Sequence[Scalar]  # on the base, base axes, N
+    torque: Sequence[Scalar]  # on the base, base axes, N m
+    joint_torques: Sequence[Scalar]  # n, N m
+    wrist_rates: Sequence[Scalar]  # psi, theta, phi rates, rad/s; empty without a wrist
+
+
+class EquationsOfMotion:
+    """Accelerations and reactions of a scene's robot; y is the state without the pose, u the input."""
+
+    def __init__(
+        self,
+        chain: Chain,
+        layout: StateLayout,
+        parameters: Sequence[Scalar] = (),
+        formulation: str | None = None,
+    ) -> None:
+        """Lay out the coordinates; `parameters` are symbols among the chain's constants.
+
+        `formulation` is a name that `forward.inertia_of` knows; None takes the fastest.
+        """
+        self.chain = chain
+        self._given_formulation = formulation
+        self._formulation = formulation or "articulated_body"
+        self.parameters = tuple(parameters)
+        self.layout = layout
+        self.n_x = layout.n_x
+        self.n_u = layout.n_u
+        self.n_t = layout.n_t
+        self.n_y = self.n_x - layout.state.pose.stop
+        twist = self._in_y(layout.state.base_velocity)
+        self.rate_indices = (*twist, *self._in_y(layout.state.joint_rates))
+        self.pose = PoseCoordinates(
+            stored=PLANAR_POSE if chain.planar else tuple(range(8)),
+            directions=PLANAR_TWIST if chain.planar else tuple(range(6)),
+            twist_indices=twist,
+        )
+
+    def _in_y(self, part: slice) -> tuple[int, ...]:
+        shift = self.n_x - self.n_y
+        return tuple(range(part.start - shift, part.stop - shift))
+
+    def motion(self, y: Sequence[Scalar]) -> Motion:
+        """Name the parts of y."""
+        layout, shift = self.layout, self.n_x - self.n_y
+
+        def part(where: slice) -> list[Scalar]:
+            return list(y[where.start - shift : where.stop - shift])
+
+        twist = self.pose.full_twist(part(layout.state.base_velocity))
+        return Motion(
+            part(layout.state.joint_angles),
+            part(layout.state.wrist_angles),
+            twist[:3],
+            twist[3:],
+            part(layout.state.joint_rates),
+        )
+
+    def inputs(self, u: Sequence[Scalar]) -> Inputs:
+        """Name the parts of u, with zeros for absent actuators."""
+        layout, planar = self.layout, self.chain.planar
+        force, torque = list(u[layout.control.base_force]), list(u[layout.control.base_torque])
+        torques: list[Scalar] = [0.0] * layout.n_joints
+        for joint, value in zip(layout.actuated_joints, u[layout.control.joint_torque], strict=True):
+            torques[joint] = value
+        wrist = list(u[layout.control.wrist_rate])
+        if not wrist and self.chain.wrist is not None:
+            wrist = [0.0, 0.0, 0.0]
+        return Inputs(
+            force=spread(force, (0, 1) if planar else (0, 1, 2), 3) if force else ZERO,
+            torque=spread(torque, (2,) if planar else (0, 1, 2), 3) if torque else ZERO,
+            joint_torques=torques,
+            wrist_rates=wrist,
+        )
+
+    def _tip(self, motion: Motion) -> tuple[Any, Any]:
+        """Rotation and position of the tip in the last link's frame."""
+        pose: Sequence[Scalar] = self.chain.tip.dual_quaternion
+        if self.chain.wrist is not None:
+            turned = dq.multiply(self.chain.wrist.dual_quaternion, wrist_rotation(motion.wrist_angles))
+            pose = dq.multiply(turned, pose)
+        return poses.to_matrix(pose)
+
+    def tip_forces(
+        self, motion: Motion, rotations: Sequence[Any], wrench: Sequence[Scalar] | None
+    ) -> Wrenches:
+        """Generalized forces of a wrench at the tip, in tip axes; zeros without one."""
+        n = len(self.chain.links)
+        if wrench is None:
+            return Wrenches(ZERO, ZERO, [0.0] * n, [(ZERO, ZERO)] * n)
+        return minimal.tip_wrench_forces(self.chain, rotations, *self._tip(motion), wrench)
+
+    def _acting(self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None) -> list[Any]:
+        """External force and torque on base and links, in their frames."""
+        acting: list[Any] = [(inputs.force, inputs.torque), *[(ZERO, ZERO)] * len(self.chain.links)]
+        if wrench is not None:
+            force, torque = minimal.shift_wrench(*self._tip(motion), wrench[:3], wrench[3:])
+            acting[-1] = (add(acting[-1][0], force), add(acting[-1][1], torque))
+        return acting
+
+    def _inertia(self, motion: Motion, *, many: bool = False) -> Inertia:
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        return inertia_of(self._formulation, self.chain, rotations, many=many)
+
+    def _solve(
+        self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None, inertia: Inertia
+    ) -> Accelerations:
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
+        return forward_dynamics(
+            self.chain,
+            inertia,
+            rotations,
+            motion.angular,
+            motion.joint_rates,
+            self._acting(motion, inputs, wrench),
+            [motor + other for motor, other in zip(inputs.joint_torques, passive, strict=True)],
+        )
+
+    def accelerations(
+        self, y: Sequence[Scalar], u: Sequence[Scalar], wrench: Sequence[Scalar] | None = None
+    ) -> list[Scalar]:
+        """Dual acceleration of the base (free directions), then joint accelerations, by (20) in minimal form.
+
+        A `wrench` at the tip, 6 in tip axes, replaces the scene's.
+        """
+        motion = self.motion(y)
+        wrench = self.chain.tip_wrench if wrench is None else wrench
+        solved = self._solve(motion, self.inputs(u), wrench, self._inertia(motion))
+        return self._dual(motion, solved)
+
+    def _dual(self, motion: Motion, solved: Accelerations) -> list[Scalar]:
+        """Accelerations in the paper's sense, v' = a - omega x v: components in axes that turn along."""
+        turning = subtract(solved.linear, cross(motion.angular, motion.linear))
+        dual = [*solved.angular, *turning]
+        return [*(dual[i] for i in self.pose.directions), *solved.joints]
+
+    def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
+        """Time derivative of y: rates of joints and wrist, base and joint accelerations."""
+        return [*self.motion(y).joint_rates, *self.inputs(u).wrist_rates, *self.accelerations(y, u)]
+
+    def reaction_wrenches(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
+        """The paper's T (21): fx, fy, fz [N], tx, ty [N m] that each joint transmits, in joint axes, 5 n."""
+        motion = self.motion(y)
+        solved = self._solve(motion, self.inputs(u), self.chain.tip_wrench, self._inertia(motion))
+        reactions = self._reactions(motion, solved)
+        return [entry for force, torque in reactions for entry in (*force, *torque[:2])]
+
+    def _missing_wrenches(self, motion: Motion, given: Accelerations) -> list[Any]:
+        """Force and torque on base and links that given accelerations need besides the tip's wrench."""
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        needed = minimal.body_wrenches(self.chain, rotations, motion.angular, motion.joint_rates, given)
+        acting = self._acting(motion, Inputs(ZERO, ZERO, [], []), self.chain.tip_wrench)
+        return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(needed, acting, strict=True)]
+
+    def _reactions(self, motion: Motion, solved: Accelerations) -> Sequence[Any]:
+        """Force and torque that each joint transmits to its link, in joint axes."""
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        missing = self._missing_wrenches(motion, solved)
+        return minimal.passed_to_base(self.chain, rotations, missing).reactions

@@ -1,0 +1,63 @@
+"""Momentum of a scene's whole system, and the external wrench that changes it, over CasADi symbols.
+
+Joint torques, springs, dampers and the motion of the arm are internal: only base actuators and a wrench at
+the tip act from outside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from dq_space_arm_env.algebra.vectors import add
+from dq_space_arm_env.dynamics import minimal
+from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion, Motion
+from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
+
+Scalar = Any
+Scalars = Sequence[Scalar]
+
+
+class SpaceArmMomentum:
+    """Momentum of a robot; all vectors have 3 entries in base axes, y is a state without the pose."""
+
+    def __init__(self, equations: EquationsOfMotion) -> None:
+        self._field, self._chain = equations, equations.chain
+
+    @property
+    def mass(self) -> Scalar:
+        """Mass of the whole system, kg."""
+        return sum((link.body.mass for link in self._chain.links), start=self._chain.base.mass)
+
+    @property
+    def springs(self) -> tuple[list[float], list[float]]:
+        """Stiffness [N m/rad] and damping [N m s/rad] of the joints, n each."""
+        links = self._chain.links
+        return [link.stiffness for link in links], [link.damping for link in links]
+
+    def momentum(self, y: Scalars) -> tuple[Scalars, Scalars, Scalars]:
+        """Linear momentum, angular momentum about the center of mass, and the latter in the base frame."""
+        motion, mass_matrix = self._mass_matrix(y)
+        linear, angular = mass_matrix.momentum(motion.angular, motion.linear, motion.joint_rates)
+        return linear, angular, mass_matrix.center
+
+    def base_twist(self, y: Scalars, linear: Scalars, angular: Scalars) -> list[Scalar]:
+        """Twist of the base, angular then linear, that gives the system a momentum; y's own is not read."""
+        motion, mass_matrix = self._mass_matrix(y)
+        turning, moving = mass_matrix.base_velocity(linear, angular, motion.joint_rates)
+        return [*turning, *moving]
+
+    def external_wrench(self, y: Scalars, u: Scalars) -> tuple[Scalars, Scalars]:
+        """External force and torque on the system, about the base origin; zeros without any."""
+        motion, inputs = self._field.motion(y), self._field.inputs(u)
+        rotations = minimal.joint_rotations(self._chain, motion.joint_angles)
+        tip = self._field.tip_forces(motion, rotations, self._chain.tip_wrench)
+        return add(inputs.force, tip.force), add(inputs.torque, tip.torque)
+
+    def joint_inertia(self, y: Scalars) -> list[list[Scalar]]:
+        """Inertia that the joints feel while the base floats freely."""
+        return self._mass_matrix(y)[1].joint_inertia()
+
+    def _mass_matrix(self, y: Scalars) -> tuple[Motion, MassMatrix]:
+        motion = self._field.motion(y)
+        return motion, MassMatrix(self._chain, minimal.joint_rotations(self._chain, motion.joint_angles))

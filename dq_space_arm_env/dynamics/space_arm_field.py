@@ -1,0 +1,225 @@
+"""A scene's equations of motion as a vector field over CasADi symbols, with exact derivatives to order 2.
+
+Derivatives come from the inverse dynamics at the solved accelerations: M a + ID(y, 0) = f is differentiated,
+never its solution, which only solves for more right-hand sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi
+
+from dq_space_arm_env.algebra.symbolic import column, columns, dense_entries, symbols, zeros
+from dq_space_arm_env.algebra.vectors import add, cross, subtract
+from dq_space_arm_env.dynamics import minimal
+from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
+from dq_space_arm_env.dynamics.forward import Inertia
+from dq_space_arm_env.dynamics.minimal import ZERO, Accelerations
+from dq_space_arm_env.dynamics.momentum_balance import SpaceArmMomentum
+from dq_space_arm_env.dynamics.residual import Residual
+
+Scalar = Any
+Matrix = Any
+
+
+class SpaceArmField(EquationsOfMotion):
+    """Vector field of a scene in minimal coordinates."""
+
+    name = "minimal"
+
+    @property
+    def momentum_balance(self) -> SpaceArmMomentum:
+        """Momentum of the whole system, and the external wrench that changes it."""
+        return SpaceArmMomentum(self)
+
+    @property
+    def beside_momentum(self) -> SpaceArmField:
+        """The same equations, formulated for use beside the momentum, which needs the mass matrix anyway."""
+        formulation = self._given_formulation or "minimal_coordinates"
+        return SpaceArmField(self.chain, self.layout, self.parameters, formulation)
+
+    def linearized_rates(
+        self, y: Sequence[Scalar], u: Sequence[Scalar]
+    ) -> tuple[list[Scalar], Matrix, Matrix]:
+        """Time derivative of y and its Jacobians by y and u.
+
+        With M a = f - ID(y, 0), differentiating the inverse dynamics at the solved accelerations gives da =
+        -M^-1 dID: far fewer operations than differentiating through the factorization.
+        """
+        motion, inputs = self.motion(y), self.inputs(u)
+        inertia = self._inertia(motion, many=True)
+        solved = self._solve(motion, inputs, self.chain.tip_wrench, inertia)
+        by_y = self._body_residual_jacobian(y, solved)
+        # da/dy = -M^-1 dID/dy, column by column; da/du = M^-1 df/du.
+        responses = [
+            self._response(inertia, [-e for e in dense_entries(by_y[:, i])]) for i in range(self.n_y)
+        ]
+        response = columns(*(column(*entries) for entries in responses), rows=len(self.rate_indices))
+        rates = [*motion.joint_rates, *inputs.wrist_rates, *self._dual(motion, solved)]
+        angles_by_y, angles_by_u, turning_by_y = self._simple_jacobians(y)
+        jacobian_y = casadi.vertcat(angles_by_y, response + turning_by_y)
+        inputs_one_by_one = (self._input_response(inertia, i) for i in range(self.n_u))
+        by_u = columns(*inputs_one_by_one, rows=len(self.rate_indices))
+        return rates, jacobian_y, casadi.vertcat(angles_by_u, by_u)
+
+    def jacobian_along(
+        self,
+        y: Sequence[Scalar],
+        u: Sequence[Scalar],
+        rates: Sequence[Scalar],
+        by_y: Matrix,
+        by_u: Matrix,
+        direction: Sequence[Scalar],
+    ) -> Matrix:
+        """Derivative of by_y times a fixed direction v with respect to (y, u), from first derivatives.
+
+        The residual R = M a + ID(y, 0) - f vanishes, and along v so does T = R_a b + R_y v, with b the change
+        of the accelerations along v. Differentiating T = 0 once more gives b_z = -M^-1 (T_y + T_a a_z), with
+        z = (y, u): the factorization of M is not differentiated.
+        """
+        rows, n_y = list(self.rate_indices), self.n_y
+        acceleration, by_state = self._inertial(y, rates, by_y, by_u)
+        # b = a_y v: the change of the accelerations along v.
+        along = casadi.densify(casadi.mtimes(by_state[:, :n_y], column(*direction))).nonzeros()
+        n = len(self.pose.directions)
+        change = [*self.pose.full_twist(along[:n]), *along[n:]]
+        by_accelerations, by_motion = self._residual(symbols("v", n_y)).along(
+            y, acceleration, direction, change
+        )
+        # T_z = T_y + T_a a_z.
+        total = casadi.horzcat(by_motion, zeros(by_motion.shape[0], self.n_u))
+        total = total + casadi.mtimes(by_accelerations, by_state)
+        inertia = self._inertia(self.motion(y), many=True)
+        columns_of_total = (dense_entries(total[:, i]) for i in range(total.shape[1]))
+        sides = (self._on_base([-entry for entry in entries]) for entries in columns_of_total)
+        responses = [self._response(inertia, side) for side in sides]
+        result = zeros(n_y, n_y + self.n_u)
+        result[rows, :] = columns(*(column(*entries) for entries in responses), rows=len(rows))
+        # omega x v is bilinear: its Jacobian changes along a direction like the Jacobian at that direction.
+        result[rows, :n_y] = result[rows, :n_y] + self._simple_jacobians(direction)[2]
+        return casadi.sparsify(result)
+
+    def _inertial(
+        self, y: Sequence[Scalar], rates: Sequence[Scalar], by_y: Matrix, by_u: Matrix
+    ) -> tuple[list[Scalar], Matrix]:
+        """Accelerations seen by an inertial observer, and their Jacobian with respect to (y, u)."""
+        rows = list(self.rate_indices)
+        motion = self.motion(y)
+        dual = self.pose.full_twist([rates[i] for i in self.pose.twist_indices])
+        turning = cross(motion.angular, motion.linear)
+        joints = [rates[i] for i in rows[len(self.pose.directions) :]]
+        by_state = casadi.horzcat(by_y[rows, :] - self._simple_jacobians(y)[2], by_u[rows, :])
+        # As seen by an inertial observer moving along, the velocity of the base changes no acceleration.
+        linear = [
+            i for i, axis in zip(self.pose.twist_indices, self.pose.directions, strict=True) if axis > 2
+        ]
+        by_state[:, linear] = zeros(len(rows), len(linear))
+        return [*dual[:3], *add(dual[3:], turning), *joints], casadi.sparsify(by_state)
+
+    def rates_hessian(
+        self,
+        y: Sequence[Scalar],
+        u: Sequence[Scalar],
+        rates: Sequence[Scalar],
+        by_y: Matrix,
+        by_u: Matrix,
+        multiplier: Sequence[Scalar],
+    ) -> Matrix:
+        """Second derivative of multiplier . rates with respect to (y, u), symmetric, from first derivatives.
+
+        With w = M^-1 multiplier, differentiating w . (M a + ID(y, 0) - f) = 0 twice gives multiplier . a_zz =
+        -[(w . ID)_zz + G' a_z + (G' a_z)'], G = d(M w)/dy: the factorization of M is not differentiated.
+        """
+        rows = list(self.rate_indices)
+        acceleration, by_state = self._inertial(y, rates, by_y, by_u)
+        # w = M^-1 multiplier: M is symmetric.
+        weights = self.pose.full_twist([multiplier[i] for i in self.pose.twist_indices])
+        response = self._inertia(self.motion(y), many=True).solve(
+            weights[3:], weights[:3], [multiplier[i] for i in rows[len(self.pose.directions) :]]
+        )
+        by_accelerations, curvature = self._residual(symbols("v", self.n_y)).weighted(
+            y, acceleration, [*response.angular, *response.linear, *response.joints]
+        )
+        coupling = casadi.mtimes(by_accelerations.T, by_state)
+        n_y, n_u = self.n_y, self.n_u
+        coupling = casadi.vertcat(coupling, zeros(n_u, n_y + n_u))
+        # The paper's accelerations are those of an inertial observer less omega x v, which is bilinear.
+        free = symbols("v", n_y)
+        moving = self.motion(free)
+        bilinear = casadi.dot(column(*weights[3:]), column(*cross(moving.angular, moving.linear)))
+        curvature = curvature + casadi.jacobian(casadi.gradient(bilinear, column(*free)), column(*free))
+        curvature = casadi.diagcat(curvature, zeros(n_u, n_u))
+        return casadi.sparsify(-(curvature + coupling + coupling.T))
+
+    def _simple_jacobians(self, y: Sequence[Scalar]) -> tuple[Matrix, Matrix, Matrix]:
+        """Constant Jacobians of the angles' rates by y and u, and the Jacobian of -omega x v by y."""
+        free_y = symbols("f", self.n_y)
+        free_u = symbols("g", self.n_u)
+        motion = self.motion(free_y)
+        angles = column(*motion.joint_rates, *self.inputs(free_u).wrist_rates)
+        turning = [*ZERO, *(-entry for entry in cross(motion.angular, motion.linear))]
+        kept = column(*(turning[i] for i in self.pose.directions), *[0.0] * len(self.chain.links))
+        by_y = casadi.substitute(
+            casadi.jacobian(kept, column(*free_y)), column(*free_y), casadi.densify(column(*y))
+        )
+        return casadi.jacobian(angles, column(*free_y)), casadi.jacobian(angles, column(*free_u)), by_y
+
+    def _body_residual_jacobian(self, y: Sequence[Scalar], solved: Accelerations) -> Matrix:
+        """Jacobian by y of the body wrenches and joint torques that fixed accelerations need.
+
+        A joint's angle turns the wrench that reaches the body before it. At a fixed angle the effect is the
+        same if the body after the joint takes, besides its own, the wrench's change z x (force, torque).
+        """
+        n = len(self.chain.links)
+        free, acceleration = symbols("v", self.n_y), symbols("a", 6 + n)
+        motion = self.motion(free)
+        given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
+        passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
+        missing = [entry for pair in self._missing_wrenches(motion, given) for part in pair for entry in part]
+        by_y = casadi.jacobian(column(*missing, *(-torque for torque in passive)), column(*free))
+        values = casadi.densify(column(*y, *solved.angular, *solved.linear, *solved.joints))
+        by_y = casadi.substitute(by_y, column(*free, *acceleration), values)
+        angles = self._in_y(self.layout.state.joint_angles)
+        for j, (force, torque) in enumerate(self._reactions(self.motion(y), solved)):
+            turned = column(-force[1], force[0], 0.0, -torque[1], torque[0], 0.0)
+            rows = list(range(6 * (j + 1), 6 * (j + 2)))
+            by_y[rows, angles[j]] = by_y[rows, angles[j]] + turned
+        return casadi.sparsify(by_y)
+
+    def _residual(self, y: Sequence[Scalar]) -> Residual:
+        """Forces that given accelerations need, minus those that depend on y, over symbols."""
+        n = len(self.chain.links)
+        acceleration = symbols("a", 6 + n)
+        motion = self.motion(y)
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
+        needed = minimal.inverse_dynamics(self.chain, rotations, motion.angular, motion.joint_rates, given)
+        tip = self.tip_forces(motion, rotations, self.chain.tip_wrench)
+        passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
+        joints = [
+            bias - other - load for bias, other, load in zip(needed.joints, passive, tip.joints, strict=True)
+        ]
+        forces = [*subtract(needed.force, tip.force), *subtract(needed.torque, tip.torque), *joints]
+        free = (*self.pose.directions, *range(6, 6 + n))
+        return Residual(column(*forces), y, acceleration, free)
+
+    def _on_base(self, forces: Sequence[Scalar]) -> list[Scalar]:
+        """Generalized forces (force, torque, joints) as wrenches on the bodies and joint torques."""
+        return [*forces[:6], *[0.0] * (6 * len(self.chain.links)), *forces[6:]]
+
+    def _response(self, inertia: Inertia, forces: Sequence[Scalar]) -> list[Scalar]:
+        """Accelerations (free directions, joints) from wrenches on the bodies and joint torques."""
+        n = len(self.chain.links)
+        if all(casadi.SX(entry).is_zero() for entry in forces):
+            return [0.0] * (len(self.pose.directions) + n)
+        wrenches = [(forces[6 * i : 6 * i + 3], forces[6 * i + 3 : 6 * i + 6]) for i in range(n + 1)]
+        solved = inertia.accelerations(wrenches, forces[6 * (n + 1) :])
+        dual = [*solved.angular, *solved.linear]
+        return [*(dual[i] for i in self.pose.directions), *solved.joints]
+
+    def _input_response(self, inertia: Inertia, index: int) -> Matrix:
+        unit = self.inputs([1.0 if i == index else 0.0 for i in range(self.n_u)])
+        forces = [*unit.force, *unit.torque, *unit.joint_torques]
+        return column(*self._response(inertia, self._on_base(forces)))

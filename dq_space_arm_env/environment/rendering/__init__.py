@@ -1,5 +1,0 @@
-"""Pictures of a scene: solids made from its data, a camera, a compiled depth buffer, and a window."""
-
-from dq_space_arm_env.environment.rendering.renderer import Renderer
-
-__all__ = ["Renderer"]

@@ -1,0 +1,127 @@
+"""The options of `reset`: initial state and target given instead of drawn."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dq_space_arm_env.algebra import dual_quaternion
+from dq_space_arm_env.kernels import Kernels
+from dq_space_arm_env.scene.start import PLANAR_POSE, target_entries
+from dq_space_arm_env.task.step_report import STATE_LIMIT
+
+Array = NDArray[Any]
+
+_OPTIONS = ("nominal", "initial_state", "target")
+
+
+class GivenStart(NamedTuple):
+    """The part of a start that is given, for one episode or for B; None for what is drawn.
+
+    With a state come the scene's nominal masses, and its nominal target unless that is given too.
+    """
+
+    state: Array | None = None  # shape (n_x,) or (B, n_x), units of the state
+    target: Array | None = None  # q_{D/I}, shape (8,) or (B, 8), dimensionless and m
+
+    def apply(self, kernels: Kernels, x: Array, parameters: Array) -> None:
+        """Overwrite drawn states, (n_x,) or (B, n_x), and parameters, (n_p,) or (B, n_p), in place."""
+        if self.state is not None:
+            x[...] = self.state
+        target = self.target
+        if target is not None:
+            entries = list(target_entries(kernels.scene))
+            parameters[..., : len(entries)] = target[..., entries]
+        elif self.state is not None:
+            target = np.array(kernels.scene.target.pose.dual_quaternion)
+        if target is not None:
+            _give_sign_of_target(kernels, x, target)
+
+
+def given_start(kernels: Kernels, options: dict[str, Any]) -> GivenStart:
+    """Check the options of `DQSpaceArmEnv.reset`.
+
+    Raises:
+        ValueError: If an option is unknown; if a number is missing or not finite; if the pose of the base or
+            the target is not a unit dual quaternion; or if the scene's target is a constant.
+    """
+    unknown = set(options) - set(_OPTIONS)
+    if unknown:
+        raise ValueError(f"options: {sorted(unknown)} unknown; choose from {', '.join(_OPTIONS)}")
+    state, target = options.get("initial_state"), options.get("target")
+    if state is not None:
+        if options.get("nominal", False):
+            raise ValueError("options: nominal and initial_state exclude each other")
+        state = _checked_state(kernels, state)
+    elif options.get("nominal", False):
+        state = kernels.layout.initial_state
+    return GivenStart(state, None if target is None else _checked_target(kernels, target))
+
+
+def _checked_state(kernels: Kernels, state: Any) -> Array:
+    """A state with the rounding errors of its base pose removed."""
+    x = _finite("initial_state", state, kernels.n_x)
+    where = kernels.layout.state.pose
+    stored = list(PLANAR_POSE) if kernels.layout.planar else list(range(8))
+    pose = np.zeros(8)
+    pose[stored] = x[where]
+    x[where] = _unit_pose("initial_state has a base pose", pose)[stored]
+    check_size("options: initial_state", x)
+    return x
+
+
+def check_size(name: str, state: Array) -> None:
+    """Raise ValueError for a state, (n_x,), so large that it counts as diverged."""
+    size = math.hypot(*state.tolist())
+    if size > STATE_LIMIT:
+        raise ValueError(
+            f"{name} has a norm of {size:.3g}, should be at most {STATE_LIMIT:g}, beyond which a simulation "
+            "counts as diverged; positions are small if the origin is near the spacecraft"
+        )
+
+
+def _checked_target(kernels: Kernels, target: Any) -> Array:
+    """A target with its rounding errors removed, if it is a pose that the compiled code can take."""
+    entries = target_entries(kernels.scene)
+    if not entries:
+        raise ValueError(
+            f"options: target; scene {kernels.scene.name!r} has the same in every episode, a constant of its "
+            "machine code: give the scene a spread of target_position or target_rotation"
+        )
+    pose = _unit_pose("target is a pose", _finite("target", target, 8))
+    fixed = [index for index in range(8) if index not in entries]
+    if np.abs(pose[fixed]).max(initial=0.0) > 1e-6:
+        raise ValueError(
+            f"options: target {pose} leaves the plane, its entries {fixed} should be 0 in a planar scene"
+        )
+    pose[fixed] = 0.0
+    return pose
+
+
+def _finite(name: str, value: Any, size: int) -> Array:
+    numbers = np.array(value, dtype=np.float64)
+    if numbers.shape != (size,) or not np.isfinite(numbers).all():
+        raise ValueError(
+            f"options: {name} {numbers} of shape {numbers.shape}, should be finite numbers of shape {(size,)}"
+        )
+    return numbers
+
+
+def _unit_pose(what: str, pose: Array) -> Array:
+    """A unit dual quaternion, |q_r| = 1 and q_r . q_d = 0, with its rounding errors removed."""
+    length, overlap = math.hypot(*pose[:4]), float(np.dot(pose[:4], pose[4:]))
+    if abs(length - 1.0) > 1e-6 or abs(overlap) > 1e-6 * (1.0 + math.hypot(*pose[4:])):
+        raise ValueError(
+            f"options: {what} with |q_r| = {length:.9g}, q_r . q_d = {overlap:.3g}; "
+            "a unit dual quaternion has 1 and 0"
+        )
+    return np.array(dual_quaternion.normalize(tuple(pose.tolist())))
+
+
+def _give_sign_of_target(kernels: Kernels, x: Array, target: Array) -> None:
+    """Give q_{e0/I} the sign with q_{G/I,r} . q_{D/I,r} >= 0: q and -q are one pose but cost differently."""
+    alignment = np.sum(kernels.tip_pose(x)[..., :4] * target[..., :4], axis=-1, keepdims=True)
+    x[..., kernels.layout.state.pose] *= np.where(alignment < 0.0, -1.0, 1.0)

@@ -1,0 +1,184 @@
+"""The sub-environments of the vector environment: their states, and the compiled calls that move them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from sys import getrefcount
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.compiler.random_draws import draws_kernel, generator_states
+from dq_space_arm_env.environment.reset_options import GivenStart
+from dq_space_arm_env.kernels import Kernels
+from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
+from dq_space_arm_env.scene.start import number_of_draws
+from dq_space_arm_env.task.step_report import FLAGS, MEMORY, REPORT
+
+Array = NDArray[Any]
+Rows = NDArray[np.int64]
+
+_TERMINATED, _DIVERGED = FLAGS.index("terminated"), FLAGS.index("diverged")
+_SPARES = 4  # a training loop holds the results of the last step or two
+
+
+class StepResult(NamedTuple):
+    """Arrays that a step fills."""
+
+    observation: Array  # shape (count, n_obs)
+    report: NDArray[np.float64]  # a row for each name in REPORT, shape (len(REPORT), count)
+    flags: NDArray[np.bool_]  # a row for each name in FLAGS, shape (len(FLAGS), count)
+
+
+class SubEnvironments:
+    """States of sub-environments, and what happens to them.
+
+    A step reads one set of states and writes another, then the two swap; so a step that raises has changed
+    nothing.
+    """
+
+    def __init__(self, kernels: Kernels, count: int) -> None:
+        self.count, self._kernels = count, kernels
+        start, observe = kernels.kernel("environment_start"), kernels.kernel("environment_observe")
+        sizes = {spec.name: spec.stride for spec in (*start.outputs, *observe.outputs)}
+        self.x, self._x_next = (np.zeros((count, kernels.n_x), kernels.dtype) for _ in range(2))
+        self._memory, self._memory_next = (np.zeros((count, len(MEMORY)), kernels.dtype) for _ in range(2))
+        self.parameters = np.zeros((count, sizes.get("parameters", 0)), kernels.dtype)
+        self._draws = np.zeros((count, number_of_draws(kernels.scene)))
+        self._generators = np.zeros((count, 4), dtype=np.uint64)
+        self._results = _ResultArrays((count, sizes["observation"]), kernels.dtype)
+        self._action_shape = (count, kernels.n_u)
+
+        drawing = BoundKernel(draws_kernel(self._draws.shape[1]))
+        self._draw = KernelCall(drawing, {"states": self._generators, "draws": self._draws})
+        constant = {"draws": self._draws, "parameters": self.parameters}
+        self._start = KernelCall(start, constant)
+        self._observe = KernelCall(observe, constant | self._results.fresh()._asdict())
+        self._steps = self._step_calls(kernels)
+        self._swap()
+        self._steps_next = self._step_calls(kernels)
+        self._swap()
+
+    def _step_calls(self, kernels: Kernels) -> dict[type, KernelCall]:
+        """The step by the type of the actions, from the present arrays of states to the others."""
+        arrays = {"x": self.x, "x_kept": self._x_next, "parameters": self.parameters}
+        arrays |= {"memory": self._memory, "memory_kept": self._memory_next}
+        arrays |= self._results.fresh()._asdict()
+        names = {np.float64: "environment_step", np.float32: "environment_step_float32_actions"}
+        return {kind: KernelCall(kernels.kernel(name), arrays) for kind, name in names.items()}
+
+    def _swap(self) -> None:
+        self.x, self._x_next = self._x_next, self.x
+        self._memory, self._memory_next = self._memory_next, self._memory
+
+    def seed(self, rows: Rows, seeds: Sequence[int | None]) -> None:
+        """Seed random generators, unpredictably for None; a negative seed is a ValueError."""
+        self._generators[rows] = generator_states(seeds)
+
+    def begin(self, rows: Rows, given: GivenStart | None = None) -> None:
+        """Put sub-environments at the start of an episode, drawn except for what is given."""
+        if given is None or given.state is None:
+            self._draw.on_rows(rows)
+        else:
+            self._draws[rows] = 0.0
+        self._start.place(x=self.x, memory=self._memory)
+        self._start.on_rows(rows)
+        if given is not None:
+            x, parameters = self.x[rows], self.parameters[rows]
+            given.apply(self._kernels, x, parameters)
+            self.x[rows], self.parameters[rows] = x, parameters
+
+    def observe(self, rows: Rows, result: StepResult | None = None) -> StepResult:
+        """Observe without a step: no costs, no end of an episode.
+
+        Without arrays for the result it takes new ones, whose other rows are arbitrary.
+        """
+        seen = self._results.fresh() if result is None else result
+        self._observe.place(x=self.x, memory=self._memory, memory_kept=self._memory, **seen._asdict())
+        self._observe.on_rows(rows)
+        return seen
+
+    def observe_states(self, x: Array) -> Array:
+        """Observations of other states, shape (count, n_x), at the present times."""
+        seen = self._results.fresh()
+        x = np.ascontiguousarray(x, self.x.dtype)
+        self._observe.place(x=x, memory=self._memory, memory_kept=self._memory_next, **seen._asdict())
+        self._observe.on_rows(np.arange(self.count))
+        return seen.observation
+
+    def move(self, rows: Rows, x: Array) -> None:
+        """Change states in mid-episode."""
+        self.x[rows] = x
+        self.observe(rows)  # the memory holds cost terms of the state
+
+    def step(self, actions: ArrayLike, resetting: Rows) -> StepResult:
+        """Step all sub-environments; actions of those about to be reset do not matter.
+
+        Raises:
+            ValueError: If the actions have a wrong shape, or NaN where they matter; nothing has changed then.
+        """
+        values = np.asarray(actions)
+        if values.shape != self._action_shape:
+            raise ValueError(f"actions: shape {values.shape}, should be {self._action_shape}")
+        values = np.ascontiguousarray(values, np.float32 if values.dtype == np.float32 else np.float64)
+        result, call = self._results.take(), self._steps[values.dtype.type]
+        observation, report, flags = result
+        call.place(action=values, observation=observation, report=report, flags=flags)
+        call(self.count, self._kernels.threads)
+        # NaN diverges, and hardly anything else does: looking for it after the step costs nothing.
+        if np.count_nonzero(flags[_TERMINATED]) and flags[_DIVERGED].any():
+            _refuse_nan(values, resetting)
+        self._swap()
+        self._steps, self._steps_next = self._steps_next, self._steps
+        return result
+
+
+def _refuse_nan(actions: Array, resetting: Rows) -> None:
+    """Raise ValueError if actions that are NaN made states diverge."""
+    missing = np.asarray(np.isnan(actions).any(axis=1))
+    missing[resetting] = False
+    if missing.any():
+        rows = np.flatnonzero(missing).tolist()
+        raise ValueError(f"actions: NaN for sub-environments {rows}, should be numbers in [-1, 1]")
+
+
+class _ResultArrays:
+    """Hands out arrays for results to which no other reference, or view, is left.
+
+    Fresh arrays of hundreds of kilobytes at every step would have the operating system map and clear pages
+    at every step, which can take as long as the physics.
+    """
+
+    def __init__(self, observation_shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        self._observation_shape, self._dtype = observation_shape, dtype
+        self._spares: list[StepResult] = []
+        self._holders_of_a_spare = _holders(self.fresh())
+        self._next = 0
+
+    def fresh(self) -> StepResult:
+        """New arrays, contents arbitrary."""
+        count = self._observation_shape[0]
+        return StepResult(
+            np.empty(self._observation_shape, self._dtype),
+            np.empty((len(REPORT), count)),
+            np.empty((len(FLAGS), count), np.bool_),
+        )
+
+    def take(self) -> StepResult:
+        """Free arrays, used before if possible, contents arbitrary."""
+        for spare in self._spares:
+            if _holders(spare) == self._holders_of_a_spare:
+                return spare
+        result = self.fresh()
+        if len(self._spares) < _SPARES:
+            self._spares.append(result)
+        else:
+            self._spares[self._next] = result
+            self._next = (self._next + 1) % _SPARES
+        return result
+
+
+def _holders(result: StepResult) -> int:
+    """References to the arrays of a result; a view holds one to the array that it shows."""
+    return getrefcount(result[0]) + getrefcount(result[1]) + getrefcount(result[2])

@@ -1,0 +1,1 @@
+"""Programs of a scene: steps, derivatives, costs, environments, the paper's formulation."""

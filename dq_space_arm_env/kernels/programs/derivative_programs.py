@@ -1,0 +1,218 @@
+"""Programs of derivatives in tangent coordinates: of a step, of the cost, and of the Lagrangian.
+
+First derivatives are exact. `cost_derivatives` gives the Gauss-Newton Hessian, which is positive
+semidefinite; `lagrangian_hessian` and `terminal_cost_hessian` give the exact second derivatives for Newton's
+method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi
+import numpy as np
+
+from dq_space_arm_env.algebra import dual_matrices
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra.symbolic import column, matrix, symbols, zeros
+from dq_space_arm_env.compiler.graph import graph_of
+from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.dynamics import kinematics
+from dq_space_arm_env.integrators import integrator_of
+from dq_space_arm_env.integrators.method import TwiceDifferentiableIntegrator
+from dq_space_arm_env.task.equations import SceneEquations
+
+Scalar = Any
+Scalars = Sequence[Scalar]
+Matrix = Any
+
+
+class DerivativePrograms:
+    """Builds the programs of one scene."""
+
+    def __init__(self, equations: SceneEquations) -> None:
+        self.equations = equations
+        self.scene, self.layout, self.field = equations.scene, equations.layout, equations.field
+        self.chain = equations.chain
+
+    def _state_cost_derivatives(
+        self, x: Scalars, pose: Scalars, velocity: Scalars, emphasis: Scalar = 1.0
+    ) -> tuple[Any, Any]:
+        """Gradient and Gauss-Newton Hessian of the state's cost in tangent coordinates, sparse SX.
+
+        An emphasis multiplies the weights of the pose. The tip's pose moves with the base by q_{e0/I} d
+        q_{G/e0} / 2 for a twist increment d, and with the angles by (27).
+        """
+        field = self.field
+        motion = field.motion(self.equations.y(x))
+        arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
+        base = self.equations.base_pose(x)
+        tip = dq.multiply(base, arm)
+        angles = column(*self.equations.y(x)[: self._angle_count()])
+        left, right = dual_matrices.left_matrix(base), dual_matrices.right_matrix(arm)
+        directions = []
+        for direction in field.pose.directions:
+            twist = [0.0] * 8
+            twist[(1, 2, 3, 5, 6, 7)[direction]] = 0.5
+            moved = dual_matrices.matrix_multiply(left, dual_matrices.matrix_multiply(right, twist))
+            directions.append(column(*moved))
+        by_angles = casadi.mtimes(matrix(left), casadi.jacobian(column(*arm), angles))
+        others = zeros(8, field.n_t - len(directions) - self._angle_count())
+        by_state = casadi.sparsify(casadi.horzcat(*directions, by_angles, others))
+        error = column(*tip) - casadi.DM(self.scene.target.pose.dual_quaternion)
+        weighted = emphasis * casadi.mtimes(casadi.diag(casadi.DM(pose)), by_state)
+        gradient = 2.0 * casadi.mtimes(weighted.T, error)
+        hessian = 2.0 * casadi.mtimes(by_state.T, weighted)
+        start = field.n_t - field.n_y
+        for index, direction in zip(field.pose.twist_indices, field.pose.directions, strict=True):
+            weight = velocity[direction]
+            deviation = self.equations.y(x)[index] - self.scene.target.base_velocity[direction]
+            gradient[start + index] += 2.0 * weight * deviation
+            hessian[start + index, start + index] += 2.0 * weight
+        return gradient, casadi.sparsify(hessian)
+
+    def _angle_count(self) -> int:
+        return self.layout.n_joints + (3 if self.layout.has_wrist else 0)
+
+    def cost(self) -> Program:
+        """Gradient and Gauss-Newton Hessian of the stage cost."""
+        field, cost = self.field, self.scene.cost
+        x, u = symbols("x", field.n_x), symbols("u", field.n_u)
+        gradient, hessian = self._state_cost_derivatives(x, cost.pose, cost.base_velocity)
+        weights = (2.0 * self.layout.control_weight).tolist()
+        outputs = {
+            "lx": casadi.densify(gradient).nonzeros(),
+            "lu": [weight * value for weight, value in zip(weights, u, strict=True)],
+            "lxx": hessian.nonzeros(),
+            "luu": weights,
+        }
+        graph = graph_of("cost_derivatives_graph", {"x": x, "u": u}, outputs)
+        n_t, n_u = field.n_t, field.n_u
+        diagonal = tuple(range(0, n_u * n_u, n_u + 1))
+        program = Program(
+            "cost_derivatives",
+            [Buffer("x", field.n_x), Buffer("u", n_u)],
+            [
+                Buffer("lx", n_t),
+                Buffer("lu", n_u),
+                sparse_buffer("lxx", hessian.sparsity()),
+                Buffer("luu", n_u, positions=diagonal, stride=n_u * n_u),
+            ],
+        )
+        program.call(graph)
+        return program
+
+    def terminal_cost(self) -> Program:
+        """Gradient and Gauss-Newton Hessian of the terminal cost, with an emphasis on its pose."""
+        field, cost = self.field, self.scene.cost
+        x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
+        gradient, hessian = self._state_cost_derivatives(
+            x, cost.terminal_pose, cost.terminal_base_velocity, emphasis
+        )
+        outputs = {"lx": casadi.densify(gradient).nonzeros(), "lxx": hessian.nonzeros()}
+        graph = graph_of("terminal_cost_derivatives_graph", {"x": x, "emphasis": [emphasis]}, outputs)
+        program = Program(
+            "terminal_cost_derivatives",
+            [Buffer("x", field.n_x), Buffer("emphasis", 1)],
+            [Buffer("lx", field.n_t), sparse_buffer("lxx", hessian.sparsity())],
+        )
+        program.call(graph)
+        return program
+
+    def linearize(self, integrator: str) -> Program:
+        """A and B of a step."""
+        field = self.field
+        program = Program(
+            "linearize", [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)], []
+        )
+        a, b = integrator_of(self.scene.simulation, integrator).append_linearization(program, field)
+        program.outputs = [sparse_buffer("A", a), sparse_buffer("B", b)]
+        return program
+
+    def lagrangian_hessian(self, integrator: str) -> Program:
+        """Hessian of stage cost + multiplier . step, in tangent coordinates around x and its successor."""
+        method = integrator_of(self.scene.simulation, integrator)
+        if not isinstance(method, TwiceDifferentiableIntegrator):
+            name = integrator or self.scene.simulation.integrator
+            raise ValueError(f"integrator: {name!r} has no second derivatives, which this asks for")
+        field, layout, cost = self.field, self.layout, self.scene.cost
+        program = Program(
+            "lagrangian_hessian",
+            [
+                Buffer("x", field.n_x),
+                Buffer("u", field.n_u),
+                Buffer("multiplier", field.n_t),
+                Buffer("h", 1, shared=True),
+            ],
+            [],
+        )
+        pattern = method.append_curvature(program, field)
+        curvature, x = casadi.SX.sym("curvature", pattern), symbols("x", field.n_x)
+        state = self._state_cost_hessian(x, cost.pose, cost.base_velocity)
+        effort = casadi.SX(casadi.diag(casadi.DM(2.0 * layout.control_weight)))
+        total = curvature + casadi.triu(casadi.diagcat(state, effort))
+        hessian = casadi.sparsify(casadi.triu2symm(total))
+        blocks = {
+            "Lxx": hessian[: field.n_t, : field.n_t],
+            "Lux": hessian[field.n_t :, : field.n_t],
+            "Luu": hessian[field.n_t :, field.n_t :],
+        }
+        outputs = {name: block.nonzeros() for name, block in blocks.items()}
+        inputs = {"x": x, "curvature": curvature.nonzeros()}
+        program.call(graph_of("lagrangian_hessian_graph", inputs, outputs))
+        program.outputs = [sparse_buffer(name, block.sparsity()) for name, block in blocks.items()]
+        return program
+
+    def terminal_cost_hessian(self) -> Program:
+        """Exact Hessian of the terminal cost, with an emphasis on its pose."""
+        field, cost = self.field, self.scene.cost
+        x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
+        hessian = self._state_cost_hessian(x, cost.terminal_pose, cost.terminal_base_velocity, emphasis)
+        program = Program(
+            "terminal_cost_hessian",
+            [Buffer("x", field.n_x), Buffer("emphasis", 1)],
+            [sparse_buffer("Lxx", hessian.sparsity())],
+        )
+        inputs = {"x": x, "emphasis": [emphasis]}
+        program.call(graph_of("terminal_cost_hessian_graph", inputs, {"Lxx": hessian.nonzeros()}))
+        return program
+
+    def _state_cost_hessian(
+        self, x: Scalars, pose: Scalars, velocity: Scalars, emphasis: Scalar = 1.0
+    ) -> Matrix:
+        """Exact Hessian of the state's cost: Gauss-Newton's, plus the residual times the tip's curvature.
+
+        A twist increment d moves the tip to q_{e0/I} (1 + d / 2 + d^2 / 8) q_{G/e0} to second order, with
+        dual quaternion products.
+        """
+        field, n = self.field, len(self.field.pose.directions)
+        hessian = self._state_cost_derivatives(x, pose, velocity, emphasis)[1]
+        base = self.equations.base_pose(x)
+        increment, angles = symbols("d", n), symbols("angle", self._angle_count())
+        n_joints = self.layout.n_joints
+        arm = kinematics.arm_pose(self.chain, angles[:n_joints], angles[n_joints:])
+        half = dq.from_vector([0.5 * entry for entry in field.pose.full_twist(increment)])
+        square = dq.multiply(half, half)
+        turned = [a + 0.5 * b for a, b in zip(half, square, strict=True)]
+        turned[0] = turned[0] + 1.0
+        tip = column(*dq.multiply(base, dq.multiply(turned, arm)))
+        error = column(*self.equations.tip(x)) - casadi.DM(self.scene.target.pose.dual_quaternion)
+        residual = casadi.SX.sym("residual", 8)
+        moved = column(*increment, *angles)
+        curvature = casadi.hessian(casadi.dot(residual, tip), moved)[0]
+        weighted = casadi.densify(2.0 * emphasis * casadi.DM(pose) * error)
+        values = column(*[0.0] * n, *self.equations.y(x)[: len(angles)])
+        curvature = casadi.substitute(
+            [curvature], [casadi.vertcat(residual, moved)], [casadi.densify(casadi.vertcat(weighted, values))]
+        )[0]
+        rest = field.n_t - curvature.shape[0]
+        return casadi.sparsify(hessian + casadi.diagcat(curvature, zeros(rest, rest)))
+
+
+def sparse_buffer(name: str, pattern: Any) -> Buffer:
+    """Output for the nonzeros (by column) of a row-major matrix; the rest of the array stays as it is."""
+    rows, columns = pattern.get_triplet()
+    count, width = pattern.shape
+    positions = np.array(rows, dtype=int) * width + np.array(columns, dtype=int)
+    return Buffer(name, pattern.nnz(), positions=tuple(positions.tolist()), stride=count * width)

@@ -1,0 +1,109 @@
+"""The programs of the environments: start an episode, observe, step, and compare goals.
+
+The equations are those of `task.episode`; here they become programs. Target, masses and inertias are inputs
+(`parameters`) where the scene draws them for each episode; other scenes have no such input.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+from dq_space_arm_env.compiler.graph import Graph, trace
+from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.integrators import integrator_of
+from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.scene.start import number_of_draws
+from dq_space_arm_env.task import episode
+from dq_space_arm_env.task.equations import SceneEquations
+from dq_space_arm_env.task.step_report import MEMORY
+
+
+class EnvironmentPrograms:
+    """Builds the programs of one scene's environments by name."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.equations = SceneEquations.parametric(scene)
+        self._parameters = self.equations.field.parameters
+
+    def build(self, name: str, integrator: str) -> Program:
+        """Trace one of `PROGRAMS`; KeyError for an unknown program or integrator."""
+        return PROGRAMS[name](self, integrator)
+
+    def _inputs(self, *buffers: Buffer) -> list[Buffer]:
+        """Inputs of a program, the parameters after the first of them."""
+        if not self._parameters:
+            return list(buffers)
+        return [buffers[0], Buffer("parameters", len(self._parameters)), *buffers[1:]]
+
+    def _start(self, integrator: str) -> Program:
+        """From draws to initial states, memory and parameters, for the listed sub-environments."""
+        count = number_of_draws(self.scene)
+        graph = trace("start_graph", {"draws": count}, partial(episode.start, self.scene))
+        buffers = [Buffer(name, size) for name, size in graph.outputs]
+        program = Program(
+            "environment_start", [Buffer("draws", count, dtype="float64")], buffers, indexed=True
+        )
+        program.call(graph)
+        return program
+
+    def _observe(self, integrator: str) -> Program:
+        """Observations of the present states, without a step, for the listed sub-environments."""
+        sizes = {"x": self.equations.field.n_x, "memory": len(MEMORY)}
+        observe = partial(episode.observe, self.equations)
+        graph = trace("observe_graph", sizes, observe, parameters=self._parameters)
+        inputs = self._inputs(*(Buffer(name, size) for name, size in sizes.items()))
+        program = Program("environment_observe", inputs, _outputs(graph), indexed=True)
+        program.call(graph)
+        return program
+
+    def _goal(self, integrator: str) -> Program:
+        """Comparison of tip poses with any goals."""
+        graph = trace("goal_graph", {"achieved": 8, "desired": 8}, partial(episode.compare_goals, self.scene))
+        dtypes = {"errors": "float64", "cost": "float64", "is_success": "bool"}
+        program = Program(
+            "environment_goal",
+            [Buffer(name, size) for name, size in graph.inputs],
+            [Buffer(name, size, dtype=dtypes[name]) for name, size in graph.outputs],
+        )
+        program.call(graph)
+        return program
+
+    def _step(self, integrator: str, name: str, actions: str) -> Program:
+        """From actions to inputs, motion, observation, reward and end of the episode."""
+        equations, simulation = self.equations, self.scene.simulation
+        n_x, n_u, n_memory = equations.field.n_x, equations.field.n_u, len(MEMORY)
+        inputs = Buffer("x", n_x), Buffer("memory", n_memory), Buffer("action", n_u, dtype=actions)
+        program = Program(name, self._inputs(*inputs), [])
+        program.call(trace("inputs_graph", {"action": n_u}, partial(episode.command, equations)))
+        program.call(trace("time_step_graph", {}, lambda: {"h": [simulation.dt]}))
+        integrator_of(simulation, integrator).append_step(program, equations.field)
+        sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": n_memory}
+        report = trace("report_graph", sizes, partial(episode.step, equations), parameters=self._parameters)
+        program.call(report)
+        program.outputs = _outputs(report)
+        return program
+
+
+def _outputs(graph: Graph) -> list[Buffer]:
+    """Buffers of a graph's outputs; report and flags have a row for each of their entries."""
+    columns = {"report": "float64", "flags": "bool"}
+    return [
+        Buffer(name, size, dtype=columns.get(name, ""), by_column=name in columns)
+        for name, size in graph.outputs
+    ]
+
+
+PROGRAMS: Mapping[str, Callable[[EnvironmentPrograms, str], Program]] = {
+    "environment_start": EnvironmentPrograms._start,
+    "environment_observe": EnvironmentPrograms._observe,
+    "environment_goal": EnvironmentPrograms._goal,
+    **{
+        name: partial(EnvironmentPrograms._step, name=name, actions=actions)
+        for name, actions in (
+            ("environment_step", "float64"),
+            ("environment_step_float32_actions", "float32"),
+        )
+    },
+}

@@ -1,0 +1,271 @@
+"""The programs of a scene, one per function of `Kernels`, traced on demand.
+
+A program's inputs are arrays with one row per state: `x` (n_x), `u` (n_u), and others by name; `h`, the time
+step in s, is shared by all rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import poses, screw
+from dq_space_arm_env.algebra.vectors import matrix_vector
+from dq_space_arm_env.compiler.graph import trace
+from dq_space_arm_env.compiler.program import Buffer, Program
+from dq_space_arm_env.dynamics import kinematics, minimal
+from dq_space_arm_env.dynamics.vector_field import split_state
+from dq_space_arm_env.integrators import integrator_of
+from dq_space_arm_env.integrators.dormand_prince import append_measured_step
+from dq_space_arm_env.integrators.momentum import MomentumPreserving
+from dq_space_arm_env.kernels.programs.derivative_programs import DerivativePrograms
+from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
+from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.task.equations import SceneEquations, total
+
+Scalar = Any
+Scalars = Sequence[Scalar]
+
+
+class ScenePrograms:
+    """Builds the programs of one scene by name."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.equations = SceneEquations.nominal(scene)
+        self.chain, self.layout = self.equations.chain, self.equations.layout
+        self.field = self.equations.field
+        derivatives = self._derivatives = DerivativePrograms(self.equations)
+        quadratic = QuadraticPrograms(self.equations)
+        self._builders: Mapping[str, Callable[[], Program]] = {
+            "forward_dynamics": self._forward_dynamics,
+            "forward_dynamics_with_tip_wrench": self._forward_dynamics_with_tip_wrench,
+            "reaction_wrenches": self._reaction_wrenches,
+            "tip_pose": self._tip_pose,
+            "frame_poses": self._frame_poses,
+            "momentum": self._momentum,
+            "energy": self._energy,
+            "cost": self._cost,
+            "terminal_cost": self._terminal_cost,
+            "emphasized_terminal_cost": self._emphasized_terminal_cost,
+            "cost_derivatives": derivatives.cost,
+            "terminal_cost_derivatives": derivatives.terminal_cost,
+            "terminal_cost_hessian": derivatives.terminal_cost_hessian,
+            "quadratic_cost": quadratic.cost,
+            "quadratic_cost_derivatives": quadratic.cost_derivatives,
+            "difference": self._difference,
+            "retract": self._retract,
+            "measured_step": self._measured_step,
+            "observation": self._observation,
+            "state_from_observation": self._state_from_observation,
+        }
+
+    def build(self, name: str, integrator: str = "") -> Program:
+        """Trace a program by name, with an integrator if it takes a step; KeyError if either is unknown."""
+        if name in ("step", "step_with_cost"):
+            return self._step(name, integrator)
+        if name == "walk":
+            return self._walk(integrator)
+        if name == "linearize":
+            return self._derivatives.linearize(integrator)
+        if name == "lagrangian_hessian":
+            return self._derivatives.lagrangian_hessian(integrator)
+        return self._builders[name]()
+
+    # Functions of a state, and of an input.
+
+    def _program(self, name: str, outputs: Callable[..., Mapping[str, Scalars]], **sizes: int) -> Program:
+        """Program of a single graph."""
+        graph = trace(name + "_graph", sizes, outputs)
+        program = Program(
+            name,
+            [Buffer(key, size) for key, size in graph.inputs],
+            [Buffer(key, size) for key, size in graph.outputs],
+        )
+        program.call(graph)
+        return program
+
+    def _forward_dynamics(self) -> Program:
+        field = self.field
+        return self._program(
+            "forward_dynamics",
+            lambda x, u: {"accelerations": field.accelerations(self.equations.y(x), u)},
+            x=field.n_x,
+            u=field.n_u,
+        )
+
+    def _forward_dynamics_with_tip_wrench(self) -> Program:
+        field = self.field
+        return self._program(
+            "forward_dynamics_with_tip_wrench",
+            lambda x, u, w_tip: {"accelerations": field.accelerations(self.equations.y(x), u, w_tip)},
+            x=field.n_x,
+            u=field.n_u,
+            w_tip=6,
+        )
+
+    def _reaction_wrenches(self) -> Program:
+        field = self.field
+        return self._program(
+            "reaction_wrenches",
+            lambda x, u: {"wrenches": field.reaction_wrenches(self.equations.y(x), u)},
+            x=field.n_x,
+            u=field.n_u,
+        )
+
+    def _tip_pose(self) -> Program:
+        return self._program("tip_pose", lambda x: {"pose": self.equations.tip(x)}, x=self.field.n_x)
+
+    def _frame_poses(self) -> Program:
+        def outputs(x: Scalars) -> Mapping[str, Scalars]:
+            motion = self.field.motion(self.equations.y(x))
+            frames = kinematics.frame_poses(
+                self.chain, self.equations.base_pose(x), motion.joint_angles, motion.wrist_angles
+            )
+            return {"poses": [entry for frame in frames for entry in frame]}
+
+        return self._program("frame_poses", outputs, x=self.field.n_x)
+
+    def _velocities(self, x: Scalars) -> tuple[Any, Any, Any]:
+        motion = self.field.motion(self.equations.y(x))
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        velocities = kinematics.body_velocities(
+            self.chain, rotations, (*motion.angular, *motion.linear), motion.joint_rates
+        )
+        return motion, rotations, velocities
+
+    def _momentum(self) -> Program:
+        def outputs(x: Scalars) -> Mapping[str, Scalars]:
+            _, rotations, velocities = self._velocities(x)
+            linear, angular, _ = kinematics.momentum(self.chain, rotations, velocities)
+            attitude, _ = poses.to_matrix(self.equations.base_pose(x))
+            return {"momentum": [*matrix_vector(attitude, linear), *matrix_vector(attitude, angular)]}
+
+        return self._program("momentum", outputs, x=self.field.n_x)
+
+    def _energy(self) -> Program:
+        def outputs(x: Scalars) -> Mapping[str, Scalars]:
+            motion, _, velocities = self._velocities(x)
+            kinetic, potential = kinematics.energy(self.chain, motion.joint_angles, velocities)
+            return {"energy": [kinetic + potential]}
+
+        return self._program("energy", outputs, x=self.field.n_x)
+
+    # The cost.
+
+    def _cost(self) -> Program:
+        field = self.field
+        return self._program(
+            "cost", lambda x, u: {"cost": [total(self.equations.cost_terms(x, u))]}, x=field.n_x, u=field.n_u
+        )
+
+    def _terminal_cost(self) -> Program:
+        return self._program(
+            "terminal_cost",
+            lambda x: {"cost": [total(self.equations.terminal_cost_terms(x))]},
+            x=self.field.n_x,
+        )
+
+    def _emphasized_terminal_cost(self) -> Program:
+        def outputs(x: Scalars, emphasis: Scalars) -> Mapping[str, Scalars]:
+            pose, velocity = self.equations.terminal_cost_terms(x)
+            return {"cost": [emphasis[0] * pose + velocity]}
+
+        return self._program("emphasized_terminal_cost", outputs, x=self.field.n_x, emphasis=1)
+
+    # Tangent coordinates.
+
+    def _difference(self) -> Program:
+        field = self.field
+
+        def outputs(x_reference: Scalars, x: Scalars) -> Mapping[str, Scalars]:
+            relative = dq.multiply(
+                dq.conjugate(self.equations.base_pose(x_reference)), self.equations.base_pose(x)
+            )
+            twist = screw.logarithm(relative)
+            rest = [a - b for a, b in zip(self.equations.y(x), self.equations.y(x_reference), strict=True)]
+            return {"dx": [*(twist[i] for i in field.pose.directions), *rest]}
+
+        return self._program("difference", outputs, x_reference=field.n_x, x=field.n_x)
+
+    def _retract(self) -> Program:
+        field = self.field
+
+        def outputs(x: Scalars, dx: Scalars) -> Mapping[str, Scalars]:
+            n = len(field.pose.directions)
+            pose = field.pose.moved(split_state(field, x)[0], field.pose.full_twist(dx[:n]))
+            return {"x_next": [*pose, *(a + b for a, b in zip(self.equations.y(x), dx[n:], strict=True))]}
+
+        return self._program("retract", outputs, x=field.n_x, dx=field.n_t)
+
+    # Observations.
+
+    def _observation(self) -> Program:
+        return self._program(
+            "observation",
+            lambda x, time_left: self.equations.observe(x, time_left[0]),
+            x=self.field.n_x,
+            time_left=1,
+        )
+
+    def _state_from_observation(self) -> Program:
+        field, state = self.field, self.layout.state
+        n_pose = len(field.pose.stored)
+        parts = (state.base_velocity, state.joint_angles, state.wrist_angles, state.joint_rates)
+
+        def outputs(observation: Scalars) -> Mapping[str, Scalars]:
+            x: list[Scalar] = [0.0] * field.n_x
+            start = n_pose
+            for entries in parts:
+                size = entries.stop - entries.start
+                x[entries] = observation[start : start + size]
+                start += size
+            # q_{D/G} = q_{G/I}* q_{D/I} and q_{G/I} = q_{e0/I} q_{G/e0}: solved for the base.
+            error = dq.normalize(field.pose.full(observation[:n_pose]))
+            motion = field.motion(self.equations.y(x))
+            arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
+            tip = dq.multiply(self.equations.target, dq.conjugate(error))
+            x[:n_pose] = field.pose.reduced(dq.multiply(tip, dq.conjugate(arm)))
+            return {"x": x}
+
+        return self._program("state_from_observation", outputs, observation=field.n_x + 1)
+
+    # Steps.
+
+    def _step(self, name: str, integrator: str) -> Program:
+        """A step alone, or with its cost."""
+        field = self.field
+        x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
+        program = Program(name, [x, u, h], [Buffer("x_next", field.n_x)])
+        integrator_of(self.scene.simulation, integrator).append_step(program, field)
+        if name == "step_with_cost":
+            sizes = {"x": field.n_x, "u": field.n_u}
+            program.call(
+                trace("cost_graph", sizes, lambda x, u: {"cost": [total(self.equations.cost_terms(x, u))]})
+            )
+            program.outputs = [*program.outputs, Buffer("cost", 1)]
+        return program
+
+    def _measured_step(self) -> Program:
+        """A step of an embedded pair, with its error and dense output."""
+        field = self.field
+        inputs = [Buffer("x", field.n_x), Buffer("u", field.n_u)]
+        inputs += [Buffer(name, size, shared=True) for name, size in (("h", 1), ("tolerances", 2))]
+        outputs = [Buffer("x_next", field.n_x), Buffer("error", 1), Buffer("dense", 4 * field.n_t)]
+        program = Program("measured_step", inputs, outputs)
+        append_measured_step(program, field)
+        return program
+
+    def _walk(self, integrator: str) -> Program:
+        """A step of many in a row; a momentum-preserving method hands on the momentum besides the state."""
+        field, method = self.field, integrator_of(self.scene.simulation, integrator)
+        x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
+        if not isinstance(method, MomentumPreserving):
+            program = Program("walk", [x, u, h], [Buffer("x_next", field.n_x)])
+            method.append_step(program, field)
+            return program
+        outputs = [Buffer("x_next", field.n_x), Buffer("momentum_next", 6)]
+        program = Program("walk", [x, Buffer("momentum", 6), u, h], outputs)
+        method.append_walk(program, field)
+        return program

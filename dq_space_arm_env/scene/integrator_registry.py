@@ -1,0 +1,107 @@
+"""The registry of integrators, one entry per method: read by the schema, kernels, solver, reports and docs.
+
+It is data only, so that a scene can be validated without loading the methods themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf, isinf
+
+
+@dataclass(frozen=True)
+class IntegratorEntry:
+    """A method, what it claims, and where it is implemented."""
+
+    name: str  # in scene files
+    order: int
+    # The class in `dq_space_arm_env.integrators`, and what it is built from, as module.name.
+    implementation: tuple[str, ...]
+    # Largest dt * frequency of an undamped spring, and dt * decay rate of a damper, at which steps stay
+    # bounded: where the stability polynomial leaves the unit circle on the imaginary and on the negative real
+    # axis. Infinite for an L-stable method, and for one that adapts its steps.
+    imaginary_interval: float = inf
+    real_interval: float = inf
+    # The method whose second derivatives the solver takes; None: Gauss-Newton. Newton's method needs a few
+    # digits of them: those of methods of order 4 and above differ by O(dt^5). Gradients, which decide where
+    # the solver ends, are always the method's own.
+    curvature: str | None = None
+    is_adaptive: bool = False  # divides a time step until tolerances are met
+    keeps_momentum: bool = False  # to rounding, where no external wrench acts
+
+    @property
+    def is_stiff(self) -> bool:
+        """Whether any stiffness and damping is bounded."""
+        return isinf(self.imaginary_interval) and isinf(self.real_interval)
+
+    @property
+    def has_curvature(self) -> bool:
+        """Whether the method has second derivatives of its own."""
+        return self.curvature == self.name
+
+
+INTEGRATORS: Mapping[str, IntegratorEntry] = {
+    entry.name: entry
+    for entry in (
+        IntegratorEntry(
+            "symplectic_euler",
+            order=1,
+            implementation=("symplectic_euler.SymplecticEuler",),
+            imaginary_interval=2.0,
+            real_interval=2.0,
+            curvature="symplectic_euler",
+        ),
+        IntegratorEntry(
+            "rk4",
+            order=4,
+            implementation=("rk4.RungeKuttaMuntheKaas4",),
+            imaginary_interval=2.828,
+            real_interval=2.785,
+            curvature="rk4",
+        ),
+        IntegratorEntry(
+            "rk6",
+            order=6,
+            implementation=("explicit_runge_kutta.ExplicitRungeKutta", "tableaus.CALVO_6"),
+            imaginary_interval=2.609,
+            real_interval=4.463,
+            curvature="rk4",
+        ),
+        IntegratorEntry(
+            "rk8",
+            order=8,
+            implementation=("explicit_runge_kutta.ExplicitRungeKutta", "tableaus.DORMAND_PRINCE_8"),
+            imaginary_interval=5.960,
+            real_interval=6.393,
+            curvature="rk4",
+        ),
+        IntegratorEntry(
+            "dormand_prince",
+            order=5,
+            implementation=("dormand_prince.DormandPrince",),
+            is_adaptive=True,
+        ),
+        IntegratorEntry(
+            "rodas4", order=4, implementation=("rosenbrock.Rosenbrock", "rosenbrock_tableaus.RODAS4")
+        ),
+        IntegratorEntry(
+            "rodas5p", order=5, implementation=("rosenbrock.Rosenbrock", "rosenbrock_tableaus.RODAS5P")
+        ),
+        IntegratorEntry(
+            "momentum_rk4",
+            order=4,
+            implementation=("momentum.MomentumPreserving", "rk4.RungeKuttaMuntheKaas4"),
+            imaginary_interval=2.828,
+            real_interval=2.785,
+            curvature="rk4",
+            keeps_momentum=True,
+        ),
+        IntegratorEntry(
+            "momentum_rosenbrock",
+            order=3,
+            implementation=("momentum.MomentumPreserving", "rosenbrock_w.RosenbrockW"),
+            keeps_momentum=True,
+        ),
+    )
+}

@@ -1,0 +1,167 @@
+"""Maneuver of a scene: actuators and limits, target, cost, start, spread of starts, success."""
+
+from pydantic import Field
+
+from dq_space_arm_env.scene.pose import Pose
+from dq_space_arm_env.validation.fields import (
+    ControlWeights3,
+    Fraction,
+    Limit,
+    Limits3,
+    NonNegative,
+    Numbers,
+    Positive,
+    StateWeights6,
+    StateWeights8,
+    Vector3,
+    Vector6,
+)
+from dq_space_arm_env.validation.problems import Model
+
+_ZERO_TWIST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class AxisLimits(Model):
+    """An actuator with three axes, each limited to [-limit, limit]."""
+
+    limit: Limits3 = Field(
+        description="largest magnitude per axis: one number for all three axes, or three; .inf: unlimited"
+    )
+
+
+class JointLimit(Model):
+    """The joint motors, each limited to [-limit, limit]; a link may set its own torque_limit."""
+
+    limit: Limit = Field(description="largest magnitude of a joint torque, one number, N m; .inf: unlimited")
+
+
+class Actuators(Model):
+    """The actuators; an absent one has no controls."""
+
+    base_force: AxisLimits | None = Field(
+        default=None, description="thrusters: force on the base in base axes, N"
+    )
+    base_torque: AxisLimits | None = Field(
+        default=None, description="wheels: torque on the base in base axes, N m"
+    )
+    joint_torque: JointLimit | None = Field(
+        default=None, description="joint motors: torque about the joint axis, N m"
+    )
+    wrist_rate: AxisLimits | None = Field(
+        default=None, description="wrist: Euler rates psi, theta, phi of the spherical joint, rad/s"
+    )
+
+
+class TipWrench(Model):
+    """A constant wrench acting on the tip at G, in the axes of G (eq. 16)."""
+
+    force: Vector3 = Field(default=(0.0, 0.0, 0.0), description="force at the tip in tip axes, N")
+    torque: Vector3 = Field(default=(0.0, 0.0, 0.0), description="torque at the tip in tip axes, N m")
+
+
+class Target(Model):
+    """Target pose of the tip, and velocity of the base there."""
+
+    pose: Pose = Field(description="desired pose q_{D/I} of the tip in the inertial frame, m")
+    base_velocity: Vector6 = Field(
+        default=_ZERO_TWIST,
+        description="desired velocity of the base in base axes: angular (3) rad/s, linear (3) m/s",
+    )
+
+
+class Cost(Model):
+    """Weights of the quadratic cost; the defaults are the paper's. The running terms carry no dt."""
+
+    pose: StateWeights8 = Field(
+        default=(15.0,) * 8, description="running weight on q_{G/I} - q_{D/I} (W_kq): one number or 8"
+    )
+    terminal_pose: StateWeights8 = Field(
+        default=(150.0,) * 8, description="terminal weight on q_{G/I} - q_{D/I} (W_fq): one number or 8"
+    )
+    base_velocity: StateWeights6 = Field(
+        default=(1.0,) * 6,
+        description="running weight on the base velocity error (W_kw), angular then linear: one number or 6",
+    )
+    terminal_base_velocity: StateWeights6 = Field(
+        default=(1.0,) * 6, description="terminal weight on the base velocity error (W_fw): one number or 6"
+    )
+    base_force: ControlWeights3 = Field(
+        default=(10.0,) * 3, description="weight on the base force, 1/N^2: one number or 3"
+    )
+    base_torque: ControlWeights3 = Field(
+        default=(1.0,) * 3, description="weight on the base torque, 1/(N m)^2: one number or 3"
+    )
+    joint_torque: Positive = Field(
+        default=0.01, description="weight on the joint torques, 1/(N m)^2: one number"
+    )
+    wrist_rate: ControlWeights3 = Field(
+        default=(0.1,) * 3, description="weight on the wrist's Euler rates, (s/rad)^2: one number or 3"
+    )
+
+
+class InitialState(Model):
+    """The scene's nominal start."""
+
+    base_pose: Pose = Field(
+        default_factory=Pose, description="pose q_{e0/I} of the base in the inertial frame, m"
+    )
+    joint_angles: Numbers = Field(
+        default=(), description="joint angles, base to tip, one per link, rad; empty: zeros"
+    )
+    wrist_angles: Numbers = Field(
+        default=(), description="wrist angles psi, theta, phi, rad; empty: zeros, or no wrist"
+    )
+    base_velocity: Vector6 = Field(
+        default=_ZERO_TWIST,
+        description="velocity of the base in base axes: angular (3) rad/s, linear (3) m/s",
+    )
+    joint_rates: Numbers = Field(
+        default=(), description="joint rates, base to tip, one per link, rad/s; empty: zeros"
+    )
+
+
+class Spread(Model):
+    """Half-widths of the uniform draws at the start of an episode.
+
+    One number for all components of a part, around the nominal start and target; fractions of the nominal
+    masses and inertias, drawn for each body. A quantity without spread is a constant of the machine code.
+    """
+
+    base_rotation: NonNegative = Field(
+        default=0.0, description="rotation vector of the base in base axes, rad"
+    )
+    base_position: NonNegative = Field(default=0.0, description="position of the base in inertial axes, m")
+    joint_angles: NonNegative = Field(default=0.0, description="joint angles, rad")
+    wrist_angles: NonNegative = Field(default=0.0, description="wrist angles psi, theta, phi, rad")
+    base_angular_velocity: NonNegative = Field(
+        default=0.0, description="angular velocity of the base, base axes, rad/s"
+    )
+    base_linear_velocity: NonNegative = Field(
+        default=0.0, description="linear velocity of the base, base axes, m/s"
+    )
+    joint_rates: NonNegative = Field(default=0.0, description="joint rates, rad/s")
+    target_rotation: NonNegative = Field(
+        default=0.0, description="rotation vector of the target in its own axes, rad"
+    )
+    target_position: NonNegative = Field(
+        default=0.0, description="position of the target in inertial axes, m"
+    )
+    base_mass: Fraction = Field(default=0.0, description="mass of the base, as a fraction of it")
+    base_inertia: Fraction = Field(
+        default=0.0, description="inertia of the base about its center of mass, as a fraction of it"
+    )
+    link_masses: Fraction = Field(default=0.0, description="mass of each link, as a fraction of it")
+    link_inertias: Fraction = Field(
+        default=0.0, description="inertia of each link about its center of mass, as a fraction of it"
+    )
+    payload_mass: Fraction = Field(default=0.0, description="mass of the payload, as a fraction of it")
+    payload_inertia: Fraction = Field(
+        default=0.0, description="inertia of the payload about its center of mass, as a fraction of it"
+    )
+
+
+class Success(Model):
+    """Largest errors of the tip at the end of a successful episode."""
+
+    attitude_error_deg: Positive = Field(default=3.0, description="largest attitude error, degrees")
+    position_error: Positive = Field(default=0.1, description="largest position error, m")

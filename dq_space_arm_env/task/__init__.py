@@ -1,0 +1,7 @@
+"""The task of a scene: cost, observation, episodes, and the record of a maneuver.
+
+equations    cost and observation over plain scalars
+episode      a step of the environment: actions, reward, success, end
+parameters   target and masses that a scene draws for each episode
+trajectory   the record of a maneuver and its file
+"""

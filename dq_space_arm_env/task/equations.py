@@ -1,0 +1,131 @@
+"""A scene's task over plain scalars: the paper's quadratic cost (section V), and the observation.
+
+The stage cost of step k is
+
+    (q_{G/I} - q_{D/I})' W_q (q_{G/I} - q_{D/I}) + (omega - omega_D)' W_omega (omega - omega_D) + u' R u,
+
+without a factor dt; the terminal cost has the first two terms with weights W_fq, W_fomega. q and -q are the
+same pose but cost differently: the sign of q_{G/I} is fixed at the start, q_r . q_{D,r} >= 0, and carried
+along by continuity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics import kinematics
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
+from dq_space_arm_env.dynamics.vector_field import split_state
+from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.task.parameters import EpisodeParameters
+
+Scalar = Any
+Scalars = Sequence[Scalar]
+
+
+@dataclass(frozen=True)
+class SceneEquations:
+    """A scene's equations of motion with its cost and observation."""
+
+    scene: Scene
+    chain: Chain
+    target: Scalars  # q_{D/I}, 8 numbers or symbols
+    layout: StateLayout
+    field: SpaceArmField
+
+    @classmethod
+    def nominal(cls, scene: Scene) -> SceneEquations:
+        """Equations with the scene's own target, masses and inertias."""
+        chain, layout = Chain.from_scene(scene), StateLayout.of(scene)
+        field = SpaceArmField(chain, layout, formulation=scene.simulation.formulation)
+        return cls(scene, chain, scene.target.pose.dual_quaternion, layout, field)
+
+    @classmethod
+    def parametric(cls, scene: Scene) -> SceneEquations:
+        """Equations with symbols, `field.parameters`, for what the scene draws for each episode."""
+        parameters, layout = EpisodeParameters.of(scene), StateLayout.of(scene)
+        field = SpaceArmField(parameters.chain, layout, parameters.symbols, scene.simulation.formulation)
+        return cls(scene, parameters.chain, parameters.target, layout, field)
+
+    def y(self, x: Scalars) -> Scalars:
+        """State without the pose."""
+        return split_state(self.field, x)[1]
+
+    def base_pose(self, x: Scalars) -> Scalars:
+        """Pose of the base q_{e0/I}, 8 numbers."""
+        return self.field.pose.full(split_state(self.field, x)[0])
+
+    def tip(self, x: Scalars) -> Scalars:
+        """Pose of the tip q_{G/I}, 8 numbers, eq. (27)."""
+        motion = self.field.motion(self.y(x))
+        return kinematics.tip_pose(self.chain, self.base_pose(x), motion.joint_angles, motion.wrist_angles)
+
+    def state_cost_terms(self, x: Scalars) -> list[Scalar]:
+        """Pose and base velocity: the stage cost's terms of the state."""
+        cost = self.scene.cost
+        return [self._pose_cost(x, cost.pose), self._velocity_cost(x, cost.base_velocity)]
+
+    def effort(self, u: Scalars) -> Scalar:
+        """Effort u' R u, the stage cost's term of the input."""
+        return weighted_square(u, [0.0] * self.field.n_u, self.layout.control_weight.tolist())
+
+    def cost_terms(self, x: Scalars, u: Scalars) -> list[Scalar]:
+        """Pose, base velocity and effort: the terms of the stage cost."""
+        return [*self.state_cost_terms(x), self.effort(u)]
+
+    def terminal_cost_terms(self, x: Scalars) -> list[Scalar]:
+        """Pose and base velocity: the terms of the terminal cost."""
+        cost = self.scene.cost
+        return [self._pose_cost(x, cost.terminal_pose), self._velocity_cost(x, cost.terminal_base_velocity)]
+
+    def _pose_cost(self, x: Scalars, weights: Sequence[float]) -> Scalar:
+        return weighted_square(self.tip(x), self.target, weights)
+
+    def _velocity_cost(self, x: Scalars, weights: Sequence[float]) -> Scalar:
+        motion = self.field.motion(self.y(x))
+        return weighted_square((*motion.angular, *motion.linear), self.scene.target.base_velocity, weights)
+
+    def observe(self, x: Scalars, time_left: Scalar) -> dict[str, list[Scalar]]:
+        """Observation, and the tip's errors: angle in rad, distance in m."""
+        tip = self.tip(x)
+        motion = self.field.motion(self.y(x))
+        # Error pose q_{D/G} = q_{G/I}* q_{D/I}, eq. (31); in a planar scene four entries vanish identically.
+        error = self.field.pose.reduced(poses.error_pose(tip, self.target))
+        observation = [
+            *error,
+            *x[self.layout.state.base_velocity],
+            *motion.joint_angles,
+            *motion.wrist_angles,
+            *motion.joint_rates,
+            time_left,
+        ]
+        errors = [poses.error_angle(tip, self.target), poses.error_distance(tip, self.target)]
+        return {"observation": observation, "errors": errors}
+
+
+def weighted_square(
+    values: Sequence[Scalar], references: Sequence[Scalar], weights: Sequence[float]
+) -> Scalar:
+    """Sum of w (value - reference)^2, a term of the cost."""
+    # Squares that share a weight are added first: fewer products, and stage and terminal cost share the sums.
+    sums: dict[float, Scalar] = {}
+    for value, reference, weight in zip(values, references, weights, strict=True):
+        error = value - reference
+        sums[weight] = sums.get(weight, 0.0) + error * error
+    result: Scalar = 0.0
+    for weight, squares in sums.items():
+        result = result + weight * squares
+    return result
+
+
+def total(terms: Scalars) -> Scalar:
+    """Sum of scalars, from left to right."""
+    result: Scalar = 0.0
+    for term in terms:
+        result = result + term
+    return result

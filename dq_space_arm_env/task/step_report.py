@@ -1,0 +1,22 @@
+"""Columns of what the environment's step reports; apart from `episode`, as they are read without CasADi."""
+
+# The costs are those of the stage before the step and the terminal ones after it, which are zero before the
+# end of the episode; the tip's errors are those after the step, in deg and m.
+REPORT = (
+    "reward",
+    "cost_pose",
+    "cost_base_velocity",
+    "cost_control",
+    "terminal_cost_pose",
+    "terminal_cost_base_velocity",
+    "attitude_error",
+    "position_error",
+)
+FLAGS = ("terminated", "is_success", "diverged")
+
+# What a step hands to the next besides the state: steps taken, and the stage cost's terms of the state.
+MEMORY = ("steps_taken", "cost_pose", "cost_base_velocity")
+
+# A state whose norm (m, rad, m/s, rad/s) is larger, or NaN, comes from a simulation that has blown up. It
+# keeps every entry of an observation within twice this number.
+STATE_LIMIT = 5e5

@@ -1,0 +1,156 @@
+"""The record of a maneuver, flown or planned, and its file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.scene.schema import Scene
+
+FloatArray = NDArray[np.float64]
+
+_REQUIRED, _OPTIONAL = ("states", "controls"), ("noise", "rewards", "target")
+_UNREADABLE = (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A maneuver of M steps as it was flown or planned.
+
+    Attributes:
+        label: Name in tables and plots.
+        states: Shape (M + 1, n_x), units of the state.
+        controls: Commanded inputs, constant over a step, shape (M, n_u), N, N m or rad/s.
+        noise: Disturbance added to them at the actuators, shape (M, n_u), same units; None for none.
+        rewards: Shape (M,), dimensionless; None if unknown.
+        target: Pose q_{D/I}, shape (8,), dimensionless and m; None for the scene's.
+        scene: The scene; None if unknown.
+        start: The initial state in words.
+        seed: Seed of the episode; None without one.
+        attitude_error: Of the tip at the end, deg; NaN if unknown.
+        position_error: Of the tip at the end, m; NaN if unknown.
+        is_success: Whether both are within the scene's tolerances.
+        diverged: Whether the simulation blew up.
+        action_seconds: Median time the controller took per action, s; NaN if not timed.
+    """
+
+    label: str
+    states: FloatArray
+    controls: FloatArray
+    noise: FloatArray | None = None
+    rewards: FloatArray | None = None
+    target: FloatArray | None = None
+    scene: Scene | None = None
+    start: str = ""
+    seed: int | None = None
+    attitude_error: float = math.nan
+    position_error: float = math.nan
+    is_success: bool = False
+    diverged: bool = False
+    action_seconds: float = math.nan
+
+    @property
+    def cost(self) -> float:
+        """J, minus the return of the episode, dimensionless; NaN without rewards."""
+        return math.nan if self.rewards is None else -math.fsum(self.rewards.tolist())
+
+    def facts(self) -> dict[str, Any]:
+        """Describe the trajectory in JSON values, units in the keys, None for what is unknown."""
+        numbers = {
+            "cost": self.cost,
+            "final_attitude_error_deg": self.attitude_error,
+            "final_position_error_m": self.position_error,
+            "action_seconds": self.action_seconds,
+        }
+        return {
+            "label": self.label,
+            "scene": None if self.scene is None else self.scene.name,
+            "start": self.start,
+            "seed": self.seed,
+            "steps": len(self.controls),
+            "is_success": self.is_success,
+            "diverged": self.diverged,
+            **{name: value if math.isfinite(value) else None for name, value in numbers.items()},
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the trajectory to a file in NumPy's npz format, in one go or not at all.
+
+        The file holds `states`, `controls`, and where they are known `rewards`, `target` and `noise`; and
+        `facts`, JSON text with the scene and the entries of `facts()`.
+
+        Args:
+            path: The file, `.npz` by convention; its folder must exist.
+        """
+        arrays = {
+            name: array
+            for name in (*_REQUIRED, *_OPTIONAL)
+            if (array := getattr(self, name)) is not None and (name != "noise" or array.any())
+        }
+        scene = None if self.scene is None else self.scene.model_dump(mode="json")
+        content = BytesIO()
+        facts = np.array(json.dumps({**self.facts(), "scene": scene}))
+        np.savez_compressed(content, allow_pickle=False, facts=facts, **arrays)
+        write_atomically(Path(path), content.getvalue())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], label: str | None = None) -> Self:
+        """Read a trajectory from a file that `save`, or `save` of a solution, has written.
+
+        Args:
+            path: The file.
+            label: Name in tables and plots; by default the file's own, "expert" for a solution, or the name
+                of the file.
+
+        Returns:
+            The trajectory.
+
+        Raises:
+            ValueError: If the file cannot be read or lacks states or controls.
+        """
+        path = Path(path)
+        try:
+            # Bytes first: if the file is no archive, NumPy would leave its descriptor open.
+            with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as content:
+                wanted = [name for name in content.files if name in (*_REQUIRED, *_OPTIONAL, "facts")]
+                arrays = {name: content[name] for name in wanted}
+            facts = json.loads(str(arrays.pop("facts"))) if "facts" in arrays else {}
+            if not isinstance(facts, dict) or not isinstance(facts.get("metadata", {}), dict):
+                raise ValueError("its facts are not a mapping")
+        except FileNotFoundError:
+            raise ValueError(f"{path}: there is no such file") from None
+        except _UNREADABLE as error:
+            raise ValueError(f"{path} cannot be read as a flight ({error})") from error
+        missing = set(_REQUIRED) - set(arrays)
+        if missing:
+            raise ValueError(f"{path} holds no flight: it lacks {' and '.join(sorted(missing))}")
+        name = label or facts.get("label") or ("expert" if "stop_reason" in facts else path.stem)
+        return cls(str(name), **arrays, **_known(facts))
+
+
+def _known(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a trajectory in the facts of its file; a solution has its scene among its metadata."""
+    scene = facts.get("scene") or facts.get("metadata", {}).get("scene")
+    fields = {
+        "start": facts.get("start"),
+        "seed": facts.get("seed"),
+        "attitude_error": facts.get("final_attitude_error_deg"),
+        "position_error": facts.get("final_position_error_m"),
+        "is_success": facts.get("is_success"),
+        "diverged": facts.get("diverged"),
+        "action_seconds": facts.get("action_seconds"),
+        "scene": None if scene is None else Scene.model_validate(scene),
+    }
+    return {name: value for name, value in fields.items() if value is not None}

@@ -1,0 +1,24 @@
+"""Validated YAML files, scenes and configurations of agents: models, kinds of numbers, text."""
+
+from dq_space_arm_env.common.suggestions import did_you_mean
+from dq_space_arm_env.validation.fields import Count, Finite, Fraction, NonNegative, Positive, Vector3
+from dq_space_arm_env.validation.problems import Model, Problem, problem
+from dq_space_arm_env.validation.yaml_text import YAMLError, dump_yaml, line_of, parse_yaml, yaml_problem
+
+__all__ = [
+    "Count",
+    "Finite",
+    "Fraction",
+    "Model",
+    "NonNegative",
+    "Positive",
+    "Problem",
+    "Vector3",
+    "YAMLError",
+    "did_you_mean",
+    "dump_yaml",
+    "line_of",
+    "parse_yaml",
+    "problem",
+    "yaml_problem",
+]

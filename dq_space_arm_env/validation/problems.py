@@ -1,0 +1,131 @@
+"""Mistakes in a scene as sentences: field path, value, and what would be right.
+
+All models derive from `Model`, which rewrites pydantic's errors. Field validators raise `problem(...)`;
+checks of several fields call `raise_problems(...)`.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, ClassVar, NamedTuple, NoReturn, Self
+
+from pydantic import BaseModel, ConfigDict, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+
+from dq_space_arm_env.common.suggestions import did_you_mean
+
+_KIND = "scene_problem"
+_LONGEST_SHOWN_VALUE = 120
+
+
+class SceneError(ValueError):
+    """An unusable scene; the message gives field, value and the remedy for every problem."""
+
+
+class Problem(NamedTuple):
+    """One mistake."""
+
+    location: tuple[str | int, ...]  # keys and indices, from the model that raises
+    value: object
+    sentence: str  # what would be right
+
+
+def problem(sentence: str) -> PydanticCustomError:
+    """Build the error that a field validator raises; its sentence says what would be right."""
+    return PydanticCustomError(_KIND, "{sentence}", {"sentence": sentence})
+
+
+def raise_problems(problems: Iterable[Problem]) -> None:
+    """Raise all problems in one `ValidationError`; do nothing when there are none."""
+    errors = [
+        InitErrorDetails(type=problem(sentence), loc=location, input=value)
+        for location, value, sentence in problems
+    ]
+    if errors:
+        raise ValidationError.from_exception_data("scene", errors)
+
+
+def field_path(location: Iterable[str | int]) -> str:
+    """Write a location as "links[1].joint.rotation", or "scene" for the whole file."""
+    path = ""
+    for part in location:
+        path += f"[{part}]" if isinstance(part, int) else f".{part}" if path else part
+    return path or "scene"
+
+
+class Model(BaseModel):
+    """Base of all models: immutable, hashable, no unknown keys, errors in plain sentences."""
+
+    # Instances are validated again: `model_copy(update=...)` does not validate what it makes.
+    model_config = ConfigDict(extra="forbid", frozen=True, revalidate_instances="always")
+
+    # Keys that a model's own "before" validator turns into fields.
+    _other_keys: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _explain(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        try:
+            model = handler(data)
+            raise_problems(model._problems())
+            return model
+        except ValidationError as error:
+            _rethrow(cls, error)
+
+    def _problems(self) -> Iterable[Problem]:
+        """Problems between fields that are valid by themselves."""
+        return ()
+
+
+def _rethrow(model: type[Model], error: ValidationError) -> NoReturn:
+    """Raise the same errors, worded as "path = value: what would be right"."""
+    explained = []
+    for detail in error.errors(include_url=False):
+        location = detail["loc"]
+        if detail["type"] == _KIND:
+            sentence = detail["ctx"]["sentence"]
+            # A nested model has already said what the field means; a check of our own has not yet.
+            complete = "path" in detail["ctx"]
+            shown = detail["ctx"].get("value", _shown(detail["input"]))
+        else:
+            sentence = _sentence(model, detail)
+            complete = detail["type"] in ("missing", "extra_forbidden", "invalid_key")
+            shown = "" if complete else _shown(detail["input"])
+        if not complete and len(location) == 1:
+            sentence += _meaning(model, location[0])
+        context = {"path": field_path(location), "value": shown, "sentence": sentence}
+        kind = PydanticCustomError(_KIND, "{path}{value}: {sentence}", context)
+        explained.append(InitErrorDetails(type=kind, loc=location, input=detail["input"]))
+    raise ValidationError.from_exception_data(model.__name__, explained) from None
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return f" = {text if len(text) <= _LONGEST_SHOWN_VALUE else text[:_LONGEST_SHOWN_VALUE] + '...'}"
+
+
+def _meaning(model: type[BaseModel], name: str | int) -> str:
+    field = model.model_fields.get(str(name))
+    return f" ({field.description})" if field and field.description else ""
+
+
+def _sentence(model: type[Model], detail: ErrorDetails) -> str:
+    """Word an error that pydantic found."""
+    kind, location = detail["type"], detail["loc"]
+    if kind == "missing":
+        return f"missing; it is required{_meaning(model, location[-1])}"
+    if kind == "extra_forbidden":
+        known = [*model.model_fields, *model._other_keys]
+        return f"unknown key; {did_you_mean(str(location[-1]), known)}Known keys here: {', '.join(known)}"
+    known_sentence = _SENTENCES.get(kind)
+    return known_sentence(detail.get("ctx", {})) if known_sentence else detail["msg"]
+
+
+_SENTENCES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "model_type": lambda context: "must be a mapping (key: value)",
+    "dict_type": lambda context: "must be a mapping (key: value)",
+    "invalid_key": lambda context: "keys must be text",
+    "string_type": lambda context: "must be text; quote it if it looks like a number, a date or true/false",
+    "bool_type": lambda context: "must be true or false",
+    "string_too_short": lambda context: "must not be empty",
+    "tuple_type": lambda context: "must be a list",
+    "literal_error": lambda context: f"must be {context['expected']}",
+}

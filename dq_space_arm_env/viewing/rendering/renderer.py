@@ -1,0 +1,104 @@
+"""Pictures of a scene: as arrays, or in a window."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.viewing.picture_format import PictureFormat, View
+from dq_space_arm_env.viewing.rendering.camera import camera_around
+from dq_space_arm_env.viewing.rendering.drawing import Image, mesh_faces, paint_sky, trail_faces
+from dq_space_arm_env.viewing.rendering.rasterizer import Faces, Rasterizer
+from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
+from dq_space_arm_env.viewing.rendering.window import Window
+
+Array = NDArray[np.float64]
+
+_DEFAULT_VIEW = View(azimuth=190.0, elevation=-22.0)
+# A planar scene is seen from straight above, x to the right and y up.
+_PLANAR_VIEW = View(azimuth=90.0, elevation=-90.0)
+
+
+class Renderer:
+    """Draws a scene from a fixed camera.
+
+    The tip has solid axes, red, green and blue for x, y and z; the target has paler ones and a ghost of the
+    hand. The target is the scene's until another is given; if the scene draws it for each episode, the whole
+    spread of its position is in view.
+
+    Attributes:
+        camera: The camera.
+    """
+
+    def __init__(self, scene: Scene, picture: PictureFormat | None = None) -> None:
+        width, height, view = picture or PictureFormat()
+        default = _PLANAR_VIEW if scene.base.motion == "planar" else _DEFAULT_VIEW
+        given = {key: value for key, value in view._asdict().items() if value is not None}
+        self._model = SpacecraftModel(scene)
+        self.camera = camera_around(*self._model.region, default._replace(**given), width, height)
+        self._rasterizer = Rasterizer(width, height)
+        self._sky = paint_sky(width, height)
+        self._target = np.array(scene.target.pose.dual_quaternion)
+        self._title = f"DQ Space Arm: {scene.name}"
+        self._window: Window | None = None
+
+    def aim_at(self, target: ArrayLike) -> None:
+        """Move the target to a pose q_{D/I}, shape (8,)."""
+        self._target = np.array(target, dtype=np.float64)
+
+    # Diverged simulations (infinite, NaN) are not drawn; a warning for each number would not help.
+    @np.errstate(over="ignore", invalid="ignore")
+    def draw(self, frame_poses: ArrayLike, trail: ArrayLike) -> Image:
+        """Draw a state; equal arguments give equal pictures.
+
+        Args:
+            frame_poses: Poses of base, joint frames, wrist frame (if any) and tip in the inertial frame, from
+                `Kernels.frame_poses`, shape (frames, 8), real part dimensionless, dual part m.
+            trail: Past positions of the tip in the inertial frame, oldest first, shape (m, 3), m; m may be 0.
+
+        Returns:
+            Picture, shape (height, width, 3), uint8.
+        """
+        dual_quaternions = _checked("frame_poses", frame_poses, (self._model.frame_count, 8))
+        faces = self._faces(dual_quaternions, _checked("trail", trail, (None, 3)))
+        image = self._sky.copy()
+        self._rasterizer.draw(faces, image)
+        return image
+
+    def show(self, frame_poses: ArrayLike, trail: ArrayLike, fps: float) -> None:
+        """Show a state, see `draw`, in a window that the first one opens, and wait until the next is due."""
+        if self._window is None:
+            self._window = Window(self._title, self.camera.width, self.camera.height)
+        if self._window.is_open:
+            self._window.show(self.draw(frame_poses, trail), fps)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _faces(self, dual_quaternions: Array, trail: Array) -> Faces:
+        """Faces of the solids and the trail."""
+        # The frame after the robot's is the target's.
+        matrices, origins = poses.to_matrix(np.vstack([dual_quaternions, self._target]).T)
+        rotations: Array = np.moveaxis(np.array(matrices), 2, 0)
+        solids = mesh_faces(self._model.mesh, rotations, np.array(origins).T, self.camera)
+        ribbon = trail_faces(trail, self.camera)
+        return Faces(
+            np.concatenate([solids.corners, ribbon.corners]),
+            np.concatenate([solids.colors, ribbon.colors]),
+            np.concatenate([solids.sieved, ribbon.sieved]),
+        )
+
+
+def _checked(name: str, value: ArrayLike, shape: tuple[int | None, int]) -> Array:
+    """The value as an array of the given shape; None stands for any length."""
+    array = np.asarray(value, dtype=np.float64)
+    rows, columns = shape
+    if array.ndim != 2 or array.shape[1] != columns or rows not in (None, array.shape[0]):
+        wanted = "m" if rows is None else rows
+        raise ValueError(f"{name}: shape {array.shape}, should be ({wanted}, {columns})")
+    return array

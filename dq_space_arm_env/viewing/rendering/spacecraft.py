@@ -1,0 +1,288 @@
+"""A scene as solids: spacecraft, arm, payload and target, and the region that they reach.
+
+A scene gives masses and frames, not shapes. Base and payload are drawn as the homogeneous boxes of their
+inertia; links join the origins of neighboring frames, in proportions taken from the length of the arm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematics import frame_poses
+from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.viewing.rendering.solids import Mesh, ball, box, crumpled_box, cylinder, lathe
+
+Array = NDArray[np.float64]
+
+FOIL = (1.0, 0.74, 0.34)
+METAL = (0.62, 0.65, 0.70)
+RADIATOR = (0.80, 0.82, 0.85)
+DARK_METAL = (0.24, 0.26, 0.31)
+CELLS = (0.16, 0.27, 0.58)
+LINK = (0.95, 0.95, 0.96)
+JOINT = (0.36, 0.42, 0.52)
+GRASPED = (0.42, 0.60, 0.58)
+LIKENESS = (0.80, 0.88, 1.0)
+AXIS_COLORS = ((1.0, 0.24, 0.22), (0.26, 0.88, 0.34), (0.26, 0.52, 1.0))
+
+_THINNEST = 0.05  # of the longest edge: even a flat body is drawn with some thickness
+
+
+def equivalent_box(mass: float, inertia: ArrayLike) -> tuple[Array, Array]:
+    """Homogeneous box of an inertia, I_x = m (b^2 + c^2) / 12 etc.: edge lengths, m, and axes as columns."""
+    matrix = np.asarray(inertia, dtype=np.float64)
+    if np.count_nonzero(matrix - np.diag(np.diag(matrix))) == 0:
+        moments, axes = np.diag(matrix), np.eye(3)
+    else:
+        moments, axes = np.linalg.eigh(matrix)
+    edges = np.sqrt(np.maximum(6.0 / mass * (moments.sum() - 2.0 * moments), 0.0))
+    return np.maximum(edges, _THINNEST * edges.max()), axes
+
+
+class SpacecraftModel:
+    """The solids of a scene.
+
+    Frames are numbered as in `Kernels.frame_poses`: base, joints, wrist (if any), tip. The number after those
+    stands for the target.
+
+    Attributes:
+        scene: The scene.
+        frame_count: Number of frames of the robot.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        offsets = [link.joint.position for link in scene.links]
+        if scene.wrist is not None:
+            offsets.append(scene.wrist.frame.position)
+        # Origin of each frame but the base, in the frame before it.
+        self._offsets = np.array([*offsets, scene.tip.position])
+        self.frame_count = len(self._offsets) + 1
+        self._body_size, self._body_axes = equivalent_box(scene.base.mass, scene.base.inertia)
+        lengths = np.linalg.norm(self._offsets, axis=1)
+        # Without links or wrist the tip is part of the base.
+        self._arm_length = float(lengths[1:].sum())
+        self._thickness = max(0.025 * self._arm_length, 0.03 * float(self._body_size.mean()))
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """All solids; the frame after the robot's is the target's."""
+        hand = list(self._hand())
+        # The ghost of the hand stands to the target as the hand to the tip.
+        from_tip = np.array(self.scene.tip.rotation_matrix)
+        likeness = [
+            part.moved(self.frame_count, from_tip.T, -from_tip.T @ self._offsets[-1]).likeness(LIKENESS)
+            for part in hand
+        ]
+        return Mesh.joined([*self._base(), *self._arm(), *hand, *self._payload(), *self._axes(), *likeness])
+
+    @cached_property
+    def axis_length(self) -> float:
+        """Length of the drawn axes of tip and target, m; without an arm they must reach out of the body."""
+        return 8.5 * self._thickness if self._arm_length else 0.8 * float(self._body_size.max())
+
+    @property
+    def region(self) -> tuple[Array, Array]:
+        """Balls around start, target, and the arm between: centers (n, 3) and radii (n,), m."""
+        start, spread = self.scene.initial_state, self.scene.spread
+        chain = Chain.from_scene(self.scene)
+        poses_at_start = frame_poses(
+            chain, start.base_pose.dual_quaternion, start.joint_angles, start.wrist_angles
+        )
+        frames = np.array([poses.position(pose) for pose in poses_at_start], dtype=np.float64)
+        rotation = np.array(start.base_pose.rotation_matrix)
+        wing = rotation @ (self._body_axes[:, self._wing_axes[0]] * self._wing_tip[self._wing_axes[0]])
+        shoulder = frames[min(1, len(frames) - 1)]
+        # Less than the arm's reach: it works between start and target, and is seen better from near.
+        reach = self._arm_length + self._overhang()
+        target = 1.2 * self.axis_length + math.sqrt(3.0) * spread.target_position
+        balls = [
+            (frames[0], 0.75 * float(np.linalg.norm(self._body_size))),
+            (frames[0] + wing, 0.3 * float(self._body_size.max())),
+            (frames[0] - wing, 0.3 * float(self._body_size.max())),
+            (shoulder, 0.6 * reach),
+            (frames[-1], 0.15 * reach + self._overhang()),
+            (np.array(self.scene.target.pose.position), target),
+        ]
+        centers, radii = zip(*balls, strict=True)
+        return np.array(centers), np.array(radii)
+
+    @cached_property
+    def _wing_axes(self) -> tuple[int, int, int]:
+        """Axes of the body for the wings' length, their width, and their normal.
+
+        The wings stretch in the body's x-y plane, sideways of the first joint.
+        """
+        shoulder = np.abs(self._body_axes.T @ self._offsets[0])
+        normal = int(np.abs(self._body_axes[2]).argmax())
+        first, second = (axis for axis in range(3) if axis != normal)
+        return (first, second, normal) if shoulder[first] < shoulder[second] else (second, first, normal)
+
+    @cached_property
+    def _wing_tip(self) -> Array:
+        along, across, _ = self._wing_axes
+        tip = np.zeros(3)
+        tip[along] = 0.5 * self._body_size[along] + 1.5 * self._body_size.mean()
+        tip[across] = 0.34 * self._body_size.mean()
+        return tip
+
+    def _base(self) -> Iterator[Mesh]:
+        size, axes = self._body_size, self._body_axes
+        yield crumpled_box(0, (0.0, 0.0, 0.0), size, FOIL, axes)
+        yield from self._rims()
+        yield from self._wing(1.0)
+        yield from self._wing(-1.0)
+        if self.scene.actuators.base_force is not None:
+            yield from self._thrusters()
+
+    def _rims(self) -> Iterator[Mesh]:
+        """Decks at the two ends of the body, and rails along the edges between them."""
+        size, axes, mean = self._body_size, self._body_axes, float(self._body_size.mean())
+        along, across, normal = self._wing_axes
+        deck = size + 0.025 * mean
+        deck[normal] = 0.05 * size[normal]
+        plate = 0.84 * size
+        plate[normal] = 0.075 * size[normal]
+        rail = np.full(3, 0.05 * mean)
+        rail[normal] = size[normal]
+        for side in (-1.0, 1.0):
+            end = axes[:, normal] * side * 0.49 * size[normal]
+            yield box(0, end, deck, METAL, axes)
+            yield box(0, end, plate, RADIATOR, axes)
+            for other in (-1.0, 1.0):
+                edge = np.zeros(3)
+                edge[[along, across]] = (
+                    side * (0.5 * size[along] - 0.013 * mean),
+                    other * (0.5 * size[across] - 0.013 * mean),
+                )
+                yield box(0, axes @ edge, rail, METAL, axes)
+
+    def _wing(self, side: float) -> Iterator[Mesh]:
+        """A boom and three panels of solar cells."""
+        axes, mean = self._body_axes, float(self._body_size.mean())
+        along, across, normal = self._wing_axes
+        outward = side * axes[:, along]
+        root, width = 0.5 * float(self._body_size[along]), 2.0 * float(self._wing_tip[across])
+        length = float(self._wing_tip[along]) - root
+        yield cylinder(0, outward * root * 0.9, outward * (root + 0.2 * length), 0.02 * mean, METAL, 12)
+        panel_length = 0.88 * length / 3
+        for panel in range(3):
+            center = root + 0.12 * length + (panel + 0.5) * panel_length
+            size = np.empty(3)
+            size[[along, across, normal]] = 0.96 * panel_length, width, 0.02 * mean
+            yield box(0, outward * center, size, METAL, axes)
+            size[[along, across, normal]] = 0.42 * panel_length, 0.455 * width, 0.026 * mean
+            for row in (-1.0, 1.0):
+                for column in (-1.0, 1.0):
+                    offset = outward * 0.228 * panel_length * row + axes[:, across] * 0.24 * width * column
+                    yield box(0, outward * center + offset, size, CELLS, axes, shine=0.7)
+
+    def _thrusters(self) -> Iterator[Mesh]:
+        """Nozzles at the edges of the body; for a planar base, in the plane."""
+        axes, size, mean = self._body_axes, self._body_size, float(self._body_size.mean())
+        along, across, normal = self._wing_axes
+        levels = (0.0,) if self.scene.base.motion == "planar" else (-0.38, 0.38)
+        bell = [(0.0, 0.0), (0.0, 0.022), (0.03, 0.022), (0.095, 0.05), (0.095, 0.042), (0.05, 0.0)]
+        profile = [(height * mean, radius * mean) for height, radius in bell]
+        colors = [METAL, METAL, METAL, METAL, DARK_METAL]
+        for level in levels:
+            for first in (-1.0, 1.0):
+                for second in (-1.0, 1.0):
+                    corner = np.zeros(3)
+                    corner[[along, across, normal]] = first * 0.36, second * 0.5, level
+                    yield lathe(0, axes @ (corner * size), second * axes[:, across], profile, colors, 16)
+
+    def _radius(self, frame: int) -> float:
+        """Radius of the link in a frame: the arm tapers toward the tip, m."""
+        return self._thickness * (1.15 - 0.4 * frame / self.frame_count)
+
+    def _arm(self) -> Iterator[Mesh]:
+        last = len(self._offsets) - 1
+        for frame, offset in enumerate(self._offsets):
+            radius, color = (self._radius(frame), LINK) if frame else (1.2 * self._radius(frame), METAL)
+            end = offset if frame < last else self._hand_start
+            if np.linalg.norm(end) > 0.1 * radius:
+                yield cylinder(frame, (0.0, 0.0, 0.0), end, radius, color)
+        for joint in range(1, len(self.scene.links) + 1):
+            yield from self._joint(joint)
+        if self.scene.wrist is not None:
+            frame = len(self.scene.links) + 1
+            yield ball(frame, (0.0, 0.0, 0.0), 1.5 * self._radius(frame), JOINT)
+
+    def _joint(self, frame: int) -> Iterator[Mesh]:
+        """A beveled housing along the joint's z axis."""
+        radius, half = 1.5 * self._radius(frame), 1.6 * self._radius(frame)
+        bevel = 0.2 * radius
+        profile = [(-half, 0.0), (-half, radius - bevel), (bevel - half, radius), (half - bevel, radius)]
+        profile += [(half, radius - bevel), (half, 0.0)]
+        yield lathe(frame, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), profile, JOINT)
+
+    @property
+    def _hand_length(self) -> float:
+        return 5.0 * self._thickness
+
+    @cached_property
+    def _approach(self) -> Array:
+        """Unit direction of the hand, in the frame before the tip's: that of the last link."""
+        direction = self._offsets[-1]
+        if not direction.any() and self.scene.wrist is not None:
+            direction = np.array(self.scene.wrist.frame.rotation_matrix).T @ self._offsets[-2]
+        if not direction.any():
+            direction = np.array([0.0, 0.0, 1.0])
+        return np.asarray(direction / np.linalg.norm(direction))
+
+    @cached_property
+    def _hand_start(self) -> Array:
+        """Start of the hand, in the frame before the tip's, m: it ends at the tip if there is room."""
+        return self._approach * max(0.0, float(np.linalg.norm(self._offsets[-1])) - self._hand_length)
+
+    def _overhang(self) -> float:
+        """Reach of hand and payload beyond the tip, m."""
+        overhang = max(0.0, self._hand_length - float(np.linalg.norm(self._offsets[-1])))
+        payload = self.scene.payload
+        if payload is not None:
+            size, _ = equivalent_box(payload.mass, payload.inertia)
+            overhang = max(overhang, float(np.linalg.norm(payload.center_of_mass) + 0.5 * size.max()))
+        return overhang
+
+    def _hand(self) -> Iterator[Mesh]:
+        """A palm and two fingers."""
+        frame = len(self._offsets) - 1
+        radius, length, approach = 0.8 * self._thickness, self._hand_length, self._approach
+        opening = np.cross(approach, np.eye(3)[np.abs(approach).argmin()])
+        opening /= np.linalg.norm(opening)
+        axes = np.column_stack([opening, np.cross(approach, opening), approach])
+        profile = [(0.0, 0.0), (0.0, radius), (0.3, 1.3 * radius), (0.4, 1.3 * radius), (0.4, 0.0)]
+        scaled = [(height * length, ring) for height, ring in profile]
+        yield lathe(frame, self._hand_start, approach, scaled, JOINT)
+        for side in (-1.0, 1.0):
+            center = self._hand_start + 0.68 * length * approach + side * radius * opening
+            yield box(frame, center, (0.5 * radius, 1.2 * radius, 0.64 * length), DARK_METAL, axes)
+
+    def _payload(self) -> Iterator[Mesh]:
+        payload = self.scene.payload
+        if payload is not None:
+            size, axes = equivalent_box(payload.mass, payload.inertia)
+            yield box(self.frame_count - 1, payload.center_of_mass, size, GRASPED, axes)
+
+    def _axes(self) -> Iterator[Mesh]:
+        """Axes of the tip, and thicker and lighter ones at the target."""
+        thickness, length = self._thickness, self.axis_length
+        yield from _arrows(self.frame_count - 1, length, 0.26 * thickness, 0.0)
+        yield from _arrows(self.frame_count, length, 0.42 * thickness, 0.5)
+
+
+def _arrows(frame: int, length: float, radius: float, lightness: float) -> Iterator[Mesh]:
+    """Arrows along the axes of a frame, x red, y green, z blue, mixed with white."""
+    head = length - 6.0 * radius
+    profile = [(0.0, 0.0), (0.0, radius), (head, radius), (head, 2.3 * radius), (length, 0.0)]
+    for direction, color in zip(np.eye(3), AXIS_COLORS, strict=True):
+        red, green, blue = (part + lightness * (1.0 - part) for part in color)
+        yield lathe(frame, np.zeros(3), direction, profile, (red, green, blue), 12)

@@ -1,0 +1,97 @@
+"""The curves beside the robot, as in the paper's plots: errors of the tip, and inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.viewing.replay.flights import FloatArray, ShownFlight
+
+_ACTUATORS = {
+    "base_force": "Force on the base",
+    "base_torque": "Torque on the base",
+    "joint_torque": "Joint torques",
+    "wrist_rate": "Wrist rates",
+}
+_EULER_RATES = ("ψ̇", "θ̇", "φ̇")
+_SMALL = 0.1  # inputs below this are shown in thousandths of their unit
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Curves of one quantity, of all flights."""
+
+    title: str
+    unit: str
+    note: str  # limits or tolerance
+    names: tuple[str, ...]  # of the curves of a flight
+    steps: bool  # whether values hold for a time step; otherwise they belong to instants
+    bounds: tuple[float, ...]  # lines to draw where they are in view
+    curves: tuple[FloatArray, ...]  # by flight, shape (curves, M) if `steps`, else (curves, M + 1)
+    disturbed: tuple[FloatArray | None, ...]  # the same with noise; None without
+
+
+def panels(flights: Sequence[ShownFlight], scene: Scene) -> list[Panel]:
+    """Errors of the tip, then the scene's actuators in the order of the controls."""
+    layout, success = StateLayout.of(scene), scene.success
+    quiet = (None,) * len(flights)
+    angles = tuple(flight.angle[None] for flight in flights)
+    distances = tuple(flight.distance[None] for flight in flights)
+    tolerances = (success.attitude_error_deg,), (success.position_error,)
+    result = [
+        _error("Attitude error", "°", tolerances[0], angles, quiet),
+        _error("Position error", "m", tolerances[1], distances, quiet),
+    ]
+    for actuator, title in _ACTUATORS.items():
+        entries = getattr(layout.control, actuator)
+        if entries.stop > entries.start:
+            result.append(_inputs(actuator, title, entries, layout, flights))
+    return result
+
+
+def _error(
+    title: str, unit: str, tolerance: tuple[float], curves: tuple[FloatArray, ...], quiet: tuple[None, ...]
+) -> Panel:
+    return Panel(title, unit, f"tolerance {tolerance[0]:g}", ("",), False, tolerance, curves, quiet)
+
+
+def _inputs(
+    actuator: str, title: str, entries: slice, layout: StateLayout, flights: Sequence[ShownFlight]
+) -> Panel:
+    unit, limits = layout.control.units[entries.start], layout.control_limit[entries]
+    largest = max(float(np.abs(flight.controls[:, entries]).max()) for flight in flights)
+    scale, prefix = (1e3, "m") if 0.0 < largest < _SMALL else (1.0, "")
+    bounds = sorted({side * scale * limit for limit in limits[np.isfinite(limits)] for side in (-1.0, 1.0)})
+    return Panel(
+        title=title,
+        unit=prefix + unit,
+        note=_limit_note(limits, f" {unit}" if prefix else ""),
+        names=_names(actuator, entries, layout),
+        steps=True,
+        bounds=tuple(bounds),
+        curves=tuple(scale * flight.controls[:, entries].T for flight in flights),
+        disturbed=tuple(
+            None if flight.noise is None else scale * (flight.controls + flight.noise)[:, entries].T
+            for flight in flights
+        ),
+    )
+
+
+def _limit_note(limits: FloatArray, unit: str) -> str:
+    sizes = sorted(set(limits.tolist()))
+    if np.isinf(sizes[-1]):
+        return "no limit" if len(sizes) == 1 else "some without limit"
+    smallest, largest = f"{sizes[0]:g}", f"{sizes[-1]:g}"
+    return f"limit ±{largest}{unit}" if len(sizes) == 1 else f"limits ±{smallest} to ±{largest}{unit}"
+
+
+def _names(actuator: str, entries: slice, layout: StateLayout) -> tuple[str, ...]:
+    """Axes, numbers of joints, or Euler angles."""
+    if actuator == "joint_torque":
+        return tuple(f"{joint + 1}" for joint in layout.actuated_joints)
+    if actuator == "wrist_rate":
+        return _EULER_RATES
+    return tuple(name[-1] for name in layout.control.names[entries])

@@ -1,0 +1,82 @@
+"""Flights from files and packages, and the scene in which several of them can be shown."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dq_space_arm_env.common.entry_points import entry_points, load
+from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.task.trajectory import Trajectory
+
+GROUP = "dq_space_arm.flights"
+"""Entry-point group: functions (source, label) -> `Trajectory`, or None for what they do not read."""
+
+
+def read_flight(source: str | os.PathLike[str], label: str | None = None) -> Trajectory:
+    """Read a flight.
+
+    Args:
+        source: A file that `Trajectory.save` or `Solution.save` has written; or a source that a package reads
+            by an entry point, like `demonstrations/paper#3`, demonstration 3 in a folder.
+        label: Name on the page; by default that in the file, or the name of the file.
+
+    Returns:
+        The flight.
+
+    Raises:
+        ValueError: If the source holds no flight.
+    """
+    text = os.fspath(source)
+    for reference in entry_points(GROUP).values():
+        flight: Trajectory | None = load(reference)(text, label)
+        if flight is not None:
+            return flight
+    return Trajectory.load(text, label)
+
+
+def common_scene(flights: Sequence[Trajectory], scene: Scene | None = None) -> tuple[list[Trajectory], Scene]:
+    """Find the scene in which all flights can be shown.
+
+    Scenes may differ in masses, limits and targets, which change the flights but not the picture.
+
+    Args:
+        flights: The flights.
+        scene: The scene to show; by default the first that a flight names.
+
+    Returns:
+        The flights, each with the target of its own scene; and the scene.
+
+    Raises:
+        ValueError: If no scene is known, or a flight has another robot or time step.
+    """
+    scene = scene or next((flight.scene for flight in flights if flight.scene is not None), None)
+    if scene is None:
+        raise ValueError("no file says which scene it belongs to: name the scene")
+    aimed = []
+    for flight in flights:
+        if flight.scene is not None:
+            _check_same_robot(flight.label, flight.scene, scene)
+            if flight.target is None:
+                flight = replace(flight, target=np.array(flight.scene.target.pose.dual_quaternion))
+        aimed.append(flight)
+    return aimed, scene
+
+
+def _check_same_robot(label: str, own: Scene, scene: Scene) -> None:
+    if own.simulation.dt != scene.simulation.dt:
+        raise ValueError(
+            f"flight {label!r} has time steps of {own.simulation.dt:g} s, the scene {scene.name!r} has "
+            f"{scene.simulation.dt:g} s: show them on separate pages"
+        )
+    mine, other = (
+        (item.base.motion, [link.joint for link in item.links], item.wrist, item.tip) for item in (own, scene)
+    )
+    if mine != other:
+        raise ValueError(
+            f"flight {label!r} is one of another robot ({own.name!r}) than that of the scene {scene.name!r}: "
+            "show them on separate pages"
+        )

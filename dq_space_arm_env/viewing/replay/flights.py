@@ -1,0 +1,164 @@
+"""The part of a flight that can be shown, and the frames of the robot during it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics import kinematics
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.start import PLANAR_POSE
+from dq_space_arm_env.task.step_report import STATE_LIMIT
+from dq_space_arm_env.task.trajectory import Trajectory
+
+FloatArray = NDArray[np.float64]
+MOST_FLIGHTS = 6
+"""Flights on one page: as many as there are colors that everybody can tell apart."""
+
+_LARGEST_INPUT = 1e30  # larger ones have blown up, and exceed the page's single precision
+_UNIT = 1e-3  # within which a target's real part has length 1
+
+
+@dataclass(frozen=True, eq=False)
+class ShownFlight:
+    """The part of a flight that can be shown: M of its steps."""
+
+    label: str
+    controls: FloatArray  # commanded, shape (M, n_u), N, N m or rad/s
+    noise: FloatArray | None  # added to it at the actuators, same shape and units; None for none
+    target: FloatArray  # q_{D/I}, shape (8,)
+    # Poses of base, joint frames, wrist frame (if any) and tip, with signs that make them continuous in time.
+    frames: FloatArray  # shape (M + 1, frames, 8), dimensionless and m
+    angle: FloatArray  # Euler angle of the tip's attitude error, shape (M + 1,), deg
+    distance: FloatArray  # from tip to target, shape (M + 1,), m
+    note: str  # why it is cut off; empty if it is not
+
+    @property
+    def steps(self) -> int:
+        """Number of steps M."""
+        return len(self.controls)
+
+
+def prepare(flights: Sequence[Trajectory], scene: Scene) -> list[ShownFlight]:
+    """Check flights, and compute their frames and errors.
+
+    A diverged flight is cut off where its numbers are no longer finite or too large to draw.
+    """
+    if not flights:
+        raise ValueError("there is no flight to show: give at least one")
+    if len(flights) > MOST_FLIGHTS:
+        raise ValueError(f"{len(flights)} flights, should be at most {MOST_FLIGHTS} on one page")
+    layout = StateLayout.of(scene)
+    return [_prepare(flight, scene, layout) for flight in flights]
+
+
+def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlight:
+    what = f"flight {flight.label!r}"
+    if not flight.label.strip():
+        raise ValueError("a flight has no label: give it one")
+    states = _matrix(f"{what}: states", flight.states, (None, layout.n_x))
+    if len(states) < 2:
+        raise ValueError(f"{what}: states: {len(states)} rows, should be at least 2: nothing moves")
+    steps = len(states) - 1
+    controls = _matrix(f"{what}: controls", flight.controls, (steps, layout.n_u))
+    noise = None if flight.noise is None else _matrix(f"{what}: noise", flight.noise, (steps, layout.n_u))
+    shown = _finite_steps(states, controls, noise)
+    if shown < 1:
+        raise ValueError(f"{what}: its first step is not finite or has blown up: there is nothing to show")
+    target = _pose(what, scene.target.pose.dual_quaternion if flight.target is None else flight.target)
+    frames = _continuous(frame_poses(scene, layout, states[: shown + 1]))
+    tip, aim = tuple(frames[:, -1].T), tuple(target.tolist())
+    seconds = shown * scene.simulation.dt
+    return ShownFlight(
+        label=flight.label,
+        controls=controls[:shown],
+        noise=None if noise is None else noise[:shown],
+        target=target,
+        frames=frames,
+        angle=np.degrees(poses.error_angle(tip, aim)),
+        distance=np.asarray(poses.error_distance(tip, aim)),
+        note="" if shown == steps else f"diverges after {seconds:.4g} s",
+    )
+
+
+def frame_poses(scene: Scene, layout: StateLayout, states: FloatArray) -> FloatArray:
+    """Frames of the robot, eq. (27), for states (M, n_x); shape (M, frames, 8); without compiled code."""
+    entries = layout.state
+    base = np.zeros((8, len(states)))
+    stored = list(PLANAR_POSE) if layout.planar else list(range(8))
+    base[stored] = states[:, entries.pose].T
+    joints, wrist = tuple(states[:, entries.joint_angles].T), tuple(states[:, entries.wrist_angles].T)
+    frames = kinematics.frame_poses(Chain.from_scene(scene), tuple(base), joints, wrist)
+    return np.stack([np.stack(frame, axis=1) for frame in frames], axis=1)
+
+
+def _continuous(frames: FloatArray) -> FloatArray:
+    """Signs of q, of which both mean one pose, such that neighbors in time are near: the page blends them."""
+    overlaps = np.sum(frames[1:, :, :4] * frames[:-1, :, :4], axis=2)
+    signs = np.cumprod(np.where(overlaps < 0.0, -1.0, 1.0), axis=0)
+    result = frames.copy()
+    result[1:] *= signs[:, :, None]
+    return result
+
+
+def _finite_steps(states: FloatArray, controls: FloatArray, noise: FloatArray | None) -> int:
+    """Number of steps before the first that is not finite or has blown up."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        good_states = np.linalg.norm(states, axis=1) <= STATE_LIMIT  # false for NaN
+    good = good_states[:-1] & good_states[1:]
+    for inputs in (controls, noise):
+        if inputs is not None:
+            good &= (np.abs(inputs) <= _LARGEST_INPUT).all(axis=1)
+    return len(good) if good.all() else int(np.argmin(good))
+
+
+def _pose(what: str, value: ArrayLike) -> FloatArray:
+    target = _numbers(f"{what}: target", value)
+    if target.shape != (8,) or not np.isfinite(target).all():
+        raise ValueError(f"{what}: target: {target}, should be a pose, 8 finite numbers")
+    if abs(np.linalg.norm(target[:4]) - 1.0) > _UNIT:
+        raise ValueError(f"{what}: target: {target}, should be a pose: its real part should have length 1")
+    return target
+
+
+def _numbers(name: str, value: ArrayLike) -> FloatArray:
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: should be numbers ({error})") from error
+
+
+def _matrix(name: str, value: ArrayLike, shape: tuple[int | None, int]) -> FloatArray:
+    array = _numbers(name, value)
+    rows, columns = shape
+    if array.ndim != 2 or array.shape[1] != columns or rows not in (None, array.shape[0]):
+        wanted = "N + 1" if rows is None else str(rows)
+        raise ValueError(f"{name}: shape {array.shape}, should be ({wanted}, {columns})")
+    return array
+
+
+def verdict(flight: ShownFlight, scene: Scene) -> str:
+    """Describe the end of a flight in a phrase."""
+    angle, distance = float(flight.angle[-1]), float(flight.distance[-1])
+    place = f"{_rounded(angle)}° and {_length(distance)} from the target"
+    if flight.note:
+        return f"{flight.note}, {place}"
+    success = scene.success
+    reached = angle <= success.attitude_error_deg and distance <= success.position_error
+    return f"ends {place}: {'success' if reached else 'outside the tolerances'}"
+
+
+def _length(meters: float) -> str:
+    if meters >= 1.0:
+        return f"{meters:.3g} m" if meters < 999.5 else f"{meters:.0f} m"
+    return f"{_rounded(100.0 * meters)} cm" if meters >= 0.01 else f"{_rounded(1000.0 * meters)} mm"
+
+
+def _rounded(value: float) -> str:
+    """Two digits, or all digits before the decimal point."""
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"

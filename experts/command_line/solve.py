@@ -1,0 +1,86 @@
+"""`dq-space-arm solve`: the optimal maneuver of a scene, from any start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from dq_space_arm_env.command_line.names import SCENE, seed_option, start_option
+from dq_space_arm_env.command_line.verb import Interrupted, json_option, print_document
+from dq_space_arm_env.common.console import FAILURE, SUCCESS, message_console, table_console
+from dq_space_arm_env.common.files import check_writable
+
+
+@click.command(
+    short_help="Solve a scene: the optimal maneuver.",
+    epilog="""\b
+        Examples:
+          dq-space-arm solve paper           # results/solutions/paper/solution.npz
+          dq-space-arm solve my.yaml --out results/mine --figures
+          dq-space-arm solve paper --seed 7  # from a start drawn at random
+          dq-space-arm solve paper --json | jq .cost
+    """,
+)
+@click.argument("scene", type=SCENE)
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Output folder.  [default: results/solutions/<scene>[-<seed>]]",
+)
+@start_option
+@seed_option
+@click.option(
+    "--solver",
+    type=click.Choice(["guided", "box"]),
+    default="guided",
+    show_default=True,
+    help="guided: from its own guesses (GuidedDDP); box: from zero controls (BoxDDP).",
+)
+@click.option("--max-iterations", type=click.IntRange(min=0), help="Replaces the solver's default.")
+@click.option("--figures", is_flag=True, help="Draw figures (needs the extra plots).")
+@json_option
+def solve(
+    scene: str,
+    out: Path | None,
+    start: str | None,
+    seed: int | None,
+    solver: str,
+    max_iterations: int | None,
+    figures: bool,
+    as_json: bool,
+) -> int:
+    """Solve SCENE, a name or a file, by control-limited differential dynamic programming.
+
+    The output folder receives solution.npz (trajectory, controls, feedback gains), scene.yaml, summary.json,
+    and figures on request. Exit status 1: the solve did not converge; 130: interrupted. The best trajectory
+    so far is always saved, flagged as not converged.
+    """
+    from dq_space_arm_env import load_scene
+    from experts.command_line import solving
+
+    loaded = load_scene(scene)
+    if figures:
+        solving.check_figures()
+    folder = out or solving.default_folder(loaded, seed)
+    check_writable(folder)
+    run = solving.solve(
+        loaded,
+        message_console(),
+        seed=seed,
+        start=start,
+        guided=solver == "guided",
+        max_iterations=max_iterations,
+    )
+    files = solving.save(run, folder, figures=figures)
+    record = {**solving.record(run), "files": [str(file) for file in files]}
+    if as_json:
+        print_document(record)
+    else:
+        console = table_console()
+        console.print(solving.table(run))
+        written = ", ".join(file.name for file in files)
+        console.print(f"{folder}: {written}", markup=False, soft_wrap=True)
+    if run.interrupted:
+        raise Interrupted(f"the best trajectory so far is saved in {folder}")
+    return SUCCESS if run.solution.converged else FAILURE

@@ -1,0 +1,169 @@
+"""A solve: prepared, solved, judged, saved."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from dq_space_arm_env import Scene
+from dq_space_arm_env.command_line.simulated_episode import (
+    Start,
+    begin,
+)
+from dq_space_arm_env.common.files import json_value, to_json, write_atomically
+from dq_space_arm_env.common.provenance import provenance
+from dq_space_arm_env.common.tables import plain_table
+from experts import BoxDDP, GuidedDDP, Solution, StopReason
+from experts.report import Maneuver, SolveProgress
+from experts.report.reproduction import results_folder
+
+
+@dataclass(frozen=True, eq=False)
+class SolveRun:
+    """A solve and its result."""
+
+    scene: Scene
+    start: Start
+    solver: str
+    solution: Solution
+    preparation_seconds: float  # compile or load, and solve the guesses' source, s
+    preparation_iterations: int | None  # of the solve from the scene's own start; None without
+    solve_seconds: float  # s
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the user stopped it."""
+        return self.solution.stop_reason is StopReason.INTERRUPTED
+
+    @property
+    def final_errors(self) -> tuple[float, float]:
+        """Attitude error [deg] and position error [m] at the end; inf where the motion has diverged."""
+        if not math.isfinite(self.solution.cost):
+            return math.inf, math.inf
+        maneuver = Maneuver(self.start.scene, self.solution.states[-1:], self.solution.controls[-1:])
+        return math.degrees(maneuver.angle[-1]), float(maneuver.distance[-1])
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the tip ends within the scene's tolerances."""
+        attitude, position = self.final_errors
+        success = self.scene.success
+        return attitude <= success.attitude_error_deg and position <= success.position_error
+
+
+def check_figures() -> None:
+    """Refuse figures without Matplotlib."""
+    if find_spec("matplotlib") is None:
+        raise ValueError('--figures needs matplotlib: pip install "dq-space-arm[plots]"')
+
+
+def default_folder(scene: Scene, seed: int | None) -> Path:
+    """Name the folder of a solution."""
+    folder = results_folder(scene, "solutions")
+    return folder if seed is None else folder.with_name(f"{folder.name}-{seed}")
+
+
+def solve(
+    scene: Scene,
+    console: Console,
+    *,
+    seed: int | None = None,
+    start: str | None = None,
+    guided: bool = True,
+    max_iterations: int | None = None,
+) -> SolveRun:
+    """Solve a scene."""
+    limits: dict[str, Any] = {} if max_iterations is None else {"max_iterations": max_iterations}
+    began = perf_counter()
+    with SolveProgress(console) as progress:
+        begun = begin(scene, seed, start)
+        solver: BoxDDP | GuidedDDP = (
+            GuidedDDP(begun.scene, **limits) if guided else BoxDDP(begun.scene, **limits)
+        )
+        before = None
+        if isinstance(solver, GuidedDDP):
+            # Solve the library now, to time this solve alone.
+            before = sum(known.iterations for known in solver.library)
+        prepared = perf_counter()
+        progress.start()
+        solution = solver.solve(begun.state, callback=progress.update)
+    solved = perf_counter()
+    solution.metadata |= {"scene": begun.scene.model_dump(mode="json"), "start": begun.title}
+    name = type(solver).__name__
+    return SolveRun(scene, begun, name, solution, prepared - began, before, solved - prepared)
+
+
+def save(run: SolveRun, folder: Path, *, figures: bool) -> list[Path]:
+    """Write the files of a run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / name for name in ("solution.npz", "scene.yaml", "summary.json")]
+    run.solution.save(files[0])
+    write_atomically(files[1], run.start.scene.to_yaml())
+    write_atomically(files[2], to_json({**record(run), **provenance()}))
+    if figures and math.isfinite(run.solution.cost):
+        from experts.figures import write_figures
+
+        maneuver = Maneuver(run.start.scene, run.solution.states, run.solution.controls)
+        files += write_figures(maneuver, folder)
+    return files
+
+
+def record(run: SolveRun) -> dict[str, Any]:
+    """Describe a run for programs."""
+    solution = run.solution
+    attitude, position = run.final_errors
+    found = {
+        "scene": run.scene.name,
+        "start": run.start.title,
+        "initial_state": run.start.state.tolist(),
+        "solver": run.solver,
+        "guess": solution.metadata.get("guess", "zero controls"),
+        "cost": solution.cost,
+        "converged": solution.converged,
+        "stop_reason": solution.stop_reason.value,
+        "message": solution.message,
+        "optimality": solution.optimality,
+        "iterations": solution.iterations,
+        "preparation_seconds": run.preparation_seconds,
+        "preparation_iterations": run.preparation_iterations,
+        "solve_seconds": run.solve_seconds,
+        "final_attitude_error_deg": attitude,
+        "final_position_error_m": position,
+        "is_success": run.is_success,
+    }
+    return {name: json_value(value) for name, value in found.items()}
+
+
+def table(run: SolveRun) -> Table:
+    """Describe a run for people."""
+    solution, success = run.solution, run.scene.success
+    attitude, position = run.final_errors
+    verdict = "converged" if solution.converged else f"NOT converged ({solution.stop_reason.value})"
+    reached = "within the tolerance" if run.is_success else "NOT within the tolerance"
+    guess = str(solution.metadata.get("guess", "zero controls"))
+    if guess.startswith("policy"):
+        guess = "the prepared maneuver, with its feedback gains"
+    prepared = "machine code loaded or compiled"
+    if run.preparation_iterations is not None:
+        prepared += f"; the maneuver from its own start, {run.preparation_iterations} iterations"
+    seconds = f"{run.solve_seconds:.2f} s"
+    if solution.converged and solution.iterations == 0:
+        seconds += ": the initial guess is already optimal"
+    rows = (
+        ("start", run.start.title, ""),
+        ("preparation", f"{run.preparation_seconds:.1f} s", prepared),
+        ("solver", run.solver, f"initial guess: {guess}"),
+        ("cost J", f"{solution.cost:.6f}", ""),
+        ("end", verdict, solution.message),
+        ("iterations", str(solution.iterations), seconds),
+        ("attitude error", f"{attitude:.3g} deg", f"tolerance {success.attitude_error_deg:g} deg; {reached}"),
+        ("position error", f"{position:.3g} m", f"tolerance {success.position_error:g} m"),
+    )
+    return plain_table(f"Scene {run.scene.name}", ("", "", ""), rows)

@@ -1,0 +1,1 @@
+"""Control-limited differential dynamic programming."""

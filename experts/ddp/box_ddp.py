@@ -1,0 +1,348 @@
+"""Box-DDP: optimal control of a shooting problem with bounds on the controls.
+
+Control-limited differential dynamic programming of Tassa, Mansard & Todorov (ICRA 2014), with Gauss-Newton's
+model of the dynamics (iLQR), exact second derivatives (Newton's method), or a hybrid of the two
+(`second_order`). An iteration differentiates along the trajectory, runs a backward pass for a control update
+and its gains, and a forward pass that searches along the update for a step that reduces the cost as
+predicted. Given a guess of the states, a solve begins by multiple shooting (`multiple_shooting`).
+
+**Convergence** is measured by the reduction of the cost that the model predicts for a full, unregularized
+step, relative to the cost. It does not depend on the units of states, controls or cost, it accounts for the
+bounds, and it vanishes exactly where the first-order conditions hold. A predicted reduction below the value
+of a rounding of the states counts as zero: at the target, cost and gradient are nothing but rounding errors.
+A small achieved reduction is no evidence of convergence: regularization, or a plateau of a curved problem,
+makes steps small far from any minimum. Where there are exact second derivatives the step is Newton's, which
+exists only if they are positive definite: neither a saddle nor a valley whose curvature Gauss-Newton
+overestimates counts as converged.
+"""
+
+from collections.abc import Iterator
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from experts.ddp.backward_pass import PASS_NOT_FINITE, PASS_NOT_POSITIVE_DEFINITE, PassResult
+from experts.ddp.multiple_shooting import MultipleShooting
+from experts.ddp.rollout import FINISHED
+from experts.ddp.second_order import EXACT_MU, Regularization, SecondOrder, SolverState
+from experts.ddp.shooting import ShootingWorkspace, WorkTime, line_search
+from experts.ddp.solution import HISTORY_DTYPE, Callback, IterationRecord, Solution, Stop, StopReason
+from experts.problems.arm_problem import as_problem
+from experts.problems.shooting_problem import (
+    FloatArray,
+    ShootingProblem,
+    check_array,
+    check_at_least,
+    check_control_weights,
+)
+
+CONVERGED = "no step is predicted to reduce the cost"
+
+
+class BoxDDP:
+    """Box-DDP for one problem; it keeps its work arrays between solves, so give each thread its own."""
+
+    def __init__(
+        self,
+        scene_or_problem: Any,
+        *,
+        max_iterations: int = 200,
+        tolerance: float = 1e-7,
+        plateau_decrease: float = 1e-8,
+        plateau_iterations: int = 50,
+        initial_regularization: float = 1000.0,
+        second_order: str | None = None,
+        threads: int = 1,
+    ) -> None:
+        """Prepare the solver.
+
+        Args:
+            scene_or_problem: A scene, or a `ShootingProblem`.
+            max_iterations: Most iterations of a solve.
+            tolerance: Predicted reduction of an unregularized step, relative to the cost, below which the
+                solve has converged.
+            plateau_decrease: Reduction of the cost, relative to it, below which an iteration is idle.
+            plateau_iterations: Consecutive idle iterations that end the solve.
+            initial_regularization: First mu, in multiples of the control weights. Small values let the first
+                steps go so far that the solve may end in a poor minimum.
+            second_order: Second derivatives to use: "gauss_newton", "exact" or "hybrid". None takes the
+                hybrid if the problem has exact ones, else Gauss-Newton's.
+            threads: Most threads that compute derivatives. More than one pays only where a core is idle.
+
+        Raises:
+            ValueError: If a setting is out of range, second_order is unknown or asks for derivatives that the
+                problem does not have, or the problem contradicts itself.
+        """
+        check_at_least("max_iterations", max_iterations, 0)
+        check_at_least("tolerance", tolerance, 0.0)
+        check_at_least("plateau_decrease", plateau_decrease, 0.0)
+        check_at_least("plateau_iterations", plateau_iterations, 1)
+        check_at_least("initial_regularization", initial_regularization, 0.0)
+        check_at_least("threads", threads, 1)
+        self.problem: ShootingProblem = as_problem(scene_or_problem)
+        self.max_iterations = max_iterations
+        self.tolerance = tolerance
+        self.plateau_decrease = plateau_decrease
+        self.plateau_iterations = plateau_iterations
+        self.initial_regularization = initial_regularization
+        self.second_order = SecondOrder.of(second_order, self.problem.has_second_order)
+        # Exact second derivatives, where there are any, have the last word on convergence.
+        self._has_exact = self.second_order is not SecondOrder.GAUSS_NEWTON
+        self._work = ShootingWorkspace(self.problem, self._has_exact, threads=threads)
+        self._shooting: MultipleShooting | None = None
+
+    def solve(
+        self,
+        x0: FloatArray | None = None,
+        u_init: FloatArray | None = None,
+        callback: Callback | None = None,
+        *,
+        x_init: FloatArray | None = None,
+    ) -> Solution:
+        """Minimize the cost, starting from a guess of the controls, or of controls and states.
+
+        Args:
+            x0: State at stage 0, shape (n_x,); the problem's initial state if None.
+            u_init: First guess of the controls, within the bounds, shape (N, n_u); if None zeros, or the
+                bound next to zero where zero is not allowed.
+            callback: Called with the record of every iteration; it may raise KeyboardInterrupt to end the
+                solve.
+            x_init: First guess of the states, shape (N + 1, n_x); the dynamics need not lead from one to the
+                next, nor need it begin at x0. The solve then begins by multiple shooting, see
+                `multiple_shooting`. None takes the rollout of the controls.
+
+        Returns:
+            The best trajectory found, whatever the reason to stop; always a rollout of its controls from x0.
+
+        Raises:
+            ValueError: If x0, u_init or x_init have the wrong shape, are not finite or out of bounds, an
+                input has no cost of its own, or states are given and the problem has no retraction.
+        """
+        initial_state, controls = self._check_start(x0, u_init)
+        work, stop = self._work, None
+        state = SolverState(Regularization(self.initial_regularization))
+        if x_init is None:
+            work.start(initial_state, controls)
+        else:
+            shooting = self._multiple_shooting()
+            guess = initial_state, shooting.check(x_init), controls
+            stop = shooting.close_gaps(guess, state, self.max_iterations, callback)
+        state.first_cost = work.current.cost
+        if work.current.failing_stage != FINISHED:
+            message = f"the first rollout is not finite from stage {work.current.failing_stage} on"
+            return self._solution(state, Stop(StopReason.DIVERGED, message), np.zeros_like(work.update.K))
+        state.moved = True
+        try:
+            while stop is None:
+                stop = self._iterate(state, callback)
+        except KeyboardInterrupt:
+            stop = Stop(StopReason.INTERRUPTED, "interrupted by the user")
+        return self._finish(state, stop)
+
+    def _iterate(self, state: SolverState, callback: Callback | None) -> Stop | None:
+        """Run one iteration; return why the solve ends, or None to continue."""
+        work, started = self._work, perf_counter()
+        work.time = WorkTime()
+        if state.moved:
+            work.differentiate()
+        if not state.records:
+            check_control_weights(work.derivatives.luu)
+        cost, alpha = work.current.cost, 0.0
+        for direction in self._backward_passes(state):
+            stop = self._stopping_criteria(state, direction)
+            if stop is not None:
+                return stop
+            alpha = line_search(work, direction)
+            if alpha > 0.0:
+                break
+        # In the hybrid mu regularizes Gauss-Newton's model only.
+        if direction.exact == (self.second_order is SecondOrder.EXACT):
+            state.regularization.adapt(alpha)
+        state.moved = alpha > 0.0
+        record = self._record(state, direction, cost, alpha, started)
+        if callback is not None:
+            callback(record)
+        return self._no_progress(state, record)
+
+    def _backward_passes(self, state: SolverState) -> Iterator[PassResult]:
+        """Yield control updates to search along; the next one is asked for if no step was accepted."""
+        if self.second_order is SecondOrder.HYBRID and state.switch.tries_exact:
+            direction = self._exact_backward_pass()
+            if direction.status != PASS_NOT_POSITIVE_DEFINITE:
+                yield direction
+            state.switch.postpone_exact()
+        yield self._regularized_backward_pass(
+            state.regularization, exact=self.second_order is SecondOrder.EXACT
+        )
+
+    def _exact_backward_pass(self) -> PassResult:
+        """Use exact second derivatives under weak regularization only; the pass may fail."""
+        self._work.differentiate_twice()
+        for mu in EXACT_MU:
+            direction = self._work.backward_pass(mu, exact=True)
+            if direction.status != PASS_NOT_POSITIVE_DEFINITE:
+                break
+        return direction
+
+    def _regularized_backward_pass(self, regularization: Regularization, *, exact: bool) -> PassResult:
+        """Increase mu until the backward pass succeeds, or mu leaves its range."""
+        if exact:
+            self._work.differentiate_twice()
+        direction = self._work.backward_pass(regularization.mu, exact=exact)
+        while direction.status == PASS_NOT_POSITIVE_DEFINITE and not regularization.exhausted:
+            regularization.increase()
+            direction = self._work.backward_pass(regularization.mu, exact=exact)
+        return direction
+
+    def _stopping_criteria(self, state: SolverState, direction: PassResult) -> Stop | None:
+        """Judge a backward pass: has it failed, is the trajectory optimal, may a step follow?"""
+        if direction.status == PASS_NOT_FINITE:
+            return Stop(StopReason.DIVERGED, f"the derivatives are not finite at stage {direction.stage}")
+        if not direction.completed:
+            return Stop(
+                StopReason.REGULARIZATION_LIMIT,
+                f"the model at stage {direction.stage} is not convex at the largest regularization",
+            )
+        if self._relative_reduction(state, direction) <= self.tolerance and self._is_optimal(
+            state, direction
+        ):
+            return Stop(StopReason.CONVERGED, CONVERGED)
+        return state.iteration_limit(self.max_iterations)
+
+    def _is_optimal(self, state: SolverState, direction: PassResult) -> bool:
+        """Judge by an unregularized step, with exact second derivatives if there are any.
+
+        Its update is kept if the trajectory is optimal.
+        """
+        if self._has_exact:
+            state.switch.request_exact()
+            self._work.differentiate_twice()
+        if direction.mu > 0.0 or direction.exact != self._has_exact:
+            direction = self._work.backward_pass(0.0, exact=self._has_exact)
+            if not direction.completed:
+                return False
+        state.optimality = self._relative_reduction(state, direction)
+        if state.optimality <= self.tolerance:
+            return True
+        self._work.restore_update()
+        return False
+
+    def _relative_reduction(self, state: SolverState, direction: PassResult) -> float:
+        """Relate the predicted reduction of the full step to the cost; zero if rounding hides it."""
+        reduction = direction.predicted_reduction(1.0)
+        if reduction <= self._work.cost_rounding():
+            return 0.0
+        return reduction / state.cost_scale(self._work.current.cost)
+
+    def _record(
+        self, state: SolverState, direction: PassResult, cost: float, alpha: float, started: float
+    ) -> IterationRecord:
+        """Record an iteration that began at a cost."""
+        work, reduction = self._work, direction.predicted_reduction(1.0)
+        record = IterationRecord(
+            iteration=len(state.records) + 1,
+            cost=work.current.cost,
+            alpha=alpha,
+            exact=direction.exact,
+            regularization=direction.mu,
+            expected_decrease=reduction,
+            optimality=reduction / state.cost_scale(cost),
+            clamped_share=direction.clamped / work.current.controls.size,
+            seconds=perf_counter() - started,
+            derivative_seconds=work.time.derivatives,
+            sweep_seconds=work.time.backward_pass,
+            rollout_seconds=work.time.rollout,
+            gap=0.0,
+        )
+        state.records.append(record)
+        state.switch.observe(record, cost)
+        idle = cost - record.cost < self.plateau_decrease * abs(record.cost)
+        state.idle_iterations = state.idle_iterations + 1 if idle else 0
+        return record
+
+    def _no_progress(self, state: SolverState, record: IterationRecord) -> Stop | None:
+        """Stop where no step is left to try, or where the cost no longer falls."""
+        if state.regularization.exhausted and record.alpha == 0.0:
+            return Stop(
+                StopReason.REGULARIZATION_LIMIT, "no step reduces the cost at the largest regularization"
+            )
+        if state.idle_iterations >= self.plateau_iterations:
+            return Stop(
+                StopReason.PLATEAU,
+                f"{self.plateau_iterations} consecutive iterations reduced the cost by less than "
+                f"{self.plateau_decrease:.0e} of its value",
+            )
+        return None
+
+    def _finish(self, state: SolverState, stop: Stop) -> Solution:
+        """Compute the gains around the final trajectory, and judge it without regularization."""
+        work, (reason, message) = self._work, stop
+        if reason is not StopReason.CONVERGED:
+            state.optimality = np.inf
+            work.differentiate()
+            direction = self._final_backward_pass()
+            if not direction.completed:
+                message += "; there are no feedback gains, they are zero"
+                return self._solution(state, Stop(reason, message), np.zeros_like(work.update.K))
+            if direction.mu == 0.0 and direction.exact == self._has_exact:
+                state.optimality = self._relative_reduction(state, direction)
+            if state.optimality <= self.tolerance and reason is not StopReason.INTERRUPTED:
+                reason, message = StopReason.CONVERGED, CONVERGED
+        if np.isfinite(state.optimality):
+            message += f"; an unregularized step predicts a relative reduction of {state.optimality:.1e}"
+        return self._solution(state, Stop(reason, message), work.update.K.copy())
+
+    def _final_backward_pass(self) -> PassResult:
+        """Run a backward pass without regularization, with exact second derivatives if that succeeds."""
+        if self._has_exact:
+            self._work.differentiate_twice()
+            direction = self._work.backward_pass(0.0, exact=True)
+            if direction.completed:
+                return direction
+        return self._regularized_backward_pass(Regularization(0.0), exact=False)
+
+    def _solution(self, state: SolverState, stop: Stop, gains: FloatArray) -> Solution:
+        """Copy the current trajectory into a solution."""
+        current = self._work.current
+        return Solution(
+            states=current.states.copy(),
+            controls=current.controls.copy(),
+            feedback_gains=gains,
+            cost=current.cost,
+            stop_reason=stop.reason,
+            message=stop.message + state.note,
+            optimality=state.optimality,
+            iterations=len(state.records),
+            history=np.array(state.records, dtype=HISTORY_DTYPE),
+            problem=self.problem,
+        )
+
+    def _multiple_shooting(self) -> MultipleShooting:
+        if not self.problem.has_retraction:
+            raise ValueError(
+                "x_init is given, but the problem has no retraction to move states with; leave x_init out"
+            )
+        if self._shooting is None:
+            self._shooting = MultipleShooting(self._work)
+        return self._shooting
+
+    def _check_start(self, x0: FloatArray | None, u_init: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """Return the initial state and the first controls, or say what is wrong with them."""
+        problem = self.problem
+        lower, upper = np.asarray(problem.control_lower), np.asarray(problem.control_upper)
+        state = np.asarray(problem.initial_state if x0 is None else x0, dtype=np.float64)
+        check_array("x0", state, (problem.n_states,))
+        shape = (problem.horizon, problem.n_controls)
+        if u_init is None:
+            return state, np.broadcast_to(np.clip(0.0, lower, upper), shape)
+        controls = np.asarray(u_init, dtype=np.float64)
+        check_array("u_init", controls, shape)
+        outside = (controls < lower) | (controls > upper)
+        if np.any(outside):
+            k, i = (int(index[0]) for index in np.nonzero(outside))
+            raise ValueError(
+                f"u_init[{k}, {i}] is {controls[k, i]}, outside [{lower[i]}, {upper[i]}], the bounds of "
+                f"input {i}; clip the guess to the bounds first"
+            )
+        return state, controls

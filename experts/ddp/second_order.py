@@ -1,0 +1,148 @@
+"""Second derivatives and regularization of an iteration, and the state of a solve that decides on them.
+
+The Gauss-Newton model (iLQR) leaves out the curvature of the dynamics. It is convex and works well far from a
+minimum, where the exact model is indefinite, but it converges slowly where residuals are large: where effort
+balances error, as in a maneuver at the limits of the actuators. Newton's method with exact second derivatives
+finishes such a solve in a few steps. The hybrid starts with the former and tries the latter once steps slow
+down.
+
+The regularization mu follows Tassa's quadratic schedule: repeated increases accelerate, and so do repeated
+decreases. It reacts to the accepted step length, not to success alone: decreased after every success, as in
+the public release, it settles where only tiny steps are accepted.
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from experts.ddp.solution import IterationRecord, Stop, StopReason
+
+SLOW_REDUCTION = 0.05
+"""A step that reduces the cost by a smaller share is slow; so is one with a short accepted length."""
+SLOW_STEPS = 2
+"""Consecutive slow steps after which the hybrid tries the exact model."""
+EXACT_MU = (1e-3, 1e-1, 1e1, 1e3)
+"""Regularizations with which the hybrid tries the exact model, in multiples of the control weights."""
+LONGEST_PAUSE = 8
+"""Most iterations that the hybrid waits before it tries the exact model again."""
+
+MU_FACTOR = 1.6
+SMALLEST_MU = 1e-6  # below it mu is zero
+LARGEST_MU = 1e10
+LONG_STEP = 1.0  # an accepted step length from here on decreases mu: the full step only
+SHORT_STEP = 0.2  # one below it, or no step at all, increases mu
+
+COST_FLOOR = 1e-9
+"""Costs below this share of the first one count as zero in relative measures."""
+
+
+class SecondOrder(StrEnum):
+    """Second derivatives that the solver uses."""
+
+    GAUSS_NEWTON = "gauss_newton"
+    """Those of the cost alone: convex."""
+    EXACT = "exact"
+    """Those of cost and dynamics: Newton's method, full DDP."""
+    HYBRID = "hybrid"
+    """Gauss-Newton's until steps slow down, then exact ones wherever they yield a step."""
+
+    @classmethod
+    def of(cls, choice: str | None, has_second_order: bool) -> "SecondOrder":
+        """Resolve a user's choice; None takes the hybrid where the problem has exact second derivatives."""
+        if choice is None:
+            return cls.HYBRID if has_second_order else cls.GAUSS_NEWTON
+        names = [member.value for member in cls]
+        if choice not in names:
+            raise ValueError(f"second_order is {choice!r}; choose one of {', '.join(names)}")
+        if choice != cls.GAUSS_NEWTON and not has_second_order:
+            raise ValueError(
+                f"second_order is {choice!r}, but the problem has no exact second derivatives; "
+                f"{cls.GAUSS_NEWTON.value} needs none"
+            )
+        return cls(choice)
+
+
+@dataclass
+class Regularization:
+    """The weight mu of diag(luu) that the backward pass adds to Quu."""
+
+    mu: float  # in [0, LARGEST_MU], except after an increase beyond the limit
+    factor: float = 1.0  # of the last change; above 1 while increasing, below 1 while decreasing
+
+    def increase(self) -> None:
+        self.factor = max(self.factor * MU_FACTOR, MU_FACTOR)
+        self.mu = max(self.mu * self.factor, SMALLEST_MU)
+
+    def decrease(self) -> None:
+        self.factor = min(self.factor / MU_FACTOR, 1.0 / MU_FACTOR)
+        self.mu = self.mu * self.factor if self.mu * self.factor >= SMALLEST_MU else 0.0
+
+    def adapt(self, alpha: float) -> None:
+        """React to an accepted step length; 0 if no step was accepted."""
+        if alpha >= LONG_STEP:
+            self.decrease()
+        elif alpha < SHORT_STEP:
+            self.increase()
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether mu has left its range: no useful step is left to try."""
+        return self.mu > LARGEST_MU
+
+
+@dataclass
+class HybridSwitch:
+    """When the hybrid tries exact second derivatives."""
+
+    slow_steps: int = 0  # consecutive ones
+    wants_exact: bool = False
+    pause: int = 0  # iterations to wait all the same
+    next_pause: int = 1  # length of the pause after the next failure
+
+    @property
+    def tries_exact(self) -> bool:
+        return self.wants_exact and self.pause == 0
+
+    def request_exact(self) -> None:
+        """Try the exact model from now on, at once."""
+        self.wants_exact, self.pause = True, 0
+
+    def postpone_exact(self) -> None:
+        """Pause after an exact model that yielded no step, longer after each failure."""
+        self.pause, self.next_pause = self.next_pause, min(2 * self.next_pause, LONGEST_PAUSE)
+
+    def observe(self, record: IterationRecord, previous_cost: float) -> None:
+        """Note whether an iteration was slow."""
+        if record.exact:
+            self.next_pause = 1
+        self.pause = max(self.pause - 1, 0)
+        reduction = previous_cost - record.cost
+        slow = reduction < SLOW_REDUCTION * abs(previous_cost) or record.alpha < SHORT_STEP
+        self.slow_steps = self.slow_steps + 1 if slow else 0
+        if self.slow_steps >= SLOW_STEPS:
+            self.wants_exact = True
+
+
+@dataclass
+class SolverState:
+    """What a solve carries from iteration to iteration."""
+
+    regularization: Regularization  # of the only model, or of Gauss-Newton's in the hybrid
+    switch: HybridSwitch = field(default_factory=HybridSwitch)
+    first_cost: float = 0.0  # of the first trajectory without gaps
+    moved: bool = True  # whether the trajectory has changed since it was differentiated
+    optimality: float = np.inf  # predicted relative reduction of an unregularized step, inf where unknown
+    idle_iterations: int = 0  # consecutive ones that hardly reduced the cost
+    note: str = ""  # for the message: how gaps were closed that no step closed
+    records: list[IterationRecord] = field(default_factory=list)
+
+    def cost_scale(self, cost: float) -> float:
+        """Return a positive number to relate changes of a cost to, however small the cost is."""
+        return max(abs(cost), COST_FLOOR * abs(self.first_cost), float(np.finfo(np.float64).tiny))
+
+    def iteration_limit(self, max_iterations: int) -> Stop | None:
+        """Stop if the iterations are used up."""
+        if len(self.records) < max_iterations:
+            return None
+        return Stop(StopReason.MAX_ITERATIONS, f"the limit of {max_iterations} iterations is reached")

@@ -1,0 +1,241 @@
+"""Work arrays of a solve and the native operations on them: rollouts, derivatives, backward pass."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from time import perf_counter
+from typing import ParamSpec, TypeVar
+
+import numpy as np
+
+from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
+from dq_space_arm_env.kernels.threads import share_rows
+from experts.ddp.backward_pass import (
+    PASS_NOT_FINITE,
+    PassResult,
+    Update,
+    allocate_update,
+    backward_pass,
+    pass_workspace,
+)
+from experts.ddp.derivatives import (
+    allocate_derivatives,
+    allocate_hessians,
+    find_costates,
+    gauss_newton_hessians,
+)
+from experts.ddp.parallel_rollouts import LANES, ParallelRollouts
+from experts.ddp.rollout import FINISHED, Trajectory
+from experts.native.compilation import BufferTable
+from experts.problems.shooting_problem import (
+    KERNEL_NAMES,
+    SECOND_ORDER_KERNEL_NAMES,
+    FloatArray,
+    ShootingProblem,
+)
+
+BATCHED_KERNELS = ("linearize", "cost_derivatives", "lagrangian_hessian")
+"""Kernels that work on all stages at once; rollouts proceed stage by stage."""
+
+_STAGES_PER_BLOCK = 32
+"""Stages that a thread differentiates at a time: enough to outweigh its overhead."""
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+@dataclass
+class WorkTime:
+    """Wall-clock time spent on each kind of work, s."""
+
+    derivatives: float = 0.0
+    backward_pass: float = 0.0
+    rollout: float = 0.0
+
+
+def timed(work: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Make a method add its duration to a field of its object's `WorkTime`, the attribute `time`."""
+
+    def decorate(method: Callable[P, R]) -> Callable[P, R]:
+        @wraps(method)
+        def measured(*args: P.args, **kwargs: P.kwargs) -> R:
+            started = perf_counter()
+            try:
+                return method(*args, **kwargs)
+            finally:
+                time = args[0].time  # type: ignore[attr-defined]  # args[0] is the object
+                setattr(time, work, getattr(time, work) + perf_counter() - started)
+
+        return measured
+
+    return decorate
+
+
+class ShootingWorkspace:
+    """A current trajectory with its derivatives and control update, and a trial trajectory.
+
+    Attributes:
+        current: The best trajectory so far.
+        trial: The trajectory of the last step tried.
+        update: Control update of the last backward pass.
+        derivatives: Derivatives along the current trajectory, valid after `differentiate`.
+        time: Durations since a new `WorkTime` was last assigned.
+    """
+
+    def __init__(
+        self, problem: ShootingProblem, second_order: bool, *, keep_values: bool = False, threads: int = 1
+    ) -> None:
+        sizes = problem.horizon, problem.n_tangent, problem.n_controls
+        self.problem = problem
+        self.time = WorkTime()
+        self._threads = threads
+        self.derivatives = allocate_derivatives(*sizes)
+        self.update: Update = allocate_update(*sizes, keep_values=keep_values)
+        self._spare_update: Update = allocate_update(*sizes, keep_values=keep_values)
+        self._time_step = np.array([problem.time_step])
+        self._no_gaps = np.zeros((0, problem.n_tangent))
+        self._pass_work = pass_workspace(problem.n_tangent, problem.n_controls)
+        self._lower = np.array(problem.control_lower, dtype=np.float64)
+        self._upper = np.array(problem.control_upper, dtype=np.float64)
+        names = (*KERNEL_NAMES, *SECOND_ORDER_KERNEL_NAMES) if second_order else KERNEL_NAMES
+        self._kernels = {name: problem.kernel(name, batched=name in BATCHED_KERNELS) for name in names}
+        self._gauss_newton = gauss_newton_hessians(self.derivatives)
+        stages = problem.horizon if second_order else 0
+        self._exact = allocate_hessians(stages, problem.n_tangent, problem.n_controls)
+        self._costates = np.zeros((stages, problem.n_tangent))
+        self._exact_is_current = False
+        self._parallel = ParallelRollouts(problem, self._time_step)
+        self.current = Trajectory(problem)
+        self.trial = Trajectory(problem)
+
+    @timed("rollout")
+    def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
+        """Roll out given controls and make the result the current trajectory."""
+        trajectory = self.current
+        trajectory.states[0] = self.trial.states[0] = initial_state
+        trajectory.controls[:] = controls
+        trajectory.roll_out(self._kernels)
+
+    @timed("derivatives")
+    def differentiate(self) -> None:
+        """Compute the derivatives along the current trajectory that Gauss-Newton needs."""
+        states, controls, d = self.current.states, self.current.controls, self.derivatives
+        horizon = self.problem.horizon
+        self._run("linearize", horizon, buffer_table(states, controls, self._time_step, d.A, d.B))
+        self._run("cost_derivatives", horizon, buffer_table(states, controls, d.lx, d.lu, d.lxx, d.luu))
+        end = states[-1:], *self.problem.terminal_inputs
+        self._run("terminal_cost_derivatives", 1, buffer_table(*end, d.terminal_lx, d.terminal_lxx))
+        self._exact_is_current = False
+
+    @timed("derivatives")
+    def differentiate_twice(self) -> None:
+        """Compute exact second derivatives along the current trajectory, unless they are current."""
+        if self._exact_is_current:
+            return
+        states, controls, exact = self.current.states, self.current.controls, self._exact
+        find_costates(self.derivatives, self._costates)
+        buffers = (states, controls, self._costates, self._time_step, exact.xx, exact.ux, exact.uu)
+        self._run("lagrangian_hessian", self.problem.horizon, buffer_table(*buffers))
+        end = states[-1:], *self.problem.terminal_inputs
+        self._run("terminal_cost_hessian", 1, buffer_table(*end, exact.terminal_xx))
+        self._exact_is_current = True
+
+    @timed("backward_pass")
+    def backward_pass(self, mu: float, *, exact: bool = False, gaps: FloatArray | None = None) -> PassResult:
+        """Compute a control update; a pass that fails leaves the last update as it is.
+
+        Exact second derivatives need `differentiate_twice`. Gaps of the current trajectory, shape (N, n_t),
+        are closed by the update.
+        """
+        outcome = backward_pass(
+            self.derivatives,
+            self._exact if exact else self._gauss_newton,
+            self._no_gaps if gaps is None else gaps,
+            self.current.controls,
+            self._lower,
+            self._upper,
+            float(mu),
+            self._spare_update,
+            self._pass_work,
+        )
+        result = PassResult(*outcome, float(mu), exact)
+        if result.status == PASS_NOT_FINITE:
+            # Its padding may hold NaN, which would spoil all later passes.
+            self._pass_work = pass_workspace(self.problem.n_tangent, self.problem.n_controls)
+        if result.completed:
+            self.update, self._spare_update = self._spare_update, self.update
+        return result
+
+    def cost_rounding(self) -> float:
+        """Estimate how much rounding of the states changes the cost; smaller changes mean nothing.
+
+        Every tangent coordinate is taken to be off by a rounding of the state's largest entry; half the trace
+        of lxx is the expected second-order cost of random errors.
+        """
+        d, states = self.derivatives, self.current.states
+        digits = np.finfo(np.float64).eps * np.abs(states).max(axis=1)
+        slopes = np.append(np.abs(d.lx).sum(axis=1), np.abs(d.terminal_lx).sum())
+        bends = np.append(np.einsum("kii->k", d.lxx), np.trace(d.terminal_lxx[0]))
+        return float(digits @ slopes + 0.5 * (digits * digits) @ bends)
+
+    def restore_update(self) -> None:
+        """Go back to the update before the last completed backward pass."""
+        self.update, self._spare_update = self._spare_update, self.update
+
+    @timed("rollout")
+    def try_step(self, alpha: float) -> float:
+        """Roll out the control update into the trial trajectory; return its cost, inf if it is not finite."""
+        reference, policy = (self.current.states, self.current.controls), (self.update.k, self.update.K)
+        return self.trial.follow(self._kernels, reference, policy, alpha)
+
+    @timed("rollout")
+    def try_steps(self, step_lengths: FloatArray) -> FloatArray:
+        """Roll out up to `LANES` step lengths at once; return their costs, inf where not finite."""
+        reference = self.current.states, self.current.controls
+        return self._parallel.run(step_lengths, reference, self.update, self._lower, self._upper)
+
+    @timed("rollout")
+    def choose(self, lane: int, cost: float) -> None:
+        """Make one of the last `try_steps` the trial trajectory."""
+        self.trial.states[:], self.trial.controls[:] = self._parallel.trajectory(lane)
+        self.trial.cost, self.trial.failing_stage = cost, FINISHED
+
+    def accept(self) -> None:
+        """Make the trial the current trajectory, which is yet to be differentiated."""
+        self.current, self.trial = self.trial, self.current
+
+    def _run(self, name: str, rows: int, buffers: BufferTable) -> None:
+        """Run a kernel over the first rows of its buffers."""
+        address = self._kernels[name].address
+
+        def work_on(begin: int, end: int) -> None:
+            run_kernel(address, begin, end, buffers)
+
+        share_rows(work_on, rows, self._threads, _STAGES_PER_BLOCK)
+
+
+SHORTER_STEPS: FloatArray = np.float64(0.5) ** np.arange(1, LANES + 1)
+"""Step lengths after the full one, as many as are rolled out at once."""
+STEP_LENGTHS: FloatArray = np.concatenate([[1.0], SHORTER_STEPS])
+ACCEPTANCE = 1e-4
+"""Share of the predicted reduction that a step must achieve (Armijo's rule)."""
+
+
+def line_search(work: ShootingWorkspace, direction: PassResult) -> float:
+    """Run the forward pass: take the full step, else the shorter one of lowest cost.
+
+    Returns the length of the accepted step; 0 if no step reduces the cost as predicted, and the trajectory
+    stays as it is.
+    """
+    cost = work.current.cost
+    if cost - work.try_step(1.0) > ACCEPTANCE * direction.predicted_reduction(1.0):
+        work.accept()
+        return 1.0
+    costs = work.try_steps(SHORTER_STEPS)
+    predicted = np.array([direction.predicted_reduction(alpha) for alpha in SHORTER_STEPS])
+    best = int(np.argmin(np.where(cost - costs > ACCEPTANCE * predicted, costs, np.inf)))
+    if not cost - costs[best] > ACCEPTANCE * predicted[best]:
+        return 0.0
+    work.choose(best, float(costs[best]))
+    work.accept()
+    return float(SHORTER_STEPS[best])

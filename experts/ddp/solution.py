@@ -1,0 +1,239 @@
+"""The result of a solve: trajectory, gains, stop reason and history; and the feedback policy around it."""
+
+import json
+import os
+import platform
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from importlib.metadata import version
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.kernels.bound import address_of, buffer_table, one_row_call
+from experts.problems.arm_problem import as_problem
+from experts.problems.shooting_problem import FloatArray, ShootingProblem
+
+Policy = Callable[[FloatArray, int], FloatArray]
+
+
+class StopReason(StrEnum):
+    """Why a solve ended."""
+
+    CONVERGED = "converged"
+    """The predicted reduction of an unregularized step is within the tolerance."""
+    MAX_ITERATIONS = "max_iterations"
+    """The iterations are used up."""
+    PLATEAU = "plateau"
+    """Many consecutive iterations hardly reduced the cost, although the model predicts a reduction."""
+    REGULARIZATION_LIMIT = "regularization_limit"
+    """No step reduces the cost, however short."""
+    DIVERGED = "diverged"
+    """The first rollout, or a derivative along the trajectory, is not finite."""
+    INTERRUPTED = "interrupted"
+    """The user interrupted the solve."""
+
+
+class IterationRecord(NamedTuple):
+    """One iteration in numbers; a row of `Solution.history`.
+
+    Attributes:
+        iteration: Counts from 1.
+        cost: Cost after the iteration; while gaps are open, of a trajectory that is not feasible.
+        alpha: Accepted step length, 0 if none was accepted.
+        exact: Whether the update used exact second derivatives, or else Gauss-Newton's.
+        regularization: mu, in multiples of the control weights.
+        expected_decrease: Predicted reduction of the cost by the full step; negative where closing gaps costs
+            more than the step gains.
+        optimality: That reduction relative to the cost; too small under strong regularization. inf for steps
+            from a trajectory with gaps.
+        clamped_share: Share of the inputs, over all stages, held at a bound; 0 to 1.
+        seconds: Wall-clock time, s.
+        derivative_seconds: Part of it spent on derivatives, s.
+        sweep_seconds: Part of it spent on backward passes, s.
+        rollout_seconds: Part of it spent on rollouts, s.
+        gap: Largest norm of a gap step(x_k, u_k) (-) x_k+1 after the iteration, in tangent coordinates; 0
+            unless the solve began with a guess of the states.
+    """
+
+    iteration: int
+    cost: float
+    alpha: float
+    exact: bool
+    regularization: float
+    expected_decrease: float
+    optimality: float
+    clamped_share: float
+    seconds: float
+    derivative_seconds: float
+    sweep_seconds: float
+    rollout_seconds: float
+    gap: float
+
+
+Callback = Callable[[IterationRecord], None]
+
+
+class Stop(NamedTuple):
+    """Why a solve ends, and the same in words."""
+
+    reason: StopReason
+    message: str
+
+
+_FIELD_TYPES = {"iteration": np.int64, "exact": np.bool_}
+HISTORY_DTYPE = np.dtype([(name, _FIELD_TYPES.get(name, np.float64)) for name in IterationRecord._fields])
+
+
+@dataclass(eq=False)
+class Solution:
+    """The best trajectory that a solve found, with feedback gains around it.
+
+    Attributes:
+        states: Shape (N + 1, n_x).
+        controls: Shape (N, n_u).
+        feedback_gains: K of u = u_k + K_k (x (-) x_k), zero in the rows of inputs at a bound; shape (N,
+            n_u, n_t).
+        cost: Total cost; inf if the first rollout diverged.
+        stop_reason: Why the solve ended.
+        message: The reason in one sentence, with its numbers.
+        optimality: Predicted reduction of an unregularized step, relative to the cost; inf where unknown.
+        iterations: Number of iterations.
+        history: One row per iteration, fields as in `IterationRecord`.
+        metadata: JSON values to be saved along, for example the resolved scene.
+        problem: The problem solved; None after `load`.
+    """
+
+    states: FloatArray
+    controls: FloatArray
+    feedback_gains: FloatArray
+    cost: float
+    stop_reason: StopReason
+    message: str
+    optimality: float
+    iterations: int
+    history: NDArray[np.void]
+    metadata: dict[str, Any] = field(default_factory=dict)
+    problem: ShootingProblem | None = field(default=None, repr=False)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the solve ended at a minimum, to the solver's tolerance."""
+        return self.stop_reason is StopReason.CONVERGED
+
+    def policy(self, problem: Any = None) -> Policy:
+        """Make the feedback policy u = clip(u_k + K_k (x (-) x_k)).
+
+        Args:
+            problem: Problem or scene, for the difference of states and the bounds; needed after `load`.
+
+        Returns:
+            Function of a state, shape (n_x,), and a stage k in [0, N); it returns a control, shape (n_u,).
+
+        Raises:
+            ValueError: If no problem is known, or its sizes are not those of the solution.
+        """
+        given = self.problem if problem is None else as_problem(problem)
+        if given is None:
+            raise ValueError("a loaded solution has no problem: call policy(problem) or policy(scene)")
+        return FeedbackPolicy(self, given)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the solution to a file, atomically.
+
+        Args:
+            path: File in NumPy's npz format; its folder must exist.
+        """
+        facts = {
+            "cost": self.cost,
+            "stop_reason": self.stop_reason.value,
+            "message": self.message,
+            "optimality": self.optimality,
+            "iterations": self.iterations,
+            "metadata": self.metadata,
+            "versions": {
+                "python": platform.python_version(),
+                **{package: version(package) for package in ("numpy", "numba", "llvmlite")},
+            },
+        }
+        content = BytesIO()
+        np.savez(
+            content,
+            states=self.states,
+            controls=self.controls,
+            feedback_gains=self.feedback_gains,
+            history=self.history,
+            facts=np.array(json.dumps(facts)),
+        )
+        write_atomically(Path(path), content.getvalue())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a solution that `save` wrote.
+
+        Args:
+            path: The file.
+
+        Returns:
+            The solution, without its problem.
+
+        Raises:
+            ValueError: If the file does not hold a solution.
+        """
+        with np.load(path, allow_pickle=False) as file:
+            missing = {"states", "controls", "feedback_gains", "history", "facts"} - set(file.files)
+            if missing:
+                raise ValueError(
+                    f"{os.fspath(path)} is not a solution: it lacks {', '.join(sorted(missing))}"
+                )
+            facts: Mapping[str, Any] = json.loads(str(file["facts"]))
+            return cls(
+                states=file["states"],
+                controls=file["controls"],
+                feedback_gains=file["feedback_gains"],
+                history=file["history"],
+                cost=facts["cost"],
+                stop_reason=StopReason(facts["stop_reason"]),
+                message=facts["message"],
+                optimality=facts["optimality"],
+                iterations=facts["iterations"],
+                metadata=facts["metadata"],
+            )
+
+
+class FeedbackPolicy:
+    """The feedback policy of a solution; it owns its buffers, so give each thread its own."""
+
+    def __init__(self, solution: Solution, problem: ShootingProblem) -> None:
+        horizon = solution.controls.shape[0]
+        expected = (horizon, problem.n_controls, problem.n_tangent)
+        if solution.feedback_gains.shape != expected or solution.states.shape[1] != problem.n_states:
+            raise ValueError(
+                f"the solution has gains {solution.feedback_gains.shape} and states {solution.states.shape}, "
+                f"the problem needs gains {expected} and states ({horizon + 1}, {problem.n_states})"
+            )
+        self._solution = solution
+        self._lower, self._upper = problem.control_lower, problem.control_upper
+        self._difference = problem.kernel("difference")
+        self._reference = np.zeros((1, problem.n_states))
+        self._state = np.zeros((1, problem.n_states))
+        self._deviation = np.zeros((1, problem.n_tangent))
+        self._buffers = buffer_table(self._reference, self._state, self._deviation)
+        self._find_deviation = one_row_call(self._difference.address, address_of(self._buffers))
+
+    def __call__(self, state: FloatArray, k: int) -> FloatArray:
+        """Compute the control, shape (n_u,), at a state, shape (n_x,), and a stage."""
+        horizon = self._solution.controls.shape[0]
+        if not 0 <= k < horizon:
+            raise IndexError(f"stage {k} is outside the trajectory, which has stages 0 to {horizon - 1}")
+        self._reference[0] = self._solution.states[k]
+        self._state[0] = state
+        self._find_deviation()
+        control = self._solution.controls[k] + self._solution.feedback_gains[k] @ self._deviation[0]
+        # Twice as fast as np.clip.
+        return np.asarray(np.minimum(np.maximum(control, self._lower), self._upper))

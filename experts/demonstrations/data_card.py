@@ -1,0 +1,203 @@
+"""The data card: what the data are, how they were made, how to read them, and what to watch out for.
+
+It begins with metadata for the Hugging Face Hub. It follows from the data alone, without dates and times, so
+equal data have equal cards.
+"""
+
+from __future__ import annotations
+
+from string import Template
+
+from dq_space_arm_env.common.tables import TextTable
+from experts.demonstrations import facts as tables
+from experts.demonstrations.facts import Facts
+from experts.demonstrations.shard import FAILURES, SUMMARIES, TRAJECTORIES
+
+MEANINGS = {
+    "states": "states of the environment, including the last one",
+    "observations": "its observations of them",
+    "actions": "inputs as fractions of their limits, in [-1, 1]",
+    "rewards": "rewards of the environment; their sum is -J",
+    "feedback_gains": "G of the policy clip(action + G (x (-) state), -1, 1); zero rows at limits",
+    "index": "number of the problem",
+    "seed": "`env.reset(seed=seed)` starts at the same state",
+    "cost": "J",
+    "iterations": "of the solve",
+    "stop_reason": "why the solve ended; in words when loaded",
+    "guess": "initial guess of the solve; in words when loaded",
+    "emphasis": "factor of the final pose's weights in the solve; 1 is the scene's own cost",
+    "start_errors": "of the tip: attitude [deg] and position [m]",
+    "final_errors": "the same at the end",
+    "clamped_share": "share of the inputs, over all stages, at a limit",
+}
+"""Meanings of the arrays of a demonstration."""
+
+_TEMPLATE = Template("""\
+---
+pretty_name: Optimal maneuvers of a spacecraft with an arm, scene $scene
+task_categories:
+- reinforcement-learning
+- robotics
+tags:
+- demonstrations
+- imitation-learning
+- optimal-control
+- feedback-gains
+- gymnasium
+size_categories:
+- $size_category
+---
+
+# $demonstrations optimal maneuvers, scene $scene
+
+A spacecraft floats freely and moves so that the tip of its arm reaches a target pose and rests there. Each
+demonstration is a locally optimal maneuver from a random start, found by control-limited differential dynamic
+programming, with the feedback gains of the optimal policy around it: how to respond where an agent drifts
+off.
+The environment is `DQSpaceArm-v0`; its documentation explains observations, actions and rewards.
+
+$contents
+
+## How it was made
+
+`env.reset(seed=...)` draws starts from the spread of the scene, uniformly in each component. A problem is
+solved from the best of several guesses, and again where the policy of a neighbor, followed from its start,
+points to a cheaper minimum. A demonstration has converged, ends within the tolerances of the scene
+($attitude_tolerance deg, $position_tolerance m), and its actions, replayed in the environment, cost J.
+$failures
+
+## Numbers
+
+$numbers
+
+## What is in a demonstration
+
+$arrays
+
+Failures are kept separately, with $failure_columns.
+
+## How to read it
+
+```python
+from experts import load_demonstrations
+
+demonstrations = load_demonstrations(".")  # the folder of this file
+training, test = demonstrations.split(0.9, 0.1)
+for batch in training.batches(256, ("observations", "actions", "feedback_gains"), seed=0):
+    break
+demonstration = demonstrations[0]
+deviations = demonstrations.tangent(demonstration.states[:1], demonstration.states[1:2])
+```
+
+The shards are safetensors files, which other libraries can read as well.$minari
+
+## How to reproduce it
+
+The complete scene is in `settings.json`; `demonstrations.scene.to_yaml("scene.yaml")` writes it to a file.
+
+```bash
+dq-space-arm demonstrations generate --scene scene.yaml \\
+    -n $problems --seed $seed --shard-size $shard_size
+```
+
+The same code and versions on the same kind of processor give the same bytes. The SHA-256 of the settings is
+`$settings_hash`, that of the code `$source_hash`.
+
+## What to keep in mind
+
+- Each demonstration is a local minimum. Neighbors have checked it, but nothing proves it to be global.
+- Where the cheapest maneuver ends outside the tolerances, the solve, and with it the gains, multiplies the
+  weights of the final pose by `emphasis`: $emphasized of $demonstrations demonstrations. Their cost J is that
+  of the scene, slightly above its minimum.
+- The model is exact: no noise, delay or disturbance. The gains respond to small deviations, and become less
+  accurate as these grow.
+- Starts cover the spread of the scene and nothing beyond it. Failed problems are missing, so the hardest
+  starts are rarer than among those drawn.
+- Time steps of one demonstration are correlated: split by problem, as `split` does, never by time step.
+
+## Source
+
+A. Valverde and P. Tsiotras, "Modeling of Spacecraft-Mounted Robot Dynamics and Control Using Dual
+Quaternions", American Control Conference, 2018: the robot, the maneuver and the cost of scene `paper`.
+""")
+
+_FILES = """ `dq-space-arm demonstrations export` makes a
+Minari data set of them. `summary/summary.html` shows distributions and sample trajectories."""
+_MINARI = """
+
+This copy is the Minari data set `$id`, one HDF5 file instead of shards; the code above is for the original.
+
+```python
+import minari
+
+dataset = minari.load_dataset("$id")
+environment = dataset.recover_environment()
+(metadata,) = dataset.storage.get_episode_metadata([0])
+observation, info = environment.reset(seed=metadata["seed"])
+for action in dataset[0].actions:
+    observation, reward, terminated, truncated, info = environment.step(action)
+```"""
+
+
+def data_card(facts: Facts, minari_id: str | None = None) -> str:
+    """Fill in the template; minari_id names the Minari data set that the card goes with."""
+    demonstrations, settings = facts.demonstrations, facts.demonstrations.settings
+    success = demonstrations.scene.success
+    return _TEMPLATE.substitute(
+        scene=demonstrations.scene.name,
+        demonstrations=len(demonstrations),
+        size_category=_size_category(len(demonstrations)),
+        contents="\n\n".join(tables.contents(facts).markdown()),
+        attitude_tolerance=f"{success.attitude_error_deg:g}",
+        position_tolerance=f"{success.position_error:g}",
+        failures=_failures(facts),
+        emphasized=int((facts.emphases != 1.0).sum()),
+        numbers=_numbers(facts),
+        arrays="\n\n".join(_arrays(facts).markdown()),
+        failure_columns=", ".join(FAILURES).replace("_", " "),
+        minari=_FILES if minari_id is None else _MINARI.replace("$id", minari_id),
+        problems=facts.problems,
+        seed=settings["seed"],
+        shard_size=settings["shard_size"],
+        settings_hash=demonstrations.manifest["settings_sha256"],
+        source_hash=settings["source"],
+    )
+
+
+def _failures(facts: Facts) -> str:
+    count = len(facts.failures["index"])
+    if not count:
+        return f"All {facts.problems} problems did."
+    reasons = ", ".join(f"{n} {reason}" for reason, n in facts.demonstrations.manifest["failures"].items())
+    return f"{count} of {facts.problems} problems did not ({reasons})."
+
+
+def _numbers(facts: Facts) -> str:
+    if not len(facts.demonstrations):
+        return "There are no demonstrations."
+    return "\n\n".join(tables.distributions(facts, with_times=False).markdown())
+
+
+def _arrays(facts: Facts) -> TextTable:
+    simulation, layout = facts.demonstrations.scene.simulation, facts.demonstrations.kernels.layout
+    n, n_x = simulation.steps, layout.n_x
+    shapes = {
+        "states": (n + 1, n_x),
+        "observations": (n + 1, n_x + 1),
+        "actions": (n, layout.n_u),
+        "rewards": (n,),
+        "feedback_gains": (n, layout.n_u, layout.n_t),
+        "start_errors": (2,),
+        "final_errors": (2,),
+    }
+    rows = (
+        (f"`{name}`", str(shapes.get(name, "a number")), MEANINGS[name])
+        for name in (*TRAJECTORIES, *SUMMARIES)
+    )
+    return TextTable("Its arrays", ("array", "shape", "meaning"), tuple(rows))
+
+
+def _size_category(count: int) -> str:
+    """The Hub's category for a number of demonstrations."""
+    bounds = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
+    return next((word for bound, word in bounds.items() if count < bound), "n>1M")

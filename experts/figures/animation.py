@@ -1,0 +1,102 @@
+"""A maneuver as an animated GIF, drawn by the environment's renderer."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.viewing.picture_format import PictureFormat
+from dq_space_arm_env.viewing.rendering import Renderer
+from experts.maneuver import Maneuver
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as PillowImage
+
+Image = NDArray[np.uint8]
+
+FASTEST = 50.0
+"""Pictures per second, 1/s: players slow down pictures shorter than 0.02 s."""
+
+NO_PILLOW = 'a GIF needs Pillow, which is not installed: pip install "dq-space-arm[plots]"'
+_LONGEST_HOLD = 600.0  # s; the file has 16 bits for hundredths of a second
+_PALETTE_PICTURES = 12  # from which the colors of all are chosen
+_PALETTE_POWER = 0.5  # of how often a color occurs, for its share of the palette
+
+
+def draw_maneuver(maneuver: Maneuver, picture: PictureFormat, fps: float, seconds: float) -> list[Image]:
+    """Draw the first seconds of a maneuver in real time: RGB pictures, shape (height, width, 3)."""
+    for name, value in (("fps", fps), ("seconds", seconds)):
+        if not value > 0.0:
+            raise ValueError(f"{name}: {value}, should be positive")
+    if not math.isfinite(fps):
+        raise ValueError(f"fps: {fps}, should be finite")
+    renderer = Renderer(maneuver.scene, picture)
+    tips = np.array(poses.position(maneuver.frames[:, -1].T)).T
+    times = np.arange(0.0, min(seconds, maneuver.time[-1]) + 1e-9, 1.0 / fps)
+    stages = np.searchsorted(maneuver.time, times - 0.5 * maneuver.scene.simulation.dt)
+    return [renderer.draw(maneuver.frames[stage], tips[: stage + 1]) for stage in stages]
+
+
+def check_gif(fps: float, hold: float, colors: int) -> None:
+    """Refuse unusable settings of `encode_gif` before any picture is drawn."""
+    if not 0.0 < fps <= FASTEST:
+        raise ValueError(f"fps: {fps}, should be positive and at most {FASTEST:g}")
+    if not 0.0 <= hold <= _LONGEST_HOLD:
+        raise ValueError(f"hold: {hold}, should be 0 to {_LONGEST_HOLD:g} s")
+    if not 2 <= colors <= 255:
+        raise ValueError(f"colors: {colors}, should be 2 to 255")
+
+
+def encode_gif(pictures: Sequence[Image], fps: float, hold: float, colors: int = 128) -> bytes:
+    """Encode RGB pictures as a GIF that loops; the last one stays for `hold` seconds.
+
+    What does not change from one picture to the next is transparent and costs next to nothing.
+    """
+    check_gif(fps, hold, colors)
+    try:
+        from PIL import Image as Pillow
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(NO_PILLOW) from error
+    palette = Pillow.fromarray(_typical_colors(pictures)).quantize(colors, Pillow.Quantize.MEDIANCUT)
+    frames: list[PillowImage] = []
+    before = None
+    for picture in pictures:
+        frame = Pillow.fromarray(picture).quantize(palette=palette, dither=Pillow.Dither.NONE)
+        indices = np.asarray(frame)
+        changed = indices if before is None else np.where(indices == before, colors, indices)
+        frame.putdata(changed.ravel().tolist())
+        frames.append(frame)
+        before = indices
+    # A GIF counts in hundredths of a second: the pictures change at the nearest, and do not lag ever more.
+    changes = [round(100.0 * number / fps) for number in range(len(frames))]
+    durations = [10 * (after - before) for before, after in itertools.pairwise(changes)]
+    durations.append(round(1000.0 * hold))
+    file = io.BytesIO()
+    frames[0].save(
+        file,
+        "GIF",
+        save_all=True,
+        append_images=frames[1:],
+        duration=durations,
+        loop=0,
+        transparency=colors,
+        disposal=1,
+        optimize=False,
+    )
+    return file.getvalue()
+
+
+def _typical_colors(pictures: Sequence[Image]) -> Image:
+    """The colors of pictures in one picture, where rare ones, such as those of axes, weigh more."""
+    chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, _PALETTE_PICTURES).astype(int)]
+    # Rounded to four steps of 256: colors that differ by less count as one.
+    levels, counts = np.unique(np.concatenate(chosen).reshape(-1, 3) >> 2, axis=0, return_counts=True)
+    shares = np.ceil(counts**_PALETTE_POWER).astype(int)
+    return np.repeat(levels << 2 | 2, shares, axis=0).astype(np.uint8)[None]

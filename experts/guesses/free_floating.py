@@ -1,0 +1,135 @@
+"""Linear maps of a free-floating robot: tip velocity, momentum, and the forces of a motion.
+
+Where nothing acts on the base, its velocity follows from the conserved momentum and the joint rates; the
+generalized Jacobian of Umetani & Yoshida (IEEE Transactions on Robotics and Automation 5, 1989) rests on
+that. All maps are exact and come from the scene's compiled functions: momentum is linear in the velocities,
+and accelerations are linear in the forces, so unit vectors give the matrices.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dq_space_arm_env import Kernels
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics.kinematics import wrist_rate_matrix
+from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
+from experts.problems.shooting_problem import FloatArray
+
+_PLANAR_MOMENTUM = (0, 1, 5)  # P_x, P_y, L_z
+_SKEW = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)  # cross-product matrices of e_x, e_y, e_z
+
+
+class TipJacobian(NamedTuple):
+    """Dual velocity of the tip, in tip axes, angular then linear, per unit velocity of the robot's parts."""
+
+    base: FloatArray  # per unit of the base's velocity, shape (B, 6, n_b)
+    joints: FloatArray  # per joint rate, shape (B, 6, n)
+    wrist: FloatArray  # per Euler rate of the wrist, shape (B, 6, 3); (B, 6, 0) without a wrist
+
+
+class MomentumMap(NamedTuple):
+    """Momentum of the system in inertial axes per unit velocity; a planar system has P_x, P_y and L_z."""
+
+    base: FloatArray  # per unit of the base's velocity, shape (B, n_b, n_b)
+    joints: FloatArray  # per joint rate, shape (B, n_b, n)
+
+
+class FreeFloatingArm:
+    """Linear maps of a scene's robot.
+
+    Attributes:
+        pose_entries: Those of the 8 numbers of the base's pose that a state stores.
+        twist_entries: Those of the 6 numbers of the base's velocity that a state stores, n_b.
+        momentum_entries: Those of the 6 numbers of the momentum that the base's velocity changes, n_b.
+    """
+
+    def __init__(self, kernels: Kernels) -> None:
+        planar, entries = kernels.layout.planar, kernels.layout.state
+        self.kernels = kernels
+        self.pose_entries = list(PLANAR_POSE if planar else range(8))
+        self.twist_entries = list(PLANAR_TWIST if planar else range(6))
+        self.momentum_entries = list(_PLANAR_MOMENTUM if planar else range(6))
+        self.velocity_entries = [*indices(entries.base_velocity), *indices(entries.joint_rates)]
+
+    def tip_jacobian(self, states: FloatArray, frames: FloatArray) -> TipJacobian:
+        """Geometric Jacobian of the tip: columns Ad(q_{X/G}) of the axes in their frames X, (B, f, 8)."""
+        layout = self.kernels.layout
+        components = frames.transpose(2, 0, 1)
+        rotation, position = poses.to_matrix(
+            dq.multiply(dq.conjugate(components[:, :, -1:]), components)
+        )  # of q_{X/G}, for every frame X
+        axes = matrix_of(rotation)
+        # Columns p x R: linear velocity per unit angular velocity of the frame.
+        swept = np.tensordot(np.stack(position, axis=-1), _SKEW, axes=1) @ axes
+        turning = np.concatenate([axes, swept], axis=-2)
+        moving = np.concatenate([np.zeros_like(axes[:, 0]), axes[:, 0]], axis=-2)
+        base = np.concatenate([turning[:, 0], moving], axis=-1)[:, :, self.twist_entries]
+        n = layout.n_joints
+        joints = turning[:, 1 : n + 1, :, 2].transpose(0, 2, 1)
+        wrist = np.zeros((len(states), 6, 0))
+        if layout.has_wrist:
+            rates = matrix_of(wrist_rate_matrix(list(states[:, layout.state.wrist_angles].T)))
+            wrist = turning[:, n + 1] @ rates
+        return TipJacobian(base, joints, wrist)
+
+    def momentum_map(self, states: FloatArray) -> MomentumMap:
+        """Momentum per unit velocity at states (B, n_x); their velocities do not matter."""
+        moving = self.velocity_entries
+        moved = np.repeat(states[:, None, :], len(moving), axis=1)
+        moved[:, :, moving] = np.eye(len(moving))
+        momenta = self.kernels.momentum(moved.reshape(-1, states.shape[1]))
+        columns = momenta.reshape(len(states), len(moving), 6)[:, :, self.momentum_entries].transpose(0, 2, 1)
+        n_base = len(self.twist_entries)
+        return MomentumMap(columns[:, :, :n_base], columns[:, :, n_base:])
+
+    def tip_load(self, states: FloatArray, system: MomentumMap) -> FloatArray:
+        """Rate of change of the momentum by the scene's tip wrench, inertial axes, (B, n_b), N and N m.
+
+        It is the momentum of the accelerations that the wrench adds.
+        """
+        if self.kernels.scene.tip_wrench is None:
+            return np.zeros((len(states), len(self.momentum_entries)))
+        still = np.zeros((len(states), self.kernels.n_u))
+        loaded = self.kernels.forward_dynamics(states, still)
+        added = loaded - self.kernels.forward_dynamics(states, still, np.zeros((len(states), 6)))
+        by_velocity = np.concatenate(system, axis=2)
+        load: FloatArray = by_velocity @ added[:, :, None]
+        return load[:, :, 0]
+
+    def controls(self, states: FloatArray, accelerations: FloatArray) -> FloatArray:
+        """Find the inputs whose accelerations are closest to given ones, (B, n_b + n), ignoring bounds."""
+        control = self.kernels.layout.control
+        acting = [
+            i
+            for part in (control.base_force, control.base_torque, control.joint_torque)
+            for i in indices(part)
+        ]
+        inputs = np.zeros((len(states), 1 + len(acting), self.kernels.n_u))
+        inputs[:, range(1, 1 + len(acting)), acting] = 1.0
+        repeated = np.repeat(states, 1 + len(acting), axis=0)
+        reached = self.kernels.forward_dynamics(repeated, inputs.reshape(len(repeated), -1))
+        reached = reached.reshape(len(states), 1 + len(acting), -1)
+        per_unit = reached[:, 1:] - reached[:, :1]
+        missing = accelerations - reached[:, 0]
+        normal = per_unit @ per_unit.transpose(0, 2, 1)
+        controls = np.zeros((len(states), self.kernels.n_u))
+        controls[:, acting] = np.linalg.solve(normal, per_unit @ missing[:, :, None])[:, :, 0]
+        return controls
+
+
+def indices(part: slice) -> range:
+    """Indices of a slice of a layout."""
+    return range(part.start, part.stop)
+
+
+def matrix_of(rows: Sequence[Sequence[Any]]) -> FloatArray:
+    """Stack a matrix of numbers or arrays (...) into one array (..., n, m)."""
+    shape = np.broadcast_shapes(*(np.shape(entry) for row in rows for entry in row))
+    matrix = np.empty((*shape, len(rows), len(rows[0])))
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            matrix[..., i, j] = entry
+    return matrix

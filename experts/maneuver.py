@@ -1,0 +1,105 @@
+"""A maneuver in the quantities that the paper plots: errors of the tip, inputs by actuator."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dq_space_arm_env import Scene, compile_scene
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.scene import StateLayout
+from experts.problems.shooting_problem import FloatArray
+
+_AT_LIMIT = 1.0 - 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class ActuatorHistory:
+    """The inputs of one actuator during a maneuver."""
+
+    name: str
+    unit: str
+    inputs: tuple[str, ...]
+    values: FloatArray  # Inputs, constant over a time step, shape (N, inputs), `unit`
+    limits: FloatArray  # Largest magnitude of each input, shape (inputs,), `unit`
+    weights: FloatArray  # Weight of each squared input in the cost, shape (inputs,), 1/unit^2
+
+    @property
+    def largest(self) -> FloatArray:
+        """Largest magnitude of each input, shape (inputs,), `unit`."""
+        return np.asarray(np.abs(self.values).max(axis=0))
+
+    @property
+    def clamped_share(self) -> float:
+        """Share of the inputs at a limit over all stages, 0 to 1."""
+        return float(np.mean(np.abs(self.values) >= _AT_LIMIT * self.limits))
+
+    @property
+    def effort(self) -> float:
+        """Sum of the weighted squares of the inputs: their part of J."""
+        return float(np.sum(self.weights * self.values**2))
+
+
+@dataclass(frozen=True, eq=False)
+class Maneuver:
+    """A trajectory of a scene."""
+
+    scene: Scene
+    states: FloatArray
+    controls: FloatArray
+
+    @cached_property
+    def time(self) -> FloatArray:
+        """Time of each state, shape (N + 1,), s."""
+        return np.asarray(np.arange(len(self.states)) * self.scene.simulation.dt, dtype=np.float64)
+
+    @cached_property
+    def frames(self) -> FloatArray:
+        """Poses of base, joint frames, wrist frame (if any) and tip, shape (N + 1, frames, 8), m."""
+        return compile_scene(self.scene).frame_poses(self.states)
+
+    @cached_property
+    def error_pose(self) -> FloatArray:
+        """Error dual quaternion q_{D/G} (31), shape (N + 1, 8), dimensionless and m."""
+        tip = tuple(self.frames[:, -1].T)
+        return np.stack(poses.error_pose(tip, self.scene.target.pose.dual_quaternion), axis=1)
+
+    @cached_property
+    def position_error(self) -> FloatArray:
+        """Position r = 2 q_d q_r* of the target seen from the tip, in the tip's axes, shape (N + 1, 3), m."""
+        return np.stack(poses.position(tuple(self.error_pose.T)), axis=1)
+
+    @cached_property
+    def distance(self) -> FloatArray:
+        """Length of the position error, shape (N + 1,), m."""
+        return np.asarray(np.linalg.norm(self.position_error, axis=1))
+
+    @cached_property
+    def angle(self) -> FloatArray:
+        """Euler angle of the attitude error, shape (N + 1,), rad."""
+        tip = tuple(self.frames[:, -1].T)
+        return np.asarray(poses.error_angle(tip, self.scene.target.pose.dual_quaternion))
+
+    @cached_property
+    def actuators(self) -> tuple[ActuatorHistory, ...]:
+        """The scene's actuators in the order of the controls."""
+        layout = StateLayout.of(self.scene)
+        histories = []
+        for name in ("base_force", "base_torque", "joint_torque", "wrist_rate"):
+            entries = getattr(layout.control, name)
+            if entries.start == entries.stop:
+                continue
+            history = ActuatorHistory(
+                name,
+                layout.control.units[entries.start],
+                layout.control.names[entries],
+                self.controls[:, entries],
+                layout.control_limit[entries],
+                layout.control_weight[entries],
+            )
+            histories.append(history)
+        return tuple(histories)
+
+    def actuator(self, name: str) -> ActuatorHistory | None:
+        """The actuator of a name in the scene's `actuators`; None if the scene does not have it."""
+        return next((actuator for actuator in self.actuators if actuator.name == name), None)

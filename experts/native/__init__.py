@@ -1,0 +1,1 @@
+"""Compiled loops and dense matrix operations of the solver."""

@@ -1,0 +1,63 @@
+"""How numba compiles the solver's loops, and how they call native kernels.
+
+A kernel is a C function ``void kernel(int64 begin, int64 end, const int64 *buffers)``. The table of a
+`buffer_table` holds the addresses of C-contiguous float64 arrays; for every row k in [begin, end) the kernel
+reads row k of its inputs and writes row k of its outputs. Numba receives the kernel as a plain int64 address,
+so one compiled loop serves every robot and can be cached on disk.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+Loop = TypeVar("Loop", bound=Callable[..., Any])
+BufferTable = NDArray[np.int64]
+
+
+def compiled(loop: Loop) -> Loop:
+    """Compile a loop over arrays, and cache its code on disk.
+
+    Only fused multiply-add may change rounding (``contract``). Without numba's memory management (``_nrt``) a
+    loop that allocates does not compile, and no time goes into counting references to arrays, which was a
+    third of the backward pass. The interpreter lock is released.
+    """
+    return _compile(loop, in_place=False)
+
+
+def inlined(loop: Loop) -> Loop:
+    """Compile like `compiled`, but inline at every call.
+
+    A matrix is nine arguments, and a named tuple of arrays a hundred or more: passing them takes as long as
+    the work of a small function.
+    """
+    return _compile(loop, in_place=True)
+
+
+def _compile(loop: Loop, *, in_place: bool) -> Loop:
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
+    options["forceinline"] = in_place
+    return cast(Loop, njit(cache=True, nogil=True, boundscheck=False, **options)(loop))
+
+
+def _emit_call(typing_context: Any, address: Any, begin: Any, end: Any, buffers: Any) -> Any:
+    signature = types.void(types.int64, types.int64, types.int64, types.Array(types.int64, 1, "C"))
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        address_value, begin_value, end_value, table_value = arguments
+        int64 = ir.IntType(64)
+        table = context.make_array(signature.args[3])(context, builder, table_value)
+        function_type = ir.FunctionType(ir.VoidType(), [int64, int64, int64.as_pointer()])
+        function = builder.inttoptr(address_value, function_type.as_pointer())
+        builder.call(function, [begin_value, end_value, builder.bitcast(table.data, int64.as_pointer())])
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+call_kernel: Any = intrinsic(_emit_call)
+"""Call a native kernel from compiled code: ``call_kernel(address, begin, end, buffer_table)``."""

@@ -1,0 +1,160 @@
+"""Vector code in LLVM IR for numba: loads and stores, sums in registers, loops over columns."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+
+from dq_space_arm_env.common.host_machine import host_machine
+
+LANES = host_machine().lanes
+"""Numbers in one vector register of this processor."""
+
+TILE_ROWS = 3
+"""Rows of a tile."""
+TILE_VECTORS = 3
+"""Vectors in a row of a tile: the nine sums hide the latency of an addition and fit in sixteen registers."""
+
+VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+ZERO = ir.Constant(VECTOR, [0.0] * LANES)
+
+_INT32 = ir.IntType(32)
+_CONTRACT = ("contract",)
+
+
+class Emitter:
+    """Emits the code of one call of an intrinsic; arguments are addressed by position."""
+
+    def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
+        self.context, self.builder, self.arguments = context, builder, arguments
+        self.index = context.get_value_type(types.intp)
+        self._types = signature.args
+
+    def shape(self, position: int) -> list[Any]:
+        """Extents of an array argument."""
+        return list(cgutils.unpack_tuple(self.builder, self._array(position).shape))
+
+    def entry(self, position: int, *indices: Any) -> Any:
+        """Address of an entry of an array argument."""
+        array_type, array = self._types[position], self._array(position)
+        return cgutils.get_item_pointer(self.context, self.builder, array_type, array, indices)
+
+    def load_vector(self, pointer: Any) -> Any:
+        """Load a vector from an address."""
+        return self.builder.load(self.builder.bitcast(pointer, VECTOR.as_pointer()), align=8)
+
+    def store_vector(self, value: Any, pointer: Any) -> None:
+        """Store a vector at an address."""
+        self.builder.store(value, self.builder.bitcast(pointer, VECTOR.as_pointer()), align=8)
+
+    def spread(self, scalar: Any) -> Any:
+        """Broadcast a number to a vector."""
+        vector_type = ir.VectorType(scalar.type, LANES)
+        undefined, zeros = (
+            ir.Constant(vector_type, ir.Undefined),
+            ir.Constant(ir.VectorType(_INT32, LANES), None),
+        )
+        first = self.builder.insert_element(undefined, scalar, _INT32(0))
+        return self.builder.shuffle_vector(first, undefined, zeros)
+
+    def multiply_add(self, total: Any, left: Any, right: Any, sign: int) -> Any:
+        """Total + sign * left * right, fused where the processor can."""
+        product = self.builder.fmul(left, right, flags=_CONTRACT)
+        combine = self.builder.fadd if sign > 0 else self.builder.fsub
+        return combine(total, product, flags=_CONTRACT)
+
+    def add(self, position: Any, offset: int) -> Any:
+        """An index plus an offset."""
+        return self.builder.add(position, self.index(offset)) if offset else position
+
+    def smaller(self, left: Any, right: Any) -> Any:
+        """The smaller of two indices."""
+        return self.builder.select(self.builder.icmp_signed("<", left, right), left, right)
+
+    def larger(self, left: Any, right: Any) -> Any:
+        """The larger of two indices."""
+        return self.builder.select(self.builder.icmp_signed(">", left, right), left, right)
+
+    def for_strips(self, begin: Any, end: Any, body: Callable[[Any, int], None]) -> None:
+        """Emit a loop over columns: body(first column, number of vectors), as wide as a tile may be."""
+        vectors = self.builder.sdiv(self.builder.sub(end, begin), self.index(LANES))
+        whole = self.builder.sdiv(vectors, self.index(TILE_VECTORS))
+        width = self.index(TILE_VECTORS * LANES)
+        with cgutils.for_range(self.builder, whole, intp=self.index) as loop:
+            body(self.builder.add(begin, self.builder.mul(loop.index, width)), TILE_VECTORS)
+        rest = self.builder.srem(vectors, self.index(TILE_VECTORS))
+        begin_rest = self.builder.add(begin, self.builder.mul(whole, width))
+        for n_vectors in range(1, TILE_VECTORS):
+            with self.builder.if_then(self.builder.icmp_signed("==", rest, self.index(n_vectors))):
+                body(begin_rest, n_vectors)
+
+    @contextmanager
+    def for_vectors(self, end: Any) -> Iterator[Any]:
+        """Emit a loop over the vectors of a row; the last may reach beyond the end."""
+        zero, step = self.index(0), self.index(LANES)
+        with cgutils.for_range_slice(self.builder, zero, end, step, intp=self.index) as (column, _):
+            yield column
+
+    def accumulate(
+        self,
+        sums: list[list[Any]],
+        sign: int,
+        first: Any,
+        last: Any,
+        factors: Callable[[Any], list[Any]],
+        row: Callable[[Any], Any],
+    ) -> list[list[Any]]:
+        """Emit a loop over steps that adds sign * factors(step)[r] * row(step)[c] to sums[r][c]."""
+        slots = [[cgutils.alloca_once_value(self.builder, value) for value in values] for values in sums]
+        with cgutils.for_range_slice(self.builder, first, last, self.index(1), intp=self.index) as (step, _):
+            vectors = self.load_row(row(step), len(slots[0]))
+            for factor, totals in zip(factors(step), slots, strict=True):
+                spread = self.spread(self.builder.load(factor))
+                for total, vector in zip(totals, vectors, strict=True):
+                    old = self.builder.load(total)
+                    self.builder.store(self.multiply_add(old, spread, vector, sign), total)
+        return [[self.builder.load(slot) for slot in totals] for totals in slots]
+
+    def load_row(self, pointer: Any, n_vectors: int) -> list[Any]:
+        """Load the vectors of a tile's row."""
+        return [self.load_vector(self._offset(pointer, c)) for c in range(n_vectors)]
+
+    def store_row(self, values: Iterable[Any], pointer: Any) -> None:
+        """Store the vectors of a tile's row."""
+        for c, value in enumerate(values):
+            self.store_vector(value, self._offset(pointer, c))
+
+    def load_masked(self, pointer: Any, n_numbers: Any) -> Any:
+        """Load n_numbers from an address into a vector, padded with zeros."""
+        arguments = [VECTOR.as_pointer(), _INT32, ir.VectorType(ir.IntType(1), LANES), VECTOR]
+        load = self._masked_function("load", ir.FunctionType(VECTOR, arguments))
+        address = self.builder.bitcast(pointer, VECTOR.as_pointer())
+        return self.builder.call(load, [address, _INT32(8), self._mask(n_numbers), ZERO])
+
+    def store_masked(self, value: Any, pointer: Any, n_numbers: Any) -> None:
+        """Store the first n_numbers of a vector at an address."""
+        arguments = [VECTOR, VECTOR.as_pointer(), _INT32, ir.VectorType(ir.IntType(1), LANES)]
+        store = self._masked_function("store", ir.FunctionType(ir.VoidType(), arguments))
+        address = self.builder.bitcast(pointer, VECTOR.as_pointer())
+        self.builder.call(store, [value, address, _INT32(8), self._mask(n_numbers)])
+
+    def _mask(self, n_numbers: Any) -> Any:
+        """Mask of the lanes below a number."""
+        lanes = ir.Constant(ir.VectorType(self.index, LANES), list(range(LANES)))
+        return self.builder.icmp_signed("<", lanes, self.spread(n_numbers))
+
+    def _masked_function(self, name: str, function_type: Any) -> Any:
+        """LLVM's masked load or store of a vector."""
+        name = f"llvm.masked.{name}.v{LANES}f64.p0"
+        return cgutils.get_or_insert_function(self.builder.module, function_type, name)
+
+    def _offset(self, pointer: Any, n_vectors: int) -> Any:
+        return self.builder.gep(pointer, [self.index(n_vectors * LANES)])
+
+    def _array(self, position: int) -> Any:
+        return self.context.make_array(self._types[position])(
+            self.context, self.builder, self.arguments[position]
+        )

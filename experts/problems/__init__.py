@@ -1,0 +1,1 @@
+"""Shooting problems: the interface that the solver asks for, and its implementers."""

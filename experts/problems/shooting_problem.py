@@ -1,0 +1,167 @@
+"""The interface of a problem: sizes, bounds, an initial state, and native kernels by name.
+
+The solver knows no robot. It sees states x of n_x stored numbers, whose differences live in n_t tangent
+coordinates (a pose stores 8 numbers and has 6 directions), controls u of n_u inputs with bounds, and six
+kernels. Every kernel works on rows (`experts.native.compilation`); its buffers, each with its row's shape:
+
+| kernel | buffers, outputs last |
+|---|---|
+| `difference` | x_reference (n_x), x (n_x); dx = x (-) x_reference (n_t) |
+| `step_with_cost` | x (n_x), u (n_u), h (one scalar for all rows); x_next (n_x), cost (1) |
+| `terminal_cost` | x (n_x); cost (1) |
+| `linearize` | x (n_x), u (n_u), h (one scalar for all rows); A (n_t, n_t), B (n_t, n_u) |
+| `cost_derivatives` | x (n_x), u (n_u); lx (n_t), lu (n_u), lxx (n_t, n_t), luu (n_u, n_u) |
+| `terminal_cost_derivatives` | x (n_x); lx (n_t), lxx (n_t, n_t) |
+| `lagrangian_hessian` | x, u, multiplier (n_t), h; Lxx (n_t, n_t), Lux (n_u, n_t), Luu (n_u, n_u) |
+| `terminal_cost_hessian` | x (n_x); Lxx (n_t, n_t) |
+| `retract` | x (n_x), dx (n_t); x_next = x (+) dx (n_x) |
+
+The three kernels of the terminal cost read the arrays of `terminal_inputs`, a row each, after the state.
+
+Output arrays of the derivative kernels start as zeros, and only the kernels write to them, so a kernel may
+skip entries that are always zero. The mixed derivative lux of the stage cost is taken to be zero.
+
+lxx and luu may be convex approximations: Gauss-Newton's. `lagrangian_hessian` and `terminal_cost_hessian`
+give exact second derivatives, and only problems with `has_second_order` need them: Lxx, Lux and Luu are those
+of the stage cost + multiplier . (step(x (+) z, u) (-) step(x, u)) with respect to tangent state z and control
+u. `retract`, the inverse of `difference`, removes rounding errors from a pose; it serves guesses of the
+states, and only problems with `has_retraction` need it.
+"""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+KERNEL_NAMES = (
+    "difference",
+    "step_with_cost",
+    "terminal_cost",
+    "linearize",
+    "cost_derivatives",
+    "terminal_cost_derivatives",
+)
+
+SECOND_ORDER_KERNEL_NAMES = ("lagrangian_hessian", "terminal_cost_hessian")
+
+RETRACTION_KERNEL_NAME = "retract"
+
+
+class Kernel(Protocol):
+    """A native function over rows; the object keeps its code loaded."""
+
+    @property
+    def address(self) -> int:
+        """Address of the function."""
+
+
+class ShootingProblem(Protocol):
+    """An optimal control problem over N stages with box-limited controls."""
+
+    @property
+    def n_states(self) -> int:
+        """Numbers n_x in a stored state."""
+
+    @property
+    def n_tangent(self) -> int:
+        """Directions n_t in which a state can move."""
+
+    @property
+    def n_controls(self) -> int:
+        """Number n_u of inputs."""
+
+    @property
+    def horizon(self) -> int:
+        """Number N of stages; a trajectory has N controls and N + 1 states."""
+
+    @property
+    def time_step(self) -> float:
+        """Duration of a stage, s."""
+
+    @property
+    def control_lower(self) -> FloatArray:
+        """Lower bounds of the inputs, -inf where there is none, shape (n_u,)."""
+
+    @property
+    def control_upper(self) -> FloatArray:
+        """Upper bounds of the inputs, +inf where there is none, shape (n_u,)."""
+
+    @property
+    def initial_state(self) -> FloatArray:
+        """State at stage 0 unless `solve` is given another, shape (n_x,)."""
+
+    @property
+    def terminal_inputs(self) -> tuple[FloatArray, ...]:
+        """Further inputs of the terminal cost: contiguous arrays whose numbers may change."""
+
+    @property
+    def has_second_order(self) -> bool:
+        """Whether the problem has the kernels `SECOND_ORDER_KERNEL_NAMES`."""
+
+    @property
+    def has_retraction(self) -> bool:
+        """Whether the problem has the kernel `RETRACTION_KERNEL_NAME`."""
+
+    def kernel(self, name: str, *, batched: bool = False) -> Kernel:
+        """Return one of the kernels.
+
+        Args:
+            name: One of `KERNEL_NAMES`, or one of `SECOND_ORDER_KERNEL_NAMES` or `RETRACTION_KERNEL_NAME` if
+                the problem has those.
+            batched: Whether it will work on many rows at once rather than one by one; the result must not
+                depend on it, the code may.
+
+        Returns:
+            The kernel.
+        """
+        ...
+
+
+def check_problem(problem: ShootingProblem) -> None:
+    """Raise ValueError if the attributes of a problem contradict each other."""
+    for name in ("n_states", "n_tangent", "n_controls", "horizon"):
+        if getattr(problem, name) < 1:
+            raise ValueError(f"{name} is {getattr(problem, name)}; a problem needs at least 1")
+    if not (np.isfinite(problem.time_step) and problem.time_step > 0.0):
+        raise ValueError(f"time_step is {problem.time_step}; it must be a positive number of seconds")
+    for name in ("control_lower", "control_upper"):
+        bound = np.asarray(getattr(problem, name))
+        if bound.shape != (problem.n_controls,):
+            raise ValueError(f"{name} has shape {bound.shape}; expected ({problem.n_controls},)")
+    crossed = ~(np.asarray(problem.control_lower) <= np.asarray(problem.control_upper))
+    if np.any(crossed):
+        i = int(np.argmax(crossed))
+        raise ValueError(
+            f"input {i} has bounds [{problem.control_lower[i]}, {problem.control_upper[i]}]; "
+            "the lower one must not exceed the upper one"
+        )
+
+
+def check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
+    """Refuse an array of another shape, or with entries that are not finite."""
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}; expected {shape}")
+    wrong = np.argwhere(~np.isfinite(array))
+    if len(wrong):
+        position = ", ".join(map(str, wrong[0]))
+        raise ValueError(f"{name}[{position}] is {array[tuple(wrong[0])]}; every entry must be finite")
+
+
+def check_at_least(name: str, value: float, smallest: float) -> None:
+    """Refuse a setting that is too small or NaN."""
+    if not value >= smallest:
+        raise ValueError(f"{name} is {value}; it must be at least {smallest}")
+
+
+def check_control_weights(luu: FloatArray) -> None:
+    """Refuse a problem in which an input has no cost of its own, luu of shape (N, n_u, n_u): mu scales it."""
+    weights = np.diagonal(luu, axis1=1, axis2=2)
+    free = weights <= 0.0
+    if np.any(free):
+        k, i = (int(index[0]) for index in np.nonzero(free))
+        raise ValueError(
+            f"the cost has the second derivative {weights[k, i]} with respect to input {i} at stage {k}; "
+            "every input needs a positive weight"
+        )

@@ -1,0 +1,114 @@
+"""The expert from random starts of a scene: share of converged and successful solves, and their times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter
+
+import numpy as np
+
+from dq_space_arm_env.common.report_page import Section
+from dq_space_arm_env.common.tables import Column, Row
+from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
+from dq_space_arm_env.scene import Scene
+from experts.ddp.solution import StopReason
+from experts.guesses.guided import GuidedDDP
+from experts.maneuver import Maneuver
+from experts.problems.shooting_problem import FloatArray
+from experts.report.effort import Announce, Effort
+
+_QUANTILES = {"least": 0.0, "median": 0.5, "90 %": 0.9, "most": 1.0}
+
+
+def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[Row]]:
+    """Solve from the starts of `env.reset(seed=)`; target and masses are the scene's."""
+    announce("the scene's own start", 0, effort.starts + 1)
+    expert = GuidedDDP(scene, max_iterations=effort.max_iterations)
+    _ = expert.library  # solved now, so that it does not count as time of the first start
+    env = DQSpaceArmEnv(scene)
+    rows: list[Row] = []
+    # Without a spread, all starts are the scene's own.
+    for seed in range(effort.starts if any(scene.spread.model_dump().values()) else 1):
+        announce(f"start {seed}", seed + 1, effort.starts + 1)
+        env.reset(seed=seed)
+        rows.append(_solve(scene, expert, np.asarray(env.state, dtype=np.float64), seed))
+    return {"starts": rows}
+
+
+def _solve(scene: Scene, expert: GuidedDDP, start: FloatArray, seed: int) -> Row:
+    began = perf_counter()
+    solution = expert.solve(start)
+    seconds = perf_counter() - began
+    if solution.stop_reason is StopReason.INTERRUPTED:
+        raise KeyboardInterrupt
+    end = Maneuver(scene, solution.states[-1:], solution.controls[-1:])
+    angle, distance = float(np.degrees(end.angle[-1])), float(end.distance[-1])
+    attempts = solution.metadata.get("attempts", ())
+    return {
+        "seed": seed,
+        "converged": solution.converged,
+        "success": angle <= scene.success.attitude_error_deg and distance <= scene.success.position_error,
+        "iterations": sum(attempt["iterations"] for attempt in attempts) or solution.iterations,
+        "seconds": seconds,
+        "cost": solution.cost,
+        "attitude_error_deg": angle,
+        "position_error_m": distance,
+        "guess": str(solution.metadata.get("guess", "")),
+    }
+
+
+def section(scene: Scene, found: dict[str, list[Row]]) -> Section:
+    """The section of the report."""
+    rows = found["starts"]
+    made = Section(
+        "expert",
+        "The expert from random starts",
+        f"GuidedDDP solves the scene from {len(rows)} starts, those of env.reset(seed=0) and the next seeds. "
+        "Success: the tip ends within the scene's tolerances.",
+    )
+    shares = {name: sum(bool(row[name]) for row in rows) / len(rows) for name in ("converged", "success")}
+    made.add_rows(
+        "shares",
+        [{"starts": len(rows), **shares}],
+        ["starts", Column("converged", format=".0%"), Column("success", format=".0%")],
+        "Of all starts",
+    )
+    made.add_rows("quantiles", _quantiles(rows), title="Distributions")
+    failed = [row for row in rows if not (row["converged"] and row["success"])]
+    if failed:
+        made.add_rows(
+            "failed",
+            failed,
+            ["seed", "converged", "success", "iterations", "cost", "attitude_error_deg", "position_error_m"],
+            "Starts that failed\n`dq-space-arm solve SCENE --seed N` repeats them",
+        )
+    if len(rows) == 1:
+        made.notes.append("The scene draws no starts (its spread is empty): only its own start is solved.")
+
+    def draw() -> bytes:
+        from experts.figures.plots import Plot
+
+        shown = [{**row, "outcome": _outcome(row)} for row in rows]
+        labels = {"seconds": "time of the solve [s]", "cost": "cost J [$-$]"}
+        return Plot("seconds", "cost", color="outcome", join=False, labels=labels).png(shown)
+
+    made.add_figure("expert", "Cost over time of each solve.", draw)
+    return made
+
+
+def _outcome(row: Row) -> str:
+    converged = "converged" if row["converged"] else "not converged"
+    return f"{converged}, {'success' if row['success'] else 'no success'}"
+
+
+def _quantiles(rows: Sequence[Row]) -> list[Row]:
+    return [
+        {
+            "quantity": name,
+            **{
+                title: float(np.quantile([row[name] for row in rows], share))
+                for title, share in _QUANTILES.items()
+            },
+        }
+        for name in ("iterations", "seconds", "cost")
+    ]

@@ -1,0 +1,293 @@
+"""Error against run time: every integrator follows the expert's maneuver in a scene.
+
+The reference is the method of order 8 in steps so short that halving them changes nothing; that of order 6
+tells how far to trust it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.common.report_page import Section
+from dq_space_arm_env.common.tables import Column, Row
+from dq_space_arm_env.kernels import Kernels, compile_scene
+from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.scene import INTEGRATORS, Scene
+from experts.ddp.box_ddp import BoxDDP
+from experts.problems.shooting_problem import FloatArray
+from experts.report.effort import Announce, Effort
+from experts.report.timing import time_in_turns
+
+ACCURACIES = (1e-3, 1e-6, 1e-9)
+"""Errors of the tip to reach, m and rad; also the relative tolerances of adaptive integrators."""
+BATCH = 1024
+"""Motions side by side on one core."""
+LOST = 1.0
+"""Beyond this error of the tip, m or rad, a motion has nothing to do with the right one."""
+_FAR_OFF = 1e6  # entries of a diverged state
+_TIMED_STEP = 8  # steps per input in the runs that are timed
+_FINEST_REFERENCE = 64  # steps per input
+_AGREEMENT = 1e-12  # m, rad; of the reference with half its steps
+_ASYMPTOTIC, _ROUNDING = 1e-3, 1e-11  # errors that show an order of convergence lie between
+_FLOORS, _UNCERTAINTIES, _SLOPES = 6.0, 30.0, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion under inputs that are held for a time step each."""
+
+    scene: Scene  # in double precision
+    start: FloatArray  # shape (n_x,)
+    controls: FloatArray  # shape (holds, n_u)
+
+    def end(self, kernels: Kernels, integrator: str, per_hold: int) -> FloatArray:
+        """State at the end, shape (n_x,), with a number of steps for each input."""
+        end: FloatArray = self.states(kernels, integrator, per_hold, per_hold * len(self.controls))[-1]
+        return end
+
+    def states(self, kernels: Kernels, integrator: str, per_hold: int, every: int) -> FloatArray:
+        """States along the motion."""
+        controls = np.repeat(self.controls, per_hold, axis=0)
+        dt = self.scene.simulation.dt / per_hold
+        with np.errstate(all="ignore"):
+            states = kernels.simulate(self.start, controls, len(controls), dt, integrator, every)
+        return np.asarray(states)
+
+
+def with_simulation(scene: Scene, **changes: Any) -> Scene:
+    """The scene with other settings of its simulation."""
+    return scene.replace(simulation={**scene.simulation.model_dump(), **changes})
+
+
+def expert_motion(scene: Scene, max_iterations: int) -> Motion:
+    """The expert's maneuver, converged or not; free motion where the expert diverges."""
+    scene = with_simulation(scene, precision="float64")
+    solution = BoxDDP(scene, max_iterations=max_iterations).solve()
+    controls = solution.controls if np.isfinite(solution.cost) else np.zeros_like(solution.controls)
+    return Motion(scene, np.array(solution.states[0]), np.array(controls))
+
+
+def tip_error(kernels: Kernels, x: FloatArray, reference: FloatArray) -> float:
+    """Distance [m] or angle [rad], whichever is larger, between the tips of two states; inf if diverged."""
+    if not np.abs(x).max() < _FAR_OFF:  # NaN is not smaller either
+        return float("inf")
+    tip, right = (tuple(kernels.tip_pose(each).tolist()) for each in (x, reference))
+    return max(float(poses.error_distance(tip, right)), float(poses.error_angle(tip, right)))
+
+
+def reference_end(motion: Motion) -> tuple[FloatArray, float]:
+    """State at the end of a motion, shape (n_x,), and the uncertainty of its tip, m or rad.
+
+    Rosenbrock methods step in where joints are too stiff for the explicit ones.
+    """
+    kernels = compile_scene(motion.scene)
+    for method, other in (("rk8", "rk6"), ("rodas5p", "rodas4")):
+        per_hold, end = 4, motion.end(kernels, method, 4)
+        while per_hold < _FINEST_REFERENCE:
+            finer = motion.end(kernels, method, 2 * per_hold)
+            change, per_hold, end = tip_error(kernels, end, finer), 2 * per_hold, finer
+            if change < _AGREEMENT:
+                break
+        if np.isfinite(end).all():
+            return end, tip_error(kernels, motion.end(kernels, other, per_hold), end)
+    raise ValueError("no integrator follows the expert's maneuver, even in short steps")
+
+
+def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[Row]]:
+    """Errors and times of all integrators."""
+    announce("the expert's maneuver", 0, 4)
+    motion = expert_motion(scene, effort.max_iterations)
+    announce("the reference", 1, 4)
+    end, uncertainty = reference_end(motion)
+    announce("times of the integrators", 2, 4)
+    variants = list(_variants(motion.scene))
+    times = _step_times(motion, variants, effort)
+    announce("errors of the integrators", 3, 4)
+    points: list[Row] = []
+    for (integrator, kernels, tolerance), (single, batch) in zip(variants, times, strict=True):
+        for per_hold in (1,) if tolerance is not None else effort.steps_per_input:
+            step = motion.scene.simulation.dt / per_hold
+            error = tip_error(kernels, motion.end(kernels, integrator, per_hold), end)
+            points.append(
+                {
+                    "integrator": integrator,
+                    "order": INTEGRATORS[integrator].order,
+                    "step_s": step,
+                    "tolerance": tolerance,
+                    "error": error if error < LOST else None,
+                    "single_us": 1e-3 * single / step,
+                    "batch_us": 1e-3 * batch / step,
+                }
+            )
+    reference = {"uncertainty": uncertainty, "duration_s": len(motion.controls) * scene.simulation.dt}
+    return {"points": points, "reference": [reference]}
+
+
+_Variant = tuple[str, Kernels, float | None]
+
+
+def _variants(scene: Scene) -> Iterator[_Variant]:
+    """Each integrator with its kernels; adaptive ones with several tolerances."""
+    for name, entry in INTEGRATORS.items():
+        if not entry.is_adaptive:
+            yield name, compile_scene(scene), None
+            continue
+        for tolerance in ACCURACIES:
+            changes = {"integrator": name, "rtol": tolerance, "atol": 0.01 * tolerance}
+            yield name, compile_scene(with_simulation(scene, **changes)), tolerance
+
+
+def _step_times(
+    motion: Motion, variants: Sequence[_Variant], effort: Effort
+) -> Iterator[tuple[float, float]]:
+    """Times of a step of one motion, and of each of a batch on one core, ns."""
+    runs: list[Callable[[], object]] = []
+    for integrator, kernels, tolerance in variants:
+        per_hold = _TIMED_STEP if tolerance is None else 1
+        step = motion.scene.simulation.dt / per_hold
+        call = step_call(kernels, integrator, *_along(motion, kernels, BATCH), step)
+        runs += [partial(motion.end, kernels, integrator, per_hold), partial(call, BATCH)]
+    samples = time_in_turns(runs, effort.repeats, effort.sample_seconds)
+    for (_, _, tolerance), single, batch in zip(variants, samples[::2], samples[1::2], strict=True):
+        steps = len(motion.controls) * (_TIMED_STEP if tolerance is None else 1)
+        yield single.best_ns / steps, batch.best_ns / BATCH
+
+
+def step_call(
+    kernels: Kernels, integrator: str, states: FloatArray, controls: FloatArray, step: float
+) -> KernelCall:
+    """A step of many states at once, shapes (B, n_x) and (B, n_u), into an array of its own."""
+    kernel = kernels.kernel("step", integrator=integrator)
+    arrays = {"x": states, "u": controls, "h": np.array([step], states.dtype)}
+    return KernelCall(kernel, {**arrays, kernel.outputs[0].name: np.zeros_like(states)})
+
+
+def _along(motion: Motion, kernels: Kernels, count: int) -> tuple[FloatArray, FloatArray]:
+    """States along a motion and the inputs there, shapes (count, n_x) and (count, n_u)."""
+    states = motion.states(kernels, "rk8", 4, every=4)
+    places = np.linspace(0, len(motion.controls) - 1, count).astype(int)
+    return np.ascontiguousarray(states[places]), np.ascontiguousarray(motion.controls[places])
+
+
+def observed_order(steps: Sequence[float], errors: Sequence[float], uncertainty: float = 0.0) -> float | None:
+    """Order of convergence that errors at shorter and shorter steps show; None if too few show it."""
+    floor = min(errors) if errors[-1] > 0.5 * errors[-2] else 0.0  # of rounding
+    smallest = max(_ROUNDING, _UNCERTAINTIES * uncertainty, _FLOORS * floor)
+    slopes = [
+        float(np.log(errors[i] / errors[i + 1]) / np.log(steps[i] / steps[i + 1]))
+        for i in range(len(steps) - 1)
+        if errors[i] < _ASYMPTOTIC and errors[i + 1] > smallest
+    ]
+    return max(float(np.median(slopes[-_SLOPES:])), slopes[-1]) if slopes else None
+
+
+def cheapest(rows: Iterable[Row], accuracy: float, time: str, error: str = "error") -> Row | None:
+    """The row of the smallest time among those whose error is at most an accuracy; columns by name."""
+    good = [row for row in rows if row[error] is not None and row[error] <= accuracy]
+    return min(good, key=lambda row: float(row[time]), default=None)
+
+
+def section(scene: Scene, found: dict[str, list[Row]]) -> Section:
+    """The section of the report."""
+    points, (reference,) = found["points"], found["reference"]
+    made = Section(
+        "precision",
+        "Error against run time",
+        f"Every integrator follows the expert's maneuver, {reference['duration_s']:g} s, in the scene's time "
+        "step and shorter ones. The error is that of the tip at the end; times are per simulated second, of "
+        f"one motion and of one of {BATCH} on one core.",
+    )
+    made.add_rows("cheapest", _choices(points), _CHOICE_COLUMNS, "The cheapest integrator and step")
+    made.add_rows("integrators", _summaries(points, reference["uncertainty"]), _SUMMARY_COLUMNS)
+    made.notes.append(
+        "Reference: the method of order 8 in short steps, or a stiff one where that fails; another one ends "
+        f"{reference['uncertainty']:.0e} m or rad from there."
+    )
+    own = [row for row in points if row["integrator"] == scene.simulation.integrator]
+    if own:
+        error = own[0]["error"]
+        ends = "loses the maneuver" if error is None else f"ends {error:.1e} m or rad off"
+        made.notes.append(
+            f"The scene's own integrator, {scene.simulation.integrator} with steps of "
+            f"{scene.simulation.dt:g} s, {ends}."
+        )
+
+    def draw() -> bytes:
+        from experts.figures.plots import Plot
+
+        labels = {"time_us": "time per simulated second [µs]", "error": "error of the tip [m, rad]"}
+        rows = [{**row, "time_us": row[key], "way": way} for key, way in _WAYS.items() for row in points]
+        return Plot(
+            "time_us", "error", color="integrator", facet="way", log="xy", levels=ACCURACIES, labels=labels
+        ).png(rows)
+
+    made.add_figure("precision", "Lower left is better; dashed: 1e-3, 1e-6, 1e-9.", draw)
+    return made
+
+
+_WAYS = {"single_us": "one motion", "batch_us": f"one of {BATCH} on one core"}
+
+
+def _step_text(row: Row) -> str:
+    return f"{row['step_s']:.3g} s" if row["tolerance"] is None else f"tolerance {row['tolerance']:g}"
+
+
+def _choices(points: Sequence[Row]) -> Iterator[Row]:
+    """The cheapest integrator for each accuracy and way."""
+    for accuracy in ACCURACIES:
+        for time, way in _WAYS.items():
+            row = cheapest(points, accuracy, time)
+            facts: dict[str, Any] = {"accuracy": accuracy, "way": way, "integrator": "not reached"}
+            if row is not None:
+                kept = {key: row[key] for key in ("integrator", "step_s", "tolerance", "error")}
+                facts |= {**kept, "step": _step_text(row), "us": row[time]}
+            yield facts
+
+
+def _summaries(points: Sequence[Row], uncertainty: float) -> Iterator[Row]:
+    """Orders, times of a step and errors of each integrator."""
+    for name in dict.fromkeys(row["integrator"] for row in points):
+        rows = [row for row in points if row["integrator"] == name]
+        known = [row for row in rows if row["error"] is not None]
+        shown = None
+        if len(known) > 1 and known[0]["tolerance"] is None:
+            steps, errors = ([row[key] for row in known] for key in ("step_s", "error"))
+            shown = observed_order(steps, errors, uncertainty)
+        least = min(known, key=lambda row: float(row["error"]), default=None)
+        yield {
+            "integrator": name,
+            "order": rows[0]["order"],
+            "observed_order": shown,
+            "single_step_ns": 1e3 * rows[0]["single_us"] * rows[0]["step_s"],
+            "batch_step_ns": 1e3 * rows[0]["batch_us"] * rows[0]["step_s"],
+            "error_at_scene_step": rows[0]["error"],
+            "least_error": None if least is None else least["error"],
+            "at": "-" if least is None else _step_text(least),
+        }
+
+
+_digits: Callable[[float], str] = "{:,.3g}".format
+_CHOICE_COLUMNS = (
+    Column("accuracy", "error\nm, rad", "g"),
+    Column("way", ""),
+    "integrator",
+    Column("step", "step"),
+    Column("us", "µs", _digits),
+    Column("error", "its error", ".0e"),
+)
+_SUMMARY_COLUMNS = (
+    "integrator",
+    "order",
+    Column("observed_order", "shown", ".1f"),
+    Column("single_step_ns", "ns/step\none", _digits),
+    Column("batch_step_ns", f"ns/step\nof {BATCH}", _digits),
+    Column("error_at_scene_step", "error at the\nscene's step", ".0e", "lost"),
+    Column("least_error", "least\nerror", ".0e", "lost"),
+    "at",
+)

@@ -1,0 +1,114 @@
+"""The report of a scene: measured part by part, and written after each one."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from time import perf_counter
+from types import ModuleType
+from typing import Any
+
+from rich.console import Console
+
+from dq_space_arm_env.common.files import json_value
+from dq_space_arm_env.common.progress import ProgressDisplay, Status
+from dq_space_arm_env.common.provenance import provenance
+from dq_space_arm_env.common.report_page import Page, Section
+from dq_space_arm_env.scene import Scene
+from experts.report import expert_trials, integrator_precision, part_costs, stability_envelope
+from experts.report.effort import FULL, QUICK, Effort
+
+PARTS: dict[str, ModuleType] = {
+    "precision": integrator_precision,
+    "stability": stability_envelope,
+    "parts": part_costs,
+    "expert": expert_trials,
+}
+"""Parts in order; each has `measure(scene, effort, announce)`, whose rows `section(scene, rows)` shows."""
+NAME = "report"
+
+
+def report(scene: Scene, folder: Path, console: Console, *, quick: bool = False) -> Page:
+    """Measure a scene and write report.html, report.md and report.json after each part.
+
+    An interrupted report of the same scene, effort and version resumes: its parts are kept.
+
+    Args:
+        scene: The scene.
+        folder: Gets the files; it must exist.
+        console: Shows progress, tables, and where the files are.
+        quick: Whether to measure less.
+
+    Returns:
+        The page.
+
+    Raises:
+        KeyboardInterrupt: If interrupted; the files of the finished parts are complete.
+        OSError: If the folder cannot be written to.
+    """
+    # Progress says enough about the many variants that are compiled.
+    logging.getLogger("dq_space_arm_env").setLevel(logging.WARNING)
+    effort, origin = QUICK if quick else FULL, provenance()
+    request = {
+        "scene": scene.model_dump(mode="json"),
+        "quick": quick,
+        "versions": origin["versions"],
+        "commit": origin["commit"],
+    }
+    found = _unfinished(folder / f"{NAME}.json", request)
+    if found:
+        console.print(f"Resuming: {', '.join(found)} are kept from an interrupted report.", markup=False)
+    page = Page(
+        f"Report of scene {scene.name}",
+        [],
+        {**origin, "request": request},
+        complaint="Not everything is measured",
+    )
+    for name, part in PARTS.items():
+        if name not in found:
+            found[name] = _measured(name, scene, effort, console)
+        section = _section(part, name, scene, found[name])
+        section.record = {**found[name], **section.record}
+        page.sections.append(section)
+        files = page.save(folder, NAME)
+        console.print(section.title, style="bold", markup=False)
+        section.print(console)
+    console.print(f"{folder}: {', '.join(files)}", markup=False)
+    return page
+
+
+def _measured(name: str, scene: Scene, effort: Effort, console: Console) -> dict[str, Any]:
+    """Rows of a part as JSON values; shows progress, and how long it took."""
+    began = perf_counter()
+    with ProgressDisplay(console) as progress:
+
+        def announce(what: str, done: int, total: int) -> None:
+            progress.update(Status(done, total, f"{name}: {what}"))
+
+        try:
+            rows: dict[str, Any] = json_value(PARTS[name].measure(scene, effort, announce))
+        except ValueError as error:  # for example, the environment refuses actuators without a limit
+            rows = {"refused": str(error)}
+    console.print(f"{name}: measured in {perf_counter() - began:.0f} s", markup=False)
+    return rows
+
+
+def _section(part: ModuleType, name: str, scene: Scene, found: dict[str, Any]) -> Section:
+    if "refused" in found:
+        sentence = f"{name} is not measured: {found['refused']}"
+        return Section(name, name.capitalize(), "Not measured.", shortcomings=[sentence])
+    section: Section = part.section(scene, found)
+    section.name = name  # by which a resumed report finds its rows
+    return section
+
+
+def _unfinished(file: Path, request: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Parts of an interrupted report of the same request; none if there is none."""
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+        parts, asked = record["parts"], record["request"]
+    except (OSError, ValueError, TypeError, KeyError):
+        return {}
+    same = asked == json.loads(json.dumps(json_value(request)))
+    return parts if same and parts.keys() < PARTS.keys() else {}

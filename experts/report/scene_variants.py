@@ -1,0 +1,187 @@
+"""Variants of a scene, each with one part left out or added."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dq_space_arm_env import Scene
+from dq_space_arm_env.scene import Pose
+
+_TIP_WRENCH = {"force": [0.2, 0.0, -0.1], "torque": [0.05, 0.0, 0.02]}
+_SPRING = {"stiffness": 10.0, "damping": 1.0}  # N m/rad, N m s/rad
+_RANDOM_TARGET = {"target_rotation": 0.1, "target_position": 0.1}  # rad, m
+_RANDOM_MASSES = ("mass", "inertia")
+_ACTUATORS = {
+    "base_force": "base force",
+    "base_torque": "base torque",
+    "joint_torque": "joint torques",
+    "wrist_rate": "wrist inputs",
+}
+
+
+def feature_variants(scene: Scene) -> dict[str, Scene]:
+    """The scene as it is, and with one part left out or added, by title."""
+    variants = {f"{scene.name}, as it is": scene}
+    if scene.wrist:
+        variants["without wrist"] = without_wrist(scene)
+    if scene.payload:
+        variants["without payload"] = _with_spread(scene, payload_mass=0.0, payload_inertia=0.0).replace(
+            payload=None
+        )
+    for name, title in _ACTUATORS.items():
+        if getattr(scene.actuators, name):
+            variants[f"without {title}"] = without_actuators(scene, name)
+    if scene.actuators.base_force and scene.actuators.base_torque:
+        both = without_actuators(scene, "base_force", "base_torque")
+        variants["without base force and torque"] = both
+    if scene.tip_wrench:
+        variants["without tip wrench"] = scene.replace(tip_wrench=None)
+    elif scene.base.motion == "spatial":
+        variants["with a tip wrench"] = scene.replace(tip_wrench=_TIP_WRENCH)
+    variants |= _spring_variants(scene)
+    variants |= _spread_variants(scene)
+    for count in reversed(range(len(scene.links))):
+        shorter = with_links(scene, count)
+        if shorter is not None:
+            variants[f"with {count} link{'s' * (count != 1)}"] = shorter
+    if scene.base.motion == "spatial":
+        title = "in the plane, without wrist" if scene.wrist else "in the plane"
+        variants[title] = in_the_plane(scene)
+    return variants
+
+
+def _spring_variants(scene: Scene) -> dict[str, Scene]:
+    if any(link.stiffness or link.damping for link in scene.links):
+        return {"without springs and dampers": _with_link_fields(scene, stiffness=0.0, damping=0.0)}
+    return {"with springs and dampers": _with_link_fields(scene, **_SPRING)} if scene.links else {}
+
+
+def _with_link_fields(scene: Scene, **fields: Any) -> Scene:
+    return scene.replace(links=[link.model_copy(update=fields) for link in scene.links])
+
+
+def _spread_variants(scene: Scene) -> dict[str, Scene]:
+    """Without the starts, target and masses that episodes draw; with those that they do not."""
+    drawn = {name: width for name, width in scene.spread.model_dump().items() if width}
+    masses = [f"base_{name}" for name in _RANDOM_MASSES]
+    if scene.links:
+        masses += ["link_masses", "link_inertias"]
+    if scene.payload:
+        masses += [f"payload_{name}" for name in _RANDOM_MASSES]
+    variants = {}
+    starts = drawn.keys() - {*masses, *_RANDOM_TARGET}
+    if starts:
+        variants["without random starts"] = _with_spread(scene, **dict.fromkeys(starts, 0.0))
+    for title, widths in (("random target", _RANDOM_TARGET), ("random masses", dict.fromkeys(masses, 0.1))):
+        if drawn.keys() & widths.keys():
+            variants[f"without {title}"] = _with_spread(scene, **dict.fromkeys(widths, 0.0))
+        else:
+            variants[f"with {title}"] = _with_spread(scene, **widths)
+    return variants
+
+
+def _with_spread(scene: Scene, **widths: float) -> Scene:
+    return scene.replace(spread=scene.spread.model_copy(update=widths))
+
+
+def without_actuators(scene: Scene, *names: str) -> Scene:
+    """Remove actuators, by their names in the scene's `actuators`."""
+    actuators = scene.actuators.model_copy(update=dict.fromkeys(names))
+    links = scene.links
+    if "joint_torque" in names:
+        links = tuple(link.model_copy(update={"torque_limit": None}) for link in links)
+    return scene.replace(actuators=actuators, links=links)
+
+
+def without_wrist(scene: Scene) -> Scene:
+    """Lock the wrist at zero angles; the tip stays where it is if it is the wrist's frame."""
+    assert scene.wrist is not None
+    return scene.replace(
+        wrist=None,
+        tip=scene.wrist.frame,
+        actuators=scene.actuators.model_copy(update={"wrist_rate": None}),
+        initial_state=scene.initial_state.model_copy(update={"wrist_angles": ()}),
+        spread=scene.spread.model_copy(update={"wrist_angles": 0.0}),
+    )
+
+
+def with_links(scene: Scene, count: int) -> Scene | None:
+    """Keep the first links; wrist or tip move to where the next joint was. None: a payload needs a link."""
+    end = scene.links[count].joint
+    start = scene.initial_state
+    changes: dict[str, Any] = {
+        "links": scene.links[:count],
+        "initial_state": start.model_copy(
+            update={"joint_angles": start.joint_angles[:count], "joint_rates": start.joint_rates[:count]}
+        ),
+    }
+    if scene.wrist:
+        changes["wrist"] = scene.wrist.model_copy(update={"frame": end})
+    else:
+        changes["tip"] = end
+    if count == 0:
+        if scene.payload:
+            return None
+        changes["actuators"] = scene.actuators.model_copy(update={"joint_torque": None})
+        none = ("joint_angles", "joint_rates", "link_masses", "link_inertias")
+        changes["spread"] = scene.spread.model_copy(update=dict.fromkeys(none, 0.0))
+    return scene.replace(**changes)
+
+
+def in_the_plane(scene: Scene) -> Scene:
+    """The robot in the plane: no wrist, all axes along z, offsets along z turned to x."""
+    flat = without_wrist(scene) if scene.wrist else scene
+    wrench, start = flat.tip_wrench, flat.initial_state
+    base_pose, velocity = _flat_pose(start.base_pose), _flat_twist(start.base_velocity)
+    changes: dict[str, Any] = {
+        "base": flat.base.model_copy(
+            update={"motion": "planar", "inertia": _flat_inertia(flat.base.inertia)}
+        ),
+        "links": [
+            link.model_copy(
+                update={
+                    "inertia": _flat_inertia(link.inertia),
+                    "center_of_mass": _flat_vector(link.center_of_mass),
+                    "joint": _flat_pose(link.joint),
+                }
+            )
+            for link in flat.links
+        ],
+        "tip": _flat_pose(flat.tip),
+        "target": {
+            "pose": _flat_pose(flat.target.pose),
+            "base_velocity": _flat_twist(flat.target.base_velocity),
+        },
+        "initial_state": start.model_copy(update={"base_pose": base_pose, "base_velocity": velocity}),
+    }
+    if flat.payload:
+        changes["payload"] = flat.payload.model_copy(
+            update={
+                "inertia": _flat_inertia(flat.payload.inertia),
+                "center_of_mass": _flat_vector(flat.payload.center_of_mass),
+            }
+        )
+    if wrench:
+        changes["tip_wrench"] = {"force": _flat_vector(wrench.force), "torque": (0.0, 0.0, wrench.torque[2])}
+    return flat.replace(**changes)
+
+
+def _flat_vector(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    return (vector[0] + vector[2], vector[1], 0.0)
+
+
+def _flat_pose(pose: Pose) -> Pose:
+    """The pose without height; only a rotation about z is kept."""
+    tilted = any(pose.rotation[1:3])
+    rotation = (1.0, 0.0, 0.0, 0.0) if tilted else pose.rotation
+    return Pose(position=_flat_vector(pose.position), rotation=rotation)
+
+
+def _flat_twist(twist: tuple[float, ...]) -> tuple[float, ...]:
+    """The part that turns about z and moves in x and y."""
+    return (0.0, 0.0, *twist[2:5], 0.0)
+
+
+def _flat_inertia(inertia: Any) -> Any:
+    (xx, xy, _), (_, yy, _), (_, _, zz) = inertia
+    return ((xx, xy, 0.0), (xy, yy, 0.0), (0.0, 0.0, zz))

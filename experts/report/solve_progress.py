@@ -1,0 +1,45 @@
+"""Progress of a solve."""
+
+from time import perf_counter
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+
+from dq_space_arm_env.common.progress import ProgressDisplay
+from experts.ddp.solution import IterationRecord
+
+LINES_EVERY = 10  # iterations, without a terminal
+
+
+class SolveProgress:
+    """Shows the iterations of a solve; use it as a context, and `update` as the solver's callback."""
+
+    def __init__(self, console: Console) -> None:
+        self._display, self._started = ProgressDisplay(console, bar=False), perf_counter()
+        self._every = 1 if console.is_terminal else LINES_EVERY
+
+    def __enter__(self) -> Self:
+        self._display.__enter__()
+        self._display.show("preparing (compiling a new scene takes about 15 s)", now=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._display.__exit__(kind, error, traceback)
+
+    def start(self) -> None:
+        """Start the clock of the solve."""
+        self._started = perf_counter()
+
+    def update(self, record: IterationRecord) -> None:
+        """Show an iteration; without a terminal, every tenth."""
+        if self._every > 1 and record.iteration % self._every != 1:
+            return
+        step = f"step {record.alpha:<6.3g}" if record.alpha > 0.0 else "no step    "
+        self._display.show(
+            f"iteration {record.iteration:3d}   J {record.cost:<10.8g}   {step}   "
+            f"damping {record.regularization:<7.2g}   {perf_counter() - self._started:5.2f} s",
+            now=True,
+        )

@@ -1,0 +1,226 @@
+"""The one harness: rows, claims, tables, figures, files and exit status of every benchmark.
+
+A benchmark yields tidy rows: plain dicts of JSON scalars whose key "table" names the table they belong to.
+Rows of the table "claims" are judged. They have one schema in all benchmarks, see `claim`. Rows of the table
+"notes" are sentences below the tables. From the rows alone, one renderer makes the tables on the terminal,
+a JSON file and figures for each benchmark, and one page for all of them.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from rich.console import Console
+
+from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, complain
+from dq_space_arm_env.common.files import json_value, to_json, write_atomically
+from dq_space_arm_env.common.provenance import provenance
+from dq_space_arm_env.common.report_page import Page, Section
+from dq_space_arm_env.common.tables import Column, tabulate
+from scripts.benchmarks.effort import Effort
+
+Row = dict[str, Any]
+CLAIMS, NOTES = "claims", "notes"
+_LONGEST_NOTE = 240
+
+
+class Status(StrEnum):
+    """Outcome of a claim."""
+
+    HANDLED = "handled"  # the error is a finite number and at most the bound
+    REFUSED = "refused"  # in the sentence of the note, as it should be
+    NOT_CLAIMED = "not claimed"  # beyond a documented limit of the method
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the rows of one name; with `by`, one for each value of this column."""
+
+    name: str
+    title: str  # a format string of the first row's columns; text after a line break explains
+    columns: tuple[Column | str, ...]
+    by: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the rows of one table, drawn by `experts.figures.plots.Plot`."""
+
+    name: str
+    table: str
+    caption: str
+    plot: Mapping[str, Any]  # arguments of Plot
+    where: Callable[[Row], bool] = lambda row: True
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A measurement, and the specification of its tables and figures."""
+
+    name: str
+    title: str
+    caption: str
+    measure: Callable[[Effort], Iterator[Row]]
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    packages: tuple[str, ...] = ()  # whose versions matter
+
+
+def claim(
+    group: str,
+    name: str,
+    subject: str,
+    error: float | None,
+    bound: float | None,
+    *,
+    unit: str = "",
+    note: str = "",
+    status: Status | None = None,
+    **others: Any,
+) -> Row:
+    """Declare a bound on an error; without a status, NaN and errors above the bound fail."""
+    if status is None:
+        assert bound is not None
+        status = Status.HANDLED
+        if error is None or not math.isfinite(error):
+            status, note = Status.FAILED, f"the error is not finite. {note}".strip()
+        elif error > bound:
+            sentence = f"the error {error:.1e} is above {bound:.3g} {unit}".strip()
+            status, note = Status.FAILED, f"{sentence}. {note}".strip()
+    labels = {"table": CLAIMS, "group": group, "name": name, "subject": subject, "status": str(status)}
+    return {**labels, "error": error, "bound": bound, "unit": unit, "note": note, **others}
+
+
+def note(sentence: str) -> Row:
+    """A sentence below the tables, shown once however often it is yielded."""
+    return {"table": NOTES, "note": sentence}
+
+
+def select(rows: Iterable[Row], **wanted: object) -> list[Row]:
+    """Rows with these values."""
+    return [row for row in rows if all(row.get(key) == value for key, value in wanted.items())]
+
+
+def shortcomings(rows: Iterable[Row]) -> list[str]:
+    """A sentence for each claim that failed."""
+    return [
+        f"{row['group']}: {row['name']}, {row['subject']}: {row['note']}"
+        for row in select(rows, table=CLAIMS, status=str(Status.FAILED))
+    ]
+
+
+def section_of(benchmark: Benchmark, rows: Sequence[Row], effort: Effort) -> Section:
+    """Show the rows of a benchmark."""
+    section = Section(benchmark.name, benchmark.title, benchmark.caption)
+    for spec in (*benchmark.tables, _CLAIMS_TABLE):
+        found = select(rows, table=spec.name)
+        for key in dict.fromkeys(tuple(row[column] for column in spec.by) for row in found):
+            own = [row for row in found if tuple(row[column] for column in spec.by) == key]
+            section.tables.append(tabulate(spec.title.format(**own[0]), own, spec.columns))
+    section.notes += dict.fromkeys(row["note"] for row in select(rows, table=NOTES))
+    claims = select(rows, table=CLAIMS)
+    counts = {status: len(select(claims, status=str(status))) for status in Status}
+    listed = ", ".join(f"{count} {status.value}" for status, count in counts.items())
+    section.notes.append(f"{len(claims)} claims: {listed}.")
+    section.shortcomings = shortcomings(rows)
+    for picture in benchmark.pictures:
+        drawn = [row for row in select(rows, table=picture.table) if picture.where(row)]
+        if drawn:
+            section.add_figure(picture.name, picture.caption, lambda p=picture, d=drawn: _draw(p, d))  # type: ignore[misc]
+    section.record = {"effort": asdict(effort), "counts": counts, "rows": json_value(list(rows))}
+    return section
+
+
+def _draw(picture: Picture, rows: Sequence[Row]) -> bytes:
+    from experts.figures.plots import Plot  # matplotlib is optional
+
+    return Plot(**picture.plot).png(rows)
+
+
+def three_digits(value: float) -> str:
+    """Three digits, or all of them before the point."""
+    return f"{value:,.0f}" if abs(value) >= 99.95 else f"{value:#.3g}".rstrip(".")
+
+
+def time_column(key: str, heading: str | None = None) -> Column:
+    return Column(key, heading, three_digits)
+
+
+def _error(value: float) -> str:
+    return f"{value:.2g}"
+
+
+def _shortened(sentence: str) -> str:
+    line = " ".join(sentence.split())
+    return line if len(line) <= _LONGEST_NOTE else f"{line[: _LONGEST_NOTE - 2]} …"
+
+
+_CLAIMS_TABLE = Table(
+    CLAIMS,
+    "Claims, {group}",
+    (
+        Column("name", "case"),
+        Column("subject", "applied to"),
+        Column("status", "", lambda status: status.upper() if status == Status.FAILED else status),
+        Column("error", format=_error, missing=""),
+        Column("bound", format=_error, missing=""),
+        Column("unit"),
+        Column("note", format=_shortened),
+    ),
+    by=("group",),
+)
+
+
+def collect(benchmark: Benchmark, effort: Effort, console: Console) -> tuple[list[Row], bool]:
+    """Measure; an interrupt keeps the rows so far, and is the second result."""
+    rows: list[Row] = []
+    with console.status(f"Measuring: {benchmark.name}") as status:
+        try:
+            for row in benchmark.measure(effort):
+                rows.append(row)
+                labels = [row[key] for key in ("group", "scene", "name", "subject") if row.get(key)]
+                status.update(f"Measuring: {benchmark.name}: {row['table']} {', '.join(map(str, labels))}")
+        except KeyboardInterrupt:
+            console.print("Interrupted: the measurements so far are saved.")
+            return rows, True
+    return rows, False
+
+
+def run(benchmarks: Sequence[Benchmark], effort: Effort, folder: Path, console: Console) -> int:
+    """Measure, print, and write a JSON file for each benchmark and the page `report` after each.
+
+    Returns the exit status: 0; 1 if a claim failed; 130 if interrupted.
+    """
+    logging.getLogger("dq_space_arm_env").setLevel(logging.WARNING)  # hundreds of scenes are compiled
+    folder.mkdir(parents=True, exist_ok=True)
+    packages = dict.fromkeys(name for benchmark in benchmarks for name in benchmark.packages)
+    page = Page(
+        "DQ Space Arm: benchmarks",
+        [],
+        provenance(*packages),
+        "All results are as accurate as declared. Times are shown, never judged.",
+        "Less accurate than declared",
+    )
+    for benchmark in benchmarks:
+        started = perf_counter()
+        rows, interrupted = collect(benchmark, effort, console)
+        page.sections.append(section_of(benchmark, rows, effort))
+        page.sections[-1].print(console)
+        record = {**page.sections[-1].record, **page.origin}
+        write_atomically(folder / f"{benchmark.name.replace('-', '_')}.json", to_json(json_value(record)))
+        page.save(folder)
+        console.print(f"{benchmark.title}: {perf_counter() - started:.0f} s", markup=False)
+        if interrupted:
+            return INTERRUPTED
+    console.print(f"{folder}: report.html, report.md, and JSON of each benchmark", markup=False)
+    for sentence in page.shortcomings:
+        complain(sentence, label="")
+    return FAILURE if page.shortcomings else SUCCESS

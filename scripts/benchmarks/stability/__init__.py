@@ -1,0 +1,97 @@
+"""Stiff and extreme cases: each handled within an error bound, refused in a sentence, or beyond a claim.
+
+`cases` defines a case, `references` holds accelerations with 50 digits and by every formulation, `scenes` the
+scenes and states of the cases; each other module is a group of cases. The references need mpmath.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+from scripts.benchmarks.effort import Effort
+from scripts.benchmarks.harness import Benchmark, Picture, Row
+from scripts.benchmarks.stability import (
+    bad_numbers,
+    expert,
+    extreme_motions,
+    far_away,
+    masses,
+    motions,
+    paper_form,
+    payloads,
+    poses,
+    stiff_joints,
+    time_steps,
+)
+from scripts.benchmarks.stability.cases import Case
+
+_MODULES = (
+    masses,
+    motions,
+    extreme_motions,
+    stiff_joints,
+    time_steps,
+    paper_form,
+    far_away,
+    poses,
+    bad_numbers,
+    payloads,
+    expert,
+)
+GROUPS: Mapping[str, Callable[[], Iterator[Case]]] = {module.GROUP: module.cases for module in _MODULES}
+
+
+def all_cases(groups: Iterable[str] = ()) -> list[Case]:
+    """The cases of some groups, or of all."""
+    wanted = tuple(groups) or tuple(GROUPS)
+    for group in wanted:
+        if group not in GROUPS:
+            raise ValueError(f"group: {group!r} is unknown; choose from {', '.join(GROUPS)}")
+    return [case for group in wanted for case in GROUPS[group]()]
+
+
+def measure(effort: Effort) -> Iterator[Row]:
+    """Try all cases."""
+    for case in all_cases(effort.only):
+        yield from case.rows(effort)
+
+
+BENCHMARK = Benchmark(
+    "stability",
+    "Stiff and extreme cases",
+    "A case is handled, with an error below its bound; refused, in the sentence that the user is told; or "
+    "beyond what the method claims. All else is a failure, and stands at the top.",
+    measure,
+    pictures=(
+        Picture(
+            "stability_masses",
+            f"curves of {masses.GROUP}",
+            "Error of the accelerations over the ratio of base to arm mass; dashed: the bound.",
+            {
+                "x": "x",
+                "y": "y",
+                "color": "subject",
+                "facet": "name",
+                "log": "xy",
+                "floor": 1e-17,
+                "levels": (masses.BACKWARD_BOUND,),
+                "labels": {"x": "mass of base / mass of arm [$-$]", "y": "error [$-$]"},
+            },
+        ),
+        Picture(
+            "stability_stiff_joints",
+            f"curves of {stiff_joints.GROUP}",
+            f"Largest change of energy of a joint on its spring in {stiff_joints.STEPS} steps over the "
+            "product of step and frequency: 1 where it is damped, at the upper edge where it blew up.",
+            {
+                "x": "x",
+                "y": "y",
+                "color": "subject",
+                "log": "xy",
+                "floor": 1e-16,
+                "labels": {"x": r"$\Delta t\,\omega$ [$-$]", "y": "largest change / first energy [$-$]"},
+            },
+        ),
+    ),
+    packages=("mpmath", "pin"),
+)

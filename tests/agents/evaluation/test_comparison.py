@@ -1,0 +1,275 @@
+"""The comparison: what controllers fly, what they know, what is kept, and what tables and commands say."""
+
+import json
+import math
+import shlex
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agents import compare
+from agents.command_line.compare import compare as compare_verb
+from agents.command_line.evaluate import evaluate as evaluate_verb
+from agents.configuration import load_configuration
+from agents.evaluation import CONTROLLERS, evaluation_seeds, fly, optimal_costs, scene_under
+from agents.evaluation.comparing import Comparison
+from agents.evaluation.comparison_tables import comparison_tables, group_record, markdown, notes, record
+from agents.evaluation.plan_followers import FEEDBACK, OPEN_LOOP, RECEDING
+from agents.evaluation.planned_flights import fly_plans
+from agents.evaluation.training_runs import agent_of, training_command
+from agents.policies import ExportedPolicy
+from dq_space_arm_env.command_line import main
+from experts import GuidedDDP
+from experts.demonstrations import SerialExecutor
+from experts.problems.arm_problem import ArmProblem
+
+N = 6
+
+
+def write_policy(folder, scene, seed=0, name="stub", **training):
+    """An exported policy with the folder of its run."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True)
+    metadata = {
+        "agent": name,
+        "scene": scene.name,
+        "scene_hash": scene.content_hash(),
+        "configuration": {"name": name, "seed": seed},
+        "training": {"environment_steps": 1000, "seconds": 90.0, "expert_solves": 7, **training},
+    }
+    weights = 0.1 * rng.standard_normal((14, 6))
+    policy = ExportedPolicy((weights,), (np.zeros(6),), "tanh", np.zeros(14), np.ones(14), metadata=metadata)
+    policy.save(folder / "policy.npz")
+    known = {"median_cost": 900.0}
+    curve = [
+        {"environment_steps": 10 * k, "seconds": 10.0 * k, "success_rate": 0.1 * k, **known} for k in (2, 1)
+    ]
+    (folder / "evaluations.jsonl").write_text("".join(json.dumps(line) + "\n" for line in curve) + "{\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def comparison(quick, tmp_path_factory) -> Comparison:
+    """Controllers and three runs of an agent, under two conditions."""
+    folder = tmp_path_factory.mktemp("runs")
+    runs = [write_policy(folder / f"stub-{seed}", quick, seed) for seed in range(3)]
+    return compare(
+        runs, quick, N, conditions=("training", "heavy_payload"), receding_starts=3, executor=SerialExecutor()
+    )
+
+
+def row_of(comparison, name, condition):
+    (row,) = (row for row in comparison.under(condition) if row.name == name)
+    return row
+
+
+def test_plans_cost_the_optimum_where_nothing_differs(comparison):
+    for name in (OPEN_LOOP, FEEDBACK):
+        evaluation = row_of(comparison, name, "training").evaluation
+        known = ~np.isnan(evaluation.cost_gaps)
+        assert known.sum() >= N - 1
+        np.testing.assert_allclose(evaluation.cost_gaps[known], 0.0, atol=1e-9)
+        assert evaluation.flights.is_success.tolist() == evaluation.optimal.is_success.tolist()
+        assert evaluation.summary()["cheaper_than_expert"] == 0
+        dearer = replace(evaluation, optimal=evaluation.optimal._replace(cost=1.01 * evaluation.optimal.cost))
+        assert dearer.summary()["cheaper_than_expert"] == evaluation.flights.is_success[known].sum()
+
+
+def test_a_wrong_payload_hurts_the_open_loop_most(comparison, counting, quick):
+    """The plans are those of the unchanged scene, and gains correct most of what that spoils."""
+    blind = row_of(comparison, OPEN_LOOP, "heavy_payload").evaluation
+    corrected = row_of(comparison, FEEDBACK, "heavy_payload").evaluation
+    assert np.nanmedian(blind.cost_gaps) > 10.0 * np.nanmedian(corrected.cost_gaps) > 0.0
+    # What they are compared with is the optimum of the scene that they fly in.
+    expected = optimal_costs(scene_under(quick, "heavy_payload"), N, executor=counting(limit=0)).cost
+    np.testing.assert_array_equal(blind.optimal.cost, expected)
+
+
+def test_gains_are_those_of_the_solution(comparison, quick):
+    """One flight by hand: the expert's own feedback policy of the unchanged scene, in the changed one."""
+    problem = ArmProblem(quick)
+    flown = scene_under(quick, "heavy_payload")
+    evaluation = row_of(comparison, FEEDBACK, "heavy_payload").evaluation
+    solver = GuidedDDP(problem)
+
+    class Follower:
+        def begin(self, environment):
+            self.environment, self.stage = environment, 0
+            self.policy = solver.solve(environment.states[0]).policy(problem)
+
+        def __call__(self, observations):
+            control = self.policy(self.environment.states[0], self.stage)
+            self.stage += 1
+            return (control / problem.control_upper)[None]
+
+    seeds = evaluation_seeds(quick, N)
+    costs = [fly(Follower(), flown, [seed]).cost[0] for seed in seeds]
+    # Of a group some may have been solved anew, from a neighbor; and gains are kept in single precision.
+    same = np.isclose(costs, evaluation.flights.cost, rtol=1e-5)
+    assert same.sum() >= N - 1
+
+
+def test_the_receding_horizon_stays_near_the_optimum(comparison):
+    evaluation = row_of(comparison, RECEDING, "training").evaluation
+    assert len(evaluation.seeds) == 3
+    assert np.nanmedian(evaluation.cost_gaps) < 0.01
+    assert row_of(comparison, RECEDING, "training").facts["planning_seconds"] > 0.0
+
+
+def test_conditions_share_plans(cache, counting, quick):
+    executor = counting()
+    conditions = ("training", "heavy_payload", "light_payload")
+    first = fly_plans(quick, (OPEN_LOOP, FEEDBACK), conditions, 2, executor)
+    assert executor.tasks == 1
+    again = fly_plans(quick, (OPEN_LOOP, FEEDBACK), conditions, 2, counting(limit=0))
+    for key, planned in first.items():
+        np.testing.assert_array_equal(again[key].flights.cost, planned.flights.cost)
+    # The optimal costs have been kept along.
+    optimal_costs(quick, 2, executor=counting(limit=0))
+    for damaged in (cache / "planned-flights").rglob("*.json"):
+        damaged.write_text("[]")
+    repaired = fly_plans(quick, (FEEDBACK,), ("training",), 2, executor)
+    assert executor.tasks == 2
+    np.testing.assert_array_equal(
+        repaired[FEEDBACK, "training"].flights.cost, first[FEEDBACK, "training"].flights.cost
+    )
+
+
+def test_interrupted_flights_resume(cache, counting, quick):
+    with pytest.raises(KeyboardInterrupt):
+        fly_plans(quick, (FEEDBACK,), ("training",), 30, counting(limit=1))
+    executor, seen = counting(), []
+    flown = fly_plans(quick, (FEEDBACK,), ("training",), 30, executor, seen.append)
+    assert executor.tasks == 1
+    assert [(advance.done, advance.total) for advance in seen] == [(1, 2), (2, 2)]
+    assert len(flown[FEEDBACK, "training"].flights.cost) == 30
+
+
+def test_runs_of_one_agent_are_taken_together(comparison):
+    assert [(group.name, group.condition, group.seeds) for group in comparison.groups] == [
+        ("stub", "training", (0, 1, 2)),
+        ("stub", "heavy_payload", (0, 1, 2)),
+    ]
+    rows = [row for row in comparison.under("training") if row.facts["is_agent"]]
+    rate = np.mean([row.evaluation.flights.is_success.mean() for row in rows])
+    assert comparison.groups[0].runs.success_rate.value == pytest.approx(rate)
+    one, same, other = (
+        {"configuration": {"name": "a", **entry}} for entry in ({"seed": 1}, {"seed": 2}, {"x": 1})
+    )
+    assert agent_of(one) == agent_of(same) != agent_of(other)
+
+
+def test_finished_rows_are_taken_up(tmp_path, monkeypatch, quick):
+    run = write_policy(tmp_path / "stub-0", quick)
+    arguments = {"controllers": ("gains",), "out": tmp_path / "out", "executor": SerialExecutor()}
+    first = compare([run], quick, 3, **arguments)
+    files = sorted(path.name for path in (tmp_path / "out" / "rows").iterdir())
+    assert files == ["plan-with-gains-training.json", "stub-0-training.json"]
+
+    def refuse(*arguments, **options):
+        raise AssertionError("evaluated again")
+
+    monkeypatch.setattr("agents.evaluation.comparing.evaluate", refuse)
+    monkeypatch.setattr("agents.evaluation.comparing.fly_plans", refuse)
+    again = compare([run], quick, 3, **arguments)
+    assert json.dumps(record(again)) == json.dumps(record(first))
+    (tmp_path / "out" / "rows" / files[1]).write_text("{")
+    with pytest.raises(AssertionError, match="evaluated again"):
+        compare([run], quick, 3, **arguments)
+    write_policy(tmp_path / "other" / "stub-0", quick, seed=1)
+    with pytest.raises(AssertionError, match="evaluated again"):
+        compare([tmp_path / "other" / "stub-0"], quick, 3, **arguments)
+
+
+def test_tables_have_all_columns_of_the_protocol(comparison):
+    first, _, second, _ = comparison_tables(comparison)
+    assert [row[0] for row in first.rows] == [*CONTROLLERS.values(), "stub-0", "stub-1", "stub-2"]
+    stub = dict(zip(first.headings, first.rows[3], strict=True))
+    assert (stub["training\nsteps"], stub["expert\nsolves"], stub["plan\ns"]) == ("1,000", "7", "-")
+    assert stub["success\n%"].startswith("0.0\n[0.0, 39.")
+    text = markdown("Title", [first, second], comparison)
+    for sentence in notes(comparison):
+        assert sentence in text
+    assert any("they do not know the new one" in sentence for sentence in notes(comparison))
+    content = json.loads(json.dumps(record(comparison), allow_nan=False))
+    assert content["groups"] == [group_record(group) for group in comparison.groups]
+    curve = content["rows"][3]["learning_curve"]  # in the order of time
+    assert [(point["seconds"], point["success_rate"]) for point in curve] == [(10.0, 0.1), (20.0, 0.2)]
+
+
+def test_commands_make_the_rows_again(comparison):
+    """Each command names what it is for, and is one that the programs understand."""
+    found = [shlex.split(command) for command in comparison.commands]
+    assert len(found) == len(CONTROLLERS) + 3
+    for words in found:
+        comparing = words[1] == "compare"
+        command = compare_verb.default if comparing else evaluate_verb.default
+        options = command.make_context("test", words[3:] if comparing else words[2:]).params
+        assert options["conditions"] == ("training", "heavy_payload")
+        assert options["n"] == N
+    receding = next(words for words in found if "receding" in words)
+    assert receding[receding.index("--receding-starts") + 1] == "3"
+
+
+def test_the_training_command_is_the_shortest_that_gives_the_configuration(tmp_path):
+    shipped = load_configuration("ppo").model_dump(mode="json", exclude_none=True)
+    assert training_command({"configuration": {**shipped, "seed": 3}}) == ("dq-space-arm train ppo --seed 3")
+    longer = {**shipped, "seed": 3, "schedule": {**shipped["schedule"], "total_steps": 9}}
+    assert training_command({"configuration": longer}) == "dq-space-arm train ppo --seed 3 --total-steps 9"
+    changed = {**shipped, "network": {**shipped["network"], "hidden": [3]}}
+    assert training_command({"configuration": changed}) is None
+    (tmp_path / "config.yaml").touch()
+    assert training_command({"configuration": changed}, tmp_path / "policy.npz") == (
+        f"dq-space-arm train {tmp_path / 'config.yaml'}"
+    )
+    assert training_command({}) is None
+
+
+def test_what_cannot_be_compared_is_refused(quick):
+    with pytest.raises(ValueError, match="controllers: 'magic' is unknown; choose from open-loop, gains"):
+        compare(scene=quick, controllers=("magic",))
+    with pytest.raises(ValueError, match="there is nothing to compare"):
+        compare(scene=quick, controllers=())
+    with pytest.raises(ValueError, match="receding_starts: 0, should be at least 1"):
+        compare(scene=quick, receding_starts=0)
+
+
+def test_the_verb_writes_table_record_and_picture(tmp_path, capsys, quick):
+    pytest.importorskip("matplotlib")
+    quick.to_yaml(tmp_path / "quick.yaml")
+    run = write_policy(tmp_path / "stub-0", quick)
+    arguments = [str(run), "--scene", str(tmp_path / "quick.yaml"), "-n", "3", "--workers", "1"]
+    out = tmp_path / "out"
+    assert main(["compare", *arguments, "--controller", "gains", "--out", str(out)]) == 0
+    assert "Commands that reproduce the rows:" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == {"rows", "table.md", "comparison.json", "comparison.png"}
+    assert (out / "comparison.png").read_bytes()[:4] == b"\x89PNG"
+    rows = json.loads((out / "comparison.json").read_text())["rows"]
+    assert [row["policy"] for row in rows] == ["plan with gains", "stub-0"]
+
+
+def test_the_verb_refuses_a_policy_before_it_begins(tmp_path, capsys, quick):
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["compare", "--policy", str(tmp_path / "nothing"), *out]) == 2
+    assert "there is no such file or folder" in capsys.readouterr().err
+    assert main(["compare", "--policy", str(write_policy(tmp_path / "stub-0", quick)), *out]) == 2
+    assert "maps 14 observations to 6 inputs (it was trained for scene 'quick')" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "rows").exists()
+
+
+def test_the_figure_draws_gaps_that_no_logarithm_has(comparison):
+    pytest.importorskip("matplotlib")
+    from agents.evaluation.comparison_figure import FLOOR, comparison_figure
+
+    figure = comparison_figure(comparison)
+    panels = [axes for part in figure.subfigs for axes in part.axes]
+    assert len(panels) == 5
+    drawn = [line for line in panels[0].lines if line.get_marker() == "v"]
+    assert [line.get_ydata()[0] for line in drawn[:2]] == [FLOOR, FLOOR]
+    for axes in panels:
+        for line in axes.lines:
+            assert np.isfinite(np.asarray(line.get_ydata(), dtype=float)).all()
+        if axes.get_yscale() == "log":
+            assert axes.get_ylim()[0] == FLOOR
+    assert not math.isnan(panels[0].get_ylim()[1])

@@ -1,0 +1,280 @@
+"""The evaluation protocol: what it counts, on which starts, and what it compares with."""
+
+import json
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+
+from agents import evaluate
+from agents.evaluation import CONDITIONS, EVALUATION_SEEDS, evaluation_seeds, fly, optimal_costs, scene_under
+from agents.evaluation.comparison_tables import remarks
+from agents.evaluation.conditions import physics_hash
+from agents.evaluation.evaluating import Evaluation
+from agents.policies import ExportedPolicy
+from agents.zoo.finding import PolicyError, as_policy
+from dq_space_arm_env import compile_scene, load_scene
+from dq_space_arm_env.command_line import main
+from experts.demonstrations import SerialExecutor, generate_demonstrations
+from experts.demonstrations.settings import Settings
+
+PAPER = load_scene("paper")
+SHORT = PAPER.replace(name="short", simulation={"dt": 0.015, "steps": 12})
+
+
+def gentle(observations):
+    """A useless feedback that depends on the whole observation."""
+    return 0.01 * np.sin(observations.sum(axis=1, keepdims=True) + np.arange(12))
+
+
+def single_episode(scene, seed, policy):
+    """The same in a single environment, everything counted by hand."""
+    env = gymnasium.make("DQSpaceArm-v0", scene=scene)
+    observation, _ = env.reset(seed=seed)
+    first = env.unwrapped.state[:4]
+    cost = effort = turn = 0.0
+    over = False
+    while not over:
+        observation, reward, over, _, info = env.step(policy(observation[None])[0])
+        cost, effort = cost - reward, effort + info["cost_control"]
+        if not over:
+            overlap = min(abs(first @ env.unwrapped.state[:4]), 1.0)
+            turn = max(turn, math.degrees(2.0 * math.acos(overlap)))
+    return cost, effort, turn, info
+
+
+STIFF = PAPER.replace(
+    links=[link.model_dump() | {"stiffness": 200.0} for link in PAPER.links],
+    simulation={"dt": 0.1, "steps": 7, "integrator": "symplectic_euler"},
+)
+"""Most of its episodes diverge, and restart without being counted."""
+
+
+@pytest.mark.parametrize(("scene", "seeds"), [(SHORT, [3, 11, 2**40]), (STIFF, list(range(12)))])
+def test_flights_are_those_of_single_environments(scene, seeds):
+    flights = fly(gentle, scene, seeds)
+    assert flights.diverged.any() == (scene is STIFF)
+    for i, seed in enumerate(seeds):
+        cost, effort, turn, info = single_episode(scene, seed, gentle)
+        assert flights.cost[i] == pytest.approx(cost, rel=1e-12)
+        assert flights.effort[i] == pytest.approx(effort, rel=1e-12)
+        assert info["diverged"] or flights.length[i] == scene.simulation.steps
+        for name in ("attitude_error", "position_error", "is_success", "diverged"):
+            np.testing.assert_equal(getattr(flights, name)[i], info[name])
+        if scene is SHORT:
+            assert flights.base_turn[i] == pytest.approx(turn, abs=1e-6)
+
+
+def test_a_policy_that_gives_nan_is_no_success():
+    scene = SHORT.replace(success={"attitude_error_deg": 180.0, "position_error": 100.0})
+    evaluation = evaluate(lambda seen: np.full((len(seen), 12), np.nan), scene, 3, expert=False)
+    assert evaluation.summary()["policy_failed"] == 3
+    assert evaluation.summary()["success_rate"][0] == 0.0
+    (remark,) = remarks([evaluation])
+    assert remark.startswith("<lambda>, training: in 3 flights the policy gave NaN")
+
+
+def test_evaluation_seeds_are_fixed_and_their_own():
+    seeds = evaluation_seeds(PAPER)
+    assert len(set(seeds)) == EVALUATION_SEEDS == 500
+    assert seeds[:2] == [3003083155383472103, 4629164122600116775]
+    assert seeds[:7] == evaluation_seeds(PAPER, 7)
+    training = Settings(PAPER, 1000, 0, 32)
+    assert not set(seeds) & {training.problem_seed(problem) for problem in range(1000)}
+    for n in (0, 501):
+        with pytest.raises(ValueError, match="should be from 1 to 500"):
+            evaluation_seeds(PAPER, n)
+
+
+def test_optimal_costs_are_those_of_demonstrations(cache, tmp_path, quick):
+    costs = optimal_costs(quick, 30, executor=SerialExecutor())
+    from agents.configuration.schema import RESERVED_SEED
+    from agents.evaluation.expert_costs import GROUP
+
+    demonstrations = generate_demonstrations(
+        quick, GROUP, tmp_path / "same", RESERVED_SEED, shard_size=GROUP, executor=SerialExecutor()
+    )
+    expected = {demonstration.seed: demonstration.cost for demonstration in demonstrations}
+    assert len(expected) > 20
+    known = {seed: cost for seed, cost in zip(costs.seeds, costs.cost, strict=True) if seed in expected}
+    assert known == expected
+    assert (costs.seconds > 0.0).all()
+
+
+def test_optimal_costs_are_computed_once_and_go_on_where_they_were(cache, counting, quick):
+    executor = counting(limit=1)
+    with pytest.raises(KeyboardInterrupt):
+        optimal_costs(quick, 60, executor=executor)
+    seen = []
+    executor = counting()
+    first = optimal_costs(quick, 60, executor=executor, progress=lambda *done: seen.append(done))
+    assert executor.tasks == 2
+    assert seen == [(25, 60), (50, 60), (60, 60)]
+    executor = counting()
+    again = optimal_costs(quick, 60, executor=executor)
+    assert executor.tasks == 0
+    np.testing.assert_array_equal(again.cost, first.cost)
+    damaged = sorted(cache.rglob("*.json"))[1]
+    damaged.write_text(damaged.read_text()[:-7])
+    repaired = optimal_costs(quick, 60, executor=executor)
+    assert executor.tasks == 1
+    np.testing.assert_array_equal(repaired.cost, first.cost)
+
+
+@pytest.mark.slow
+def test_optimal_costs_of_another_scene_are_others(cache, counting, quick):
+    optimal_costs(quick, 1, executor=SerialExecutor())
+    executor = counting()
+    optimal_costs(quick.replace(name="renamed"), 1, executor=executor)
+    assert executor.tasks == 0
+    optimal_costs(quick.replace(success={"position_error": 0.2}), 1, executor=executor)
+    assert executor.tasks == 1
+
+
+def idle(scene):
+    n_u = compile_scene(scene).layout.n_u
+    return lambda observations: np.zeros((len(observations), n_u))
+
+
+def test_an_evaluation_reports_what_the_protocol_asks_for(cache, quick):
+    evaluation = evaluate(idle(quick), quick, 10, executor=SerialExecutor(), label="idle")
+    summary = evaluation.summary()
+    json.dumps(summary, allow_nan=False)
+    assert (summary["policy"], summary["episodes"], summary["training_steps"]) == ("idle", 10, None)
+    assert summary["success_rate"][0] == evaluation.flights.is_success.mean()
+    gaps = evaluation.flights.cost / evaluation.optimal.cost - 1.0
+    assert (gaps[~np.isnan(gaps)] > 0.0).all()
+    assert summary["median_cost_gap"][0] == pytest.approx(np.nanmedian(gaps))
+    assert summary["tail_cost_gap"][0] == pytest.approx(np.nanpercentile(gaps, 95))
+    assert summary["effort"] == 0.0
+    assert 0.0 < summary["action_seconds"] < 1e-3
+    without = evaluate(idle(quick), quick, 10, expert=False).summary()
+    assert without["median_cost_gap"] is None
+    assert without["success_rate"] == summary["success_rate"]
+
+
+def test_conditions_change_what_they_say():
+    changed = {condition: scene_under(PAPER, condition) for condition in CONDITIONS}
+    assert changed["training"] is PAPER
+    assert changed["wide_starts"].spread.joint_angles == 0.75
+    masses = [changed[name].links[2].mass for name in ("light_payload", "heavy_payload")]
+    assert masses == pytest.approx([7.0, 13.0])
+    assert changed["heavy_payload"].links[2].inertia[1][1] == pytest.approx(0.65)
+    assert changed["heavy_payload"].links[:2] == PAPER.links[:2]
+    assert changed["spin"].initial_state.base_velocity[2] == pytest.approx(0.05)
+    carrying = load_scene("payload")
+    assert scene_under(carrying, "heavy_payload").payload.mass == pytest.approx(1.3 * carrying.payload.mass)
+    assert scene_under(carrying, "heavy_payload").links == carrying.links
+    with pytest.raises(ValueError, match="condition: 'rain' is unknown; choose from training, wide_starts"):
+        scene_under(PAPER, "rain")
+
+
+def exported(n_observation=24, n_action=12, **metadata):
+    rng = np.random.default_rng(0)
+    weights = rng.standard_normal((n_observation, 8)), 0.1 * rng.standard_normal((8, n_action))
+    biases, mean, scale = (np.zeros(8), np.zeros(n_action)), np.zeros(n_observation), np.ones(n_observation)
+    return ExportedPolicy(weights, biases, "tanh", mean, scale, metadata=metadata)
+
+
+def test_files_functions_and_objects_are_one_policy(tmp_path):
+    policy = exported(agent="stub", training={"environment_steps": 7, "seconds": 3.0, "expert_solves": 2})
+    policy.save(tmp_path / "policy.npz")
+    ways = [policy, tmp_path / "policy.npz", str(tmp_path), lambda observations: policy(observations)]
+    summaries = [evaluate(way, SHORT, 5, expert=False).summary() for way in ways]
+    assert len({summary["median_cost"] for summary in summaries}) == 1
+    assert summaries[0]["policy"] == "stub"
+    assert summaries[1]["training_steps"] == 7
+    assert summaries[1]["expert_solves"] == 2
+
+
+def test_what_is_no_policy_is_refused(tmp_path):
+    with pytest.raises(PolicyError, match="should be a path, an ExportedPolicy"):
+        as_policy(3)
+    (tmp_path / "model.zip").write_bytes(b"nothing")
+    with pytest.raises(PolicyError, match="is not a model of Stable-Baselines3"):
+        as_policy(tmp_path / "model.zip")
+
+
+def test_a_policy_of_the_goal_environment_sees_what_that_shows():
+    """Its observations are the goal environment's own, joined in alphabetical order."""
+    seen = []
+    scene = load_scene("random-target").replace(simulation={"dt": 0.015, "steps": 4})
+    policy = exported(8 + 8 + 23, observation="goal")
+
+    class Spy(ExportedPolicy):
+        def __call__(self, observation):
+            seen.append(np.array(observation))
+            return super().__call__(observation)
+
+    spy = Spy(policy.weights, policy.biases, "tanh", policy.mean, policy.scale, metadata=policy.metadata)
+    fly(as_policy(spy).act, scene, [5, 6])
+    env = gymnasium.make("DQSpaceArmGoal-v0", scene=scene)
+    for copy, seed in enumerate([5, 6]):
+        observation, _ = env.reset(seed=seed)
+        for step in range(4):
+            joined = np.concatenate([observation[key] for key in sorted(observation)]).astype(np.float32)
+            np.testing.assert_allclose(seen[step][copy], joined, atol=1e-6)
+            observation = env.step(policy(joined))[0]
+
+
+def test_a_policy_of_another_scene_is_refused_in_a_sentence(tmp_path, quick):
+    policy = exported(agent="stub", scene="paper")
+    with pytest.raises(PolicyError, match="stub maps 24 observations to 12 inputs"):
+        evaluate(policy, quick, 3, expert=False)
+    with pytest.raises(PolicyError, match=r"cannot fly alone: use `dq-space-arm compare residual`"):
+        evaluate(exported(agent="stub", observation="residual"), SHORT, 3, expert=False)
+
+
+def test_it_is_told_whether_the_scene_is_that_of_the_training():
+    for made_in, same in ((SHORT.content_hash(), True), ("another", False), (None, None)):
+        metadata = {"scene": "short"} | ({} if made_in is None else {"scene_hash": made_in})
+        evaluation = evaluate(exported(**metadata), SHORT, 2, condition="spin", expert=False)
+        assert evaluation.summary()["same_scene"] is same
+    renamed = SHORT.replace(name="renamed", description="the same")
+    assert evaluate(exported(scene_hash=SHORT.content_hash()), renamed, 2, expert=False).same_scene
+
+
+def test_the_physics_are_neither_names_nor_tolerances():
+    same = SHORT.replace(name="renamed", success={"position_error": 9.0}, spread={"base_rotation": 0.1})
+    assert physics_hash(same) == physics_hash(SHORT) == physics_hash(scene_under(SHORT, "spin"))
+    assert physics_hash(scene_under(SHORT, "heavy_payload")) != physics_hash(SHORT)
+
+
+def test_records_give_evaluations_back(cache, quick):
+    evaluation = evaluate(idle(quick), quick, 4, executor=SerialExecutor())
+    text = json.dumps(evaluation.record(), allow_nan=False)
+    again = Evaluation.from_record(json.loads(text))
+    assert again.summary() == evaluation.summary()
+    for old, new in zip(evaluation.flights, again.flights, strict=True):
+        np.testing.assert_array_equal(new, old)
+
+
+def test_the_command_writes_a_table_json_and_every_episode(tmp_path, capsys):
+    for seed in range(3):
+        configuration = {"name": "stub", "seed": seed}
+        exported(agent="stub", configuration=configuration).save(tmp_path / f"{seed}.npz")
+    SHORT.to_yaml(tmp_path / "short.yaml")
+    policies = [str(tmp_path / f"{number}.npz") for number in range(3)]
+    arguments = ["--scene", str(tmp_path / "short.yaml"), "-n", "4", "--no-expert"]
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["evaluate", "--policy", *policies, *arguments, *out]) == 0
+    assert "All training runs of an agent" in capsys.readouterr().out
+    records = [json.loads(path.read_text()) for path in sorted((tmp_path / "out").iterdir())]
+    assert [record["episodes"]["seed"] for record in records] == [evaluation_seeds(SHORT, 4)] * 3
+    assert len(records[0]["episodes"]["cost"]) == 4
+    conditions = ["--condition", "training", "spin"]
+    assert main(["evaluate", "--policy", policies[0], *arguments, "--json", *conditions]) == 0
+    summaries = json.loads(capsys.readouterr().out)
+    assert [summary["condition"] for summary in summaries] == ["training", "spin"]
+    assert summaries[0]["success_rate"][0] == 0.0
+
+
+def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
+    assert main(["evaluate", str(tmp_path / "policy.npz"), "--no-expert"]) == 2
+    assert "there is no such file or folder" in capsys.readouterr().err
+    (tmp_path / "damaged.npz").write_bytes(b"nothing")
+    assert main(["evaluate", "--policy", str(tmp_path / "damaged.npz"), "--no-expert"]) == 1
+    assert "cannot be read as a policy" in capsys.readouterr().err
+    assert main(["evaluate", "--policy", "nobody", "--no-expert"]) == 2
+    assert "the zoo has no policy 'nobody'" in capsys.readouterr().err

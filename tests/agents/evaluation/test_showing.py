@@ -1,0 +1,110 @@
+"""A flight beside the expert's solution: the same start, the right numbers, pictures, and the verb."""
+
+import json
+
+import numpy as np
+import pytest
+
+from agents.evaluation import evaluate, evaluation_seeds
+from agents.evaluation.beside_expert import fly_beside_expert
+from agents.policies import ExportedPolicy
+from agents.zoo.finding import as_policy
+from dq_space_arm_env import load_scene
+from dq_space_arm_env.command_line import main
+from experts import GuidedDDP
+from experts.problems.arm_problem import ArmProblem
+
+
+class Expert:
+    """The expert's controls, flown by an agent that solves where it starts."""
+
+    def __init__(self, scene):
+        self.problem = ArmProblem(scene)
+        self.solver = GuidedDDP(self.problem)
+
+    def begin(self, environment):
+        self.actions = self.solver.solve(environment.states[0]).controls / self.problem.control_upper
+        self.stage = 0
+
+    def __call__(self, observations):
+        self.stage += 1
+        return self.actions[None, self.stage - 1]
+
+
+@pytest.fixture
+def exported(tmp_path, quick):
+    rng = np.random.default_rng(0)
+    weights = 0.01 * rng.standard_normal((14, 6))
+    metadata = {"agent": "stub", "scene": str(tmp_path / "quick.yaml")}
+    policy = ExportedPolicy((weights,), (np.zeros(6),), "tanh", np.zeros(14), np.ones(14), metadata=metadata)
+    policy.save(tmp_path / "policy.npz")
+    quick.to_yaml(tmp_path / "quick.yaml")
+    return tmp_path / "policy.npz"
+
+
+def test_the_experts_own_controls_have_no_gap(quick):
+    nominal, drawn = fly_beside_expert(as_policy(Expert(quick)), quick, [None, 5])
+    for pair in (nominal, drawn):
+        assert pair.converged
+        assert pair.cost_gap == pytest.approx(0.0, abs=1e-9)
+        np.testing.assert_allclose(pair.agent.maneuver.states, pair.expert.maneuver.states, atol=1e-9)
+        assert pair.agent.is_success
+        assert pair.agent.record()["effort"] == pytest.approx(pair.expert.record()["effort"])
+    np.testing.assert_array_equal(nominal.agent.maneuver.states[0], ArmProblem(quick).initial_state)
+
+
+def test_a_flight_is_that_of_an_evaluation(exported, quick):
+    """The same seed, the same policy: cost, errors and effort agree."""
+    seed = evaluation_seeds(quick, 1)[0]
+    (pair,) = fly_beside_expert(as_policy(exported), quick, [seed])
+    flights = evaluate(exported, quick, 1, expert=False).flights
+    assert pair.agent.cost == pytest.approx(flights.cost[0], rel=1e-12)
+    for name in ("attitude_error", "position_error", "effort"):
+        assert pair.agent.record()[name] == pytest.approx(getattr(flights, name)[0], rel=1e-9)
+    json.dumps(pair.record(), allow_nan=False)
+
+
+def test_a_scene_that_draws_its_target_is_refused():
+    scene = load_scene("random-target").replace(simulation={"dt": 0.015, "steps": 4})
+    with pytest.raises(ValueError, match="draws more than the start for each episode"):
+        fly_beside_expert(as_policy(lambda observations: np.zeros((1, 12))), scene, [0])
+
+
+def test_the_verb_writes_numbers_and_pictures(exported, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    out = tmp_path / "out"
+    assert main(["evaluate", "show", "--policy", str(exported), "-n", "2", "--out", str(out)]) == 1
+    printed = capsys.readouterr().out
+    assert "seed 0" in printed
+    assert {path.name for path in out.iterdir()} == {"flight.json", "errors.png", "inputs.png"}
+    flights = json.loads((out / "flight.json").read_text())["flights"]
+    assert [flight["seed"] for flight in flights] == [None, 0]
+    assert flights[0]["expert"]["is_success"]
+    assert flights[0]["cost_gap"] > 0.0
+    assert main(["evaluate", "show", "--policy", str(exported), "-n", "0", "--out", str(out)]) == 2
+    assert "-n: 0, should be at least 1" in capsys.readouterr().err
+
+
+def test_the_verb_draws_the_flight(exported, tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    options = ["--no-picture", "--out", str(tmp_path), "--gif", str(tmp_path / "flight.gif")]
+    assert main(["evaluate", "show", "--policy", str(exported), *options]) == 1
+    with image.open(tmp_path / "flight.gif") as picture:
+        assert picture.size == (640, 480)
+        assert picture.n_frames == 151
+
+
+def test_the_verb_needs_neither_torch_nor_matplotlib(exported, run_without, tmp_path):
+    """In a process where neither can be imported: the core install."""
+    code = """
+import importlib.util
+found = importlib.util.find_spec
+importlib.util.find_spec = lambda name, package=None: None if name == "matplotlib" else found(name, package)
+from dq_space_arm_env.command_line import main
+sys.exit(main(sys.argv[1:]))
+"""
+    arguments = ["evaluate", "show", str(exported), "--out", str(tmp_path / "out")]
+    result = run_without(("matplotlib", "stable_baselines3", "torch"), code, *arguments)
+    assert result.returncode == 1, result.stderr
+    assert "No picture: it needs matplotlib" in result.stdout
+    assert "does NOT reach the target" in result.stdout

@@ -1,0 +1,145 @@
+"""A run by imitation, from a configuration to a policy: its folder, and that it may be killed."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("tensorboard")
+
+import agents  # noqa: E402
+from agents import ExportedPolicy  # noqa: E402
+from agents.imitation.trainer import TrainingAdvance  # noqa: E402
+from agents.run_folder import validate, validation_seeds  # noqa: E402
+from agents.training import train  # noqa: E402
+from dq_space_arm_env.command_line import main  # noqa: E402
+from dq_space_arm_env.common.progress import ProgressDisplay  # noqa: E402
+
+pytestmark = pytest.mark.agents
+
+STEPS = {"batch_size": 64, "warm_up": 10}
+CLONING = {"optimization": {"updates": 120, "learning_rate": 1e-2, **STEPS}, "validate_every": 40}
+ALGORITHMS = {
+    "cloning": {"name": "cloning", **CLONING},
+    "dagger": {
+        "name": "dagger",
+        "cloning": CLONING,
+        "rounds": 2,
+        "episodes": 4,
+        "labels": "gains",
+        "optimization": {"updates": 30, "learning_rate": 1e-3, **STEPS},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def settings(demonstrations, small_file):
+    def of(name, **changes):
+        return {
+            "name": name,
+            "scene": str(small_file),
+            "demonstrations": {"folder": str(demonstrations.path)},
+            "network": {"hidden": [16, 16]},
+            "algorithm": ALGORITHMS[name],
+            "curve": {"every": 80, "episodes": 3},
+            **changes,
+        }
+
+    return of
+
+
+@pytest.fixture(scope="module")
+def runs(settings, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    return {name: train(settings(name), folder / name) for name in ALGORITHMS}
+
+
+def curve(folder):
+    lines = (folder / "evaluations.jsonl").read_text().splitlines()
+    return [{**json.loads(line), "seconds": None} for line in lines]
+
+
+def test_the_folder_says_what_was_done(runs, demonstrations):
+    run = runs["cloning"]
+    assert {path.name for path in run.folder.iterdir()} >= {"config.yaml", "provenance.json", "tensorboard"}
+    assert agents.configuration.load_configuration(run.folder / "config.yaml").name == "cloning"
+    assert [line["updates"] for line in curve(run.folder)] == [80, 120]
+    policy = ExportedPolicy.load(run.folder / "policy.npz")
+    found = validate(policy, demonstrations.scene, validation_seeds(3))
+    assert found["median_cost"] == pytest.approx(curve(run.folder)[-1]["median_cost"], rel=1e-6)
+    assert policy.metadata["configuration"]["algorithm"]["optimization"]["updates"] == 120
+    assert policy.metadata["provenance"]["versions"]
+    training = policy.metadata["training"]
+    assert (training["environment_steps"], training["updates"]) == (0, 120)
+    assert training["expert_solves"] == training["demonstrations"] == len(demonstrations)
+    assert training["seconds"] > 0.0
+
+
+def test_corrections_go_on_where_cloning_ends(runs):
+    run = runs["dagger"]
+    lines = curve(run.folder)
+    assert lines[:2] == curve(runs["cloning"].folder)
+    assert [line["updates"] for line in lines] == [80, 120, 150, 180]
+    assert [line["environment_steps"] for line in lines] == [0, 0, 600, 1200]
+    training = ExportedPolicy.load(run.folder / "policy.npz").metadata["training"]
+    assert (training["environment_steps"], training["updates"]) == (1200, 180)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_exported_policy_acts_like_the_network(algorithm, runs, demonstrations):
+    observations = np.concatenate([each.observations for each in demonstrations])
+    expected = runs[algorithm].network.act(observations)
+    policy = ExportedPolicy.load(runs[algorithm].folder / "policy.npz")
+    np.testing.assert_allclose(policy(observations), expected, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("algorithm", "stop"), [("cloning", 100), ("dagger", 150)])
+def test_a_killed_run_ends_as_if_nothing_had_happened(algorithm, stop, runs, settings, tmp_path):
+    done = []
+
+    def interrupt(advance):
+        if isinstance(advance, TrainingAdvance):
+            done.append(advance.done)
+            before = 120 if "round" in advance.part else 0
+            if before + advance.done + 30 * (advance.part == "round 2") >= stop:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(settings(algorithm), tmp_path, report=interrupt)
+    assert not (tmp_path / "policy.npz").exists()
+    resumed = train(settings(algorithm), tmp_path)
+    for one, other in zip(resumed.policy.weights, runs[algorithm].policy.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert curve(tmp_path) == curve(runs[algorithm].folder)
+    assert len(json.loads((tmp_path / "provenance.json").read_text())) == 2
+
+
+def test_the_command_trains_and_refuses(settings, tmp_path, capsys):
+    path = tmp_path / "small.yaml"
+    content = settings("cloning", algorithm={"name": "cloning", "optimization": {"updates": 5, **STEPS}})
+    path.write_text(json.dumps(content))  # JSON is YAML
+    assert main(["train", "--config", str(path), "--out", str(tmp_path / "run"), "--seed", "3"]) == 0
+    assert "policy.npz" in capsys.readouterr().out
+    assert ExportedPolicy.load(tmp_path / "run" / "policy.npz").metadata["configuration"]["seed"] == 3
+    assert main(["train", "--config", str(path), "--minutes", "3"]) == 2
+    assert "--minutes is for reinforcement learning" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    path.write_text(json.dumps({**content, "demonstrations": {"folder": str(tmp_path / "empty")}}))
+    assert main(["train", "--config", str(path), "--out", str(tmp_path / "other")]) == 1
+    assert "holds no demonstrations" in capsys.readouterr().err
+
+
+def test_a_terminal_shows_a_bar_and_a_file_the_first_and_last_line():
+    stream = io.StringIO()
+    with ProgressDisplay(Console(file=stream, width=200)) as progress:
+        for done in range(0, 101, 10):
+            progress.update(TrainingAdvance(100, done, 50.0, {}))
+    lines = stream.getvalue().splitlines()
+    assert [line.split(",")[0] for line in lines] == ["0 of 100 updates", "100 of 100 updates"]
+    stream = io.StringIO()
+    with ProgressDisplay(Console(file=stream, width=200, force_terminal=True)) as progress:
+        progress.update(TrainingAdvance(100, 50, 50.0, {"action": 0.25}))
+    assert "50 of 100 updates, action loss 2.50e-01" in stream.getvalue()

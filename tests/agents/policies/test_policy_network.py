@@ -1,0 +1,59 @@
+"""The network of a policy: its derivative, its units, and its twin in NumPy."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from agents.policies import PolicyNetwork  # noqa: E402
+
+pytestmark = pytest.mark.agents
+
+N_OBS, N_U = 9, 4
+
+
+def network(activation="tanh", constant=()):
+    torch.manual_seed(0)
+    made = PolicyNetwork(N_OBS, N_U, (32, 16), activation)
+    rng = np.random.default_rng(0)
+    deviation = rng.uniform(1.0, 5.0, N_OBS)
+    deviation[list(constant)] = 0.0
+    made.normalize(rng.normal(size=N_OBS), deviation, rng.uniform(-0.9, 0.9, N_U), rng.uniform(0.3, 1.0, N_U))
+    with torch.no_grad():
+        # Large enough that some actions are clipped.
+        made.layers[-1].weight.mul_(10.0 if activation == "tanh" else 30.0)
+    return made
+
+
+def observations(count=100):
+    return 3.0 * np.random.default_rng(1).normal(size=(count, N_OBS))
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_the_exported_policy_gives_the_same_actions(activation):
+    made = network(activation)
+    actions = made.act(observations())
+    policy = made.export({"scene": "none"})
+    assert 0.02 < np.mean(np.abs(actions) == 1.0) < 0.98
+    np.testing.assert_allclose(policy(observations()), actions, atol=1e-6)
+    np.testing.assert_allclose([policy(each) for each in observations()], actions, atol=1e-6)
+    assert policy.metadata == {"scene": "none"}
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_the_derivative_is_that_of_automatic_differentiation(activation):
+    made = network(activation)
+    inputs, tangents = torch.randn(20, N_OBS), torch.randn(20, N_OBS)
+    outputs, slopes = made.forward_with_tangent(inputs, tangents)
+    same_outputs, same_slopes = torch.autograd.functional.jvp(made, inputs, tangents)
+    torch.testing.assert_close(outputs, same_outputs)
+    torch.testing.assert_close(slopes, same_slopes)
+
+
+def test_entries_that_did_not_vary_are_ignored():
+    made = network(constant=(3,))
+    changed = observations()
+    changed[:, 3] += 7.0
+    np.testing.assert_array_equal(made.act(changed), made.act(observations()))
+    policy = made.export({})
+    np.testing.assert_array_equal(policy(changed), policy(observations()))

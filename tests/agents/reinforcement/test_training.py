@@ -1,0 +1,342 @@
+"""Every algorithm trains, saves, resumes and exports, and acts the same way each time."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+from agents import DQSpaceArmVecEnv, ExportedPolicy, evaluate
+from agents.configuration import ConfigurationError, load_configuration
+from agents.reinforcement.callback import DivergedError, read_checkpoint
+from agents.reinforcement.networks import export_policy
+from agents.reinforcement.reinforcement_training import LEARNERS, make_environment, make_learner
+from agents.run_folder import RunFolder, RunFolderError, reserved
+from agents.training import train
+from agents.zoo.finding import as_policy, read_policy
+from dq_space_arm_env import load_scene
+from dq_space_arm_env.command_line import main
+
+pytestmark = pytest.mark.agents
+
+PAPER = load_scene("paper")
+STEPS, REPEAT, COPIES = 40, 4, 4
+EVERY = {"evaluate_every": 1600, "checkpoint_every": 1600}
+OFF_POLICY = {"batch_size": 32, "learning_starts": 200, "buffer_size": 2000, "gradient_steps": 2}
+ALGORITHMS = {
+    "PPO": {"name": "PPO", "n_steps": 10, "batch_size": 40, "n_epochs": 2},
+    "SAC": {"name": "SAC", **OFF_POLICY},
+    "TQC": {"name": "TQC", **OFF_POLICY},
+    "TD3": {"name": "TD3", **OFF_POLICY},
+    "HER": {"name": "SAC", **OFF_POLICY, "hindsight": {"n_sampled_goal": 2}},
+}
+
+
+def configuration(algorithm, scene_file, total_steps=3200, **changes):
+    return load_configuration(
+        {
+            "name": algorithm.lower(),
+            "scene": str(scene_file),
+            "environment": {
+                "copies": COPIES,
+                "action_repeat": REPEAT,
+                "action_scale": {"base_force": 0.001, "base_torque": 0.2},
+                "reward_scale": 1.0 if algorithm == "HER" else 0.01,
+            },
+            "network": {"hidden": [16, 16], "activation": "tanh" if algorithm == "PPO" else "relu"},
+            "algorithm": ALGORITHMS[algorithm],
+            "schedule": {"total_steps": total_steps, "evaluation_episodes": 4, **EVERY},
+            **changes,
+        }
+    )
+
+
+def observations(model, count=50):
+    """As far apart as those of the environment, or twice as far; as the model takes them, and joined."""
+    policy = export_policy(model, {})
+    deviation = np.where(policy.scale > 0.0, 1.0 / np.maximum(policy.scale, 1e-9), 0.0)
+    noise = np.random.default_rng(0).normal(0.0, 1.5, (count, policy.n_observation))
+    joined = (policy.mean + deviation * noise).astype(np.float32)
+    spaces = getattr(model.observation_space, "spaces", None)
+    if spaces is None:
+        return joined, joined
+    ends = np.cumsum([spaces[name].shape[0] for name in sorted(spaces)])[:-1]
+    return dict(zip(sorted(spaces), np.split(joined, ends, axis=1), strict=True)), joined
+
+
+def state_of(model):
+    """Parameters and the state of every optimizer, as a flat list of arrays."""
+    tensors = []
+
+    def collect(value):
+        if isinstance(value, dict):
+            value = [value[key] for key in sorted(value, key=str)]
+        if isinstance(value, (list, tuple)):
+            for item in value:
+                collect(item)
+        elif isinstance(value, torch.Tensor):
+            tensors.append(value.detach().numpy())
+        elif isinstance(value, float):
+            tensors.append(np.array(value))
+
+    collect(model.get_parameters())
+    return tensors
+
+
+@pytest.fixture(scope="module")
+def trained(scene_file, tmp_path_factory):
+    """Each algorithm, trained for some thousand steps."""
+    folder = tmp_path_factory.mktemp("runs")
+    runs = {}
+
+    def get(algorithm):
+        if algorithm not in runs:
+            runs[algorithm] = train(configuration(algorithm, scene_file), folder / algorithm)
+        return runs[algorithm]
+
+    return get
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_training_learns_for_as_many_steps_as_it_was_asked_for(algorithm, trained, scene_file):
+    run = trained(algorithm)
+    assert run.model.num_timesteps * REPEAT == 3200
+    settings = configuration(algorithm, scene_file)
+    untrained = make_learner(settings, make_environment(settings, load_scene(scene_file)))
+    weights = zip(export_policy(untrained, {}).weights, run.policy.weights, strict=True)
+    assert all(np.abs(after - before).max() > 1e-4 for before, after in weights)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_saved_and_exported_policies_act_like_the_model(algorithm, trained):
+    run = trained(algorithm)
+    seen, joined = observations(run.model)
+    expected, _ = run.model.predict(seen, deterministic=True)
+    expected = np.clip(expected, -1.0, 1.0)  # what the environment does
+    loaded = read_policy(run.folder / "model.zip")
+    assert issubclass(type(run.model), type(loaded))
+    np.testing.assert_array_equal(np.clip(loaded.predict(seen, deterministic=True)[0], -1.0, 1.0), expected)
+    exported = ExportedPolicy.load(run.folder / "policy.npz")
+    np.testing.assert_allclose(exported(joined), expected, rtol=0.0, atol=1e-6)
+    single = np.array([exported(observation) for observation in joined])
+    np.testing.assert_allclose(single, expected, rtol=0.0, atol=1e-6)
+    assert np.ptp(expected, axis=0).min() > 0.0
+    assert exported.metadata["training"]["environment_steps"] == 3200
+    assert exported.metadata["observation"] == ("goal" if algorithm == "HER" else "plain")
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_run_resumes_with_optimizer_and_buffer(algorithm, scene_file, tmp_path):
+    """Killed after its first checkpoint: what a new process reads there is what was written."""
+    settings = configuration(algorithm, scene_file)
+    kept = {}
+
+    def kill(advance):
+        if advance.environment_steps > 1600:
+            raise KeyboardInterrupt
+
+    def remember(path, model, progress):
+        kept.update(state=[array.copy() for array in state_of(model)], steps=model.num_timesteps)
+        if hasattr(model, "replay_buffer"):
+            kept.update(actions=model.replay_buffer.actions.copy(), position=model.replay_buffer.pos)
+        write(path, model, progress)
+
+    from agents.reinforcement import callback
+
+    write = callback.write_checkpoint
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(callback, "write_checkpoint", remember)
+        with pytest.raises(KeyboardInterrupt):
+            train(settings, tmp_path / "run", report=kill)
+    checkpoint = RunFolder(tmp_path / "run", settings).checkpoint()
+    environment = make_environment(settings, load_scene(scene_file))
+    learner = LEARNERS[settings.algorithm.name]
+    model, progress = read_checkpoint(checkpoint, learner, environment, settings.seed)
+    assert progress.environment_steps == kept["steps"] * REPEAT == 1600
+    for actual, expected in zip(state_of(model), kept["state"], strict=True):
+        np.testing.assert_array_equal(actual, expected)
+    if "actions" in kept:
+        np.testing.assert_array_equal(model.replay_buffer.actions, kept["actions"])
+        assert model.replay_buffer.pos == kept["position"]
+    run = train(settings, tmp_path / "run")
+    assert run.model.num_timesteps * REPEAT == 3200
+    curve = [json.loads(line) for line in (tmp_path / "run" / "evaluations.jsonl").read_text().splitlines()]
+    assert [line["environment_steps"] for line in curve] == [1600, 3200]
+    assert len(json.loads((tmp_path / "run" / "provenance.json").read_text())) == 3
+    again = train(settings, tmp_path / "run")  # nothing is left to do
+    for actual, expected in zip(state_of(again.model), state_of(run.model), strict=True):
+        np.testing.assert_array_equal(actual, expected)
+
+
+def test_networks_see_the_goals_of_hindsight_although_the_target_never_varies(trained):
+    """Goals are in units of what is achieved."""
+    extractor = trained("HER").model.actor.features_extractor
+    achieved, desired = slice(0, 8), slice(8, 16)
+    assert (extractor.scale[desired] > 0.0).any()
+    assert torch.equal(extractor.scale[desired], extractor.scale[achieved])
+    assert torch.equal(extractor.mean[desired], extractor.mean[achieved])
+
+
+def test_an_unfinished_checkpoint_is_none(scene_file, tmp_path):
+    folder = RunFolder(tmp_path, configuration("PPO", scene_file))
+    (tmp_path / "checkpoints" / "somebody's").mkdir()
+
+    def fail(path):
+        (path / "model.zip").write_bytes(b"half of it")
+        raise OSError("the disk is full")
+
+    folder.add_checkpoint(10, lambda path: (path / "model.zip").touch())
+    with pytest.raises(OSError, match="full"):
+        folder.add_checkpoint(20, fail)
+    assert folder.checkpoint().name == f"{10:012d}"
+    folder.add_checkpoint(30, lambda path: (path / "model.zip").touch())
+    left = {path.name for path in (tmp_path / "checkpoints").iterdir()}
+    assert left == {"somebody's", f"{30:012d}"}
+
+
+def test_a_folder_is_for_one_configuration_and_scene_but_may_get_more_time(scene_file, tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_bytes(scene_file.read_bytes())
+    for changes in ({}, {"total_steps": 6400}, {"description": "the same in other words"}):
+        RunFolder(tmp_path / "run", configuration("PPO", path, **changes))
+    with pytest.raises(RunFolderError, match="seed is 0 there and 1 here"):
+        RunFolder(tmp_path / "run", configuration("PPO", path, seed=1))
+    PAPER.replace(name="short", simulation={"dt": 0.01, "steps": STEPS}).to_yaml(path)
+    with pytest.raises(RunFolderError, match="started with another version of scene"):
+        RunFolder(tmp_path / "run", configuration("PPO", path))
+
+
+def test_a_damaged_file_of_a_folder_is_named(scene_file, tmp_path):
+    settings = configuration("PPO", scene_file)
+    for name in ("evaluations.jsonl", "provenance.json"):
+        folder = tmp_path / f"with damaged {name}"
+        RunFolder(folder, settings)
+        (folder / name).write_text('{"half')
+        with pytest.raises(RunFolderError, match=f"{name} is damaged"):
+            RunFolder(folder, settings).evaluations()
+
+
+RESERVE = "import sys, pathlib; from agents.run_folder import reserved\n"
+RESERVE += "with reserved(pathlib.Path(sys.argv[1])): print('reserved', flush=True); sys.stdin.read()"
+
+
+def test_two_processes_do_not_train_in_one_folder(scene_file, tmp_path):
+    command = [sys.executable, "-c", RESERVE, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=Path(__file__).parents[3], **pipes) as other:
+        assert other.stdout.readline() == "reserved\n"
+        with pytest.raises(RunFolderError, match="another process trains in"):
+            train(configuration("PPO", scene_file), tmp_path)
+        assert {path.name for path in tmp_path.iterdir()} == {".lock"}
+        other.kill()
+    with reserved(tmp_path):  # a killed process keeps nothing
+        pass
+
+
+def test_a_run_whose_time_is_up_is_left_as_it_is(scene_file, tmp_path):
+    settings = configuration("PPO", scene_file, total_steps=10**6).model_dump(exclude_none=True)
+    settings["schedule"]["minutes"] = 1e-6
+    first = train(settings, tmp_path)
+    curve = (tmp_path / "evaluations.jsonl").read_text()
+    assert first.model.num_timesteps * REPEAT < 10**6
+    again = train(settings, tmp_path)
+    assert again.model.num_timesteps == first.model.num_timesteps
+    assert (tmp_path / "evaluations.jsonl").read_text() == curve
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "part", "changes", "sentence"),
+    [
+        ("PPO", "environment", {"action_repeat": STEPS + 1}, "action_repeat = 41: must be at most 40"),
+        ("HER", "algorithm", {"learning_starts": 39}, "algorithm.learning_starts = 39: must be at least 40"),
+    ],
+)
+def test_lengths_that_do_not_fit_the_scene_are_named(algorithm, part, changes, sentence, scene_file):
+    content = configuration(algorithm, scene_file).model_dump(exclude_none=True)
+    content[part] |= changes
+    with pytest.raises(ConfigurationError, match=sentence):
+        make_environment(load_configuration(content), load_scene(scene_file))
+
+
+def test_the_same_seed_gives_the_same_agent(scene_file, tmp_path):
+    runs = [train(configuration("PPO", scene_file, total_steps=800), tmp_path / name) for name in "ab"]
+    other = train(configuration("PPO", scene_file, total_steps=800, seed=1), tmp_path / "c")
+    first, second, third = (run.policy.weights[0] for run in (*runs, other))
+    np.testing.assert_array_equal(first, second)
+    assert np.abs(first - third).max() > 1e-3
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "HER"])
+def test_models_folders_and_exports_fly_alike(algorithm, trained, scene_file):
+    run = trained(algorithm)
+    ways = [run.model, run.folder / "model.zip", run.policy, run.folder]
+    costs = [evaluate(way, scene_file, 6, expert=False).flights.cost for way in ways]
+    np.testing.assert_array_equal(costs[0], costs[1])
+    np.testing.assert_allclose(costs[2], costs[0], rtol=1e-5)
+    np.testing.assert_array_equal(costs[2], costs[3])
+
+
+def test_what_the_arrays_cannot_hold_is_not_exported():
+    env = DQSpaceArmVecEnv(2, PAPER)
+    normalized = PPO("MlpPolicy", VecNormalize(env), device="cpu")
+    with pytest.raises(ValueError, match="VecNormalize cannot be exported"):
+        export_policy(normalized, {})
+    odd = PPO("MlpPolicy", env, device="cpu", policy_kwargs={"activation_fn": torch.nn.ELU})
+    with pytest.raises(ValueError, match="activations ELU"):
+        export_policy(odd, {})
+
+
+def test_a_plain_model_of_stable_baselines3_is_exported_and_evaluated(tmp_path):
+    model = PPO("MlpPolicy", DQSpaceArmVecEnv(2, PAPER), device="cpu", seed=0)
+    seen, joined = observations(model)
+    expected = np.clip(model.predict(seen, deterministic=True)[0], -1.0, 1.0)
+    np.testing.assert_allclose(export_policy(model, {})(joined), expected, rtol=0.0, atol=1e-6)
+    model.save(tmp_path / "model.zip")
+    np.testing.assert_array_equal(as_policy(tmp_path / "model.zip").act(joined), expected)
+
+
+def test_the_command_trains_and_names_what_is_wrong(scene_file, tmp_path, capsys):
+    path, out = tmp_path / "ppo.yaml", str(tmp_path / "run")
+    content = configuration("PPO", scene_file).model_dump(mode="json", exclude_none=True)
+    path.write_text(json.dumps(content))  # JSON is YAML
+    assert main(["train", "--config", str(path), "--out", out, "--total-steps", "800"]) == 0
+    assert "800 of 800 steps" in capsys.readouterr().err
+    assert main(["train", "pppo", "--out", out]) == 2
+    assert "did you mean 'ppo'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("algorithm", "rate"), [("PPO", 1e3), ("PPO", 1e38), ("TD3", 1e38)])
+def test_a_training_that_diverges_ends_in_one_sentence(algorithm, rate, scene_file, tmp_path, monkeypatch):
+    monkeypatch.setitem(ALGORITHMS, algorithm, {**ALGORITHMS[algorithm], "learning_rate": rate})
+    with pytest.raises(DivergedError, match=r"diverged before step .*learning_rate below 1"):
+        train(configuration(algorithm, scene_file), tmp_path)
+    assert not (tmp_path / "policy.npz").exists()
+
+
+def test_a_network_of_no_numbers_is_not_kept(scene_file, tmp_path, monkeypatch):
+    """What was written before stays: one checkpoint, in which all weights are numbers."""
+    learn = PPO.train
+
+    def spoil(self):
+        learn(self)
+        if self.num_timesteps * REPEAT >= 2400:
+            next(self.policy.mlp_extractor.value_net.parameters()).data.fill_(np.nan)
+
+    monkeypatch.setattr(PPO, "train", spoil)
+    checked = configuration("PPO", scene_file)
+    with pytest.raises(DivergedError, match=r"the checkpoint at 1,600 is kept"):
+        train(checked, tmp_path)
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [f"{1600:012d}"]
+    environment = make_environment(checked, load_scene(scene_file))
+    checkpoint = RunFolder(tmp_path, checked).checkpoint()
+    model, _ = read_checkpoint(checkpoint, LEARNERS["PPO"], environment, checked.seed)
+    assert all(torch.isfinite(weights).all() for weights in model.policy.parameters())

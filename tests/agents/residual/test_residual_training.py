@@ -1,0 +1,192 @@
+"""A correction trains for some thousand steps, begins as the plan, and resumes and exports what it is."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+
+
+from agents.configuration import load_configuration
+from agents.evaluation.plan_followers import follower
+from agents.evaluation.plans import Plans
+from agents.policies import ExportedPolicy
+from agents.reinforcement.callback import read_checkpoint
+from agents.reinforcement.networks import export_policy
+from agents.reinforcement.reinforcement_training import LEARNERS, make_learner
+from agents.residual.corrections import CorrectionObserver, correcting, correction
+from agents.residual.mismatch import Worlds, fly_mismatched
+from agents.residual.residual_training import make_residual_environment, silence, train_residual
+from agents.run_folder import RunFolder, RunFolderError
+from dq_space_arm_env import compile_scene
+from experts.demonstrations import DemonstrationsError
+
+pytestmark = pytest.mark.agents
+
+COPIES, REPEAT, TOTAL = 8, 10, 4800
+SEEN = {"repeat": REPEAT, "memory": 0.5, "full_authority": 0.1}
+HEAVY = 1.3
+"""As in the tests of controllers, which compile it as well."""
+EVERY = {"evaluate_every": 2400, "checkpoint_every": 2400}
+ALGORITHMS = {
+    "residual-PPO": {"n_steps": 15, "batch_size": 60, "n_epochs": 2, "log_std_init": -2.0},
+    "residual-SAC": {"batch_size": 32, "learning_starts": 100, "buffer_size": 1000, "ent_coef": 0.001},
+}
+
+
+@pytest.fixture
+def configuration(small_file, demonstrations):
+    def make(algorithm="residual-PPO", total_steps=TOTAL, **changes):
+        content = {
+            "name": "small",
+            "scene": str(small_file),
+            "demonstrations": {"folder": str(demonstrations.path)},
+            "mismatch": {"mass_factors": [1.0], "noise": 0.01, "push": 0.02},
+            "environment": {"copies": COPIES, "action_repeat": REPEAT, "memory": 0.5, "full_authority": 0.1},
+            "network": {"hidden": [16, 16], "activation": "tanh" if algorithm.endswith("PPO") else "relu"},
+            "algorithm": {"name": algorithm, **ALGORITHMS[algorithm]},
+            "schedule": {"total_steps": total_steps, "evaluation_episodes": 6, **EVERY},
+        }
+        return load_configuration(content | changes)
+
+    return make
+
+
+def trained_parameters(run):
+    return {name: array.numpy().copy() for name, array in run.model.policy.state_dict().items()}
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_before_training_the_agent_is_the_plan_with_its_gains(
+    algorithm, configuration, small_scene, demonstrations
+):
+    settings = configuration(algorithm)
+    environment = make_residual_environment(settings, small_scene, demonstrations)
+    model = make_learner(settings.learner(), environment)
+    silence(model)
+    observations = environment.reset()
+    actions, _ = model.predict(observations, deterministic=True)
+    np.testing.assert_array_equal(actions, 0.0)
+    rewards = []
+    for _ in range(small_scene.simulation.steps // REPEAT):
+        observations, reward, done, infos = environment.step(actions)
+        rewards.append(reward)
+    assert not np.any(rewards)  # a copy that corrects nothing costs what its twin costs
+    assert done.all()
+    assert all(info["cost"] == info["twin_cost"] for info in infos)
+    plans, worlds = Plans.of(demonstrations), Worlds(1.0, 0.01, 0.02, 6.0, seed=1)
+    scale = environment.action_space.high
+    silent = correcting(small_scene, plans, export_policy(model, {}), action_scale=scale, **SEEN)
+    planned = follower(small_scene, plans, feedback=True)
+    costs = [fly_mismatched(each, small_scene, plans, worlds).cost for each in (silent, planned)]
+    np.testing.assert_array_equal(*costs)
+
+
+@pytest.fixture
+def unscaled(configuration, small_scene, demonstrations):
+    """An environment that rewards with savings as they are, begun."""
+    settings = configuration()
+    practice = settings.environment.model_copy(update={"cost_power": 1.0, "reward_scale": 1.0})
+    settings = settings.model_copy(update={"environment": practice})
+    environment = make_residual_environment(settings, small_scene, demonstrations)
+    environment.reset()
+    return environment
+
+
+def test_rewards_are_what_corrections_save(unscaled, small_scene):
+    total = np.zeros(COPIES)
+    for _ in range(small_scene.simulation.steps // REPEAT):
+        beyond = np.tile(3.0 * unscaled.action_space.high, (COPIES, 1))
+        _, reward, done, infos = unscaled.step(beyond)
+        total += reward
+    assert done.all()
+    saved = [info["twin_cost"] - info["cost"] for info in infos]
+    np.testing.assert_allclose(total, saved, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose([info["episode"]["r"] for info in infos], saved, rtol=1e-9)
+    assert min(np.abs(saved)) > 0.0
+
+
+def test_a_flight_that_diverges_is_charged_for_the_rest(unscaled, small_scene):
+    worlds = unscaled.venv._worlds
+    push = np.zeros((2 * COPIES, worlds.kernels.n_t))
+    push[0, worlds.kernels.layout.tangent.base_velocity] = 1e9
+    worlds.perturb(push)
+    total, idle = np.zeros(COPIES), np.zeros((COPIES, worlds.kernels.n_u))
+    for _ in range(small_scene.simulation.steps // REPEAT):
+        _, reward, _, infos = unscaled.step(idle)
+        total += reward
+    lost = infos[0]["cost"] - infos[0]["twin_cost"]
+    assert 0.0 < lost < np.inf
+    assert total[0] == pytest.approx(-lost, rel=1e-5)
+    assert not infos[0]["is_success"]
+    assert not total[1:].any()
+
+
+def test_the_environment_and_the_controller_see_and_do_the_same(configuration, small_scene, demonstrations):
+    """A policy that corrects by what it sees costs the same in both, with nothing drawn at random."""
+    kernels = compile_scene(small_scene)
+    weights = 0.05 * np.random.default_rng(0).standard_normal((CorrectionObserver.size(kernels), 6))
+
+    def policy(seen):
+        return np.tanh(seen @ weights)[:, : kernels.n_u]
+
+    heavy = {"mass_factors": [HEAVY], "noise": 0.0, "push": 0.0}
+    settings = configuration(mismatch=heavy)
+    environment = make_residual_environment(settings, small_scene, demonstrations[:1])
+    observations = environment.reset()
+    for _ in range(small_scene.simulation.steps // REPEAT):
+        observations, _, _, infos = environment.step(policy(observations))
+    plans = Plans.of(demonstrations[:1])
+    controller = correcting(small_scene, plans, policy, action_scale=environment.action_space.high, **SEEN)
+    flown = fly_mismatched(controller, small_scene, plans, Worlds(HEAVY, 0.0, 0.0, 6.0, seed=0))
+    np.testing.assert_allclose([info["cost"] for info in infos], flown.cost[0], rtol=1e-6)
+    assert abs(flown.cost[0] / infos[0]["twin_cost"] - 1.0) > 1e-4
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_it_trains_exports_and_resumes(algorithm, configuration, small_scene, demonstrations, tmp_path):
+    settings = configuration(algorithm)
+
+    def kill(advance):
+        if advance.environment_steps > 2400:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_residual(settings, tmp_path, report=kill)
+    checkpoint = RunFolder(tmp_path, settings).checkpoint()
+    environment = make_residual_environment(settings, small_scene, demonstrations)
+    learner = LEARNERS[settings.learner().algorithm.name]
+    model, progress = read_checkpoint(checkpoint, learner, environment, settings.seed)
+    assert progress.environment_steps == model.num_timesteps * REPEAT == 2400
+    run = train_residual(settings, tmp_path)
+    assert run.model.num_timesteps * REPEAT == TOTAL
+    exported = ExportedPolicy.load(tmp_path / "policy.npz")
+    seen = np.random.default_rng(0).normal(size=(50, exported.n_observation)) + exported.mean
+    seen = seen.astype(np.float32)
+    expected, _ = run.model.predict(seen, deterministic=True)
+    np.testing.assert_allclose(exported(seen), np.clip(expected, -1.0, 1.0), rtol=0.0, atol=1e-6)
+    assert np.ptp(expected, axis=0).min() > 0.0  # it has learned something
+    again = train_residual(settings, tmp_path)  # nothing is left to do
+    for name, array in trained_parameters(run).items():
+        np.testing.assert_array_equal(trained_parameters(again)[name], array)
+    curve = [json.loads(line) for line in (tmp_path / "evaluations.jsonl").read_text().splitlines()]
+    assert [line["environment_steps"] for line in curve] == [2400, TOTAL]
+    assert exported.metadata["training"]["environment_steps"] == TOTAL
+    assert exported.metadata["observation"] == "residual"
+    plans = Plans.of(demonstrations[:2])
+    corrected = correction(exported, small_scene, plans)
+    flown = fly_mismatched(corrected, small_scene, plans, Worlds(1.0, 0.0, 0.0, 6.0, seed=0))
+    assert np.isfinite(flown.cost).all()
+
+
+def test_a_folder_or_a_scene_that_does_not_fit_is_refused(configuration, tmp_path):
+    RunFolder(tmp_path / "run", configuration())
+    with pytest.raises(RunFolderError, match="seed is 0 there and 1 here"):
+        train_residual(configuration(seed=1), tmp_path / "run")
+    with pytest.raises(DemonstrationsError, match="demonstrations of another scene than 'paper'"):
+        train_residual(configuration(scene="paper"), tmp_path / "other")
+    generated = {"problems": 2}
+    with pytest.raises(ValueError, match="draws more than the start"):
+        train_residual(configuration(scene="random-target", demonstrations=generated), tmp_path / "random")

@@ -1,0 +1,253 @@
+"""The same maneuver in other solvers: steps, costs and optima that agree; what is said where they cannot."""
+
+from typing import Any
+
+import casadi
+import numpy as np
+import pytest
+
+from dq_space_arm_env import Scene, load_scene
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics import kinematics
+from dq_space_arm_env.dynamics.chain import Chain
+from experts import BoxDDP
+from experts.problems.arm_problem import ArmProblem
+from experts.problems.shooting_problem import FloatArray
+from scripts.benchmarks.peers import crocoddyl_maneuver, crocoddyl_peer
+from scripts.benchmarks.peers.crocoddyl_maneuver import CrocoddylManeuver
+from scripts.benchmarks.peers.crocoddyl_peer import solve_with_crocoddyl
+from scripts.benchmarks.peers.ipopt_peer import solve_with_ipopt
+from scripts.benchmarks.peers.ipopt_transcription import transcribe
+from scripts.benchmarks.solvers.runs import SolverRun, roll_out
+from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
+
+
+def shortened(name: str, steps: int, integrator: str = "symplectic_euler") -> ArmProblem:
+    scene = load_scene(name)
+    changes = {"steps": steps, "integrator": integrator}
+    return ArmProblem(scene.replace(simulation={**scene.simulation.model_dump(), **changes}))
+
+
+def random_controls(problem: ArmProblem, share: float = 0.2) -> FloatArray:
+    rng = np.random.default_rng(0)
+    shape = problem.horizon, problem.n_controls
+    return np.asarray(share * problem.control_upper * rng.uniform(-1.0, 1.0, shape))
+
+
+def check_record(run: SolverRun, problem: ArmProblem, start: FloatArray) -> None:
+    """Whatever the solver: sizes, limits, a clock that runs, and costs that are those of the controls."""
+    assert run.costs.shape == run.seconds.shape == (run.iterations + 1,)
+    assert run.seconds[0] == 0.0
+    assert np.all(np.diff(run.seconds) > 0.0)
+    assert np.all(np.abs(run.controls) <= problem.control_upper)
+    assert run.replayed_cost == run.costs[-1] == roll_out(problem, start, run.controls).cost
+    assert set(run.parts) == {"derivatives", "sweep", "rollout"}
+    assert all(time >= 0.0 for time in run.parts.values())
+
+
+# IPOPT -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
+def test_ipopt_finds_the_optimum_of_the_expert(short_scene: Scene, integrator: str) -> None:
+    problem = ArmProblem(short_scene, integrator)
+    run, expected = solve_with_ipopt(problem), BoxDDP(problem).solve()
+    assert run.converged
+    assert run.stop_reason == "Solve_Succeeded"
+    assert run.replayed_cost == pytest.approx(expected.cost, rel=1e-6)
+    assert run.controls == pytest.approx(expected.controls, abs=1e-2)
+    zero = roll_out(problem, problem.initial_state, np.zeros_like(run.controls)).cost
+    assert run.costs[0] == pytest.approx(zero, rel=1e-2)  # IPOPT moves a guess off the bounds
+    check_record(run, problem, problem.initial_state)
+
+
+def test_ipopt_takes_another_start_and_a_guess_of_states_and_controls(short_scene: Scene) -> None:
+    problem = ArmProblem(short_scene)
+    start = problem.initial_state.copy()
+    start[problem.kernels.layout.state.joint_angles] += 0.3
+    plan = BoxDDP(problem).solve(start)
+    guess: dict[str, Any] = {"u_init": plan.controls, "x_init": plan.states, "first_barrier": 1e-5}
+    warm, cold = solve_with_ipopt(problem, start, **guess), solve_with_ipopt(problem, start)
+    for run in (warm, cold):
+        assert run.replayed_cost == pytest.approx(plan.cost, rel=1e-6)
+        check_record(run, problem, start)
+    assert warm.costs[0] < 1.1 * plan.cost < cold.costs[0]
+    assert warm.iterations < cold.iterations
+
+
+def test_ipopt_says_when_iterations_or_time_are_used_up(short_scene: Scene) -> None:
+    problem = ArmProblem(short_scene)
+    few, brief = solve_with_ipopt(problem, max_iterations=2), solve_with_ipopt(problem, max_seconds=1e-3)
+    assert (few.converged, few.iterations, few.stop_reason) == (False, 2, "Maximum_Iterations_Exceeded")
+    assert (brief.converged, brief.stop_reason) == (False, "Maximum_WallTime_Exceeded")
+
+
+@pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
+def test_transcription_has_the_experts_steps_and_costs(integrator: str) -> None:
+    problem = shortened("paper", 20, integrator)
+    trajectory = roll_out(problem, problem.initial_state, random_controls(problem))
+    program = transcribe(problem.scene)
+    values = casadi.Function("values", [program.variables], [program.cost, program.gaps])
+    cost, gaps = values(np.concatenate([trajectory.states.ravel(), trajectory.controls.ravel()]))
+    assert float(cost) == pytest.approx(trajectory.cost, rel=1e-12)
+    # Of RK4, the pose is integrated otherwise: order 4 as well, another error.
+    assert float(casadi.norm_inf(gaps)) < (1e-9 if integrator == "rk4" else 1e-12)
+
+
+@pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
+def test_transcription_has_the_derivatives_that_casadi_finds(short_scene: Scene, integrator: str) -> None:
+    scene = short_scene.replace(simulation={"dt": 0.05, "steps": 3, "integrator": integrator})
+    program = transcribe(scene)
+    rng = np.random.default_rng(0)
+    values, gaps = rng.normal(size=program.variables.numel()), rng.normal(size=program.gaps.numel())
+    symbols = casadi.MX.sym("l", len(gaps))
+    jacobian = casadi.jacobian(program.gaps, program.variables)
+    lagrangian = 1.7 * program.cost + casadi.dot(symbols, program.gaps)
+    hessian = casadi.triu(casadi.hessian(lagrangian, program.variables)[0])
+    expected = casadi.Function("expected", [program.variables, symbols], [jacobian, hessian])(values, gaps)
+    found = (
+        program.derivatives["jac_g"](values, [])[1],
+        program.derivatives["hess_lag"](values, [], 1.7, gaps),
+    )
+    for ours, theirs in zip(found, expected, strict=True):
+        assert float(casadi.norm_inf(theirs)) > 1.0
+        assert float(casadi.norm_inf(ours - theirs)) < 1e-11
+
+
+# Crocoddyl -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def crocoddyl() -> Any:
+    """Crocoddyl, or no test."""
+    return pytest.importorskip("crocoddyl")
+
+
+@pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
+@pytest.mark.parametrize("name", ["no-wrist", "paper", "payload"])
+def test_crocoddyl_takes_the_same_steps(crocoddyl: Any, name: str, integrator: str) -> None:
+    problem = shortened(name, 40, integrator)
+    controls = random_controls(problem)
+    if integrator == "rk4":
+        controls[:, problem.kernels.layout.control.wrist_rate] = 0.0  # a ramp in a step of Crocoddyl
+    ours = roll_out(problem, problem.initial_state, controls).states
+    maneuver = CrocoddylManeuver(problem)
+    theirs = maneuver.states(maneuver.shooting.rollout(maneuver.model_inputs(controls)))
+    pose = problem.kernels.layout.state.pose
+    assert np.abs(ours[-1, pose.stop :] - ours[0, pose.stop :]).max() > 1e-3
+    assert theirs[:, pose.stop :] == pytest.approx(ours[:, pose.stop :], abs=1e-13)
+    assert theirs[:, pose] == pytest.approx(ours[:, pose], abs=1e-8 if integrator == "rk4" else 1e-13)
+
+
+@pytest.mark.parametrize("name", ["no-wrist", "paper"])
+def test_crocoddyl_has_the_exact_cost(crocoddyl: Any, name: str) -> None:
+    ratios = {}
+    for integrator in COMPARED_INTEGRATORS:
+        problem = shortened(name, 200, integrator)
+        controls = random_controls(problem)
+        cost = roll_out(problem, problem.initial_state, controls).cost
+        maneuver = CrocoddylManeuver(problem, exact_pose_cost=True)
+        inputs = maneuver.model_inputs(controls)
+        ratios[integrator] = maneuver.shooting.calc(maneuver.shooting.rollout(inputs), inputs) / cost
+    assert ratios["symplectic_euler"] == pytest.approx(1.0, abs=1e-12)
+    assert ratios["rk4"] == pytest.approx(1.0, abs=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("angle", "distance", "error"), [(1e-3, 1e-3, 1e-3), (0.2, 0.3, 0.06), (0.7, 0.9, 0.2)]
+)
+def test_crocoddyl_approximates_the_pose_cost(
+    crocoddyl: Any, angle: float, distance: float, error: float
+) -> None:
+    """The tip a rotation and a displacement away from the target, in random directions."""
+    problem = shortened("paper", 1)
+    layout, rng = problem.kernels.layout, np.random.default_rng(0)
+    chain, target = Chain.from_scene(problem.scene), problem.scene.target.pose.dual_quaternion
+    angles = (
+        problem.initial_state[layout.state.joint_angles],
+        problem.initial_state[layout.state.wrist_angles],
+    )
+    to_base = dq.conjugate(kinematics.arm_pose(chain, *angles))
+    exact, approximate = (CrocoddylManeuver(problem, exact_pose_cost=flag).shooting for flag in (True, False))
+    maneuver = CrocoddylManeuver(problem)
+    for _ in range(50):
+        axis, shift = rng.normal(size=(2, 3))
+        shift *= distance / np.linalg.norm(shift)
+        tip = dq.multiply(
+            target, poses.from_axis_angle(tuple(axis / np.linalg.norm(axis)), angle, tuple(shift))
+        )
+        state = problem.initial_state.copy()
+        state[layout.state.pose] = dq.multiply(tip, to_base)
+        maneuver.start_at(state)
+        costs = []
+        for shooting in (exact, approximate):
+            data = shooting.terminalModel.createData()
+            shooting.terminalModel.calc(data, maneuver.shooting.x0)
+            costs.append(data.cost)
+        assert costs[1] == pytest.approx(costs[0], rel=error)
+        expected = 150.0 * sum((a - b) ** 2 for a, b in zip(tip, target, strict=True))
+        assert costs[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_crocoddyl_has_the_jacobian_of_the_exact_pose_cost(crocoddyl: Any) -> None:
+    problem = shortened("paper", 1)
+    shooting = CrocoddylManeuver(problem, exact_pose_cost=True).shooting
+    model = shooting.runningModels[0].differential
+    numeric = crocoddyl.DifferentialActionModelNumDiff(model, True)
+    x = model.state.integrate(shooting.x0, np.random.default_rng(0).normal(size=model.state.ndx))
+    u = np.ones(model.nu)
+    datas = model.createData(), numeric.createData()
+    for each, data in zip((model, numeric), datas, strict=True):
+        each.calc(data, x, u)
+        each.calcDiff(data, x, u)
+    assert datas[0].Lx == pytest.approx(datas[1].Lx, rel=1e-4, abs=1e-3 * np.abs(datas[1].Lx).max())
+
+
+@pytest.mark.parametrize("method", crocoddyl_peer.METHODS)
+def test_crocoddyl_finds_the_optimum_of_the_expert(crocoddyl: Any, method: str) -> None:
+    problem = shortened("no-wrist", 50)
+    start = problem.initial_state.copy()
+    start[problem.kernels.layout.state.joint_angles] += 0.1
+    first = random_controls(problem, 0.01)
+    run = solve_with_crocoddyl(problem, start, first, method=method, exact_pose_cost=True)
+    expected = BoxDDP(problem).solve(start)
+    assert run.converged
+    assert run.replayed_cost == pytest.approx(expected.cost, rel=1e-5)
+    assert run.costs[0] == roll_out(problem, start, first).cost
+    assert run.own_costs == pytest.approx(run.costs, rel=1e-9)
+    check_record(run, problem, start)
+
+
+@pytest.mark.slow
+def test_crocoddyl_comes_near_with_compiled_residuals_and_a_wrist(crocoddyl: Any) -> None:
+    problem = shortened("paper", 100)
+    expected = BoxDDP(problem).solve().cost
+    exact, compiled = (
+        solve_with_crocoddyl(problem, exact_pose_cost=flag, max_iterations=150) for flag in (True, False)
+    )
+    assert exact.replayed_cost == pytest.approx(expected, rel=2e-3)
+    assert compiled.replayed_cost == pytest.approx(expected, rel=5e-2)
+    assert compiled.own_costs[-1] != pytest.approx(compiled.replayed_cost, rel=1e-3)
+    for run in (exact, compiled):
+        check_record(run, problem, problem.initial_state)
+
+
+def test_crocoddyl_refuses_weights_that_its_residual_has_not(crocoddyl: Any) -> None:
+    scene = load_scene("no-wrist")
+    weights = (15.0, 15.0, 15.0, 14.0, *(15.0,) * 4)
+    problem = ArmProblem(scene.replace(cost={**scene.cost.model_dump(), "pose": weights}))
+    with pytest.raises(ValueError, match="within the real or the dual part"):
+        CrocoddylManeuver(problem)
+    CrocoddylManeuver(problem, exact_pose_cost=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("planar", "a planar base"), ("free-floating", "parts without an actuator"), ("tip-load", "a wrench")],
+)
+def test_crocoddyl_is_left_out_with_a_sentence(name: str, reason: str) -> None:
+    sentence = crocoddyl_maneuver.obstacle(ArmProblem(name))
+    assert sentence is not None
+    assert reason in sentence
+    assert crocoddyl_maneuver.obstacle(ArmProblem("paper")) is None

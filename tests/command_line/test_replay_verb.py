@@ -1,0 +1,98 @@
+"""The script that writes pages: what it takes for flights, and what it refuses."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from agents import ExportedPolicy
+from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, compile_scene
+from dq_space_arm_env.command_line import main
+from dq_space_arm_env.command_line.replaying import collect_flights
+from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.viewing.replay import Trajectory, common_scene, read_flight
+
+
+@pytest.fixture
+def scene(short_scene: Scene, tmp_path: Path) -> Scene:
+    short_scene.to_yaml(tmp_path / "short.yaml")
+    return short_scene
+
+
+@pytest.fixture
+def rollout(scene: Scene, tmp_path: Path) -> Path:
+    layout = StateLayout.of(scene)
+    states = np.tile(layout.initial_state, (9, 1))
+    states[:, layout.state.joint_angles] += np.linspace(0, 1, 9)[:, None]
+    Trajectory("swing", states, np.ones((8, layout.n_u)), scene=scene).save(tmp_path / "swing.npz")
+    return tmp_path / "swing.npz"
+
+
+def save_policy(path: Path, n_obs: int) -> Path:
+    """Half of each limit, whatever it observes."""
+    weights, biases = (np.zeros((n_obs, 2), np.float32),), (np.full(2, 0.5, np.float32),)
+    ExportedPolicy(weights, biases, "relu", np.zeros(n_obs), np.ones(n_obs)).save(path)
+    return path
+
+
+def test_policy_flies_from_where_the_first_flight_starts(rollout: Path, scene: Scene, tmp_path: Path) -> None:
+    kernels = compile_scene(scene)
+    n_obs = DQSpaceArmVectorEnv(1, scene).reset()[0].shape[1]
+    policy = save_policy(tmp_path / "half.npz", n_obs)
+    start = read_flight(rollout).states[0]
+    (_, flight), _ = collect_flights([(None, str(rollout)), (None, str(policy))], scene, Console(quiet=True))
+    np.testing.assert_allclose(flight.states[0], start, atol=1e-12)
+    assert flight.states.shape[0] == 61
+    np.testing.assert_allclose(flight.controls, np.tile([1.0, 0.25], (60, 1)))
+    step = kernels.step(flight.states[0], flight.controls[0])
+    np.testing.assert_allclose(flight.states[1], step, atol=1e-12)
+
+    # The folder of a solution stands for its file.
+    out, folder = tmp_path / "page.html", tmp_path / "solved"
+    folder.mkdir()
+    rollout.rename(folder / "solution.npz")
+    assert main(["replay", str(folder), f"again={folder}", f"agent={policy}", "--out", str(out)]) == 0
+    page = out.read_text(encoding="utf-8")
+    for label, steps in (("swing", 8), ("again", 8), ("agent", 60)):
+        assert f'"label":"{label}","steps":{steps}' in page
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["nowhere.npz"], "there is no such file"),
+        (["{folder}/short.yaml"], "cannot be read as a flight"),
+        (["{folder}/numbers.npz"], "it lacks controls and states"),
+        (["{folder}/half.npz"], "give --scene"),
+        (["{folder}/bare.npz"], "name the scene"),
+        (["{folder}/facts.npz"], "its facts are not a mapping"),
+        (["{folder}"], "holds no demonstrations"),
+        (["{folder}/swing.npz", "--scene", "paper"], "show them on separate pages"),
+    ],
+)
+def test_unusable_input_is_one_sentence(
+    arguments: list[str], sentence: str, rollout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.savez(tmp_path / "numbers.npz", numbers=np.zeros(3))
+    save_policy(tmp_path / "half.npz", 5)
+    flight = read_flight(rollout)
+    np.savez(tmp_path / "bare.npz", states=flight.states, controls=flight.controls)
+    np.savez(tmp_path / "facts.npz", facts=np.array("[1]"), states=flight.states, controls=flight.controls)
+    given = [argument.format(folder=tmp_path) for argument in arguments]
+    assert main(["replay", *given, "--out", str(tmp_path / "page.html")]) == 2
+    assert sentence in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_scenes_may_differ_in_masses_and_target(rollout: Path, scene: Scene) -> None:
+    one = read_flight(rollout)
+    base, target = {**scene.base.model_dump(), "mass": 30.0}, {"pose": {"position": (0.5, 0.5, 0.0)}}
+    heavy = scene.replace(base=base, target=target)
+    flights, shown = common_scene([one, replace(one, scene=heavy)])
+    assert shown == scene
+    np.testing.assert_allclose(flights[1].target, heavy.target.pose.dual_quaternion)
+    slower = scene.replace(simulation=scene.simulation.model_dump() | {"dt": 0.1})
+    with pytest.raises(ValueError, match=r"time steps of 0.1 s, the scene 'short' has 0.05 s"):
+        common_scene([one, replace(one, scene=slower)])

@@ -1,0 +1,156 @@
+"""Rollouts: equal to episodes of single environments, their records, and disturbances."""
+
+import numpy as np
+import pytest
+from short_scenes import short
+
+from dq_space_arm_env import DQSpaceArmEnv, compile_scene
+from dq_space_arm_env.environment.disturbances import Disturbances, MassMismatchVectorEnv, with_masses
+from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
+from dq_space_arm_env.task.trajectory import Trajectory
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return short("planar", 25)
+
+
+def wave(observations):
+    """A policy that depends on each observation alone."""
+    return np.sin(3.0 * observations[:, :6])
+
+
+def test_rollout_is_the_same_episodes_as_in_single_environments(scene):
+    flown = rollout(wave, scene, [5, 7], record=True)
+    assert (len(flown), flown.seeds) == (2, (5, 7))
+    for i, seed in enumerate(flown.seeds):
+        env = DQSpaceArmEnv(scene)
+        observation, info = env.reset(seed=seed)
+        assert flown.initial_errors[i].tolist() == [info["attitude_error"], info["position_error"]]
+        rewards, effort = [], 0.0
+        for step in range(25):
+            np.testing.assert_array_equal(flown.observations[i, step], observation)
+            action = wave(observation[None])[0]
+            np.testing.assert_array_equal(flown.controls[i, step], env.kernels.layout.to_control(action))
+            observation, reward, _, _, info = env.step(action)
+            rewards.append(reward)
+            effort += info["cost_control"]
+        np.testing.assert_array_equal(flown.states[i, -1], env.state)
+        np.testing.assert_array_equal(flown.observations[i, -1], observation)
+        np.testing.assert_array_equal(flown.rewards[i], rewards)
+        assert flown.cost_terms["cost_control"][i] == pytest.approx(effort, rel=1e-12)
+        assert flown.attitude_error[i] == info["attitude_error"]
+        assert flown.is_success[i] == info["is_success"]
+        assert flown.cost[i] == pytest.approx(-sum(rewards), rel=1e-12)
+
+
+def test_state_feedback_sees_states_and_steps_and_begins_with_the_environment(scene):
+    seen, begun = [], []
+
+    def act(states, step):
+        seen.append((step, states.copy()))
+        return np.zeros((len(states), 6))
+
+    start = compile_scene(scene).layout.initial_state
+    flown = rollout(StateFeedback(act, begun.append), scene, starts=[start, start], record=True, steps=4)
+    assert [step for step, _ in seen] == [0, 1, 2, 3]
+    np.testing.assert_array_equal(np.stack([states for _, states in seen], axis=1), flown.states[:, :4])
+    assert begun[0].num_envs == 2
+    resting = rollout(lambda observations: np.zeros((1, 6)), scene, steps=4, record=True)
+    np.testing.assert_array_equal(flown.states[0], resting.states[0])
+
+
+def test_nan_makes_a_policy_fail_and_the_others_go_on(scene):
+    def partly_broken(observations):
+        actions = wave(observations)
+        actions[1] = np.nan
+        return actions
+
+    flown, sound = rollout(partly_broken, scene, [1, 2]), rollout(wave, scene, [1])
+    assert flown.policy_failed.tolist() == [False, True]
+    assert flown.cost[0] == sound.cost[0]
+    assert flown.cost_terms["cost_control"][1] == 0.0
+    with pytest.raises(ValueError, match=r"shape \(6,\); 2 episodes of scene 'planar' want \(2, 6\)"):
+        rollout(lambda observations: np.zeros(6), scene, [1, 2])
+
+
+def test_diverged_episode_ends_early_and_is_charged_like_in_the_environment(scene):
+    layout = compile_scene(scene).layout
+    fast, calm = layout.initial_state.copy(), layout.initial_state
+    fast[layout.state.joint_rates] = 1e5
+    flown = rollout(lambda seen: np.ones((len(seen), 6)), scene, starts=[fast, calm], record=True)
+    assert flown.diverged.tolist() == [True, False]
+    assert flown.length[0] < flown.length[1] == 25
+    assert not flown.rewards[0, flown.length[0] :].any()
+    trajectory = flown.trajectory(0, "fast")
+    assert (len(trajectory.states), len(trajectory.controls)) == (flown.length[0] + 1, flown.length[0])
+    assert trajectory.diverged
+    env = DQSpaceArmEnv(scene)
+    env.reset(options={"initial_state": fast})
+    total, over = 0.0, False
+    while not over:
+        _, reward, over, _, _ = env.step(np.ones(6))
+        total += reward
+    assert trajectory.cost == pytest.approx(-total, rel=1e-12)
+
+
+def test_trajectory_comes_back_from_its_file(scene, tmp_path):
+    noisy = Disturbances(scene, np.random.default_rng(0), inputs=0.1)
+    flown = rollout(wave, scene, [3], disturbances=noisy, record=True).trajectory(label="wave", start="drawn")
+    flown.save(tmp_path / "flight.npz")
+    back = Trajectory.load(tmp_path / "flight.npz")
+    for name in ("states", "controls", "noise", "rewards", "target"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(flown, name))
+    assert back.scene == scene
+    assert (back.facts(), back.label) == (flown.facts(), "wave")
+    assert Trajectory.load(tmp_path / "flight.npz", "other").label == "other"
+    assert (back.cost, back.seed) == (flown.cost, 3)
+    # What the actuators got moved the arm.
+    kernels, u = compile_scene(scene), back.controls + back.noise
+    np.testing.assert_allclose(kernels.step(back.states[:-1], u), back.states[1:], atol=1e-12)
+
+
+def test_pushes_change_velocities_and_noise_only_what_is_measured(scene):
+    kernels = compile_scene(scene)
+    measured = []
+
+    def act(states, step):
+        measured.append(states.copy())
+        return np.zeros((1, 6))
+
+    rng = np.random.default_rng(1)
+    disturbances = Disturbances(scene, rng, push=0.1, pushes=4, evenly=True, measurement=1e-3)
+    flown = rollout(StateFeedback(act), scene, disturbances=disturbances, record=True)
+    noise = np.array(measured)[:, 0] - flown.states[0, :-1]
+    assert 1e-4 < np.abs(noise).mean() < 1e-2
+    time_left = scene.simulation.dt * np.arange(25, 0, -1.0)[:, None]
+    seen = kernels.observation(np.array(measured)[:, 0], time_left)[0]
+    np.testing.assert_allclose(flown.observations[0, :-1], seen, atol=1e-12)
+    free = kernels.step(flown.states[0, :-1], np.zeros((25, 6)))
+    jumps = flown.states[0, 1:] - free
+    struck = np.flatnonzero(np.abs(jumps).max(axis=1) > 1e-9)
+    assert struck.tolist() == [3, 8, 13, 18, 23]  # a push comes before the step whose state it changes
+    others = np.delete(jumps, np.r_[kernels.layout.state.base_velocity], axis=1)
+    np.testing.assert_allclose(others, 0.0, atol=1e-12)
+
+
+def test_masses_differ_from_the_scene(scene):
+    start = np.tile(compile_scene(scene).layout.initial_state, (3, 1))
+    factors = [1.3, 1.0, 1.3]
+    flown = rollout(wave, scene, starts=start, mass_factors=factors)
+    alone = [rollout(wave, with_masses(scene, factor), starts=start[:1]).cost[0] for factor in factors]
+    np.testing.assert_allclose(flown.cost, alone, rtol=1e-12)
+    assert with_masses(scene, 1.3).links[-1].mass == pytest.approx(1.3 * scene.links[-1].mass)
+    bare = scene.replace(links=[], actuators={"base_force": {"limit": 1}}, initial_state={}, spread={})
+    with pytest.raises(ValueError, match="has neither payload nor links"):
+        MassMismatchVectorEnv(bare, [1.3])
+
+
+def test_equal_generators_draw_equal_disturbances(scene):
+    one, other = (
+        Disturbances(scene, np.random.default_rng(3), push=[0.1, 0.2], pushes=6, measurement=[0.0, 0.1])
+        for _ in range(2)
+    )
+    for _ in range(3):
+        for mine, theirs in zip(one.draw()[:2], other.draw()[:2], strict=True):
+            np.testing.assert_array_equal(mine, theirs)

@@ -1,0 +1,74 @@
+"""Motions that the tests of integrators follow, and their end by an independent code."""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from dq_space_arm_env import compile_scene, load_scene
+from dq_space_arm_env.algebra import dual_quaternion as dq
+
+
+def simulated(scene, **changes):
+    """A shipped scene with other settings of the simulation."""
+    scene = load_scene(scene)
+    return scene.replace(simulation=scene.simulation.model_dump() | changes)
+
+
+def sprung(scene="paper", stiffness=0.0, damping=0.0, joints=None, **simulation):
+    """The scene with a spring, at rest at the start, and a damper in every joint or in some."""
+    scene = simulated(scene, **simulation)
+    layout = compile_scene(scene).layout
+    angles = layout.initial_state[layout.state.joint_angles].tolist()
+    links = [link.model_dump() for link in scene.links]
+    for j in range(len(links)) if joints is None else joints:
+        links[j] |= {"stiffness": stiffness, "damping": damping, "rest_angle": angles[j]}
+    return scene.replace(links=links)
+
+
+def free_body(*actuators, **changes):
+    """Kernels of a body without an arm."""
+    limits = {name: {"limit": 1.0} for name in actuators or ("base_force",)}
+    bare = {"links": [], "wrist": None, "actuators": limits, "initial_state": {}, "spread": {}}
+    return compile_scene(load_scene("paper").replace(**bare, **changes))
+
+
+def rollout(kernels, x, controls, dt, integrator):
+    """States along a sequence of inputs: the scalar kernel walks down rows that it has just written."""
+    steps = len(controls)
+    states = np.empty((steps + 1, kernels.n_x))
+    states[0], h = x, np.array([dt])
+    arrays = (states, np.ascontiguousarray(controls), h, states[1:])
+    buffers = np.array([array.ctypes.data for array in arrays], dtype=np.int64)
+    kernels.kernel("step", integrator=integrator, lanes=1).native.function(0, steps, buffers.ctypes.data)
+    return states
+
+
+def moving_start(kernels, seed=0, joint_rate=0.4, base_rate=0.15):
+    rng = np.random.default_rng(seed)
+    layout, x = kernels.layout.state, kernels.layout.initial_state.copy()
+    for part, rate in ((layout.joint_rates, joint_rate), (layout.base_velocity, base_rate)):
+        x[part] = rng.uniform(-rate, rate, part.stop - part.start)
+    return x
+
+
+def exact_motion(kernels, x, u, end, method="DOP853", tolerance=1e-13):
+    """End of a motion by SciPy, on the vector field of (8) and (22)."""
+    layout, wrist = kernels.layout.state, u[kernels.layout.control.wrist_rate]
+
+    def field(_, state):
+        pose_rate = dq.derivative(tuple(state[layout.pose]), tuple(state[layout.base_velocity]))
+        accelerations = kernels.forward_dynamics(state, u)
+        return np.concatenate([pose_rate, state[layout.joint_rates], wrist, accelerations])
+
+    return solve_ivp(field, (0.0, end), x, method=method, rtol=tolerance, atol=tolerance).y[:, -1]
+
+
+def convergence(kernels, name, counts, reference=("rk4", 8192)):
+    """Errors at the end of 1.2 s, against a finer motion, for each number of steps."""
+    x = moving_start(kernels, joint_rate=0.8, base_rate=0.4)
+    u = np.random.default_rng(1).uniform(-0.3, 0.3, kernels.n_u)
+
+    def end(method, steps):
+        return rollout(kernels, x, np.tile(u, (steps, 1)), 1.2 / steps, method)[-1]
+
+    exact = end(*reference)
+    return [np.linalg.norm(kernels.difference(exact, end(name, steps))) for steps in counts]

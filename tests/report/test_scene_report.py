@@ -1,0 +1,193 @@
+"""The report of a scene: its numbers against known truths, its files, and what an interrupt leaves."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from dq_space_arm_env import DQSpaceArmEnv, Scene, compile_scene
+from dq_space_arm_env.command_line import main
+from dq_space_arm_env.common.report_page import Section
+from dq_space_arm_env.common.tables import Row
+from dq_space_arm_env.scene import INTEGRATORS
+from experts import GuidedDDP
+from experts.report import expert_trials, integrator_precision, part_costs, scene_report, stability_envelope
+from experts.report.effort import Announce, Effort
+from experts.report.integrator_precision import Motion, observed_order, reference_end
+from experts.report.stability_envelope import SLOW, largest, on_springs
+
+Limits = dict[tuple[str, str], float]
+EFFORT = Effort((1, 2, 4, 8, 16, 32, 64), 2, 1e-4, starts=3, ratio=1.05, all_parts=False)
+
+
+def announce(what: str, done: int, total: int) -> None:
+    assert 0 <= done <= total
+
+
+@pytest.fixture(scope="module")
+def precision(short_scene: Scene) -> dict[str, list[dict[str, object]]]:
+    return integrator_precision.measure(short_scene, EFFORT, announce)  # type: ignore[return-value]
+
+
+@pytest.fixture(scope="module")
+def limits(short_scene: Scene) -> Limits:
+    found = stability_envelope.measure(short_scene, EFFORT, announce)
+    rows = found["envelope"]
+    section = stability_envelope.section(short_scene, found)
+    assert [row["integrator"] for row in section.record["limits"]] == list(INTEGRATORS)
+    return {(row["integrator"], row["quantity"]): row["largest"] for row in rows}
+
+
+def test_integrators_show_their_order(short_scene: Scene, precision: dict) -> None:
+    section = integrator_precision.section(short_scene, precision)
+    shown = {row["integrator"]: row["observed_order"] for row in section.record["integrators"]}
+    for name in ("rk4", "rodas4", "momentum_rk4", "momentum_rosenbrock"):
+        assert shown[name] == pytest.approx(INTEGRATORS[name].order, abs=0.3), name
+
+
+def test_observed_order_of_a_power_law() -> None:
+    steps = [0.1 / 2**i for i in range(6)]
+    assert observed_order(steps, [1e-3 * step**3 for step in steps]) == pytest.approx(3.0)
+    # Below the uncertainty of the reference, errors show nothing.
+    assert observed_order(steps, [1e-3 * step**3 for step in steps], uncertainty=1.0) is None
+
+
+def test_the_reference_is_more_precise_than_what_it_judges(precision: dict) -> None:
+    assert precision["reference"][0]["uncertainty"] < 1e-11
+    assert precision["reference"][0]["duration_s"] == pytest.approx(3.0)
+
+
+def test_stiff_joints_get_a_stiff_reference(short_scene: Scene) -> None:
+    (link,) = short_scene.links
+    stiff = short_scene.replace(links=[link.model_copy(update={"stiffness": 1e9})])
+    start = np.array(compile_scene(stiff).layout.initial_state)
+    end, uncertainty = reference_end(Motion(stiff, start, np.zeros((60, 2))))
+    assert np.isfinite(end).all()
+    assert uncertainty < 1e-9
+
+
+def test_stiffness_ends_where_the_stability_polynomial_says(short_scene: Scene, limits: Limits) -> None:
+    # The fastest vibration, from accelerations of the sprung arm slightly deflected.
+    kernels, deflection = compile_scene(on_springs(short_scene)), 1e-6
+    x = kernels.layout.initial_state.copy()
+    x[kernels.layout.state.joint_angles] += deflection
+    frequency = math.sqrt(-kernels.forward_dynamics(x, np.zeros(kernels.n_u))[-1] / deflection)
+    for name, entry in INTEGRATORS.items():
+        product = frequency * short_scene.simulation.dt * math.sqrt(limits[name, "stiffness"])
+        if entry.is_stiff:
+            assert product > 100.0, name
+        else:
+            assert product == pytest.approx(entry.imaginary_interval, rel=0.06), name
+
+
+def test_higher_order_holds_longer_steps_and_slow_motions(short_scene: Scene, limits: Limits) -> None:
+    """Without springs only rate times step counts; the steps of a motion are whole."""
+    steps = [limits[name, "step"] for name in ("symplectic_euler", "rk4", "rk8")]
+    assert steps == sorted(steps)
+    for name in ("symplectic_euler", "rk4", "momentum_rosenbrock"):
+        turned = limits[name, "rate"] * short_scene.simulation.dt
+        assert turned == pytest.approx(SLOW * limits[name, "step"], rel=0.35), name
+
+
+def test_search_finds_a_limit_between_its_ends() -> None:
+    assert largest(lambda value: value < 123.0, 1.0, 1e-6, 1e6, 1.01) == pytest.approx(123.0, rel=0.01)
+    assert largest(lambda value: value < 1e-3, 1.0, 1e-6, 1e6, 1.01) == pytest.approx(1e-3, rel=0.01)
+    assert largest(lambda value: True, 1.0, 1e-6, 1e6, 1.01) == 1e6
+    assert largest(lambda value: False, 1.0, 1e-6, 1e6, 1.01) == 0.0
+
+
+def test_parts_that_are_left_out_cost_nothing(spread_scene: Scene) -> None:
+    single = spread_scene.replace(simulation={"dt": 0.05, "steps": 60, "precision": "float32"})
+    rows = {row["part"]: row for row in part_costs.measure(single, EFFORT, announce)["parts"]}
+    whole = rows["short, as it is"]
+    assert whole["operations_ratio"] == whole["time_ratio"] == 1.0
+    assert whole["states"] == compile_scene(spread_scene).n_x
+    # Starts are drawn in resets, not in steps.
+    assert rows["without random starts"]["step_operations"] == whole["step_operations"]
+    fewer = rows["without joint torques"]
+    assert fewer["inputs"] == whole["inputs"] - 1
+    assert fewer["step_operations"] < whole["step_operations"]
+
+
+def test_starts_are_those_of_the_seeds(spread_scene: Scene) -> None:
+    rows = expert_trials.measure(spread_scene, EFFORT, announce)["starts"]
+    env = DQSpaceArmEnv(spread_scene)
+    env.reset(seed=2)
+    expected = GuidedDDP(spread_scene).solve(np.asarray(env.state))
+    assert [row["seed"] for row in rows] == [0, 1, 2]
+    assert rows[2]["cost"] == pytest.approx(expected.cost, rel=1e-9)
+    assert all(row["converged"] and row["success"] for row in rows)
+
+
+def test_starts_that_fail_are_listed_by_seed(spread_scene: Scene) -> None:
+    rows = expert_trials.measure(spread_scene, Effort(starts=2, max_iterations=1), announce)["starts"]
+    section = expert_trials.section(spread_scene, {"starts": rows})
+    assert section.record["shares"] == [{"starts": 2, "converged": 0.0, "success": 0.0}]
+    assert [row["seed"] for row in section.record["failed"]] == [0, 1]
+
+
+def test_a_scene_without_spread_is_solved_once(short_scene: Scene) -> None:
+    found = expert_trials.measure(short_scene, EFFORT, announce)
+    assert len(found["starts"]) == 1
+    assert "draws no starts" in expert_trials.section(short_scene, found).notes[0]
+
+
+class MadeUpPart:
+    """Counts how often it is measured; interrupts the first time if told to."""
+
+    def __init__(self, interrupts: bool = False) -> None:
+        self.measured, self._interrupts = 0, interrupts
+
+    def measure(self, scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[Row]]:
+        announce("something", 0, 1)
+        self.measured += 1
+        if self._interrupts and self.measured == 1:
+            raise KeyboardInterrupt
+        return {"rows": [{"scene": scene.name, "error": float("nan")}]}
+
+    def section(self, scene: Scene, found: dict[str, list[Row]]) -> Section:
+        made = Section("made up", "Made up", "Nothing.")
+        made.add_rows("table", found["rows"])
+        return made
+
+
+def test_an_interrupted_report_keeps_its_parts_and_resumes(
+    short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = MadeUpPart(), MadeUpPart(interrupts=True)
+    monkeypatch.setattr(scene_report, "PARTS", {"first": first, "second": second})
+    with pytest.raises(KeyboardInterrupt):
+        scene_report.report(short_scene, tmp_path, Console(), quick=True)
+    assert "Made up" in (tmp_path / "report.html").read_text()
+    console = Console(record=True, width=110)
+    scene_report.report(short_scene, tmp_path, console, quick=True)
+    assert "Resuming: first" in console.export_text()
+    assert (first.measured, second.measured) == (1, 2)
+    # A finished report, and one of another scene or effort, is measured anew.
+    for scene, quick in (
+        (short_scene, True),
+        (short_scene.replace(name="other"), True),
+        (short_scene, False),
+    ):
+        before = first.measured
+        page = scene_report.report(scene, tmp_path, Console(), quick=quick)
+        assert first.measured == before + 1
+    record = json.loads((tmp_path / "report.json").read_text())
+    assert record["request"]["quick"] is False
+    assert record["parts"]["first"]["rows"] == [{"scene": "short", "error": None}]
+    assert page.shortcomings == []
+
+
+def test_a_part_that_refuses_the_scene_says_so(
+    short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene_report, "PARTS", {"expert": expert_trials})
+    actuators = {"base_torque": {"limit": math.inf}, "joint_torque": {"limit": 0.5}}
+    endless = short_scene.replace(actuators=actuators)
+    page = scene_report.report(endless, tmp_path, Console(), quick=True)
+    assert "finite limit" in page.shortcomings[0]
+    assert "finite limit" in (tmp_path / "report.md").read_text()
+    assert main(["report", "paper", "--out", "/dev/null/report"]) == 2

@@ -1,0 +1,134 @@
+"""What a page shows of flights: poses (27), errors (31), what is refused, and where a flight is cut off."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env import list_scenes, load_scene
+from dq_space_arm_env.algebra import dual_quaternion, poses
+from dq_space_arm_env.dynamics import kinematics
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.start import PLANAR_POSE
+from dq_space_arm_env.viewing.replay.curves import panels
+from dq_space_arm_env.viewing.replay.flights import MOST_FLIGHTS, prepare, verdict
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_frames_are_those_of_the_chain_one_state_at_a_time(name, make_flight):
+    """(27) with plain numbers, and the errors (31)."""
+    scene = load_scene(name)
+    flight = make_flight(scene, steps=5)
+    shown = prepare([flight], scene)[0]
+    layout, chain, target = StateLayout.of(scene), Chain.from_scene(scene), scene.target.pose.dual_quaternion
+    for instant, state in enumerate(flight.states.tolist()):
+        base = np.zeros(8)
+        base[list(PLANAR_POSE) if layout.planar else list(range(8))] = state[layout.state.pose]
+        joints, wrist = state[layout.state.joint_angles], state[layout.state.wrist_angles]
+        expected = kinematics.frame_poses(chain, tuple(base.tolist()), joints, wrist)
+        np.testing.assert_allclose(shown.frames[instant], expected, atol=1e-14)
+        error = poses.error_angle(tuple(expected[-1]), target)
+        assert shown.angle[instant] == pytest.approx(np.degrees(error), abs=1e-6)
+        distance = poses.error_distance(tuple(expected[-1]), target)
+        assert shown.distance[instant] == pytest.approx(distance, abs=1e-12)
+
+
+def test_neighboring_poses_have_the_same_sign(paper, make_flight):
+    flight = make_flight(paper, steps=20)
+    states = flight.states.copy()
+    states[7:12, :8] *= -1.0
+    frames = prepare([replace(flight, states=states)], paper)[0].frames
+    np.testing.assert_allclose(frames, prepare([flight], paper)[0].frames, atol=1e-14)
+    assert (np.sum(frames[1:, :, :4] * frames[:-1, :, :4], axis=2) > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "bad"),
+    [("states", np.nan), ("controls", np.inf), ("states", 1e9), ("controls", 1e39), ("noise", -1e200)],
+)
+def test_diverged_flight_is_cut_off_before_what_is_not_finite(paper, make_flight, bad, field):
+    flight = replace(make_flight(paper), noise=np.zeros((60, 12)))
+    array = getattr(flight, field).copy()
+    array[40:, 3] = bad
+    shown = prepare([replace(flight, **{field: array})], paper)[0]
+    assert shown.steps == (39 if field == "states" else 40)
+    assert shown.frames.shape == (shown.steps + 1, 6, 8)
+    assert shown.note == f"diverges after {shown.steps * 0.015:.4g} s"
+    assert verdict(shown, paper).startswith("diverges after 0.")
+    assert np.isfinite(shown.frames).all()
+
+
+def test_own_target_is_what_errors_refer_to(paper, make_flight):
+    flight = make_flight(paper)
+    tip = prepare([flight], paper)[0].frames[-1, -1]
+    shown = prepare([replace(flight, target=tip)], paper)[0]
+    assert shown.distance[-1] == pytest.approx(0.0, abs=1e-12)
+    assert shown.angle[-1] == pytest.approx(0.0, abs=1e-5)
+    assert verdict(shown, paper).endswith("success")
+    turn = poses.from_axis_angle((0.0, 0.0, 1.0), np.radians(4.0), (0.0, 0.0, 0.0))
+    aside = dual_quaternion.multiply(tuple(tip.tolist()), turn)
+    missed = prepare([replace(flight, target=np.array(aside))], paper)[0]
+    assert missed.angle[-1] == pytest.approx(4.0)
+    assert verdict(missed, paper).startswith("ends 4°")
+    assert verdict(missed, paper).endswith("outside the tolerances")
+
+
+@pytest.mark.parametrize(
+    ("angle", "distance", "expected"),
+    [
+        (104.2, 1.1934, "ends 104° and 1.19 m from the target"),
+        (0.456, 0.09994, "ends 0.46° and 10 cm from the target"),
+        (0.0, 0.00012, "ends 0° and 0.12 mm from the target"),
+    ],
+)
+def test_verdict_is_in_plain_numbers(paper, make_flight, angle, distance, expected):
+    shown = prepare([make_flight(paper, steps=1)], paper)[0]
+    ending = replace(shown, angle=np.array([0.0, angle]), distance=np.array([0.0, distance]))
+    assert verdict(ending, paper).startswith(expected + ":")
+
+
+def test_unusable_flights_are_refused_in_a_sentence(paper, make_flight):
+    good = make_flight(paper)
+    nan = np.full_like(good.states, np.nan)
+    for flights, sentence in (
+        ([], "there is no flight to show"),
+        ([good] * (MOST_FLIGHTS + 1), "7 flights, should be at most 6"),
+        ([replace(good, label=" ")], "a flight has no label"),
+        ([replace(good, states=good.states[:, :5])], r"shape \(61, 5\), should be \(N \+ 1, 23\)"),
+        ([replace(good, states=good.states[:1], controls=good.controls[:0])], "1 rows, should be at least 2"),
+        ([replace(good, controls=good.controls[1:])], r"controls: shape \(59, 12\), should be \(60, 12\)"),
+        ([replace(good, states=nan)], "its first step is not finite"),
+        ([replace(good, target=np.zeros(3))], "should be a pose, 8 finite numbers"),
+        ([replace(good, target=np.zeros(8))], "its real part should have length 1"),
+        ([replace(good, controls=np.full((60, 12), "x"))], "'expert': controls: should be numbers"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            prepare(flights, paper)
+
+
+def test_panels_hold_errors_and_the_actuators_that_there_are(paper, make_flight):
+    flights = [make_flight(paper), replace(make_flight(paper, steps=30), noise=np.full((30, 12), 0.25))]
+    shown = panels(prepare(flights, paper), paper)
+    assert len(shown) == 6
+    assert [curve.shape for curve in shown[0].curves] == [(1, 61), (1, 31)]
+    joints = shown[4]
+    assert (joints.names, joints.unit, joints.bounds) == (("1", "2", "3"), "N m", (-2.0, 2.0))
+    np.testing.assert_array_equal(joints.curves[1], flights[1].controls[:, 6:9].T)
+    assert joints.disturbed[0] is None
+    np.testing.assert_array_equal(joints.disturbed[1], flights[1].controls[:, 6:9].T + 0.25)
+
+
+def test_small_inputs_are_shown_in_thousandths(paper, make_flight):
+    flight = make_flight(paper)
+    controls = flight.controls.copy()
+    controls[:, :3] *= 1e-3
+    force = panels(prepare([replace(flight, controls=controls)], paper), paper)[2]
+    assert (force.unit, force.note, force.bounds) == ("mN", "limit ±10 N", (-10000.0, 10000.0))
+    np.testing.assert_allclose(force.curves[0], flight.controls[:, :3].T)
+
+
+def test_absent_actuators_have_no_panel(make_flight):
+    scene = load_scene("planar")
+    shown = panels(prepare([make_flight(scene)], scene), scene)
+    assert [panel.names for panel in shown[2:]] == [("x", "y"), ("z",), ("1", "2", "3")]

@@ -1,0 +1,119 @@
+"""The page as a file: self-contained, small, escaped, and with scripts that a JavaScript engine accepts."""
+
+import json
+import re
+import subprocess
+from base64 import b64decode
+from dataclasses import replace
+from importlib.resources import files
+from shutil import which
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env import list_scenes, load_scene
+from dq_space_arm_env.algebra import dual_quaternion, poses, screw
+from dq_space_arm_env.viewing.replay import replay_page, write_replay
+from dq_space_arm_env.viewing.replay.flights import prepare
+from dq_space_arm_env.viewing.replay.page import SCRIPTS, bundle
+
+BROWSER = files("dq_space_arm_env.viewing.replay").joinpath("browser")
+DATA = re.compile(r'<script type="application/json" id="replay-data">(.*?)</script>', re.DOTALL)
+
+
+def data_of(page):
+    return json.loads(DATA.search(page)[1])
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_every_scene_has_a_page_without_a_reference_to_anything(name, make_flight):
+    scene = load_scene(name)
+    page = replay_page([make_flight(scene)], scene)
+    outside_the_data = DATA.sub("", page)
+    assert not re.search(r"(src|href)=(?!\"data:,\")", outside_the_data)
+    asks = r"url\(|@import|fetch\(|XMLHttpRequest|WebSocket|\bimport\b.*\bfrom\b"
+    assert not re.search(asks, outside_the_data)
+    assert set(re.findall(r"https?://[^\"']+", outside_the_data)) == {"http://www.w3.org/2000/svg"}
+    assert "default-src 'none'" in page
+    assert "{{" not in outside_the_data
+
+
+def test_two_flights_of_a_thousand_steps_stay_below_two_megabytes(make_flight):
+    scene = load_scene("six-joint")  # the most frames
+    flights = [make_flight(scene, "expert", 1000), make_flight(scene, "agent", 1000, 0.6)]
+    assert len(replay_page(flights, scene).encode()) < 2e6
+
+
+def test_labels_cannot_end_the_script(make_flight, paper, tmp_path):
+    label = "</script><img src=x onerror=alert(1)><!--{{script}}"
+    scene = paper.replace(name=label, description=label)
+    page = write_replay(tmp_path / "page.html", [make_flight(scene, label)], scene).read_text("utf-8")
+    assert "<img" not in page
+    assert page.count("</script>") == 2
+    data = data_of(page)
+    assert data["flights"][0]["label"] == label == data["scene"]["name"]
+
+
+@pytest.mark.parametrize("label", ["fl\udce9g", "سلام\u2028", "🚀"])
+def test_any_name_of_a_file_can_be_a_label(make_flight, paper, tmp_path, label):
+    """Names of files need not be valid Unicode: what is not comes as a lone surrogate."""
+    page = write_replay(tmp_path / "page.html", [make_flight(paper, label, 2)], paper).read_text("utf-8")
+    assert data_of(page)["flights"][0]["label"] == label
+
+
+def test_numbers_of_the_page_are_those_of_the_flight(make_flight, paper):
+    flight = replace(make_flight(paper), noise=np.ones((60, 12)))
+    data = data_of(replay_page([flight], paper))
+    blob = b64decode(data["blob"])
+
+    def array(place):
+        return np.frombuffer(blob, place["type"], place["length"], place["start"])
+
+    shown = prepare([flight], paper)[0]
+    frames = array(data["flights"][0]["frames"]).reshape(61, 6, 8)
+    np.testing.assert_array_equal(frames, shown.frames.astype(np.float32))
+    rates = data["panels"][5]
+    expected = flight.controls[:, 9:].T.ravel()
+    np.testing.assert_array_equal(array(rates["curves"][0]), expected.astype(np.float32))
+    np.testing.assert_allclose(array(rates["disturbed"][0]), expected + 1.0, rtol=1e-6)
+
+
+def test_unlimited_inputs_have_a_page(make_flight, paper):
+    actuators = paper.actuators.model_dump() | {"joint_torque": {"limit": float("inf")}}
+    scene = paper.replace(actuators=actuators)
+    data = data_of(replay_page([make_flight(scene)], scene))
+    assert (data["panels"][4]["note"], data["panels"][4]["bounds"]) == ("no limit", [])
+
+
+@pytest.mark.skipif(which("node") is None, reason="node is not installed")
+def test_node_accepts_the_scripts_one_by_one_and_joined(tmp_path):
+    joined = tmp_path / "joined.mjs"
+    joined.write_text(bundle(), encoding="utf-8")
+    assert {part.name for part in BROWSER.iterdir() if part.name.endswith(".mjs")} == set(SCRIPTS)
+    for path in (*(BROWSER.joinpath(name) for name in SCRIPTS), joined):
+        subprocess.run(["node", "--check", str(path)], check=True, capture_output=True)
+
+
+@pytest.mark.skipif(which("node") is None, reason="node is not installed")
+def test_blended_poses_are_screw_motions(tmp_path):
+    """The page's blend of two instants against the screw motion between them; a step turns by 0.6 degrees."""
+    start = poses.from_axis_angle((1.0, 0.0, 0.0), 0.3, (0.2, -1.0, 4.0))
+    step = poses.from_axis_angle((0.0, 0.6, 0.8), 0.01, (0.003, 0.01, -0.005))
+    end = dual_quaternion.multiply(start, step)
+    script = tmp_path / "blend.mjs"
+    script.write_text(
+        f'import {{ blendPoses, poseMatrix, positionOf }} from "{BROWSER / "algebra.mjs"}";\n'
+        f"const poses = {json.dumps([*start, *end])}, blend = [];\n"
+        "blendPoses(poses, 0, 8, 0.25, 1, blend);\n"
+        "const result = { blend, position: positionOf(blend), matrix: [...poseMatrix(blend, 0)] };\n"
+        "console.log(JSON.stringify(result));"
+    )
+    printed = subprocess.run(["node", str(script)], check=True, capture_output=True, text=True).stdout
+    result = json.loads(printed)
+    expected = screw.interpolate(start, end, 0.25)
+    np.testing.assert_allclose(result["blend"], expected, atol=1e-6)
+    rotation, position = poses.to_matrix(expected)
+    np.testing.assert_allclose(result["position"], position, atol=1e-6)
+    matrix = np.array(result["matrix"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix[:3, :3], rotation, atol=1e-6)
+    np.testing.assert_allclose(matrix[:3, 3], position, atol=1e-6)
