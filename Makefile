@@ -20,7 +20,7 @@ docs: $(VENV)/installed-docs
 	$(BIN)/sphinx-build -q -W -n --keep-going -b html docs results/docs
 
 test: $(VENV)/installed-$(TEST) lint
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal $(if $(CI),-m "")
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal $(if $(CI),-m "not endurance")
 	$(if $(CI),$(BIN)/python -m scripts.benchmarks --quick)
 
 lint: $(VENV)/installed-$(TEST)
