@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from agents.command_line.agent_policies import TRAINED_POLICY, policy_files
-from dq_space_arm_env.command_line.names import SCENE, OneOf, given
+from dq_space_arm_env.command_line.names import SCENE, OneOf, given, trust_option
 from dq_space_arm_env.command_line.results_options import destination, results_options
 from dq_space_arm_env.command_line.verb import (
     DefaultGroup,
@@ -97,6 +97,7 @@ def evaluate() -> None:
     type=click.Path(file_okay=False, path_type=Path),
     help="Folder for a JSON file per evaluation, with its episodes.",
 )
+@trust_option
 @json_option
 def policies_verb(
     policies: tuple[str, ...],
@@ -107,6 +108,7 @@ def policies_verb(
     workers: int | None,
     expert: bool,
     out: Path | None,
+    trust: bool,
     as_json: bool,
 ) -> None:
     """Evaluate each POLICY on the evaluation starts of a scene, beside the expert's optimal costs."""
@@ -124,7 +126,7 @@ def policies_verb(
     with keeping("the expert's solutions are kept; run the same command to resume"):
         console, named = wide_console(150, stderr=as_json), (*policies, *more)
         summaries = evaluate_policies(
-            console, named, scene, expert=expert, workers=workers, out=out, **chosen
+            console, named, scene, expert=expert, workers=workers, out=out, trust=trust, **chosen
         )
     if as_json:
         print_document(summaries)
@@ -149,6 +151,7 @@ def policies_verb(
     type=click.Path(dir_okay=False, path_type=Path),
     help="Animate the flight in this file (needs the extra plots).",
 )
+@trust_option
 @results_options("flight")
 def show(
     policy: str | None,
@@ -157,6 +160,7 @@ def show(
     seed: int | None,
     n: int,
     gif: Path | None,
+    trust: bool,
     out: Path,
     picture: bool,
     as_json: bool,
@@ -174,5 +178,5 @@ def show(
         )
     from agents.evaluation.showing import show as fly_and_show
 
-    reached = fly_and_show(destination(out, as_json, picture), chosen, scene, seed, n, gif)
+    reached = fly_and_show(destination(out, as_json, picture), chosen, scene, seed, n, gif, trust=trust)
     return SUCCESS if reached else FAILURE

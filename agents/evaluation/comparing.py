@@ -104,6 +104,7 @@ def compare(
     out: Path | None = None,
     workers: int | None = None,
     executor: Executor | None = None,
+    trust: bool = False,
     progress: Callable[[Advance], None] = lambda advance: None,
 ) -> Comparison:
     """Compare agents with the expert's controllers, from the fixed evaluation starts of a scene.
@@ -123,6 +124,7 @@ def compare(
             keeps only flights of plans and optimal costs, in the cache.
         workers: Number of processes of the expert; one per processor by default.
         executor: Used instead of local processes.
+        trust: Whether to execute the code in a model's file (.zip) where its tensors do not suffice.
         progress: Called now and then.
 
     Returns:
@@ -151,11 +153,12 @@ def compare(
         min(receding_starts, n),
         KeptRows(out),
         executor or local_executor(workers),
+        trust,
         progress,
     )
     files = [policy_path(policy) for policy in policies]
     for file in files:
-        check_fit(as_policy(file), given)  # refuse unusable policies before hours of work
+        check_fit(as_policy(file, trust=trust), given)  # refuse unusable policies before hours of work
     names = distinct_names(files)
     rows: list[Row] = []
     for condition in conditions:
@@ -176,6 +179,7 @@ class _Work:
     receding_starts: int
     kept: KeptRows
     executor: Executor
+    trust: bool
     progress: Callable[[Advance], None]
 
     def agent(self, file: Path, name: str, condition: str) -> Row:
@@ -189,6 +193,7 @@ class _Work:
                 condition=condition,
                 executor=self.executor,
                 label=name,
+                trust=self.trust,
                 progress=self._announced(name, condition),
             )
             return evaluation, 0.0

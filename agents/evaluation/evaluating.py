@@ -175,6 +175,7 @@ def evaluate(
     workers: int | None = None,
     executor: Executor | None = None,
     label: str | None = None,
+    trust: bool = False,
     progress: Callable[[Advance], None] = lambda advance: None,
 ) -> Evaluation:
     """Evaluate a policy from the fixed evaluation starts of a scene.
@@ -191,6 +192,8 @@ def evaluate(
         workers: Number of processes that compute them; one per processor by default.
         executor: Computes them in place of these processes.
         label: Name in tables.
+        trust: Whether to execute the code in a model's file (.zip) where its tensors do not suffice; only if
+            you trust whoever made it.
         progress: Called now and then.
 
     Returns:
@@ -203,7 +206,7 @@ def evaluate(
         ValueError: If an argument is out of range; if the expert is asked for in a scene that draws targets
             or masses, which it cannot solve in bulk; if the policy's actions do not fit the scene.
     """
-    acting, given = as_policy(policy, label), load_scene(scene)
+    acting, given = as_policy(policy, label, trust=trust), load_scene(scene)
     flown = scene_under(given, condition)
     check_fit(acting, flown)
     seeds = evaluation_seeds(flown, n)

@@ -51,6 +51,7 @@ def evaluate_policies(
     expert: bool = True,
     workers: int | None = None,
     out: Path | None = None,
+    trust: bool = False,
 ) -> list[dict[str, Any]]:
     """Evaluate policies, print a table for each condition, and return the summaries.
 
@@ -60,7 +61,16 @@ def evaluate_policies(
     for condition in CONDITIONS if ALL in conditions else conditions:
         with progress_bar() as show:
             evaluations = [
-                evaluate(policy, scene, n, condition=condition, expert=expert, workers=workers, progress=show)
+                evaluate(
+                    policy,
+                    scene,
+                    n,
+                    condition=condition,
+                    expert=expert,
+                    workers=workers,
+                    trust=trust,
+                    progress=show,
+                )
                 for policy in policies
             ]
         summaries += [evaluation.summary() for evaluation in evaluations]
@@ -88,6 +98,7 @@ def compare_controllers(
     controllers: Sequence[str] = tuple(CONTROLLERS),
     receding_starts: int = RECEDING_STARTS,
     workers: int | None = None,
+    trust: bool = False,
 ) -> None:
     """Compare, print the tables, and write the files; finished rows are read from the folder."""
     with progress_bar() as show:
@@ -100,6 +111,7 @@ def compare_controllers(
             receding_starts=receding_starts,
             out=destination.folder,
             workers=workers,
+            trust=trust,
             progress=show,
         )
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 
 from agents.policies import ExportedPolicy
 from agents.policies.flying import Policy
+from agents.zoo.model_archive import ModelArchiveError, NeedsCodeError, read_attributes, read_model
 from agents.zoo.shelf import ZooError, policy_file
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
 
@@ -34,14 +33,18 @@ class ActingPolicy(NamedTuple):
     sizes: tuple[int, int] | None = None  # entries of observations and actions, if known
 
 
-def as_policy(policy: Any, label: str | None = None) -> ActingPolicy:
+def as_policy(policy: Any, label: str | None = None, *, trust: bool = False) -> ActingPolicy:
     """Make a policy ready to fly, whatever it is.
+
+    A model's file (.zip) may hold code. None is run unless you trust the file: built-in policies of
+    Stable-Baselines3 and those of this package are read by their tensors.
 
     Args:
         policy: Name in the zoo; path of an exported policy (.npz), of a model of Stable-Baselines3 (.zip), or
             of a run folder; an `ExportedPolicy`; a model; or a function from observations, shape (B, n_obs),
             to actions, shape (B, n_u).
         label: Its name in tables; the file or class by default.
+        trust: Whether to execute the code in a model's file where its tensors do not suffice.
 
     Returns:
         The policy.
@@ -53,7 +56,7 @@ def as_policy(policy: Any, label: str | None = None) -> ActingPolicy:
     """
     if isinstance(policy, str | Path):
         path = policy_path(policy)
-        return as_policy(read_policy(path), label or _label(policy))
+        return as_policy(read_policy(path, trust=trust), label or _label(policy))
     if isinstance(policy, ExportedPolicy):
         name = label or str(policy.metadata.get("agent", "exported policy"))
         sizes = policy.n_observation, policy.n_action
@@ -160,37 +163,54 @@ class _OnGoals:
         return self._act(np.concatenate(list(single.values()), axis=1) if self._joined else single)
 
 
-def read_policy(path: Path) -> Any:
-    """Read an exported policy or a model of Stable-Baselines3."""
+def read_policy(path: Path, *, trust: bool = False) -> Any:
+    """Read an exported policy or a model of Stable-Baselines3; only a trusted file's code is executed."""
     if not path.exists():
         raise PolicyError(f"{path}: there is no such file or folder")
     if path.suffix == ".npz":
         return ExportedPolicy.load(path)
     if path.suffix == ".zip":
-        return _read_model(path)
+        return _read_model(path, trust=trust)
     raise PolicyError(
         f"{path}: should be an exported policy (.npz), a model of Stable-Baselines3 (.zip), a run folder, "
         "or a name in the zoo"
     )
 
 
-def _read_model(path: Path) -> Any:
-    """Load a model to act, without a replay buffer; its file's policy class names the algorithm."""
+def _read_model(path: Path, *, trust: bool) -> Any:
+    """Read a model by its tensors, or have Stable-Baselines3 load it, which executes what its pickles say."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            home = json.loads(archive.read("data"))["policy_class"]["__module__"]
-    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
-        raise PolicyError(f"{path} is not a model of Stable-Baselines3 ({error})") from error
+        return read_model(path)
+    except NeedsCodeError as error:
+        if trust:
+            return _load_model(path)
+        raise PolicyError(
+            f"{error}: only code in the file can fly it, so give --trust, in Python trust=True, if you trust "
+            "whoever made it"
+        ) from error
+    except ModelArchiveError as error:
+        raise PolicyError(str(error)) from error
+    except ModuleNotFoundError as error:
+        raise _lacking(path, error) from error
+
+
+def _load_model(path: Path) -> Any:
+    """Load a trusted model to act, without a replay buffer; its attributes tell the algorithm."""
     try:
         from sb3_contrib import TQC
         from stable_baselines3 import PPO, SAC, TD3
     except ModuleNotFoundError as error:
-        raise ImportError(
-            f'{path} needs {error.name}: pip install "dq-space-arm[agents]". An exported policy needs neither'
-        ) from error
-    off_policy = (SAC, TQC, TD3)
-    learner = next((each for each in off_policy if f".{each.__name__.lower()}." in f".{home}."), PPO)
+        raise _lacking(path, error) from error
+    attributes = read_attributes(path)
+    marks: dict[str, Any] = {"top_quantiles_to_drop_per_net": TQC, "target_entropy": SAC, "policy_delay": TD3}
+    learner = next((marks[name] for name in marks if name in attributes), PPO)
     options: dict[str, Any] = {}
-    if learner in off_policy:
+    if learner is not PPO:
         options = {"buffer_size": 1, "replay_buffer_class": None, "replay_buffer_kwargs": {}}
     return learner.load(path, device="cpu", **options)
+
+
+def _lacking(path: Path, error: ModuleNotFoundError) -> ImportError:
+    return ImportError(
+        f'{path} needs {error.name}: pip install "dq-space-arm[agents]". An exported policy needs neither'
+    )

@@ -114,3 +114,8 @@ start_option = click.option(
     help="Begin here: numbers separated by commas, or a file (.npy, .json, .npz).  [default: the scene's "
     "own start]",
 )
+trust_option = click.option(
+    "--trust",
+    is_flag=True,
+    help="Execute the code in models (.zip) that need it, with your rights: only if you trust who made them.",
+)

@@ -4,7 +4,8 @@ An entry point of the group `dq_space_arm.policies` names a module with three fu
 
     policy_names() -> dict[str, str]                    descriptions by name; fast, for completion
     owns_policy(policy: str) -> bool                        whether it can load this name or path
-    load_policy(policy, start, console, seed) -> Pilot  for an episode that begins at `start`
+    load_policy(policy, start, console, seed, trust) -> Pilot  for an episode that begins at `start`;
+                                                            executes no code of the file unless `trust`
 """
 
 from __future__ import annotations
@@ -35,13 +36,15 @@ def policy_names() -> dict[str, str]:
     return names
 
 
-def load_policy(policy: str, start: Start, console: Console, seed: int | None) -> Pilot:
+def load_policy(
+    policy: str, start: Start, console: Console, seed: int | None, *, trust: bool = False
+) -> Pilot:
     """Load a policy by name or path; `console` shows the progress of a solve."""
     if policy.lower() in _BUILT_IN:
         return _built_in(policy.lower(), start, seed)
     for source in _sources():
         if source.owns_policy(policy):
-            pilot: Pilot = source.load_policy(policy, start, console, seed)
+            pilot: Pilot = source.load_policy(policy, start, console, seed, trust)
             return pilot
     known = list(policy_names())
     if Path(policy).exists():

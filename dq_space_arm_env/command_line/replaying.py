@@ -21,6 +21,7 @@ def collect_flights(
     console: Console,
     *,
     seed: int | None = None,
+    trust: bool = False,
 ) -> tuple[list[Trajectory], Scene]:
     """Read flights, and let policies fly from where the first one starts, or where `seed` does.
 
@@ -42,7 +43,7 @@ def collect_flights(
         begun = begin(scene, seed, state)
         for place, (label, source) in enumerate(sources):
             if place not in recordings:
-                pilot = load_policy(source, begun, console, seed)
+                pilot = load_policy(source, begun, console, seed, trust=trust)
                 recordings[place] = fly(scene, begun, pilot, seed=seed, label=label)
     return common_scene([recordings[place] for place in range(len(sources))], scene)
 

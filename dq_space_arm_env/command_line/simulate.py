@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dq_space_arm_env.command_line.names import SCENE, seed_option, start_option
+from dq_space_arm_env.command_line.names import SCENE, seed_option, start_option, trust_option
 from dq_space_arm_env.command_line.policy_sources import POLICY, load_policy
 from dq_space_arm_env.command_line.verb import json_option, print_document
 from dq_space_arm_env.common.console import message_console, table_console
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     help="File for the flight (.npz), which `replay` shows.",
 )
 @click.option("--label", help="Name of the flight in a replay.")
+@trust_option
 @json_option
 def simulate(
     scene: str,
@@ -66,6 +67,7 @@ def simulate(
     noise: float,
     out: Path | None,
     label: str | None,
+    trust: bool,
     as_json: bool,
 ) -> None:
     """Fly one episode of SCENE, a name or a file, and report the outcome.
@@ -83,7 +85,7 @@ def simulate(
     if out is not None:
         check_writable(out.parent)
     begun = begin(loaded, seed, start)
-    pilot = load_policy(policy, begun, message_console(), seed)
+    pilot = load_policy(policy, begun, message_console(), seed, trust=trust)
     flight = fly(loaded, begun, pilot, seed=seed, noise=noise, label=label)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -31,8 +31,8 @@ def owns_policy(policy: str) -> bool:
     return policy.lower() in _NAMES or "feedback_gains" in archive_members(Path(policy))
 
 
-def load_policy(policy: str, start: Start, console: Console, seed: int | None) -> Pilot:
-    """Solve the maneuver from a start, or read its solution."""
+def load_policy(policy: str, start: Start, console: Console, seed: int | None, trust: bool) -> Pilot:
+    """Solve the maneuver from a start, or read its solution, which holds no code."""
     from dq_space_arm_env.command_line.simulated_episode import Pilot
     from dq_space_arm_env.environment.rollouts import StateFeedback
     from dq_space_arm_env.scene import StateLayout

@@ -1,0 +1,240 @@
+"""Models of Stable-Baselines3 (.zip), read by their tensors: the file may hold code, and none of it is run.
+
+A model's file holds its attributes as JSON, those that JSON cannot hold as pickles in text, and its tensors
+in files of PyTorch. Pickles execute what they contain. The actor of every built-in policy follows from the
+tensors and the JSON, which names classes, spaces and options beside the pickles.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.policies import ExportedPolicy
+from agents.policies.tensor_files import TensorFileError, read_tensors
+
+MOST_BYTES = {"data": 1 << 26, "policy.pth": 1 << 28}
+"""Largest members of a model's file that are read."""
+
+_POLICIES = frozenset(
+    {
+        "stable_baselines3.common.policies",
+        "stable_baselines3.sac.policies",
+        "stable_baselines3.td3.policies",
+        "sb3_contrib.tqc.policies",
+        "agents.reinforcement.networks",
+        "agents.reinforcement.sac",
+    }
+)
+"""Modules whose policies act as this file computes."""
+_SCALED_ACTIONS = "agents.reinforcement.networks"  # an output of 1 means the bound of the box
+_EXTRACTORS = ("FlattenExtractor", "CombinedExtractor", "ScaledObservations")
+_ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "SiLU": "silu"}
+
+
+class ModelArchiveError(ValueError):
+    """A file is no model of Stable-Baselines3, or is damaged."""
+
+
+class NeedsCodeError(ModelArchiveError):
+    """A model acts by code in its file."""
+
+
+class _Actor(NamedTuple):
+    """Where a kind of policy keeps its actor."""
+
+    layers: str  # prefix of the numbered layers
+    last: str  # name of the last layer; empty if it is numbered as well
+    extractors: tuple[str, ...]  # prefixes of what prepares observations, the first that is there
+    squash: str
+    activation: str  # unless the file says otherwise
+    ignored: tuple[str, ...]  # prefixes of tensors without effect on deterministic actions
+
+
+_CRITICS = ("critic.", "critic_target.", "actor_target.", "actor.log_std.")
+_ACTORS = (
+    _Actor(
+        "mlp_extractor.policy_net.",
+        "action_net",
+        ("pi_features_extractor.", "features_extractor."),
+        "clip",
+        "tanh",
+        (
+            "features_extractor.",
+            "vf_features_extractor.",
+            "mlp_extractor.value_net.",
+            "value_net.",
+            "log_std",
+        ),
+    ),
+    _Actor("actor.latent_pi.", "actor.mu", ("actor.features_extractor.",), "tanh", "relu", _CRITICS),
+    _Actor("actor.mu.", "", ("actor.features_extractor.",), "tanh", "relu", _CRITICS),
+)
+
+
+def read_model(path: Path) -> ExportedPolicy:
+    """Read the deterministic policy of PPO, A2C, SAC, TQC, TD3 or DDPG without executing anything.
+
+    Args:
+        path: The model's file.
+
+    Returns:
+        The policy; it acts like the model up to rounding in single precision.
+
+    Raises:
+        NeedsCodeError: If the policy is not one of Stable-Baselines3's or of this package.
+        ModelArchiveError: If the file is damaged, or no model.
+        ImportError: If PyTorch is not installed.
+    """
+    try:
+        return _policy(read_attributes(path), _read_arrays(path))
+    except NeedsCodeError as error:
+        raise NeedsCodeError(f"{path}: {error}") from error
+    except (OSError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise ModelArchiveError(f"{path} is not a model of Stable-Baselines3 ({error})") from error
+    except TensorFileError as error:
+        raise ModelArchiveError(f"{path}: policy.pth is {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        missing = f"it has no {error}" if isinstance(error, KeyError) else error
+        raise ModelArchiveError(f"{path} is not a model of Stable-Baselines3 ({missing})") from error
+
+
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Attributes of a model by name; those that JSON cannot hold are mappings with pickled text, not read."""
+    try:
+        attributes = json.loads(_member(path, "data"))
+    except RecursionError:
+        raise ValueError("data is nested too deep") from None
+    if not isinstance(attributes, dict):
+        raise ValueError("data should be a mapping")
+    return attributes
+
+
+def _member(path: Path, name: str) -> bytes:
+    with zipfile.ZipFile(path) as archive:
+        size = archive.getinfo(name).file_size
+        if size > MOST_BYTES[name]:
+            raise ValueError(f"{name} has {size:,} bytes, should have {MOST_BYTES[name]:,} at most")
+        return archive.read(name)
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Tensors of a model's policy by name."""
+    content = _member(path, "policy.pth")
+    tensors = read_tensors(content)
+    if not isinstance(tensors, dict):
+        raise ValueError("policy.pth should be a mapping")
+    for name, tensor in tensors.items():
+        # A tensor may repeat one number at any length.
+        if tensor.numel() * tensor.element_size() > len(content):
+            raise ValueError(f"{str(name)[:80]} has more numbers than the file")
+    return {str(name): tensor.detach().numpy() for name, tensor in tensors.items()}
+
+
+def _policy(data: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]]) -> ExportedPolicy:
+    module, options = str(data["policy_class"]["__module__"]), _checked_options(data)
+    if module not in _POLICIES:
+        raise NeedsCodeError(f"its policy is a class of {module[:80]!r}, not of Stable-Baselines3")
+    actor = next((each for each in _ACTORS if any(name.startswith(each.layers) for name in tensors)), None)
+    if actor is None:
+        raise NeedsCodeError("its network is none of PPO, A2C, SAC, TQC, TD3 or DDPG")
+    weights, biases = _layers(actor, tensors)
+    scale = _action_scale(data["action_space"], len(biases[-1]))
+    if actor.squash == "clip":
+        if module == _SCALED_ACTIONS:
+            weights[-1], biases[-1] = weights[-1] * scale, biases[-1] * scale
+        elif not (scale == 1.0).all():
+            raise NeedsCodeError(f"its actions reach {scale}, should reach 1")
+        scale = np.ones_like(scale)
+    mean, factor = _units(actor, tensors, len(weights[0]))
+    is_goal = str(data["observation_space"][":type:"]) == "<class 'gymnasium.spaces.dict.Dict'>"
+    return ExportedPolicy(
+        weights=tuple(weights),
+        biases=tuple(biases),
+        activation=_activation(options, actor.activation),
+        squash=actor.squash,
+        action_scale=scale,
+        mean=mean,
+        scale=factor,
+        metadata={"observation": "goal" if is_goal else "plain"},
+    )
+
+
+def _checked_options(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Options of the policy; those that change how it acts in other ways are refused."""
+    options = data["policy_kwargs"]
+    if data.get("use_sde") or options.get("use_sde"):
+        raise NeedsCodeError("its actions depend on state-dependent exploration")
+    extractor = _class_name(options.get("features_extractor_class", _EXTRACTORS[0]))
+    if extractor not in _EXTRACTORS:
+        raise NeedsCodeError(f"its observations go through {extractor!r}")
+    return dict(options)
+
+
+def _layers(
+    actor: _Actor, tensors: Mapping[str, NDArray[Any]]
+) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
+    """Weights, transposed, and biases of the actor's layers in order."""
+    numbers = {
+        int(match[1])
+        for name in tensors
+        if (match := re.fullmatch(re.escape(actor.layers) + r"(\d{1,4})\.weight", name))
+    }
+    names = [f"{actor.layers}{number}" for number in sorted(numbers)] + ([actor.last] if actor.last else [])
+    used = {f"{name}.{part}" for name in names for part in ("weight", "bias")}
+    known = (*actor.ignored, *actor.extractors)
+    others = sorted(name for name in tensors if name not in used and not name.startswith(known))
+    if others:
+        raise NeedsCodeError(f"its network has {others[0][:80]!r}, which plain layers have not")
+    if any(tensors[f"{name}.weight"].ndim != 2 for name in names):
+        raise NeedsCodeError("its network has layers that are not linear")
+    weights = [tensors[f"{name}.weight"].astype(np.float64).T for name in names]
+    return weights, [tensors[f"{name}.bias"].astype(np.float64) for name in names]
+
+
+def _action_scale(space: Mapping[str, Any], n_action: int) -> NDArray[np.float64]:
+    """Largest actions, shape (n_u,), from the text of a symmetric box."""
+    low, high = (
+        np.array([float(number) for number in space[key].strip("[]").split()]) for key in ("low", "high")
+    )
+    if high.shape != (n_action,) or not np.array_equal(low, -high):
+        raise NeedsCodeError(
+            f"its actions are in [{space['low'][:80]}, {space['high'][:80]}], should be symmetric, one range "
+            f"for each of {n_action}"
+        )
+    return high
+
+
+def _units(
+    actor: _Actor, tensors: Mapping[str, NDArray[Any]], n_observation: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and scale of observations, shape (n_obs,) each."""
+    prefix = next((each for each in actor.extractors if any(name.startswith(each) for name in tensors)), None)
+    if prefix is None:
+        return np.zeros(n_observation), np.ones(n_observation)
+    found = {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+    if set(found) != {"mean", "scale"}:
+        raise NeedsCodeError("its observations go through a network of their own")
+    return found["mean"].astype(np.float64), found["scale"].astype(np.float64)
+
+
+def _activation(options: Mapping[str, Any], default: str) -> str:
+    if "activation_fn" not in options:
+        return default
+    name = _class_name(options["activation_fn"])
+    if name not in _ACTIVATIONS:
+        raise NeedsCodeError(f"its activation is {name!r}, not one of {', '.join(_ACTIVATIONS)}")
+    return _ACTIVATIONS[name]
+
+
+def _class_name(text: Any) -> str:
+    """The name in `<class 'package.module.Name'>`."""
+    return str(text)[:200].removesuffix("'>").rpartition(".")[2]
