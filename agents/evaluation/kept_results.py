@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from dq_space_arm_env.common.code_cache import cache_directory
 from dq_space_arm_env.common.files import write_atomically
-from dq_space_arm_env.compiler.native import cache_directory
 
 Row = dict[str, Any]
 ROWS = "rows"

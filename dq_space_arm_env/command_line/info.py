@@ -131,7 +131,7 @@ def _required() -> dict[str, list[str]]:
 
 def caches() -> dict[str, Any]:
     """Measure the caches."""
-    from dq_space_arm_env.compiler.native import cache_directory
+    from dq_space_arm_env.common.code_cache import cache_directory
 
     folder = cache_directory()
     nearest = next(path for path in (folder, *folder.parents) if path.exists())

@@ -56,10 +56,15 @@ def open_regular(path: str | os.PathLike[str], most: int) -> IO[bytes]:
     return file
 
 
-def _check_kind(path: str | os.PathLike[str], found: os.stat_result, most: int) -> None:
+def kind_of(mode: int) -> str:
+    """Say what is no regular file; `mode` is that of its status."""
     kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
+    return kinds.get(stat.S_IFMT(mode), "a device")
+
+
+def _check_kind(path: str | os.PathLike[str], found: os.stat_result, most: int) -> None:
     if not stat.S_ISREG(found.st_mode):
-        kind = kinds.get(stat.S_IFMT(found.st_mode), "a device")
+        kind = kind_of(found.st_mode)
         raise UnreadableError(f"{os.fspath(path)} is {kind}, it should be a regular file")
     if found.st_size > most:
         raise _too_large(path, found.st_size, most)

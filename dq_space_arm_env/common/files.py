@@ -1,35 +1,123 @@
-"""Atomic writes, checks of folders and archives, JSON."""
+"""Atomic files, checks of files, folders and archives, JSON."""
 
+import contextlib
 import json
 import math
 import os
+import re
+import secrets
+import stat
+import time
 from pathlib import Path
 from typing import Any
 
+from dq_space_arm_env.common.bounded_reading import kind_of
+
+STALE = 86_400.0
+"""Age at which the temporary file of a killed process is removed, s; a living one is renamed long before."""
+
+_TEMPORARY = re.compile(r"\.(.+)\.[0-9a-f]{16}\.part", re.DOTALL)
+
 
 def write_atomically(path: Path, content: str | bytes, *, durable: bool = False) -> None:
-    """Write a file in one go, or leave the existing one as it is; `durable` waits until the disk has it."""
+    """Write a file in one go, or leave the existing one as it is.
+
+    A link stays, and the file it points to is written. An existing file keeps its permissions; a new one gets
+    those of any other file. What killed processes left of earlier attempts is removed once it is `STALE`.
+
+    Args:
+        path: File to write.
+        content: New content; text is encoded in UTF-8.
+        durable: Whether to wait until the disk has it.
+
+    Raises:
+        ValueError: If a device, a pipe, a socket or a folder is there.
+        OSError: If the file cannot be written, for example on a full disk.
+    """
+    target, mode = _target(path)
     data = content.encode() if isinstance(content, str) else content
-    # Not mkstemp, whose files nobody else may read.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    _replace(target, data, mode=mode, durable=durable)
+    remove_leftovers(target.parent, target.name, age=STALE)
+
+
+def write_privately(path: Path, content: bytes) -> None:
+    """Replace whatever is at a path, in one go, by a file that only this user may read or write."""
+    _replace(path, content, creation_mode=0o600)
+
+
+def temporary_name(name: str) -> str:
+    """Return a hidden name that no other host, process or thread uses, for what will be renamed to `name`."""
+    return f".{name}.{secrets.token_hex(8)}.part"
+
+
+def remove_leftovers(folder: Path, name: str | None = None, *, age: float = 0.0) -> None:
+    """Remove temporary files that killed processes left in a folder.
+
+    Args:
+        folder: Folder to look in.
+        name: Only those of the file of this name.
+        age: Only those that were last written this long ago, s. Without an age, the caller holds the lock of
+            the folder.
+    """
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            match = _TEMPORARY.fullmatch(entry.name)
+            if match is None or (name is not None and match[1] != name):
+                continue
+            with contextlib.suppress(OSError):
+                if time.time() - entry.stat(follow_symlinks=False).st_mtime >= age:
+                    Path(entry).unlink()
+
+
+def _replace(
+    path: Path, data: bytes, *, mode: int | None = None, creation_mode: int = 0o666, durable: bool = False
+) -> None:
+    """Write a temporary file beside a path, and rename it."""
+    temporary = path.with_name(temporary_name(path.name))
+    # O_EXCL: never through a link or into a file that is there already.
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     try:
-        temporary.write_bytes(data)
-        if durable:
-            _flush(temporary)
+        with os.fdopen(os.open(temporary, flags, creation_mode), "wb") as file:
+            file.write(data)
+            if mode is not None:
+                temporary.chmod(mode)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         temporary.replace(path)
-        if durable:
-            _flush(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+    if durable and os.name != "nt":  # Windows opens no folders
+        _flush(path.parent)
 
 
-def _flush(path: Path) -> None:
-    """Wait until the disk has the content of a file, or the entries of a folder."""
-    descriptor = os.open(path, os.O_RDONLY)
+def _target(path: Path) -> tuple[Path, int | None]:
+    """Follow links; return the file and its permissions, None if it does not exist."""
+    target = Path(os.path.realpath(path))
+    try:
+        mode = target.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return target, None
+    if not stat.S_ISREG(mode):
+        raise ValueError(f"{path} is {kind_of(mode)}: name a regular file, or one that does not exist")
+    return target, stat.S_IMODE(mode)
+
+
+def _flush(folder: Path) -> None:
+    """Wait until the disk has the entries of a folder."""
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def check_writable_file(path: Path) -> None:
+    """Raise ValueError if a file cannot be created or replaced; create nothing."""
+    target, mode = _target(path)
+    check_writable(target.parent)
+    if mode is not None and not os.access(target, os.W_OK):
+        raise ValueError(f"{path}: no permission to write this file")
 
 
 def check_writable(folder: Path) -> None:

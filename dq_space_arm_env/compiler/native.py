@@ -1,33 +1,22 @@
 """Machine code: compile for this processor, cache the object file, load it without compiling.
 
 An object file is cached under the hash of everything it depends on: the program's content, the compiler's and
-the model's source, the versions of LLVM and CasADi, and the processor. A cached file is used only if it
-belongs to this user, is writable by nobody else, and its checksum and key match; otherwise it is rebuilt.
+the model's source, the versions of LLVM and CasADi, and the processor.
 """
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
-import hashlib
 import json
-import os
-import stat
-import tempfile
-import warnings
 from collections.abc import Callable
 from functools import cache
 from itertools import count
-from pathlib import Path
 from typing import Any
 
-import llvmlite
 import llvmlite.binding as llvm
-import platformdirs
 
+from dq_space_arm_env.common.code_cache import keep_code, read_code
 from dq_space_arm_env.common.host_machine import host_machine
-
-_MAGIC = b"DQSpaceArm native kernel 1\n"
 
 KernelFunction = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
 
@@ -102,68 +91,16 @@ class NativeKernel:
         self.metadata = metadata
 
 
-def cache_directory() -> Path:
-    """Folder of the compiled kernels: $DQ_SPACE_ARM_CACHE, or the platform's user cache folder."""
-    configured = os.environ.get("DQ_SPACE_ARM_CACHE")
-    return Path(configured) if configured else Path(platformdirs.user_cache_dir("dq-space-arm"))
-
-
-def cache_key(*parts: str) -> str:
-    """Hash everything a kernel depends on, including the machine and tool versions."""
-    machine = host_machine()
-    everything = [*parts, llvmlite.__version__, str(llvm.llvm_version_info), machine.cpu, machine.features]
-    return hashlib.sha256(json.dumps(everything).encode()).hexdigest()
-
-
 def load_or_build(name: str, key: str, build: Callable[[], tuple[bytes, dict[str, Any]]]) -> NativeKernel:
     """Load a kernel from the cache, or build and store it.
 
     `build` returns the object file and the metadata; it is called when the cache has no sound file.
     """
-    path = cache_directory() / f"{name}-{key[:32]}.kernel"
-    cached = _read(path, key)
-    if cached is None:
-        cached = build()
-        _write(path, key, *cached)
-    return NativeKernel(name, *cached)
-
-
-def _read(path: Path, key: str) -> tuple[bytes, dict[str, Any]] | None:
-    """Read a cache file; None if it is missing, foreign or damaged."""
-    try:
-        with path.open("rb") as file:
-            status = os.fstat(file.fileno())
-            foreign = hasattr(os, "getuid") and status.st_uid != os.getuid()
-            if foreign or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-                return None
-            content = file.read()
-    except OSError:
-        return None
-    digest, payload = content[len(_MAGIC) : len(_MAGIC) + 32], content[len(_MAGIC) + 32 :]
-    if not content.startswith(_MAGIC) or hashlib.sha256(payload).digest() != digest:
-        return None
-    header, _, object_code = payload.partition(b"\n")
-    notes = json.loads(header)
-    return (object_code, notes["metadata"]) if notes["key"] == key else None
-
-
-def _write(path: Path, key: str, object_code: bytes, metadata: dict[str, Any]) -> None:
-    """Write a cache file under a temporary name and rename it, so no reader sees a partial one."""
-    payload = json.dumps({"key": key, "metadata": metadata}).encode() + b"\n" + object_code
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-        try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(_MAGIC + hashlib.sha256(payload).digest() + payload)
-            Path(temporary).replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                Path(temporary).unlink()
-            raise
-    except OSError as error:
-        warnings.warn(
-            f"cannot keep compiled kernels in {path.parent} ({error.strerror}); they are compiled again "
-            "in every process. Set DQ_SPACE_ARM_CACHE to a folder that can be written.",
-            stacklevel=2,
-        )
+    kept = read_code(name, key)
+    if kept is None:
+        object_code, metadata = build()
+        keep_code(name, key, json.dumps(metadata).encode() + b"\n" + object_code)
+    else:
+        header, _, object_code = kept.partition(b"\n")
+        metadata = json.loads(header)
+    return NativeKernel(name, object_code, metadata)

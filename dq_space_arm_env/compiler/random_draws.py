@@ -16,6 +16,7 @@ import numpy as np
 from llvmlite import ir
 from numpy.typing import NDArray
 
+from dq_space_arm_env.common.code_cache import cache_key
 from dq_space_arm_env.compiler import native
 from dq_space_arm_env.compiler.vector_builder import DOUBLE, INDEX, POINTER
 
@@ -56,7 +57,7 @@ def draws_kernel(count: int) -> native.NativeKernel:
         }
         return native.compile_to_object(_assembly(count)), metadata
 
-    key = native.cache_key("uniform_draws", Path(__file__).read_text(encoding="utf-8"), str(count))
+    key = cache_key("uniform_draws", Path(__file__).read_text(encoding="utf-8"), str(count))
     return native.load_or_build("uniform_draws", key, build)
 
 

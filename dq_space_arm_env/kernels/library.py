@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.common.code_cache import cache_directory, cache_key
 from dq_space_arm_env.common.host_machine import host_machine
 from dq_space_arm_env.compiler import native
 from dq_space_arm_env.kernels.bound import BoundKernel, rows_of
@@ -103,7 +104,7 @@ class KernelLibrary:
             self._announce()
             return build_program(trace(), lanes, self.scene.simulation.precision)
 
-        return BoundKernel(native.load_or_build(name, native.cache_key(*parts), build))
+        return BoundKernel(native.load_or_build(name, cache_key(*parts), build))
 
     def operation_count(self, name: str, *, integrator: str | None = None) -> int:
         """Arithmetic operations of a program per state, after folding and sharing subexpressions."""
@@ -133,7 +134,7 @@ class KernelLibrary:
             _logger().info(
                 "compiling scene %r for its first use, which takes seconds; the result is kept in %s",
                 self.scene.name,
-                native.cache_directory(),
+                cache_directory(),
             )
 
 

@@ -22,7 +22,7 @@ from itertools import islice
 from typing import Any
 
 from dq_space_arm_env import Scene
-from dq_space_arm_env.compiler.native import cache_directory
+from dq_space_arm_env.common.code_cache import cache_directory
 from experts.demonstrations.outcomes import expert_of
 from experts.demonstrations.settings import differences, software
 from experts.demonstrations.shard import ShardResult, Task, make_shard

@@ -15,6 +15,8 @@ from numba import njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from experts.native.loop_cache import LoopCache
+
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 BufferTable = NDArray[np.int64]
 
@@ -41,7 +43,9 @@ def inlined(loop: Loop) -> Loop:
 def _compile(loop: Loop, *, in_place: bool) -> Loop:
     options: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
     options["forceinline"] = in_place
-    return cast(Loop, njit(cache=True, nogil=True, boundscheck=False, **options)(loop))
+    dispatcher = njit(nogil=True, boundscheck=False, **options)(loop)
+    dispatcher._cache = LoopCache(loop)  # numba's way to cache, but for whose files it trusts
+    return cast(Loop, dispatcher)
 
 
 def _emit_call(typing_context: Any, address: Any, begin: Any, end: Any, buffers: Any) -> Any:

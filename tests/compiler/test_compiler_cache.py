@@ -1,17 +1,23 @@
 """The cache of object files: found by other processes, never trusted when damaged or foreign."""
 
 import os
+import stat
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
+from dq_space_arm_env.common import code_cache
+from dq_space_arm_env.common.code_cache import cache_key
 from dq_space_arm_env.compiler import native
 from dq_space_arm_env.compiler.build import build_program
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
+
+posix = pytest.mark.skipif(os.name == "nt", reason="POSIX permissions and files")
 
 
 @pytest.fixture
@@ -42,7 +48,7 @@ def value(kernel):
 
 
 def load(builder, key="key"):
-    return native.load_or_build("double", native.cache_key(key), builder)
+    return native.load_or_build("double", cache_key(key), builder)
 
 
 def the_file(cache):
@@ -67,7 +73,7 @@ def flip(position):
     return flipped
 
 
-FOREIGN = [b"", b"DQSpaceArm native kernel 1\n", b"\x7fELF" + bytes(1000)]
+FOREIGN = [b"", code_cache._MAGIC, b"\x7fELF" + bytes(1000)]
 
 
 @pytest.mark.parametrize(
@@ -78,9 +84,10 @@ def test_a_damaged_or_foreign_file_is_rebuilt_once(cache, damage):
     load(builder)
     path = the_file(cache)
     path.write_bytes(damage(path.read_bytes()))
-    for _ in range(2):
+    with pytest.warns(UserWarning, match=r"double-\w+\.kernel is damaged; its code is compiled again"):
         assert value(load(builder)) == 6.0
-        assert builder.calls == 2
+    assert value(load(builder)) == 6.0
+    assert builder.calls == 2
 
 
 def test_a_sound_file_under_the_wrong_name_is_rebuilt(cache):
@@ -90,17 +97,115 @@ def test_a_sound_file_under_the_wrong_name_is_rebuilt(cache):
     (own,) = set(cache.glob("*.kernel")) - {foreign}
     own.write_bytes(foreign.read_bytes())
     builder = Builder(2.0)
-    assert value(load(builder)) == 6.0
+    with pytest.warns(UserWarning, match="is damaged"):
+        assert value(load(builder)) == 6.0
     assert builder.calls == 1
 
 
-@pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
-def test_a_file_that_others_can_write_is_rebuilt(cache):
+@posix
+@pytest.mark.parametrize("mode", [0o660, 0o602, 0o666])
+def test_a_file_that_others_can_write_is_rebuilt(cache, mode):
     builder = Builder()
     load(builder)
-    the_file(cache).chmod(0o666)
+    the_file(cache).chmod(mode)
+    with pytest.warns(UserWarning, match="can be written by others"):
+        load(builder)
     load(builder)
     assert builder.calls == 2
+    assert stat.S_IMODE(the_file(cache).stat().st_mode) == 0o600
+
+
+@posix
+def test_a_file_of_another_user_is_rebuilt(cache, monkeypatch):
+    builder = Builder()
+    load(builder)
+    monkeypatch.setattr(os, "getuid", lambda: the_file(cache).stat().st_uid + 1)
+    with pytest.warns(UserWarning, match="belongs to another user"):
+        assert value(load(builder)) == 6.0
+    assert builder.calls == 2
+
+
+@posix
+@pytest.mark.parametrize("kind", ["pipe", "link to a device"])
+def test_what_is_no_regular_file_is_replaced(cache, kind):
+    builder = Builder()
+    load(builder)
+    path = the_file(cache)
+    path.unlink()
+    os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
+    with pytest.warns(UserWarning, match="it should be a regular file; its code is compiled again"):
+        assert value(load(builder)) == 6.0
+    assert path.is_file()
+    assert not path.is_symlink()
+
+
+@posix
+def test_code_is_never_written_through_a_link(cache, tmp_path):
+    load(Builder())
+    path, other = the_file(cache), tmp_path / "other"
+    path.rename(tmp_path / "elsewhere")
+    other.write_text("mine")
+    path.symlink_to(other)
+    with pytest.warns(UserWarning, match="is damaged|can be written"):
+        load(Builder())
+    assert other.read_text() == "mine"
+
+
+def test_the_files_unused_for_longest_are_removed_above_the_limit(cache, monkeypatch):
+    for number in range(6):
+        code_cache.keep_code("code", f"{number}" * 64, bytes(1000))
+        os.utime(cache / f"code-{str(number) * 32}.kernel", (number, number))
+    leftover = cache / f".{the_first(cache)}.0123456789abcdef.part"
+    leftover.touch()
+    os.utime(leftover, (0, 0))
+    (cache / "notes.txt").write_text("of others")
+    assert code_cache.read_code("code", "0" * 64) == bytes(1000)  # used again: now the newest
+    monkeypatch.setattr(code_cache, "LIMIT", 4000)
+    code_cache.keep_code("code", "6" * 64, bytes(1000))
+    assert sorted(path.name[5] for path in cache.glob("*.kernel")) == ["0", "5", "6"]
+    assert {path.name for path in cache.iterdir() if path.suffix != ".kernel"} == {"notes.txt"}
+
+
+def the_first(cache):
+    return min(path.name for path in cache.iterdir())
+
+
+def test_a_process_that_trims_disturbs_no_reader(cache, monkeypatch):
+    monkeypatch.setattr(code_cache, "LIMIT", 20_000)
+
+    def use(thread):
+        wrong = 0
+        for turn in range(200):
+            key = f"{(thread + turn) % 16:032x}" * 2
+            code = code_cache.read_code("code", key)
+            if code is None:
+                code_cache.keep_code("code", key, key.encode() * 40)
+            else:
+                wrong += code != key.encode() * 40
+        return wrong
+
+    with ThreadPoolExecutor(8) as pool:
+        assert sum(pool.map(use, range(8))) == 0
+    assert sum(path.stat().st_size for path in cache.iterdir()) <= 20_000 + 8 * 3000
+
+
+@posix
+def test_a_full_disk_costs_only_the_cache(cache):
+    with limited_file_size(1000), pytest.warns(UserWarning, match="cannot keep machine code"):
+        assert value(load(Builder())) == 6.0
+    assert list(cache.iterdir()) == []
+
+
+@contextmanager
+def limited_file_size(size):
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_a_folder_that_cannot_be_written_costs_only_the_cache(tmp_path, monkeypatch):
@@ -144,4 +249,4 @@ def test_two_processes_at_once_agree(cache):
     with ThreadPoolExecutor() as pool:
         outputs = pool.map(run_process, [cache] * 3)
     assert len({output.stdout.split("\n")[0] for output in outputs}) == 1
-    assert not list(cache.glob("*.tmp"))
+    assert not list(cache.glob(".*"))

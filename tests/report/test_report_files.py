@@ -1,46 +1,13 @@
-"""Files are written whole, and `summary.json` is JSON whatever happened."""
+"""`summary.json` is JSON whatever happened."""
 
 import dataclasses
 import json
 import math
-import os
-from pathlib import Path
 
 import pytest
 
-from dq_space_arm_env.common.files import to_json, write_atomically
+from dq_space_arm_env.common.files import to_json
 from experts.report import ManeuverRun, summarize
-
-
-def test_file_is_replaced_and_nothing_is_left_over(tmp_path: Path) -> None:
-    file = tmp_path / "a.txt"
-    for content in ("old", "Δt", b"\x00\xff"):
-        write_atomically(file, content)
-        assert file.read_bytes() == (content if isinstance(content, bytes) else content.encode())
-    assert list(tmp_path.iterdir()) == [file]
-
-
-def test_failure_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "a.txt"
-    file.write_text("old")
-
-    def full(self: Path, data: bytes) -> int:
-        self.open("wb").close()
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match="no space"):
-        write_atomically(file, "new")
-    assert file.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [file]
-
-
-@pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
-def test_others_may_read_the_file(tmp_path: Path) -> None:
-    file, usual = tmp_path / "a.txt", tmp_path / "usual.txt"
-    usual.touch()
-    write_atomically(file, "text")
-    assert file.stat().st_mode == usual.stat().st_mode
 
 
 def test_summary_has_the_numbers_of_the_run(short_run: ManeuverRun) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 
 from llvmlite import ir
 
+from dq_space_arm_env.common.code_cache import cache_key
 from dq_space_arm_env.compiler import native
 
 LANES = 8  # samples processed at a time; the buffer of a row is a multiple of them long
@@ -44,7 +45,7 @@ def fill_kernel(samples: int) -> native.NativeKernel:
     def build() -> tuple[bytes, dict[str, Any]]:
         return native.compile_to_object(_assembly(samples)), {}
 
-    key = native.cache_key(_NAME, Path(__file__).read_text(encoding="utf-8"), str(samples))
+    key = cache_key(_NAME, Path(__file__).read_text(encoding="utf-8"), str(samples))
     return native.load_or_build(_NAME, key, build)
 
 
