@@ -9,6 +9,7 @@ more than one.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
@@ -26,6 +27,11 @@ KernelFunction = Callable[[int, int, int], None]
 @cache
 def _helpers(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads - 1, thread_name_prefix="dq-space-arm")
+
+
+if hasattr(os, "register_at_fork"):
+    # Threads do not survive a fork: the child's work would pile up in a queue that nobody empties.
+    os.register_at_fork(after_in_child=_helpers.cache_clear)
 
 
 def run_shared(function: KernelFunction, rows: int, buffers: int, threads: int = 1) -> None:
@@ -53,10 +59,23 @@ def share_rows(work_on: Callable[[int, int], None], rows: int, threads: int, blo
         while (ticket := next(tickets)) < blocks:
             work_on(ticket * block, min(rows, (ticket + 1) * block))
 
-    helpers: list[Future[None]] = [_helpers(threads).submit(work) for _ in range(threads - 1)]
+    helpers = _begin(work, threads)
     try:
         work()
     finally:
         for helper in helpers:
             if not helper.cancel():
                 helper.result()
+
+
+def _begin(work: Callable[[], None], threads: int) -> list[Future[None]]:
+    """Hand work to helpers, to fewer where the system starts no more threads or the interpreter is ending."""
+    pool, begun = _helpers(threads), []
+    try:
+        for _ in range(threads - 1):
+            begun.append(pool.submit(work))
+    except RuntimeError:
+        # The refused work is in the queue all the same: let nobody begin it after the arrays are gone.
+        pool.shutdown(cancel_futures=True)
+        _helpers.cache_clear()
+    return [helper for helper in begun if not helper.cancelled()]

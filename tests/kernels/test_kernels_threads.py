@@ -68,14 +68,34 @@ def test_an_error_of_a_helper_is_raised():
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork")
-def test_a_forked_process_does_its_work_alone():
+def test_a_forked_process_starts_helpers_that_run():
     threads.run_shared(lambda *block: None, 3000, 0, 2)
     process = os.fork()
     if process == 0:
         done = []
         threads.run_shared(lambda *block: done.append(block), 3000, 0, 2)
-        os._exit(0 if sum(end - begin for begin, end, _ in done) == 3000 else 1)
+        whole = sum(end - begin for begin, end, _ in done) == 3000
+        # Work that nobody takes would pile up, step by step.
+        os._exit(0 if whole and threads._helpers(2).submit(lambda: 7).result(timeout=30) == 7 else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 0
+
+
+def test_work_is_done_where_no_more_threads_can_be_started(monkeypatch):
+    threads._helpers.cache_clear()
+    start, started = threading.Thread.start, []
+
+    def start_one(thread):
+        if started:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", start_one)
+    for _ in range(2):
+        done = []
+        threads.run_shared(lambda *block, done=done: done.append(block), 4096, 0, 4)
+        assert sorted(block[0] for block in done) == list(range(0, 4096, 256))
+        assert not started[0].is_alive()  # nobody works on arrays that the caller may drop
 
 
 def test_no_thread_at_all_is_refused():
