@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.real_arrays import real_array
 
 FORMAT = 1  # version of the files
 
@@ -168,9 +169,11 @@ class ExportedPolicy:
             Inputs as fractions of their limits, in [-1, 1], float32, shape (n_u,) or (B, n_u).
 
         Raises:
+            TypeError: If the observation is masked, or not of real numbers.
             ValueError: If the shape does not fit.
         """
-        observation = np.asarray(observation)
+        if type(observation) is not np.ndarray:
+            observation = real_array("observation", observation)
         shape = observation.shape
         if shape == self.mean.shape:
             return self._evaluate(observation, self._work)

@@ -18,6 +18,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.common.real_arrays import DOUBLE, SINGLE, real_array
 from dq_space_arm_env.environment.reset_options import check_size, given_start
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
@@ -280,15 +281,17 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
 
         Raises:
             ResetNeeded: Before the first reset, and after the end of an episode.
+            TypeError: If the action is masked, or not of real numbers.
             ValueError: If the action has a wrong shape or a NaN.
         """
         if self._over:
             state = "is over" if self._begun else "has not begun"
             raise ResetNeeded(f"the episode {state}: call reset() before step()")
-        # An array knows its shape; anything else is asked for it more slowly.
-        shape = action.shape if isinstance(action, np.ndarray) else np.shape(action)
-        if shape != self._action_shape:
-            raise ValueError(f"action: shape {shape}, should be {self._action_shape}")
+        # Arrays of floats are taken as they are; telling them by identity costs nothing.
+        if type(action) is not np.ndarray or not ((kind := action.dtype) is SINGLE or kind is DOUBLE):
+            action = real_array("action", action)
+        if action.shape != self._action_shape:
+            raise ValueError(f"action: shape {action.shape}, should be {self._action_shape}")
         self._action[...] = action
         self._take_step()  # inputs, motion, observation, reward and end of the episode: task/episode.py
         over, success, diverged = self._flags.tolist()

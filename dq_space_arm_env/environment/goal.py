@@ -12,6 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.environment.dq_space_arm import OBSERVATION_LIMIT, DQSpaceArmEnv
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene
@@ -229,6 +230,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
 
         Raises:
             ResetNeeded: Before the first reset, and after the end of an episode.
+            TypeError: If the action is masked, or not of real numbers.
             ValueError: If the action has a wrong shape or a NaN.
         """
         _, _, self._truncated, _, info = self._env.step(action)
@@ -265,6 +267,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
             Reward, dimensionless, a float or shape (B,).
 
         Raises:
+            TypeError: If a goal is masked, or not of real numbers.
             ValueError: If the goals have wrong or different shapes.
         """
         rewards = self._rewards(self._compare(achieved_goal, desired_goal), _diverged(info))
@@ -307,7 +310,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
 
     def _compare(self, achieved: ArrayLike, desired: ArrayLike) -> _Comparison:
         """Compare goals in machine code, bit-equal for a pair alone and in a batch."""
-        goals = [np.asarray(goal, self.kernels.dtype) for goal in (achieved, desired)]
+        goals = [real_array("goals", goal, self.kernels.dtype) for goal in (achieved, desired)]
         if any(goal.shape[-1:] != (8,) for goal in goals):
             shapes = " and ".join(str(goal.shape) for goal in goals)
             raise ValueError(f"goals: shapes {shapes}, should be (8,) or (B, 8)")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import dual_quaternion
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene.start import PLANAR_POSE, target_entries
 from dq_space_arm_env.task.step_report import STATE_LIMIT
@@ -102,7 +103,7 @@ def _checked_target(kernels: Kernels, target: Any) -> Array:
 
 
 def _finite(name: str, value: Any, size: int) -> Array:
-    numbers = np.array(value, dtype=np.float64)
+    numbers = real_array(f"options: {name}", value).astype(np.float64)
     if numbers.shape != (size,) or not np.isfinite(numbers).all():
         raise ValueError(
             f"options: {name} {numbers} of shape {numbers.shape}, should be finite numbers of shape {(size,)}"

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.compiler.random_draws import draws_kernel, generator_states
 from dq_space_arm_env.environment.reset_options import GivenStart
 from dq_space_arm_env.kernels import Kernels
@@ -116,9 +117,10 @@ class SubEnvironments:
         """Step all sub-environments; actions of those about to be reset do not matter.
 
         Raises:
+            TypeError: If the actions are masked, or not of real numbers.
             ValueError: If the actions have a wrong shape, or NaN where they matter; nothing has changed then.
         """
-        values = np.asarray(actions)
+        values = real_array("actions", actions)
         if values.shape != self._action_shape:
             raise ValueError(f"actions: shape {values.shape}, should be {self._action_shape}")
         values = np.ascontiguousarray(values, np.float32 if values.dtype == np.float32 else np.float64)

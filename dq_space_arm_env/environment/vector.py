@@ -16,6 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.environment.reset_options import GivenStart, given_start
 from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
@@ -240,6 +241,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
 
         Raises:
             ResetNeeded: Before the first reset, and with autoreset disabled when an episode is over.
+            TypeError: If the actions are masked, or not of real numbers.
             ValueError: If the actions have a wrong shape or a NaN; nothing has moved then.
         """
         resetting = self._over
@@ -280,11 +282,12 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
 
         Raises:
             ResetNeeded: Before the first reset.
+            TypeError: If the increments are masked, or not of real numbers.
             ValueError: If the increments have a wrong shape.
         """
         if not self._begun:
             raise ResetNeeded("the episodes have not begun: call reset() before perturb()")
-        increments = np.asarray(increments, dtype=np.float64)
+        increments = real_array("increments", increments, np.float64)
         expected = self.num_envs, self.kernels.n_t
         if increments.shape != expected:
             raise ValueError(f"increments: shape {increments.shape}, should be {expected}")
@@ -304,11 +307,12 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
 
         Raises:
             ResetNeeded: Before the first reset.
+            TypeError: If the states are masked, or not of real numbers.
             ValueError: If the states have a wrong shape.
         """
         if not self._begun:
             raise ResetNeeded("the episodes have not begun: call reset() before observe()")
-        x = self._envs.x if states is None else np.asarray(states)
+        x = self._envs.x if states is None else real_array("states", states)
         if x.shape != self._envs.x.shape:
             raise ValueError(f"states: shape {x.shape}, should be {self._envs.x.shape}")
         return self._envs.observe_states(x)

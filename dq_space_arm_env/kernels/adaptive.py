@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.kernels.library import KernelLibrary
 
@@ -163,7 +164,7 @@ def _intervals(held: Array, duration: float) -> Iterator[tuple[float, float, Arr
 
 def _checked(kernels: KernelLibrary, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
     """The start, shape (n_x,), and the inputs of all intervals, shape (N, n_u)."""
-    start, held = np.array(x, dtype=kernels.dtype), np.array(u, dtype=kernels.dtype)
+    start, held = real_array("x", x).astype(kernels.dtype), real_array("u", u).astype(kernels.dtype)
     if start.shape != (kernels.n_x,):
         raise ValueError(f"x: shape {start.shape}, should be ({kernels.n_x},)")
     if held.ndim == 1:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.compiler import native
 from dq_space_arm_env.kernels.threads import run_shared
 
@@ -140,12 +141,12 @@ def run_kernel(address: int, begin: int, end: int, buffers: NDArray[np.int64]) -
 _function_at = cache(native.KernelFunction)
 
 
-def rows_of(inputs: dict[str, ArrayLike | None], dtype: DTypeLike) -> tuple[int, bool, dict[str, Array]]:
+def rows_of(inputs: Mapping[str, ArrayLike], dtype: DTypeLike) -> tuple[int, bool, dict[str, Array]]:
     """Broadcast inputs, (n,) or (B, n) by name, to rows; `h` is shared by all of them.
 
     Returns the number of rows, whether there is a batch axis, and the arrays.
     """
-    arrays = {name: np.asarray(value, dtype=dtype) for name, value in inputs.items()}
+    arrays = {name: real_array(name, value, dtype) for name, value in inputs.items()}
     shared = {name: arrays.pop(name) for name in ("h",) if name in arrays}
     batches = {name: array.shape[0] for name, array in arrays.items() if array.ndim == 2}
     for name, array in arrays.items():

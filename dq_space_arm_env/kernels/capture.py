@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.dynamics.chain import Chain, RigidBody
 from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 from dq_space_arm_env.dynamics.minimal import (
@@ -125,7 +126,7 @@ def catch_payload(free: Kernels, loaded: Kernels, x: ArrayLike, payload_twist: A
 
 
 def _finite(name: str, value: ArrayLike, size: int) -> Array:
-    numbers = np.array(value, dtype=np.float64)
+    numbers = real_array(name, value).astype(np.float64)
     if numbers.shape != (size,) or not np.isfinite(numbers).all():
         raise ValueError(
             f"{name}: {numbers} of shape {numbers.shape}, should be finite numbers of shape {(size,)}"

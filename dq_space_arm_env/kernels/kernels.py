@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import walk
 from dq_space_arm_env.kernels.library import KernelLibrary
 from dq_space_arm_env.scene import Scene, load_scene
@@ -92,7 +93,7 @@ class Kernels(KernelLibrary):
         """
         if steps < 1 or every < 1:
             raise ValueError(f"steps: {steps}, every: {every}, should be at least 1")
-        start, inputs = np.asarray(x, self.dtype), np.asarray(u, self.dtype)
+        start, inputs = real_array("x", x, self.dtype), real_array("u", u, self.dtype)
         if start.shape != (self.n_x,) or inputs.shape not in ((self.n_u,), (steps, self.n_u)):
             raise ValueError(
                 f"x: shape {start.shape}, u: shape {inputs.shape}, should be ({self.n_x},), and "

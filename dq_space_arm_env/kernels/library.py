@@ -110,7 +110,7 @@ class KernelLibrary:
         """Arithmetic operations of a program per state, after folding and sharing subexpressions."""
         return self.kernel(name, integrator=integrator).operation_count
 
-    def call(self, name: str, integrator: str | None = None, **inputs: ArrayLike | None) -> tuple[Array, ...]:
+    def call(self, name: str, integrator: str | None = None, **inputs: ArrayLike) -> tuple[Array, ...]:
         """Run a program on one row or a batch; outputs take the form of the inputs."""
         rows, batched, arrays = rows_of(inputs, self.dtype)
         kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.maneuver import AxisLimits
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import PLANAR_POSE, Array, free_axes, initial_state, is_planar
@@ -119,7 +120,7 @@ class StateLayout:
         Returns:
             Controls, shape (..., n_u), N, N m, rad/s.
         """
-        return np.asarray(action, dtype=np.float64) * self.control_limit
+        return real_array("action", action, np.float64) * self.control_limit
 
     def to_action(self, control: ArrayLike) -> Array:
         """Scale controls to actions, the inverse of `to_control`.
@@ -130,7 +131,7 @@ class StateLayout:
         Returns:
             Fractions of the limits, shape (..., n_u); 0 where a control has no limit.
         """
-        return np.asarray(control, dtype=np.float64) / self.control_limit
+        return real_array("control", control, np.float64) / self.control_limit
 
     @classmethod
     def of(cls, scene: Scene) -> "StateLayout":
