@@ -16,9 +16,7 @@ of imitation, a folder for each part |
 Files and checkpoints are written under a temporary name and renamed: under their own name they are complete.
 """
 
-import fcntl
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,7 +27,8 @@ import numpy as np
 
 from agents.configuration import AgentConfiguration, load_configuration
 from dq_space_arm_env import Scene, load_scene
-from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.files import remove_leftovers, temporary_name, write_atomically
+from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.environment.rollouts import Policy, rollout
 from dq_space_arm_env.validation import dump_yaml
@@ -54,14 +53,9 @@ class RunFolderError(RuntimeError):
 def reserved(path: Path) -> Iterator[None]:
     """Lock a folder against other training processes; the system releases the lock when the process ends."""
     path.mkdir(parents=True, exist_ok=True)
-    with (path / LOCK).open("w") as file:
-        try:
-            # Not flock, whose lock would live on in forked workers after a kill.
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (BlockingIOError, PermissionError) as error:
-            raise RunFolderError(
-                f"another process trains in {path}: wait for it, or use another folder"
-            ) from error
+    refusal = RunFolderError(f"another process trains in {path}: wait for it, or use another folder")
+    with locked(path / LOCK, refusal):
+        remove_leftovers(path)
         yield
 
 
@@ -120,14 +114,14 @@ class RunFolder:
         return max(complete, key=lambda path: int(path.name), default=None)
 
     def add_checkpoint(self, steps: int, write: Callable[[Path], None]) -> None:
-        """Have `write` fill an empty folder, then let it replace the last checkpoint."""
+        """Have `write` fill an empty folder, then let it replace the last checkpoint, of fewer steps."""
         folder = self.path / CHECKPOINTS
-        temporary = folder / f".{os.getpid()}{_PART}"
-        shutil.rmtree(temporary, ignore_errors=True)
+        final = folder / f"{steps:0{_DIGITS}d}"
+        if final.exists():  # to replace it, it would have to be removed first
+            return
+        temporary = folder / temporary_name(final.name)
         temporary.mkdir()
         write(temporary)
-        final = folder / f"{steps:0{_DIGITS}d}"
-        shutil.rmtree(final, ignore_errors=True)
         temporary.rename(final)
         for other in folder.iterdir():
             if other != final and (other.name.isdigit() or other.suffix == _PART):

@@ -13,7 +13,7 @@ from rich.console import Console
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.command_line.verb_program import run_to_end
 from dq_space_arm_env.common.console import SUCCESS
-from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.files import check_writable_file, write_atomically
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 from experts import BoxDDP
 from experts.figures.animation import check_gif, draw_maneuver, encode_gif
@@ -30,6 +30,7 @@ def _run(options: argparse.Namespace) -> int:
     config = {key: value for key, value in vars(options).items() if key in ("azimuth", "elevation")}
     picture = PictureFormat.checked(options.width, options.height, config)
     check_gif(options.fps, options.hold, options.colors)
+    check_writable_file(options.out)
     scene = load_scene(options.scene)
     solution = BoxDDP(scene).solve()
     maneuver = Maneuver(scene, solution.states, solution.controls)

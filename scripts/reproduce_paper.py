@@ -9,7 +9,7 @@ import click
 from dq_space_arm_env.command_line.names import SCENE, OneOf
 from dq_space_arm_env.command_line.verb import json_option
 from dq_space_arm_env.command_line.verb_program import run_to_end
-from dq_space_arm_env.common.files import check_writable
+from dq_space_arm_env.common.files import check_writable, check_writable_file
 from dq_space_arm_env.scene import INTEGRATORS, load_scene
 from experts.report import reproduction
 
@@ -52,6 +52,8 @@ def reproduce(
         loaded = loaded.replace(simulation={**loaded.simulation.model_dump(), "integrator": integrator})
     folder = out or reproduction.results_folder(loaded)
     check_writable(folder)
+    if readme_picture is not None:
+        check_writable_file(readme_picture)
     return reproduction.run(
         loaded,
         folder,

@@ -19,7 +19,7 @@ from dq_space_arm_env.command_line.verb import (
     print_document,
 )
 from dq_space_arm_env.common.console import FAILURE, SUCCESS
-from dq_space_arm_env.common.files import check_writable
+from dq_space_arm_env.common.files import check_writable, check_writable_file
 
 Function = Callable[..., Any]
 
@@ -178,5 +178,7 @@ def show(
         )
     from agents.evaluation.showing import show as fly_and_show
 
+    if gif is not None:
+        check_writable_file(gif)
     reached = fly_and_show(destination(out, as_json, picture), chosen, scene, seed, n, gif, trust=trust)
     return SUCCESS if reached else FAILURE

@@ -103,6 +103,7 @@ def _save(console: Console, destination: Destination, gif: Path | None, pairs: S
             write_atomically(folder / name, as_png(partial(make, pairs[0])))
             files.append(name)
     if gif is not None:
+        gif.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(gif, _animation(pairs[0].agent.maneuver))
         files.append(str(gif))
     console.print(f"{folder}: {', '.join(files)}", markup=False)

@@ -1,5 +1,6 @@
 """Train an agent by reinforcement: configuration -> environment -> learner -> learn -> exported policy."""
 
+import io
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -32,6 +33,7 @@ from agents.reinforcement.warm_start import fly_again, load_start, set_actor, sp
 from agents.run_folder import DEMONSTRATIONS, MODEL, POLICY, TENSORBOARD, RunFolder
 from agents.vec_env import DQSpaceArmVecEnv
 from dq_space_arm_env import Scene, compile_scene, load_scene
+from dq_space_arm_env.common.files import write_atomically
 
 LEARNERS: Mapping[str, type[BaseAlgorithm]] = {
     "PPO": ProximalPolicyOptimization,
@@ -97,7 +99,9 @@ def train_learner(
         torch.set_num_threads(threads)
         environment.close()
     policy.save(folder.path / POLICY)
-    model.save(folder.path / MODEL)
+    content = io.BytesIO()
+    model.save(content)
+    write_atomically(folder.path / MODEL, content.getvalue())
     return Trained(folder.path, model, policy)
 
 

@@ -7,7 +7,7 @@ import click
 from dq_space_arm_env.command_line.names import SCENE, trust_option
 from dq_space_arm_env.command_line.verb import json_option, print_document
 from dq_space_arm_env.common.console import message_console, table_console
-from dq_space_arm_env.common.files import check_writable
+from dq_space_arm_env.common.files import check_writable_file
 
 
 @click.command(
@@ -62,7 +62,7 @@ def replay(
     from dq_space_arm_env.command_line.replaying import collect_flights
     from dq_space_arm_env.viewing.replay import write_replay
 
-    check_writable(out.parent)
+    check_writable_file(out)
     sources = [_labeled(flight) for flight in flights]
     for place, label in enumerate(labels):
         sources[place] = label, sources[place][1]

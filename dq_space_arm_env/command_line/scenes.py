@@ -11,7 +11,7 @@ import click
 from dq_space_arm_env.command_line.names import SCENE, PartOf, description_of, given, scene_files
 from dq_space_arm_env.command_line.verb import json_option, print_document
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, complain, message_console, table_console
-from dq_space_arm_env.common.files import check_writable
+from dq_space_arm_env.common.files import check_writable_file
 
 
 @click.group(
@@ -154,6 +154,7 @@ def _scene_file(file: str, force: bool) -> Path:
 
 
 def _check_free(path: Path, force: bool) -> None:
+    check_writable_file(path)
     if path.exists() and not force:
         raise click.UsageError(f"{path} exists: give another name, or --force", click.get_current_context())
 
@@ -161,7 +162,6 @@ def _check_free(path: Path, force: bool) -> None:
 def _write(path: Path, text: str) -> None:
     from dq_space_arm_env.common.files import write_atomically
 
-    check_writable(path.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, text)
 

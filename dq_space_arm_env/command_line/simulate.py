@@ -11,7 +11,7 @@ from dq_space_arm_env.command_line.names import SCENE, seed_option, start_option
 from dq_space_arm_env.command_line.policy_sources import POLICY, load_policy
 from dq_space_arm_env.command_line.verb import json_option, print_document
 from dq_space_arm_env.common.console import message_console, table_console
-from dq_space_arm_env.common.files import check_writable
+from dq_space_arm_env.common.files import check_writable_file
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -83,7 +83,7 @@ def simulate(
 
     loaded = load_scene(scene)
     if out is not None:
-        check_writable(out.parent)
+        check_writable_file(out)
     begun = begin(loaded, seed, start)
     pilot = load_policy(policy, begun, message_console(), seed, trust=trust)
     flight = fly(loaded, begun, pilot, seed=seed, noise=noise, label=label)

@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import Field, StrictStr, ValidationInfo, field_validator
 
+from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
 from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
 from dq_space_arm_env.scene.pose import Matrix3, Pose
@@ -181,7 +182,7 @@ class Scene(Model):
         """
         text = dump_yaml(self.model_dump(exclude_none=True))
         if path is not None:
-            Path(path).write_text(text, encoding="utf-8")
+            write_atomically(Path(path), text)
         return text
 
     def content_hash(self) -> str:

@@ -16,16 +16,16 @@ therefore complete at any moment; the rest is left over from a killed run and is
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.files import remove_leftovers, write_atomically
+from dq_space_arm_env.common.locks import locked
 from experts.demonstrations.outcomes import REASONS
 from experts.demonstrations.settings import Settings, differences
 from experts.demonstrations.shard import ShardResult
@@ -61,12 +61,9 @@ class Folder:
         """
         for folder in (self.path, self.path / SHARDS, self.path / LOG):
             folder.mkdir(parents=True, exist_ok=True)
-        whole, part = self.path / LOG / "lock", self.path / LOG / f"lock-{self.part.number}-of-{self.part.of}"
-        with _locked(whole, exclusive=self.part.of == 1), _locked(part, exclusive=True):
+        with _reserved(self.path, self.part):
             if self.part.of == 1:  # no other run is writing
-                for name in (SETTINGS, MANIFEST):
-                    for unfinished in self.path.glob(f".{name}.*.part"):
-                        unfinished.unlink()
+                remove_leftovers(self.path)
             self._check_settings()
             yield
 
@@ -158,18 +155,17 @@ def _manifest(settings: Path, paths: list[Path]) -> dict[str, Any]:
 
 
 @contextmanager
-def _locked(path: Path, *, exclusive: bool) -> Iterator[None]:
-    """Hold an exclusive or a shared lock."""
-    import fcntl  # not on Windows
-
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        try:
-            fcntl.flock(descriptor, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise DemonstrationsError(
-                f"another run is writing to {path.parent.parent}: wait for it, or choose another folder"
-            ) from error
+def _reserved(folder: Path, part: Part) -> Iterator[None]:
+    """Lock a part of the work. A run that does all of it excludes any other; parts exclude only that."""
+    refusal = DemonstrationsError(
+        f"another run is writing to {folder}: wait for it, or choose another folder"
+    )
+    log = folder / LOG
+    mine = log / f"lock-{part.number}-of-{part.of}"
+    with ExitStack() as held:
+        with locked(log / "lock", refusal, seconds=10.0):  # held only while looking who is there
+            for other in set(log.glob("lock-*" if part.of == 1 else "lock-1-of-1")) - {mine}:
+                with locked(other, refusal):
+                    pass
+            held.enter_context(locked(mine, refusal))
         yield
-    finally:
-        os.close(descriptor)

@@ -25,6 +25,7 @@ import gymnasium
 import numpy as np
 
 import dq_space_arm_env
+from dq_space_arm_env.common.locks import locked
 from experts.demonstrations.reading import Demonstration, Demonstrations
 from experts.demonstrations.tensors import DemonstrationsError
 
@@ -116,8 +117,6 @@ def _staging(dataset_id: str, overwrite: bool) -> Iterator[Path]:
     The folder's name follows from that of the data set, so that the next process removes the leftovers of a
     killed one; the lock vanishes with the process.
     """
-    import fcntl  # not on Windows
-
     from minari.namespace import create_namespace, list_local_namespaces
     from minari.storage import get_dataset_path
 
@@ -130,19 +129,14 @@ def _staging(dataset_id: str, overwrite: bool) -> Iterator[Path]:
         )
     folder = get_dataset_path() / f".{dataset_id.replace('/', '-')}.part"
     folder.mkdir(exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise DemonstrationsError(
-                f"another process is writing the Minari data set {dataset_id}"
-            ) from error
+    refusal = DemonstrationsError(f"another process is writing the Minari data set {dataset_id}")
+    with locked(folder / "lock", refusal):
         replaced = folder / "replaced"
         try:
             _put_back(replaced, place)
             for leftover in folder.iterdir():
-                shutil.rmtree(leftover)
+                if leftover.is_dir():  # all but the lock
+                    shutil.rmtree(leftover)
             yield folder
             namespace = dataset_id.rpartition("/")[0]
             if namespace and namespace not in list_local_namespaces():
@@ -152,9 +146,7 @@ def _staging(dataset_id: str, overwrite: bool) -> Iterator[Path]:
             (folder / dataset_id).rename(place)
         finally:
             _put_back(replaced, place)
-            shutil.rmtree(folder)
-    finally:
-        os.close(descriptor)
+            shutil.rmtree(folder, ignore_errors=True)  # Windows keeps a file that is locked
 
 
 def _put_back(replaced: Path, place: Path) -> None:

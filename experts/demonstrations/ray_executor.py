@@ -16,13 +16,14 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache
 from itertools import islice
 from typing import Any
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.common.code_cache import cache_directory
+from dq_space_arm_env.common.locks import locked
 from experts.demonstrations.outcomes import expert_of
 from experts.demonstrations.settings import differences, software
 from experts.demonstrations.shard import ShardResult, Task, make_shard
@@ -205,20 +206,14 @@ def _prepare(scene: Scene) -> None:
 @contextmanager
 def _first_alone() -> Iterator[None]:
     """Let the first process work alone; those that wait for it then continue together."""
-    import fcntl  # not on Windows
-
-    descriptor = None
-    # All compile where the folder cannot be locked, as on some network disks.
-    with suppress(OSError):
-        cache_directory().mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(cache_directory(), os.O_RDONLY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            fcntl.flock(descriptor, fcntl.LOCK_SH)
-            fcntl.flock(descriptor, fcntl.LOCK_UN)
-    try:
+    lock = cache_directory() / "compiling.lock"
+    with ExitStack() as held:
+        # All compile where the folder cannot be locked, as on some network disks.
+        with suppress(OSError):
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                held.enter_context(locked(lock, BlockingIOError()))
+            except BlockingIOError:
+                with locked(lock, BlockingIOError(), seconds=-1.0):
+                    pass
         yield
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)

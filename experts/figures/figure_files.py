@@ -75,6 +75,7 @@ def _write(figures: Mapping[str, Draw], folder: Path, formats: Sequence[str]) ->
 
 def write_readme_picture(maneuver: Maneuver, file: Path) -> None:
     """Write snapshots and error curves of a finite maneuver into one PNG of 1600 x 700 pixels."""
+    file.parent.mkdir(parents=True, exist_ok=True)
     with house_style():
         write_atomically(file, encode(_readme_figure(maneuver), "png", _README_DOTS))
 

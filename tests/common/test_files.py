@@ -99,7 +99,10 @@ def test_what_is_no_file_is_refused_and_stays(tmp_path: Path, kind: str, linked:
     elif kind == "folder":
         place.mkdir()
     else:
-        place = Path(os.devnull)
+        try:  # one that nobody misses
+            os.mknod(place, stat.S_IFCHR | 0o666, os.makedev(1, 3))
+        except (AttributeError, PermissionError):
+            pytest.skip("devices can be made by the superuser alone")
     out = place
     if linked:
         out = tmp_path / "link"

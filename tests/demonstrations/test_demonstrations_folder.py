@@ -12,6 +12,7 @@ from demonstration_files import CountingExecutor, contents, shard_files
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.common import files
+from dq_space_arm_env.common.files import temporary_name
 from experts import generate_demonstrations, load_demonstrations
 from experts.demonstrations import Demonstrations, DemonstrationsError, SerialExecutor
 from experts.demonstrations.folder import Folder, Part
@@ -60,8 +61,8 @@ def test_missing_and_half_written_shards_are_made_again(
     first, second = shard_files(folder)[:2]
     first.unlink()
     second.write_bytes(second.read_bytes()[:1000])
-    (folder / "shards" / f".{first.name}.123.part").write_bytes(b"begun")
-    (folder / ".manifest.json.123.part").write_bytes(b"begun")
+    (folder / "shards" / temporary_name(first.name)).write_bytes(b"begun")
+    (folder / temporary_name("manifest.json")).write_bytes(b"begun")
     executor = CountingExecutor()
     go_on(quick_scene, folder, executor)
     assert sorted(executor.made) == [0, 1]
@@ -124,7 +125,7 @@ def test_a_lock_ends_with_its_process(quick_scene: Scene, folder: Path):
         "print('held', flush=True)\n"
         "sys.stdin.read()"
     )
-    command = [sys.executable, "-c", code, str(folder / "log" / "lock")]
+    command = [sys.executable, "-c", code, str(folder / "log" / "lock-1-of-1")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout.readline() == b"held\n"
         with pytest.raises(DemonstrationsError, match="another run is writing to"):

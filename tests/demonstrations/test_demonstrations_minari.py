@@ -1,6 +1,5 @@
 """Demonstrations as a Minari data set: what a user of Minari gets, and that nobody ever sees half of it."""
 
-import fcntl
 import os
 import re
 import shutil
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env.command_line import main
+from dq_space_arm_env.common.locks import locked
 from experts.demonstrations import Demonstrations, DemonstrationsError, export_to_minari, minari_export
 
 minari = pytest.importorskip("minari")
@@ -193,11 +193,11 @@ def test_a_namespace_is_not_overwritten(whole: Demonstrations, root: Path):
 
 def test_two_processes_do_not_write_the_same_data_set(whole: Demonstrations, root: Path):
     (root / STAGING).mkdir(parents=True)
-    descriptor = os.open(root / STAGING, os.O_RDONLY)
-    fcntl.flock(descriptor, fcntl.LOCK_EX)
-    with pytest.raises(DemonstrationsError, match="another process is writing"):
+    with (
+        locked(root / STAGING / "lock", RuntimeError()),
+        pytest.raises(DemonstrationsError, match="another process is writing"),
+    ):
         export_to_minari(whole, ID)
-    os.close(descriptor)
     assert export_to_minari(whole[:1], ID).total_episodes == 1
 
 

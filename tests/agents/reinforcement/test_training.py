@@ -200,6 +200,10 @@ def test_an_unfinished_checkpoint_is_none(scene_file, tmp_path):
     folder.add_checkpoint(30, lambda path: (path / "model.zip").touch())
     left = {path.name for path in (tmp_path / "checkpoints").iterdir()}
     assert left == {"somebody's", f"{30:012d}"}
+    with pytest.raises(OSError, match="full"):
+        folder.add_checkpoint(40, fail)
+    folder.add_checkpoint(30, fail)  # it is there: a kill while it is replaced would leave none
+    assert (folder.checkpoint() / "model.zip").read_bytes() == b""
 
 
 def test_a_folder_is_for_one_configuration_and_scene_but_may_get_more_time(scene_file, tmp_path):
