@@ -93,6 +93,41 @@ def test_pushes_are_recovered_from(plans, experts):
     assert experts["paper"].fallbacks == 0
 
 
+def test_without_iterations_it_is_the_feedback_of_the_stage_that_has_come(short_scene):
+    """Gains move with the stages: u = clip(u_k + K_k (x (-) x_k)), at every stage and not at the first alone."""
+    expert = RecedingHorizonExpert(short_scene, horizon=20, iterations=0)
+    kernels = expert.maneuver.kernels
+    state = kernels.layout.initial_state
+    expert.reset(state)
+    displacement = np.linspace(1e-3, 2e-3, kernels.n_t)
+    gains = expert.plan.solution.feedback_gains
+    for k in range(0, 50):
+        if k in (30, 49):  # the end of the window lies before the end of the episode, and at it
+            assert np.abs((gains[k] - gains[0]) @ displacement).max() > 1e-3
+            seen = kernels.retract(state, displacement)
+            expert(seen)
+            np.testing.assert_allclose(expert.control, expert.plan.policy(seen, k), rtol=1e-9, atol=1e-12)
+        else:
+            expert(state)
+        state = kernels.step(state, expert.plan.solution.controls[k])
+
+
+@pytest.mark.parametrize("horizon", [1, 7])
+def test_what_lies_beyond_the_horizon_costs_what_the_plan_says_of_its_end(short_scene, horizon):
+    """Gradient and Hessian are those of the stage at which the window ends, around the plan's state there."""
+    expert = RecedingHorizonExpert(short_scene, horizon=horizon)
+    expert.reset(expert.maneuver.initial_state)
+    plan = expert.plan
+    for k in range(0, 60 - horizon):
+        expert(plan.solution.states[k])
+        end = k + horizon
+        state, gradient, hessian = expert._work.problem.terminal_inputs
+        np.testing.assert_array_equal(state[0], plan.solution.states[end])
+        np.testing.assert_array_equal(gradient[0], plan.Vx[end])
+        np.testing.assert_array_equal(hessian[0], plan.Vxx[end])
+    assert np.abs(plan.Vxx[1:] - plan.Vxx[:-1]).max(axis=(1, 2)).min() > 0.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.8, 1.2])
 def test_a_payload_of_another_mass_costs_hardly_more_than_to_who_knows_it(factor, plans, experts):
