@@ -208,24 +208,14 @@ def limited_file_size(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-@pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
-def test_a_file_of_another_user_is_rebuilt(cache, monkeypatch):
-    builder = Builder()
-    load(builder)
-    user = os.getuid()
-    for name in ("getuid", "geteuid"):
-        monkeypatch.setattr(os, name, lambda: user + 1)
-    load(builder)
-    assert builder.calls == 2
-
-
 def test_a_file_is_replaced_and_never_written_in_place(cache, tmp_path):
     """Another process may have the old one open."""
     load(Builder())
     path, old = the_file(cache), tmp_path / "old"
     path.write_bytes(b"damaged")
     os.link(path, old)
-    load(Builder())
+    with pytest.warns(UserWarning, match="is damaged"):
+        load(Builder())
     assert old.read_bytes() == b"damaged"
     assert path.read_bytes() != b"damaged"
 

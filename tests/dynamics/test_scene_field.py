@@ -1,4 +1,4 @@
-"""The field of a scene in plain numbers: accelerations undo inverse dynamics, derivatives are those of the rates.
+"""The field of a scene in plain numbers: accelerations undo inverse dynamics, derivatives are of the rates.
 
 Nothing is compiled here: what the compiled dynamics must give is said in `kernels/test_kernels_dynamics.py`.
 """
@@ -59,7 +59,7 @@ def test_the_forces_that_the_accelerations_need_are_those_that_act(name: str, fo
     joints[list(layout.actuated_joints)] = u[control.joint_torque]
     joints -= 3.0 * (np.array(motion.joint_angles) - 0.2) + 0.7 * np.array(motion.joint_rates)
     tip = field.tip_forces(motion, rotations, chain.tip_wrench)
-    expected = np.array([*expected, *joints]) + [*tip.force, *tip.torque, *tip.joints]
+    expected = np.add([*expected, *joints], [*tip.force, *tip.torque, *tip.joints])
     actual = np.array([*needed.force, *needed.torque, *needed.joints])
     if chain.planar:  # what holds the base in its plane
         actual[2:5] = 0.0

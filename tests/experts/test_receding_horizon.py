@@ -94,7 +94,7 @@ def test_pushes_are_recovered_from(plans, experts):
 
 
 def test_without_iterations_it_is_the_feedback_of_the_stage_that_has_come(short_scene):
-    """Gains move with the stages: u = clip(u_k + K_k (x (-) x_k)), at every stage and not at the first alone."""
+    """Gains move with the stages: u = clip(u_k + K_k (x (-) x_k)) at every stage, not at the first alone."""
     expert = RecedingHorizonExpert(short_scene, horizon=20, iterations=0)
     kernels = expert.maneuver.kernels
     state = kernels.layout.initial_state
