@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ from experts.demonstrations import (
     generate_demonstrations,
     load_demonstrations,
 )
-from experts.demonstrations.folder import LOG
+from experts.demonstrations.facts import read_log
 from experts.demonstrations.settings import differences
 from experts.problems.arm_problem import in_double_precision
 
@@ -57,14 +56,7 @@ def prepare_demonstrations(
 
 def expert_seconds(demonstrations: Demonstrations) -> float:
     """Processor time that generating a folder of demonstrations took, s; 0 without a log."""
-    lines = [
-        json.loads(line)
-        for path in sorted((demonstrations.path / LOG).glob("*.jsonl"))
-        for line in path.read_text(encoding="utf-8").splitlines()
-    ]
-    # A shard may have been generated more than once; the last time counts.
-    shards = {line["shard"]: math.fsum(line["seconds"].values()) for line in lines if "shard" in line}
-    return math.fsum(shards.values())
+    return math.fsum(read_log(demonstrations).seconds.values())
 
 
 def stricter(scene: Scene, scale: float) -> Scene:

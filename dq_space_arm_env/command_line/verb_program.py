@@ -21,8 +21,8 @@ GROUP = "dq_space_arm.verbs"
 """Entry-point group: a package adds a verb by naming a Click command here."""
 DEBUG_VARIABLE = "DQ_SPACE_ARM_DEBUG"
 _OURS = ("agents", "dq_space_arm_env", "experts")
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-"""Errors of the disk rather than of what the user asked for."""
+_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENOMEM)
+"""Errors of the disk or the memory rather than of what the user asked for."""
 
 
 def _switch_debug_on(context: click.Context, parameter: click.Parameter, value: bool) -> None:
@@ -123,11 +123,16 @@ def _explain(error: BaseException) -> int:
         see = "" if context is None else f" (see {context.command_path} --help)"
         complain(" ".join(error.format_message().split()) + see)
         return error.exit_code
+    if _is_out_of_memory(error):
+        error.__traceback__ = None  # its frames hold what could be freed
+        # Plainly: the console would need memory of its own.
+        print("Error: out of memory; finished files are complete, repeat the command", file=sys.stderr)
+        return FAILURE
     if isinstance(error, OSError):
         file = error.filename2 or error.filename
         reason = error.strerror or str(error)
         complain(reason if file is None else f"{file}: {reason}")
-        return FAILURE if error.errno in _DISK_FULL else UNUSABLE
+        return FAILURE if error.errno in _MACHINE else UNUSABLE
     if isinstance(error, ValueError | ImportError):
         complain(str(error))
         return UNUSABLE
@@ -140,6 +145,18 @@ def _explain(error: BaseException) -> int:
         f"`{PROGRAM} info` and the traceback that --debug (or {DEBUG_VARIABLE}=1) shows."
     )
     return INTERNAL
+
+
+def _is_out_of_memory(error: BaseException | None) -> bool:
+    """Tell whether memory ran out, in this error or in one that it followed.
+
+    A SystemError is how that ends where the interpreter has no memory for the error itself.
+    """
+    while error is not None:
+        if isinstance(error, MemoryError | SystemError):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _warn(

@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -248,6 +249,42 @@ def test_ctrl_c_says_what_is_kept() -> None:
     result = process(code)
     assert result.returncode == INTERRUPTED
     assert result.stderr.strip() == "Interrupted: the first part remains."
+
+
+def test_ctrl_c_while_the_program_is_imported_is_a_sentence() -> None:
+    result = process(
+        "import sys\n"
+        "class Press:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.endswith('verb_program'):\n"
+        "            raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Press())\n"
+        "from dq_space_arm_env.command_line import main\n"
+        "sys.exit(main(['scenes', 'list']))"
+    )
+    assert result.returncode == INTERRUPTED
+    assert result.stderr == "Interrupted: nothing is saved.\n"
+
+
+def _fail(error: Exception, cause: Exception | None = None) -> None:
+    raise error from cause
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda: _fail(MemoryError()),
+        lambda: _fail(RuntimeError("of a library"), MemoryError()),
+        lambda: _fail(SystemError("error return without exception set")),
+        lambda: _fail(OSError(errno.ENOMEM, "Cannot allocate memory")),
+    ],
+)
+def test_running_out_of_memory_is_no_bug(run: Callable[[], None], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_to_end(run) == FAILURE
+    said = capsys.readouterr().err
+    assert said.startswith("Error: ")
+    assert "memory" in said
+    assert len(said.splitlines()) == 1
 
 
 def test_info_is_one_document(capsys: pytest.CaptureFixture[str]) -> None:
