@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.start import PLANAR_POSE
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.shooting import ShootingWorkspace, line_search
@@ -87,12 +88,21 @@ def _convex_part(matrices: FloatArray) -> FloatArray:
     return np.ascontiguousarray(vectors * np.maximum(values, 0.0)[:, None, :] @ vectors.transpose(0, 2, 1))
 
 
+class MeasurementError(ValueError):
+    """A measurement that is no state: it has numbers that are not finite, or a zero quaternion."""
+
+
 class RecedingHorizonExpert:
     """A policy `action = expert(observation_or_state)`; it owns its work arrays, so give each thread its own.
 
     Observations of `DQSpaceArm-v0` reveal the stage by the time left; the first one, and any with no less
     time left than the last, begins a new episode. States do not reveal it: calls are counted, and `reset`
     begins an episode. A state has n_x entries, an observation one more. Poses are normalized.
+
+    A measurement that is no state, with numbers that are not finite or a zero quaternion, is an error where
+    an episode begins. Within an episode the expert flies on: the state that its last solution predicts for
+    the stage takes the place of the measurement, and `dropouts` counts it. The next good measurement corrects
+    the prediction.
 
     The call that begins an episode plans it first, which takes a fraction of a second; so does `reset` with a
     state. Target and masses are those of the scene: where the environment draws them, pass
@@ -106,6 +116,7 @@ class RecedingHorizonExpert:
         control: Last control in N, N m, rad/s, shape (n_u,).
         fallbacks: Actions of this episode from the plan's feedback policy u = clip(u_k + K_k (x (-) x_k)), or
             from u_k alone where that is not finite, because no finite rollout started at the state.
+        dropouts: Actions of this episode from a predicted state, because the measurement was none.
     """
 
     def __init__(self, scene: Scene | str | Path, horizon: int = 100, iterations: int = 1) -> None:
@@ -131,7 +142,7 @@ class RecedingHorizonExpert:
         self.horizon, self.iterations = horizon, iterations
         self.plan: ManeuverPlan | None = None
         self.control: FloatArray = np.zeros(self.maneuver.n_controls)
-        self.fallbacks = 0
+        self.fallbacks = self.dropouts = 0
         self._next_stage = 0
         self._nominal: Solution | None = None
         self._work: ShootingWorkspace | None = None
@@ -147,12 +158,16 @@ class RecedingHorizonExpert:
                 call.
 
         Raises:
-            ValueError: If it has another shape or is not finite.
+            ValueError: If it has another shape or is no state; the episode goes on then.
             RuntimeError: If the maneuver cannot be simulated from there.
         """
-        self.plan, self._work, self._next_stage, self.fallbacks = None, None, 0, 0
+        start = None
         if observation_or_state is not None:
-            self._begin(*self._read(observation_or_state))
+            given = self._checked(observation_or_state)
+            start = self._state_of(given), self._stage_of(given, 0)
+        self.plan, self._work, self._next_stage, self.fallbacks, self.dropouts = None, None, 0, 0, 0
+        if start is not None:
+            self._begin(*start)
 
     def __call__(self, observation_or_state: ArrayLike) -> FloatArray:
         """Choose an action.
@@ -164,11 +179,22 @@ class RecedingHorizonExpert:
             Inputs as fractions of their limits, in [-1, 1], shape (n_u,).
 
         Raises:
-            ValueError: If it has another shape, is not finite, or its time left exceeds the episode.
+            TypeError: If it is not of real numbers.
+            ValueError: If it has another shape, its time left exceeds the episode, or the episode begins and
+                it is no state; nothing has changed then.
             RuntimeError: If the episode is over, or the maneuver cannot be simulated from its start.
         """
-        state, stage = self._read(observation_or_state)
-        if self.plan is None or stage < self._next_stage:
+        given = self._checked(observation_or_state)
+        stage = self._stage_of(given, self._next_stage)
+        begins = self.plan is None or stage < self._next_stage
+        try:
+            state = self._state_of(given)
+            dropped = False
+        except MeasurementError:
+            if begins:
+                raise
+            state, dropped = self._predicted(stage), True
+        if begins:
             self._begin(state, stage)
         assert self.plan is not None
         work = self._window(self.plan, stage)
@@ -179,36 +205,61 @@ class RecedingHorizonExpert:
         else:
             self._work, self.control = None, _planned_control(self.plan, state, stage)
             self.fallbacks += 1
+        self.dropouts += dropped
         self._next_stage = stage + 1
         return self.control / self.maneuver.control_upper
 
-    def _read(self, observation_or_state: ArrayLike) -> tuple[FloatArray, int]:
-        """Return the state and its stage."""
-        maneuver = self.maneuver
-        given = np.asarray(observation_or_state, dtype=np.float64)
-        if given.shape == (maneuver.n_states + 1,):
-            check_array("observation", given, given.shape)
-            stage = maneuver.horizon - round(given[-1] / maneuver.time_step)
-            if stage == maneuver.horizon:
-                raise RuntimeError("the observation has no time left: the episode is over")
-            if not 0 <= stage < maneuver.horizon:
-                duration = maneuver.horizon * maneuver.time_step
-                raise ValueError(
-                    f"observation[{maneuver.n_states}], the time left, is {given[-1]} s; an episode of scene "
-                    f"{maneuver.scene.name!r} lasts {duration:g} s"
-                )
-            state = maneuver.kernels.state_from_observation(given)
-            check_array("the state behind the observation", state, state.shape)
-            return state, stage
-        if given.shape != (maneuver.n_states,):
+    def _checked(self, observation_or_state: ArrayLike) -> FloatArray:
+        """Return an observation or a state, or raise for another shape; its numbers may be wrong."""
+        n_states = self.maneuver.n_states
+        given = real_array("observation_or_state", observation_or_state, np.float64)
+        if given.shape not in ((n_states,), (n_states + 1,)):
             raise ValueError(
-                f"observation_or_state has shape {given.shape}; expected a state, ({maneuver.n_states},), or "
-                f"an observation, ({maneuver.n_states + 1},)"
+                f"observation_or_state has shape {given.shape}; expected a state, ({n_states},), or "
+                f"an observation, ({n_states + 1},)"
             )
-        check_array("state", given, given.shape)
-        if self._next_stage == maneuver.horizon:
-            raise RuntimeError(f"the episode's {maneuver.horizon} stages are over: call reset()")
-        return self._of_unit_norm(given), self._next_stage
+        return given
+
+    def _stage_of(self, given: FloatArray, following: int) -> int:
+        """Return the stage that an observation reveals, or else the following one."""
+        maneuver, time_left = self.maneuver, float(given[-1])
+        if len(given) == maneuver.n_states or not np.isfinite(time_left):
+            if following == maneuver.horizon:
+                raise RuntimeError(f"the episode's {maneuver.horizon} stages are over: call reset()")
+            return following
+        stage = maneuver.horizon - round(time_left / maneuver.time_step)
+        if stage == maneuver.horizon:
+            raise RuntimeError("the observation has no time left: the episode is over")
+        if not 0 <= stage < maneuver.horizon:
+            duration = maneuver.horizon * maneuver.time_step
+            raise ValueError(
+                f"observation[{maneuver.n_states}], the time left, is {time_left} s; an episode of scene "
+                f"{maneuver.scene.name!r} lasts {duration:g} s"
+            )
+        return stage
+
+    def _state_of(self, given: FloatArray) -> FloatArray:
+        """Return the state; raise MeasurementError where there is none."""
+        try:
+            if len(given) == self.maneuver.n_states:
+                check_array("state", given, given.shape)
+                return self._of_unit_norm(given)
+            check_array("observation", given, given.shape)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                state = self.maneuver.kernels.state_from_observation(given)
+            check_array("the state behind the observation", state, state.shape)
+            return state
+        except ValueError as error:
+            raise MeasurementError(str(error)) from error
+
+    def _predicted(self, stage: int) -> FloatArray:
+        """Return the state that the last solution predicts for a stage, or else the plan's."""
+        assert self.plan is not None
+        if self._work is not None:
+            states, ahead = self._work.current.states, stage - self._next_stage + 1
+            if ahead <= self._work.problem.horizon:
+                return np.array(states[ahead])
+        return np.array(self.plan.solution.states[stage - self.plan.first_stage])
 
     def _of_unit_norm(self, state: FloatArray) -> FloatArray:
         """Return a state with its pose normalized to a unit dual quaternion."""
@@ -227,7 +278,7 @@ class RecedingHorizonExpert:
         if self._nominal is None:
             self._nominal = BoxDDP(self.maneuver).solve()
         self.plan = ManeuverPlan.make(self.maneuver, state, stage, self._nominal)
-        self._work, self._next_stage, self.fallbacks = None, stage, 0
+        self._work, self._next_stage, self.fallbacks, self.dropouts = None, stage, 0, 0
 
     def _window(self, plan: ManeuverPlan, stage: int) -> ShootingWorkspace:
         """Prepare the problem that starts at a stage.

@@ -243,6 +243,50 @@ def test_wrong_input_is_named(paper):
             RecedingHorizonExpert("paper", **setting)
 
 
+def bad_states(state):
+    """Measurements of the right shape that are no states."""
+    nan, infinite, zero = state.copy(), state.copy(), state.copy()
+    nan[9], infinite[20], zero[:8] = np.nan, np.inf, 0.0
+    return [nan, infinite, zero, np.full_like(state, np.nan)]
+
+
+@pytest.mark.parametrize("observed", [False, True])
+def test_a_flight_goes_on_where_measurements_drop_out(observed, paper, plans):
+    """The prediction takes their place, the stages stay right, and each is counted."""
+    kernels, plan = compile_scene("paper"), plans["paper"]
+    limit, x = paper.maneuver.control_upper, plan.states[0]
+    for stage in range(30):
+        seen = kernels.observation(x, [(1000 - stage) * 0.015])[0] if observed else x
+        if stage in (3, 10, 11, 12, 13, 29):
+            seen = bad_states(seen)[stage % 4]  # the last is nothing but NaN, also for the time
+        control = paper(seen) * limit
+        np.testing.assert_allclose(control, plan.controls[stage], atol=5e-3)
+        x = kernels.step(x, control)
+    assert paper.dropouts == 6
+    assert paper.fallbacks == 0
+    np.testing.assert_allclose(x, plan.states[30], atol=1e-4)
+    paper.reset()
+    assert paper.dropouts == 0
+
+
+def test_a_bad_measurement_at_the_start_changes_nothing(paper, plans):
+    start = plans["paper"].states[0]
+    for bad in bad_states(start):
+        for begin in (paper, paper.reset):
+            with pytest.raises(ValueError, match="state"):
+                begin(bad)
+    paper(start)
+    plan = paper.plan
+    with pytest.raises(ValueError, match=r"observation\[9\] is nan"):
+        paper(np.append(bad_states(start)[0], 15.0))  # a new episode
+    with pytest.raises(ValueError, match="state"):
+        paper.reset(bad_states(start)[2])
+    assert paper.plan is plan
+    action = paper(plans["paper"].states[1])
+    np.testing.assert_allclose(action * paper.maneuver.control_upper, plans["paper"].controls[1], atol=5e-3)
+    assert paper.dropouts == 0
+
+
 def test_actions_need_limits():
     scene = load_scene("paper")
     actuators = {**scene.actuators.model_dump(), "wrist_rate": {"limit": np.inf}}
