@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -176,6 +176,34 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
             infos[i]["terminal_observation"] = info["final_obs"][i].astype(np.float32)
             infos[i]["episode"] = {"r": round(returns[k], 6), "l": lengths[k], "t": elapsed}
         self._begin_episodes(copies, info)
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copy the running episodes with their statistics, to `restore` them later or in another process.
+
+        Returns:
+            Arrays by name, see `DQSpaceArmVectorEnv.snapshot`.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+        """
+        lengths = self._step_count - self._first_steps
+        return {**self.vector_env.snapshot(), "returns": self._returns.copy(), "lengths": lengths}
+
+    def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
+        """Go on where a snapshot was taken.
+
+        Args:
+            snapshot: Arrays of an environment with the same scene and `num_envs`.
+
+        Raises:
+            ValueError: If an array is missing, or has another shape or type.
+        """
+        for name in ("returns", "lengths"):
+            if name not in snapshot or snapshot[name].shape != (self.num_envs,):
+                raise ValueError(f"snapshot: {name} is missing, or not of shape ({self.num_envs},)")
+        self.vector_env.restore(snapshot)
+        self._returns[:] = snapshot["returns"]
+        self._first_steps = self._step_count - snapshot["lengths"].astype(np.int64)
 
     def close(self) -> None:
         """Close the vector environment; closing twice is harmless."""

@@ -1,10 +1,8 @@
 """Evaluate, write checkpoints and report progress between updates of a learner."""
 
-import json
 import math
 from collections.abc import Callable
 from datetime import timedelta
-from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -12,49 +10,15 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from agents.configuration import Configuration
 from agents.policies import ExportedPolicy
-from agents.reinforcement.held_actions import HeldActions
+from agents.reinforcement.checkpoint import write_checkpoint
 from agents.reinforcement.networks import export_policy
+from agents.reinforcement.training_progress import Progress
 from agents.run_folder import BEST, RunFolder, validate, validation_seeds
 from agents.zoo.finding import as_policy
 from dq_space_arm_env import Scene
-
-_MODEL, _BUFFER, _PROGRESS = "model.zip", "replay_buffer.pkl", "progress.json"
-
-
-class Progress(NamedTuple):
-    """State of a run, kept in its checkpoints."""
-
-    environment_steps: int = 0  # of all copies together
-    seconds: float = 0.0  # training time, over all starts of the run
-    expert_solves: int = 0  # for demonstrations, or for the policy it started from
-    seconds_before: float = 0.0  # time for these, and for training the policy it started from
-
-
-def write_checkpoint(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:
-    """Write parameters, optimizer state, replay buffer and counters into an empty folder."""
-    model.save(folder / _MODEL)
-    if isinstance(model, OffPolicyAlgorithm):
-        model.save_replay_buffer(folder / _BUFFER)
-    (folder / _PROGRESS).write_text(json.dumps(progress._asdict()), encoding="utf-8")
-
-
-def read_checkpoint(
-    folder: Path, learner: type[BaseAlgorithm], environment: HeldActions, seed: int
-) -> tuple[BaseAlgorithm, Progress]:
-    """Read a checkpoint of your own (it holds pickled objects), to train on in an environment.
-
-    Running episodes are not part of it: new ones start, seeded by the run's seed and the number of steps.
-    """
-    progress = Progress(**json.loads((folder / _PROGRESS).read_text(encoding="utf-8")))
-    model = learner.load(folder / _MODEL, env=environment, device="cpu")
-    if isinstance(model, OffPolicyAlgorithm):
-        model.load_replay_buffer(folder / _BUFFER)
-    model.set_random_seed(seed + progress.environment_steps)
-    return model, progress
 
 
 class Advance(NamedTuple):
@@ -89,8 +53,12 @@ class DivergedError(RuntimeError):
     """Training diverged: the network yields NaN or infinity."""
 
 
+class TimeIsUp(Exception):  # noqa: N818 - an event, not a mistake
+    """The time of a run is up; its learner has used all the data that it has gathered."""
+
+
 class TrainingCallback(BaseCallback):
-    """Evaluates, writes checkpoints and reports between updates; stops when time is up."""
+    """Evaluates, writes checkpoints and reports between updates; stops there when time is up."""
 
     def __init__(
         self,
@@ -150,7 +118,7 @@ class TrainingCallback(BaseCallback):
         )
 
     def _on_step(self) -> bool:
-        return not self.is_time_up
+        return True
 
     @property
     def is_time_up(self) -> bool:
@@ -168,6 +136,8 @@ class TrainingCallback(BaseCallback):
             self._next_checkpoint = _next(steps, schedule.checkpoint_every)
             self.write_checkpoint()
         self._report(self._advance())
+        if self.is_time_up:
+            raise TimeIsUp
 
     def write_checkpoint(self) -> None:
         progress = self.progress

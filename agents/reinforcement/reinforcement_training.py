@@ -24,11 +24,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from agents import configuration as c
 from agents.demonstrations import expert_seconds, prepare_demonstrations
 from agents.policies import ExportedPolicy
-from agents.reinforcement.callback import Advance, Progress, TrainingCallback, read_checkpoint
+from agents.reinforcement.callback import Advance, TimeIsUp, TrainingCallback
+from agents.reinforcement.checkpoint import read_checkpoint
 from agents.reinforcement.held_actions import HeldActions, action_limits
 from agents.reinforcement.networks import ACTIVATIONS, ScaledActionsPolicy, ScaledObservations
 from agents.reinforcement.ppo import ProximalPolicyOptimization
 from agents.reinforcement.sac import DemonstrationBuffer, LayerNormalizedPolicy, SoftActorCritic
+from agents.reinforcement.training_progress import Progress
 from agents.reinforcement.warm_start import fly_again, load_start, set_actor, spent_before
 from agents.run_folder import DEMONSTRATIONS, MODEL, POLICY, TENSORBOARD, RunFolder
 from agents.vec_env import DQSpaceArmVecEnv
@@ -89,8 +91,8 @@ def train_learner(
         if checkpoint is None:
             model, before = begin()
         else:
-            learner = LEARNERS[configuration.algorithm.name]
-            model, before = read_checkpoint(checkpoint, learner, environment, configuration.seed)
+            model = make_learner(configuration, environment, blank=True)
+            before = read_checkpoint(checkpoint, model)
         model.set_logger(configure(str(folder.path / TENSORBOARD), ["tensorboard"]))
         callback = watch(before)
         _learn(model, callback, configuration)
@@ -192,10 +194,13 @@ def _begin(
     )
 
 
-def make_learner(configuration: c.Configuration, environment: HeldActions) -> BaseAlgorithm:
+def make_learner(
+    configuration: c.Configuration, environment: HeldActions, *, blank: bool = False
+) -> BaseAlgorithm:
     """Make an untrained algorithm; PPO's actor starts from `start_from` if given.
 
-    Flies one random episode in the environment to measure the spread of observations.
+    Flies one random episode in the environment to measure the spread of observations. A blank one, whose
+    weights and units are to be replaced, needs neither.
     """
     algorithm, network = configuration.algorithm, configuration.network
     options = algorithm.model_dump(
@@ -204,10 +209,13 @@ def make_learner(configuration: c.Configuration, environment: HeldActions) -> Ba
     first, last = algorithm.learning_rate, algorithm.final_learning_rate
     options["learning_rate"] = LinearSchedule(first, first if last is None else last, 1.0)
     sizes = spaces.flatdim(environment.observation_space), len(action_limits(environment))
-    start = load_start(configuration, *sizes)
-    units = (
-        _units(configuration, environment) if start is None else (start.mean.tolist(), start.scale.tolist())
-    )
+    start = None if blank else load_start(configuration, *sizes)
+    if blank:
+        units = [0.0] * sizes[0], [1.0] * sizes[0]
+    elif start is None:
+        units = _units(configuration, environment)
+    else:
+        units = start.mean.tolist(), start.scale.tolist()
     policy_options: dict[str, Any] = {
         "net_arch": list(network.hidden),
         "activation_fn": ACTIVATIONS[network.activation],
@@ -305,6 +313,8 @@ def _learn(model: BaseAlgorithm, callback: TrainingCallback, configuration: c.Co
     # Stable-Baselines3 adds the requested steps to those done, and runs schedules over the sum.
     try:
         model.learn(left, callback=callback, reset_num_timesteps=model.num_timesteps == 0)
+    except TimeIsUp:
+        pass
     except (ValueError, RuntimeError) as error:
         if _is_rejected_by_torch(error):
             raise callback.diverged() from error

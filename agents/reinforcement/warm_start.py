@@ -11,8 +11,8 @@ from torch import nn
 
 from agents.configuration import Configuration, ConfigurationError
 from agents.policies import ExportedPolicy, PolicyFileError
-from agents.reinforcement.callback import Progress
 from agents.reinforcement.held_actions import HeldActions, action_limits
+from agents.reinforcement.training_progress import Progress
 from agents.vec_env import DQSpaceArmVecEnv
 from agents.zoo.finding import PolicyError, policy_path
 from dq_space_arm_env import Scene

@@ -15,10 +15,11 @@ from agents.demonstrations import expert_seconds, prepare_demonstrations
 from agents.evaluation.plan_followers import follower
 from agents.evaluation.plans import Plans
 from agents.policies import ExportedPolicy
-from agents.reinforcement.callback import Advance, Progress, TrainingCallback
+from agents.reinforcement.callback import Advance, TrainingCallback
 from agents.reinforcement.held_actions import HeldActions
 from agents.reinforcement.networks import export_policy
 from agents.reinforcement.reinforcement_training import Trained, action_scale, make_learner, train_learner
+from agents.reinforcement.training_progress import Progress
 from agents.residual.corrections import correction
 from agents.residual.environment import ResidualVecEnv
 from agents.residual.mismatch import Worlds, fly_mismatched

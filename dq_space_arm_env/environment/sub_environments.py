@@ -73,6 +73,16 @@ class SubEnvironments:
         self.x, self._x_next = self._x_next, self.x
         self._memory, self._memory_next = self._memory_next, self._memory
 
+    def kept(self) -> dict[str, Array]:
+        """Arrays that all later steps and resets depend on."""
+        return {
+            "x": self.x,
+            "memory": self._memory,
+            "parameters": self.parameters,
+            "draws": self._draws,
+            "generators": self._generators,
+        }
+
     def seed(self, rows: Rows, seeds: Sequence[int | None]) -> None:
         """Seed random generators, unpredictably for None; a negative seed is a ValueError."""
         self._generators[rows] = generator_states(seeds)

@@ -317,6 +317,47 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
             raise ValueError(f"states: shape {x.shape}, should be {self._envs.x.shape}")
         return self._envs.observe_states(x)
 
+    def snapshot(self) -> dict[str, Array]:
+        """Copy what all later steps and resets depend on, to `restore` it later or in another process.
+
+        Returns:
+            Arrays by name: states, parameters, random generators, and which episodes are over.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+        """
+        if not self._begun:
+            raise ResetNeeded("the episodes have not begun: call reset() before snapshot()")
+        seen = {} if self._seen is None else {"seen": self._seen}
+        over = np.isin(np.arange(self.num_envs), self._over)
+        return {name: array.copy() for name, array in {**self._envs.kept(), **seen, "over": over}.items()}
+
+    def restore(self, snapshot: Mapping[str, Array]) -> None:
+        """Go on where a snapshot was taken: the same actions give the same bits.
+
+        Args:
+            snapshot: Arrays of an environment with the same scene, `num_envs` and autoreset mode.
+
+        Raises:
+            ValueError: If an array is missing, or has another shape or type.
+        """
+        disabled = self.autoreset_mode is AutoresetMode.DISABLED
+        expected = {**self._envs.kept(), "over": self._all}
+        if disabled:
+            expected["seen"] = np.empty(self.observation_space.shape or (), self.kernels.dtype)
+        for name, array in expected.items():
+            found = snapshot.get(name)
+            if found is None or found.shape != array.shape or found.dtype != array.dtype:
+                given = "is missing" if found is None else f"has shape {found.shape}, type {found.dtype}"
+                raise ValueError(f"snapshot: {name} {given}, should have {array.shape}, {array.dtype}")
+        for name, array in self._envs.kept().items():
+            array[...] = snapshot[name]
+        self._begun, self._over = True, np.flatnonzero(snapshot["over"])
+        self._seen = snapshot["seen"].copy() if disabled else None
+        if self._trails is not None:
+            self._trails.begin(np.arange(self.num_envs))
+            self._trails.append(self._tip_positions())
+
     def _begin_anew(self, rows: Rows, result: StepResult) -> None:
         """Begin new episodes, and overwrite the old observations."""
         self._envs.begin(rows)

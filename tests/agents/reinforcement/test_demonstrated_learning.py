@@ -10,9 +10,9 @@ import torch
 
 from agents import DQSpaceArmVecEnv, ExportedPolicy
 from agents.configuration import load_configuration
-from agents.reinforcement.callback import read_checkpoint
-from agents.reinforcement.reinforcement_training import make_environment
-from agents.reinforcement.sac import DemonstrationBuffer, LayerNormalizedCritic, SoftActorCritic
+from agents.reinforcement.checkpoint import read_checkpoint
+from agents.reinforcement.reinforcement_training import make_environment, make_learner
+from agents.reinforcement.sac import DemonstrationBuffer, LayerNormalizedCritic
 from agents.reinforcement.warm_start import fly_again
 from agents.run_folder import RunFolder
 from agents.training import train
@@ -140,7 +140,8 @@ def test_a_run_resumes_with_both_buffers(trained, demonstrations, small_scene, s
     settings = configuration(demonstrations, small_file)
     checkpoint = RunFolder(trained.folder, settings).checkpoint()
     environment = make_environment(settings, small_scene)
-    model, progress = read_checkpoint(checkpoint, SoftActorCritic, environment, settings.seed)
+    model = make_learner(settings, environment, blank=True)
+    progress = read_checkpoint(checkpoint, model)
     before, after = trained.model.replay_buffer, model.replay_buffer
     assert isinstance(after, DemonstrationBuffer)
     assert after.pos == before.pos > 0

@@ -1,6 +1,8 @@
 """Every algorithm trains, saves, resumes and exports, and acts the same way each time."""
 
+import io
 import json
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -17,9 +19,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import DQSpaceArmVecEnv, ExportedPolicy, evaluate
 from agents.configuration import ConfigurationError, load_configuration
-from agents.reinforcement.callback import DivergedError, read_checkpoint
+from agents.reinforcement.callback import DivergedError
+from agents.reinforcement.checkpoint import read_checkpoint
 from agents.reinforcement.networks import export_policy
-from agents.reinforcement.reinforcement_training import LEARNERS, make_environment, make_learner
+from agents.reinforcement.reinforcement_training import make_environment, make_learner
 from agents.run_folder import RunFolder, RunFolderError, reserved
 from agents.training import train
 from agents.zoo.finding import as_policy, read_policy
@@ -134,8 +137,11 @@ def test_saved_and_exported_policies_act_like_the_model(algorithm, trained):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_run_resumes_with_optimizer_and_buffer(algorithm, scene_file, tmp_path):
-    """Killed after its first checkpoint: what a new process reads there is what was written."""
+def test_a_run_resumes_with_optimizer_and_buffer(algorithm, trained, scene_file, tmp_path):
+    """Killed after its first checkpoint: what a new process reads there is what was written.
+
+    It ends with the very weights of a run that was not killed; new episodes begin with hindsight alone.
+    """
     settings = configuration(algorithm, scene_file)
     kept = {}
 
@@ -158,22 +164,68 @@ def test_a_run_resumes_with_optimizer_and_buffer(algorithm, scene_file, tmp_path
             train(settings, tmp_path / "run", report=kill)
     checkpoint = RunFolder(tmp_path / "run", settings).checkpoint()
     environment = make_environment(settings, load_scene(scene_file))
-    learner = LEARNERS[settings.algorithm.name]
-    model, progress = read_checkpoint(checkpoint, learner, environment, settings.seed)
+    model = make_learner(settings, environment, blank=True)
+    progress = read_checkpoint(checkpoint, model)
     assert progress.environment_steps == kept["steps"] * REPEAT == 1600
     for actual, expected in zip(state_of(model), kept["state"], strict=True):
         np.testing.assert_array_equal(actual, expected)
     if "actions" in kept:
         np.testing.assert_array_equal(model.replay_buffer.actions, kept["actions"])
         assert model.replay_buffer.pos == kept["position"]
+    torch.manual_seed(7)  # as in another process
+    np.random.seed(7)  # noqa: NPY002
+    whole = trained(algorithm)
     run = train(settings, tmp_path / "run")
     assert run.model.num_timesteps * REPEAT == 3200
+    if algorithm != "HER":
+        for actual, expected in zip(state_of(run.model), state_of(whole.model), strict=True):
+            np.testing.assert_array_equal(actual, expected)
+        if "actions" in kept:
+            for name in ("observations", "actions", "rewards", "dones"):
+                columns = (getattr(each.model.replay_buffer, name) for each in (run, whole))
+                np.testing.assert_array_equal(*columns)
     curve = [json.loads(line) for line in (tmp_path / "run" / "evaluations.jsonl").read_text().splitlines()]
     assert [line["environment_steps"] for line in curve] == [1600, 3200]
     assert len(json.loads((tmp_path / "run" / "provenance.json").read_text())) == 3
     again = train(settings, tmp_path / "run")  # nothing is left to do
     for actual, expected in zip(state_of(again.model), state_of(run.model), strict=True):
         np.testing.assert_array_equal(actual, expected)
+
+
+class Bomb:
+    """Unpickling this creates a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_resuming_executes_nothing_that_a_checkpoint_holds(scene_file, tmp_path):
+    settings, bomb = configuration("SAC", scene_file), Bomb(tmp_path / "executed")
+    train(configuration("SAC", scene_file, total_steps=1600), tmp_path / "run")
+    checkpoint = RunFolder(tmp_path / "run", settings).checkpoint()
+    names = {path.name for path in checkpoint.iterdir()}
+    contents = {path: path.read_bytes() for path in checkpoint.iterdir()}
+    for name in names | {"model.zip", "replay_buffer.pkl"}:
+        for armed in (pickle.dumps(bomb), tensors({"parameters": bomb}), b"", b"{}"):
+            (checkpoint / name).write_bytes(armed)
+            if name in names:
+                with pytest.raises(RunFolderError, match=r"checkpoint .* is damaged"):
+                    train(settings, tmp_path / "run")
+        for path, content in contents.items():
+            path.write_bytes(content)
+    (checkpoint / "state.json").unlink()
+    with pytest.raises(RunFolderError, match=r"earlier version, whose pickles are not read"):
+        train(settings, tmp_path / "run")
+    assert not (tmp_path / "executed").exists()
+
+
+def tensors(value):
+    content = io.BytesIO()
+    torch.save(value, content)
+    return content.getvalue()
 
 
 def test_networks_see_the_goals_of_hindsight_although_the_target_never_varies(trained):
@@ -341,5 +393,6 @@ def test_a_network_of_no_numbers_is_not_kept(scene_file, tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [f"{1600:012d}"]
     environment = make_environment(checked, load_scene(scene_file))
     checkpoint = RunFolder(tmp_path, checked).checkpoint()
-    model, _ = read_checkpoint(checkpoint, LEARNERS["PPO"], environment, checked.seed)
+    model = make_learner(checked, environment, blank=True)
+    read_checkpoint(checkpoint, model)
     assert all(torch.isfinite(weights).all() for weights in model.policy.parameters())

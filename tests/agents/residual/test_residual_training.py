@@ -13,9 +13,9 @@ from agents.configuration import load_configuration
 from agents.evaluation.plan_followers import follower
 from agents.evaluation.plans import Plans
 from agents.policies import ExportedPolicy
-from agents.reinforcement.callback import read_checkpoint
+from agents.reinforcement.checkpoint import read_checkpoint
 from agents.reinforcement.networks import export_policy
-from agents.reinforcement.reinforcement_training import LEARNERS, make_learner
+from agents.reinforcement.reinforcement_training import make_learner
 from agents.residual.corrections import CorrectionObserver, correcting, correction
 from agents.residual.mismatch import Worlds, fly_mismatched
 from agents.residual.residual_training import make_residual_environment, silence, train_residual
@@ -157,8 +157,8 @@ def test_it_trains_exports_and_resumes(algorithm, configuration, small_scene, de
         train_residual(settings, tmp_path, report=kill)
     checkpoint = RunFolder(tmp_path, settings).checkpoint()
     environment = make_residual_environment(settings, small_scene, demonstrations)
-    learner = LEARNERS[settings.learner().algorithm.name]
-    model, progress = read_checkpoint(checkpoint, learner, environment, settings.seed)
+    model = make_learner(settings.learner(), environment, blank=True)
+    progress = read_checkpoint(checkpoint, model)
     assert progress.environment_steps == model.num_timesteps * REPEAT == 2400
     run = train_residual(settings, tmp_path)
     assert run.model.num_timesteps * REPEAT == TOTAL

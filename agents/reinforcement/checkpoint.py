@@ -1,0 +1,207 @@
+"""Checkpoints of reinforcement learning: all that the next update depends on, as numbers and text.
+
+| file | content |
+|---|---|
+| `learner.pth` | parameters, optimizers, and the state of PyTorch's random generator |
+| `arrays.npz` | running episodes with the last observations, and the replay buffer |
+| `state.json` | progress of the run, counters, and the states of the other random generators |
+
+A run that is killed and resumed ends with the weights of one that was not, bit for bit on one machine, where
+the environment can be put back into its running episodes. Goal environments (hindsight) and those of
+corrections cannot: there new episodes begin, seeded by the run's seed and its number of steps.
+
+Nothing in these files is executed: a run folder that somebody else made can be resumed.
+"""
+
+import json
+import random
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
+
+from agents.policies.tensor_files import read_tensors
+from agents.reinforcement.sac import DemonstrationBuffer
+from agents.reinforcement.training_progress import Progress
+from agents.run_folder import RunFolderError
+from dq_space_arm_env.common.bounded_formats import read_arrays
+from dq_space_arm_env.common.bounded_reading import read_bytes, read_mapping
+
+LEARNER, ARRAYS, STATE = "learner.pth", "arrays.npz", "state.json"
+MOST_BYTES = 1 << 30
+"""Largest parameters and optimizers that are read."""
+_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "step_factor")
+_COLUMNS = (
+    "observations",
+    "next_observations",
+    "actions",
+    "rewards",
+    "dones",
+    "timeouts",
+    "ep_start",
+    "ep_length",
+)
+_SPARE = 1 << 26  # bytes that an archive has beside what is known of it
+
+
+def write_checkpoint(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:
+    """Write a learner between two rollouts into an empty folder."""
+    parts = {
+        "parameters": model.get_parameters(),
+        "variables": {name: tensor.detach() for name, tensor in _variables(model).items()},
+        "generator": torch.get_rng_state(),
+    }
+    torch.save(parts, folder / LEARNER)
+    np.savez(folder / ARRAYS, allow_pickle=False, **_running(model), **_recorded(model))
+    buffer = getattr(model, "replay_buffer", None)
+    state = {
+        "progress": progress._asdict(),
+        "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
+        "buffer": None if buffer is None else {"pos": int(buffer.pos), "full": bool(buffer.full)},
+        "generators": _generators(model),
+    }
+    (folder / STATE).write_text(json.dumps(state), encoding="utf-8")
+
+
+def read_checkpoint(folder: Path, model: BaseAlgorithm) -> Progress:
+    """Put an untrained learner, and its environment, into the state of a checkpoint.
+
+    Raises:
+        RunFolderError: If the checkpoint is damaged, of another learner, or of an earlier version.
+    """
+    if not (folder / STATE).exists():
+        raise RunFolderError(
+            f"{folder} lacks {STATE}: it is damaged, or of an earlier version, whose pickles are not read: "
+            "train in another folder"
+        )
+    try:
+        state = read_mapping(folder / STATE)
+        parts = read_tensors(read_bytes(folder / LEARNER, MOST_BYTES))
+        expected = sum(8 * array.size for _, array in _columns(model))
+        arrays = read_arrays(folder / ARRAYS, most=expected + _SPARE)
+        return _restored(model, state, parts, arrays)
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).partition("\n")[0]
+        raise RunFolderError(
+            f"checkpoint {folder} is damaged ({reason}): remove it to begin anew, or use another folder"
+        ) from error
+
+
+def _restored(
+    model: BaseAlgorithm, state: Mapping[str, Any], parts: Any, arrays: Mapping[str, NDArray[Any]]
+) -> Progress:
+    progress = Progress(**state["progress"])
+    model.set_parameters(parts["parameters"], exact_match=True, device="cpu")
+    for name, tensor in _variables(model).items():
+        tensor.data.copy_(parts["variables"][name])
+    for name, value in state["counters"].items():
+        if name in _COUNTERS:
+            setattr(model, name, type(getattr(model, name))(value))
+    _fill(model, state["buffer"], arrays)
+    if "last_observations" not in arrays:
+        assert model.seed is not None
+        model.set_random_seed(model.seed + progress.environment_steps)
+        return progress
+    environment: Any = model.get_env()
+    environment.restore(_part("environment.", arrays))
+    model._last_obs = arrays["last_observations"]
+    model._last_episode_starts = arrays["episode_starts"]
+    _seed_again(model, state["generators"], parts["generator"])
+    return progress
+
+
+def _variables(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
+    """Tensors of a learner outside its networks: the weight of the entropy."""
+    return {name: recursive_getattr(model, name) for name in model._get_torch_save_params()[1]}
+
+
+# --- environment ---
+
+
+def _running(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
+    """Running episodes of an environment that can be put back into them; else nothing."""
+    environment: Any = model.get_env()
+    if not hasattr(environment, "snapshot") or not isinstance(model._last_obs, np.ndarray):
+        return {}
+    found = {f"environment.{name}": array for name, array in environment.snapshot().items()}
+    starts = np.asarray(model._last_episode_starts)
+    return {**found, "last_observations": model._last_obs, "episode_starts": starts}
+
+
+def _part(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
+# --- replay buffer ---
+
+
+def _columns(model: BaseAlgorithm) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Arrays of the replay buffer with a row for each decision; those of goals part by part."""
+    buffer = model.replay_buffer if isinstance(model, OffPolicyAlgorithm) else None
+    for name in _COLUMNS if buffer is not None else ():
+        column = getattr(buffer, name, None)
+        if isinstance(column, dict):
+            yield from ((f"buffer.{name}.{key}", part) for key, part in column.items())
+        elif column is not None:
+            yield f"buffer.{name}", column
+
+
+def _recorded(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
+    """The filled rows of the replay buffer, and what else it holds."""
+    buffer: Any = getattr(model, "replay_buffer", None)
+    found = {name: column if buffer.full else column[: buffer.pos] for name, column in _columns(model)}
+    if isinstance(buffer, HerReplayBuffer):
+        found["episodes.start"] = buffer._current_ep_start
+    if isinstance(buffer, DemonstrationBuffer):
+        found["demonstrated.share"] = np.array(buffer.share)
+        found |= {f"demonstrated.{place}": column for place, column in enumerate(buffer._demonstrated)}
+    return found
+
+
+def _fill(model: BaseAlgorithm, place: Any, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Fill an empty replay buffer."""
+    buffer: Any = getattr(model, "replay_buffer", None)
+    if buffer is None:
+        return
+    buffer.pos, buffer.full = place["pos"], place["full"]
+    for name, column in _columns(model):
+        rows = column if buffer.full else column[: buffer.pos]
+        if arrays[name].shape != rows.shape or arrays[name].dtype != rows.dtype:
+            raise ValueError(f"{name} has shape {arrays[name].shape}, should have {rows.shape}")
+        rows[...] = arrays[name]
+    if isinstance(buffer, HerReplayBuffer):
+        buffer._current_ep_start = arrays["episodes.start"]
+        buffer.truncate_last_trajectory()  # its episodes do not go on
+    if isinstance(buffer, DemonstrationBuffer):
+        shown = _part("demonstrated.", arrays)
+        buffer.share = float(shown.pop("share"))
+        buffer._demonstrated = tuple(shown[str(place)] for place in range(len(shown)))
+
+
+# --- random generators ---
+
+
+def _generators(model: BaseAlgorithm) -> dict[str, Any]:
+    """States of the generators that learners draw from, besides PyTorch's."""
+    kind, key, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - that of SB3
+    return {
+        "python": random.getstate(),
+        "numpy": [kind, np.asarray(key).tolist(), position, has_gauss, gauss],
+        "actions": model.action_space.np_random.bit_generator.state,
+    }
+
+
+def _seed_again(model: BaseAlgorithm, states: Mapping[str, Any], torch_state: torch.Tensor) -> None:
+    version, numbers, gauss = states["python"]
+    random.setstate((version, tuple(numbers), gauss))
+    kind, key, *rest = states["numpy"]
+    np.random.set_state((kind, np.array(key, dtype=np.uint32), *rest))  # noqa: NPY002
+    model.action_space.np_random.bit_generator.state = states["actions"]
+    torch.set_rng_state(torch_state)
