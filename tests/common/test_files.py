@@ -1,6 +1,7 @@
 """Files are written whole, through links, by many writers at once, and never over what is no file."""
 
 import os
+import shutil
 import socket
 import stat
 import subprocess
@@ -203,7 +204,9 @@ def test_threads_that_write_the_same_file_never_meet(tmp_path: Path) -> None:
 WRITER = """
 import os, sys
 from pathlib import Path
-os.getpid = lambda: 1  # as in a container
+if not os.environ.get("IN_A_NAMESPACE"):
+    os.getpid = lambda: 1  # as in a container
+assert os.getpid() == 1
 from dq_space_arm_env.common.files import write_atomically
 print("ready", flush=True)
 sys.stdin.readline()
@@ -212,11 +215,15 @@ for _ in range(300):
 """
 
 
-def test_processes_of_the_same_number_never_meet(tmp_path: Path) -> None:
+@pytest.mark.parametrize("container", [[], ["unshare", "--pid", "--fork"]], ids=["patched", "namespaces"])
+def test_processes_of_the_same_number_never_meet(tmp_path: Path, container: list[str]) -> None:
+    if container and (shutil.which("unshare") is None or subprocess.run([*container, "true"]).returncode):
+        pytest.skip("no permission to make namespaces")
     file = tmp_path / "a.txt"
-    commands = [[sys.executable, "-c", WRITER, str(file), letter] for letter in "ab"]
+    commands = [[*container, sys.executable, "-c", WRITER, str(file), letter] for letter in "ab"]
+    environment = {**os.environ, "IN_A_NAMESPACE": "yes" if container else ""}
     writers = [
-        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
         for command in commands
     ]
     for writer in writers:
