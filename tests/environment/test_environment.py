@@ -25,7 +25,9 @@ def make(scene="paper", **arguments):
 
 
 def test_the_environment_and_its_pictures_load_nothing_heavy():
-    make()  # compiled, with CasADi, for the first use
+    env = make(render_mode="rgb_array")  # compiled, with CasADi, for the first use
+    env.reset(seed=0)
+    env.render()
     code = """
 import os, sys, gymnasium, dq_space_arm_env
 before = dict(os.environ)
