@@ -7,10 +7,7 @@ tensors and the JSON, which names classes, spaces and options beside the pickles
 
 from __future__ import annotations
 
-import json
 import re
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +17,7 @@ from numpy.typing import NDArray
 
 from agents.policies import ExportedPolicy
 from agents.policies.tensor_files import TensorFileError, read_tensors
+from dq_space_arm_env.common.bounded_reading import parse_json, read_member
 
 MOST_BYTES = {"data": 1 << 26, "policy.pth": 1 << 28}
 """Largest members of a model's file that are read."""
@@ -98,8 +96,6 @@ def read_model(path: Path) -> ExportedPolicy:
         return _policy(read_attributes(path), _read_arrays(path))
     except NeedsCodeError as error:
         raise NeedsCodeError(f"{path}: {error}") from error
-    except (OSError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise ModelArchiveError(f"{path} is not a model of Stable-Baselines3 ({error})") from error
     except TensorFileError as error:
         raise ModelArchiveError(f"{path}: policy.pth is {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -109,26 +105,15 @@ def read_model(path: Path) -> ExportedPolicy:
 
 def read_attributes(path: Path) -> dict[str, Any]:
     """Attributes of a model by name; those that JSON cannot hold are mappings with pickled text, not read."""
-    try:
-        attributes = json.loads(_member(path, "data"))
-    except RecursionError:
-        raise ValueError("data is nested too deep") from None
+    attributes = parse_json(read_member(path, "data", MOST_BYTES["data"]), "data")
     if not isinstance(attributes, dict):
         raise ValueError("data should be a mapping")
     return attributes
 
 
-def _member(path: Path, name: str) -> bytes:
-    with zipfile.ZipFile(path) as archive:
-        size = archive.getinfo(name).file_size
-        if size > MOST_BYTES[name]:
-            raise ValueError(f"{name} has {size:,} bytes, should have {MOST_BYTES[name]:,} at most")
-        return archive.read(name)
-
-
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Tensors of a model's policy by name."""
-    content = _member(path, "policy.pth")
+    content = read_member(path, "policy.pth", MOST_BYTES["policy.pth"])
     tensors = read_tensors(content)
     if not isinstance(tensors, dict):
         raise ValueError("policy.pth should be a mapping")
@@ -205,10 +190,10 @@ def _action_scale(space: Mapping[str, Any], n_action: int) -> NDArray[np.float64
     low, high = (
         np.array([float(number) for number in space[key].strip("[]").split()]) for key in ("low", "high")
     )
-    if high.shape != (n_action,) or not np.array_equal(low, -high):
+    if high.shape != (n_action,) or not np.array_equal(low, -high) or not (high <= 1.0).all():
         raise NeedsCodeError(
-            f"its actions are in [{space['low'][:80]}, {space['high'][:80]}], should be symmetric, one range "
-            f"for each of {n_action}"
+            f"its actions are in [{space['low'][:80]}, {space['high'][:80]}], should be {n_action} symmetric "
+            "ranges, at most 1"
         )
     return high
 

@@ -1,8 +1,8 @@
 """Shards made by the machines of a Ray cluster, and returned as bytes: no shared disk is needed.
 
-If a process or machine is lost, Ray repeats its tasks, including those whose shards were not fetched yet;
-the bytes are the same. Every machine needs the same version of this package and its dependencies, and reports
-a difference. Processors with different instruction sets agree only up to rounding.
+If a process or machine is lost, its tasks are given to Ray again, including those whose shards were not
+fetched yet; the bytes are the same. Every machine needs the same version of this package and its
+dependencies, and reports a difference. Processors with different instruction sets agree only up to rounding.
 
 The run itself, which writes the files, should be on a machine of the cluster. If that machine or the head of
 the cluster is lost, the run ends and is resumed like any other.
@@ -15,10 +15,12 @@ import re
 import signal
 import socket
 import threading
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache
 from itertools import islice
+from time import sleep
 from typing import Any
 
 from dq_space_arm_env import Scene
@@ -36,6 +38,9 @@ WAITING = 2
 """Additional tasks, queued even while the cluster has no processor yet."""
 MOST_LOSSES = 10
 """Times that a shard is repeated after its process or machine was lost."""
+LONGEST_PAUSE = 10.0
+"""Time before the last repetitions, s; the first follow sooner. A cluster takes seconds to notice that a
+machine is gone, and gives it tasks until then."""
 CONNECTION_SECONDS = 10.0
 """Time after which a cluster counts as unreachable."""
 
@@ -122,23 +127,41 @@ def _same_signals() -> Iterator[None]:
 
 def _run_on(ray: Any, tasks: Iterable[Task]) -> Generator[ShardResult]:
     """Run tasks on the connected cluster."""
-    under_way: list[Any] = []
+    under_way: dict[Any, Task] = {}  # tasks by the references to their shards
+    losses: Counter[int] = Counter()  # by shard
     here, remaining = software(), iter(tasks)
-    make = ray.remote(num_cpus=1, max_retries=MOST_LOSSES)(remote_task())
+    # Ray's own repetitions are not counted where they can be seen.
+    make = ray.remote(num_cpus=1, max_retries=0)(remote_task())
     try:
         while True:
             most = AHEAD * int(ray.cluster_resources().get("CPU", 0.0)) + WAITING
             for task in islice(remaining, max(most - len(under_way), 0)):
-                under_way.append(make.remote(here, pickle.dumps(task)))
+                under_way[make.remote(here, pickle.dumps(task))] = task
             if not under_way:
                 return
-            (ready,), under_way = ray.wait(under_way)
-            result = _fetch(ray, ready)
+            (ready, *_), _ = ray.wait(list(under_way))
+            task = under_way.pop(ready)
+            try:
+                result = _fetch(ray, ready)
+            except _ShardLost as loss:
+                losses[task.shard] += 1
+                if losses[task.shard] > MOST_LOSSES:
+                    raise DemonstrationsError(
+                        f"shard {task.shard} was lost {losses[task.shard]} times with the process or the "
+                        f"machine that made it: {loss}"
+                    ) from loss
+                sleep(min(0.1 * 2.0 ** losses[task.shard], LONGEST_PAUSE))
+                under_way[make.remote(here, pickle.dumps(task))] = task
+                continue
             del ready  # frees the cluster's copy
             yield result
     finally:
         for reference in under_way:
             ray.cancel(reference, force=True)
+
+
+class _ShardLost(Exception):  # noqa: N818 - an event, not a mistake
+    """The process or machine that made a shard, or held it, is gone."""
 
 
 def _fetch(ray: Any, reference: Any) -> ShardResult:
@@ -147,11 +170,16 @@ def _fetch(ray: Any, reference: Any) -> ShardResult:
         result: ShardResult | str = ray.get(reference)
     except failures.RayTaskError:
         raise  # a bug, with its remote traceback
+    except (
+        failures.WorkerCrashedError,
+        failures.NodeDiedError,
+        failures.ObjectLostError,
+        failures.OutOfMemoryError,
+    ) as error:
+        raise _ShardLost(str(error).partition("\n")[0]) from error
     except failures.RayError as error:
         reason = str(error).partition("\n")[0]
-        raise DemonstrationsError(
-            f"a shard was lost {MOST_LOSSES + 1} times with the process or the machine that made it: {reason}"
-        ) from error
+        raise DemonstrationsError(f"the Ray cluster cannot go on: {reason}") from error
     if isinstance(result, str):
         raise DemonstrationsError(result)
     return result

@@ -1,6 +1,7 @@
 """The machines of a Ray cluster give what this process gives, also when one of them is lost."""
 
 import os
+import pickle
 import shutil
 import signal
 import socket
@@ -184,6 +185,69 @@ def test_shards_lost_with_the_machine_that_has_made_them_are_made_again(
     digests = [entry["sha256"] for entry in whole.manifest["shards"]]
     assert {result.shard: result.sha256 for result in made} == dict(enumerate(digests))
     assert len(made) == 5
+
+
+class _Cluster:
+    """What the executor asks of Ray; `outcome` of a shard and its attempt names an error, or is None."""
+
+    class exceptions:  # noqa: N801 - named like Ray's module
+        RayError = type("RayError", (Exception,), {})
+        RayTaskError = type("RayTaskError", (RayError,), {})
+        WorkerCrashedError = type("WorkerCrashedError", (RayError,), {})
+        NodeDiedError = type("NodeDiedError", (RayError,), {})
+        ObjectLostError = type("ObjectLostError", (RayError,), {})
+        OutOfMemoryError = type("OutOfMemoryError", (RayError,), {})
+        LocalRayletDiedError = type("LocalRayletDiedError", (RayError,), {})
+
+    def __init__(self, outcome: Callable[[int, int], str | None]) -> None:
+        self.outcome, self.attempts = outcome, []
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 2.0}
+
+    def remote(self, **options: Any) -> Callable[[Any], "_Cluster"]:
+        assert options["max_retries"] == 0
+        self_ = self
+
+        class Remote:
+            def remote(self, here: Any, packed: bytes) -> tuple[int, int]:
+                shard = pickle.loads(packed).shard
+                self_.attempts.append(shard)
+                return shard, self_.attempts.count(shard)
+
+        return lambda function: Remote()
+
+    def wait(self, references: list[Any]) -> tuple[list[Any], list[Any]]:
+        return references[:1], references[1:]
+
+    def get(self, reference: tuple[int, int]) -> Any:
+        failure = self.outcome(*reference)
+        if failure is not None:
+            raise getattr(self.exceptions, failure)(f"{failure}: gone\nand more")
+        return reference
+
+    def cancel(self, reference: Any, force: bool) -> None:
+        pass
+
+
+def test_losses_are_counted_shard_by_shard(tasks: list[Task], monkeypatch: pytest.MonkeyPatch):
+    """A shard that is lost now and then is made again; one that is always lost ends the run."""
+    monkeypatch.setattr(ray_executor, "sleep", lambda seconds: None)
+    kinds = ["WorkerCrashedError", "NodeDiedError", "ObjectLostError", "OutOfMemoryError"]
+    sometimes = _Cluster(lambda shard, attempt: kinds[attempt % 4] if attempt <= shard else None)
+    made = list(ray_executor._run_on(sometimes, tasks))
+    assert sorted(made) == [(shard, shard + 1) for shard in range(5)]
+    always = _Cluster(lambda shard, attempt: "WorkerCrashedError" if shard == 2 else None)
+    with pytest.raises(DemonstrationsError, match=r"shard 2 was lost 11 times .*: WorkerCrashedError: gone$"):
+        list(ray_executor._run_on(always, tasks))
+    assert always.attempts.count(2) == ray_executor.MOST_LOSSES + 1
+
+
+def test_a_lost_cluster_is_not_a_shard_lost_eleven_times(tasks: list[Task]):
+    cluster = _Cluster(lambda shard, attempt: "LocalRayletDiedError")
+    with pytest.raises(DemonstrationsError, match=r"^the Ray cluster cannot go on: LocalRayletDiedError"):
+        list(ray_executor._run_on(cluster, tasks))
+    assert len(cluster.attempts) <= len(tasks)
 
 
 @pytest.mark.ray
