@@ -29,7 +29,7 @@ class Interrupted(click.ClickException):
 
     exit_code = INTERRUPTED
 
-    def __init__(self, kept: str = "nothing is saved") -> None:
+    def __init__(self, kept: str = "files are complete, or as they were") -> None:
         super().__init__(f"Interrupted: {kept}.")
 
 

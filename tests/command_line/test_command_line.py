@@ -188,7 +188,7 @@ class OurError(Exception):
         (OSError(errno.ENOSPC, "No space left", "a.npz"), FAILURE, "Error: a.npz: No space left\n"),
         (OSError(errno.ENOSPC, "No space left"), FAILURE, "Error: No space left\n"),
         (FileNotFoundError(errno.ENOENT, "No such file", "a.npz"), UNUSABLE, "Error: a.npz: No such file\n"),
-        (KeyboardInterrupt(), INTERRUPTED, "Interrupted: nothing is saved.\n"),
+        (KeyboardInterrupt(), INTERRUPTED, "Interrupted: files are complete, or as they were.\n"),
         (SystemExit(7), 7, ""),
         (SystemExit(None), SUCCESS, ""),
     ],

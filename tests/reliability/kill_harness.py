@@ -27,14 +27,7 @@ import numpy as np
 
 ROOT = Path(__file__).parents[2]
 CACHE = "cache"
-PRELOADED = (
-    "agents.command_line.compare", "agents.command_line.train", "agents.evaluation.comparison_figure",
-    "agents.evaluation.data_efficiency_command", "agents.evaluation.showing",
-    "agents.imitation.imitation_training", "agents.residual.mismatch_comparison",
-    "agents.residual.residual_training", "experts.command_line.demonstrations_work",
-    "experts.command_line.solving", "experts.figures.plots", "experts.figures.animation", "h5py", "minari",
-    "scripts.benchmarks.harness", "scripts.reproduce_paper",
-)  # fmt: skip
+PRELOADED = ("warm_imports",)
 TIMES = re.compile(r"second|date$|provenance|^host|^machine|commit|rate$|versions|^file$|^rss|times?$")
 """Keys of what differs from run to run."""
 
@@ -358,7 +351,10 @@ class FailedError(AssertionError):
 
 
 def disturb(undertaking, whole, attempt, disturbance, rng):
-    """Disturb a run at a random moment, repeat it, and judge both; "same", "refused" or "finished"."""
+    """Disturb a run at a random moment, repeat it, and judge both.
+
+    Returns "finished" if it ended well all the same; else "same", or "refused" where its file was there.
+    """
     limit = 60.0 + 20.0 * whole.seconds
     at = int(rng.integers(1, whole.changes + 1)) if rng.random() < 0.5 else None
     seconds = float(rng.uniform(0.0, whole.seconds))
@@ -377,9 +373,9 @@ def disturb(undertaking, whole, attempt, disturbance, rng):
         _judge_files(whole, undertaking, attempt.files(), complete=True, swept=status == whole.status)
     except FailedError as failure:
         raise FailedError(f"{undertaking.name}, {moment}: {failure}") from failure
-    if status != whole.status:
-        return "refused"
-    return "finished" if runs[0][1] == whole.status else "same"
+    if runs[0][1] == whole.status:
+        return "finished"
+    return "same" if status == whole.status else "refused"
 
 
 def _struck(undertaking, attempt, disturbance, rng, seconds, at, limit):
