@@ -7,8 +7,8 @@
 | `state.json` | progress of the run, counters, and the states of the other random generators |
 
 A run that is killed and resumed ends with the weights of one that was not, bit for bit on one machine, where
-the environment can be put back into its running episodes. Goal environments (hindsight) and those of
-corrections cannot: there new episodes begin, seeded by the run's seed and its number of steps.
+the environment can be put back into its running episodes. Goal environments (hindsight) cannot: there new
+episodes begin, seeded by the run's seed and its number of steps.
 
 Nothing in these files is executed: a run folder that somebody else made can be resumed.
 """
@@ -87,7 +87,7 @@ def read_checkpoint(folder: Path, model: BaseAlgorithm) -> Progress:
         expected = sum(8 * array.size for _, array in _columns(model))
         arrays = read_arrays(folder / ARRAYS, most=expected + _SPARE)
         return _restored(model, state, parts, arrays)
-    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).partition("\n")[0]
         raise RunFolderError(
             f"checkpoint {folder} is damaged ({reason}): remove it to begin anew, or use another folder"

@@ -32,7 +32,7 @@ class CorrectionObserver:
         self._kernels = compile_scene(scene)
         self._dt, self._steps = scene.simulation.dt, scene.simulation.steps
         self._share = min(1.0, self._dt / memory)
-        self._average: FloatArray | None = None
+        self.average: FloatArray | None = None
 
     @staticmethod
     def size(kernels: Kernels) -> int:
@@ -41,22 +41,22 @@ class CorrectionObserver:
 
     def reset(self) -> None:
         """Clear the average."""
-        self._average = None
+        self.average = None
 
     def authority(self) -> FloatArray:
         """Share of corrections that counts, in [0, 1], shape (B, 1): it grows with the averaged deviation."""
-        assert self._average is not None
-        size = np.linalg.norm(self._average, axis=1, keepdims=True)
+        assert self.average is not None
+        size = np.linalg.norm(self.average, axis=1, keepdims=True)
         return np.asarray(np.minimum(1.0, size / self._full))
 
     def __call__(self, stage: int, measured: FloatArray, followed: Followed) -> NDArray[np.float32]:
         """Observe measured states, shape (B, n_x), once per stage."""
-        if self._average is None:
-            self._average = np.zeros_like(followed.deviation)
-        self._average += self._share * (followed.deviation - self._average)
+        if self.average is None:
+            self.average = np.zeros_like(followed.deviation)
+        self.average += self._share * (followed.deviation - self.average)
         time_left = np.full((len(measured), 1), (self._steps - stage) * self._dt)
         seen = self._kernels.observation(measured, time_left)[0]
-        deviations = (np.arcsinh(each / SMALL) for each in (followed.deviation, self._average))
+        deviations = (np.arcsinh(each / SMALL) for each in (followed.deviation, self.average))
         parts = (seen, *deviations, followed.action)
         return np.concatenate(parts, axis=1).astype(np.float32)
 

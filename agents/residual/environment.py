@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -93,14 +94,64 @@ class ResidualVecEnv(VecEnv):
         chosen = self._rng.integers(len(self._plans.states), size=count)
         self._plans = self._plans.choose(np.tile(chosen, 2))
         noise, push = (largest * self._rng.random(count) for largest in (mismatch.noise, mismatch.push))
-        self._disturbances = Disturbances(
-            self._scene, self._rng, push=push, pushes=mismatch.pushes, measurement=noise
-        )
+        self._disturb(noise, push)
         self._worlds.reset(self._plans.starts)
         self._stage, self._cost, self._returns = 0, np.zeros(2 * count), np.zeros(count)
         self._flying, self._success = np.ones(2 * count, dtype=np.bool_), np.zeros(2 * count, dtype=np.bool_)
         self._observer.reset()
         return self._observe()
+
+    def _disturb(self, noise: FloatArray, push: FloatArray) -> None:
+        """Disturb the episodes from now on, standard deviations of shape (num_envs,)."""
+        self._noise, self._push = noise, push
+        self._disturbances = Disturbances(
+            self._scene, self._rng, push=push, pushes=self._mismatch.pushes, measurement=noise
+        )
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copy the running episodes, to `restore` them later or in another process.
+
+        Returns:
+            Arrays by name.
+        """
+        own = {
+            "chosen": self._plans.chosen,
+            "noise": self._noise,
+            "push": self._push,
+            "stage": self._stage,
+            "cost": self._cost,
+            "returns": self._returns,
+            "flying": self._flying,
+            "success": self._success,
+            "uncorrected": self._uncorrected,
+            "average": self._observer.average,
+            "generator": json.dumps(self._rng.bit_generator.state),
+        }
+        worlds = {f"worlds.{name}": array for name, array in self._worlds.snapshot().items()}
+        return {**worlds, **{name: np.array(value) for name, value in own.items()}}
+
+    def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
+        """Go on where a snapshot of an environment with the same arguments was taken.
+
+        Args:
+            snapshot: Arrays by name.
+
+        Raises:
+            KeyError: If an array is missing.
+            ValueError: If an array has a wrong shape or type.
+        """
+        prefix = "worlds."
+        self._worlds.restore(
+            {name.removeprefix(prefix): snapshot[name] for name in snapshot if name.startswith(prefix)}
+        )
+        self._rng.bit_generator.state = json.loads(str(snapshot["generator"]))
+        self._plans = self._plans.choose(snapshot["chosen"])
+        self._disturb(snapshot["noise"], snapshot["push"])
+        self._stage = int(snapshot["stage"])
+        self._cost, self._returns = snapshot["cost"].copy(), snapshot["returns"].copy()
+        self._flying, self._success = snapshot["flying"].copy(), snapshot["success"].copy()
+        self._uncorrected = snapshot["uncorrected"].copy()
+        self._observer.average = snapshot["average"].copy()
 
     def _observe(self) -> NDArray[np.float32]:
         """Disturb flights and twins alike, and compute the plans' actions."""
@@ -110,7 +161,7 @@ class ResidualVecEnv(VecEnv):
         self._worlds.perturb(np.tile(draw.push, (2, 1)))
         measured = kernels.retract(self._worlds.states, np.tile(draw.measurement, (2, 1)))
         followed = self._plans.follow(kernels, self._stage, measured)
-        self._uncorrected: FloatArray = followed.action
+        self._uncorrected = followed.action
         few = Followed(*(part[:count] for part in followed))
         return self._observer(self._stage, measured[:count], few)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -156,6 +156,21 @@ class MassMismatchVectorEnv:
     def observe(self, states: FloatArray) -> NDArray[Any]:
         """Observations of given states, shape (B, n_x), at the present times."""
         return self._joined([environment.observe(states[rows]) for environment, rows in self._groups])
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copy what all later steps depend on, see `DQSpaceArmVectorEnv.snapshot`."""
+        return {
+            f"{place}.{name}": array
+            for place, (environment, _) in enumerate(self._groups)
+            for name, array in environment.snapshot().items()
+        }
+
+    def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
+        """Go on where a snapshot was taken, see `DQSpaceArmVectorEnv.restore`."""
+        for place, (environment, _) in enumerate(self._groups):
+            prefix = f"{place}."
+            part = {name.removeprefix(prefix): snapshot[name] for name in snapshot if name.startswith(prefix)}
+            environment.restore(part)
 
     def _joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Arrays of the groups in the order of the episodes."""

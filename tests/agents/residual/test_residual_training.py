@@ -162,6 +162,9 @@ def test_it_trains_exports_and_resumes(algorithm, configuration, small_scene, de
     assert progress.environment_steps == model.num_timesteps * REPEAT == 2400
     run = train_residual(settings, tmp_path)
     assert run.model.num_timesteps * REPEAT == TOTAL
+    whole = train_residual(settings, tmp_path / "whole")  # as a run that was not killed
+    for actual, expected in zip(run.policy.weights, whole.policy.weights, strict=True):
+        np.testing.assert_array_equal(actual, expected)
     exported = ExportedPolicy.load(tmp_path / "policy.npz")
     seen = np.random.default_rng(0).normal(size=(50, exported.n_observation)) + exported.mean
     seen = seen.astype(np.float32)
