@@ -30,15 +30,20 @@ lint: $(VENV)/installed-$(TEST)
 	$(BIN)/mypy
 	$(BIN)/mypy scripts
 
-# One marker file per set of extras: a second run installs nothing.
+# One marker file per set of extras: a second run installs nothing. By uv: with hashes, pip refuses editable packages.
+LOCKED := --constraint requirements.lock --build-constraint requirements.lock
 $(VENV)/installed-%: pyproject.toml requirements.lock
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable ".[$*]"
+	sed -n '/^uv==/,/[^\\]$$/p' requirements.lock > $(VENV)/uv.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement $(VENV)/uv.lock
+	$(BIN)/uv pip install --quiet --python $(BIN)/python $(LOCKED) --editable ".[$*]"
 	touch $@
 
-# Pin versions that work together on every supported Python; needs uv.
+# Pin versions that work together on every supported Python, and the hashes of their files; needs uv. The second
+# source is what builds this package, and uv.
 lock:
-	uv pip compile --quiet --universal --all-extras --no-annotate --no-header --output-file requirements.lock pyproject.toml
+	printf '%s\n' editables hatchling uv | uv pip compile --quiet --universal --all-extras --generate-hashes \
+		--no-annotate --no-header --output-file requirements.lock pyproject.toml -
 
 clean:
 	rm -rf $(VENV) results

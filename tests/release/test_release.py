@@ -38,6 +38,16 @@ def test_the_citation_has_what_its_format_requires() -> None:
         assert all(isinstance(name, str) for author in reference["authors"] for name in author.values())
 
 
+def test_every_locked_version_has_hashes() -> None:
+    lock = (ROOT / "requirements.lock").read_text(encoding="utf-8").replace("\\\n", " ")
+    hashes = {line.split("==")[0]: line.count("--hash=sha256:") for line in lock.splitlines()}
+    assert min(hashes.values()) >= 1
+    extras = PROJECT["project"]["optional-dependencies"].values()
+    required = [*PROJECT["project"]["dependencies"], *(each for extra in extras for each in extra)]
+    named = {re.split(r"[^\w.-]", each)[0].lower().replace(".", "-") for each in required}
+    assert named - {"dq-space-arm"} | {"editables", "hatchling", "uv"} <= hashes.keys()
+
+
 def test_the_oldest_python_is_the_first_classifier() -> None:
     pattern = r"Programming Language :: Python :: (3\.\d+)"
     named = re.findall(pattern, "\n".join(PROJECT["project"]["classifiers"]))
