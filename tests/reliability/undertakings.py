@@ -98,7 +98,7 @@ UNDERTAKINGS = (
         "replay", "replay {inputs}/solution/solution.npz {inputs}/flight.npz --out a.html", EVERYTHING
     ),
     Undertaking("demonstrations generate", _SHARDS + " 1", _DATA, _LOGS),
-    Undertaking("demonstrations generate, 2 workers", _SHARDS + " 2", _DATA, _LOGS, weight=0.3),
+    Undertaking("demonstrations generate, 2 workers", _SHARDS + " 2", _DATA, _LOGS, weight=0.1),
     Undertaking(
         "demonstrations generate, summary", _GENERATE + " -n 4 --workers 1", _DATA, _LOGS, weight=0.3
     ),
