@@ -58,7 +58,7 @@ _SOLVER = [f"tests/experts/ddp/test_{name}.py" for name in ("line_search", "roll
 _SOLVER += [f"tests/experts/ddp/test_{name}.py" for name in ("backward_pass", "second_order", "box_ddp")]
 _SOLVER += [f"tests/experts/ddp/test_{name}.py" for name in ("multiple_shooting", "open_gaps")]
 _KERNELS = [f"tests/kernels/test_kernels_{name}.py" for name in ("dynamics", "formulations", "derivatives")]
-_ENVIRONMENT = [f"tests/environment/test_{name}.py" for name in ("episode_end", "environment", "rollouts")]
+_ENVIRONMENT = [f"tests/environment/test_{name}.py" for name in ("episode_end", "rollouts", "environment")]
 _VECTORS = [f"tests/environment/test_{name}.py" for name in ("vector_environment", "target_option")]
 _METHODS = [f"tests/integrators/test_{name}.py" for name in ("explicit_runge_kutta", "integrators")]
 _METHODS += [f"tests/integrators/test_{name}.py" for name in ("rosenbrock", "momentum", "dormand_prince")]
@@ -67,15 +67,15 @@ TESTS: dict[str, dict[str, list[str]]] = {
     "dq_space_arm_env/algebra/": {"quick": _ALGEBRA, "default": ["tests/dynamics", *_KERNELS]},
     "dq_space_arm_env/dynamics/": {"quick": ["tests/dynamics"], "default": _KERNELS},
     "dq_space_arm_env/task/trajectory.py": {
-        "quick": ["tests/viewing/test_replay_flights.py"],
-        "default": ["tests/environment/test_rollouts.py"],
+        "quick": ["tests/environment/test_rollouts.py"],
+        "default": ["tests/viewing/test_replay_flights.py"],
     },
     "dq_space_arm_env/task/": {
         "quick": ["tests/task"],
         "default": [*_ENVIRONMENT, *_VECTORS, "tests/kernels/test_kernels_randomization.py"],
     },
     "dq_space_arm_env/environment/goal.py": {"quick": ["tests/environment/test_goal_environment.py"]},
-    "dq_space_arm_env/environment/": {"quick": [*_ENVIRONMENT, *_VECTORS]},
+    "dq_space_arm_env/environment/": {"quick": _ENVIRONMENT[:2] + _VECTORS, "default": _ENVIRONMENT[2:]},
     "dq_space_arm_env/integrators/": {
         "quick": [
             f"tests/integrators/test_{name}.py" for name in ("tableaus", "registry", "interpreted_steps")
@@ -85,7 +85,10 @@ TESTS: dict[str, dict[str, list[str]]] = {
     "experts/ddp/": {"quick": _SOLVER, "default": ["tests/experts/ddp/test_parallel_rollouts.py"]},
     "experts/receding_horizon.py": {"quick": ["tests/experts/test_receding_horizon.py"]},
     "dq_space_arm_env/common/files.py": {"quick": ["tests/common"]},
-    "experts/demonstrations/": {"quick": ["tests/demonstrations/test_demonstrations_folder.py"]},
+    "experts/demonstrations/": {
+        "quick": ["tests/demonstrations/test_folder_of_shards.py"],
+        "default": ["tests/demonstrations/test_demonstrations_folder.py"],
+    },
     "agents/run_folder.py": {"quick": ["tests/agents/test_run_folder.py"]},
 }
 STAGES = ("quick", "default", "slow")
