@@ -49,7 +49,7 @@ def test_another_configuration_is_refused_but_for_its_length_and_description(
     longer = schedule.model_copy(update={"total_steps": 2 * schedule.total_steps})
     RunFolder(tmp_path, configuration.model_copy(update={"schedule": longer}))
     before = contents(tmp_path)
-    with pytest.raises(RunFolderError, match="another configuration: .*name"):
+    with pytest.raises(RunFolderError, match=r"another configuration: .*name"):
         RunFolder(tmp_path, configuration.model_copy(update={"name": "another"}))
     starts = json.loads(before["provenance.json"])
     starts[0]["scene_hash"] = "0" * 64
