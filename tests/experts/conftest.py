@@ -22,6 +22,7 @@ class PythonKernel:
         self, function: Callable[..., None], shapes: list[tuple[int, ...]], shared: int = -1
     ) -> None:
         def run(begin: int, end: int, buffers: Any) -> None:
+            assert 0 <= begin <= end
             tables = [np.ctypeslib.as_array(buffers[i], (end, *shape)) for i, shape in enumerate(shapes)]
             for k in range(begin, end):
                 function(*(table[0 if i == shared else k] for i, table in enumerate(tables)))

@@ -54,9 +54,17 @@ MODEL = ("algebra", "compiler", "dynamics", "integrators", "kernels", "scene", "
 # the one before: "quick" takes seconds, "default" the other default tests, "slow" the slow ones of both.
 _ALGEBRA = [f"tests/algebra/test_algebra_{name}.py" for name in ("poses", "screw", "tables", "api")]
 _ALGEBRA.append("tests/algebra/test_algebra_accuracy.py")
-_SOLVER = [f"tests/experts/ddp/test_{name}.py" for name in ("line_search", "rollout", "box_qp", "solution")]
-_SOLVER += [f"tests/experts/ddp/test_{name}.py" for name in ("backward_pass", "second_order", "box_ddp")]
-_SOLVER += [f"tests/experts/ddp/test_{name}.py" for name in ("multiple_shooting", "open_gaps")]
+
+
+def _solver(*names: str) -> dict[str, list[str]]:
+    """Tests of the solver, those of one of its files first."""
+    others = ("line_search", "rollout", "box_qp", "solution", "backward_pass", "second_order", "box_ddp")
+    others += ("multiple_shooting", "open_gaps", "parallel_rollouts")
+    quick, default = names, [name for name in others if name not in names]
+    paths = [[f"tests/experts/ddp/test_{name}.py" for name in part] for part in (quick, default)]
+    return dict(zip(("quick", "default"), paths, strict=True))
+
+
 _KERNELS = [f"tests/kernels/test_kernels_{name}.py" for name in ("dynamics", "formulations", "derivatives")]
 _ENVIRONMENT = [f"tests/environment/test_{name}.py" for name in ("episode_end", "rollouts", "environment")]
 _VECTORS = [f"tests/environment/test_{name}.py" for name in ("vector_environment", "target_option")]
@@ -82,7 +90,14 @@ TESTS: dict[str, dict[str, list[str]]] = {
         ],
         "default": [*_METHODS, "tests/kernels/test_kernels_derivatives.py"],
     },
-    "experts/ddp/": {"quick": _SOLVER, "default": ["tests/experts/ddp/test_parallel_rollouts.py"]},
+    "experts/ddp/backward_pass.py": _solver("backward_pass", "box_ddp"),
+    "experts/ddp/box_ddp.py": _solver("box_ddp", "second_order"),
+    "experts/ddp/box_qp.py": _solver("box_qp", "backward_pass"),
+    "experts/ddp/multiple_shooting.py": _solver("line_search", "multiple_shooting", "open_gaps"),
+    "experts/ddp/parallel_rollouts.py": _solver("parallel_rollouts", "line_search"),
+    "experts/ddp/rollout.py": _solver("rollout", "solution"),
+    "experts/ddp/second_order.py": _solver("second_order", "box_ddp"),
+    "experts/ddp/": _solver("line_search", "box_ddp", "second_order"),
     "experts/receding_horizon.py": {"quick": ["tests/experts/test_receding_horizon.py"]},
     "dq_space_arm_env/common/files.py": {"quick": ["tests/common"]},
     "experts/demonstrations/": {

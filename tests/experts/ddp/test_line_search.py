@@ -90,3 +90,17 @@ def test_with_gaps_a_step_may_cost_more_by_the_weight_of_the_gaps_it_closes(exce
     assert taken == (1.0 if excess < 0.0 else 0.25)
     assert accepted == [taken]
     assert taken in STEP_LENGTHS
+
+
+def test_a_predicted_gain_of_the_second_order_makes_no_gap_cheaper() -> None:
+    """The weight is raised by L + max(Q, 0): Q is no bargain."""
+    accepted: list[float] = []
+    search = SimpleNamespace(
+        share=0.5, weight=0.0, work=SimpleNamespace(current=SimpleNamespace(cost=COST)),
+        try_step=lambda alpha: COST - 10.0, accept=accepted.append,
+    )  # fmt: skip
+    assert MultipleShooting.line_search(search, 2.0, -0.5) == 1.0  # type: ignore[arg-type]
+    assert search.weight == pytest.approx(2.0 / ((1.0 - MODEL_SHARE) * 0.5))
+    search.weight = 100.0  # it never falls
+    MultipleShooting.line_search(search, 2.0, -0.5)  # type: ignore[arg-type]
+    assert search.weight == 100.0
