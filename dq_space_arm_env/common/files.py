@@ -5,7 +5,6 @@ import json
 import math
 import os
 import re
-import secrets
 import stat
 import time
 from pathlib import Path
@@ -47,7 +46,7 @@ def write_privately(path: Path, content: bytes) -> None:
 
 def temporary_name(name: str) -> str:
     """Return a hidden name that no other host, process or thread uses, for what will be renamed to `name`."""
-    return f".{name}.{secrets.token_hex(8)}.part"
+    return f".{name}.{os.urandom(8).hex()}.part"
 
 
 def remove_leftovers(folder: Path, name: str | None = None, *, age: float = 0.0) -> None:
@@ -115,6 +114,8 @@ def _flush(folder: Path) -> None:
 def check_writable_file(path: Path) -> None:
     """Raise ValueError if a file cannot be created or replaced; create nothing."""
     target, mode = _target(path)
+    if path.is_symlink() and not target.parent.is_dir():
+        raise ValueError(f"{path} links to {target}, whose folder does not exist")
     check_writable(target.parent)
     if mode is not None and not os.access(target, os.W_OK):
         raise ValueError(f"{path}: no permission to write this file")

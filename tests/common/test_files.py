@@ -131,6 +131,13 @@ def test_a_link_stays_and_its_target_is_written(tmp_path: Path) -> None:
 
 
 @posix
+def test_a_link_into_a_folder_that_is_missing_is_refused_early(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "missing" / "file")
+    with pytest.raises(ValueError, match="whose folder does not exist"):
+        check_writable_file(tmp_path / "link")
+
+
+@posix
 def test_links_in_a_circle_are_refused(tmp_path: Path) -> None:
     circle = tmp_path / "circle"
     circle.symlink_to(circle)
