@@ -31,6 +31,23 @@ def racing(scene: Scene) -> np.ndarray:
     return state
 
 
+def test_the_time_left_and_the_error_fit_their_space(scene: Scene) -> None:
+    env = DQSpaceArmEnv(scene)
+    space, duration = env.observation_space, STEPS * scene.simulation.dt
+    assert space.low[-1] == 0.0
+    assert duration <= space.high[-1] <= 1.001 * duration
+    np.testing.assert_array_equal(space.low[:-1], -space.high[:-1])
+    assert ((1.0 < space.high[:2]) & (space.high[:2] < 1.001)).all()
+    observation, _ = env.reset(seed=0)
+    while True:
+        assert space.contains(observation)
+        observation, _, terminated, truncated, _ = env.step(np.ones(6))
+        assert truncated is False
+        if terminated:
+            break
+    assert observation[-1] == 0.0
+
+
 def test_an_episode_that_diverges_at_the_target_is_no_success(at_target: Scene) -> None:
     env = DQSpaceArmEnv(at_target)
     _, info = env.reset(options={"initial_state": racing(at_target)})

@@ -79,6 +79,26 @@ def test_check_env_has_no_complaint(scene, kind):
         check_env(make(scene, reward_type=kind), skip_render_check=True)
 
 
+def test_spaces_are_as_small_as_unit_quaternions_allow():
+    env = make(short("paper"))
+    for space in env.observation_space.spaces.values():
+        assert (1.0 < space.high[:4]).all()
+        assert (space.high[:4] < 1.001).all()
+        np.testing.assert_array_equal(space.low, -space.high)
+        assert (space.high[4:] > 1e5).all()
+
+
+def test_an_info_that_says_nothing_of_a_divergence_reports_none():
+    env = make(short("paper"), reward_type="dense")
+    achieved, desired = neighbors(2)
+    sound = env.compute_reward(achieved, desired, {"diverged": np.array([False, False])})
+    for silent in (None, {}, [{}, {}]):
+        np.testing.assert_array_equal(env.compute_reward(achieved, desired, silent), sound)
+    lost = env.compute_reward(achieved, desired, {"diverged": np.array([False, True])})
+    assert lost[0] == sound[0]
+    assert lost[1] < sound[1]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     "scene",
