@@ -37,7 +37,7 @@ def test_the_time_left_and_the_error_fit_their_space(scene: Scene) -> None:
     assert space.low[-1] == 0.0
     assert duration <= space.high[-1] <= 1.001 * duration
     np.testing.assert_array_equal(space.low[:-1], -space.high[:-1])
-    assert ((1.0 < space.high[:2]) & (space.high[:2] < 1.001)).all()
+    assert ((space.high[:2] > 1.0) & (space.high[:2] < 1.001)).all()
     observation, _ = env.reset(seed=0)
     while True:
         assert space.contains(observation)
