@@ -5,8 +5,11 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from _thread import interrupt_main
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
+from threading import Timer
 from typing import Any, NoReturn
 
 import click
@@ -91,7 +94,8 @@ def run_to_end(run: Callable[[], Any], session: Mapping[str, bool] | None = None
     """
     session = {"debug": _debug_by_default()} if session is None else session
     try:
-        status = run()
+        with _no_interrupt_lost():
+            status = run()
         sys.stdout.flush()
     except BrokenPipeError:
         return FAILURE  # quietly: the reader of our output has seen enough
@@ -104,6 +108,24 @@ def run_to_end(run: Callable[[], Any], session: Mapping[str, bool] | None = None
     finally:
         _discard_unwritable_output()
     return SUCCESS if status is None else int(status)
+
+
+@contextmanager
+def _no_interrupt_lost() -> Iterator[None]:
+    """Repeat interrupts that Python drops inside a block, as it does in callbacks and finalizers."""
+    usual = sys.unraisablehook
+
+    def repeat(dropped: Any) -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            Timer(0.01, interrupt_main).start()  # once the callback has returned
+        else:
+            usual(dropped)
+
+    sys.unraisablehook = repeat
+    try:
+        yield
+    finally:
+        sys.unraisablehook = usual
 
 
 def _explain(error: BaseException) -> int:

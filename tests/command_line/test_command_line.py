@@ -251,6 +251,24 @@ def test_ctrl_c_says_what_is_kept() -> None:
     assert result.stderr.strip() == "Interrupted: the first part remains."
 
 
+def test_ctrl_c_in_a_finalizer_interrupts_all_the_same() -> None:
+    code = (
+        "import os, signal, sys, time\n"
+        "from dq_space_arm_env.command_line.verb_program import run_to_end\n"
+        "class Pressed:\n"
+        "    def __del__(self):\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "        time.sleep(10)\n"
+        "def run():\n"
+        "    Pressed()\n"
+        "    time.sleep(10)\n"
+        "sys.exit(run_to_end(run))"
+    )
+    result = process(code)
+    assert result.returncode == INTERRUPTED
+    assert result.stderr == "Interrupted: files are complete, or as they were.\n"
+
+
 def test_ctrl_c_while_the_program_is_imported_is_a_sentence() -> None:
     result = process(
         "import sys\n"
