@@ -20,12 +20,15 @@ from agents.configuration.imitation import Optimization
 from agents.imitation.objective import Losses, Objective
 from agents.imitation.samples import Source
 from agents.policies.network import PolicyNetwork
+from agents.policies.tensor_files import read_tensors
 from agents.run_folder import RunFolderError
+from dq_space_arm_env.common.bounded_reading import read_bytes
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import Advance
 from experts.demonstrations.settings import differences
 
 CHECKPOINT = "checkpoint.pt"
+MOST_BYTES = 1 << 30  # of a checkpoint that is read
 VALIDATION_BATCHES = 32  # at most; the same time steps every time
 UPDATES_BETWEEN_MESSAGES = 20
 FINAL_RATE = 1e-3  # learning rate at the end, relative to its peak
@@ -276,7 +279,7 @@ def _load_checkpoint(folder: Path, identity: dict[str, Any]) -> dict[str, Any] |
     if not path.is_file():
         return None
     try:
-        content = torch.load(path, weights_only=True)
+        content = read_tensors(read_bytes(path, MOST_BYTES))
         there = content["identity"]
     except Exception as error:  # damaged bytes make the reader raise anything
         raise CheckpointError(

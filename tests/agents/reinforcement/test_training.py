@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import DQSpaceArmVecEnv, ExportedPolicy, evaluate
 from agents.configuration import ConfigurationError, load_configuration
-from agents.reinforcement.callback import DivergedError
+from agents.reinforcement.callback import DivergedError, TrainingCallback
 from agents.reinforcement.checkpoint import read_checkpoint
 from agents.reinforcement.networks import export_policy
 from agents.reinforcement.reinforcement_training import make_environment, make_learner
@@ -306,6 +306,18 @@ def test_a_run_whose_time_is_up_is_left_as_it_is(scene_file, tmp_path):
     again = train(settings, tmp_path)
     assert again.model.num_timesteps == first.model.num_timesteps
     assert (tmp_path / "evaluations.jsonl").read_text() == curve
+
+
+def test_a_run_whose_time_is_up_resumes_to_the_same_weights(trained, scene_file, tmp_path, monkeypatch):
+    """It stops between two rollouts, and throws none away."""
+    over = property(lambda callback: callback.progress.environment_steps >= 1920)
+    monkeypatch.setattr(TrainingCallback, "is_time_up", over)
+    settings = configuration("PPO", scene_file)
+    assert train(settings, tmp_path).model.num_timesteps * REPEAT == 1920
+    monkeypatch.undo()
+    run = train(settings, tmp_path)
+    for actual, expected in zip(state_of(run.model), state_of(trained("PPO").model), strict=True):
+        np.testing.assert_array_equal(actual, expected)
 
 
 @pytest.mark.parametrize(
