@@ -71,6 +71,12 @@ _VECTORS = [f"tests/environment/test_{name}.py" for name in ("vector_environment
 _METHODS = [f"tests/integrators/test_{name}.py" for name in ("explicit_runge_kutta", "integrators")]
 _METHODS += [f"tests/integrators/test_{name}.py" for name in ("rosenbrock", "momentum", "dormand_prince")]
 
+_RECEDING = "tests/experts/test_receding_horizon.py"
+_RECEDING_QUICK = (
+    "without_iterations_it_is_the_feedback_of_the_stage_that_has_come",
+    "what_lies_beyond_the_horizon_costs_what_the_plan_says_of_its_end",
+)
+
 TESTS: dict[str, dict[str, list[str]]] = {
     "dq_space_arm_env/algebra/": {"quick": _ALGEBRA, "default": ["tests/dynamics", *_KERNELS]},
     "dq_space_arm_env/dynamics/": {"quick": ["tests/dynamics"], "default": _KERNELS},
@@ -83,7 +89,7 @@ TESTS: dict[str, dict[str, list[str]]] = {
         "default": [*_ENVIRONMENT, *_VECTORS, "tests/kernels/test_kernels_randomization.py"],
     },
     "dq_space_arm_env/environment/goal.py": {"quick": ["tests/environment/test_goal_environment.py"]},
-    "dq_space_arm_env/environment/": {"quick": _ENVIRONMENT[:2] + _VECTORS, "default": _ENVIRONMENT[2:]},
+    "dq_space_arm_env/environment/": {"quick": _ENVIRONMENT[:2], "default": _VECTORS + _ENVIRONMENT[2:]},
     "dq_space_arm_env/integrators/": {
         "quick": [
             f"tests/integrators/test_{name}.py" for name in ("tableaus", "registry", "interpreted_steps")
@@ -98,7 +104,10 @@ TESTS: dict[str, dict[str, list[str]]] = {
     "experts/ddp/rollout.py": _solver("rollout", "solution"),
     "experts/ddp/second_order.py": _solver("second_order", "box_ddp"),
     "experts/ddp/": _solver("line_search", "box_ddp", "second_order"),
-    "experts/receding_horizon.py": {"quick": ["tests/experts/test_receding_horizon.py"]},
+    "experts/receding_horizon.py": {
+        "quick": [f"{_RECEDING}::test_{name}" for name in _RECEDING_QUICK],
+        "default": [_RECEDING],
+    },
     "dq_space_arm_env/common/files.py": {"quick": ["tests/common"]},
     "experts/demonstrations/": {
         "quick": ["tests/demonstrations/test_folder_of_shards.py"],
@@ -178,7 +187,10 @@ def import_everything(tree: Path) -> None:
     os.chdir(tree)
     os.environ["PYTHONPATH"] = str(tree)
     files = dict.fromkeys(
-        test for tests in TESTS.values() for test in tests["quick"] if (tree / test).exists()
+        test
+        for tests in TESTS.values()
+        for test in tests["quick"]
+        if (tree / test.partition("::")[0]).exists()
     )
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):  # noqa: PTH123
         code = pytest.main([*OPTIONS, "--collect-only", "-m", "not endurance", *files])
@@ -275,7 +287,7 @@ def run(tree: Path, mutant: dict[str, Any], stage: str) -> str:
     changed = mutated(source, mutant)
     if changed is None:
         return "stale"
-    tests = [test for test in tests_of(mutant["file"], stage) if (tree / test).exists()]
+    tests = [test for test in tests_of(mutant["file"], stage) if (tree / test.partition("::")[0]).exists()]
     if not tests:
         return "survived"
     parts, kept = Path(mutant["file"]).parts, os.environ.get("DQ_SPACE_ARM_CACHE")
