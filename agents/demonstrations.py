@@ -34,7 +34,7 @@ def prepare_demonstrations(
     Generated ones, and those read from Minari, go to `folder`; an interrupted call resumes there.
     """
     if source.folder is not None:
-        demonstrations = load_demonstrations(source.folder)
+        demonstrations = load_demonstrations(source.folder, verify=True)
     elif source.minari is not None:
         demonstrations = read_from_minari(source.minari, folder)
     else:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env import Scene
+from dq_space_arm_env.common.bounded_reading import read_text
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.kernels import Kernels
 from experts.ddp.solution import StopReason
@@ -36,9 +37,9 @@ def read_from_minari(dataset_id: str, folder: Path) -> Demonstrations:
     settings = _settings(dataset, dataset_id)
     text = json.dumps(settings, indent=2) + "\n"
     if (folder / MANIFEST).is_file():
-        if (folder / SETTINGS).read_text(encoding="utf-8") != text:
+        if read_text(folder / SETTINGS) != text:
             raise DemonstrationsError(f"{folder} holds other demonstrations: use another folder")
-        return load_demonstrations(folder)
+        return load_demonstrations(folder, verify=True)
     shutil.rmtree(folder / SHARDS, ignore_errors=True)  # of an interrupted run
     (folder / SHARDS).mkdir(parents=True)
     kernels = Demonstrations(folder, settings, {"shards": [], "demonstrations": 0}).kernels

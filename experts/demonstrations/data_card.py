@@ -6,9 +6,12 @@ equal data have equal cards.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from string import Template
 
+from dq_space_arm_env.common.shown_text import markdown_text
 from dq_space_arm_env.common.tables import TextTable
+from dq_space_arm_env.validation import dump_yaml
 from experts.demonstrations import facts as tables
 from experts.demonstrations.facts import Facts
 from experts.demonstrations.shard import FAILURES, SUMMARIES, TRAJECTORIES
@@ -34,7 +37,7 @@ MEANINGS = {
 
 _TEMPLATE = Template("""\
 ---
-pretty_name: Optimal maneuvers of a spacecraft with an arm, scene $scene
+$pretty_name
 task_categories:
 - reinforcement-learning
 - robotics
@@ -144,10 +147,11 @@ def data_card(facts: Facts, minari_id: str | None = None) -> str:
     demonstrations, settings = facts.demonstrations, facts.demonstrations.settings
     success = demonstrations.scene.success
     return _TEMPLATE.substitute(
-        scene=demonstrations.scene.name,
+        scene=markdown_text(demonstrations.scene.name),
+        pretty_name=_pretty_name(demonstrations.scene.name),
         demonstrations=len(demonstrations),
         size_category=_size_category(len(demonstrations)),
-        contents="\n\n".join(tables.contents(facts).markdown()),
+        contents="\n\n".join(_contents(facts).markdown()),
         attitude_tolerance=f"{success.attitude_error_deg:g}",
         position_tolerance=f"{success.position_error:g}",
         failures=_failures(facts),
@@ -159,16 +163,30 @@ def data_card(facts: Facts, minari_id: str | None = None) -> str:
         problems=facts.problems,
         seed=settings["seed"],
         shard_size=settings["shard_size"],
-        settings_hash=demonstrations.manifest["settings_sha256"],
-        source_hash=settings["source"],
+        settings_hash=markdown_text(demonstrations.manifest["settings_sha256"]),
+        source_hash=markdown_text(str(settings["source"])),
     )
+
+
+def _pretty_name(scene: str) -> str:
+    """The line of the metadata, which are YAML."""
+    text = f"Optimal maneuvers of a spacecraft with an arm, scene {scene}"
+    return dump_yaml({"pretty_name": text}, header="").strip()
+
+
+def _contents(facts: Facts) -> TextTable:
+    """The table of contents, whose names others have chosen."""
+    table = tables.contents(facts)
+    return replace(table, rows=tuple((key, markdown_text(value)) for key, value in table.rows))
 
 
 def _failures(facts: Facts) -> str:
     count = len(facts.failures["index"])
     if not count:
         return f"All {facts.problems} problems did."
-    reasons = ", ".join(f"{n} {reason}" for reason, n in facts.demonstrations.manifest["failures"].items())
+    reasons = ", ".join(
+        f"{n} {markdown_text(reason)}" for reason, n in facts.demonstrations.manifest["failures"].items()
+    )
     return f"{count} of {facts.problems} problems did not ({reasons})."
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json, read_text
 from dq_space_arm_env.common.tables import TextTable
 from experts.demonstrations import Demonstrations
 from experts.demonstrations.folder import LOG
@@ -19,6 +20,7 @@ from experts.demonstrations.outcomes import GUESSES
 from experts.demonstrations.shard import tip_errors
 from experts.problems.shooting_problem import FloatArray
 
+_LOG_BYTES = 2**26  # of a part: tens of thousands of shards
 REPLAYED = 1000
 """Demonstrations, evenly spaced, whose return is compared with the cost."""
 
@@ -89,16 +91,19 @@ def read_log(demonstrations: Demonstrations) -> Log:
     entries: dict[int, dict[str, Any]] = {}
     for path in sorted((demonstrations.path / LOG).glob("*.jsonl")):
         processors: dict[str, str] = {}  # of machines that started a run
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for line in _lines(path):
             try:
-                entry = json.loads(line)
-            except ValueError:
-                continue  # left over from a killed run
-            if "run" in entry:
-                processors[entry["host"]] = f" ({entry['run']['machine']['processor_name']})"
-            else:
-                machine = entry["host"] + processors.get(entry["host"], "")
-                entries[entry["shard"]] = {**entry, "machine": machine}  # a repeated one counts once
+                entry = parse_json(line, str(path))
+                if "run" in entry:
+                    processors[entry["host"]] = f" ({entry['run']['machine']['processor_name']})"
+                    continue
+                machine = str(entry["host"]) + processors.get(entry["host"], "")
+                timed = {str(part): float(value) for part, value in entry["seconds"].items()}
+                solves = [float(value) for value in entry["solve_seconds"]]
+                # A repeated one counts once.
+                entries[int(entry["shard"])] = {"machine": machine, "seconds": timed, "solve_seconds": solves}
+            except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
+                continue  # left over from a killed run, or damaged
     seconds: dict[str, float] = {}
     for entry in entries.values():
         for part, value in entry["seconds"].items():
@@ -106,6 +111,13 @@ def read_log(demonstrations: Demonstrations) -> Log:
     solves = [value for _, entry in sorted(entries.items()) for value in entry["solve_seconds"]]
     machines = tuple(sorted({entry["machine"] for entry in entries.values()}))
     return Log(len(entries), machines, np.array(solves), seconds)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return read_text(path, _LOG_BYTES).splitlines()
+    except UnreadableError:
+        return []  # nothing follows from the log
 
 
 def _quantities(

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
 from dq_space_arm_env.common.files import remove_leftovers, write_atomically
 from dq_space_arm_env.common.locks import locked
 from experts.demonstrations.outcomes import REASONS
@@ -32,7 +33,7 @@ from experts.demonstrations.shard import ShardResult
 from experts.demonstrations.tensors import DemonstrationsError, map_tensors
 
 SETTINGS, MANIFEST, SHARDS, LOG = "settings.json", "manifest.json", "shards", "log"
-_SHARD_NAME = re.compile(r"(\d{6,})-([0-9a-f]{64})\.safetensors")
+SHARD_NAME = re.compile(r"(\d{6,})-([0-9a-f]{64})\.safetensors")
 
 
 class Part(NamedTuple):
@@ -70,11 +71,11 @@ class Folder:
     def _check_settings(self) -> None:
         path, here = self.path / SETTINGS, self.settings.record()
         try:
-            there = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            write_atomically(path, self.settings.to_json(), durable=True)
-            return
-        except ValueError as error:
+            if not path.exists():
+                write_atomically(path, self.settings.to_json(), durable=True)
+                return
+            there = read_mapping(path)
+        except UnreadableError as error:
             raise DemonstrationsError(f"{path} is damaged ({error}); choose a new folder") from error
         found = differences(there, here)
         if found:
@@ -88,7 +89,7 @@ class Folder:
         files: dict[int, list[Path]] = {}
         for path in sorted((self.path / SHARDS).iterdir()):
             name = path.name.removeprefix(".")
-            match = _SHARD_NAME.match(name)
+            match = SHARD_NAME.match(name)
             if match and int(match[1]) in self.shards:
                 if path.name == match[0]:
                     files.setdefault(int(match[1]), []).append(path)
@@ -115,12 +116,12 @@ class Folder:
 
     def complete(self) -> bool:
         """Write the manifest if all shards exist, those of other parts included; tell whether they do."""
-        paths = sorted(path for path in (self.path / SHARDS).iterdir() if _SHARD_NAME.fullmatch(path.name))
+        paths = sorted(path for path in (self.path / SHARDS).iterdir() if SHARD_NAME.fullmatch(path.name))
         shards = {int(path.name.partition("-")[0]): path for path in paths}
         if len(shards) < self.settings.n_shards:
             return False
-        manifest = _manifest(self.path / SETTINGS, [shards[i] for i in range(self.settings.n_shards)])
-        write_atomically(self.path / MANIFEST, json.dumps(manifest, indent=2) + "\n", durable=True)
+        manifest = manifest_of(self.path / SETTINGS, [shards[i] for i in range(self.settings.n_shards)])
+        write_atomically(self.path / MANIFEST, manifest_text(manifest), durable=True)
         return True
 
 
@@ -130,7 +131,11 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _manifest(settings: Path, paths: list[Path]) -> dict[str, Any]:
+def manifest_text(manifest: dict[str, Any]) -> str:
+    return json.dumps(manifest, indent=2) + "\n"
+
+
+def manifest_of(settings: Path, paths: list[Path]) -> dict[str, Any]:
     """Outcomes and shards; the same whichever part writes it."""
     shards, failures = [], np.zeros(len(REASONS), dtype=np.int64)
     for path in paths:

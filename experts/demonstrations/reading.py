@@ -3,7 +3,6 @@
 Files are read on access and not kept: a data set may be far larger than memory.
 """
 
-import json
 import os
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,13 +14,26 @@ from typing import Any, Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
 
 from dq_space_arm_env import Scene, compile_scene
+from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping, read_text
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.kernels import Kernels
-from experts.demonstrations.folder import MANIFEST, SETTINGS, SHARDS, sha256_of
+from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.validation import problem_list
+from experts.demonstrations.folder import (
+    MANIFEST,
+    SETTINGS,
+    SHARD_NAME,
+    SHARDS,
+    manifest_of,
+    manifest_text,
+    sha256_of,
+)
 from experts.demonstrations.outcomes import GUESSES, REASONS
 from experts.demonstrations.settings import FORMAT
-from experts.demonstrations.shard import FAILURES, SUMMARIES, TRAJECTORIES
+from experts.demonstrations.shard import FAILURES, SUMMARIES, TRAJECTORIES, check_arrays
 from experts.demonstrations.tensors import DemonstrationsError, Tensors, map_tensors
 from experts.problems.shooting_problem import FloatArray
 
@@ -77,13 +89,22 @@ class Batch:
 class _Files:
     """The shards of a folder, some of them mapped."""
 
-    def __init__(self, folder: Path, shards: Sequence[Mapping[str, Any]]) -> None:
+    def __init__(self, folder: Path, shards: Sequence[Mapping[str, Any]], scene: Scene) -> None:
+        self._layout, self._horizon = StateLayout.of(scene), scene.simulation.steps
+        self._sizes = [int(shard["demonstrations"]) for shard in shards]
         self.paths = [folder / SHARDS / shard["file"] for shard in shards]
-        self.ends = list(accumulate(int(shard["demonstrations"]) for shard in shards))
+        self.ends = list(accumulate(self._sizes))
         self.mapped = lru_cache(maxsize=OPEN_SHARDS)(self._map)
 
     def _map(self, shard: int) -> Tensors:
-        return map_tensors(self.paths[shard])
+        tensors, path = map_tensors(self.paths[shard]), self.paths[shard]
+        check_arrays(path, tensors.arrays, self._layout, self._horizon)
+        if len(tensors.arrays["index"]) != self._sizes[shard]:
+            raise DemonstrationsError(
+                f"{path} holds {len(tensors.arrays['index'])} demonstrations, its manifest says "
+                f"{self._sizes[shard]}; generate it again"
+            )
+        return tensors
 
     def locate(self, place: int) -> tuple[Tensors, int]:
         """Return the shard of a demonstration, and its row there."""
@@ -125,7 +146,7 @@ class Demonstrations(Sequence[Demonstration]):
         self.path, self.settings, self.manifest = path, settings, manifest
         self.scene = Scene.model_validate(settings["scene"])
         if selection is None:
-            files = _Files(path, manifest["shards"])
+            files = _Files(path, manifest["shards"], self.scene)
             selection = files, np.arange(manifest["demonstrations"], dtype=np.int64)
         self._files, self._places = selection
 
@@ -298,6 +319,12 @@ class Demonstrations(Sequence[Demonstration]):
 def load_demonstrations(path: str | os.PathLike[str], *, verify: bool = False) -> Demonstrations:
     """Open a folder that `generate_demonstrations` completed.
 
+    With `verify`, every byte of settings, manifest and shards is checked: the manifest has the hashes of the
+    other files, and follows from them, so it is made again and compared. Card, log and summary, from which
+    nothing is learned, are not. This finds damage and careless changes. Whoever rewrites the whole folder can
+    write a manifest that fits: to recognize a data set, compare the hash of its `manifest.json`, which stands
+    for all of it, with one that you keep elsewhere.
+
     Args:
         path: The folder.
         verify: Whether to compare the hash of every file with the manifest, rather than its size.
@@ -309,39 +336,120 @@ def load_demonstrations(path: str | os.PathLike[str], *, verify: bool = False) -
         DemonstrationsError: If there is no such folder, it is not complete, or a file is damaged.
     """
     folder = Path(path)
-    if not (folder / SETTINGS).is_file():
+    if not (folder / SETTINGS).exists():
         raise DemonstrationsError(f"{folder} holds no demonstrations: it has no {SETTINGS}")
-    if not (folder / MANIFEST).is_file():
+    if not (folder / MANIFEST).exists():
         raise DemonstrationsError(
             f"{folder} is not complete: it has no {MANIFEST}; run the command that began it again to resume"
         )
     settings, manifest = (_read_json(folder / name) for name in (SETTINGS, MANIFEST))
     if settings.get("format") != FORMAT:
         raise DemonstrationsError(
-            f"{folder} has format {settings.get('format')}, this version reads {FORMAT}: generate it again"
+            f"{folder} has format {shortened(settings.get('format'))}, this version reads {FORMAT}: generate "
+            "it again"
         )
-    for shard in manifest["shards"]:
-        _check_file(folder / SHARDS / shard["file"], shard, verify)
-    return Demonstrations(folder, settings, manifest)
+    _check_fields(folder / SETTINGS, settings, _SETTINGS)
+    _check_fields(folder / MANIFEST, manifest, _MANIFEST)
+    paths = [_checked_file(folder, shard, verify) for shard in manifest["shards"]]
+    held = sum(shard["demonstrations"] for shard in manifest["shards"])
+    if manifest["demonstrations"] != held:
+        raise DemonstrationsError(
+            f"{folder / MANIFEST} has {manifest['demonstrations']} demonstrations, its shards have {held}; "
+            f"{_REMEDY}"
+        )
+    if verify:
+        _verify_descriptions(folder, paths, manifest)
+    try:
+        return Demonstrations(folder, settings, manifest)
+    except ValidationError as error:
+        raise DemonstrationsError(problem_list(f"{folder / SETTINGS}: scene", error)) from error
+
+
+_REMEDY = "run the command that made the folder again to repair it"
+_Fields = Mapping[str, tuple[type, str]]
+_SETTINGS: _Fields = {
+    "scene": (dict, "a mapping"),
+    "problems": (int, "a whole number"),
+    "seed": (int, "a whole number"),
+    "shard_size": (int, "a whole number"),
+    "source": (str, "text"),
+    "versions": (dict, "a mapping"),
+}
+_MANIFEST: _Fields = {
+    "settings_sha256": (str, "text"),
+    "demonstrations": (int, "a whole number"),
+    "failures": (dict, "a mapping"),
+    "shards": (list, "a list"),
+}
+_SHARD: _Fields = {
+    "file": (str, "text"),
+    "sha256": (str, "text"),
+    "bytes": (int, "a whole number"),
+    "demonstrations": (int, "a whole number"),
+    "failures": (int, "a whole number"),
+}
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return read_mapping(path)
+    except UnreadableError as error:
         raise DemonstrationsError(f"{path} cannot be read ({error}); generate it again") from error
-    return dict(content)
 
 
-def _check_file(path: Path, shard: Mapping[str, Any], verify: bool) -> None:
-    remedy = "run the command that made the folder again to repair it"
+def _check_fields(path: Path, content: Any, fields: _Fields) -> None:
+    """Refuse a mapping whose entries are missing or of another kind; whole numbers are 0 or greater."""
+    if not isinstance(content, dict):
+        raise DemonstrationsError(f"{path} holds {shortened(content, 60)}, it should be a mapping; {_REMEDY}")
+    for name, (kind, wanted) in fields.items():
+        value: Any = content.get(name)
+        right = isinstance(value, kind) and not isinstance(value, bool)
+        if not right or (isinstance(value, int) and not 0 <= value < 2**63):
+            raise DemonstrationsError(
+                f"{path}: {name} is {shortened(value)}, it should be {wanted}; {_REMEDY}"
+            )
+
+
+def _checked_file(folder: Path, shard: Any, verify: bool) -> Path:
+    """Path of a shard, whose entry in the manifest and whose file fit each other."""
+    _check_fields(folder / MANIFEST, shard, _SHARD)
+    name = SHARD_NAME.fullmatch(shard["file"])
+    if name is None or name[2] != shard["sha256"]:
+        raise DemonstrationsError(
+            f"{folder / MANIFEST}: file is {shortened(shard['file'])}, it should be a number and the hash "
+            f"{shortened(shard['sha256'])}, in the folder {SHARDS}; {_REMEDY}"
+        )
+    path = folder / SHARDS / name[0]
     if not path.is_file():
-        raise DemonstrationsError(f"{path} is missing; {remedy}")
+        raise DemonstrationsError(f"{path} is missing; {_REMEDY}")
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise DemonstrationsError(f"{path} is a link out of the folder, it should be a file in it; {_REMEDY}")
     size = path.stat().st_size
     if size != shard["bytes"]:
-        raise DemonstrationsError(f"{path} has {size} bytes instead of {shard['bytes']}; {remedy}")
+        raise DemonstrationsError(f"{path} has {size} bytes instead of {shard['bytes']}; {_REMEDY}")
     if verify and sha256_of(path) != shard["sha256"]:
-        raise DemonstrationsError(f"{path} is damaged: its hash is not that of the manifest; {remedy}")
+        raise DemonstrationsError(f"{path} is damaged: its hash is not that of the manifest; {_REMEDY}")
+    return path
+
+
+def _verify_descriptions(folder: Path, paths: list[Path], manifest: Mapping[str, Any]) -> None:
+    """Compare settings and manifest with what follows from the files; the shards are checked already."""
+    if sha256_of(folder / SETTINGS) != manifest["settings_sha256"]:
+        raise DemonstrationsError(
+            f"{folder / SETTINGS} is not what the demonstrations were made with: its hash is not that of the "
+            f"manifest; restore it, or generate them again"
+        )
+    try:
+        made = manifest_text(manifest_of(folder / SETTINGS, paths))
+        kept = read_text(folder / MANIFEST)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DemonstrationsError(
+            f"{folder}: a shard has other arrays than a shard should ({error})"
+        ) from error
+    if made != kept:
+        raise DemonstrationsError(
+            f"{folder / MANIFEST} is damaged: it is not what follows from settings and shards; {_REMEDY}"
+        )
 
 
 def _check_names(names: Sequence[str], known: Sequence[str]) -> None:

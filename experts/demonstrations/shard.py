@@ -25,7 +25,8 @@ Gains are control-limited: rows of inputs at a limit are zero.
 
 import hashlib
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -36,6 +37,7 @@ from dq_space_arm_env import Scene
 from dq_space_arm_env.environment import DQSpaceArmVectorEnv
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
 from dq_space_arm_env.kernels import Kernels
+from dq_space_arm_env.scene import StateLayout
 from experts.demonstrations.outcomes import (
     GUESSES,
     REASONS,
@@ -48,7 +50,7 @@ from experts.demonstrations.outcomes import (
     solve_again,
 )
 from experts.demonstrations.settings import Settings
-from experts.demonstrations.tensors import pack
+from experts.demonstrations.tensors import DemonstrationsError, pack
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 
@@ -137,6 +139,52 @@ def make_shard(task: Task) -> ShardResult:
     clock.lap("packing")
     counts = len(good), len(failed)
     return ShardResult(task.shard, content, digest, platform.node(), *counts, solve_seconds, clock.seconds)
+
+
+def check_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], layout: StateLayout, horizon: int) -> None:
+    """Raise DemonstrationsError where a shard has other arrays than those of its scene."""
+    sizes = {"n_x": layout.n_x, "n_u": layout.n_u, "n_t": layout.n_t, "n_obs": layout.n_x + 1}
+    sizes |= {"N": horizon, "N + 1": horizon + 1, "2": 2}
+    for name, (dtype, *axes) in _ARRAYS.items():
+        first = "failures.index" if name.startswith("failures.") else "index"
+        array, counted = arrays.get(name), arrays.get(first)
+        rows = () if counted is None else counted.shape[:1]
+        shape = (*rows, *(sizes[axis] for axis in axes))
+        if array is None or array.shape != shape or array.dtype != dtype:
+            found = "is missing" if array is None else f"has shape {array.shape} of {array.dtype}"
+            raise DemonstrationsError(
+                f"{path}: {name} {found}, it should have shape {shape} of {dtype}; generate it again"
+            )
+    for name, known in (("stop_reason", REASONS), ("failures.stop_reason", REASONS), ("guess", GUESSES)):
+        if arrays[name].max(initial=0) >= len(known):
+            raise DemonstrationsError(
+                f"{path}: {name} has entries beyond {len(known) - 1}; generate it again"
+            )
+
+
+_ARRAYS: Mapping[str, tuple[str, ...]] = {  # type, and axes after the first
+    "states": ("float64", "N + 1", "n_x"),
+    "observations": ("float64", "N + 1", "n_obs"),
+    "actions": ("float64", "N", "n_u"),
+    "rewards": ("float64", "N"),
+    "feedback_gains": ("float32", "N", "n_u", "n_t"),
+    "index": ("int64",),
+    "seed": ("int64",),
+    "cost": ("float64",),
+    "iterations": ("int64",),
+    "stop_reason": ("uint8",),
+    "guess": ("uint8",),
+    "emphasis": ("float64",),
+    "start_errors": ("float64", "2"),
+    "final_errors": ("float64", "2"),
+    "clamped_share": ("float64",),
+    "failures.index": ("int64",),
+    "failures.seed": ("int64",),
+    "failures.stop_reason": ("uint8",),
+    "failures.cost": ("float64",),
+    "failures.start": ("float64", "n_x"),
+    "failures.final_errors": ("float64", "2"),
+}
 
 
 def draw_starts(scene: Scene, seeds: Sequence[int]) -> FloatArray:

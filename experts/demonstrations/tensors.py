@@ -13,7 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-_TYPES = {"F64": "<f8", "F32": "<f4", "I64": "<i8", "U8": "u1"}
+from dq_space_arm_env.common import bounded_formats
+from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json
+from dq_space_arm_env.common.shown_text import shortened
+
 _NOTES = "notes"
 
 
@@ -36,19 +39,13 @@ def pack(arrays: Mapping[str, NDArray[Any]], notes: Mapping[str, Any]) -> bytes:
 def map_tensors(path: Path) -> Tensors:
     """Map a file written by `pack`, which must not change while it is in use."""
     try:
-        content = np.memmap(path, mode="r").view(np.ndarray)
-        begin = 8 + int.from_bytes(content[:8].tobytes(), "little")
-        header = json.loads(content[8:begin].tobytes())
-        notes = json.loads(header.pop("__metadata__")[_NOTES])
-        arrays = {name: _view(content[begin:], entry) for name, entry in header.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        arrays, metadata = bounded_formats.map_tensors(path)
+        notes = parse_json(metadata.get(_NOTES, ""), f"{path}: notes")
+        if not isinstance(notes, dict):
+            raise UnreadableError(f"{path}: notes are {shortened(notes, 40)}, they should be a mapping")
+    except UnreadableError as error:
         raise DemonstrationsError(f"{path} cannot be read ({error}); generate it again") from error
     return Tensors(arrays, notes)
-
-
-def _view(content: NDArray[np.uint8], entry: Mapping[str, Any]) -> NDArray[Any]:
-    start, stop = entry["data_offsets"]
-    return content[start:stop].view(_TYPES[entry["dtype"]]).reshape(entry["shape"])
 
 
 class DemonstrationsError(RuntimeError):
