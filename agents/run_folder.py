@@ -17,6 +17,7 @@ Files and checkpoints are written under a temporary name and renamed: under thei
 """
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,9 +28,11 @@ import numpy as np
 
 from agents.configuration import AgentConfiguration, load_configuration
 from dq_space_arm_env import Scene, load_scene
+from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json, read_text
 from dq_space_arm_env.common.files import remove_leftovers, temporary_name, write_atomically
 from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.provenance import provenance
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.environment.rollouts import Policy, rollout
 from dq_space_arm_env.validation import dump_yaml
 from experts.demonstrations.settings import differences
@@ -43,6 +46,8 @@ VALIDATION_SEED = 1
 _HEADER = "# The resolved configuration of this run.\n"
 _DIGITS = 12
 _PART = ".part"
+_POINT = ("environment_steps", "success_rate", "median_cost")  # numbers of a learning curve that count
+_REMEDY = "repair it, or use another folder"
 
 
 class RunFolderError(RuntimeError):
@@ -93,7 +98,12 @@ class RunFolder:
 
     def _starts(self) -> list[dict[str, Any]]:
         file = self.path / PROVENANCE
-        return list(_parsed(file, file.read_text(encoding="utf-8"))) if file.exists() else []
+        if not file.exists():
+            return []
+        starts = _parsed(file, _text(file))
+        if not isinstance(starts, list) or not all(isinstance(start, dict) for start in starts):
+            raise RunFolderError(f"{file} is damaged (it should be a list of mappings): {_REMEDY}")
+        return starts
 
     def metadata(
         self, configuration: AgentConfiguration, scene: Scene, training: Mapping[str, Any]
@@ -110,7 +120,7 @@ class RunFolder:
 
     def checkpoint(self) -> Path | None:
         """Folder of the last complete checkpoint, if any."""
-        complete = [path for path in (self.path / CHECKPOINTS).iterdir() if path.name.isdigit()]
+        complete = [path for path in (self.path / CHECKPOINTS).iterdir() if _is_complete(path)]
         return max(complete, key=lambda path: int(path.name), default=None)
 
     def add_checkpoint(self, steps: int, write: Callable[[Path], None]) -> None:
@@ -124,7 +134,7 @@ class RunFolder:
         write(temporary)
         temporary.rename(final)
         for other in folder.iterdir():
-            if other != final and (other.name.isdigit() or other.suffix == _PART):
+            if other != final and (_is_complete(other) or other.suffix == _PART):
                 shutil.rmtree(other, ignore_errors=True)
 
     def evaluations(self, until: int | None = None) -> list[dict[str, Any]]:
@@ -132,7 +142,7 @@ class RunFolder:
         file = self.path / EVALUATIONS
         if not file.exists():
             return []
-        lines = [_parsed(file, line) for line in file.read_text(encoding="utf-8").splitlines()]
+        lines = [_point(file, line) for line in _text(file).splitlines()]
         return [line for line in lines if until is None or line["environment_steps"] <= until]
 
     def write_evaluations(self, lines: list[dict[str, Any]]) -> None:
@@ -156,11 +166,33 @@ def validate(policy: Policy, scene: Scene, seeds: Sequence[int]) -> dict[str, fl
     }
 
 
+def _is_complete(checkpoint: Path) -> bool:
+    return re.fullmatch(r"[0-9]{1,20}", checkpoint.name) is not None
+
+
+def _text(file: Path) -> str:
+    try:
+        return read_text(file)
+    except UnreadableError as error:
+        raise RunFolderError(f"{error}: {_REMEDY}") from error
+
+
 def _parsed(file: Path, text: str) -> Any:
     try:
-        return json.loads(text)
-    except ValueError as error:
-        raise RunFolderError(f"{file} is damaged ({error}): repair it, or use another folder") from error
+        return parse_json(text, "JSON")
+    except UnreadableError as error:
+        raise RunFolderError(f"{file} is damaged ({error}): {_REMEDY}") from error
+
+
+def _point(file: Path, line: str) -> dict[str, Any]:
+    """A point of the learning curve."""
+    point = _parsed(file, line)
+    numbers = [point.get(name) for name in _POINT] if isinstance(point, dict) else [None]
+    if not all(isinstance(number, int | float) for number in numbers):
+        raise RunFolderError(
+            f"{file} is damaged ({shortened(point)} lacks a number of {', '.join(_POINT)}): {_REMEDY}"
+        )
+    return dict(point)
 
 
 def _identity(configuration: dict[str, Any]) -> dict[str, Any]:

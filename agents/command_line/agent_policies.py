@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dq_space_arm_env.command_line.names import Named, package_folder, shipped_files
-from dq_space_arm_env.common.files import archive_members
+from dq_space_arm_env.common.bounded_reading import archive_members
 
 if TYPE_CHECKING:
     from rich.console import Console

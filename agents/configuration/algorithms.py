@@ -5,8 +5,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool
 
-from agents.configuration.schema import DemonstrationSource
-from dq_space_arm_env.validation import Count, Finite, Fraction, Model, NonNegative, Positive, Problem
+from agents.configuration.schema import MOST_IN_MEMORY, DemonstrationSource, Few, Many
+from dq_space_arm_env.validation import (
+    Count,
+    Finite,
+    Fraction,
+    Model,
+    NonNegative,
+    Positive,
+    Problem,
+    count_up_to,
+)
 
 
 class _Common(Model):
@@ -14,7 +23,7 @@ class _Common(Model):
     final_learning_rate: NonNegative | None = Field(
         default=None, description="final step size, reached linearly; absent: learning_rate"
     )
-    batch_size: Count = Field(default=256, description="decisions per minibatch")
+    batch_size: Many = Field(default=256, description="decisions per minibatch")
     gamma: Fraction = Field(default=0.98, description="discount per decision")
 
 
@@ -22,9 +31,9 @@ class PPO(_Common):
     """Proximal policy optimization (Schulman et al., 2017)."""
 
     name: Literal["PPO"]
-    batch_size: Count = Field(default=4096, description="decisions per minibatch")
-    n_steps: Count = Field(default=50, description="decisions of each copy between updates")
-    n_epochs: Count = Field(default=10, description="passes over these decisions per update")
+    batch_size: Many = Field(default=4096, description="decisions per minibatch")
+    n_steps: Many = Field(default=50, description="decisions of each copy between updates")
+    n_epochs: Few = Field(default=10, description="passes over these decisions per update")
     gae_lambda: Fraction = Field(default=0.95, description="decay of the advantage estimate")
     clip_range: Positive = Field(default=0.2, description="largest change of a probability ratio")
     ent_coef: NonNegative = Field(default=0.0, description="weight of the entropy")
@@ -65,7 +74,7 @@ class PPO(_Common):
 class Hindsight(Model):
     """Hindsight experience replay (Andrychowicz et al., NeurIPS 2017), on the goal environment."""
 
-    n_sampled_goal: Count = Field(default=4, description="relabeled decisions per real one")
+    n_sampled_goal: Few = Field(default=4, description="relabeled decisions per real one")
     goal_selection_strategy: Literal["future", "final", "episode"] = Field(
         default="future", description="which achieved goals replace desired ones"
     )
@@ -77,12 +86,14 @@ class Hindsight(Model):
 class OffPolicy(_Common):
     """Settings common to the algorithms with a replay buffer."""
 
-    buffer_size: Count = Field(default=1_000_000, description="decisions in the replay buffer")
+    buffer_size: Annotated[int, count_up_to(MOST_IN_MEMORY)] = Field(
+        default=1_000_000, description="decisions in the replay buffer"
+    )
     learning_starts: Count = Field(default=10_000, description="random decisions before learning")
     tau: Positive = Field(default=0.005, description="update rate of the target networks")
-    train_freq: Count = Field(default=1, description="decisions of each copy between updates")
-    gradient_steps: Count = Field(default=1, description="gradient steps per update")
-    n_critics: Count = Field(default=2, description="critics; the lowest value or quantiles count")
+    train_freq: Many = Field(default=1, description="decisions of each copy between updates")
+    gradient_steps: Many = Field(default=1, description="gradient steps per update")
+    n_critics: Few = Field(default=2, description="critics; the lowest value or quantiles count")
     hindsight: Hindsight | None = Field(
         default=None, description="learn on the goal environment, with hindsight; absent: neither"
     )
@@ -154,7 +165,7 @@ class TQC(_MaximumEntropy):
     """Truncated quantile critics (Kuznetsov et al., ICML 2020)."""
 
     name: Literal["TQC"]
-    n_quantiles: Count = Field(default=25, description="quantiles of a critic")
+    n_quantiles: Few = Field(default=25, description="quantiles of a critic")
     top_quantiles_to_drop_per_net: Count = Field(
         default=2, description="highest quantiles of each critic to drop"
     )

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictInt
 
-from agents.configuration.schema import AgentConfiguration, DemonstrationSource
+from agents.configuration.schema import AgentConfiguration, DemonstrationSource, Few, Many
 from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
 
 SMOOTH_ACTIVATIONS = ("tanh", "silu")  # differentiable everywhere, as matching gains needs
@@ -41,7 +41,7 @@ class Optimization(Model):
     """Settings of the optimizer, Adam."""
 
     updates: Count = Field(default=20_000, description="steps of the optimizer")
-    batch_size: Count = Field(default=256, description="time steps of an update")
+    batch_size: Many = Field(default=256, description="time steps of an update")
     learning_rate: Positive = Field(
         default=2e-3, description="peak learning rate: linear warm-up, then cosine decay"
     )
@@ -74,14 +74,14 @@ class Dagger(Model):
 
     name: Literal["dagger"] = "dagger"
     cloning: Cloning = Field(default_factory=Cloning, description="the policy to start from")
-    rounds: Count = Field(default=4, description="rounds of flying, labeling and training")
-    episodes: Count = Field(default=64, description="episodes of a round")
+    rounds: Few = Field(default=4, description="rounds of flying, labeling and training")
+    episodes: Many = Field(default=64, description="episodes of a round")
     labels: Literal["gains", "solve"] = Field(
         default="solve",
         description="source of the labels: 'gains', the feedback policy of the demonstration from the same "
         "start; 'solve', the expert, replanning from visited states",
     )
-    solves: Count = Field(
+    solves: Many = Field(
         default=2, description="with 'solve', states per episode to replan from, one in each of as many parts"
     )
     every: Count = Field(
@@ -104,7 +104,7 @@ class LearningCurve(Model):
     every: Count = Field(
         default=5000, description="updates between flights, which happen at the next validation or at the end"
     )
-    episodes: Count = Field(default=64, description="flights, always from the same starts")
+    episodes: Many = Field(default=64, description="flights, always from the same starts")
 
 
 class ImitationConfiguration(AgentConfiguration):

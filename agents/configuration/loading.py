@@ -13,7 +13,16 @@ from agents.configuration.imitation import Cloning, Dagger, ImitationConfigurati
 from agents.configuration.reinforcement import Configuration
 from agents.configuration.residual import ResidualConfiguration, ResidualPPO, ResidualSAC
 from agents.configuration.schema import AgentConfiguration
-from dq_space_arm_env.validation import YAMLError, did_you_mean, parse_yaml
+from dq_space_arm_env.common.bounded_reading import UnreadableError
+from dq_space_arm_env.common.shown_text import shortened
+from dq_space_arm_env.validation import (
+    YAMLError,
+    did_you_mean,
+    parse_yaml,
+    problem_list,
+    read_yaml,
+    yaml_problem,
+)
 
 _SUFFIXES = (".yaml", ".yml")
 
@@ -61,14 +70,14 @@ def load_configuration(source: str | Path | Mapping[str, Any] | AgentConfigurati
     if isinstance(source, AgentConfiguration):
         return _validated(type(source), source, f"configuration {source.name!r}")
     if isinstance(source, Mapping):
-        return _of_its_class(source, f"configuration {source.get('name')!r}")
+        return _of_its_class(source, f"configuration {shortened(source.get('name'))}")
     if isinstance(source, Path) or "/" in source or "\\" in source or source.endswith(_SUFFIXES):
         return _read(Path(source))
     names = list_configurations()
     if source not in names:
         close = did_you_mean(source, names)
         raise ConfigurationError(
-            f"no configuration is named {source!r}{f'; {close}' if close else '. '}They are "
+            f"no configuration is named {shortened(source)}{f'; {close}' if close else '. '}They are "
             f"{', '.join(names)}; give a file of your own by its path, ending in .yaml"
         )
     return _read(_directory() / f"{source}.yaml")
@@ -88,11 +97,12 @@ def _directory() -> Traversable:
 
 def _read(file: Traversable) -> AgentConfiguration:
     try:
-        data = parse_yaml(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigurationError(f"{file}: there is no such file") from error
-    except (OSError, UnicodeDecodeError, YAMLError) as error:
-        raise ConfigurationError(f"{file}: cannot be read: {error}") from error
+        # A package in a zip file has its configurations there.
+        data = read_yaml(file) if isinstance(file, Path) else parse_yaml(file.read_text(encoding="utf-8"))
+    except UnreadableError as error:
+        raise ConfigurationError(str(error)) from error
+    except YAMLError as error:
+        raise ConfigurationError(f"{file}: not valid YAML: {yaml_problem(error)}") from error
     if not isinstance(data, dict):
         raise ConfigurationError(f"{file}: must be a mapping (key: value) at the top")
     return _of_its_class(data, str(file))
@@ -104,7 +114,7 @@ def _of_its_class(data: Mapping[str, Any], origin: str) -> AgentConfiguration:
     if not isinstance(name, str) or name not in _CLASSES:
         hint = did_you_mean(name, _CLASSES) if isinstance(name, str) else ""
         raise ConfigurationError(
-            f"{origin}: algorithm.name = {name!r}: {hint}it must be one of {', '.join(_CLASSES)}"
+            f"{origin}: algorithm.name = {shortened(name)}: {hint}it must be one of {', '.join(_CLASSES)}"
         )
     return _validated(_CLASSES[name], dict(data), origin)
 
@@ -113,6 +123,4 @@ def _validated(kind: type[AgentConfiguration], data: object, origin: str) -> Age
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        problems = [detail["msg"] for detail in error.errors(include_url=False)]
-        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-        raise ConfigurationError("\n  - ".join([f"{origin}: {count}", *problems])) from error
+        raise ConfigurationError(problem_list(origin, error)) from error

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pydantic import Field, StrictBool, StrictStr
 
 from agents.configuration.algorithms import PPO, SAC, Algorithm, Hindsight, OffPolicy
-from agents.configuration.schema import AgentConfiguration
+from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many
 from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
 
 _REWARD_SHAPING = ("reward_scale", "cost_power", "success_reward", "end_error_cost")
@@ -33,8 +33,8 @@ class ActionScale(Model):
 class Practice(Model):
     """The training environment; evaluations use the unchanged one."""
 
-    copies: Count = Field(default=128, description="environments stepped together")
-    action_repeat: Count = Field(default=1, description="time steps for which an action is held")
+    copies: Many = Field(default=128, description="environments stepped together")
+    action_repeat: Many = Field(default=1, description="time steps for which an action is held")
     action_scale: ActionScale = Field(
         default_factory=ActionScale, description="largest actions, as fractions of the limits"
     )
@@ -68,7 +68,7 @@ class Schedule(Model):
         default=None, description="time limit of the training, min; absent: none"
     )
     evaluate_every: Count = Field(default=1_000_000, description="environment steps between evaluations")
-    evaluation_episodes: Count = Field(default=64, description="episodes of an evaluation")
+    evaluation_episodes: Many = Field(default=64, description="episodes of an evaluation")
     checkpoint_every: Count = Field(default=5_000_000, description="environment steps between checkpoints")
 
 
@@ -89,6 +89,12 @@ class Configuration(AgentConfiguration):
             yield Problem(
                 ("start_from",), self.start_from, f"is for PPO, not for {self.algorithm.name}: leave it out"
             )
+        decisions = self.environment.copies * getattr(self.algorithm, "n_steps", 1)
+        if decisions > MOST_IN_MEMORY:
+            sentence = (
+                f"all copies gather {decisions:,} decisions, at most {MOST_IN_MEMORY:,} fit into memory"
+            )
+            yield Problem(("environment", "copies"), self.environment.copies, sentence)
         if isinstance(self.algorithm, SAC) and self.algorithm.layer_norm and not self.network.hidden:
             yield Problem(
                 ("network", "hidden"), [], "must have a layer for algorithm.layer_norm to normalize"

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from agents.configuration.algorithms import PPO, SAC
 from agents.configuration.reinforcement import ActionScale, Configuration, Practice, Schedule
-from agents.configuration.schema import AgentConfiguration, DemonstrationSource
+from agents.configuration.schema import AgentConfiguration, DemonstrationSource, Many
 from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
 
 PREFIX = "residual-"
@@ -37,8 +37,8 @@ class Mismatch(Model):
 class ResidualPractice(Model):
     """The training environment: the plan flies with its gains, and the agent corrects it."""
 
-    copies: Count = Field(default=125, description="environments stepped together")
-    action_repeat: Count = Field(
+    copies: Many = Field(default=125, description="environments stepped together")
+    action_repeat: Many = Field(
         default=20, description="time steps for which a correction is held; the plan's feedback acts at each"
     )
     action_scale: ActionScale = Field(

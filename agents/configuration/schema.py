@@ -1,20 +1,33 @@
 """Settings shared by all agents: name, scene, seed, network, and demonstrations."""
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, StrictInt, StrictStr
 
-from dq_space_arm_env.validation import Count, Model, Positive, Problem
+from dq_space_arm_env.validation import Model, Positive, Problem, count_up_to
 
 RESERVED_SEED = 20180627
 """Seed that the evaluation starts follow from; demonstrations with it would hold the answers."""
 
 
+Width = Annotated[int, count_up_to(2**14)]
+"""Size of a layer, at most what a matrix of a gigabyte has."""
+Few = Annotated[int, count_up_to(10_000)]
+"""Number of networks, rounds or the like."""
+Many = Annotated[int, count_up_to(10_000_000)]
+"""Number of things that are in memory together, some hundred bytes each."""
+MOST_IN_MEMORY = 100_000_000
+"""Largest number of decisions in memory, some ten gigabytes."""
+_MOST_LAYERS = 32
+
+
 class Network(Model):
     """The network of the policy, and of its critics."""
 
-    hidden: tuple[Count, ...] = Field(default=(128, 128), description="sizes of the hidden layers")
+    hidden: tuple[Width, ...] = Field(
+        default=(128, 128), max_length=_MOST_LAYERS, description="sizes of the hidden layers"
+    )
     activation: Literal["tanh", "relu", "silu"] = Field(default="tanh", description="between the layers")
 
 
@@ -25,7 +38,7 @@ class AgentConfiguration(Model):
     description: StrictStr = Field(default="", description="what it is, and what to expect")
     scene: StrictStr = Field(default="paper", description="name of a shipped scene, or path of a YAML file")
     seed: StrictInt = Field(default=0, ge=0, lt=2**31, description="seed of everything random")
-    threads: Count = Field(default=1, description="threads of PyTorch")
+    threads: Few = Field(default=1, description="threads of PyTorch")
     network: Network = Field(default_factory=Network, description="the networks")
 
 
@@ -36,7 +49,7 @@ class DemonstrationSource(Model):
     misses. Demonstrations may therefore have to meet stricter ones.
     """
 
-    problems: Count = Field(default=1000, description="problems to solve; few of them fail")
+    problems: Many = Field(default=1000, description="problems to solve; few of them fail")
     seed: StrictInt = Field(default=0, ge=0, description="seed of their starts")
     tolerance_scale: Positive = Field(
         default=1.0, description="tolerances of success that they meet, relative to the scene's, at most 1"

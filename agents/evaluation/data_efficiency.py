@@ -20,6 +20,7 @@ from agents.configuration.imitation import ImitationConfiguration, ObjectiveWeig
 from agents.evaluation.statistics import wilson_interval
 from agents.imitation.cloning import Making, clone, fingerprint
 from agents.imitation.trainer import Progress
+from dq_space_arm_env.common.bounded_reading import parse_json, read_text
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import Advance, Status
 from dq_space_arm_env.common.tables import Row
@@ -195,7 +196,8 @@ def _identity(
 def _read(path: Path, identity: Mapping[str, Any]) -> list[Row]:
     if not path.is_file():
         return []
-    first, *rows = map(json.loads, path.read_text(encoding="utf-8").splitlines())
-    if first != identity:
+    lines = read_text(path).splitlines() or ["null"]
+    first, *rows = (parse_json(line, f"{path}, line {number}") for number, line in enumerate(lines, 1))
+    if first != identity or not all(isinstance(row, dict) for row in rows):
         raise ValueError(f"{path} is of another measurement: use another folder")
-    return list(rows)
+    return rows

@@ -24,6 +24,7 @@ from agents.evaluation.evaluating import Advance, evaluate
 from agents.evaluation.expert_costs import EVALUATION_SEEDS
 from agents.evaluation.plan_followers import CONTROLLERS
 from agents.evaluation.training_runs import groups
+from dq_space_arm_env.common.console import message_console
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import ProgressDisplay
 from dq_space_arm_env.common.provenance import provenance
@@ -37,7 +38,7 @@ ALL, NONE = "all", "none"
 @contextmanager
 def progress_bar() -> Iterator[Callable[[Advance], None]]:
     """Show the progress of an evaluation on standard error; yields the callback."""
-    with ProgressDisplay(Console(stderr=True, highlight=False)) as display:
+    with ProgressDisplay(message_console()) as display:
         yield display.update
 
 

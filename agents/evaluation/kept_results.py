@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from dq_space_arm_env.common.bounded_reading import UnreadableError, read_json, read_mapping
 from dq_space_arm_env.common.code_cache import cache_directory
 from dq_space_arm_env.common.files import write_atomically
 
@@ -56,11 +57,14 @@ class CachedGroups:
     def _read(self, group: int) -> list[Row] | None:
         """Rows of a group; None if the file is missing or damaged."""
         try:
-            rows = json.loads(self._file(group).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            rows = read_json(self._file(group))
+        except UnreadableError:
             return None
         if not isinstance(rows, list) or not all(
-            isinstance(row, dict) and row.keys() == self._columns for row in rows
+            isinstance(row, dict)
+            and row.keys() == self._columns
+            and all(value is None or isinstance(value, int | float) for value in row.values())
+            for row in rows
         ):
             return None
         return rows if [row["seed"] for row in rows] == self.seeds(group) else None
@@ -80,10 +84,10 @@ class KeptRows:
         if self._folder is None:
             return None
         try:
-            record = json.loads(self._file(name).read_text(encoding="utf-8"))
-            return dict(record) if record["key"] == _digest(follows_from) else None
-        except (OSError, ValueError, KeyError, TypeError):
+            record = read_mapping(self._file(name))
+        except UnreadableError:
             return None
+        return record if record.get("key") == _digest(follows_from) else None
 
     def write(self, name: str, follows_from: Mapping[str, Any], record: Mapping[str, Any]) -> None:
         """Write a row, JSON values."""

@@ -13,6 +13,7 @@ from agents.configuration import ConfigurationError, list_configurations, load_c
 from agents.evaluation.evaluating import Evaluation
 from agents.evaluation.statistics import FEWEST_RUNS, Runs, compare_runs
 from agents.zoo.shelf import SHELF
+from dq_space_arm_env.common.bounded_reading import parse_json, read_text
 
 CONFIGURATION, EVALUATIONS = "config.yaml", "evaluations.jsonl"
 _BUDGET = {"total_steps": "--total-steps", "minutes": "--minutes"}
@@ -59,9 +60,9 @@ def learning_curve(policy: Path) -> list[dict[str, Any]]:
     if not file.is_file():
         return []
     points = []
-    for line in file.read_text(encoding="utf-8").splitlines():
+    for line in read_text(file).splitlines():
         try:
-            found = json.loads(line)
+            found = parse_json(line, str(file))
             cost = found.get("median_cost")
             point = {
                 "seconds": float(found["seconds"]),
@@ -69,7 +70,7 @@ def learning_curve(policy: Path) -> list[dict[str, Any]]:
                 "success_rate": float(found["success_rate"]),
                 "median_cost": None if cost is None or math.isnan(cost) else float(cost),
             }
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
             continue  # not a point of a learning curve
         points.append(point)
     return sorted(points, key=lambda point: point["seconds"])

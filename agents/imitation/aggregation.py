@@ -12,7 +12,6 @@ import copy
 import io
 import json
 import os
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -30,12 +29,15 @@ from agents.imitation.samples import NAMES, Corrections, Mixture, Statistics
 from agents.imitation.trainer import CheckpointError, Progress, Record, Spent, Trainer, Watch, torch_threads
 from agents.policies.exported import ExportedPolicy
 from agents.policies.network import PolicyNetwork
+from dq_space_arm_env.common.bounded_formats import read_arrays
+from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import Status
 from dq_space_arm_env.environment.rollouts import rollout
 from experts.demonstrations import Demonstrations
 
 CORRECTIONS = "corrections.npz"
+_MOST_BYTES = 2**31  # all labels of a run fit into memory
 
 
 class Round(NamedTuple):
@@ -193,11 +195,16 @@ def _corrections(
 
 def _read(path: Path, identity: dict[str, Any]) -> tuple[Round, Corrections]:
     try:
-        with np.load(path, allow_pickle=False) as content:
-            facts = json.loads(str(content["facts"]))
-            corrections = Corrections(*(content[name] for name in NAMES))
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+        content = read_arrays(path, (*NAMES, "facts"), _MOST_BYTES)
+        facts = parse_json(str(content["facts"]), "facts")
+        done, corrections = Round(**facts["round"]), Corrections(*(content[name] for name in NAMES))
+        found, arrays = facts["identity"], [content[name] for name in NAMES]
+        if len({array.shape[:1] for array in arrays}) != 1 or any(
+            array.dtype.kind != "f" for array in arrays
+        ):
+            raise UnreadableError("its arrays should hold numbers, in as many rows each")
+    except (UnreadableError, KeyError, TypeError) as error:
         raise CheckpointError(f"{path} cannot be read ({error}); remove its folder and later ones") from error
-    if facts["identity"] != identity:
+    if found != identity:
         raise CheckpointError(f"{path} is of another run; use another folder")
-    return Round(**facts["round"]), corrections
+    return done, corrections

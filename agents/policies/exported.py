@@ -11,8 +11,6 @@ import io
 import json
 import math
 import os
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,22 +19,19 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.common.bounded_formats import read_arrays
+from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.common.shown_text import shortened
+from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
 
 FORMAT = 1  # version of the files
 
-_UNREADABLE = (  # raised for damaged archives, depending on the bytes
-    OSError,
-    ValueError,
-    EOFError,
-    AttributeError,
-    TypeError,
-    NotImplementedError,  # of a compression that zipfile does not know
-    RuntimeError,  # of an encrypted archive
-    zipfile.BadZipFile,
-    zlib.error,
-)
+_MOST_BYTES = 64 * 2**20  # 8 million weights, hundreds of times those of a policy of the zoo
+_LONGEST = 200  # characters of a list of names
+
+_LARGEST_VALUE = 1e300  # of anything that an observation leads to: next to no double overflows
 
 FloatArray = NDArray[np.float64]
 SingleArray = NDArray[np.float32]
@@ -261,19 +256,16 @@ class ExportedPolicy:
             PolicyFileError: If the file is missing, damaged, or of another format.
         """
         try:
-            archive = io.BytesIO(Path(path).read_bytes())
-            if not zipfile.is_zipfile(archive):  # NumPy would suggest loading it unsafely
-                raise ValueError("it is not an archive of arrays, or incomplete")
-            with np.load(archive, allow_pickle=False) as content:
-                arrays = {name: content[name] for name in content.files}
-        except _UNREADABLE as error:
+            arrays = read_arrays(path, most=_MOST_BYTES)
+        except UnreadableError as error:
             raise PolicyFileError(f"{path} cannot be read as a policy ({error})") from error
         found = arrays.get("format")
         if found is None:
-            raise PolicyFileError(f"{path} holds no policy but {', '.join(arrays) or 'nothing'}")
+            raise PolicyFileError(f"{path} holds no policy but {', '.join(arrays)[:_LONGEST] or 'nothing'}")
         if found.shape != () or found != FORMAT:
             raise PolicyFileError(
-                f"{path} has format {found}, this version reads {FORMAT}: export the policy again"
+                f"{path} has format {shortened(found.tolist())}, this version reads {FORMAT}: export the "
+                "policy again"
             )
         try:
             return cls(**_fields(arrays))
@@ -283,11 +275,21 @@ class ExportedPolicy:
             raise PolicyFileError(f"{path} is not a policy: {error}") from error
 
 
+_TEXTS, _SINGLE = (
+    ("activation", "squash", "metadata"),
+    ("activation", "squash", "metadata", "normalized_limit"),
+)
+
+
 def _fields(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     layers = range(sum(name.startswith("weight_") for name in arrays))
-    metadata = json.loads(str(arrays["metadata"]))
+    metadata = parse_json(str(arrays["metadata"]), "metadata")
     if not isinstance(metadata, dict):
         raise ValueError("metadata: should be a mapping")
+    for name, array in arrays.items():
+        if (array.dtype.kind in "biuf") is (name in _TEXTS) or (name in _SINGLE and array.shape):
+            kind = "a text" if name in _TEXTS else "one number" if name in _SINGLE else "numbers"
+            raise ValueError(f"{name}: shape {array.shape} of {array.dtype}, should be {kind}")
     return {
         "weights": tuple(arrays[f"weight_{i}"] for i in layers),
         "biases": tuple(arrays[f"bias_{i}"] for i in layers),
@@ -307,7 +309,7 @@ def _check(policy: ExportedPolicy) -> None:
         ("squash", policy.squash, SQUASHES),
     ):
         if value not in known:
-            raise ValueError(f"{name}: {value!r} is unknown; choose from {', '.join(known)}")
+            raise ValueError(f"{name}: {shortened(value)} is unknown; choose from {', '.join(known)}")
     if not policy.weights or len(policy.weights) != len(policy.biases):
         raise ValueError(
             f"{len(policy.weights)} weights and {len(policy.biases)} biases, should be one of each per layer"
@@ -333,6 +335,28 @@ def _check(policy: ExportedPolicy) -> None:
             raise ValueError(f"{name}: shape {array.shape}, should be {shape}")
         if not np.isfinite(array).all():
             raise ValueError(f"{name}: has entries that are not finite")
+    _check_growth(policy)
     scale = policy.action_scale
     if scale is not None and not ((scale >= 0.0) & (scale <= 1.0)).all():
         raise ValueError(f"action_scale: {scale}, should be in [0, 1]")
+
+
+def _check_growth(policy: ExportedPolicy) -> None:
+    """Refuse numbers with which an observation that the environment may give makes a layer overflow."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        seen = np.abs(policy.scale) * (OBSERVATION_LIMIT + np.abs(policy.mean))
+        _check_bound("scale and mean", seen)
+        largest = np.minimum(seen, policy.normalized_limit)
+        for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+            # Rows are scaled before they are summed where the scale is folded into them.
+            sums = largest @ np.abs(weight.astype(np.float64)) + np.abs(bias.astype(np.float64))
+            _check_bound(f"weight_{i} and bias_{i}", sums)
+            largest = np.minimum(sums, 1.0) if policy.activation == "tanh" else sums
+
+
+def _check_bound(name: str, values: FloatArray) -> None:
+    if not (values <= _LARGEST_VALUE).all():
+        raise ValueError(
+            f"{name}: an observation within {OBSERVATION_LIMIT:g} gives {np.max(values):.3g}, should stay "
+            f"below {_LARGEST_VALUE:g}"
+        )

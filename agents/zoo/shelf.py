@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
 from agents.policies import ExportedPolicy
+from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
 from dq_space_arm_env.validation import did_you_mean
 
 SHELF = Path(__file__).parent / "policies"
@@ -64,8 +64,8 @@ def load_record(name: str, shelf: Path | None = None) -> dict[str, Any]:
     """Record of a policy's evaluation, JSON values as `scripts/add_to_zoo.py` describes them."""
     file = policy_file(name, shelf).with_suffix(".json")
     try:
-        return dict(json.loads(file.read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
+        return read_mapping(file)
+    except UnreadableError as error:
         raise ZooError(f"{file} cannot be read ({error}): add the policy to the zoo again") from error
 
 

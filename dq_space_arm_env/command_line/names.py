@@ -9,6 +9,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from dq_space_arm_env.common.bounded_reading import UnreadableError, read_text
 from dq_space_arm_env.common.suggestions import did_you_mean
 
 
@@ -92,10 +93,10 @@ class PartOf(Named):
     ) -> list[CompletionItem]:
         """Complete from the file's text, which may not be well-formed."""
         try:
-            text = Path(str(ctx.params.get(self._argument))).read_text(encoding="utf-8")
-        except (OSError, ValueError):
+            text = read_text(str(ctx.params.get(self._argument)))
+        except UnreadableError:
             return []
-        names = re.findall(rf"""<{self.name}\s[^>]*?\bname\s*=\s*["']([^"'>]+)["']""", text)
+        names = re.findall(rf"""<{self.name}\s[^>]{{0,500}}?\bname\s*=\s*["']([^"'>]{{1,200}})["']""", text)
         return [CompletionItem(name) for name in dict.fromkeys(names) if name.startswith(incomplete)]
 
 

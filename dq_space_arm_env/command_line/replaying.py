@@ -11,7 +11,7 @@ from dq_space_arm_env.command_line.simulated_episode import (
     begin,
     fly,
 )
-from dq_space_arm_env.common.files import archive_members
+from dq_space_arm_env.common.bounded_reading import archive_members
 from dq_space_arm_env.viewing.replay import Trajectory, common_scene, read_flight
 
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from pydantic import ValidationError
 from ruamel.yaml.error import MarkedYAMLError
 
+from dq_space_arm_env.common.bounded_reading import read_text
 from dq_space_arm_env.scene import SceneError, load_scene
 from dq_space_arm_env.validation import line_of
 
@@ -33,7 +34,7 @@ def check(source: str) -> list[LocatedProblem]:
 
 
 def _located(error: ValidationError, file: Path) -> list[LocatedProblem]:
-    text = file.read_text(encoding="utf-8") if file.is_file() else None
+    text = read_text(file) if file.is_file() else None
     found = []
     for detail in error.errors(include_url=False):
         line = None if text is None else line_of(text, detail["loc"])

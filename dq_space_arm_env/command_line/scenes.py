@@ -10,7 +10,7 @@ import click
 
 from dq_space_arm_env.command_line.names import SCENE, PartOf, description_of, given, scene_files
 from dq_space_arm_env.command_line.verb import json_option, print_document
-from dq_space_arm_env.common.console import FAILURE, SUCCESS, complain, message_console, table_console
+from dq_space_arm_env.common.console import FAILURE, SUCCESS, complain, message_console, say, table_console
 from dq_space_arm_env.common.files import check_writable_file
 
 
@@ -97,9 +97,9 @@ def validate(files: tuple[str, ...], as_json: bool) -> int:
             continue
         for problem in problems:
             where = file if problem.line is None else f"{file}:{problem.line}"
-            click.echo(f"{where}: {problem.message}")
+            say(f"{where}: {problem.message}")
         if not problems:
-            click.echo(f"{file}: valid")
+            say(f"{file}: valid")
     if as_json:
         print_document(found)
     return SUCCESS if all(each["valid"] for each in found) else FAILURE
@@ -244,7 +244,7 @@ def import_(
         print_document(scene_exchange.record(imported, str(path), robot))
         return
     for line in scene_exchange.summary(imported, str(path), bool(spacecraft)):
-        click.echo(line)
+        say(line)
 
 
 @scenes.command(

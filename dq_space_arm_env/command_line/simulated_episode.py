@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
-import zipfile
-import zlib
-from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dq_space_arm_env.common.bounded_formats import read_array, read_arrays
+from dq_space_arm_env.common.bounded_reading import read_json
 from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.environment.disturbances import Disturbances
 from dq_space_arm_env.environment.rollouts import Policy, StateFeedback, rollout
@@ -22,7 +20,7 @@ from dq_space_arm_env.task.trajectory import Trajectory
 FILES = (".npy", ".json", ".npz")  # that a state is read from
 _NOISE = 1  # stream of random numbers that belongs to a seed
 OWN = "the scene's own"
-_UNREADABLE = (TypeError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile, zlib.error)
+_UNREADABLE = (TypeError, ValueError, KeyError, IndexError, OverflowError)
 """What reading numbers from a text or a file raises."""
 _PARTS_OF_SCENE = ("target", "base_mass", "base_inertia", "link_", "payload")
 
@@ -112,7 +110,5 @@ def read_state(text: str, size: int) -> NDArray[np.float64]:
 
 def _from_file(path: Path) -> Any:
     if path.suffix == ".json":
-        return json.loads(path.read_text(encoding="utf-8"))
-    # Read first: of a file that is no archive, NumPy would leave the descriptor open.
-    content = np.load(BytesIO(path.read_bytes()), allow_pickle=False)
-    return content["states"][0] if path.suffix == ".npz" else content
+        return read_json(path)
+    return read_arrays(path, ("states",))["states"][0] if path.suffix == ".npz" else read_array(path)

@@ -11,6 +11,7 @@ import click
 
 from dq_space_arm_env.common.console import INTERRUPTED
 from dq_space_arm_env.common.files import json_value
+from dq_space_arm_env.common.shown_text import printable
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON document instead of tables."
@@ -19,9 +20,11 @@ json_option = click.option(
 
 def print_document(value: Any) -> None:
     """Print JSON to standard output; infinities and NaN become null."""
-    # Terminals with another encoding get escapes.
-    escaped = (sys.stdout.encoding or "").lower().replace("-", "") != "utf8"
-    click.echo(json.dumps(json_value(value), indent=2, ensure_ascii=escaped, allow_nan=False))
+    text = json.dumps(json_value(value), indent=2, ensure_ascii=False, allow_nan=False)
+    # Terminals with another encoding get escapes, and all where they would obey a character.
+    if (sys.stdout.encoding or "").lower().replace("-", "") != "utf8" or printable(text) != text:
+        text = json.dumps(json_value(value), indent=2, allow_nan=False)
+    click.echo(text)
 
 
 class Interrupted(click.ClickException):

@@ -65,34 +65,48 @@ def read_arrays(
     return found
 
 
+def read_array(path: str | os.PathLike[str], most: int = ARRAY_BYTES) -> NDArray[Any]:
+    """Read the array of an npy file, as `read_arrays` does those of an npz file."""
+    with open_regular(path, most) as file:
+        return _read_stream(file, os.fspath(path), most)[0]
+
+
 def _read_member(
     archive: zipfile.ZipFile, member: zipfile.ZipInfo, what: str, most: int
 ) -> tuple[NDArray[Any], int]:
-    """Read an array, and count the bytes that it stands for."""
     try:
         with archive.open(member) as stream:
-            shape, fortran, dtype = _npy_header(stream)
-            count, kind = math.prod(shape), f"{dtype}"[:60]
-            # Small numbers become double precision sooner or later; empty text takes no bytes at all.
-            size = count * max(dtype.itemsize, 8)
-            if size > most:
-                raise UnreadableError(
-                    f"{what}: claims shape {shortened(shape)} of {kind}, {size:,} bytes; it should have at "
-                    f"most {most:,}"
-                )
-            if dtype.hasobject or (dtype.kind not in "biufU" and dtype.names is None):
-                raise UnreadableError(f"{what}: holds {kind}, it should hold numbers or text")
-            # Zeroed pages take no memory until the archive really has content for them.
-            content = np.zeros(count * dtype.itemsize, np.uint8)
-            read = _fill(content, stream)
-            if read < len(content) or stream.read(1):
-                raise UnreadableError(f"{what}: its size is not that of shape {shape} of {kind}")
+            return _read_stream(stream, what, most)
+    except UnreadableError:
+        raise
+    except Exception as error:  # damaged bytes make zipfile and zlib raise anything
+        raise UnreadableError(f"{what}: is damaged ({error})") from error
+
+
+def _read_stream(stream: IO[bytes], what: str, most: int) -> tuple[NDArray[Any], int]:
+    """Read an array, and count the bytes that it stands for."""
+    try:
+        shape, fortran, dtype = _npy_header(stream)
+        count, kind = math.prod(shape), f"{dtype}"[:60]
+        # Small numbers become double precision sooner or later; empty text takes no bytes at all.
+        size = count * max(dtype.itemsize, 8)
+        if size > most:
+            raise UnreadableError(
+                f"{what}: claims shape {shortened(shape)} of {kind}, {size:,} bytes; it should have at most "
+                f"{most:,}"
+            )
+        if dtype.hasobject or (dtype.kind not in "biufU" and dtype.names is None):
+            raise UnreadableError(f"{what}: holds {kind}, it should hold numbers or text")
+        # Zeroed pages take no memory until the file really has content for them.
+        content = np.zeros(count * dtype.itemsize, np.uint8)
+        if _fill(content, stream) < len(content) or stream.read(1):
+            raise UnreadableError(f"{what}: its size is not that of shape {shape} of {kind}")
+        array = content.view(dtype) if dtype.itemsize else np.zeros(count, dtype)
+        return array.reshape(shape, order="F" if fortran else "C"), size
     except UnreadableError:
         raise
     except Exception as error:  # damaged bytes make zipfile, zlib and NumPy raise anything
         raise UnreadableError(f"{what}: is damaged ({error})") from error
-    array = content.view(dtype) if dtype.itemsize else np.zeros(count, dtype)
-    return array.reshape(shape, order="F" if fortran else "C"), size
 
 
 def _fill(content: NDArray[np.uint8], stream: IO[bytes]) -> int:

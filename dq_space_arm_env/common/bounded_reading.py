@@ -47,7 +47,7 @@ def open_regular(path: str | os.PathLike[str], most: int) -> IO[bytes]:
     except (ValueError, TypeError) as error:
         if isinstance(error, UnreadableError):
             raise
-        raise UnreadableError(f"{shortened(path)} cannot be the name of a file ({error})") from error
+        raise UnreadableError(f"{shortened(path)} cannot be read: {error}") from error
     try:
         _check_kind(path, os.fstat(file.fileno()), most)
     except UnreadableError:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import TYPE_CHECKING
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from dq_space_arm_env.common.shown_text import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -13,20 +16,38 @@ SUCCESS, FAILURE, UNUSABLE, INTERNAL, INTERRUPTED = 0, 1, 2, 70, 130
 """Exit statuses: done; done, but below what was asked for; unusable input; a bug; interrupted."""
 
 
+@cache
+def _console_class() -> type[Console]:
+    """A console that shows control characters in what it prints, rather than send them to the terminal."""
+    from rich.console import Console
+    from rich.segment import Segment
+
+    class PrintableConsole(Console):
+        def render(self, *renderable: Any, **options: Any) -> Any:
+            for segment in super().render(*renderable, **options):
+                # Rich's own control codes are marked as such.
+                yield segment if segment.control else Segment(printable(segment.text), segment.style)
+
+    return PrintableConsole
+
+
 def table_console(width: int = 110, *, stderr: bool = False) -> Console:
     """Make a console for tables; `width` applies to files and pipes, which have none."""
-    from rich.console import Console
-
     stream = sys.stderr if stderr else sys.stdout
     known = stream.isatty() or "COLUMNS" in os.environ
-    return Console(stderr=stderr, highlight=False, width=None if known else width)
+    return _console_class()(stderr=stderr, highlight=False, width=None if known else width)
 
 
 def message_console() -> Console:
     """Make the console for progress and remarks, on standard error."""
-    from rich.console import Console
+    return _console_class()(stderr=True, highlight=False)
 
-    return Console(stderr=True, highlight=False)
+
+def say(sentence: str) -> None:
+    """Print a line on standard output."""
+    import click
+
+    click.echo(printable(sentence))
 
 
 def complain(sentence: str, *, label: str = "Error: ") -> None:

@@ -132,17 +132,6 @@ def check_writable(folder: Path) -> None:
         raise ValueError(f"{folder}: no permission to write {place}")
 
 
-def archive_members(path: Path) -> set[str]:
-    """List the arrays in an npz file; nothing for any other file."""
-    import zipfile
-
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {name.removesuffix(".npy") for name in archive.namelist()}
-    except (OSError, zipfile.BadZipFile):
-        return set()
-
-
 def to_json(record: dict[str, Any]) -> str:
     """Write JSON text."""
     return json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

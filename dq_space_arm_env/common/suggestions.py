@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable
 
+_LONGEST = 60  # characters of a word that was meant to be another
+
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Suggest the closest known word: "did you mean 'mass'? ", or an empty string."""
     from difflib import get_close_matches  # costs the command line a millisecond
 
-    close = get_close_matches(word, list(known), n=1)
+    close = get_close_matches(word[:_LONGEST], list(known), n=1)
     return f"did you mean {close[0]!r}? " if close else ""

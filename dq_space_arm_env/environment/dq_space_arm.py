@@ -19,21 +19,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.common.real_arrays import DOUBLE, SINGLE, real_array
-from dq_space_arm_env.environment.reset_options import check_size, given_start
+from dq_space_arm_env.environment.reset_options import check_scene, given_start
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.start import episode_scene, target_entries
-from dq_space_arm_env.task.step_report import REPORT, STATE_LIMIT
+from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT, REPORT
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 
 if TYPE_CHECKING:
     from dq_space_arm_env.viewing.rendering import Renderer
 
 Array = NDArray[Any]
-
-# Bound of every observation of a simulation that has not diverged, m, rad, m/s, rad/s.
-OBSERVATION_LIMIT = 2.0 * STATE_LIMIT
 
 _ROW = np.zeros(1, dtype=np.int64)  # of the one state
 
@@ -191,7 +188,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             raise ValueError(
                 f"scene {self.scene.name!r} has no normalized actions: {problem}; give each actuator a finite limit"
             )
-        check_size(f"scene {self.scene.name!r}: initial_state", layout.initial_state)
+        check_scene(self.scene)
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.scene.simulation.dt))}
         self.action_space = spaces.Box(-1.0, 1.0, (layout.n_u,), np.float32)

@@ -13,9 +13,10 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.real_arrays import real_array
-from dq_space_arm_env.environment.dq_space_arm import OBSERVATION_LIMIT, DQSpaceArmEnv
+from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
 
 Array = NDArray[Any]
 Observation = dict[str, Array]

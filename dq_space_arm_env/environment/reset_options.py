@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels import Kernels
+from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.start import PLANAR_POSE, target_entries
 from dq_space_arm_env.task.step_report import STATE_LIMIT
 
@@ -81,6 +82,43 @@ def check_size(name: str, state: Array) -> None:
         raise ValueError(
             f"{name} has a norm of {size:.3g}, should be at most {STATE_LIMIT:g}, beyond which a simulation "
             "counts as diverged; positions are small if the origin is near the spacecraft"
+        )
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise ValueError for a scene whose starts may count as diverged, or whose tip is beyond observation."""
+    layout, spread = StateLayout.of(scene), scene.spread
+    check_size(f"scene {scene.name!r}: initial_state", layout.initial_state)
+    start = math.hypot(*layout.initial_state.tolist())
+    # The dual part is half the position.
+    widths = {
+        "base_position": 0.5 * math.sqrt(3.0) * spread.base_position,
+        "joint_angles": math.sqrt(layout.n_joints) * spread.joint_angles,
+        "wrist_angles": math.sqrt(3.0) * spread.wrist_angles,
+        "base_angular_velocity": math.sqrt(3.0) * spread.base_angular_velocity,
+        "base_linear_velocity": math.sqrt(3.0) * spread.base_linear_velocity,
+        "joint_rates": math.sqrt(layout.n_joints) * spread.joint_rates,
+    }
+    name, width = max(widths.items(), key=lambda each: each[1])
+    if start + math.hypot(*widths.values()) > STATE_LIMIT:
+        raise ValueError(
+            f"scene {scene.name!r}: spread.{name} = {getattr(spread, name):g}: starts may have a norm of "
+            f"{start + width:.3g}, should be at most {STATE_LIMIT:g}, beyond which a simulation counts as "
+            "diverged"
+        )
+    lengths = {
+        f"links[{index}].joint.position": link.joint.position for index, link in enumerate(scene.links)
+    }
+    if scene.wrist is not None:
+        lengths["wrist.frame.position"] = scene.wrist.frame.position
+    lengths |= {"tip.position": scene.tip.position, "target.pose.position": scene.target.pose.position}
+    sizes = {name: math.hypot(*position) for name, position in lengths.items()}
+    sizes["spread.target_position"] = math.sqrt(3.0) * spread.target_position
+    if sum(sizes.values()) > STATE_LIMIT:
+        name, size = max(sizes.items(), key=lambda each: each[1])
+        raise ValueError(
+            f"scene {scene.name!r}: {name}: {size:.3g} m; lengths of the arm and distance of the target "
+            f"should add up to at most {STATE_LIMIT:g} m, for observations to hold them"
         )
 
 

@@ -10,20 +10,26 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree.ElementTree import Element, TreeBuilder
-from xml.parsers import expat
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from dq_space_arm_env.algebra import poses, rotations
+from dq_space_arm_env.common.bounded_formats import parse_xml
+from dq_space_arm_env.common.bounded_reading import UnreadableError, read_bytes
+from dq_space_arm_env.common.shown_text import printable, shortened
 from dq_space_arm_env.interoperability.rigid_body import Array, Body
 from dq_space_arm_env.scene import SceneError
 
 MOVABLE = ("revolute", "continuous")
 TYPES = (*MOVABLE, "fixed", "prismatic", "planar", "floating")
+
+_MOST = 10_000  # links or joints, a hundred times those of a humanoid
+_LONGEST_NAME = 200  # characters
+_LARGEST = 1e15  # number, whose square times another's has digits to spare
 
 Pose = tuple[float, ...]
 
@@ -66,12 +72,16 @@ def read_robot(source: str | Path) -> UrdfRobot:
     """Read a URDF file, given by its path or its text; shapes, transmissions and settings are left out."""
     root = _parse(_content(source))
     if root.tag != "robot":
-        raise SceneError(f"URDF: the outermost element is <{root.tag}>, it must be <robot>")
+        raise SceneError(
+            f"URDF: the outermost element is <{shorten(printable(root.tag), 40)}>, it must be <robot>"
+        )
     links = [_read_link(element) for element in root.iterfind("link")]
     joints = [_read_joint(element) for element in root.iterfind("joint")]
     if not links:
         raise SceneError("URDF: there is no <link> in <robot>; a robot needs at least two, and a joint")
     for kind, names in (("link", [link.name for link in links]), ("joint", [joint.name for joint in joints])):
+        if len(names) > _MOST:
+            raise SceneError(f"URDF: there are {len(names)} {kind}s, a robot should have at most {_MOST}")
         name, count = Counter(names).most_common(1)[0] if names else ("", 0)
         if count > 1:
             raise SceneError(f"URDF: two {kind}s are named {name!r}: each needs its own name")
@@ -85,7 +95,7 @@ def read_robot(source: str | Path) -> UrdfRobot:
 def _content(source: str | Path) -> str | bytes:
     """The text, or the bytes of the file, whose encoding the XML parser detects."""
     if not isinstance(source, str | Path):
-        raise SceneError(f"URDF: {shorten(repr(source), 40)} is neither the path nor the text of a URDF file")
+        raise SceneError(f"URDF: {shortened(source, 40)} is neither the path nor the text of a URDF file")
     if isinstance(source, str):
         text = source.removeprefix("\ufeff").lstrip()
         if text.startswith("<"):
@@ -95,10 +105,9 @@ def _content(source: str | Path) -> str | bytes:
                 f"URDF: the text {shorten(text, 40)!r} must begin with '<', or be the path of a file"
             )
     try:
-        content = Path(source).read_bytes()
-    except (OSError, ValueError) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or str(error)
-        raise SceneError(f"URDF: {shorten(str(source), 200)} cannot be read: {reason}") from error
+        content = read_bytes(source)
+    except UnreadableError as error:
+        raise SceneError(f"URDF: {shorten(str(error), 300)}") from error
     if not content.strip():
         raise SceneError(f"URDF: {source} is empty")
     if b"<" not in content:
@@ -112,35 +121,18 @@ def shorten(text: str, width: int) -> str:
 
 
 def _parse(content: str | bytes) -> Element:
-    builder = TreeBuilder()
-    # Text is text already, whatever encoding it declares.
-    parser = expat.ParserCreate("utf-8" if isinstance(content, str) else None)
-    parser.StartElementHandler = _start_into(builder)
-    parser.EndElementHandler = builder.end
-    parser.StartDoctypeDeclHandler = _refuse_doctype
     try:
-        parser.Parse(content.encode("utf-8") if isinstance(content, str) else content, True)
-    except SceneError:
-        raise
-    except (expat.ExpatError, LookupError, ValueError) as error:
-        raise SceneError(f"URDF: not valid XML: {error}") from error
-    return builder.close()
+        return parse_xml(content, "URDF", _refuse_xacro)
+    except UnreadableError as error:
+        raise SceneError(str(error)) from error
 
 
-def _start_into(builder: TreeBuilder) -> Callable[[str, dict[str, str]], None]:
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        if tag.startswith("xacro:") or any("${" in value or "$(" in value for value in attributes.values()):
-            raise SceneError(
-                f"URDF: <{tag}> belongs to xacro, a macro language; expand the file first, with ROS: "
-                "xacro robot.urdf.xacro > robot.urdf"
-            )
-        builder.start(tag, attributes)
-
-    return start
-
-
-def _refuse_doctype(*declaration: object) -> None:
-    raise SceneError("URDF: remove the document type declaration (<!DOCTYPE ...>)")
+def _refuse_xacro(tag: str, attributes: Mapping[str, str]) -> None:
+    if tag.startswith("xacro:") or any("${" in value or "$(" in value for value in attributes.values()):
+        raise SceneError(
+            f"URDF: <{tag}> belongs to xacro, a macro language; expand the file first, with ROS: "
+            "xacro robot.urdf.xacro > robot.urdf"
+        )
 
 
 def _read_link(element: Element) -> UrdfLink:
@@ -169,7 +161,7 @@ def _read_joint(element: Element) -> UrdfJoint:
     where = f"joint {name!r}"
     kind = element.get("type", "")
     if kind not in TYPES:
-        raise SceneError(f"URDF: {where}: type = {kind!r}, it must be one of {', '.join(TYPES)}")
+        raise SceneError(f"URDF: {where}: type = {shortened(kind)}, it must be one of {', '.join(TYPES)}")
     limit, dynamics, mimic = (_only(element, tag, where) for tag in ("limit", "dynamics", "mimic"))
     effort = _optional(limit, "effort", f"{where}, <limit>")
     damping, friction = (_optional(dynamics, key, f"{where}, <dynamics>") for key in ("damping", "friction"))
@@ -200,7 +192,7 @@ def _limits(limit: Element | None, where: str) -> tuple[float, float]:
 
 def _axis(element: Element, where: str) -> Array:
     axis = _only(element, "axis", where)
-    vector = np.array((1.0, 0.0, 0.0) if axis is None else _vector(axis, "xyz", f"{where}, <axis>"))
+    vector = np.array((1.0, 0.0, 0.0) if axis is None else _direction(axis, where))
     largest = float(np.abs(vector).max())
     if largest == 0:
         raise SceneError(f"URDF: {where}: the axis has zero length; it must give a direction")
@@ -221,7 +213,13 @@ def _origin(element: Element, where: str) -> Pose:
 
 
 def _name(element: Element) -> str:
-    return _required(element, "name", f"a <{element.tag}>")
+    name = _required(element, "name", f"a <{element.tag}>")
+    if len(name) > _LONGEST_NAME:
+        raise SceneError(
+            f"URDF: a <{element.tag}>: name = {shortened(name, 40)} of {len(name):,} characters, it should "
+            f"have at most {_LONGEST_NAME}"
+        )
+    return name
 
 
 def _only(element: Element, tag: str, where: str) -> Element | None:
@@ -253,16 +251,23 @@ def _optional(element: Element | None, key: str, where: str) -> float:
     return 0.0 if element is None or key not in element.attrib else _number(element, key, where)
 
 
+def _direction(element: Element, where: str) -> tuple[float, ...]:
+    where = f"{where}, <axis>"
+    return _numbers(_required(element, "xyz", where), 3, "xyz", where, largest=math.inf)
+
+
 def _vector(element: Element, key: str, where: str) -> tuple[float, ...]:
     return _numbers(_required(element, key, where), 3, key, where)
 
 
-def _numbers(text: str, count: int, key: str, where: str) -> tuple[float, ...]:
+def _numbers(text: str, count: int, key: str, where: str, *, largest: float = _LARGEST) -> tuple[float, ...]:
     try:
         numbers = tuple(float(word) for word in text.split())
     except ValueError:
         numbers = ()
     if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
         wanted = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise SceneError(f"URDF: {where}: {key} = {text!r}, it must be {wanted}")
+        raise SceneError(f"URDF: {where}: {key} = {shortened(text)}, it must be {wanted}")
+    if any(abs(number) > largest for number in numbers):
+        raise SceneError(f"URDF: {where}: {key} = {shortened(text)}, it must be within {_LARGEST:g}")
     return numbers

@@ -3,22 +3,26 @@
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, StrictBool, StrictStr
+from pydantic import BeforeValidator, Field, StrictBool
 
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.validation.fields import (
-    Finite,
+    INERTIAS,
+    Angle,
     Limit,
+    Mass,
+    Name,
     NonNegative,
-    Positive,
+    Position,
+    Range,
     Three,
-    Vector3,
     read_numbers,
 )
 from dq_space_arm_env.validation.problems import Model, problem
 
 _TOLERANCE = 1e-9  # fractions of the largest moment
 _SINGULAR = 1e-12
+_ENTRIES = Range(0.0, INERTIAS.most)  # before anything is computed with them
 _FORMS = "3 numbers (diagonal) or 3x3"
 
 
@@ -30,6 +34,7 @@ def _read_inertia(value: Any) -> Matrix3:
     matrix = 0.5 * (matrix + matrix.T)
     if flaw := flaw_of(matrix):
         raise problem(f"no rigid body has it: {flaw}")
+    INERTIAS.check(*np.linalg.eigvalsh(matrix).tolist())
     first, second, third = (_three(row) for row in matrix)
     return (first, second, third)
 
@@ -52,8 +57,8 @@ def _read_matrix(value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     if not isinstance(value, list | tuple) or len(value) != 3:
         raise problem(f"must be {_FORMS}")
     if any(isinstance(row, list | tuple | np.ndarray) for row in value):
-        return np.array([read_numbers(row, 3) for row in value])
-    return np.diag(read_numbers(value, 3))
+        return np.array([read_numbers(row, 3, _ENTRIES) for row in value])
+    return np.diag(read_numbers(value, 3, _ENTRIES))
 
 
 def _three(row: Any) -> Three:
@@ -67,7 +72,7 @@ Inertia = Annotated[Matrix3, BeforeValidator(_read_inertia)]
 class Base(Model):
     """The spacecraft: a free rigid body whose frame e0 sits at its center of mass."""
 
-    mass: Positive = Field(description="mass of the base, kg")
+    mass: Mass = Field(description="mass of the base, kg")
     inertia: Inertia = Field(
         description=f"inertia of the base about its center of mass, base axes, kg m^2: {_FORMS}"
     )
@@ -80,12 +85,12 @@ class Base(Model):
 class Link(Model):
     """A link and the revolute joint that carries it; the joint turns about the z axis of its own frame."""
 
-    name: StrictStr = Field(min_length=1, description="name of the link, unique in the scene")
-    mass: Positive = Field(description="mass of the link, kg")
+    name: Name = Field(description="name of the link, unique in the scene")
+    mass: Mass = Field(description="mass of the link, kg")
     inertia: Inertia = Field(
         description=f"inertia of the link about its center of mass, joint-frame axes, kg m^2: {_FORMS}"
     )
-    center_of_mass: Vector3 = Field(description="center of mass of the link in its joint frame, m")
+    center_of_mass: Position = Field(description="center of mass of the link in its joint frame, m")
     joint: Pose = Field(
         description="pose of the joint frame at zero angle in the parent's frame, m (first link: base frame "
         "e0 at the center of mass; others: joint frame of the link before)"
@@ -98,7 +103,7 @@ class Link(Model):
         description="largest motor torque of this joint, N m; absent: the limit of actuators.joint_torque",
     )
     stiffness: NonNegative = Field(default=0.0, description="stiffness of the joint spring, N m/rad")
-    rest_angle: Finite = Field(default=0.0, description="joint angle at which the spring is at rest, rad")
+    rest_angle: Angle = Field(default=0.0, description="joint angle at which the spring is at rest, rad")
     damping: NonNegative = Field(default=0.0, description="viscous damping of the joint, N m s/rad")
 
 
@@ -114,10 +119,10 @@ class Wrist(Model):
 class Payload(Model):
     """A body held rigidly at the tip."""
 
-    mass: Positive = Field(description="mass of the payload, kg")
+    mass: Mass = Field(description="mass of the payload, kg")
     inertia: Inertia = Field(
         description=f"inertia of the payload about its center of mass, tip axes, kg m^2: {_FORMS}"
     )
-    center_of_mass: Vector3 = Field(
+    center_of_mass: Position = Field(
         default=(0.0, 0.0, 0.0), description="center of mass of the payload in the tip frame, m"
     )

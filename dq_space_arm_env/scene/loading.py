@@ -8,10 +8,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from dq_space_arm_env.common.bounded_reading import UnreadableError
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.validation.problems import SceneError
-from dq_space_arm_env.validation.yaml_text import YAMLError, parse_yaml, yaml_problem
+from dq_space_arm_env.validation.problems import SceneError, problem_list
+from dq_space_arm_env.validation.yaml_text import YAMLError, parse_yaml, read_yaml, yaml_problem
 
 _SUFFIXES = (".yaml", ".yml")
 
@@ -56,16 +58,16 @@ def load_scene(source: str | Path | Mapping[str, Any] | Scene) -> Scene:
     if isinstance(source, Path) or (isinstance(source, str) and _is_path(source)):
         return _read(Path(source))
     if isinstance(source, Mapping):
-        return _validated(dict(source), f"scene {source.get('name')!r}")
+        return _validated(dict(source), f"scene {shortened(source.get('name'))}")
     if not isinstance(source, str):
         raise SceneError(
-            f"{source!r} is not a scene: give a name, the path of a YAML file, a mapping or a Scene"
+            f"{shortened(source)} is not a scene: give a name, the path of a YAML file, a mapping or a Scene"
         )
     names = list_scenes()
     if source not in names:
         raise SceneError(
-            f"no scene is named {source!r}; {did_you_mean(source, names)}The scenes are {', '.join(names)}; "
-            "give your own file by its path, ending in .yaml"
+            f"no scene is named {shortened(source)}; {did_you_mean(source, names)}The scenes are "
+            f"{', '.join(names)}; give your own file by its path, ending in .yaml"
         )
     return _read(scenes_directory() / f"{source}.yaml")
 
@@ -75,14 +77,11 @@ def _is_path(source: str) -> bool:
 
 
 def _read(file: Traversable) -> Scene:
-    if not file.is_file():
-        raise SceneError(f"{file}: there is no such file")
     try:
-        data = parse_yaml(file.read_text(encoding="utf-8"))
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{file}: must be a text file in UTF-8: {error}") from error
-    except OSError as error:
-        raise SceneError(f"{file}: cannot be read: {error.strerror}") from error
+        # A package in a zip file has its scenes there.
+        data = read_yaml(file) if isinstance(file, Path) else parse_yaml(file.read_text(encoding="utf-8"))
+    except UnreadableError as error:
+        raise SceneError(str(error)) from error
     except YAMLError as error:
         raise SceneError(f"{file}: not valid YAML: {yaml_problem(error)}") from error
     if data is None:
@@ -96,6 +95,4 @@ def _validated(data: object, origin: str) -> Scene:
     try:
         return Scene.model_validate(data)
     except ValidationError as error:
-        problems = [detail["msg"] for detail in error.errors(include_url=False)]
-        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-        raise SceneError("\n  - ".join([f"{origin}: {count}", *problems])) from error
+        raise SceneError(problem_list(origin, error)) from error

@@ -4,17 +4,21 @@ from pydantic import Field
 
 from dq_space_arm_env.scene.pose import Pose
 from dq_space_arm_env.validation.fields import (
+    Angles,
+    AngleSpread,
+    ControlWeight,
     ControlWeights3,
     Fraction,
+    LengthSpread,
     Limit,
     Limits3,
-    NonNegative,
-    Numbers,
+    Load,
     Positive,
+    Rates,
+    RateSpread,
     StateWeights6,
     StateWeights8,
-    Vector3,
-    Vector6,
+    Twist,
 )
 from dq_space_arm_env.validation.problems import Model
 
@@ -55,15 +59,15 @@ class Actuators(Model):
 class TipWrench(Model):
     """A constant wrench acting on the tip at G, in the axes of G (eq. 16)."""
 
-    force: Vector3 = Field(default=(0.0, 0.0, 0.0), description="force at the tip in tip axes, N")
-    torque: Vector3 = Field(default=(0.0, 0.0, 0.0), description="torque at the tip in tip axes, N m")
+    force: Load = Field(default=(0.0, 0.0, 0.0), description="force at the tip in tip axes, N")
+    torque: Load = Field(default=(0.0, 0.0, 0.0), description="torque at the tip in tip axes, N m")
 
 
 class Target(Model):
     """Target pose of the tip, and velocity of the base there."""
 
     pose: Pose = Field(description="desired pose q_{D/I} of the tip in the inertial frame, m")
-    base_velocity: Vector6 = Field(
+    base_velocity: Twist = Field(
         default=_ZERO_TWIST,
         description="desired velocity of the base in base axes: angular (3) rad/s, linear (3) m/s",
     )
@@ -91,7 +95,7 @@ class Cost(Model):
     base_torque: ControlWeights3 = Field(
         default=(1.0,) * 3, description="weight on the base torque, 1/(N m)^2: one number or 3"
     )
-    joint_torque: Positive = Field(
+    joint_torque: ControlWeight = Field(
         default=0.01, description="weight on the joint torques, 1/(N m)^2: one number"
     )
     wrist_rate: ControlWeights3 = Field(
@@ -105,17 +109,17 @@ class InitialState(Model):
     base_pose: Pose = Field(
         default_factory=Pose, description="pose q_{e0/I} of the base in the inertial frame, m"
     )
-    joint_angles: Numbers = Field(
+    joint_angles: Angles = Field(
         default=(), description="joint angles, base to tip, one per link, rad; empty: zeros"
     )
-    wrist_angles: Numbers = Field(
+    wrist_angles: Angles = Field(
         default=(), description="wrist angles psi, theta, phi, rad; empty: zeros, or no wrist"
     )
-    base_velocity: Vector6 = Field(
+    base_velocity: Twist = Field(
         default=_ZERO_TWIST,
         description="velocity of the base in base axes: angular (3) rad/s, linear (3) m/s",
     )
-    joint_rates: Numbers = Field(
+    joint_rates: Rates = Field(
         default=(), description="joint rates, base to tip, one per link, rad/s; empty: zeros"
     )
 
@@ -127,23 +131,23 @@ class Spread(Model):
     masses and inertias, drawn for each body. A quantity without spread is a constant of the machine code.
     """
 
-    base_rotation: NonNegative = Field(
+    base_rotation: AngleSpread = Field(
         default=0.0, description="rotation vector of the base in base axes, rad"
     )
-    base_position: NonNegative = Field(default=0.0, description="position of the base in inertial axes, m")
-    joint_angles: NonNegative = Field(default=0.0, description="joint angles, rad")
-    wrist_angles: NonNegative = Field(default=0.0, description="wrist angles psi, theta, phi, rad")
-    base_angular_velocity: NonNegative = Field(
+    base_position: LengthSpread = Field(default=0.0, description="position of the base in inertial axes, m")
+    joint_angles: AngleSpread = Field(default=0.0, description="joint angles, rad")
+    wrist_angles: AngleSpread = Field(default=0.0, description="wrist angles psi, theta, phi, rad")
+    base_angular_velocity: RateSpread = Field(
         default=0.0, description="angular velocity of the base, base axes, rad/s"
     )
-    base_linear_velocity: NonNegative = Field(
+    base_linear_velocity: RateSpread = Field(
         default=0.0, description="linear velocity of the base, base axes, m/s"
     )
-    joint_rates: NonNegative = Field(default=0.0, description="joint rates, rad/s")
-    target_rotation: NonNegative = Field(
+    joint_rates: RateSpread = Field(default=0.0, description="joint rates, rad/s")
+    target_rotation: AngleSpread = Field(
         default=0.0, description="rotation vector of the target in its own axes, rad"
     )
-    target_position: NonNegative = Field(
+    target_position: LengthSpread = Field(
         default=0.0, description="position of the target in inertial axes, m"
     )
     base_mass: Fraction = Field(default=0.0, description="mass of the base, as a fraction of it")

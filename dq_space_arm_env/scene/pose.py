@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from dq_space_arm_env.algebra import poses, rotations
-from dq_space_arm_env.validation.fields import Eight, Finite, Three, Vector3, read_numbers
+from dq_space_arm_env.validation.fields import Eight, Finite, Position, Three, Vector3, read_numbers
 from dq_space_arm_env.validation.problems import Model, problem
 
 Quaternion = tuple[float, float, float, float]
@@ -108,7 +108,7 @@ class Pose(Model):
 
     _other_keys: ClassVar[tuple[str, ...]] = ("dual_quaternion",)
 
-    position: Vector3 = Field(
+    position: Position = Field(
         default=(0.0, 0.0, 0.0), description="origin of the frame in the outer frame, m"
     )
     rotation: Annotated[Quaternion, BeforeValidator(_read_rotation)] = Field(

@@ -6,6 +6,7 @@ velocities have their angular part first, quaternions their scalar.
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,11 @@ from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
 from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.scene.simulation import Simulation
+from dq_space_arm_env.validation.fields import Name
 from dq_space_arm_env.validation.problems import Model, Problem, raise_problems
 from dq_space_arm_env.validation.yaml_text import dump_yaml
 
+_LARGEST_COST = 1e30  # of one actuator: sums and second derivatives stay finite in single precision too
 _PLANAR = 'base.motion is "planar"'
 _Location = tuple[str | int, ...]
 
@@ -27,7 +30,7 @@ _Location = tuple[str | int, ...]
 class Scene(Model):
     """A spacecraft with an arm, its actuators and its maneuver; equations and task are derived from it."""
 
-    name: StrictStr = Field(min_length=1, description="name of the scene")
+    name: Name = Field(description="name of the scene")
     description: StrictStr = Field(default="", description="purpose of the scene")
     base: Base = Field(description="the spacecraft")
     links: tuple[Link, ...] = Field(default=(), description="links of the arm, base to tip")
@@ -85,6 +88,7 @@ class Scene(Model):
     def _problems(self) -> Iterator[Problem]:
         yield from self._actuator_problems()
         yield from self._part_problems()
+        yield from self._cost_problems()
         if self.base.motion == "planar":
             yield from self._planar_problems()
 
@@ -131,6 +135,24 @@ class Scene(Model):
             half_width = getattr(self.spread, field)
             if half_width and not part:
                 yield Problem(("spread", field), half_width, f"must be 0: the scene has no {part_name}")
+
+    def _cost_problems(self) -> Iterator[Problem]:
+        """Find weights with which the reward of inputs at their limits would not be a number."""
+        for name in type(self.actuators).model_fields:
+            actuator, weight = getattr(self.actuators, name), getattr(self.cost, name)
+            if actuator is None:
+                continue
+            largest = [link.torque_limit or 0.0 for link in self.links] if name == "joint_torque" else []
+            largest += [*actuator.limit] if isinstance(actuator.limit, tuple) else [actuator.limit]
+            bound = max((limit for limit in largest if limit < math.inf), default=0.0)
+            heaviest = max(weight) if isinstance(weight, tuple) else weight
+            cost = heaviest * bound**2 * self.simulation.steps
+            if cost > _LARGEST_COST:
+                sentence = (
+                    f"with the limit {bound:g} and {self.simulation.steps} steps an episode may cost "
+                    f"{cost:.3g}, it must be at most {_LARGEST_COST:g}: lower it or actuators.{name}.limit"
+                )
+                yield Problem(("cost", name), weight, sentence)
 
     def _planar_problems(self) -> Iterator[Problem]:
         """Find what leaves the x-y plane or turns about another axis than z."""

@@ -7,7 +7,7 @@ from pydantic import Field, StrictStr, field_validator
 
 from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
-from dq_space_arm_env.validation.fields import Count, Positive
+from dq_space_arm_env.validation.fields import Positive, Steps, TimeStep
 from dq_space_arm_env.validation.problems import Model, Problem, problem
 
 TOLERANCES = {"float64": (1e-8, 1e-10), "float32": (1e-5, 1e-6)}
@@ -19,8 +19,8 @@ SMALLEST_SINGLE_RTOL = 1e-6
 class Simulation(Model):
     """Time step, integrator and precision."""
 
-    dt: Positive = Field(default=0.015, description="time step, s")
-    steps: Count = Field(default=1000, description="number of time steps of an episode")
+    dt: TimeStep = Field(default=0.015, description="time step, s")
+    steps: Steps = Field(default=1000, description="number of time steps of an episode")
     integrator: StrictStr = Field(default="rk4", description="name of the integrator")
     precision: Literal["float64", "float32"] = Field(
         default="float64",

@@ -20,3 +20,5 @@ MEMORY = ("steps_taken", "cost_pose", "cost_base_velocity")
 # A state whose norm (m, rad, m/s, rad/s) is larger, or NaN, comes from a simulation that has blown up. It
 # keeps every entry of an observation within twice this number.
 STATE_LIMIT = 5e5
+OBSERVATION_LIMIT = 2.0 * STATE_LIMIT
+"""Bound of every observation of a simulation that has not diverged, m, rad, m/s, rad/s."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
@@ -16,13 +14,18 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dq_space_arm_env.common.bounded_formats import read_arrays
+from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json
 from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.shown_text import shortened
+from dq_space_arm_env.scene.loading import load_scene
 from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.validation.problems import SceneError
 
 FloatArray = NDArray[np.float64]
 
 _REQUIRED, _OPTIONAL = ("states", "controls"), ("noise", "rewards", "target")
-_UNREADABLE = (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error)
+_LONGEST = 200  # characters of a sentence about an array
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,36 +124,63 @@ class Trajectory:
             ValueError: If the file cannot be read or lacks states or controls.
         """
         path = Path(path)
+        if not path.exists():
+            raise ValueError(f"{path}: there is no such file")
         try:
-            # Bytes first: if the file is no archive, NumPy would leave its descriptor open.
-            with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as content:
-                wanted = [name for name in content.files if name in (*_REQUIRED, *_OPTIONAL, "facts")]
-                arrays = {name: content[name] for name in wanted}
-            facts = json.loads(str(arrays.pop("facts"))) if "facts" in arrays else {}
+            arrays: dict[str, Any] = read_arrays(path, (*_REQUIRED, *_OPTIONAL, "facts"))
+            facts = parse_json(str(arrays.pop("facts", "{}")), f"{path}: facts")
             if not isinstance(facts, dict) or not isinstance(facts.get("metadata", {}), dict):
-                raise ValueError("its facts are not a mapping")
-        except FileNotFoundError:
-            raise ValueError(f"{path}: there is no such file") from None
-        except _UNREADABLE as error:
+                raise UnreadableError("its facts are not a mapping")
+            wrong = [
+                f"{name} holds {array.dtype}"
+                for name, array in arrays.items()
+                if array.dtype.kind not in "biuf"
+            ]
+            if wrong:
+                raise UnreadableError(f"{wrong[0]}, it should hold numbers"[:_LONGEST])
+            known = _known(facts)
+        except UnreadableError as error:
             raise ValueError(f"{path} cannot be read as a flight ({error})") from error
         missing = set(_REQUIRED) - set(arrays)
         if missing:
             raise ValueError(f"{path} holds no flight: it lacks {' and '.join(sorted(missing))}")
         name = label or facts.get("label") or ("expert" if "stop_reason" in facts else path.stem)
-        return cls(str(name), **arrays, **_known(facts))
+        return cls(str(name), **arrays, **known)
+
+
+_KINDS: Mapping[str, tuple[str, Any]] = {  # fields, their keys in the facts, and what these may be
+    "label": ("label", str),
+    "start": ("start", str),
+    "seed": ("seed", int),
+    "attitude_error": ("final_attitude_error_deg", float | int),
+    "position_error": ("final_position_error_m", float | int),
+    "is_success": ("is_success", bool),
+    "diverged": ("diverged", bool),
+    "action_seconds": ("action_seconds", float | int),
+}
 
 
 def _known(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a trajectory in the facts of its file; a solution has its scene among its metadata."""
     scene = facts.get("scene") or facts.get("metadata", {}).get("scene")
-    fields = {
-        "start": facts.get("start"),
-        "seed": facts.get("seed"),
-        "attitude_error": facts.get("final_attitude_error_deg"),
-        "position_error": facts.get("final_position_error_m"),
-        "is_success": facts.get("is_success"),
-        "diverged": facts.get("diverged"),
-        "action_seconds": facts.get("action_seconds"),
-        "scene": None if scene is None else Scene.model_validate(scene),
-    }
-    return {name: value for name, value in fields.items() if value is not None}
+    found: dict[str, Any] = {}
+    for name, (key, kind) in _KINDS.items():
+        value = facts.get(key)
+        if value is not None and (
+            not isinstance(value, kind) or isinstance(value, bool) is not (kind is bool)
+        ):
+            raise UnreadableError(f"facts: {key} is {shortened(value)}, it should be a {_word(kind)}")
+        if value is not None and name != "label":
+            found[name] = value
+    if scene is not None:
+        if not isinstance(scene, dict):
+            raise UnreadableError(f"facts: scene is {shortened(scene)}, it should be a mapping")
+        try:
+            found["scene"] = load_scene(scene)
+        except SceneError as error:
+            raise UnreadableError(f"facts: {error}") from error
+    return found
+
+
+def _word(kind: Any) -> str:
+    return {str: "text", int: "whole number", bool: "truth value"}.get(kind, "number")

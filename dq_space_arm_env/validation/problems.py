@@ -10,10 +10,12 @@ from typing import Any, ClassVar, NamedTuple, NoReturn, Self
 from pydantic import BaseModel, ConfigDict, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
+from dq_space_arm_env.common.shown_text import printable, shortened
 from dq_space_arm_env.common.suggestions import did_you_mean
 
 _KIND = "scene_problem"
-_LONGEST_SHOWN_VALUE = 120
+_MOST_SHOWN = 20  # problems in one message
+_LONGEST_KEY = 60  # characters
 
 
 class SceneError(ValueError):
@@ -47,8 +49,19 @@ def field_path(location: Iterable[str | int]) -> str:
     """Write a location as "links[1].joint.rotation", or "scene" for the whole file."""
     path = ""
     for part in location:
-        path += f"[{part}]" if isinstance(part, int) else f".{part}" if path else part
+        # Unknown keys are in the words of whoever wrote the file.
+        key = part if isinstance(part, int) else printable(part[:_LONGEST_KEY])
+        path += f"[{key}]" if isinstance(key, int) else f".{key}" if path else key
     return path or "scene"
+
+
+def problem_list(origin: str, error: ValidationError) -> str:
+    """List the problems of a model, a line each."""
+    problems = [detail["msg"] for detail in error.errors(include_url=False)]
+    count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+    more = len(problems) - _MOST_SHOWN
+    rest = [f"and {more} more"] if more > 0 else []
+    return "\n  - ".join([f"{origin}: {count}", *problems[:_MOST_SHOWN], *rest])
 
 
 class Model(BaseModel):
@@ -98,8 +111,7 @@ def _rethrow(model: type[Model], error: ValidationError) -> NoReturn:
 
 
 def _shown(value: object) -> str:
-    text = repr(value)
-    return f" = {text if len(text) <= _LONGEST_SHOWN_VALUE else text[:_LONGEST_SHOWN_VALUE] + '...'}"
+    return f" = {shortened(value)}"
 
 
 def _meaning(model: type[BaseModel], name: str | int) -> str:

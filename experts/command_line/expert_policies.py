@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dq_space_arm_env.common.files import archive_members
+from dq_space_arm_env.common.bounded_reading import archive_members
 
 if TYPE_CHECKING:
     from rich.console import Console

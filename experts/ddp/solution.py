@@ -14,7 +14,10 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dq_space_arm_env.common.bounded_formats import read_arrays
+from dq_space_arm_env.common.bounded_reading import parse_json
 from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.kernels.bound import address_of, buffer_table, one_row_call
 from experts.problems.arm_problem import as_problem
 from experts.problems.shooting_problem import FloatArray, ShootingProblem
@@ -185,25 +188,58 @@ class Solution:
         Raises:
             ValueError: If the file does not hold a solution.
         """
-        with np.load(path, allow_pickle=False) as file:
-            missing = {"states", "controls", "feedback_gains", "history", "facts"} - set(file.files)
-            if missing:
-                raise ValueError(
-                    f"{os.fspath(path)} is not a solution: it lacks {', '.join(sorted(missing))}"
-                )
-            facts: Mapping[str, Any] = json.loads(str(file["facts"]))
-            return cls(
-                states=file["states"],
-                controls=file["controls"],
-                feedback_gains=file["feedback_gains"],
-                history=file["history"],
-                cost=facts["cost"],
-                stop_reason=StopReason(facts["stop_reason"]),
-                message=facts["message"],
-                optimality=facts["optimality"],
-                iterations=facts["iterations"],
-                metadata=facts["metadata"],
+        where = os.fspath(path)
+        arrays: dict[str, Any] = read_arrays(path, _ARRAYS)
+        missing = set(_ARRAYS) - set(arrays)
+        if missing:
+            raise ValueError(f"{where} is not a solution: it lacks {', '.join(sorted(missing))}")
+        facts = parse_json(str(arrays.pop("facts")), f"{where}: facts")
+        _check(arrays, facts, where)
+        return cls(
+            **arrays,
+            cost=facts["cost"],
+            stop_reason=StopReason(facts["stop_reason"]),
+            message=facts["message"],
+            optimality=facts["optimality"],
+            iterations=facts["iterations"],
+            metadata=facts["metadata"],
+        )
+
+
+_ARRAYS = ("states", "controls", "feedback_gains", "history", "facts")
+_FACTS: Mapping[str, tuple[Any, str]] = {
+    "cost": (float | int, "a number"),
+    "stop_reason": (str, "text"),
+    "message": (str, "text"),
+    "optimality": (float | int, "a number"),
+    "iterations": (int, "a whole number"),
+    "metadata": (dict, "a mapping"),
+}
+
+
+def _check(arrays: Mapping[str, NDArray[Any]], facts: Any, where: str) -> None:
+    """Raise ValueError where a file holds other arrays or facts than `Solution.save` writes."""
+    if not isinstance(facts, dict):
+        raise ValueError(f"{where}: facts are {shortened(facts, 40)}, they should be a mapping")
+    for name, (kind, wanted) in _FACTS.items():
+        value = facts.get(name)
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise ValueError(f"{where}: facts: {name} is {shortened(value)}, it should be {wanted}")
+    if facts["stop_reason"] not in list(StopReason):
+        reasons = ", ".join(StopReason)
+        raise ValueError(
+            f"{where}: facts: stop_reason is {shortened(facts['stop_reason'])}, it should be one of {reasons}"
+        )
+    steps, axes = len(np.atleast_1d(arrays["controls"])), {"states": 2, "controls": 2, "feedback_gains": 3}
+    for name, count in axes.items():
+        array, rows = arrays[name], steps + (name == "states")
+        if array.ndim != count or array.dtype.kind not in "iuf" or len(array) != rows:
+            raise ValueError(
+                f"{where}: {name} has shape {array.shape} of {array.dtype}, it should have {count} axes of "
+                f"numbers and {rows} rows"
             )
+    if arrays["history"].dtype != HISTORY_DTYPE or arrays["history"].ndim != 1:
+        raise ValueError(f"{where}: history has other columns, they should be those of IterationRecord")
 
 
 class FeedbackPolicy:

@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
+from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.progress import ProgressDisplay, Status
 from dq_space_arm_env.common.provenance import provenance
@@ -106,9 +107,11 @@ def _section(part: ModuleType, name: str, scene: Scene, found: dict[str, Any]) -
 def _unfinished(file: Path, request: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Parts of an interrupted report of the same request; none if there is none."""
     try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-        parts, asked = record["parts"], record["request"]
-    except (OSError, ValueError, TypeError, KeyError):
+        record = read_mapping(file)
+    except UnreadableError:
+        return {}
+    parts, asked = record.get("parts"), record.get("request")
+    if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
         return {}
     same = asked == json.loads(json.dumps(json_value(request)))
     return parts if same and parts.keys() < PARTS.keys() else {}

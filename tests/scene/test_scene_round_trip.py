@@ -71,7 +71,7 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
     if wrist:
         actuators["wrist_rate"] = st.fixed_dictionaries({"limit": one_or(limits, 3)})
     scene: dict[str, st.SearchStrategy[Any]] = {
-        "name": st.text(min_size=1, max_size=8),
+        "name": st.text(st.characters(exclude_categories=("C", "Zl", "Zp")), min_size=1, max_size=8),
         "description": st.text(max_size=20),
         "base": st.fixed_dictionaries({"mass": positive, "inertia": inertias()}),
         "links": st.tuples(*[st.fixed_dictionaries(link | {"name": st.just(f"link {i}")}) for i in range(n)]),

@@ -168,7 +168,7 @@ def test_nothing_in_a_file_is_executed(tmp_path):
     np.lib.format.write_array(stream, array, allow_pickle=True)
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("weight_3.npy", stream.getvalue())
-    with pytest.raises(PolicyFileError, match="pickle"):
+    with pytest.raises(PolicyFileError, match="holds object, it should hold numbers"):
         ExportedPolicy.load(path)
 
 
