@@ -19,7 +19,7 @@ from agents.policies import ExportedPolicy
 from agents.policies.tensor_files import TensorFileError, read_tensors
 from dq_space_arm_env.common.bounded_reading import parse_json, read_member
 
-MOST_BYTES = {"data": 1 << 26, "policy.pth": 1 << 28}
+MOST_BYTES = {"data": 1 << 23, "policy.pth": 1 << 27}
 """Largest members of a model's file that are read."""
 
 _POLICIES = frozenset(
@@ -114,6 +114,8 @@ def read_attributes(path: Path) -> dict[str, Any]:
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Tensors of a model's policy by name."""
     content = read_member(path, "policy.pth", MOST_BYTES["policy.pth"])
+    if len(content) > path.stat().st_size:
+        raise ValueError("policy.pth is compressed, which Stable-Baselines3 does not do")
     tensors = read_tensors(content)
     if not isinstance(tensors, dict):
         raise ValueError("policy.pth should be a mapping")

@@ -236,6 +236,18 @@ def test_attributes_that_are_no_models_are_refused_in_a_sentence(data, plain, tm
         as_policy(model)
 
 
+def test_a_small_file_cannot_claim_large_tensors(plain, tmp_path):
+    with (
+        zipfile.ZipFile(plain) as old,
+        zipfile.ZipFile(tmp_path / "model.zip", "w", zipfile.ZIP_DEFLATED) as new,
+    ):
+        new.writestr("data", old.read("data"))
+        new.writestr("policy.pth", tensors({"mlp_extractor.policy_net.0.weight": torch.zeros(4_000_000)}))
+    assert (tmp_path / "model.zip").stat().st_size < 100_000
+    with pytest.raises(PolicyError, match="compressed"):
+        as_policy(tmp_path / "model.zip")
+
+
 def test_a_damaged_archive_is_refused_in_a_sentence(plain, tmp_path):
     content = plain.read_bytes()
     for cut in (0, 10, len(content) // 2, len(content) - 10):
