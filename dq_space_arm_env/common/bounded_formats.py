@@ -23,6 +23,7 @@ from dq_space_arm_env.common.bounded_reading import (
     open_archive,
     open_regular,
     parse_json,
+    reason_of,
     too_deep,
 )
 from dq_space_arm_env.common.shown_text import shortened
@@ -80,7 +81,7 @@ def _read_member(
     except UnreadableError:
         raise
     except Exception as error:  # damaged bytes make zipfile and zlib raise anything
-        raise UnreadableError(f"{what}: is damaged ({error})") from error
+        raise UnreadableError(f"{what}: is damaged ({reason_of(error)})") from error
 
 
 def _read_stream(stream: IO[bytes], what: str, most: int) -> tuple[NDArray[Any], int]:
@@ -106,7 +107,7 @@ def _read_stream(stream: IO[bytes], what: str, most: int) -> tuple[NDArray[Any],
     except UnreadableError:
         raise
     except Exception as error:  # damaged bytes make zipfile, zlib and NumPy raise anything
-        raise UnreadableError(f"{what}: is damaged ({error})") from error
+        raise UnreadableError(f"{what}: is damaged ({reason_of(error)})") from error
 
 
 def _fill(content: NDArray[np.uint8], stream: IO[bytes]) -> int:
@@ -245,4 +246,4 @@ def parse_xml(
     except UnreadableError:
         raise
     except (expat.ExpatError, LookupError, UnicodeError, AssertionError) as error:
-        raise UnreadableError(f"{what}: not valid XML: {error}") from error
+        raise UnreadableError(f"{what}: not valid XML: {reason_of(error)}") from error

@@ -13,7 +13,7 @@ import zipfile
 from pathlib import Path
 from typing import IO, Any
 
-from dq_space_arm_env.common.shown_text import shortened
+from dq_space_arm_env.common.shown_text import LONGEST, shortened
 
 TEXT_BYTES = 8 * 2**20
 """Default limit of a text: the manifest of a million demonstrations, parsed in half a second."""
@@ -183,7 +183,12 @@ def open_archive(file: IO[bytes], what: str) -> zipfile.ZipFile:
     except UnreadableError:
         raise
     except Exception as error:  # damaged bytes make zipfile raise anything
-        raise UnreadableError(f"{what}: is a damaged archive ({error})") from error
+        raise UnreadableError(f"{what}: is a damaged archive ({reason_of(error)})") from error
+
+
+def reason_of(error: Exception) -> str:
+    """What an error of a library says, on one line; some repeat the whole file."""
+    return " ".join(str(error)[: 2 * LONGEST].split())[:LONGEST] or type(error).__name__
 
 
 def read_member(path: str | os.PathLike[str], name: str, most: int = TEXT_BYTES) -> bytes:
@@ -200,7 +205,7 @@ def read_member(path: str | os.PathLike[str], name: str, most: int = TEXT_BYTES)
         except KeyError:
             raise UnreadableError(f"{what} is missing in the archive") from None
         except Exception as error:  # damaged bytes make zipfile raise anything
-            raise UnreadableError(f"{what} is damaged ({error})") from error
+            raise UnreadableError(f"{what} is damaged ({reason_of(error)})") from error
     if len(content) > most:
         raise UnreadableError(f"{what} unpacks to more than {most:,} bytes, it should not")
     return content
