@@ -112,6 +112,23 @@ def test_without_iterations_it_is_the_feedback_of_the_stage_that_has_come(short_
         state = kernels.step(state, expert.plan.solution.controls[k])
 
 
+def test_an_iteration_lowers_the_cost_of_what_lies_ahead(short_scene):
+    """Pushed by more than the feedback is good for; nothing is left to gain where the plan is kept."""
+    costs = {}
+    for iterations in (0, 1):
+        expert = RecedingHorizonExpert(short_scene, horizon=20, iterations=iterations)
+        start = expert.maneuver.initial_state
+        expert.reset(start)
+        expert(start)
+        kept = expert._work.current.cost
+        pushed = expert.maneuver.kernels.retract(start, np.full(expert.maneuver.n_tangent, 0.2))
+        expert.reset(start)
+        expert(pushed)
+        costs[iterations] = kept, expert._work.current.cost
+    assert costs[1][0] == pytest.approx(costs[0][0], rel=1e-6)
+    assert costs[1][1] < 0.9999 * costs[0][1]
+
+
 @pytest.mark.parametrize("horizon", [1, 7])
 def test_what_lies_beyond_the_horizon_costs_what_the_plan_says_of_its_end(short_scene, horizon):
     """Gradient and Hessian are those of the stage at which the window ends, around the plan's state there."""
