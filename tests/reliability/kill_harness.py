@@ -410,7 +410,8 @@ def _struck(undertaking, attempt, disturbance, rng, seconds, at, limit):
     else:
         with suppress(ProcessLookupError, FileNotFoundError):
             _limit(first.pid, disturbance, rng)
-        allowed = (-signal.SIGABRT,) if disturbance == "no memory" else ()
+        # Libraries that do not check what they allocate crash.
+        allowed = (-signal.SIGABRT, -signal.SIGSEGV) if disturbance == "no memory" else ()
     if undertaking.aborts and disturbance in ("full disk", "short files"):
         allowed = (-signal.SIGABRT, -signal.SIGSEGV)
     first.release()
