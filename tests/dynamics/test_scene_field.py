@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import Scene, load_scene
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import screw
 from dq_space_arm_env.algebra.vectors import add, cross
 from dq_space_arm_env.dynamics import linear, minimal
 from dq_space_arm_env.dynamics.chain import Chain
@@ -164,3 +166,19 @@ def test_factorizations_solve(n: int) -> None:
     np.testing.assert_allclose(by_ldl, np.linalg.solve(definite, right), rtol=1e-9)
     by_lu = linear.solve_lu(linear.factorize_lu(scaled.tolist()), right.tolist())
     np.testing.assert_allclose(by_lu, np.linalg.solve(scaled, right), rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["paper", "planar"])
+def test_a_pose_moves_by_the_exponential_and_stays_a_unit(name: str) -> None:
+    """Also where it was off a unit dual quaternion by a rounding."""
+    field = field_of(load_scene(name))
+    rng, coordinates = np.random.default_rng(7), field.pose
+    increment = np.zeros(6)
+    increment[list(coordinates.directions)] = rng.normal(size=len(coordinates.directions))
+    pose = field.layout.initial_state[field.layout.state.pose].tolist()
+    expected = dq.multiply(coordinates.full(pose), screw.exponential(increment.tolist()))
+    np.testing.assert_allclose(coordinates.moved(pose, increment), coordinates.reduced(expected), atol=1e-14)
+    off = coordinates.moved([entry * (1.0 + 1e-7) for entry in pose], increment)
+    np.testing.assert_allclose(off, coordinates.reduced(expected), atol=1e-6)
+    unit = dq.multiply(dq.conjugate(coordinates.full(off)), coordinates.full(off))
+    np.testing.assert_allclose(unit, [1.0, *[0.0] * 7], atol=1e-13)

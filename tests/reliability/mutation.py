@@ -82,7 +82,7 @@ TESTS: dict[str, dict[str, list[str]]] = {
     "dq_space_arm_env/algebra/": {"quick": _ALGEBRA, "default": ["tests/dynamics", *_KERNELS]},
     "dq_space_arm_env/dynamics/": {"quick": ["tests/dynamics"], "default": _KERNELS},
     "dq_space_arm_env/task/trajectory.py": {
-        "quick": ["tests/environment/test_rollouts.py"],
+        "quick": ["tests/task/test_trajectory_files.py", "tests/environment/test_rollouts.py"],
         "default": ["tests/viewing/test_replay_flights.py"],
     },
     "dq_space_arm_env/task/": {
@@ -95,7 +95,7 @@ TESTS: dict[str, dict[str, list[str]]] = {
         "quick": [
             f"tests/integrators/test_{name}.py" for name in ("tableaus", "registry", "interpreted_steps")
         ],
-        "default": [*_METHODS, "tests/kernels/test_kernels_derivatives.py"],
+        "default": ["tests/kernels/test_kernels_second_order.py", *_METHODS, _KERNELS[2]],
     },
     "experts/ddp/backward_pass.py": _solver("backward_pass", "box_ddp"),
     "experts/ddp/box_ddp.py": _solver("box_ddp", "second_order"),

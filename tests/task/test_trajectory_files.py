@@ -1,0 +1,42 @@
+"""A trajectory's file holds what is known of it, and no more."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env.task.trajectory import Trajectory
+
+STATES, CONTROLS = np.arange(12.0).reshape(4, 3), np.ones((3, 2))
+
+
+@pytest.mark.parametrize("noise", [None, np.zeros((3, 2))])
+def test_what_is_unknown_is_left_out(noise: np.ndarray | None, tmp_path: Path) -> None:
+    path = tmp_path / "flight.npz"
+    Trajectory("bare", STATES, CONTROLS, noise=noise).save(path)
+    with np.load(path) as content:
+        assert sorted(content.files) == ["controls", "facts", "states"]
+    found = Trajectory.load(path)
+    np.testing.assert_array_equal(found.states, STATES)
+    np.testing.assert_array_equal(found.controls, CONTROLS)
+    assert (found.label, found.noise, found.rewards, found.target, found.scene) == ("bare", *[None] * 4)
+    assert np.isnan(found.cost)
+
+
+def test_what_is_known_comes_back(tmp_path: Path) -> None:
+    path, noise, rewards = tmp_path / "flight.npz", 0.1 * CONTROLS, np.array([-1.0, -2.0, -0.5])
+    given = Trajectory("full", STATES, CONTROLS, noise=noise, rewards=rewards, target=np.arange(8.0), seed=3)
+    given.save(path)
+    found = Trajectory.load(path)
+    for name in ("states", "controls", "noise", "rewards", "target"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(given, name))
+    assert (found.cost, found.seed) == (3.5, 3)
+
+
+@pytest.mark.parametrize("missing", ["states", "controls"])
+def test_a_file_without_states_or_controls_is_no_flight(missing: str, tmp_path: Path) -> None:
+    arrays = {"states": STATES, "controls": CONTROLS, "rewards": np.ones(3)}
+    del arrays[missing]
+    np.savez(tmp_path / "other.npz", **arrays)
+    with pytest.raises(ValueError, match=f"lacks {missing}"):
+        Trajectory.load(tmp_path / "other.npz")
