@@ -84,6 +84,8 @@ def _replace(
                 file.flush()
                 os.fsync(file.fileno())
         temporary.replace(path)
+    except OSError as error:  # nobody knows the temporary name, and a full disk names no file
+        raise OSError(error.errno, error.strerror or str(error), os.fspath(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
     if durable and os.name != "nt":  # Windows opens no folders

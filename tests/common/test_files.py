@@ -39,7 +39,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
     try:
-        with pytest.raises(OSError, match="too large"):
+        with pytest.raises(OSError, match=rf"File too large: '{file}'$"):
             write_atomically(file, bytes(2000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
