@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env import Scene
-from dq_space_arm_env.common.bounded_reading import read_text
+from dq_space_arm_env.common.bounded_reading import read_text, reason_of
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.kernels import Kernels
 from experts.ddp.solution import StopReason
@@ -34,7 +35,8 @@ def read_from_minari(dataset_id: str, folder: Path) -> Demonstrations:
     not keep, is NaN.
     """
     dataset = _open(dataset_id)
-    settings = _settings(dataset, dataset_id)
+    with _damage_named(dataset_id):
+        settings = _settings(dataset, dataset_id)
     text = json.dumps(settings, indent=2) + "\n"
     if (folder / MANIFEST).is_file():
         if read_text(folder / SETTINGS) != text:
@@ -47,7 +49,8 @@ def read_from_minari(dataset_id: str, folder: Path) -> Demonstrations:
     episodes = dataset.episode_indices.tolist()
     for number, first in enumerate(range(0, len(episodes), SHARD_SIZE)):
         indices = episodes[first : first + SHARD_SIZE]
-        content = pack(_arrays(dataset, indices, kernels), NOTES)
+        with _damage_named(dataset_id):
+            content = pack(_arrays(dataset, indices, kernels), NOTES)
         digest = hashlib.sha256(content).hexdigest()
         name = f"{number:06d}-{digest}.safetensors"
         write_atomically(folder / SHARDS / name, content)
@@ -71,6 +74,19 @@ def read_from_minari(dataset_id: str, folder: Path) -> Demonstrations:
     return load_demonstrations(folder)
 
 
+@contextmanager
+def _damage_named(dataset_id: str) -> Iterator[None]:
+    """Turn what damaged metadata and HDF5 files raise into a sentence."""
+    try:
+        yield
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
+        if isinstance(error, DemonstrationsError):
+            raise
+        raise DemonstrationsError(
+            f"the Minari data set {dataset_id} is damaged ({reason_of(error)}): export or download it again"
+        ) from error
+
+
 def _open(dataset_id: str) -> Any:
     try:
         import h5py  # noqa: F401
@@ -81,8 +97,12 @@ def _open(dataset_id: str) -> Any:
         ) from error
     try:
         return minari.load_dataset(dataset_id)
-    except (FileNotFoundError, ValueError) as error:
+    except FileNotFoundError as error:
         raise DemonstrationsError(f"Minari has no data set {dataset_id} here: {error}") from error
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
+        raise DemonstrationsError(
+            f"Minari cannot read the data set {dataset_id}: {reason_of(error)}"
+        ) from error
 
 
 def _settings(dataset: Any, dataset_id: str) -> dict[str, Any]:
