@@ -7,7 +7,7 @@ import pytest
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from experts import BoxDDP, GuidedDDP, RecedingHorizonExpert
 from experts.problems.arm_problem import ArmProblem
-from experts.receding_horizon import ManeuverPlan
+from experts.receding_horizon import ManeuverPlan, _convex_part
 
 SCENES = ("paper", "payload")
 
@@ -127,6 +127,16 @@ def test_an_iteration_lowers_the_cost_of_what_lies_ahead(short_scene):
         costs[iterations] = kept, expert._work.current.cost
     assert costs[1][0] == pytest.approx(costs[0][0], rel=1e-6)
     assert costs[1][1] < 0.9999 * costs[0][1]
+
+
+def test_negative_curvature_is_cut_off_and_the_rest_stays():
+    rng = np.random.default_rng(0)
+    basis = np.linalg.qr(rng.normal(size=(3, 4, 4)))[0]
+    values = np.array([[2.0, -1.0, 0.5, 0.0], [1.0, 2.0, 3.0, 4.0], [-1.0, -2.0, -3.0, -4.0]])
+    given, kept = (
+        (basis * part[:, None, :]) @ basis.transpose(0, 2, 1) for part in (values, values.clip(0.0))
+    )
+    np.testing.assert_allclose(_convex_part(given), kept, atol=1e-14)
 
 
 @pytest.mark.parametrize("horizon", [1, 7])

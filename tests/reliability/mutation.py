@@ -74,6 +74,7 @@ _METHODS += [f"tests/integrators/test_{name}.py" for name in ("rosenbrock", "mom
 _RECEDING = "tests/experts/test_receding_horizon.py"
 _RECEDING_QUICK = (
     "without_iterations_it_is_the_feedback_of_the_stage_that_has_come",
+    "negative_curvature_is_cut_off_and_the_rest_stays",
     "an_iteration_lowers_the_cost_of_what_lies_ahead",
     "what_lies_beyond_the_horizon_costs_what_the_plan_says_of_its_end",
 )
