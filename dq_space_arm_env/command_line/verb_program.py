@@ -148,7 +148,8 @@ def _explain(error: BaseException) -> int:
     if _is_out_of_memory(error):
         error.__traceback__ = None  # its frames hold what could be freed
         # Plainly: the console would need memory of its own.
-        print("Error: out of memory; finished files are complete, repeat the command", file=sys.stderr)
+        said = "" if isinstance(error, MemoryError) else f" ({type(error).__name__}: {error})"
+        print(f"Error: out of memory{said}; finished files are complete, repeat the command", file=sys.stderr)
         return FAILURE
     if isinstance(error, OSError):
         file = error.filename2 or error.filename

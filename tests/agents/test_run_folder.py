@@ -100,7 +100,9 @@ def test_the_learning_curve_is_read_up_to_a_number_of_steps(
     tmp_path: Path, configuration: AgentConfiguration
 ) -> None:
     folder = RunFolder(tmp_path, configuration)
-    lines = [{"environment_steps": steps, "success_rate": steps / 40} for steps in (10, 20, 30)]
+    lines = [
+        {"environment_steps": steps, "success_rate": steps / 40, "median_cost": 1.0} for steps in (10, 20, 30)
+    ]
     folder.write_evaluations(lines)
     assert folder.evaluations() == lines
     assert folder.evaluations(20) == lines[:2]

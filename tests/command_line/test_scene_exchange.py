@@ -68,7 +68,7 @@ def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -
         ([*HAND, *CARRIED, "--passive", "j"], "--passive: 'j' is not .* shoulder, elbow"),
         ([*HAND, *CARRIED, "--joint-torque", "0"], "--joint-torque = 0.0: must be a number"),
         (["import", ARM, "--tip", "mount", "--base", "hand"], "choose link '.*', or .* above it, as --base$"),
-        (["import", "nowhere.urdf", "--tip", "hand"], "nowhere.urdf cannot be read: No such file"),
+        (["import", "nowhere.urdf", "--tip", "hand"], "nowhere.urdf: there is no such file"),
         (["export", "paper"], "would be infinite: --wrist fixed writes it at its initial angles"),
         (["export", "planar"], "no base that moves in a plane"),
         (["export", "papr"], "did you mean 'paper'"),

@@ -79,12 +79,11 @@ def test_what_cannot_be_followed_is_nan_and_harms_no_other_lane():
     np.testing.assert_array_equal(result[others], expected[others])
 
 
-def test_tolerances_or_times_out_of_reach_end_in_nan_and_not_in_an_endless_loop():
-    kernels, hopeless = (compile_scene(adaptive(rtol=r, atol=0.1 * r)) for r in (1e-13, 1e-30))
+def test_a_time_out_of_reach_ends_in_nan_and_not_in_an_endless_loop():
+    kernels = compile_scene(adaptive(rtol=1e-13, atol=1e-14))
     x, u = moving_start(kernels, joint_rate=4.0, base_rate=2.0), np.zeros(kernels.n_u)
     assert np.isfinite(kernels.step(x, u, 0.5)).all()
     assert np.isnan(kernels.step(x, u, 1000.0)).all()
-    assert np.isnan(hopeless.step(x, u)).all()
 
 
 def test_the_environment_simulates_with_it_and_reports_a_failure():
@@ -95,7 +94,7 @@ def test_the_environment_simulates_with_it_and_reports_a_failure():
     assert np.isfinite(observation).all()
     assert np.isfinite(reward)
     assert not terminated
-    hopeless = gymnasium.make("DQSpaceArm-v0", scene=adaptive("tumbling", rtol=1e-30, atol=1e-30))
+    hopeless = gymnasium.make("DQSpaceArm-v0", scene=adaptive("tumbling", dt=1000.0))
     hopeless.reset(seed=0)
     observation, reward, terminated, _, _ = hopeless.step(np.zeros(hopeless.action_space.shape))
     assert terminated
