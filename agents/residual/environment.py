@@ -93,8 +93,8 @@ class ResidualVecEnv(VecEnv):
         mismatch, count = self._mismatch, self.num_envs
         chosen = self._rng.integers(len(self._plans.states), size=count)
         self._plans = self._plans.choose(np.tile(chosen, 2))
-        noise = mismatch.noise * self._rng.random(count)
-        self._disturb(noise, mismatch.push * self._rng.random(count))
+        noise, push = self._rng.random((2, count))
+        self._disturb(mismatch.noise * noise, mismatch.push * push)
         self._worlds.reset(self._plans.starts)
         self._stage, self._cost, self._returns = 0, np.zeros(2 * count), np.zeros(count)
         self._flying, self._success = np.ones(2 * count, dtype=np.bool_), np.zeros(2 * count, dtype=np.bool_)
