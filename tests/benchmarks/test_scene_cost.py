@@ -17,6 +17,8 @@ from scripts.benchmarks.scene_cost.processes import IMPORT, MAKE, STEP, WRENCHES
 from scripts.benchmarks.scene_cost.sizes import BATCH, OUTPUTS, output_rows, program_row, scene_rows, size_row
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
 
+pytestmark = pytest.mark.slow  # they compile many variants of scenes
+
 SHORT = replace(QUICK, cost_timing=Sampling(1, 1e-4))
 
 

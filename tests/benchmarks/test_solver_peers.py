@@ -22,6 +22,8 @@ from scripts.benchmarks.peers.ipopt_transcription import transcribe
 from scripts.benchmarks.solvers.runs import SolverRun, roll_out
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
 
+pytestmark = pytest.mark.slow  # they compile many variants of scenes
+
 
 def shortened(name: str, steps: int, integrator: str = "symplectic_euler") -> ArmProblem:
     scene = load_scene(name)

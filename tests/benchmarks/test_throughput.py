@@ -34,6 +34,8 @@ from scripts.benchmarks.subjects import (
 )
 from scripts.benchmarks.throughput.measurement import busy_process, measure_scene, ratios
 
+pytestmark = pytest.mark.slow  # they compile many variants of scenes
+
 SHORT = replace(QUICK, batch_sizes=(1, 5), kernel_timing=Sampling(2, 1e-4))
 PEAKS = {FLOAT64: 100.0, FLOAT32: 200.0}
 

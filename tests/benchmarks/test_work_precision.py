@@ -35,6 +35,8 @@ from scripts.benchmarks.work_precision.motions import (
 )
 from scripts.benchmarks.work_precision.references import reference_of
 
+pytestmark = pytest.mark.slow  # they compile many variants of scenes
+
 SHORT = replace(QUICK, duration=1.0, most_steps=600, step_timing=Sampling(1, 1e-3), accuracy_states=2)
 
 

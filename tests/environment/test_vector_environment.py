@@ -33,7 +33,17 @@ def assert_same(actual, expected, path="result"):
 
 
 MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
-CASES = [(name, "float64", 9, AutoresetMode.NEXT_STEP) for name in list_scenes()]
+QUICK_SCENES = ("paper", "planar", "random-masses", "random-target")
+CASES = [
+    pytest.param(
+        name,
+        "float64",
+        9,
+        AutoresetMode.NEXT_STEP,
+        marks=[pytest.mark.slow] if name not in QUICK_SCENES else [],
+    )
+    for name in list_scenes()
+]
 CASES += [("paper", "float64", copies, mode) for copies in (1, 3, 11) for mode in MODES]
 CASES += [(name, "float32", 19, mode) for name in ("paper", "random-masses", "planar") for mode in MODES]
 

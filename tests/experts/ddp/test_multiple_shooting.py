@@ -214,6 +214,7 @@ def arm():
     return problem, BoxDDP(problem).solve()
 
 
+@pytest.mark.slow
 def test_a_disturbed_maneuver_of_the_arm_leads_back_to_it(arm):
     problem, reference = arm
     offsets = 1e-3 * np.random.default_rng(0).normal(size=(problem.horizon + 1, problem.n_tangent))

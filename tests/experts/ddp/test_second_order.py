@@ -83,6 +83,7 @@ def test_every_choice_ends_at_a_minimum(pendulum, name):
         assert np.all(solution.history["exact"] == (name is SecondOrder.EXACT))
 
 
+@pytest.mark.slow
 def test_minimum_is_confirmed_by_exact_second_derivatives():
     """The hybrid ends only where Newton's step exists, whichever model led there."""
     solver = BoxDDP("reaction-wheels")
@@ -131,10 +132,7 @@ def test_hybrid_ends_no_higher_than_gauss_newton(scene):
 
 @pytest.mark.parametrize(
     "scene",
-    [
-        name if name in ("paper", "planar") else pytest.param(name, marks=pytest.mark.slow)
-        for name in ONE_OF_EACH_KIND
-    ],
+    [name if name == "planar" else pytest.param(name, marks=pytest.mark.slow) for name in ONE_OF_EACH_KIND],
 )
 def test_hybrid_converges_and_says_which_model_led_to_each_step(scene):
     solution = BoxDDP(scene).solve()
@@ -204,7 +202,8 @@ def test_an_integrator_without_second_derivatives_leaves_gauss_newton():
     assert np.linalg.eigvalsh(plan.Vxx).min() > -1e-9
 
 
-@pytest.mark.parametrize("integrator", ["rk6", pytest.param("momentum_rk4", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["rk6", "momentum_rk4"])
 def test_methods_of_higher_order_do_with_the_second_derivatives_of_rk4(integrator):
     """Where the solver ends is decided by gradients, which are the method's own."""
     problem = ArmProblem("planar", integrator)
