@@ -49,6 +49,7 @@ def odd_scenes_and_integrators():
 
 
 @pytest.mark.parametrize(("name", "integrator"), list(odd_scenes_and_integrators()))
+@pytest.mark.slow
 def test_linearization_agrees_with_complex_steps(name, integrator, draw):
     kernels, states, inputs = draw(ODD[name], 2)
     a, b = kernels.linearize(states, inputs, integrator=integrator)

@@ -19,6 +19,8 @@ from experts.report.effort import Announce, Effort
 from experts.report.integrator_precision import Motion, observed_order, reference_end
 from experts.report.stability_envelope import SLOW, largest, on_springs
 
+pytestmark = pytest.mark.slow  # every integrator and variant of a scene is compiled
+
 Limits = dict[tuple[str, str], float]
 EFFORT = Effort((1, 2, 4, 8, 16, 32, 64), 2, 1e-4, starts=3, ratio=1.05, all_parts=False)
 

@@ -4,25 +4,14 @@ import pytest
 
 pytest.importorskip("mpmath")
 
-from dq_space_arm_env.scene import INTEGRATORS
 from scripts.benchmarks.effort import QUICK
 from scripts.benchmarks.harness import Status
 from scripts.benchmarks.stability import all_cases
 from scripts.benchmarks.stability.cases import Case
 
-FAST_INTEGRATORS = ("rk4", "momentum_rosenbrock")
+pytestmark = pytest.mark.slow  # their machine code takes minutes
 
-
-def is_slow(case: Case) -> bool:
-    """Fast tests do with two integrators and double precision: the others' machine code takes minutes."""
-    others = [name for name in INTEGRATORS if name not in FAST_INTEGRATORS]
-    return any(name in case.subject for name in ("float32", *others))
-
-
-CASES = [
-    pytest.param(case, id=f"{case.group}: {case.title}", marks=[pytest.mark.slow] if is_slow(case) else [])
-    for case in all_cases()
-]
+CASES = [pytest.param(case, id=f"{case.group}: {case.title}") for case in all_cases()]
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -24,6 +24,8 @@ from experts import GuidedDDP
 from experts.demonstrations import SerialExecutor
 from experts.problems.arm_problem import ArmProblem
 
+pytestmark = pytest.mark.slow  # the expert plans for every condition
+
 N = 6
 
 
