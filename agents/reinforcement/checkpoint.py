@@ -87,7 +87,7 @@ def read_checkpoint(folder: Path, model: BaseAlgorithm) -> Progress:
         expected = sum(8 * array.size for _, array in _columns(model))
         arrays = read_arrays(folder / ARRAYS, most=expected + _SPARE)
         return _restored(model, state, parts, arrays)
-    except (ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).partition("\n")[0]
         raise RunFolderError(
             f"checkpoint {folder} is damaged ({reason}): remove it to begin anew, or use another folder"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import zipfile
 from collections.abc import Callable, Collection, Mapping
 from typing import IO, Any
@@ -103,11 +104,19 @@ def _read_stream(stream: IO[bytes], what: str, most: int) -> tuple[NDArray[Any],
         if _fill(content, stream) < len(content) or stream.read(1):
             raise UnreadableError(f"{what}: its size is not that of shape {shape} of {kind}")
         array = content.view(dtype) if dtype.itemsize else np.zeros(count, dtype)
+        if dtype.kind == "U" and not _is_unicode(array):
+            raise UnreadableError(f"{what}: holds text that is not Unicode")
         return array.reshape(shape, order="F" if fortran else "C"), size
     except UnreadableError:
         raise
     except Exception as error:  # damaged bytes make zipfile, zlib and NumPy raise anything
         raise UnreadableError(f"{what}: is damaged ({reason_of(error)})") from error
+
+
+def _is_unicode(array: NDArray[Any]) -> bool:
+    """Whether all characters are some; NumPy makes strings of any numbers, which crash what reads them."""
+    codes = array.view(f"{array.dtype.str[0]}u4") if array.itemsize else np.zeros(0, "u4")
+    return not ((codes > sys.maxunicode) | ((codes >= 0xD800) & (codes < 0xE000))).any()
 
 
 def _fill(content: NDArray[np.uint8], stream: IO[bytes]) -> int:

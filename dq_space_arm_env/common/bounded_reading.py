@@ -22,6 +22,7 @@ ANY_SIZE = 2**63
 DEPTH = 64
 """Limit of nesting, some ten times that of our own files, and far below Python's for recursion."""
 _INTEGER_BITS = 1023  # larger integers have no float
+_PART = 2**20  # bytes read at a time
 _MEMBERS = 2**20  # bytes of an archive's directory: some ten thousand members
 
 
@@ -82,12 +83,15 @@ def read_bytes(path: str | os.PathLike[str], most: int = TEXT_BYTES) -> bytes:
     """
     with open_regular(path, most) as file:
         try:
-            content = file.read(most + 1)
+            parts, left = [], most + 1
+            while left and (part := file.read(min(left, _PART))):  # it makes room for all that it may read
+                parts.append(part)
+                left -= len(part)
         except OSError as error:
             raise UnreadableError(f"{os.fspath(path)}: cannot be read: {error.strerror}") from error
-    if len(content) > most:  # it has grown, or has no size
-        raise _too_large(path, len(content), most)
-    return content
+    if not left:  # it has grown, or has no size
+        raise _too_large(path, most + 1, most)
+    return b"".join(parts)
 
 
 def read_text(path: str | os.PathLike[str], most: int = TEXT_BYTES) -> str:

@@ -131,19 +131,13 @@ class Trajectory:
             facts = parse_json(str(arrays.pop("facts", "{}")), f"{path}: facts")
             if not isinstance(facts, dict) or not isinstance(facts.get("metadata", {}), dict):
                 raise UnreadableError("its facts are not a mapping")
-            wrong = [
-                f"{name} holds {array.dtype}"
-                for name, array in arrays.items()
-                if array.dtype.kind not in "biuf"
-            ]
-            if wrong:
-                raise UnreadableError(f"{wrong[0]}, it should hold numbers"[:_LONGEST])
+            missing = set(_REQUIRED) - set(arrays)
+            if missing:
+                raise ValueError(f"{path} holds no flight: it lacks {' and '.join(sorted(missing))}")
+            _check_arrays(arrays)
             known = _known(facts)
         except UnreadableError as error:
             raise ValueError(f"{path} cannot be read as a flight ({error})") from error
-        missing = set(_REQUIRED) - set(arrays)
-        if missing:
-            raise ValueError(f"{path} holds no flight: it lacks {' and '.join(sorted(missing))}")
         name = label or facts.get("label") or ("expert" if "stop_reason" in facts else path.stem)
         return cls(str(name), **arrays, **known)
 
@@ -158,6 +152,23 @@ _KINDS: Mapping[str, tuple[str, Any]] = {  # fields, their keys in the facts, an
     "diverged": ("diverged", bool),
     "action_seconds": ("action_seconds", float | int),
 }
+
+
+def _check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise UnreadableError for arrays that are no numbers, or not of one maneuver."""
+    steps, inputs = (*arrays["controls"].shape, 0, 0)[:2]
+    shapes = {
+        "states": (steps + 1, *(arrays["states"].shape[1:2] or (1,))),
+        "controls": (steps, inputs),
+        "noise": (steps, inputs),
+        "rewards": (steps,),
+        "target": (8,),
+    }
+    for name, array in arrays.items():
+        if array.dtype.kind not in "biuf":
+            raise UnreadableError(f"{name} holds {array.dtype}, it should hold numbers"[:_LONGEST])
+        if array.shape != shapes[name]:
+            raise UnreadableError(f"{name} has shape {shortened(array.shape)}, it should have {shapes[name]}")
 
 
 def _known(facts: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import io
 import os
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from dq_space_arm_env.common.bounded_reading import (
     UnreadableError,
     archive_members,
     parse_json,
+    read_bytes,
     read_mapping,
     read_member,
     read_text,
@@ -42,6 +44,16 @@ def test_only_regular_files_are_opened(read: Callable[[Path], Any], tmp_path: Pa
     assert "is a folder" in refusal(lambda: read(tmp_path))
     assert "is a device" in refusal(lambda: read(Path("/dev/zero")))
     assert refusal(lambda: read(tmp_path / "none")) == f"{tmp_path / 'none'}: there is no such file"
+
+
+def test_a_high_limit_costs_no_memory(tmp_path: Path) -> None:
+    (tmp_path / "small").write_bytes(b"abc")
+    tracemalloc.start()
+    try:
+        assert read_bytes(tmp_path / "small", 2**30) == b"abc"
+        assert tracemalloc.get_traced_memory()[1] < 2**22
+    finally:
+        tracemalloc.stop()
 
 
 def test_size_and_encoding_of_texts(tmp_path: Path) -> None:
@@ -90,6 +102,8 @@ def npy(shape: str, descr: str = "<f8") -> bytes:
         (npy("(1,)", "|O"), "holds object, it should hold numbers or text"),
         (npy("(1,)", "<c16") + bytes(16), "holds complex128"),
         (npy("()") + bytes(9), "its size is not that of shape"),
+        (npy("()", "<U1") + b"\x00\x00\x00\x40", "holds text that is not Unicode"),
+        (npy("(1,)", ">U2") + b"\x00\x00\x00a\x00\x00\xd8\x00", "holds text that is not Unicode"),
         (b"\x93NUMPY\x03\x00\xff\xff\xff\xff", "version (3, 0) of the npy format"),
         (b"nonsense", "is damaged"),
     ],

@@ -1,5 +1,6 @@
 """A trajectory's file holds what is known of it, and no more."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -39,4 +40,23 @@ def test_a_file_without_states_or_controls_is_no_flight(missing: str, tmp_path: 
     del arrays[missing]
     np.savez(tmp_path / "other.npz", **arrays)
     with pytest.raises(ValueError, match=f"lacks {missing}"):
+        Trajectory.load(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "wanted"),
+    [
+        ("states", STATES[:3], "(4, 3)"),
+        ("states", STATES[:, 0], "(4, 1)"),
+        ("controls", CONTROLS[:, 0], "(3, 0)"),
+        ("noise", np.ones((3, 3)), "(3, 2)"),
+        ("rewards", np.ones((3, 1)), "(3,)"),
+        ("target", np.ones(7), "(8,)"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(
+    name: str, array: np.ndarray, wanted: str, tmp_path: Path
+) -> None:
+    np.savez(tmp_path / "other.npz", **{"states": STATES, "controls": CONTROLS, name: array})
+    with pytest.raises(ValueError, match=f"{name} has shape .*, it should have {re.escape(wanted)}"):
         Trajectory.load(tmp_path / "other.npz")
