@@ -9,7 +9,7 @@ Actions are float64, and so is the data set's action space, although the environ
 reads float64 at full precision, which reproduces an episode's rewards bit for bit.
 
 The data set is written under a hidden name, a few episodes at a time, and renamed, so that nobody sees a
-partial one.
+partial one. A process of its own writes it, for HDF5 ends a process that finds the disk full.
 """
 
 import os
@@ -17,7 +17,7 @@ import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ import numpy as np
 
 import dq_space_arm_env
 from dq_space_arm_env.common.locks import locked
+from dq_space_arm_env.common.worker_process import WorkerLostError, WorkerProcess
 from experts.demonstrations.reading import Demonstration, Demonstrations
 from experts.demonstrations.tensors import DemonstrationsError
 
@@ -36,6 +37,7 @@ PIECE = 16
 """Episodes written at a time: some ten megabytes."""
 PADDING, MARGIN = 1.3, 2**25
 """Overhead of HDF5 on the size of the arrays: a factor, and bytes."""
+MINARI_MISSING = 'this needs Minari: pip install "dq-space-arm[minari]" ({} is missing)'
 _ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")
 _FOLDER_VARIABLE = "MINARI_DATASETS_PATH"
 _DESCRIPTION = """\
@@ -87,27 +89,37 @@ def export_to_minari(
         import minari
         import PIL  # noqa: F401
     except ModuleNotFoundError as error:
+        raise DemonstrationsError(MINARI_MISSING.format(error.name)) from error
+    check_dataset_id(dataset_id)
+    if not len(demonstrations):
+        raise DemonstrationsError(f"{demonstrations.path} has no demonstration to export")
+    origin = {"author": author, "author_email": author_email, "code_permalink": code_permalink}
+    count, scene = len(demonstrations), demonstrations.scene.name
+    described = _DESCRIPTION.format(count=count, name=scene, gains=_GAINS if feedback_gains else "")
+    try:
+        with _staging(dataset_id, overwrite) as folder, closing(WorkerProcess(quiet=True)) as worker:
+            worker.assign(_create, folder, dataset_id, demonstrations.settings, described, origin)
+            worker.answer()
+            for done in _added(worker, folder / dataset_id, demonstrations, feedback_gains):
+                if progress is not None:
+                    progress(done)
+            if card is not None:
+                (folder / dataset_id / CARD).write_text(card, encoding="utf-8")
+    except (OSError, WorkerLostError) as error:
+        lost = isinstance(error, WorkerLostError)
+        reason = "HDF5 ended the process that wrote it" if lost else getattr(error, "strerror", "") or error
         raise DemonstrationsError(
-            f'this needs Minari: pip install "dq-space-arm[minari]" ({error.name} is missing)'
+            f"the data set cannot be written: {reason}; nothing of it remains"
         ) from error
+    return minari.load_dataset(dataset_id)
+
+
+def check_dataset_id(dataset_id: str) -> None:
+    """Raise ValueError if a name is not one of Minari's: it becomes a path."""
     if not _ID.fullmatch(dataset_id):
         raise ValueError(
             f"dataset_id: {dataset_id!r}, should be a name with a version, such as space-arm/paper/expert-v0"
         )
-    if not len(demonstrations):
-        raise DemonstrationsError(f"{demonstrations.path} has no demonstration to export")
-    origin = {"author": author, "author_email": author_email, "code_permalink": code_permalink}
-    try:
-        with _staging(dataset_id, overwrite) as folder:
-            dataset = _create(demonstrations, dataset_id, folder, feedback_gains, origin)
-            _fill(dataset, demonstrations, feedback_gains, progress or (lambda done: None))
-            if card is not None:
-                (folder / dataset_id / CARD).write_text(card, encoding="utf-8")
-    except OSError as error:
-        raise DemonstrationsError(
-            f"the data set cannot be written: {error.strerror or error}; nothing of it remains"
-        ) from error
-    return minari.load_dataset(dataset_id)
 
 
 @contextmanager
@@ -156,22 +168,15 @@ def _put_back(replaced: Path, place: Path) -> None:
 
 
 def _create(
-    demonstrations: Demonstrations,
-    dataset_id: str,
-    folder: Path,
-    feedback_gains: bool,
-    origin: dict[str, str | None],
-) -> Any:
-    """Create an empty data set."""
+    folder: Path, dataset_id: str, settings: dict[str, Any], description: str, origin: dict[str, str | None]
+) -> None:
+    """Create an empty data set in a folder; the worker does."""
     import minari
 
+    os.environ[_FOLDER_VARIABLE] = str(folder)
     # By its content: a scene's name may mean something else elsewhere, or nothing.
-    environment = gymnasium.make("DQSpaceArm-v0", scene=demonstrations.settings["scene"])
-    name, version = demonstrations.scene.name, dq_space_arm_env.__version__
-    description = _DESCRIPTION.format(
-        count=len(demonstrations), name=name, gains=_GAINS if feedback_gains else ""
-    )
-    with _datasets_in(folder), warnings.catch_warnings():
+    environment = gymnasium.make("DQSpaceArm-v0", scene=settings["scene"])
+    with warnings.catch_warnings():
         # Minari recommends all of them; they are up to the user.
         warnings.filterwarnings("ignore", f"`({'|'.join(origin)})` is set to None", UserWarning)
         dataset = minari.create_dataset_from_buffers(
@@ -182,46 +187,37 @@ def _create(
             action_space=gymnasium.spaces.Box(-1.0, 1.0, environment.action_space.shape, np.float64),
             algorithm_name=ALGORITHM,
             description=description,
-            requirements=[f"dq-space-arm>={version}"],
+            requirements=[f"dq-space-arm>={dq_space_arm_env.__version__}"],
             data_format="hdf5",
             **origin,
         )
     # The scene is in the environment's specification.
-    settings = {key: value for key, value in demonstrations.settings.items() if key != "scene"}
-    dataset.storage.update_metadata({"demonstrations": settings})
+    dataset.storage.update_metadata({"demonstrations": {k: v for k, v in settings.items() if k != "scene"}})
     environment.close()
-    return dataset
 
 
-@contextmanager
-def _datasets_in(folder: Path) -> Iterator[None]:
-    """Make Minari create data sets in a folder: an environment variable is the only way."""
-    before = os.environ.get(_FOLDER_VARIABLE)
-    os.environ[_FOLDER_VARIABLE] = str(folder)
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[_FOLDER_VARIABLE]
-        else:
-            os.environ[_FOLDER_VARIABLE] = before
-
-
-def _fill(
-    dataset: Any, demonstrations: Demonstrations, feedback_gains: bool, progress: Callable[[int], None]
-) -> None:
-    """Write all episodes, a few at a time."""
+def _added(
+    worker: WorkerProcess, folder: Path, demonstrations: Demonstrations, feedback_gains: bool
+) -> Iterator[int]:
+    """Write all episodes, a few at a time, and yield how many there are."""
     for begin in range(0, len(demonstrations), PIECE):
         piece = list(demonstrations[begin : begin + PIECE])
-        end = begin + len(piece)
         episodes = [_episode(demonstrations, demonstration, feedback_gains) for demonstration in piece]
         # First for all of them, later in case others write to the disk too.
         remaining = len(demonstrations) if begin == 0 else len(piece)
-        _check_space(dataset.storage.data_path, remaining * _size(episodes[0]))
-        dataset.update_dataset_from_buffer(episodes)
-        metadata = [_metadata(demonstration) for demonstration in piece]
-        dataset.storage.update_episode_metadata(metadata, range(begin, end))
-        progress(end)
+        _check_space(folder, remaining * _size(episodes[0]))
+        worker.assign(_add, folder, begin, episodes, [_metadata(demonstration) for demonstration in piece])
+        worker.answer()
+        yield begin + len(piece)
+
+
+def _add(folder: Path, begin: int, episodes: list[Any], metadata: list[dict[str, Any]]) -> None:
+    """Add episodes to a data set, the first at a position; the worker does."""
+    import minari
+
+    dataset = minari.MinariDataset(folder / "data")
+    dataset.update_dataset_from_buffer(episodes)
+    dataset.storage.update_episode_metadata(metadata, range(begin, begin + len(episodes)))
 
 
 def _episode(demonstrations: Demonstrations, demonstration: Demonstration, feedback_gains: bool) -> Any:

@@ -9,9 +9,9 @@ import pytest
 from demonstration_files import contents
 
 from dq_space_arm_env import Scene
+from dq_space_arm_env.common import worker_process
 from experts import generate_demonstrations
 from experts.demonstrations import Demonstrations, DemonstrationsError, ProcessExecutor
-from experts.demonstrations import executors as worker_module
 from experts.demonstrations.settings import Settings
 from experts.demonstrations.shard import Task
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 def children() -> list[int]:
     """Workers that this process has started."""
     found = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
-    return [int(pid) for pid in found if b"executors" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    return [int(pid) for pid in found if b"worker_process" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="Linux")
@@ -50,7 +50,7 @@ def test_killed_workers_are_replaced_and_the_bytes_are_the_same(
 def test_workers_that_end_again_and_again_end_the_run_with_a_sentence(
     quick_scene: Scene, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(worker_module, "_BEGIN", "import os, sys; sys.stdin.buffer.read(1); os._exit(1)")
+    monkeypatch.setattr(worker_process, "BEGIN", "import os, sys; sys.stdin.buffer.read(1); os._exit(1)")
     settings = Settings.of(quick_scene, 18, 3, 4)
     tasks = [Task(settings, shard) for shard in range(5)]
     with pytest.raises(DemonstrationsError, match=r"4 processes in a row ended .* use fewer than 2"):

@@ -6,14 +6,14 @@ import sys
 
 import pytest
 
-from experts.demonstrations.executors import _BEGIN
+from dq_space_arm_env.common.worker_process import BEGIN
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX processes")
 def test_an_orphan_ends() -> None:
     nobody = os.getpid() + 1  # any process but the worker's parent
     worker = subprocess.Popen(
-        [sys.executable, "-c", _BEGIN, str(nobody), *sys.path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", BEGIN, str(nobody), *sys.path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     try:
         assert worker.wait(timeout=30.0) == 1

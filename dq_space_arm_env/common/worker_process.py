@@ -1,0 +1,102 @@
+"""A process that works for this one, and may die without taking it along.
+
+A worker has its own pipes, tasks on standard input and answers on standard output: if it is killed in the
+middle of an answer, nobody waits for the rest of it, as with a shared queue.
+"""
+
+import contextlib
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from time import sleep
+from typing import Any
+
+# Ctrl-C is left to the parent. The package is imported from where the parent imported it.
+BEGIN = (
+    "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); sys.path[:] = sys.argv[2:]; "
+    "from dq_space_arm_env.common.worker_process import serve; serve(int(sys.argv[1]))"
+)
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+class WorkerLostError(Exception):
+    """A worker ended before its answer."""
+
+
+class WorkerProcess:
+    """A worker, seen from its parent."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        """Start it; a quiet one has no standard error, where libraries complain when they crash."""
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", BEGIN, str(os.getpid()), *sys.path],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL if quiet else None,
+            env={**os.environ, **_ONE_THREAD},
+        )
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when the worker answers or ends."""
+        assert self._process.stdout is not None
+        return self._process.stdout.fileno()
+
+    def assign(self, function: Callable[..., Any], *arguments: Any) -> None:
+        """Let it call a function of a module."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # noticed where the answer is read
+            pickle.dump((function, arguments), self._process.stdin)
+            self._process.stdin.flush()
+
+    def answer(self) -> Any:
+        """Wait for what the function returns; raise what it has raised, or `WorkerLostError`."""
+        assert self._process.stdout is not None
+        try:
+            answer, error = pickle.load(self._process.stdout)
+        except (EOFError, pickle.UnpicklingError) as broken:
+            raise WorkerLostError from broken
+        if error is not None:
+            raise error
+        return answer
+
+    def close(self) -> None:
+        """Kill the process."""
+        self._process.kill()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(BrokenPipeError):
+                if pipe is not None:
+                    pipe.close()
+        self._process.wait()
+
+
+def serve(parent: int) -> None:
+    """Work for a parent until it closes standard input or exits."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+    tasks = sys.stdin.buffer
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # prints must not mix with answers
+    with answers:
+        while True:
+            try:
+                function, arguments = pickle.load(tasks)
+            except EOFError:
+                return
+            answer, problem = None, None
+            try:
+                answer = function(*arguments)
+            except Exception as error:
+                error.add_note("".join(traceback.format_exception(error)))
+                problem = error
+            pickle.dump((answer, problem), answers)
+            answers.flush()
+            del function, arguments, answer, problem  # frees their memory before the next ones
