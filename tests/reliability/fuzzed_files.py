@@ -6,6 +6,7 @@ arrays, whose archive then has correct checksums again.
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import math
@@ -103,6 +104,11 @@ _SHAPES = (
 )
 
 
+def nasty(rng: random.Random) -> Any:
+    """One of these values, which the next mutation may change."""
+    return copy.deepcopy(rng.choice(NASTY))
+
+
 def flipped(data: bytes, rng: random.Random) -> bytes:
     """Change some bits."""
     changed = bytearray(data)
@@ -164,11 +170,11 @@ def mutated_tree(tree: Any, rng: random.Random) -> Any:
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         places = _places(tree)
         if not places:
-            return rng.choice(NASTY)
+            return nasty(rng)
         holder, key = rng.choice(places)
         kind = rng.randrange(7)
         if kind <= 2:
-            holder[key] = rng.choice(NASTY)
+            holder[key] = nasty(rng)
         elif kind == 3:
             del holder[key]
         elif kind == 4:
@@ -180,7 +186,7 @@ def mutated_tree(tree: Any, rng: random.Random) -> Any:
         else:
             for _ in range(rng.choice((1, 5, DEEP))):
                 holder[key] = [holder[key]]
-    return tree if rng.random() < 0.97 else rng.choice(NASTY)
+    return tree if rng.random() < 0.97 else nasty(rng)
 
 
 def in_json(data: bytes, rng: random.Random) -> bytes:
@@ -301,6 +307,37 @@ def in_tensors(data: bytes, rng: random.Random) -> bytes:
         return data[:begin] + rng.choice(RAW)(data[begin:], rng)
     header = in_json(data[8:begin], rng) if rng.random() < 0.7 else rng.choice(RAW)(data[8:begin], rng)
     return len(header).to_bytes(8, "little") + header + data[begin:]
+
+
+def in_hdf5(data: bytes, rng: random.Random) -> bytes:
+    """Remove, replace or link elsewhere a member or an attribute of an HDF5 file."""
+    import h5py
+
+    stream, members = io.BytesIO(data), []
+    with h5py.File(stream, "r+") as file:
+        file.visititems(lambda name, item: members.append(item))
+        item, kind = rng.choice(members), rng.randrange(5)
+        name = item.name
+        if item.attrs and rng.random() < 0.5:
+            value = rng.choice(("x", np.nan, 2.0**80, -1, [1, 2, 3], h5py.Empty("f8")))
+            item.attrs[rng.choice(sorted(item.attrs))] = value
+            return _closed(file, stream)
+        del file[name]
+        if kind == 1:
+            file[name] = rng.choice((h5py.SoftLink("/"), h5py.ExternalLink("/etc/passwd", "/")))
+        elif kind == 2:
+            shape = rng.choice(((), (0,), (3,), (4, 7), (2**40,), (2**20, 2**20)))
+            file.create_dataset(name, shape, rng.choice(("f8", "f4", "i8", "c16", "S3")), chunks=shape != ())
+        elif kind == 3 and isinstance(item, h5py.Dataset):
+            file.create_dataset(name, item.shape, maxshape=(None,) * item.ndim, chunks=(2**10,) * item.ndim)
+        elif kind == 4:
+            file.create_group(name)
+        return _closed(file, stream)
+
+
+def _closed(file: Any, stream: io.BytesIO) -> bytes:
+    file.close()
+    return stream.getvalue()
 
 
 class Subject(NamedTuple):

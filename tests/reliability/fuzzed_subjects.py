@@ -1,4 +1,4 @@
-"""The readers of this project, each with good files small enough to be read thousands of times."""
+"""The readers of environment and expert, each with good files small enough to be read thousands of times."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ import io
 import json
 from collections.abc import Callable
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
-import pytest
 
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.command_line.simulated_episode import read_state
@@ -21,7 +18,6 @@ from dq_space_arm_env.environment.reset_options import check_scene
 from dq_space_arm_env.interoperability.urdf_import import scene_from_urdf
 from dq_space_arm_env.scene import Scene, SceneError, StateLayout, draw_initial_state
 from dq_space_arm_env.scene.loading import scenes_directory
-from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
 from dq_space_arm_env.task.trajectory import Trajectory
 from dq_space_arm_env.viewing.replay import replay_page
 from experts import Solution, load_demonstrations
@@ -105,7 +101,7 @@ def _solution() -> Solution:
     )
 
 
-def _written(save: Callable[[Path], Any], folder: Path) -> bytes:
+def written(save: Callable[[Path], Any], folder: Path) -> bytes:
     save(folder / "written")
     content = (folder / "written").read_bytes()
     (folder / "written").unlink()
@@ -113,7 +109,7 @@ def _written(save: Callable[[Path], Any], folder: Path) -> bytes:
 
 
 def solutions(folder: Path) -> Subject:
-    files = {"solution.npz": _written(_solution().save, folder)}
+    files = {"solution.npz": written(_solution().save, folder)}
 
     def read(place: Path) -> Any:
         Trajectory.load(place / "solution.npz")  # as a flight, too
@@ -143,7 +139,7 @@ def flights(folder: Path) -> Subject:
         if found.scene is not None:
             replay_page([found], found.scene)
 
-    files = {"flight.npz": _written(flight.save, folder)}
+    files = {"flight.npz": written(flight.save, folder)}
     mutations = {"flight.npz": (in_archive,)}
     return Subject(
         files, lambda place: Trajectory.load(place / "flight.npz"), (ValueError,), mutations, use=use
@@ -162,37 +158,6 @@ def starts(folder: Path) -> Subject:
 
     mutations = {"start.json": (in_json,), "start.npz": (in_archive,)}
     return Subject(files, read, (ValueError,), mutations)
-
-
-def policies(folder: Path) -> Subject:
-    from agents.policies import ExportedPolicy
-    from agents.policies.exported import PolicyFileError
-
-    rng = np.random.default_rng(0)
-    sizes, weights = (6, 5, 3), []
-    for inputs, outputs in pairwise(sizes):
-        weights.append(rng.normal(size=(inputs, outputs)).astype(np.float32))
-    policy = ExportedPolicy(
-        weights=tuple(weights),
-        biases=tuple(np.zeros(size, dtype=np.float32) for size in sizes[1:]),
-        activation="silu",
-        mean=np.zeros(6),
-        scale=np.ones(6),
-        action_scale=np.ones(3),
-        metadata={"agent": "a", "scene": "paper", "configuration": {"seed": 3}, "list": [1, 2.5]},
-    )
-
-    def use(found: ExportedPolicy) -> None:
-        for value in (0.0, OBSERVATION_LIMIT, -OBSERVATION_LIMIT):
-            with np.errstate(all="raise", under="ignore"):
-                action = found(np.full(found.n_observation, value))
-            assert (np.abs(action) <= 1.0).all()
-
-    files = {"policy.npz": _written(policy.save, folder)}
-    mutations = {"policy.npz": (in_archive,)}
-    return Subject(
-        files, lambda place: ExportedPolicy.load(place / "policy.npz"), (PolicyFileError,), mutations, use=use
-    )
 
 
 def _shard(scene: Scene) -> bytes:
@@ -227,16 +192,23 @@ def _shard(scene: Scene) -> bytes:
     return pack(arrays, NOTES)
 
 
-def demonstrations(folder: Path, *, verify: bool) -> Subject:
-    """A folder; without `verify`, names and manifest are made to fit whatever is in the shard."""
+def write_demonstrations(made: Path) -> str:
+    """Write a folder of two demonstrations of random numbers; return the name of its shard."""
     shard = _shard(small_scene())
-    digest = hashlib.sha256(shard).hexdigest()
-    name = f"shards/000000-{digest}.safetensors"
-    made = folder / "made"
+    name = f"shards/000000-{hashlib.sha256(shard).hexdigest()}.safetensors"
     (made / "shards").mkdir(parents=True, exist_ok=True)
     (made / name).write_bytes(shard)
     (made / "settings.json").write_text(Settings(small_scene(), 3, 0, 32).to_json())
-    manifest = manifest_text(manifest_of(made / "settings.json", [made / name])).encode()
+    (made / "manifest.json").write_text(manifest_text(manifest_of(made / "settings.json", [made / name])))
+    return name
+
+
+def demonstrations(folder: Path, *, verify: bool) -> Subject:
+    """A folder; without `verify`, names and manifest are made to fit whatever is in the shard."""
+    made = folder / "made"
+    name = write_demonstrations(made)
+    shard, manifest = (made / name).read_bytes(), (made / "manifest.json").read_bytes()
+    digest = hashlib.sha256(shard).hexdigest()
     entry = {"host": "h", "shard": 0, "seconds": {"solves": 1.0}, "solve_seconds": [0.5, 0.5]}
     run = {"run": {"machine": {"processor_name": "p"}}, "host": "h"}
     log = b"".join(json.dumps(line).encode() + b"\n" for line in (run, entry))
@@ -281,105 +253,12 @@ def demonstrations(folder: Path, *, verify: bool) -> Subject:
     return Subject(files, read, (DemonstrationsError,), mutations, repair, use)
 
 
-def configurations() -> Subject:
-    from agents.configuration import ConfigurationError, load_configuration
-
-    root = Path(__file__).parents[2] / "configs" / "agents"
-    names = ("ppo.yaml", "sac-with-demonstrations.yaml", "dagger.yaml", "residual.yaml")
-    files = {name: (root / name).read_bytes() for name in names}
-
-    def read(place: Path) -> Any:
-        changed = [name for name in names if (place / name).read_bytes() != files[name]]
-        return [load_configuration(place / name) for name in changed]
-
-    def use(found: Any) -> None:
-        for each in found:
-            assert load_configuration(json.loads(json.dumps(each.model_dump(exclude_none=True)))) == each
-
-    return Subject(files, read, (ConfigurationError,), dict.fromkeys(names, (in_yaml,)), use=use)
-
-
-def runs(folder: Path) -> Subject:
-    """A run's folder; provenance is not asked for again, as it starts processes."""
-    from agents import run_folder
-    from agents.configuration import ConfigurationError, load_configuration
-    from agents.evaluation.training_runs import learning_curve
-    from agents.run_folder import RunFolder, RunFolderError
-
-    configuration = load_configuration("ppo")
-    run_folder.provenance = lambda *peers: {"commit": None}
-    RunFolder(folder / "run", configuration)
-    point = {"environment_steps": 10, "seconds": 1.0, "success_rate": 0.5, "median_cost": 3.0}
-    files = {
-        "config.yaml": (folder / "run" / "config.yaml").read_bytes(),
-        "provenance.json": (folder / "run" / "provenance.json").read_bytes(),
-        "evaluations.jsonl": b"".join(json.dumps(point).encode() + b"\n" for _ in range(3)),
-    }
-
-    def read(place: Path) -> Any:
-        opened = RunFolder(place, configuration)
-        curve = opened.evaluations(until=20)
-        learning_curve(place / "policy.npz")
-        opened.checkpoint()
-        return max(((line["success_rate"], -line["median_cost"]) for line in curve), default=None)
-
-    mutations = {
-        "config.yaml": (in_yaml,),
-        "provenance.json": (in_json,),
-        "evaluations.jsonl": (in_lines,),
-    }
-    kinds = (RunFolderError, ConfigurationError, SceneError)
-    return Subject(files, read, kinds, mutations, repair=lambda place: None)
-
-
-class _Spaces(gymnasium.Env[Any, Any]):
-    """Spaces of a model."""
-
-    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (6,))
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,))
-
-
-def models(folder: Path) -> Subject:
-    """A model of Stable-Baselines3, read without trust."""
-    pytest.importorskip("stable_baselines3")
-    from stable_baselines3 import PPO
-
-    from agents.zoo.model_archive import ModelArchiveError, read_model
-
-    options = {
-        "policy_kwargs": {"net_arch": [8, 8]},
-        "n_steps": 4,
-        "batch_size": 4,
-        "device": "cpu",
-        "seed": 0,
-    }
-    model = PPO("MlpPolicy", _Spaces(), **options)
-    model.save(folder / "model.zip")
-    files = {"model.zip": (folder / "model.zip").read_bytes()}
-
-    def use(found: Any) -> None:
-        with np.errstate(all="ignore"):
-            found(np.zeros(found.n_observation))
-
-    return Subject(
-        files,
-        lambda place: read_model(place / "model.zip"),
-        (ModelArchiveError,),
-        {"model.zip": (in_archive,)},
-        use=use,
-    )
-
-
 SUBJECTS: dict[str, Callable[[Path], Subject]] = {
     "scenes": lambda folder: scenes(),
     "URDF": lambda folder: robots(),
     "solutions": solutions,
     "flights": flights,
     "starts": starts,
-    "policies": policies,
     "shards": partial(demonstrations, verify=False),
     "verified demonstrations": partial(demonstrations, verify=True),
-    "agents' configurations": lambda folder: configurations(),
-    "run folders": runs,
-    "Stable-Baselines3 models": models,
 }
