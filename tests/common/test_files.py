@@ -1,5 +1,6 @@
 """Files are written whole, through links, by many writers at once, and never over what is no file."""
 
+import math
 import os
 import shutil
 import socket
@@ -14,9 +15,11 @@ import pytest
 
 from dq_space_arm_env.common.files import (
     check_writable_file,
+    json_value,
     remove_leftovers,
     temporary_name,
     write_atomically,
+    write_privately,
 )
 
 posix = pytest.mark.skipif(os.name == "nt", reason="POSIX permissions and files")
@@ -85,6 +88,9 @@ def test_content_is_on_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(Path, "replace", rename)
     write_atomically(tmp_path / "a.txt", "new", durable=True)
     assert calls == (["file", "rename"] if os.name == "nt" else ["file", "rename", "folder"])
+    calls.clear()
+    write_atomically(tmp_path / "a.txt", "new")
+    assert calls == ["rename"]  # nobody waits for the disk without need
 
 
 @posix
@@ -278,3 +284,29 @@ def test_a_killed_writer_leaves_the_old_file_whole(tmp_path: Path) -> None:
         assert file.read_text() in ("a" * 50_000, "b" * 50_000)
     remove_leftovers(tmp_path)
     assert list(tmp_path.iterdir()) == [file]
+
+
+@posix
+def test_a_private_file_replaces_what_is_there(tmp_path: Path) -> None:
+    target, link = tmp_path / "target", tmp_path / "link"
+    target.write_bytes(b"old")
+    link.symlink_to(target)
+    write_privately(link, b"new")
+    assert (link.read_bytes(), link.is_symlink(), target.read_bytes()) == (b"new", False, b"old")
+    assert stat.S_IMODE(link.stat().st_mode) == 0o600
+
+
+def test_a_leftover_of_just_the_age_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    leftover = tmp_path / temporary_name("a.txt")
+    leftover.touch()
+    os.utime(leftover, (1000.0, 1000.0))
+    monkeypatch.setattr(time, "time", lambda: 1060.0)
+    remove_leftovers(tmp_path, age=60.5)
+    assert leftover.exists()
+    remove_leftovers(tmp_path, age=60.0)
+    assert not leftover.exists()
+
+
+def test_json_has_no_infinity_and_no_tuple() -> None:
+    value = {"a": (1, [math.nan, (math.inf,)]), "b": 2.5, "c": "x", "d": None, "e": True}
+    assert json_value(value) == {"a": [1, [None, [None]]], "b": 2.5, "c": "x", "d": None, "e": True}

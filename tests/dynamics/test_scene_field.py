@@ -182,3 +182,14 @@ def test_a_pose_moves_by_the_exponential_and_stays_a_unit(name: str) -> None:
     np.testing.assert_allclose(off, coordinates.reduced(expected), atol=1e-6)
     unit = dq.multiply(dq.conjugate(coordinates.full(off)), coordinates.full(off))
     np.testing.assert_allclose(unit, [1.0, *[0.0] * 7], atol=1e-13)
+
+
+def test_a_wrench_on_a_base_alone() -> None:
+    changes = {"links": [], "wrist": None, "tip": {"position": [0, 0, 0]}, "initial_state": {}, "spread": {}}
+    actuators = {"base_force": {"limit": 1.0}, "base_torque": {"limit": 1.0}}
+    scene = load_scene("paper").replace(
+        **changes, actuators=actuators, tip_wrench={"force": [3.0, 0.0, -6.0]}
+    )
+    field = field_of(scene)
+    found = field.accelerations([*field.layout.initial_state], [0.0] * 6)
+    np.testing.assert_allclose(found, np.array([0, 0, 0, 3, 0, -6]) / [1, 1, 1, *[scene.base.mass] * 3])

@@ -300,3 +300,12 @@ def test_make_vec_steps_several():
     assert truncated.all()
     assert not terminated.any()
     venv.close()
+
+
+def test_an_episode_that_has_just_begun_is_not_truncated():
+    env = make(DIVERGING)
+    observation, *_, info = episode(env)[-1]
+    goals = observation["achieved_goal"], observation["desired_goal"]
+    assert env.unwrapped.compute_truncated(*goals, info)
+    observation, info = env.reset()
+    assert not env.unwrapped.compute_truncated(*goals, info)

@@ -140,6 +140,8 @@ def test_masses_differ_from_the_scene(scene):
     flown = rollout(wave, scene, starts=start, mass_factors=factors)
     alone = [rollout(wave, with_masses(scene, factor), starts=start[:1]).cost[0] for factor in factors]
     np.testing.assert_allclose(flown.cost, alone, rtol=1e-12)
+    uniform = rollout(wave, scene, starts=start, mass_factors=[1.3] * 3)
+    np.testing.assert_allclose(uniform.cost, alone[0], rtol=1e-12)
     assert with_masses(scene, 1.3).links[-1].mass == pytest.approx(1.3 * scene.links[-1].mass)
     bare = scene.replace(links=[], actuators={"base_force": {"limit": 1}}, initial_state={}, spread={})
     with pytest.raises(ValueError, match="has neither payload nor links"):

@@ -267,3 +267,17 @@ def test_a_snapshot_restores_running_episodes_to_the_bit(mode):
         for wrong in ({}, {name: array[:2]}, {name: array.astype(np.complex128)}):
             with pytest.raises(ValueError, match=f"snapshot: {name} "):
                 other.restore({**{key: value for key, value in snapshot.items() if key != name}, **wrong})
+
+
+def test_the_final_info_of_copies_that_go_on_is_zero():
+    venv = gymnasium.make_vec("DQSpaceArm-v0", 2, scene=short(), autoreset_mode=AutoresetMode.SAME_STEP)
+    venv.reset(seed=0)
+    venv.step(np.zeros((2, 12)))
+    venv.reset(options={"reset_mask": np.array([False, True])})
+    info = {}
+    while "final_info" not in info:
+        *_, info = venv.step(np.zeros((2, 12)))
+    assert info["_final_info"].tolist() == [True, False]
+    final = {name: value for name, value in info["final_info"].items() if not name.startswith("_")}
+    assert final["cost_pose"][0] > 0.0
+    assert not any(np.any(value[1]) for value in final.values())

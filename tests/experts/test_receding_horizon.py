@@ -375,3 +375,12 @@ def test_where_the_cheapest_maneuver_misses_the_target_it_is_reached_all_the_sam
         state = kernels.step(state, expert(state) * expert.maneuver.control_upper)
     assert expert.maneuver.misses(state) <= 1.0
     assert expert.maneuver.misses(expert.plan.solution.states[-1]) <= 1.0
+
+
+def test_a_measured_quaternion_need_not_be_of_unit_norm(paper):
+    start = paper.maneuver.kernels.layout.initial_state
+    expected = paper(start)
+    paper.reset()
+    scaled = start.copy()
+    scaled[paper.maneuver.kernels.layout.state.pose] *= 1.01
+    np.testing.assert_allclose(paper(scaled), expected, rtol=1e-9)
