@@ -49,7 +49,7 @@ def reproduce(
     """
     loaded = load_scene(scene)
     if integrator is not None:
-        loaded = loaded.replace(simulation={**loaded.simulation.model_dump(), "integrator": integrator})
+        loaded = loaded.replace(simulation={"integrator": integrator})
     folder = out or reproduction.results_folder(loaded)
     check_writable(folder)
     if readme_picture is not None:

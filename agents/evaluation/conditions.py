@@ -64,8 +64,7 @@ def physics_hash(scene: Scene) -> str:
 
 
 def _wide_starts(scene: Scene) -> Scene:
-    spread = scene.spread.model_dump()
-    return scene.replace(spread=spread | {name: WIDER * spread[name] for name in _WIDENED})
+    return scene.replace(spread={name: WIDER * getattr(scene.spread, name) for name in _WIDENED})
 
 
 def _with_load(factor: float) -> Callable[[Scene], Scene]:
@@ -80,7 +79,7 @@ def _with_load(factor: float) -> Callable[[Scene], Scene]:
 def _spin(scene: Scene) -> Scene:
     velocity = list(scene.initial_state.base_velocity)
     velocity[2] += SPIN
-    return scene.replace(initial_state=scene.initial_state.model_dump() | {"base_velocity": velocity})
+    return scene.replace(initial_state={"base_velocity": velocity})
 
 
 _CHANGES: Mapping[str, Callable[[Scene], Scene]] = {

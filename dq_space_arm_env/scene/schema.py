@@ -7,19 +7,20 @@ velocities have their angular part first, quaternions their scalar.
 import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, StrictStr, ValidationInfo, field_validator
+from pydantic import Field, StrictStr, ValidationError, ValidationInfo, field_validator
 
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
 from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.scene.simulation import Simulation
+from dq_space_arm_env.validation.changes import ChangeError, merged, nested
 from dq_space_arm_env.validation.fields import Name
-from dq_space_arm_env.validation.problems import Model, Problem, raise_problems
+from dq_space_arm_env.validation.problems import Model, Problem, SceneError, problem_list, raise_problems
 from dq_space_arm_env.validation.yaml_text import dump_yaml
 
 _LARGEST_COST = 1e30  # of one actuator: sums and second derivatives stay finite in single precision too
@@ -178,20 +179,31 @@ class Scene(Model):
         yield from _pose_problems(("initial_state", "base_pose"), self.initial_state.base_pose)
         yield from _velocity_problems(("initial_state", "base_velocity"), self.initial_state.base_velocity)
 
-    def replace(self, **changes: Any) -> "Scene":
-        """Copy the scene with some fields changed, and validate it (`model_copy` does not).
+    def replace(self, changes: Mapping[str, Any] | None = None, /, **sections: Any) -> "Scene":
+        """Copy the scene with something changed, and validate it (`model_copy` does not).
+
+        A mapping changes what it names, and leaves the rest of its section; a model or a list replaces all
+        of it. None removes a part that may be absent.
+
+            scene.replace({"links.0.mass": 4.0}, simulation={"dt": 0.01}, spread=Spread())
 
         Args:
-            **changes: New values of top-level fields, as models or as plain data.
+            changes: New values by their paths, keys and positions with dots between them.
+            **sections: New values of top-level fields.
 
         Returns:
             The new scene.
 
         Raises:
-            ValidationError: If the new scene is not valid.
+            SceneError: If a path leads nowhere, or the new scene is not valid; it lists every problem.
         """
-        fields = {name: getattr(self, name) for name in type(self).model_fields}
-        return type(self).model_validate({**fields, **changes})
+        origin = f"scene {self.name!r}, changed"
+        try:
+            return type(self).model_validate(merged(self, nested({**(changes or {}), **sections})))
+        except ValidationError as error:
+            raise SceneError(problem_list(origin, error)) from error
+        except ChangeError as error:
+            raise SceneError(f"{origin}: {error}") from error
 
     def to_yaml(self, path: str | Path | None = None) -> str:
         """Write the scene with every default filled in; loading it gives an equal scene.

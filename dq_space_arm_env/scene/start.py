@@ -11,6 +11,7 @@ from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.algebra.quaternion import multiply
 from dq_space_arm_env.algebra.scalars import select
 from dq_space_arm_env.scene.bodies import Base, Link, Payload
+from dq_space_arm_env.scene.maneuver import Spread
 from dq_space_arm_env.scene.schema import Scene
 
 Array = NDArray[np.float64]
@@ -167,7 +168,7 @@ def episode_scene(scene: Scene, draws: Sequence[float], target: Sequence[float] 
     start = episode_start(scene, list(draws))
     masses = start.masses
     changes: dict[str, Any] = {
-        "spread": {},
+        "spread": Spread(),
         "base": _scaled(scene.base, masses.base_mass, masses.base_inertia),
         "links": [
             _scaled(link, mass, inertia)

@@ -86,7 +86,7 @@ def as_problem(scene_or_problem: Any) -> ShootingProblem:
 def in_double_precision(scene: Scene, integrator: str | None = None) -> Scene:
     """Return the scene in double precision, which convergence needs, and with an integrator."""
     changes = {"precision": "float64", "integrator": integrator or scene.simulation.integrator}
-    return scene.replace(simulation={**scene.simulation.model_dump(), **changes})
+    return scene.replace(simulation=changes)
 
 
 _QUADRATIC = {"terminal_cost": "quadratic_cost", "terminal_cost_derivatives": "quadratic_cost_derivatives"}

@@ -62,7 +62,7 @@ class Motion:
 
 def with_simulation(scene: Scene, **changes: Any) -> Scene:
     """The scene with other settings of its simulation."""
-    return scene.replace(simulation={**scene.simulation.model_dump(), **changes})
+    return scene.replace(simulation=changes)
 
 
 def expert_motion(scene: Scene, max_iterations: int) -> Motion:

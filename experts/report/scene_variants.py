@@ -81,16 +81,15 @@ def _spread_variants(scene: Scene) -> dict[str, Scene]:
 
 
 def _with_spread(scene: Scene, **widths: float) -> Scene:
-    return scene.replace(spread=scene.spread.model_copy(update=widths))
+    return scene.replace(spread=widths)
 
 
 def without_actuators(scene: Scene, *names: str) -> Scene:
     """Remove actuators, by their names in the scene's `actuators`."""
-    actuators = scene.actuators.model_copy(update=dict.fromkeys(names))
     links = scene.links
     if "joint_torque" in names:
         links = tuple(link.model_copy(update={"torque_limit": None}) for link in links)
-    return scene.replace(actuators=actuators, links=links)
+    return scene.replace(actuators=dict.fromkeys(names), links=links)
 
 
 def without_wrist(scene: Scene) -> Scene:
@@ -99,9 +98,9 @@ def without_wrist(scene: Scene) -> Scene:
     return scene.replace(
         wrist=None,
         tip=scene.wrist.frame,
-        actuators=scene.actuators.model_copy(update={"wrist_rate": None}),
-        initial_state=scene.initial_state.model_copy(update={"wrist_angles": ()}),
-        spread=scene.spread.model_copy(update={"wrist_angles": 0.0}),
+        actuators={"wrist_rate": None},
+        initial_state={"wrist_angles": ()},
+        spread={"wrist_angles": 0.0},
     )
 
 
@@ -111,20 +110,21 @@ def with_links(scene: Scene, count: int) -> Scene | None:
     start = scene.initial_state
     changes: dict[str, Any] = {
         "links": scene.links[:count],
-        "initial_state": start.model_copy(
-            update={"joint_angles": start.joint_angles[:count], "joint_rates": start.joint_rates[:count]}
-        ),
+        "initial_state": {
+            "joint_angles": start.joint_angles[:count],
+            "joint_rates": start.joint_rates[:count],
+        },
     }
     if scene.wrist:
-        changes["wrist"] = scene.wrist.model_copy(update={"frame": end})
+        changes["wrist"] = {"frame": end}
     else:
         changes["tip"] = end
     if count == 0:
         if scene.payload:
             return None
-        changes["actuators"] = scene.actuators.model_copy(update={"joint_torque": None})
+        changes["actuators"] = {"joint_torque": None}
         none = ("joint_angles", "joint_rates", "link_masses", "link_inertias")
-        changes["spread"] = scene.spread.model_copy(update=dict.fromkeys(none, 0.0))
+        changes["spread"] = dict.fromkeys(none, 0.0)
     return scene.replace(**changes)
 
 
@@ -134,9 +134,7 @@ def in_the_plane(scene: Scene) -> Scene:
     wrench, start = flat.tip_wrench, flat.initial_state
     base_pose, velocity = _flat_pose(start.base_pose), _flat_twist(start.base_velocity)
     changes: dict[str, Any] = {
-        "base": flat.base.model_copy(
-            update={"motion": "planar", "inertia": _flat_inertia(flat.base.inertia)}
-        ),
+        "base": {"motion": "planar", "inertia": _flat_inertia(flat.base.inertia)},
         "links": [
             link.model_copy(
                 update={
@@ -152,15 +150,13 @@ def in_the_plane(scene: Scene) -> Scene:
             "pose": _flat_pose(flat.target.pose),
             "base_velocity": _flat_twist(flat.target.base_velocity),
         },
-        "initial_state": start.model_copy(update={"base_pose": base_pose, "base_velocity": velocity}),
+        "initial_state": {"base_pose": base_pose, "base_velocity": velocity},
     }
     if flat.payload:
-        changes["payload"] = flat.payload.model_copy(
-            update={
-                "inertia": _flat_inertia(flat.payload.inertia),
-                "center_of_mass": _flat_vector(flat.payload.center_of_mass),
-            }
-        )
+        changes["payload"] = {
+            "inertia": _flat_inertia(flat.payload.inertia),
+            "center_of_mass": _flat_vector(flat.payload.center_of_mass),
+        }
     if wrench:
         changes["tip_wrench"] = {"force": _flat_vector(wrench.force), "torque": (0.0, 0.0, wrench.torque[2])}
     return flat.replace(**changes)

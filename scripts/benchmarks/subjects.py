@@ -81,7 +81,7 @@ class Variant:
     def scene(self, scene: Scene, integrator: str | None = None) -> Scene:
         """The scene in this precision, with another integrator if one is named."""
         changes = {"precision": self.precision, "integrator": integrator or scene.simulation.integrator}
-        return scene.replace(simulation={**scene.simulation.model_dump(), **changes})
+        return scene.replace(simulation=changes)
 
     def compile(self, scene: Scene) -> Kernels:
         return compile_scene(self.scene(scene), threads=self.threads)

@@ -94,7 +94,7 @@ def test_sizes_of_scenes_are_those_of_kernels_and_environment(name: str) -> None
 
 def test_single_precision_halves_the_memory() -> None:
     scene = load_scene("planar")
-    single = scene.replace(simulation={**scene.simulation.model_dump(), "precision": "float32"})
+    single = scene.replace(simulation={"precision": "float32"})
     double_cost, single_cost = (program_row(each, "step", "rk4") for each in (scene, single))
     assert double_cost["memory_bytes"] == 2 * single_cost["memory_bytes"]
     assert double_cost["operations"] == single_cost["operations"]

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow  # they compile many variants of scenes
 def shortened(name: str, steps: int, integrator: str = "symplectic_euler") -> ArmProblem:
     scene = load_scene(name)
     changes = {"steps": steps, "integrator": integrator}
-    return ArmProblem(scene.replace(simulation={**scene.simulation.model_dump(), **changes}))
+    return ArmProblem(scene.replace(simulation=changes))
 
 
 def random_controls(problem: ArmProblem, share: float = 0.2) -> FloatArray:
@@ -238,7 +238,7 @@ def test_crocoddyl_comes_near_with_compiled_residuals_and_a_wrist(crocoddyl: Any
 def test_crocoddyl_refuses_weights_that_its_residual_has_not(crocoddyl: Any) -> None:
     scene = load_scene("no-wrist")
     weights = (15.0, 15.0, 15.0, 14.0, *(15.0,) * 4)
-    problem = ArmProblem(scene.replace(cost={**scene.cost.model_dump(), "pose": weights}))
+    problem = ArmProblem(scene.replace(cost={"pose": weights}))
     with pytest.raises(ValueError, match="within the real or the dual part"):
         CrocoddylManeuver(problem)
     CrocoddylManeuver(problem, exact_pose_cost=True)

@@ -88,11 +88,10 @@ def test_unusable_input_is_one_sentence(
 
 def test_scenes_may_differ_in_masses_and_target(rollout: Path, scene: Scene) -> None:
     one = read_flight(rollout)
-    base, target = {**scene.base.model_dump(), "mass": 30.0}, {"pose": {"position": (0.5, 0.5, 0.0)}}
-    heavy = scene.replace(base=base, target=target)
+    heavy = scene.replace({"base.mass": 30.0, "target.pose.position": (0.5, 0.5, 0.0)})
     flights, shown = common_scene([one, replace(one, scene=heavy)])
     assert shown == scene
     np.testing.assert_allclose(flights[1].target, heavy.target.pose.dual_quaternion)
-    slower = scene.replace(simulation=scene.simulation.model_dump() | {"dt": 0.1})
+    slower = scene.replace(simulation={"dt": 0.1})
     with pytest.raises(ValueError, match=r"time steps of 0.1 s, the scene 'short' has 0.05 s"):
         common_scene([one, replace(one, scene=slower)])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import Scene, load_scene
+from dq_space_arm_env.scene import Spread
 from experts import BoxDDP, generate_demonstrations
 from experts.demonstrations import Demonstration, Demonstrations, SerialExecutor
 from experts.demonstrations.settings import Settings
@@ -122,7 +123,7 @@ def test_single_precision_is_taken_in_double(quick_scene: Scene, tmp_path: Path)
         ({"workers": 0}, "workers: 0, should be at least 1"),
         ({"scene": "random-target"}, "target and masses are constants"),
         ({"scene": "random-masses"}, "target and masses are constants"),
-        ({"scene": load_scene("planar").replace(spread={})}, "would be the same"),
+        ({"scene": load_scene("planar").replace(spread=Spread())}, "would be the same"),
     ],
 )
 def test_unusable_input_is_refused(changes, sentence: str, quick_scene: Scene, tmp_path: Path):

@@ -74,7 +74,7 @@ def test_a_second_solve_never_makes_anything_worse(solved: tuple[Expert, list[Ou
 @pytest.fixture(scope="module")
 def hard(quick_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Demonstrations:
     """Starts so far away that not every one is solved."""
-    scene = quick_scene.replace(spread={**quick_scene.spread.model_dump(), "base_position": 1.5})
+    scene = quick_scene.replace(spread={"base_position": 1.5})
     made = generate_demonstrations(
         scene, 8, tmp_path_factory.mktemp("hard"), shard_size=8, executor=SerialExecutor()
     )

@@ -6,7 +6,7 @@ from dq_space_arm_env import load_scene
 def short(scene="paper", steps=12, precision="float64"):
     scene = load_scene(scene)
     changes = {"steps": steps, "precision": precision}
-    return scene.replace(simulation=scene.simulation.model_copy(update=changes))
+    return scene.replace(simulation=changes)
 
 
 def diverging(scene="paper", stiffness=1e6, steps=60):

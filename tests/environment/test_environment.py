@@ -16,6 +16,7 @@ from short_scenes import diverging, short
 import dq_space_arm_env
 from dq_space_arm_env import list_scenes, load_scene
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.scene import Actuators
 
 TARGET = np.array([0.5, 0.5, -0.5, -0.5, 0.25, 2.25, 0.25, 2.25])
 
@@ -237,6 +238,6 @@ def test_scenes_that_have_no_normalized_actions_are_refused():
     with pytest.raises(ValueError, match=r"base f.* has no finite limit"):
         make(scene.replace(actuators=unlimited))
     with pytest.raises(ValueError, match="it has no actuator"):
-        make(scene.replace(actuators={}))
+        make(scene.replace(actuators=Actuators()))
     with pytest.raises(ValueError, match="render_mode: 'ansi' is unknown"):
         dq_space_arm_env.DQSpaceArmEnv(render_mode="ansi")

@@ -7,6 +7,7 @@ from short_scenes import short
 from dq_space_arm_env import DQSpaceArmEnv, compile_scene
 from dq_space_arm_env.environment.disturbances import Disturbances, MassMismatchVectorEnv, with_masses
 from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
+from dq_space_arm_env.scene import InitialState, Spread
 from dq_space_arm_env.task.trajectory import Trajectory
 
 
@@ -143,7 +144,9 @@ def test_masses_differ_from_the_scene(scene):
     uniform = rollout(wave, scene, starts=start, mass_factors=[1.3] * 3)
     np.testing.assert_allclose(uniform.cost, alone[0], rtol=1e-12)
     assert with_masses(scene, 1.3).links[-1].mass == pytest.approx(1.3 * scene.links[-1].mass)
-    bare = scene.replace(links=[], actuators={"base_force": {"limit": 1}}, initial_state={}, spread={})
+    bare = scene.replace(
+        links=[], actuators={"joint_torque": None}, initial_state=InitialState(), spread=Spread()
+    )
     with pytest.raises(ValueError, match="has neither payload nor links"):
         MassMismatchVectorEnv(bare, [1.3])
 

@@ -7,6 +7,7 @@ from short_scenes import short
 
 from dq_space_arm_env import DQSpaceArmVectorEnv, load_scene
 from dq_space_arm_env.algebra import poses, rotations
+from dq_space_arm_env.scene import Spread
 
 
 def make(scene="random-target", **arguments):
@@ -17,7 +18,7 @@ def pose(vector, position):
     return np.array(poses.from_rotation_and_position(rotations.exponential(vector), position))
 
 
-PLANAR = load_scene("planar").replace(spread={"target_position": 0.1})
+PLANAR = load_scene("planar").replace(spread=Spread(target_position=0.1))
 TARGET = pose((0.3, -1.0, 0.5), (0.5, -3.0, 4.8))
 
 

@@ -5,12 +5,13 @@ from scipy.integrate import solve_ivp
 
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.scene import Actuators, InitialState, Spread
 
 
 def simulated(scene, **changes):
     """A shipped scene with other settings of the simulation."""
     scene = load_scene(scene)
-    return scene.replace(simulation=scene.simulation.model_dump() | changes)
+    return scene.replace(simulation=changes)
 
 
 def sprung(scene="paper", stiffness=0.0, damping=0.0, joints=None, **simulation):
@@ -27,8 +28,8 @@ def sprung(scene="paper", stiffness=0.0, damping=0.0, joints=None, **simulation)
 def free_body(*actuators, **changes):
     """Kernels of a body without an arm."""
     limits = {name: {"limit": 1.0} for name in actuators or ("base_force",)}
-    bare = {"links": [], "wrist": None, "actuators": limits, "initial_state": {}, "spread": {}}
-    return compile_scene(load_scene("paper").replace(**bare, **changes))
+    bare = {"links": [], "wrist": None, "initial_state": InitialState(), "spread": Spread()}
+    return compile_scene(load_scene("paper").replace(actuators=Actuators(**limits), **bare, **changes))
 
 
 def rollout(kernels, x, controls, dt, integrator):

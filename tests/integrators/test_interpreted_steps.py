@@ -30,7 +30,7 @@ def robot(short_scene: Scene, motion: str) -> Scene:
     if motion == "planar":
         return short_scene.replace(links=[link])
     joint = {"position": [0.6, 0.1, 0], "rotation": {"axis": [1, 0, 0], "angle": 80}}
-    base = {"mass": 20, "inertia": [1.0, 1.5, 2.0]}
+    base = {"motion": "spatial", "inertia": [1.0, 1.5, 2.0]}
     return short_scene.replace(base=base, links=[link | {"joint": joint}])
 
 

@@ -11,6 +11,7 @@ from dq_space_arm_env.dynamics.linear import factorize_lu, solve_lu
 from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.integrators.rosenbrock_tableaus import RODAS4, RODAS5P
 from dq_space_arm_env.kernels.programs.paper_programs import PaperPrograms
+from dq_space_arm_env.scene import Actuators, InitialState, Spread
 
 interpreter = pytest.importorskip("graph_interpreter")
 
@@ -207,8 +208,8 @@ def test_the_papers_formulation_takes_the_same_steps_with_exact_derivatives():
     """Its pose is among the entries of y, number by number, instead of moving by an exponential."""
     paper = load_scene("paper")
     link = paper.links[1].model_dump() | {"stiffness": 40.0, "damping": 1.0}
-    actuators = {"joint_torque": {"limit": 1.0}}
-    scene = paper.replace(links=[link], wrist=None, initial_state={}, spread={}, actuators=actuators)
+    bare = {"wrist": None, "initial_state": InitialState(), "spread": Spread()}
+    scene = paper.replace(links=[link], actuators=Actuators(joint_torque={"limit": 1.0}), **bare)
     kernels, programs = compile_scene(scene), PaperPrograms(scene)
     rng = np.random.default_rng(9)
     x, u = kernels.layout.initial_state.copy(), rng.normal(size=kernels.n_u)

@@ -105,7 +105,7 @@ def test_the_start_is_a_key_frame(name):
 
 def test_motors_have_the_names_and_limits_of_the_inputs():
     scene = load_scene("six-joint")
-    scene = scene.replace(actuators={**scene.actuators.model_dump(), "base_force": {"limit": float("inf")}})
+    scene = scene.replace(actuators={"base_force": {"limit": float("inf")}})
     layout = StateLayout.of(scene)
     model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene))
     assert [model.actuator(i).name for i in range(model.nu)] == list(layout.control.names)

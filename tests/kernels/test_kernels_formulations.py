@@ -15,7 +15,7 @@ SCENES = {name: load_scene(name) for name in list_scenes()} | ODD
 
 
 def by(scene, formulation):
-    return scene.replace(simulation=scene.simulation.model_dump() | {"formulation": formulation})
+    return scene.replace(simulation={"formulation": formulation})
 
 
 def assert_close(found, expected, bound=1e-12):
@@ -85,7 +85,7 @@ def test_environments_that_draw_masses_agree():
 
 
 def operations(scene, program, integrator="", **changes):
-    scene = scene.replace(simulation=scene.simulation.model_dump() | changes)
+    scene = scene.replace(simulation=changes)
     return ScenePrograms(scene).build(program, integrator).operation_count
 
 

@@ -17,7 +17,7 @@ def arm():
 
 
 def simulated(scene, **changes):
-    return compile_scene(scene.replace(simulation=scene.simulation.model_dump() | changes))
+    return compile_scene(scene.replace(simulation=changes))
 
 
 def followed(kernels, x, u, times, step=1e-3):

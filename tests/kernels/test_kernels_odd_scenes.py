@@ -6,23 +6,29 @@ from test_kernels_derivatives import complex_step_jacobians
 from test_kernels_dynamics import paper_solution, relative_error
 
 from dq_space_arm_env import load_scene
-from dq_space_arm_env.scene import INTEGRATORS
+from dq_space_arm_env.scene import INTEGRATORS, Actuators, InitialState, Spread, Target
 
 PAPER = load_scene("paper")
 LINKS = [link.model_dump() for link in PAPER.links]
-HERE = {"pose": {"position": [0.5, 0.0, 0.0]}}
-BASE_ONLY = {"base_force": {"limit": 1.0}, "base_torque": {"limit": 1.0}}
+HERE = Target(pose={"position": [0.5, 0.0, 0.0]})
+
+
+def only(**actuators):
+    return Actuators(**{name: {"limit": limit} for name, limit in actuators.items()})
+
+
+BASE_ONLY = only(base_force=1.0, base_torque=1.0)
 
 
 def scene(**changes):
-    return PAPER.replace(**{"initial_state": {}, "spread": {}, "target": HERE, **changes})
+    return PAPER.replace(**{"initial_state": InitialState(), "spread": Spread(), "target": HERE, **changes})
 
 
 ODD = {
     "base": scene(links=[], wrist=None, actuators=BASE_ONLY),
-    "wrist": scene(links=[], actuators={"base_force": {"limit": 1.0}, "wrist_rate": {"limit": 0.5}}),
-    "one link": scene(links=LINKS[1:2], wrist=None, actuators={"joint_torque": {"limit": 1.0}}),
-    "no actuator": scene(actuators={}),
+    "wrist": scene(links=[], actuators=only(base_force=1.0, wrist_rate=0.5)),
+    "one link": scene(links=LINKS[1:2], wrist=None, actuators=only(joint_torque=1.0)),
+    "no actuator": scene(actuators=Actuators()),
     "wrist without motor": scene(actuators=BASE_ONLY),
     "passive middle joint": scene(links=[LINKS[0], LINKS[1] | {"actuated": False}, LINKS[2]]),
     "five links": scene(links=[LINKS[i % 3] | {"name": f"link {i}"} for i in range(5)]),

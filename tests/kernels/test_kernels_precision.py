@@ -8,7 +8,7 @@ from dq_space_arm_env import compile_scene, list_scenes, load_scene
 
 def in_single_precision(scene):
     scene = load_scene(scene)
-    return scene.replace(simulation={**scene.simulation.model_dump(), "precision": "float32"})
+    return scene.replace(simulation={"precision": "float32"})
 
 
 @pytest.mark.parametrize("scene", list_scenes())

@@ -6,6 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
+from dq_space_arm_env.scene import Spread
 from dq_space_arm_env.scene.start import episode_scene, episode_start, number_of_draws
 from dq_space_arm_env.task.parameters import EpisodeParameters
 
@@ -85,7 +86,7 @@ def test_a_scene_that_draws_states_only_pays_nothing():
         inputs = [spec.name for spec in compile_scene(name).kernel("environment_step").inputs]
         assert ("parameters" in inputs) == draws
     paper = load_scene("paper")
-    still = compile_scene(paper.replace(spread={})).operation_count("environment_step")
+    still = compile_scene(paper.replace(spread=Spread())).operation_count("environment_step")
     assert compile_scene("paper").operation_count("environment_step") == still
     drawn = compile_scene("random-target").operation_count("environment_step")
     assert still < drawn < 1.05 * still

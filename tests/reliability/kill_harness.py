@@ -244,7 +244,8 @@ class Attempt:
 
     def heal(self):
         """Make room, give permissions back, and let a day pass: temporary files are stale then."""
-        for folder, mode in self._closed.items():
+        while self._closed:
+            folder, mode = self._closed.popitem()
             folder.chmod(mode)
         (self.folder / ".filler").unlink(missing_ok=True)
         for path in self.folder.rglob(".*.part"):

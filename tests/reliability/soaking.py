@@ -40,7 +40,7 @@ class Soak:
 
     def __init__(self, scene: str, mode: AutoresetMode, seed: int) -> None:
         loaded = load_scene(scene)
-        loaded = loaded.replace(simulation=loaded.simulation.model_copy(update={"steps": 211}))
+        loaded = loaded.replace(simulation={"steps": 211})
         self.env, self.mode = DQSpaceArmVectorEnv(COPIES, loaded, mode), mode
         self.rng, self.order, self.sums = np.random.default_rng(seed), 0, dict.fromkeys(_SUMS, 0.0)
         self.actions = np.zeros(self.env.action_space.shape, np.float32)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from dq_space_arm_env.scene import (
     Pose,
     Scene,
+    Spread,
     StateLayout,
     draw_initial_state,
     initial_state,
@@ -205,7 +206,7 @@ class TestDraw:
         first = draw_initial_state(scene, np.random.default_rng(7))
         np.testing.assert_array_equal(first, draw_initial_state(scene, np.random.default_rng(7)))
         assert (first != draw_initial_state(scene, np.random.default_rng(8))).any()
-        still = scene.replace(spread={})
+        still = scene.replace(spread=Spread())
         nominal = draw_initial_state(still, np.random.default_rng(7))
         np.testing.assert_array_equal(nominal, initial_state(scene))
 
@@ -234,7 +235,7 @@ class TestDraw:
         """The order of the draws is part of the meaning of a seed."""
         scene = load_scene("paper")
         turned = {"position": [1, 2, 3], "rotation": {"axis": [1, 2, 3], "angle": 50}}
-        scene = scene.replace(initial_state=scene.initial_state.model_dump() | {"base_pose": turned})
+        scene = scene.replace(initial_state={"base_pose": turned})
         x = draw_initial_state(scene, np.random.default_rng(5))
         uniform = np.random.default_rng(5).uniform(-1, 1, 21)
         nominal = Rotation.from_quat(scene.initial_state.base_pose.rotation, scalar_first=True)
@@ -250,7 +251,7 @@ class TestDraw:
 
     def test_a_spread_of_zero_still_takes_its_draws(self) -> None:
         scene = load_scene("paper")
-        still = scene.replace(spread=scene.spread.model_copy(update={"base_rotation": 0.0}))
+        still = scene.replace(spread={"base_rotation": 0.0})
         first, second = (draw_initial_state(each, np.random.default_rng(2)) for each in (scene, still))
         np.testing.assert_array_equal(first[8:], second[8:])
 

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from dq_space_arm_env.scene import AxisLimits, Link, Pose, Scene
+from dq_space_arm_env.scene import (
+    AxisLimits,
+    Link,
+    Pose,
+    Scene,
+    SceneError,
+    Simulation,
+    Spread,
+    load_scene,
+)
 
 Change = Callable[..., dict[str, Any]]
 Refusals = Callable[[dict[str, Any]], list[str]]
@@ -171,12 +180,78 @@ def test_replace_takes_models_and_plain_data_and_validates_both(data: dict[str, 
     slow = scene.replace(simulation={"dt": 0.1, "steps": 10})
     assert (slow.simulation.dt, slow.simulation.steps) == (0.1, 10)
     assert slow.replace(simulation=scene.simulation) == scene
-    with pytest.raises(ValidationError, match=r"simulation\.dt = -1"):
+    with pytest.raises(
+        SceneError, match=r"changed: 1 problem\n  - simulation\.dt = -1: must be a finite number greater"
+    ):
         scene.replace(simulation={"dt": -1})
-    with pytest.raises(ValidationError, match=r"base\.mass = -1"):
+    with pytest.raises(SceneError, match=r"base\.mass = -1"):
         scene.replace(base=scene.base.model_copy(update={"mass": -1}))
-    with pytest.raises(ValidationError, match=r"nam: unknown key; did you mean 'name'\?"):
+    with pytest.raises(SceneError, match=r"nam: unknown key; did you mean 'name'\?"):
         scene.replace(nam="x")
+
+
+def test_replace_changes_what_a_mapping_names_and_nothing_else() -> None:
+    planar, paper = load_scene("planar"), load_scene("paper")
+    heavy = planar.replace(base={"mass": 200.0})
+    assert heavy.base == planar.base.model_copy(update={"mass": 200.0})
+    assert heavy.base.motion == "planar"
+    slow = paper.replace(simulation={"integrator": "rk6"}).replace(simulation={"dt": 0.02})
+    assert (slow.simulation.integrator, slow.simulation.dt) == ("rk6", 0.02)
+    assert paper.replace(cost={"base_torque": 5}).cost == paper.cost.model_copy(
+        update={"base_torque": (5.0,) * 3}
+    )
+    moved = paper.replace(target={"pose": {"position": [1, 2, 3]}})
+    assert moved.target.pose.position == (1.0, 2.0, 3.0)
+    assert moved.target.pose.rotation == paper.target.pose.rotation
+    assert moved.target.base_velocity == paper.target.base_velocity
+    turned = moved.replace(target={"pose": {"rotation": {"axis": [0, 0, 1], "angle": 180}}})
+    assert turned.target.pose.rotation == (0.0, 0.0, 0.0, 1.0)
+    exact = paper.target.pose.dual_quaternion
+    np.testing.assert_allclose(
+        turned.replace(target={"pose": {"dual_quaternion": exact}}).target.pose.dual_quaternion,
+        exact,
+        atol=1e-15,
+    )
+    assert (
+        paper.replace(actuators={"wrist_rate": None}).actuators.joint_torque == paper.actuators.joint_torque
+    )
+    assert paper.replace(spread={}) == paper
+    assert paper.replace(spread=Spread()).spread == Spread()
+
+
+def test_replace_takes_paths() -> None:
+    paper = load_scene("paper")
+    changed = paper.replace(
+        {"links.1.mass": 4, "links.1.joint.position.0": 0.5, "cost.base_torque": 5}, name="x"
+    )
+    first, second, third = paper.links
+    joint = second.joint.model_copy(update={"position": (0.5, *second.joint.position[1:])})
+    assert changed.links == (first, second.model_copy(update={"mass": 4.0, "joint": joint}), third)
+    assert changed.cost == paper.cost.model_copy(update={"base_torque": (5.0,) * 3})
+    assert changed.name == "x"
+    assert paper.replace() == paper
+    assert paper.replace({"target.pose": paper.links[0].joint}).target.pose == paper.links[0].joint
+
+
+@pytest.mark.parametrize(
+    ("changes", "sections", "said"),
+    [
+        ({"links.3.mass": 4}, {}, "links has 3 entries, the first is 0; there is no '3'"),
+        ({"links.first.mass": 4}, {}, "links = .*: must be a list"),
+        ({"links.0.mas": 4}, {}, r"links\[0\]\.mas: unknown key; did you mean 'mass'"),
+        ({"cots.pose": 4}, {}, "cots: unknown key; did you mean 'cost'"),
+        ({"cost.pose.99": 4}, {}, r"cost\.pose has 8 entries"),
+        ({"simulation": Simulation(), "simulation.dt": 1}, {}, "simulation is replaced as a whole"),
+        ({"simulation.dt": 1}, {"simulation": {"dt": 2}}, r"simulation: is changed twice"),
+        ({"base.mass.x": 4}, {}, r"base\.mass = "),
+        ({"links.0.mass": float("nan")}, {}, r"links\[0\]\.mass = nan"),
+        ({3: 4}, {}, "3: unknown key"),
+    ],
+)
+def test_replace_says_what_is_wrong(changes: Any, sections: dict[str, Any], said: str) -> None:
+    with pytest.raises(SceneError, match=said) as caught:
+        load_scene("paper").replace(changes, **sections)
+    assert str(caught.value).startswith("scene 'paper', changed")
 
 
 class TestContentHash:

@@ -100,5 +100,5 @@ def _environment(effort: Effort) -> Outcome:
 def _environment_of_far_scene(effort: Effort) -> Outcome:
     scene = load_scene("paper")
     pose = {"position": (RADIUS * _DIRECTION).tolist()}
-    far = scene.replace(initial_state={**scene.initial_state.model_dump(), "base_pose": pose})
+    far = scene.replace(initial_state={"base_pose": pose})
     return refusal(lambda: DQSpaceArmEnv(far), naming="initial_state")

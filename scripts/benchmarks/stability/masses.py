@@ -139,8 +139,7 @@ def _with_heavy_payload() -> Scene:
     if scene.payload is None:
         raise ValueError("scene payload: its payload is missing")
     inertia = (HEAVY * np.array(scene.payload.inertia)).tolist()
-    fields = {**scene.payload.model_dump(), "mass": HEAVY * scene.payload.mass, "inertia": inertia}
-    return scene.replace(payload=fields)
+    return scene.replace(payload={"mass": HEAVY * scene.payload.mass, "inertia": inertia})
 
 
 def _forward(scene: Callable[[], Scene], formulation: str, effort: Effort) -> Outcome:

@@ -51,7 +51,7 @@ def _kernels(factor: float) -> tuple[Kernels, Kernels]:
     scene = load_scene("payload")
     assert scene.payload is not None
     inertia = (factor * np.array(scene.payload.inertia)).tolist()
-    heavy = {**scene.payload.model_dump(), "mass": factor * scene.payload.mass, "inertia": inertia}
+    heavy = {"mass": factor * scene.payload.mass, "inertia": inertia}
     return compile_scene(scene.replace(payload=None)), compile_scene(scene.replace(payload=heavy))
 
 

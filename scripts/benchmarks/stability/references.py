@@ -203,7 +203,7 @@ class Sample:
 
 
 def _compiled(sample: Sample, **simulation: str) -> FloatArray:
-    changed = sample.scene.replace(simulation={**sample.scene.simulation.model_dump(), **simulation})
+    changed = sample.scene.replace(simulation=simulation)
     found = compile_scene(changed).forward_dynamics(sample.state, sample.control)
     return np.asarray(found, dtype=np.float64)
 

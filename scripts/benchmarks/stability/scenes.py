@@ -8,6 +8,7 @@ import numpy as np
 
 from dq_space_arm_env import Kernels, Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import screw
+from dq_space_arm_env.scene import InitialState, Spread
 from experts.problems.shooting_problem import FloatArray
 
 PRECISIONS = ("float64", "float32")
@@ -15,7 +16,7 @@ PRECISIONS = ("float64", "float32")
 
 def with_simulation(scene: Scene, **changes: Any) -> Scene:
     """A scene with other settings of its simulation."""
-    return scene.replace(simulation={**scene.simulation.model_dump(), **changes})
+    return scene.replace(simulation=changes)
 
 
 def paper(precision: str = "float64", scene: str = "paper") -> Kernels:
@@ -38,9 +39,7 @@ def with_mass_ratio(ratio: float) -> Scene:
     scene = load_scene("paper")
     factor = ratio * sum(link.mass for link in scene.links) / scene.base.mass
     inertia = (factor * np.array(scene.base.inertia)).tolist()
-    return scene.replace(
-        base={**scene.base.model_dump(), "mass": factor * scene.base.mass, "inertia": inertia}
-    )
+    return scene.replace(base={"mass": factor * scene.base.mass, "inertia": inertia})
 
 
 def with_links(scene: Scene, **changes: Any) -> Scene:
@@ -49,14 +48,14 @@ def with_links(scene: Scene, **changes: Any) -> Scene:
 
 
 def with_base(scene: Scene, **changes: Any) -> Scene:
-    return scene.replace(base={**scene.base.model_dump(), **changes})
+    return scene.replace(base=changes)
 
 
 def sprung_joint(stiffness: float = 0.0, damping: float = 0.0) -> Scene:
     """A planar base, and one link on a spring [N m/rad] and a damper [N m s/rad]."""
     planar = load_scene("planar")
     link = {**planar.links[0].model_dump(), "stiffness": stiffness, "damping": damping}
-    return planar.replace(links=[link], initial_state={}, spread={}, name="sprung joint")
+    return planar.replace(links=[link], initial_state=InitialState(), spread=Spread(), name="sprung joint")
 
 
 def sprung_inertia(scene: Scene) -> float:

@@ -80,8 +80,7 @@ def _times(runs: Sequence[Callable[[], object]], counts: Sequence[int], effort: 
 
 
 def _compiled(scene: Scene, precision: str, formulation: str) -> Kernels:
-    simulation = {**scene.simulation.model_dump(), "formulation": formulation}
-    return Variant(precision).compile(scene.replace(simulation=simulation))
+    return Variant(precision).compile(scene.replace(simulation={"formulation": formulation}))
 
 
 class _Judge:

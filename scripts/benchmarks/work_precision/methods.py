@@ -43,7 +43,7 @@ class Method:
         changes: dict[str, object] = {"precision": "float64"}
         if tolerance is not None:
             changes |= {"integrator": self.name, "rtol": tolerance, "atol": 0.01 * tolerance}
-        return compile_scene(scene.replace(simulation={**scene.simulation.model_dump(), **changes}))
+        return compile_scene(scene.replace(simulation=changes))
 
     def step_kernel(self, kernels: Kernels, lanes: int | None) -> BoundKernel:
         """The kernel that takes a step; the next state is its only output."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
+from dq_space_arm_env.scene import InitialState, Spread
 from experts import BoxDDP
 from experts.problems.shooting_problem import FloatArray
 
@@ -84,9 +85,9 @@ def body_scene() -> Scene:
         links=[],
         wrist=None,
         tip={"position": [1, 0, 0]},
-        actuators={"base_torque": {"limit": 1}},
-        initial_state={},
-        spread={},
+        actuators={"base_force": None, "joint_torque": None, "wrist_rate": None},
+        initial_state=InitialState(),
+        spread=Spread(),
     )
 
 
@@ -178,7 +179,9 @@ def chain_scene() -> Scene:
         # Roll and pitch alternate.
         links.append(links[4 + index % 2].model_copy(update={"name": f"joint {len(links) + 1}"}))
     angles = (*scene.initial_state.joint_angles, *(0.3,) * (CHAIN_JOINTS - len(scene.links)))
-    return scene.replace(name="long chain", links=links, initial_state={"joint_angles": angles}, spread={})
+    return scene.replace(
+        name="long chain", links=links, initial_state=InitialState(joint_angles=angles), spread=Spread()
+    )
 
 
 def _chain(duration: float) -> MotionCase:

@@ -26,7 +26,7 @@ SMALL = {"net_arch": [8]}
 
 def short_scene(steps=STEPS):
     scene = load_scene("paper")
-    return scene.replace(simulation=scene.simulation.model_copy(update={"steps": steps}))
+    return scene.replace(simulation={"steps": steps})
 
 
 def diverging_scene():
