@@ -177,33 +177,33 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
             infos[i]["episode"] = {"r": round(returns[k], 6), "l": lengths[k], "t": elapsed}
         self._begin_episodes(copies, info)
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
-        """Copy the running episodes with their statistics, to `restore` them later or in another process.
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Copy the running episodes with their statistics, to `set_state` it later or in another process.
 
         Returns:
-            Arrays by name, see `DQSpaceArmVectorEnv.snapshot`.
+            Arrays by name, see `DQSpaceArmVectorEnv.get_state`.
 
         Raises:
             ResetNeeded: Before the first reset.
         """
         lengths = self._step_count - self._first_steps
-        return {**self.vector_env.snapshot(), "returns": self._returns.copy(), "lengths": lengths}
+        return {**self.vector_env.get_state(), "returns": self._returns.copy(), "lengths": lengths}
 
-    def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
-        """Go on where a snapshot was taken.
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on where `get_state` was called.
 
         Args:
-            snapshot: Arrays of an environment with the same scene and `num_envs`.
+            state: Arrays of an environment with the same scene and `num_envs`.
 
         Raises:
             ValueError: If an array is missing, or has another shape or type.
         """
         for name in ("returns", "lengths"):
-            if name not in snapshot or snapshot[name].shape != (self.num_envs,):
-                raise ValueError(f"snapshot: {name} is missing, or not of shape ({self.num_envs},)")
-        self.vector_env.restore(snapshot)
-        self._returns[:] = snapshot["returns"]
-        self._first_steps = self._step_count - snapshot["lengths"].astype(np.int64)
+            if name not in state or state[name].shape != (self.num_envs,):
+                raise ValueError(f"state: {name} is missing, or not of shape ({self.num_envs},)")
+        self.vector_env.set_state(state)
+        self._returns[:] = state["returns"]
+        self._first_steps = self._step_count - state["lengths"].astype(np.int64)
 
     def close(self) -> None:
         """Close the vector environment; closing twice is harmless."""

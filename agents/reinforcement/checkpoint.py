@@ -13,6 +13,7 @@ episodes begin, seeded by the run's seed and its number of steps.
 Nothing in these files is executed: a run folder that somebody else made can be resumed.
 """
 
+import io
 import json
 import random
 from collections.abc import Iterator, Mapping
@@ -58,7 +59,9 @@ def write_checkpoint(folder: Path, model: BaseAlgorithm, progress: Progress) -> 
         "variables": {name: tensor.detach() for name, tensor in _variables(model).items()},
         "generator": torch.get_rng_state(),
     }
-    torch.save(parts, folder / LEARNER)
+    content = io.BytesIO()  # a full disk makes PyTorch raise a RuntimeError
+    torch.save(parts, content)
+    (folder / LEARNER).write_bytes(content.getvalue())
     np.savez(folder / ARRAYS, allow_pickle=False, **_running(model), **_recorded(model))
     buffer = getattr(model, "replay_buffer", None)
     state = {
@@ -110,7 +113,7 @@ def _restored(
         model.set_random_seed(model.seed + progress.environment_steps)
         return progress
     environment: Any = model.get_env()
-    environment.restore(_part("environment.", arrays))
+    environment.set_state(_part("environment.", arrays))
     model._last_obs = arrays["last_observations"]
     model._last_episode_starts = arrays["episode_starts"]
     _seed_again(model, state["generators"], parts["generator"])
@@ -128,9 +131,9 @@ def _variables(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
 def _running(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
     """Running episodes of an environment that can be put back into them; else nothing."""
     environment: Any = model.get_env()
-    if not hasattr(environment, "snapshot") or not isinstance(model._last_obs, np.ndarray):
+    if not hasattr(environment, "get_state") or not isinstance(model._last_obs, np.ndarray):
         return {}
-    found = {f"environment.{name}": array for name, array in environment.snapshot().items()}
+    found = {f"environment.{name}": array for name, array in environment.get_state().items()}
     starts = np.asarray(model._last_episode_starts)
     return {**found, "last_observations": model._last_obs, "episode_starts": starts}
 

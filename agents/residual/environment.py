@@ -108,8 +108,8 @@ class ResidualVecEnv(VecEnv):
             self._scene, self._rng, push=push, pushes=self._mismatch.pushes, measurement=noise
         )
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
-        """Copy the running episodes, to `restore` them later or in another process.
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Copy the running episodes, to `set_state` it later or in another process.
 
         Returns:
             Arrays by name.
@@ -127,31 +127,31 @@ class ResidualVecEnv(VecEnv):
             "average": self._observer.average,
             "generator": json.dumps(self._rng.bit_generator.state),
         }
-        worlds = {f"worlds.{name}": array for name, array in self._worlds.snapshot().items()}
+        worlds = {f"worlds.{name}": array for name, array in self._worlds.get_state().items()}
         return {**worlds, **{name: np.array(value) for name, value in own.items()}}
 
-    def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
-        """Go on where a snapshot of an environment with the same arguments was taken.
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on where `get_state` of an environment with the same arguments was called.
 
         Args:
-            snapshot: Arrays by name.
+            state: Arrays by name.
 
         Raises:
             KeyError: If an array is missing.
             ValueError: If an array has a wrong shape or type.
         """
         prefix = "worlds."
-        self._worlds.restore(
-            {name.removeprefix(prefix): snapshot[name] for name in snapshot if name.startswith(prefix)}
+        self._worlds.set_state(
+            {name.removeprefix(prefix): state[name] for name in state if name.startswith(prefix)}
         )
-        self._rng.bit_generator.state = json.loads(str(snapshot["generator"]))
-        self._plans = self._plans.choose(snapshot["chosen"])
-        self._disturb(snapshot["noise"], snapshot["push"])
-        self._stage = int(snapshot["stage"])
-        self._cost, self._returns = snapshot["cost"].copy(), snapshot["returns"].copy()
-        self._flying, self._success = snapshot["flying"].copy(), snapshot["success"].copy()
-        self._uncorrected = snapshot["uncorrected"].copy()
-        self._observer.average = snapshot["average"].copy()
+        self._rng.bit_generator.state = json.loads(str(state["generator"]))
+        self._plans = self._plans.choose(state["chosen"])
+        self._disturb(state["noise"], state["push"])
+        self._stage = int(state["stage"])
+        self._cost, self._returns = state["cost"].copy(), state["returns"].copy()
+        self._flying, self._success = state["flying"].copy(), state["success"].copy()
+        self._uncorrected = state["uncorrected"].copy()
+        self._observer.average = state["average"].copy()
 
     def _observe(self) -> NDArray[np.float32]:
         """Disturb flights and twins alike, and compute the plans' actions."""

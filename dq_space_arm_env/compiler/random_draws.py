@@ -32,12 +32,24 @@ def generator_states(seeds: Sequence[int | None]) -> NDArray[np.uint64]:
 
     A row is state and increment, low word first. Raises ValueError for a negative seed.
     """
-    states = np.empty((len(seeds), 4), dtype=np.uint64)
-    for row, seed in zip(states, seeds, strict=True):
-        inner: Any = np.random.PCG64(seed).state["state"]
-        for start, value in ((0, inner["state"]), (2, inner["inc"])):
-            row[start], row[start + 1] = value & _WORD, value >> 64
-    return states
+    return np.array([generator_state(np.random.PCG64(seed)) for seed in seeds]).reshape(-1, 4)
+
+
+def generator_state(bits: np.random.BitGenerator) -> NDArray[np.uint64]:
+    """State of a PCG64, shape (4,), see `generator_states`. Raises ValueError for another kind."""
+    state: Any = bits.state
+    if state["bit_generator"] != "PCG64":
+        raise ValueError(f"np_random: a {state['bit_generator']}, should be the PCG64 of reset(seed=...)")
+    values = state["state"]["state"], state["state"]["inc"]
+    return np.array([word for value in values for word in (value & _WORD, value >> 64)], dtype=np.uint64)
+
+
+def generator_of(state: NDArray[np.uint64]) -> np.random.Generator:
+    """Make the generator with a state, shape (4,)."""
+    bits, words = np.random.PCG64(), [int(word) for word in state]
+    inner: Any = {"state": words[0] | words[1] << 64, "inc": words[2] | words[3] << 64}
+    bits.state = {"bit_generator": "PCG64", "state": inner, "has_uint32": 0, "uinteger": 0}
+    return np.random.Generator(bits)
 
 
 @cache

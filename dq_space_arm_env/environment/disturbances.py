@@ -157,20 +157,20 @@ class MassMismatchVectorEnv:
         """Observations of given states, shape (B, n_x), at the present times."""
         return self._joined([environment.observe(states[rows]) for environment, rows in self._groups])
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
-        """Copy what all later steps depend on, see `DQSpaceArmVectorEnv.snapshot`."""
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Copy what all later steps depend on, see `DQSpaceArmVectorEnv.get_state`."""
         return {
             f"{place}.{name}": array
             for place, (environment, _) in enumerate(self._groups)
-            for name, array in environment.snapshot().items()
+            for name, array in environment.get_state().items()
         }
 
-    def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
-        """Go on where a snapshot was taken, see `DQSpaceArmVectorEnv.restore`."""
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on where `get_state` was called, see `DQSpaceArmVectorEnv.set_state`."""
         for place, (environment, _) in enumerate(self._groups):
             prefix = f"{place}."
-            part = {name.removeprefix(prefix): snapshot[name] for name in snapshot if name.startswith(prefix)}
-            environment.restore(part)
+            part = {name.removeprefix(prefix): state[name] for name in state if name.startswith(prefix)}
+            environment.set_state(part)
 
     def _joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Arrays of the groups in the order of the episodes."""

@@ -14,12 +14,13 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
-from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.common.real_arrays import DOUBLE, SINGLE, real_array
-from dq_space_arm_env.environment.reset_options import check_scene, given_start
+from dq_space_arm_env.compiler.random_draws import generator_of, generator_state
+from dq_space_arm_env.environment.reset_options import GivenStart, check_scene, given_start, saved_state
+from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene, load_scene
@@ -35,7 +36,7 @@ Array = NDArray[Any]
 _ROW = np.zeros(1, dtype=np.int64)  # of the one state
 
 
-class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
+class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     """
     ## Description
 
@@ -170,7 +171,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
             ValueError: If the scene has no actuator, or one without a finite limit, or starts too far from the origin; if the
                 render mode is unknown; or if size or camera of the pictures is invalid.
         """
-        EzPickle.__init__(self, scene, render_mode, width, height, default_camera_config)
+        PicklesEpisodes.__init__(self, scene, render_mode, width, height, default_camera_config)
         self._picture = PictureFormat.checked(width, height, default_camera_config)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             modes = ", ".join(self.metadata["render_modes"])
@@ -224,6 +225,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         self._start, self._observe = KernelCall(start, arrays), KernelCall(observe, arrays)
         self._take_step = KernelCall(step, arrays).of_one_row()
         self._x, self._draws, self._action = arrays["x"], arrays["draws"], arrays["action"]
+        self._memory = arrays["memory"]
         self._parameters = arrays.get("parameters", np.zeros(0, dtype=self.kernels.dtype))
         self._observation, self._report, self._flags = (
             arrays[name] for name in ("observation", "report", "flags")
@@ -262,6 +264,47 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         self._require_reset("asking for the episode's scene")
         given = None if self._given_target is None else self._given_target.tolist()
         return episode_scene(self.scene, self._draws.tolist(), given)
+
+    def get_state(self) -> dict[str, Array]:
+        """Copy what all later steps and resets depend on.
+
+        Returns:
+            Arrays by name, for `set_state`, of this environment or another of the same scene: the state "x", shape (n_x,); "memory" of the
+            step (number, sign of the error, stage cost), "parameters", "draws", and "target", NaN unless it was given, shape (8,);
+            whether the episode is "over"; and the state of the random "generator". `ResetNeeded` before the first reset.
+        """
+        self._require_reset("get_state()")
+        target = np.full(8, np.nan) if self._given_target is None else self._given_target
+        state = {**self._kept(), "target": target, "over": np.array(self._over)}
+        return {name: array.copy() for name, array in state.items()} | {
+            "generator": generator_state(self.np_random.bit_generator)
+        }
+
+    def set_state(self, state: Mapping[str, Array]) -> None:
+        """Go on where `get_state` was called: the same actions give the same bits. The trail in pictures begins anew.
+
+        Args:
+            state: What `get_state` returned, arrays of its shapes.
+
+        Raises:
+            ValueError: If an array is missing, or has another shape or type; nothing is changed then.
+        """
+        expected = {
+            **self._kept(),
+            "target": np.empty(8),
+            "over": np.array(True),
+            "generator": np.empty(4, np.uint64),
+        }
+        found = checked_state(state, expected)
+        for name, array in self._kept().items():
+            array[...] = found[name]
+        self._given_target = None if np.isnan(found["target"]).any() else found["target"].copy()
+        self._begun, self._over = True, bool(found["over"])
+        self.np_random = generator_of(found["generator"])
+        self._trail = []
+
+    def _kept(self) -> dict[str, Array]:
+        return {"x": self._x, "memory": self._memory, "parameters": self._parameters, "draws": self._draws}
 
     def _require_reset(self, what: str) -> None:
         if not self._begun:
@@ -320,30 +363,39 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], EzPickle):
         Args:
             seed: Seed of the random start; None keeps the generator.
             options: {"nominal": True} for the scene's initial state, or {"initial_state": x} with x of shape (n_x,);
-                {"target": q} for the target q_{D/I} of shape (8,), in a scene that draws it.
+                {"target": q} for the target q_{D/I} of shape (8,), in a scene that draws it; {"state": s} alone to go on in the
+                middle of an episode, see `get_state`, with its generator unless a seed is given.
 
         Returns:
             Observation and info.
 
         Raises:
-            ValueError: If an option is unknown; if state or target has a wrong shape, is not finite, or its pose is not a unit dual quaternion; or if the
+            ValueError: If an option is unknown or excludes another; if state or target has a wrong shape, is not finite, or its pose is not a unit dual quaternion; or if the
                 scene's target is not drawn.
         """
-        super().reset(seed=seed)
-        start = given_start(self.kernels, options or {})
-        drawn = start.state is None
-        self._draws[:] = self.np_random.uniform(-1.0, 1.0, self._draws.shape) if drawn else 0.0
-        self._start.on_rows(_ROW)
-        start.apply(self.kernels, self._x, self._parameters)
-        self._given_target = start.target
+        saved = saved_state(options or {})
+        if saved is not None:
+            self.set_state(saved)
+            super().reset(seed=seed)
+        else:
+            super().reset(seed=seed)
+            self._begin(given_start(self.kernels, options or {}))
         self._observe.on_rows(_ROW)
-        self._begun, self._over = True, False
-        self._trail = []
         if self.render_mode is not None:
             self._show()
         _, success, diverged = self._flags.tolist()
         info = dict(zip(REPORT[1:], self._report.tolist()[1:], strict=True))
         return self._observation.copy(), {**info, "is_success": success, "diverged": diverged}
+
+    def _begin(self, start: GivenStart) -> None:
+        """Draw an episode, except for what is given."""
+        drawn = start.state is None
+        self._draws[:] = self.np_random.uniform(-1.0, 1.0, self._draws.shape) if drawn else 0.0
+        self._start.on_rows(_ROW)
+        start.apply(self.kernels, self._x, self._parameters)
+        self._given_target = start.target
+        self._begun, self._over = True, False
+        self._trail = []
 
     def _show(self) -> None:
         """Extend the tip's trail, and update the window."""

@@ -9,11 +9,12 @@ from typing import Any, Literal, NamedTuple, get_args
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
+from dq_space_arm_env.environment.reset_options import saved_state
+from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
@@ -33,7 +34,7 @@ class _Comparison(NamedTuple):
     is_success: NDArray[np.bool_]
 
 
-class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
+class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisodes):
     """
     ## Description
 
@@ -158,7 +159,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
             SceneError: If the scene cannot be loaded.
             ValueError: If the reward type or the render mode is unknown, or `DQSpaceArmEnv` refuses the scene.
         """
-        EzPickle.__init__(self, scene, reward_type, render_mode, width, height, default_camera_config)
+        PicklesEpisodes.__init__(self, scene, reward_type, render_mode, width, height, default_camera_config)
         if reward_type not in get_args(RewardType):
             kinds = " and ".join(get_args(RewardType))
             raise ValueError(f"reward_type: {reward_type!r} is unknown; choose from {kinds}")
@@ -198,6 +199,31 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         """The scene of this episode, see `DQSpaceArmEnv.episode_scene`."""
         return self._env.episode_scene
 
+    @property
+    def _begun(self) -> bool:
+        return self._env._begun
+
+    def get_state(self) -> dict[str, Array]:
+        """Copy what all later steps and resets depend on.
+
+        Returns:
+            Arrays by name, see `DQSpaceArmEnv.get_state`.
+        """
+        return {**self._env.get_state(), "truncated": np.array(self._truncated)}
+
+    def set_state(self, state: Mapping[str, Array]) -> None:
+        """Go on where `get_state` was called, see `DQSpaceArmEnv.set_state`.
+
+        Args:
+            state: What `get_state` returned, arrays of its shapes.
+
+        Raises:
+            ValueError: If an array is missing, or has another shape or type.
+        """
+        truncated = checked_state(state, {"truncated": np.array(True)})["truncated"]
+        self._env.set_state(state)
+        self.np_random, self._truncated = self._env.np_random, bool(truncated)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
@@ -213,10 +239,15 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], EzPickle):
         Raises:
             ValueError: If an option is wrong.
         """
+        saved = saved_state(options or {})
+        if saved is not None:
+            self.set_state(saved)
         super().reset(seed=seed)
         self._env.np_random = self.np_random
         _, info = self._env.reset(options=options)
-        self._truncated = False
+        if saved is None:
+            self._truncated = False
+        self._env.np_random = self.np_random
         observation = self._observe()
         return observation, self._judged(info, self._compare_goals(observation))
 

@@ -17,7 +17,7 @@ from dq_space_arm_env.task.step_report import STATE_LIMIT
 
 Array = NDArray[Any]
 
-_OPTIONS = ("nominal", "initial_state", "target")
+_OPTIONS = ("nominal", "initial_state", "target", "state")
 
 
 class GivenStart(NamedTuple):
@@ -41,6 +41,14 @@ class GivenStart(NamedTuple):
             target = np.array(kernels.scene.target.pose.dual_quaternion)
         if target is not None:
             _give_sign_of_target(kernels, x, target)
+
+
+def saved_state(options: dict[str, Any]) -> Any:
+    """The option "state", which excludes the others; None without it."""
+    others = sorted(set(options) - {"state"})
+    if options.get("state") is not None and others:
+        raise ValueError(f"options: state holds the whole episode, it excludes {', '.join(others)}")
+    return options.get("state")
 
 
 def given_start(kernels: Kernels, options: dict[str, Any]) -> GivenStart:

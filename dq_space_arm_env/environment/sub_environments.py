@@ -80,7 +80,7 @@ class SubEnvironments:
             "memory": self._memory,
             "parameters": self.parameters,
             "draws": self._draws,
-            "generators": self._generators,
+            "generator": self._generators,
         }
 
     def seed(self, rows: Rows, seeds: Sequence[int | None]) -> None:

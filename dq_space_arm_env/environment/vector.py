@@ -10,15 +10,16 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
-from gymnasium.utils import EzPickle
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
-from dq_space_arm_env.environment.reset_options import GivenStart, given_start
+from dq_space_arm_env.environment.reset_options import GivenStart, given_start, saved_state
+from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
 from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene
@@ -39,7 +40,7 @@ _KEYS = (*REPORT[1:], "is_success", "diverged")
 _NONE = np.empty(0, dtype=np.int64)
 
 
-class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle):
+class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesEpisodes):
     """`num_envs` sub-environments, bit-equal to single `DQSpaceArmEnv` with the same seeds and actions.
 
     `gymnasium.make_vec("DQSpaceArm-v0", num_envs=1024)` creates it. Spaces, reward, `info`, options and
@@ -94,7 +95,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
                 render mode is unknown, or size or camera of the pictures is invalid.
         """
         picture = width, height, default_camera_config
-        EzPickle.__init__(self, num_envs, scene, autoreset_mode, render_mode, threads, *picture)
+        PicklesEpisodes.__init__(self, num_envs, scene, autoreset_mode, render_mode, threads, *picture)
         if num_envs < 1:
             raise ValueError(f"num_envs: {num_envs}, should be at least 1")
         if render_mode not in (None, "rgb_array"):
@@ -117,12 +118,12 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
         self._envs = SubEnvironments(self.kernels, num_envs)
-        self._begun = False
+        self._begun, disabled = False, self.autoreset_mode is AutoresetMode.DISABLED
         self._all = np.ones(num_envs, dtype=np.bool_)
         self._all.setflags(write=False)
         self._masks = dict.fromkeys((f"_{key}" for key in _KEYS), self._all)
         self._over = _NONE  # rows whose episodes are over, to be reset by the next step or the caller
-        self._seen: Array | None = None
+        self._seen = self._envs.observe_states(self._envs.x) if disabled else None
         self._trails = None if render_mode is None else Trails(num_envs)
         self._renderer: Renderer | None = None
 
@@ -152,7 +153,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
 
         Args:
             seed: Seed s for s, s + 1, ...; one seed per sub-environment; or None to keep the generators.
-            options: As for `DQSpaceArmEnv.reset`, and "reset_mask".
+            options: As for `DQSpaceArmEnv.reset`, and "reset_mask"; "state" is what `get_state` gives, or
+                `DQSpaceArmEnv.get_state`, the same for all.
 
         Returns:
             Observations, shape (num_envs, n_obs), the present ones where nothing is reset; and info.
@@ -160,14 +162,19 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
         Raises:
             ValueError: If an option or the number of seeds is wrong.
         """
-        rest = dict(options or {})
+        rest, begins = dict(options or {}), not self._begun
         mask = self._checked_mask(rest.pop("reset_mask", None))
         rows, others = np.flatnonzero(mask), np.flatnonzero(~mask)
-        starts = self._given_starts(rows, rest)
-        self._seed(seed, rows)
-        self._envs.begin(rows, starts)
+        saved = saved_state(rest)
+        if saved is None:
+            starts = self._given_starts(rows, rest)
+            self._seed(seed, rows)
+            self._envs.begin(rows, starts)
+        else:
+            self.set_state(self._given_state(saved, rows), rows)
+            self._seed(seed, rows)
         result = self._envs.observe(rows)
-        if self._seen is None:
+        if self._seen is None or begins:
             result.observation[others] = self._envs.observe(others).observation[others]
         else:
             result.observation[others] = self._seen[others]
@@ -181,8 +188,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
 
     def _remember(self, observations: Array) -> None:
         """Keep observations for resets of some sub-environments, which return the others' last ones."""
-        if self.autoreset_mode is AutoresetMode.DISABLED:
-            self._seen = observations.copy()
+        if self._seen is not None:
+            self._seen[...] = observations
 
     def _checked_mask(self, mask: Any) -> Mask:
         if mask is None:
@@ -317,46 +324,77 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], EzPickle
             raise ValueError(f"states: shape {x.shape}, should be {self._envs.x.shape}")
         return self._envs.observe_states(x)
 
-    def snapshot(self) -> dict[str, Array]:
-        """Copy what all later steps and resets depend on, to `restore` it later or in another process.
+    def get_state(self, rows: ArrayLike | None = None) -> dict[str, Array]:
+        """Copy what all later steps and resets depend on.
+
+        Args:
+            rows: Numbers of sub-environments, or a mask, shape (num_envs,); None for all.
 
         Returns:
-            Arrays by name: states, parameters, random generators, and which episodes are over.
+            Arrays by name with a row for each, see `DQSpaceArmEnv.get_state`; for `set_state`, of this
+            environment or another of the same scene.
 
         Raises:
             ResetNeeded: Before the first reset.
+            ValueError: If there is no such sub-environment.
         """
         if not self._begun:
-            raise ResetNeeded("the episodes have not begun: call reset() before snapshot()")
-        seen = {} if self._seen is None else {"seen": self._seen}
-        over = np.isin(np.arange(self.num_envs), self._over)
-        return {name: array.copy() for name, array in {**self._envs.kept(), **seen, "over": over}.items()}
+            raise ResetNeeded("the episodes have not begun: call reset() before get_state()")
+        chosen = self._checked_rows(rows)
+        return {name: array[chosen] for name, array in self._kept().items()}
 
-    def restore(self, snapshot: Mapping[str, Array]) -> None:
-        """Go on where a snapshot was taken: the same actions give the same bits.
+    def set_state(self, state: Mapping[str, Array], rows: ArrayLike | None = None) -> None:
+        """Go on where `get_state` was called: the same actions give the same bits.
 
         Args:
-            snapshot: Arrays of an environment with the same scene, `num_envs` and autoreset mode.
+            state: What `get_state` returned for as many sub-environments, arrays of its shapes.
+            rows: Numbers of those that take it, or a mask, shape (num_envs,); None for all.
 
         Raises:
-            ValueError: If an array is missing, or has another shape or type.
+            ResetNeeded: For some of the sub-environments, before the first reset of all.
+            ValueError: If there is no such sub-environment, or an array is missing, or has another shape or
+                type; nothing is changed then.
         """
-        disabled = self.autoreset_mode is AutoresetMode.DISABLED
-        expected = {**self._envs.kept(), "over": self._all}
-        if disabled:
-            expected["seen"] = np.empty(self.observation_space.shape or (), self.kernels.dtype)
-        for name, array in expected.items():
-            found = snapshot.get(name)
-            if found is None or found.shape != array.shape or found.dtype != array.dtype:
-                given = "is missing" if found is None else f"has shape {found.shape}, type {found.dtype}"
-                raise ValueError(f"snapshot: {name} {given}, should have {array.shape}, {array.dtype}")
-        for name, array in self._envs.kept().items():
-            array[...] = snapshot[name]
-        self._begun, self._over = True, np.flatnonzero(snapshot["over"])
-        self._seen = snapshot["seen"].copy() if disabled else None
+        chosen = self._checked_rows(rows)
+        if not self._begun and len(chosen) < self.num_envs:
+            raise ResetNeeded("the other episodes have not begun: call reset() before set_state() of some")
+        kept = self._kept()
+        found = checked_state(state, {name: array[chosen] for name, array in kept.items()})
+        for name, array in kept.items():
+            array[chosen] = found[name]
+        self._begun, self._over = True, np.flatnonzero(kept["over"])
         if self._trails is not None:
-            self._trails.begin(np.arange(self.num_envs))
+            self._trails.begin(chosen)
             self._trails.append(self._tip_positions())
+
+    def _kept(self) -> dict[str, Array]:
+        """Arrays that all later steps depend on; "over" is made anew."""
+        over = np.isin(np.arange(self.num_envs), self._over)
+        return {**self._envs.kept(), "over": over, **({} if self._seen is None else {"seen": self._seen})}
+
+    def _given_state(self, state: Any, rows: Rows) -> Any:
+        """The option "state" for some sub-environments; that of a single environment is the same for all."""
+        if not isinstance(state, Mapping):
+            return state
+        if np.ndim(state.get("over", [])) == 0:
+            state = {
+                name: np.broadcast_to(array, (self.num_envs, *np.shape(array)))
+                for name, array in state.items()
+            }
+        seen = {} if self._seen is None else {"seen": self._seen}  # what follows observes anew
+        return {name: np.asarray(array)[rows] for name, array in {**state, **seen}.items()}
+
+    def _checked_rows(self, rows: ArrayLike | None) -> Rows:
+        everyone = np.arange(self.num_envs)
+        try:
+            chosen = everyone if rows is None else np.atleast_1d(everyone[np.asarray(rows)])
+        except IndexError as error:
+            raise ValueError(
+                f"rows: {shortened(rows)}, should be numbers below {self.num_envs}, or a mask"
+            ) from error
+        if len(np.unique(chosen)) < len(chosen):
+            raise ValueError(f"rows: {shortened(rows)} has a sub-environment twice")
+        return chosen
 
     def _begin_anew(self, rows: Rows, result: StepResult) -> None:
         """Begin new episodes, and overwrite the old observations."""

@@ -17,6 +17,7 @@ from dq_space_arm_env.dynamics import linear, minimal
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.minimal import Accelerations
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
+from dq_space_arm_env.scene import Actuators, InitialState, JointLimit, Pose, Spread
 from dq_space_arm_env.scene.layout import StateLayout
 
 FORMULATIONS = ("articulated_body", "minimal_coordinates")
@@ -82,7 +83,7 @@ def test_a_wrench_at_the_tip_replaces_the_scenes() -> None:
 
 def test_a_missing_actuator_pushes_nothing() -> None:
     scene = load_scene("paper")
-    bare = scene.replace(actuators={"joint_torque": {"limit": 1.0}})
+    bare = scene.replace(actuators=Actuators(joint_torque=JointLimit(limit=1.0)))
     field = field_of(bare)
     inputs = field.inputs([1.0, 2.0, 3.0])
     assert (tuple(inputs.force), tuple(inputs.torque)) == ((0.0,) * 3, (0.0,) * 3)
@@ -185,11 +186,16 @@ def test_a_pose_moves_by_the_exponential_and_stays_a_unit(name: str) -> None:
 
 
 def test_a_wrench_on_a_base_alone() -> None:
-    changes = {"links": [], "wrist": None, "tip": {"position": [0, 0, 0]}, "initial_state": {}, "spread": {}}
-    actuators = {"base_force": {"limit": 1.0}, "base_torque": {"limit": 1.0}}
-    scene = load_scene("paper").replace(
-        **changes, actuators=actuators, tip_wrench={"force": [3.0, 0.0, -6.0]}
-    )
+    bare: Any = {
+        "links": [],
+        "wrist": None,
+        "initial_state": InitialState(),
+        "spread": Spread(),
+        "tip": Pose(),
+    }
+    actuators = {"joint_torque": None, "wrist_rate": None}
+    wrench = {"force": [3.0, 0.0, -6.0]}
+    scene = load_scene("paper").replace(**bare, actuators=actuators, tip_wrench=wrench)
     field = field_of(scene)
     found = field.accelerations([*field.layout.initial_state], [0.0] * 6)
     np.testing.assert_allclose(found, np.array([0, 0, 0, 3, 0, -6]) / [1, 1, 1, *[scene.base.mass] * 3])

@@ -10,7 +10,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from short_scenes import diverging, short
 
-from dq_space_arm_env import DQSpaceArmVectorEnv, list_scenes, load_scene
+from dq_space_arm_env import DQSpaceArmVectorEnv, list_scenes
 
 
 def twins(scene, copies, mode):
@@ -236,37 +236,6 @@ def test_bad_construction_is_refused():
         DQSpaceArmVectorEnv(2, render_mode="human")
     with pytest.raises(ResetNeeded):
         DQSpaceArmVectorEnv(2).step(np.zeros((2, 12)))
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-def test_a_snapshot_restores_running_episodes_to_the_bit(mode):
-    scene = load_scene("random-target").replace(simulation={"dt": 0.015, "steps": 5})
-    rng = np.random.default_rng(0)
-    actions = rng.uniform(-1.0, 1.0, (12, 3, 12)).astype(np.float32)
-
-    def fly(venv, steps):
-        seen = []
-        for step in steps:
-            observations, rewards, over, _, _ = venv.step(actions[step])
-            seen += [observations.copy(), rewards.copy(), venv.states, venv.targets]
-            if mode == "Disabled" and over.any():
-                seen.append(venv.reset(options={"reset_mask": over})[0].copy())
-        return seen
-
-    venv, other = (DQSpaceArmVectorEnv(3, scene, autoreset_mode=mode) for _ in range(2))
-    with pytest.raises(ResetNeeded):
-        venv.snapshot()
-    venv.reset(seed=[1, 2, 3])
-    fly(venv, range(5))
-    snapshot = venv.snapshot()
-    expected = fly(venv, range(5, 12))
-    other.restore(snapshot)
-    for actual, wanted in zip(fly(other, range(5, 12)), expected, strict=True):
-        np.testing.assert_array_equal(actual, wanted)
-    for name, array in snapshot.items():
-        for wrong in ({}, {name: array[:2]}, {name: array.astype(np.complex128)}):
-            with pytest.raises(ValueError, match=f"snapshot: {name} "):
-                other.restore({**{key: value for key, value in snapshot.items() if key != name}, **wrong})
 
 
 def test_the_final_info_of_copies_that_go_on_is_zero():

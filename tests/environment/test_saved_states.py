@@ -1,0 +1,183 @@
+"""A running episode that is saved and put back, in any environment, goes on to the same bits."""
+
+import copy
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from short_scenes import short
+
+from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, list_scenes
+
+LENGTH, MODES = 12, ("NextStep", "SameStep", "Disabled")
+DRAWN = short("random-target", LENGTH)
+
+
+def actions(shape, seed=0):
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
+
+
+def fly(env, steps, seed=0):
+    """All that an environment returns, across the ends of episodes."""
+    seen = []
+    for action in actions((steps, *env.action_space.shape), seed):
+        *returned, info = env.step(action)
+        seen += [*returned, info]
+        over = np.asarray(returned[2]) | np.asarray(returned[3])
+        if over.ndim == 0 and over:
+            seen += [*env.reset()]
+        elif over.ndim and over.any() and env.unwrapped.autoreset_mode.value == "Disabled":
+            seen += [*env.reset(options={"reset_mask": over})]
+        seen.append(env.unwrapped.get_state())
+    return copy.deepcopy(seen)
+
+
+def assert_same(actual, expected):
+    if isinstance(expected, dict):
+        assert actual.keys() == expected.keys()
+        actual, expected = list(actual.values()), list(expected.values())
+    if isinstance(expected, list | tuple) or (isinstance(expected, np.ndarray) and expected.dtype == object):
+        for one, other in zip(actual, expected, strict=True):
+            assert_same(one, other)
+    else:
+        np.testing.assert_array_equal(actual, expected)
+
+
+def check(env, other, *, seed):
+    with pytest.raises(ResetNeeded):
+        env.unwrapped.get_state()
+    env.reset(seed=seed)
+    fly(env, LENGTH + 4, seed=1)  # in the middle of a second episode
+    state = env.unwrapped.get_state()
+    kept = copy.deepcopy(state)
+    copied, pickled = copy.deepcopy(env), pickle.dumps(env)
+    expected = fly(env, 2 * LENGTH)
+    assert_same(state, kept)  # it is a copy
+    if isinstance(other, DQSpaceArmVectorEnv):
+        other.set_state(state)
+    else:  # wrappers want a reset
+        other.reset(options={"state": state})
+    for again in (other, env, copied, pickle.loads(pickled)):
+        if again is env:
+            env.unwrapped.set_state(state)
+        assert_same(fly(again, 2 * LENGTH), expected)
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_a_single_environment_goes_on(name):
+    check(*(gymnasium.make("DQSpaceArm-v0", scene=short(name, LENGTH)) for _ in range(2)), seed=3)
+
+
+def test_a_goal_environment_goes_on():
+    check(*(gymnasium.make("DQSpaceArmGoal-v0", scene=DRAWN) for _ in range(2)), seed=3)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", list_scenes())
+def test_a_vector_environment_goes_on(name, mode):
+    check(*(DQSpaceArmVectorEnv(3, short(name, LENGTH), mode) for _ in range(2)), seed=[1, 2, 3])
+
+
+@pytest.mark.parametrize("kind", ["DQSpaceArm-v0", "DQSpaceArmGoal-v0"])
+def test_reset_goes_on_with_a_state(kind):
+    env, other = (gymnasium.make(kind, scene=DRAWN) for _ in range(2))
+    env.reset(seed=3)
+    *_, (observation, _, _, _, info, _) = [(*env.step(action), 0) for action in actions((5, 12))]
+    state = env.unwrapped.get_state()
+    found, seen = other.reset(options={"state": state})
+    assert_same(found, observation)
+    for name in ("attitude_error", "position_error", "is_success", "diverged"):
+        assert seen[name] == info[name]
+    assert_same(other.unwrapped.get_state(), state)
+    other.reset(options={"state": state}, seed=7)
+    assert_same({**other.unwrapped.get_state(), "generator": 0}, {**state, "generator": 0})
+    assert_same(other.reset(), gymnasium.make(kind, scene=DRAWN).reset(seed=7))
+
+
+def test_the_episodes_scene_and_target_come_along():
+    env, other = DQSpaceArmEnv(DRAWN), DQSpaceArmEnv(DRAWN)
+    env.reset(seed=3)
+    given = env.target
+    for options in ({}, {"target": given}):
+        env.reset(seed=4, options=options)
+        other.set_state(env.get_state())
+        assert other.episode_scene == env.episode_scene
+        np.testing.assert_array_equal(other.target, env.target)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_an_episode_branches_into_copies(mode):
+    env, venv = DQSpaceArmEnv(DRAWN), DQSpaceArmVectorEnv(4, DRAWN, mode)
+    observation, _ = env.reset(seed=3)
+    for action in actions((5, 12)):
+        observation, *_ = env.step(action)
+    observations, _ = venv.reset(options={"state": env.get_state()})
+    assert_same(observations, np.tile(observation, (4, 1)))
+    branches = actions((4, 12), seed=2)
+    rewards = venv.step(branches)[1]
+    for i, action in enumerate(branches):
+        branch = copy.deepcopy(env)
+        assert branch.step(action)[1] == rewards[i]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("rows", [[2, 0], np.array([True, False, True])])
+def test_rows_are_saved_and_put_back(mode, rows):
+    venv = DQSpaceArmVectorEnv(3, DRAWN, mode)
+    venv.reset(seed=[1, 2, 3])
+    moves = actions((8, 3, 12))
+    for move in moves[:4]:
+        venv.step(move)
+    state, other = venv.get_state(rows), DQSpaceArmVectorEnv(3, DRAWN, mode)
+    with pytest.raises(ResetNeeded, match="the other episodes have not begun"):
+        other.set_state(state, rows)
+    other.reset(seed=[4, 5, 6])
+    before = other.get_state([1])
+    other.set_state(state, rows)
+    assert_same(other.get_state([1]), before)
+    chosen = np.arange(3)[rows]
+    for move in moves[4:]:
+        np.testing.assert_array_equal(other.step(move)[0][chosen], venv.step(move)[0][chosen])
+    mask = np.isin(np.arange(3), chosen)
+    whole = venv.get_state()
+    other.reset(options={"state": whole, "reset_mask": mask})
+    np.testing.assert_array_equal(other.states[mask], whole["x"][mask])
+    assert (other.states[1] != whole["x"][1]).any()
+
+
+def test_bad_states_are_refused_and_change_nothing():
+    venv = DQSpaceArmVectorEnv(3, DRAWN, "Disabled")
+    env = DQSpaceArmEnv(DRAWN)
+    for each in (env, venv):
+        each.reset(seed=0)
+        state = each.get_state()
+        for name, array in state.items():
+            wrong = [{}, {name: np.zeros((7, 7))}, {name: array.astype(np.complex128)}]
+            for change in wrong:
+                rest = {key: value for key, value in state.items() if key != name}
+                with pytest.raises(ValueError, match=f"state: {name} "):
+                    each.set_state({**rest, **change})
+        for bad in (3, [1, 2], "x"):
+            with pytest.raises(ValueError, match="should be what get_state"):
+                each.set_state(bad)
+            with pytest.raises(ValueError, match="should be what get_state"):
+                each.reset(options={"state": bad})
+        with pytest.raises(ValueError, match="state holds the whole episode, it excludes nominal"):
+            each.reset(options={"state": state, "nominal": True})
+        assert_same(each.get_state(), state)
+    for rows in ([3], [0, 0], [[True]], "x"):
+        with pytest.raises(ValueError, match="rows: "):
+            venv.get_state(rows)
+    env.np_random = np.random.Generator(np.random.MT19937(0))
+    with pytest.raises(ValueError, match="np_random: a MT19937, should be the PCG64"):
+        env.get_state()
+
+
+def test_what_has_not_begun_is_copied_too():
+    for env in (DQSpaceArmEnv(DRAWN), DQSpaceArmVectorEnv(2, DRAWN)):
+        copied = copy.deepcopy(env)
+        with pytest.raises(ResetNeeded):
+            copied.step(np.zeros(env.action_space.shape))
+        assert_same(copied.reset(seed=1), env.reset(seed=1))
