@@ -3,13 +3,13 @@
 import errno
 import os
 import sys
+import threading
 import traceback
 import warnings
 from _thread import interrupt_main
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from threading import Timer
 from typing import Any, NoReturn
 
 import click
@@ -94,7 +94,7 @@ def run_to_end(run: Callable[[], Any], session: Mapping[str, bool] | None = None
     """
     session = {"debug": _debug_by_default()} if session is None else session
     try:
-        with _no_interrupt_lost():
+        with _no_interrupt_lost(), _threads_in_sentences(session):
             status = run()
         sys.stdout.flush()
     except BrokenPipeError:
@@ -117,7 +117,7 @@ def _no_interrupt_lost() -> Iterator[None]:
 
     def repeat(dropped: Any) -> None:
         if issubclass(dropped.exc_type, KeyboardInterrupt):
-            Timer(0.01, interrupt_main).start()  # once the callback has returned
+            threading.Timer(0.01, interrupt_main).start()  # once the callback has returned
         else:
             usual(dropped)
 
@@ -126,6 +126,25 @@ def _no_interrupt_lost() -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = usual
+
+
+@contextmanager
+def _threads_in_sentences(session: Mapping[str, bool]) -> Iterator[None]:
+    """Show what the disk refuses to a library's thread as a sentence, inside a block."""
+    usual = threading.excepthook
+
+    def show(failed: threading.ExceptHookArgs) -> None:
+        error = failed.exc_value
+        if isinstance(error, OSError) and not session["debug"]:
+            complain(error.strerror or str(error), label="Warning: ")
+        else:
+            usual(failed)
+
+    threading.excepthook = show
+    try:
+        yield
+    finally:
+        threading.excepthook = usual
 
 
 def _explain(error: BaseException) -> int:

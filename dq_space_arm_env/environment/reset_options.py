@@ -45,10 +45,11 @@ class GivenStart(NamedTuple):
 
 def saved_state(options: dict[str, Any]) -> Any:
     """The option "state", which excludes the others; None without it."""
-    others = sorted(set(options) - {"state"})
-    if options.get("state") is not None and others:
-        raise ValueError(f"options: state holds the whole episode, it excludes {', '.join(others)}")
-    return options.get("state")
+    state = options.get("state")
+    if state is not None and len(options) > 1:
+        others = ", ".join(sorted(set(options) - {"state"}))
+        raise ValueError(f"options: state holds the whole episode, it excludes {others}")
+    return state
 
 
 def given_start(kernels: Kernels, options: dict[str, Any]) -> GivenStart:

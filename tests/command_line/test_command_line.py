@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from itertools import takewhile
 from pathlib import Path
@@ -368,3 +369,21 @@ def test_a_group_with_a_default_can_do_without_its_name(monkeypatch: pytest.Monk
     assert [name for name, _ in done] == [*["agents"] * 5, "residual", "cloning"]
     assert [options["policies"] for _, options in done[:5]] == [(), (), (), ("ppo",), ("ppo",)]
     assert [options["n"] for _, options in done[3:5]] == [3, 3]
+
+
+@pytest.mark.parametrize("debug", [False, True])
+def test_what_the_disk_refuses_to_a_thread_is_a_sentence(
+    debug: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def write() -> None:
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+
+    def run() -> None:
+        thread = threading.Thread(target=write)
+        thread.start()
+        thread.join()
+
+    assert run_to_end(run, {"debug": debug}) == SUCCESS
+    said = capsys.readouterr().err
+    assert ("Traceback" in said) == debug
+    assert debug or said == "Warning: File too large\n"

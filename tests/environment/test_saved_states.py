@@ -181,3 +181,22 @@ def test_what_has_not_begun_is_copied_too():
         with pytest.raises(ResetNeeded):
             copied.step(np.zeros(env.action_space.shape))
         assert_same(copied.reset(seed=1), env.reset(seed=1))
+
+
+def test_a_planner_of_others_branches_an_episode():
+    tau_ctrl = pytest.importorskip("tau_ctrl")
+    env = gymnasium.make("DQSpaceArm-v0", scene=short("planar", 20).replace({"simulation.dt": 0.3}))
+    planner = tau_ctrl.make("cem", env, horizon=12, n_samples=200)
+
+    def cost(act):
+        observation, _ = env.reset(seed=3)
+        total, over = 0.0, False
+        while not over:
+            state = env.unwrapped.get_state()
+            action = act(observation)
+            assert_same(env.unwrapped.get_state(), state)
+            observation, reward, over, *_ = env.step(np.clip(action, -1.0, 1.0))
+            total -= reward
+        return total
+
+    assert cost(lambda observation: planner.predict(observation)[0]) < cost(lambda observation: np.zeros(6))

@@ -42,7 +42,6 @@ class Undertaking:
     loose: tuple[str, ...] = ()  # files that may be there or not
     program: str = "dq_space_arm_env.command_line"
     once: bool = False  # refused where its file exists
-    aborts: bool = False  # where the disk is full, by a library
     weight: float = 1.0  # share of the moments that are tried
 
 
@@ -413,8 +412,6 @@ def _struck(undertaking, attempt, disturbance, rng, seconds, at, limit):
             _limit(first.pid, disturbance, rng)
         # Libraries that do not check what they allocate crash.
         allowed = (-signal.SIGABRT, -signal.SIGSEGV) if disturbance == "no memory" else ()
-    if undertaking.aborts and disturbance in ("full disk", "short files"):
-        allowed = (-signal.SIGABRT, -signal.SIGSEGV)
     first.release()
     ended = [(first, first.end(limit))]
     return ended + [run if isinstance(run, tuple) else (run, run.end(limit)) for run in others], allowed
@@ -437,7 +434,7 @@ def _judge_run(run, status, allowed):
         raise FailedError(f"it leaves processes: {left}")
     if status in allowed and status < 0:
         return
-    # Without memory the interpreter, and on a full disk HDF5, complain of callbacks that fail.
+    # Without memory the interpreter complains of callbacks that fail.
     excused = -signal.SIGABRT in allowed and (status == 0 or re.search("^Error: ", said, re.MULTILINE))
     if ("Traceback" in said or "Exception ignored" in said) and not excused:
         raise FailedError(f"exit status {status} with a traceback: {said[-3000:]}")

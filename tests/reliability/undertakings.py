@@ -107,7 +107,6 @@ UNDERTAKINGS = (
         "demonstrations export {inputs}/data short/a-v0",
         ("*.hdf5",),
         (".short-a-v0.lock", "minari/.short-a-v0.lock"),
-        aborts=True,  # HDF5, which Minari writes with
         once=True,
     ),
     Undertaking("train cloning", "train {inputs}/cloning.yaml --out out", _RUN, _LOGS),
