@@ -168,6 +168,8 @@ def test_hybrid_tries_the_exact_model_after_two_slow_steps_and_pauses_when_it_fa
     switch.observe(record(True, 30.0, 1.0), 39.5)
     switch.postpone_exact()
     assert switch.pause == 1
+    switch.request_exact()
+    assert switch.tries_exact
 
 
 def test_problem_without_second_derivatives_takes_gauss_newton(unicycle):
