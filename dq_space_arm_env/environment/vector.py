@@ -170,6 +170,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             starts = self._given_starts(rows, rest)
             self._seed(seed, rows)
             self._envs.begin(rows, starts)
+            self._over = np.setdiff1d(self._over, rows)
         else:
             self.set_state(self._given_state(saved, rows), rows)
             self._seed(seed, rows)
@@ -179,7 +180,6 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         else:
             result.observation[others] = self._seen[others]
         result.report[:, others], result.flags[:, others] = 0.0, False
-        self._over = np.setdiff1d(self._over, rows)
         self._remember(result.observation)
         if self._trails is not None:
             self._trails.begin(rows)
@@ -382,7 +382,11 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
                 for name, array in state.items()
             }
         seen = {} if self._seen is None else {"seen": self._seen}  # what follows observes anew
-        return {name: np.asarray(array)[rows] for name, array in {**state, **seen}.items()}
+        arrays = {name: np.asarray(array) for name, array in {**state, **seen}.items()}
+        return {
+            name: array[rows] if array.shape[:1] == (self.num_envs,) else array
+            for name, array in arrays.items()
+        }
 
     def _checked_rows(self, rows: ArrayLike | None) -> Rows:
         everyone = np.arange(self.num_envs)

@@ -147,6 +147,20 @@ def test_rows_are_saved_and_put_back(mode, rows):
     assert (other.states[1] != whole["x"][1]).any()
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_an_episode_that_is_over_stays_so(mode):
+    venv, other = (DQSpaceArmVectorEnv(2, DRAWN, mode) for _ in range(2))
+    venv.reset(seed=[1, 2])
+    for move in actions((LENGTH, 2, 12)):
+        venv.step(move)
+    other.reset(options={"state": venv.get_state()})
+    if mode == "Disabled":
+        with pytest.raises(ResetNeeded, match="are over"):
+            other.step(move)
+    else:
+        assert_same(other.step(move), venv.step(move))
+
+
 def test_bad_states_are_refused_and_change_nothing():
     venv = DQSpaceArmVectorEnv(3, DRAWN, "Disabled")
     env = DQSpaceArmEnv(DRAWN)
@@ -166,6 +180,8 @@ def test_bad_states_are_refused_and_change_nothing():
                 each.reset(options={"state": bad})
         with pytest.raises(ValueError, match="state holds the whole episode, it excludes nominal"):
             each.reset(options={"state": state, "nominal": True})
+        with pytest.raises(ValueError, match="state: x has shape"):
+            each.reset(options={"state": {**state, "x": state["x"][:2]}})
         assert_same(each.get_state(), state)
     for rows in ([3], [0, 0], [[True]], "x"):
         with pytest.raises(ValueError, match="rows: "):
