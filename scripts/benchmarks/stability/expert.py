@@ -11,6 +11,7 @@ import numpy as np
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.dynamics.vector_field import PoseCoordinates
+from dq_space_arm_env.scene import InitialState
 from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.solution import StopReason
@@ -62,7 +63,7 @@ def cases() -> Iterator[Case]:
 def _scene(**changes: Any) -> Scene:
     """A planar arm of two joints, and a maneuver of few stages."""
     planar = load_scene("planar")
-    start = {"joint_angles": [0.5, -1.2]}
+    start = InitialState(joint_angles=(0.5, -1.2))
     links = [link.model_dump() for link in planar.links[:2]]
     simulation = {"steps": _STEPS, "dt": 0.05}
     fields = {"links": links, "initial_state": start, "simulation": simulation, "name": _TWO_JOINTS}
