@@ -240,14 +240,14 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
             ValueError: If an option is wrong.
         """
         saved = saved_state(options or {})
-        if saved is not None:
+        if saved is None:
+            self._truncated = False
+        else:
             self.set_state(saved)
         super().reset(seed=seed)
         self._env.np_random = self.np_random
         _, info = self._env.reset(options=options)
-        if saved is None:
-            self._truncated = False
-        self._env.np_random = self.np_random
+        self._env.np_random = self.np_random  # not that of the state, if there is a seed
         observation = self._observe()
         return observation, self._judged(info, self._compare_goals(observation))
 

@@ -123,7 +123,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         self._all.setflags(write=False)
         self._masks = dict.fromkeys((f"_{key}" for key in _KEYS), self._all)
         self._over = _NONE  # rows whose episodes are over, to be reset by the next step or the caller
-        self._seen = self._envs.observe_states(self._envs.x) if disabled else None
+        self._seen = np.zeros(self.observation_space.shape or (), self.kernels.dtype) if disabled else None
         self._trails = None if render_mode is None else Trails(num_envs)
         self._renderer: Renderer | None = None
 
@@ -154,7 +154,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         Args:
             seed: Seed s for s, s + 1, ...; one seed per sub-environment; or None to keep the generators.
             options: As for `DQSpaceArmEnv.reset`, and "reset_mask"; "state" is what `get_state` gives, or
-                `DQSpaceArmEnv.get_state`, the same for all.
+                `DQSpaceArmEnv.get_state`, the same for all, generators included unless there is a seed.
 
         Returns:
             Observations, shape (num_envs, n_obs), the present ones where nothing is reset; and info.

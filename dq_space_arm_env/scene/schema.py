@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import Field, StrictStr, ValidationError, ValidationInfo, field_validator
 
 from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
 from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
 from dq_space_arm_env.scene.pose import Matrix3, Pose
@@ -198,8 +199,11 @@ class Scene(Model):
             SceneError: If a path leads nowhere, or the new scene is not valid; it lists every problem.
         """
         origin = f"scene {self.name!r}, changed"
+        if not isinstance(changes, Mapping | None):
+            raise SceneError(f"{origin}: {shortened(changes)}, should be a mapping from paths to new values")
         try:
-            return type(self).model_validate(merged(self, nested({**(changes or {}), **sections})))
+            named = [*(changes or {}).items(), *sections.items()]
+            return type(self).model_validate(merged(self, nested(named)))
         except ValidationError as error:
             raise SceneError(problem_list(origin, error)) from error
         except ChangeError as error:

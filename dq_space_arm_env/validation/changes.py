@@ -1,6 +1,6 @@
 """Changes of a model: a mapping changes what it names, anything else replaces what is there."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from dq_space_arm_env.common.shown_text import shortened
@@ -11,10 +11,14 @@ class ChangeError(ValueError):
     """A path that leads nowhere."""
 
 
-def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Turn paths, such as "links.0.mass", into mappings within mappings."""
+def nested(changes: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Turn paths, such as "links.0.mass", with their values into mappings within mappings.
+
+    Raises:
+        ChangeError: If two paths change the same.
+    """
     tree: dict[str, Any] = {}
-    for path, value in changes.items():
+    for path, value in changes:
         *parents, last = str(path).split(".")
         here = tree
         for key in parents:

@@ -84,7 +84,7 @@ def test_a_vector_environment_goes_on(name, mode):
 def test_reset_goes_on_with_a_state(kind):
     env, other = (gymnasium.make(kind, scene=DRAWN) for _ in range(2))
     env.reset(seed=3)
-    *_, (observation, _, _, _, info, _) = [(*env.step(action), 0) for action in actions((5, 12))]
+    *_, (observation, _, _, _, info) = [env.step(action) for action in actions((5, 12))]
     state = env.unwrapped.get_state()
     found, seen = other.reset(options={"state": state})
     assert_same(found, observation)

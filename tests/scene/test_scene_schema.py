@@ -243,6 +243,8 @@ def test_replace_takes_paths() -> None:
         ({"cost.pose.99": 4}, {}, r"cost\.pose has 8 entries"),
         ({"simulation": Simulation(), "simulation.dt": 1}, {}, "simulation is replaced as a whole"),
         ({"simulation.dt": 1}, {"simulation": {"dt": 2}}, r"simulation: is changed twice"),
+        ({"name": "x"}, {"name": "y"}, "name: is changed twice"),
+        ("links.0.mass", {}, "should be a mapping from paths to new values"),
         ({"base.mass.x": 4}, {}, r"base\.mass = "),
         ({"links.0.mass": float("nan")}, {}, r"links\[0\]\.mass = nan"),
         ({3: 4}, {}, "3: unknown key"),
