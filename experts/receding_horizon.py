@@ -27,7 +27,7 @@ from experts.ddp.shooting import ShootingWorkspace, line_search
 from experts.ddp.solution import Policy, Solution, StopReason
 from experts.guesses.guided import GuidedDDP
 from experts.problems.arm_problem import ArmProblem, WindowProblem, as_problem
-from experts.problems.shooting_problem import FloatArray, check_array, check_at_least
+from experts.problems.shooting_problem import FloatArray, check_array, check_at_least, stage_bounds
 
 WORTHWHILE = 1e-12
 """A smaller predicted reduction, relative to the plan's cost, is not tried: rounding would decide."""
@@ -50,21 +50,16 @@ class ManeuverPlan:
 
     @classmethod
     def make(cls, maneuver: ArmProblem, state: FloatArray, stage: int, known: Solution) -> Self:
-        """Plan from a state at a stage; the policy of a known solution of the whole maneuver is a guess.
+        """Plan from a state at a stage; the policy of a known solution from that stage on is a guess.
 
         Raises:
             RuntimeError: If the maneuver cannot be simulated or differentiated from this state.
         """
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
-        rest = replace(
-            known,
-            states=known.states[stage:],
-            controls=known.controls[stage:],
-            feedback_gains=known.feedback_gains[stage:],
-        )
+        problem.begin_at(stage)
         # At stage 0 the problem is the maneuver itself, which adds the tip's screw motion to the guesses.
-        solver = GuidedDDP(maneuver if stage == 0 else problem, library=[rest])
-        solution = solver.solve(state)
+        solver = GuidedDDP(maneuver if stage == 0 else problem, library=[known])
+        solution = solver.solve(state, parameters=problem.parameters.rows)
         emphasis = float(solution.metadata["emphasis"])
         exact = problem.has_second_order
         work = ShootingWorkspace(problem, second_order=exact, keep_values=True)
@@ -80,6 +75,17 @@ class ManeuverPlan:
             raise RuntimeError(f"there is no plan from the state at stage {stage}: {solution.message}")
         hessians = _convex_part(work.update.Vxx_all)
         return cls(stage, solution, solution.policy(), emphasis, work.update.Vx_all, hessians)
+
+
+def _from_stage(solution: Solution, stage: int) -> Solution:
+    """The rest of a maneuver."""
+    return replace(
+        solution,
+        states=solution.states[stage:],
+        controls=solution.controls[stage:],
+        feedback_gains=solution.feedback_gains[stage:],
+        parameters=solution.parameters[stage:],
+    )
 
 
 def _convex_part(matrices: FloatArray) -> FloatArray:
@@ -105,8 +111,8 @@ class RecedingHorizonExpert:
     the prediction.
 
     The call that begins an episode plans it first, which takes a fraction of a second; so does `reset` with a
-    state. Target and masses are those of the scene: where the environment draws them, pass
-    `env.unwrapped.episode_scene`.
+    state. What varies in the scene, such as the target, has its nominal value until `reset` or `inform` says
+    otherwise: `expert.reset(observation, parameters=env.unwrapped.parameters)`.
 
     Attributes:
         maneuver: The scene as a shooting problem of N stages.
@@ -135,39 +141,60 @@ class RecedingHorizonExpert:
         check_at_least("iterations", iterations, 0)
         self.maneuver = ArmProblem(scene)
         as_problem(self.maneuver)
-        if not np.isfinite(self.maneuver.control_upper).all():
-            unlimited = int(np.argmax(~np.isfinite(self.maneuver.control_upper)))
+        if not np.isfinite(self.maneuver.kernels.layout.control_limit).all():
+            unlimited = int(np.argmax(~np.isfinite(self.maneuver.kernels.layout.control_limit)))
             name = self.maneuver.kernels.layout.control.names[unlimited]
             raise ValueError(f"{name} has no finite limit, but actions are fractions of limits: give it one")
         self.horizon, self.iterations = horizon, iterations
         self.plan: ManeuverPlan | None = None
         self.control: FloatArray = np.zeros(self.maneuver.n_controls)
         self.fallbacks = self.dropouts = 0
-        self._next_stage = 0
+        self._next_stage, self._informed = 0, False
         self._nominal: Solution | None = None
         self._work: ShootingWorkspace | None = None
         self._model_state = np.zeros((1, self.maneuver.n_states))
         self._model_gradient = np.zeros((1, self.maneuver.n_tangent))
         self._model_hessian = np.zeros((1, self.maneuver.n_tangent, self.maneuver.n_tangent))
 
-    def reset(self, observation_or_state: ArrayLike | None = None) -> None:
+    def reset(
+        self, observation_or_state: ArrayLike | None = None, *, parameters: ArrayLike | None = None
+    ) -> None:
         """Begin an episode.
 
         Args:
             observation_or_state: Its start, shape (n_x + 1,) or (n_x,), to plan now; None plans in the next
                 call.
+            parameters: What varies in the scene, shape (n_p,), or a row for each stage and the end, (N + 1,
+                n_p), entries as in `kernels.parameters`; None for nominal ones.
 
         Raises:
-            ValueError: If it has another shape or is no state; the episode goes on then.
+            ValueError: If one has another shape, the parameters are not finite or the other is no state; the
+                episode goes on then.
             RuntimeError: If the maneuver cannot be simulated from there.
         """
-        start = None
+        rows, start = self.maneuver.parameters.checked(parameters).copy(), None
         if observation_or_state is not None:
             given = self._checked(observation_or_state)
-            start = self._state_of(given), self._stage_of(given, 0)
+            stage = self._stage_of(given, 0)
+            with self.maneuver.parameters.being(rows):
+                start = self._state_of(given, stage), stage
+        self.maneuver.parameters.set(rows)
         self.plan, self._work, self._next_stage, self.fallbacks, self.dropouts = None, None, 0, 0, 0
+        self._informed = False
         if start is not None:
             self._begin(*start)
+
+    def inform(self, parameters: ArrayLike) -> None:
+        """Take other parameters in mid-flight, a new target or mass; the next call plans the rest anew.
+
+        Args:
+            parameters: See `reset`.
+
+        Raises:
+            ValueError: If they have another shape or are not finite.
+        """
+        self.maneuver.parameters.set(parameters)
+        self._informed = True
 
     def __call__(self, observation_or_state: ArrayLike) -> FloatArray:
         """Choose an action.
@@ -188,7 +215,7 @@ class RecedingHorizonExpert:
         stage = self._stage_of(given, self._next_stage)
         begins = self.plan is None or stage < self._next_stage
         try:
-            state = self._state_of(given)
+            state = self._state_of(given, stage)
             dropped = False
         except MeasurementError:
             if begins:
@@ -196,6 +223,8 @@ class RecedingHorizonExpert:
             state, dropped = self._predicted(stage), True
         if begins:
             self._begin(state, stage)
+        elif self._informed:
+            self._plan_anew(state, stage)
         assert self.plan is not None
         work = self._window(self.plan, stage)
         with self.maneuver.emphasized(self.plan.emphasis):
@@ -207,7 +236,8 @@ class RecedingHorizonExpert:
             self.fallbacks += 1
         self.dropouts += dropped
         self._next_stage = stage + 1
-        return self.control / self.maneuver.control_upper
+        action: FloatArray = self.control / stage_bounds(self.maneuver)[1][stage]
+        return action
 
     def _checked(self, observation_or_state: ArrayLike) -> FloatArray:
         """Return an observation or a state, or raise for another shape; its numbers may be wrong."""
@@ -238,15 +268,16 @@ class RecedingHorizonExpert:
             )
         return stage
 
-    def _state_of(self, given: FloatArray) -> FloatArray:
-        """Return the state; raise MeasurementError where there is none."""
+    def _state_of(self, given: FloatArray, stage: int) -> FloatArray:
+        """Return the state at a stage; raise MeasurementError where there is none."""
         try:
             if len(given) == self.maneuver.n_states:
                 check_array("state", given, given.shape)
                 return self._of_unit_norm(given)
             check_array("observation", given, given.shape)
             with np.errstate(invalid="ignore", divide="ignore"):
-                state = self.maneuver.kernels.state_from_observation(given)
+                parameters = self.maneuver.parameters.rows[stage]
+                state = self.maneuver.kernels.state_from_observation(given, p=parameters)
             check_array("the state behind the observation", state, state.shape)
             return state
         except ValueError as error:
@@ -276,9 +307,18 @@ class RecedingHorizonExpert:
     def _begin(self, state: FloatArray, stage: int) -> None:
         """Plan an episode, with the policy of the nominal maneuver as a guess."""
         if self._nominal is None:
-            self._nominal = BoxDDP(self.maneuver).solve()
-        self.plan = ManeuverPlan.make(self.maneuver, state, stage, self._nominal)
+            with self.maneuver.parameters.being(None):
+                self._nominal = BoxDDP(self.maneuver).solve()
+        self.plan = ManeuverPlan.make(self.maneuver, state, stage, _from_stage(self._nominal, stage))
         self._work, self._next_stage, self.fallbacks, self.dropouts = None, stage, 0, 0
+        self._informed = False
+
+    def _plan_anew(self, state: FloatArray, stage: int) -> None:
+        """Plan the rest of the episode with other parameters; the present plan's policy is a guess."""
+        assert self.plan is not None
+        known = _from_stage(self.plan.solution, stage - self.plan.first_stage)
+        self.plan = ManeuverPlan.make(self.maneuver, state, stage, known)
+        self._work, self._informed = None, False
 
     def _window(self, plan: ManeuverPlan, stage: int) -> ShootingWorkspace:
         """Prepare the problem that starts at a stage.
@@ -289,6 +329,8 @@ class RecedingHorizonExpert:
         horizon = min(self.horizon, self.maneuver.horizon - stage)
         end = stage + horizon
         work = self._workspace(horizon, ends_early=end < self.maneuver.horizon)
+        assert isinstance(work.problem, WindowProblem)
+        work.problem.begin_at(stage)
         kept = 0
         if last is not None:
             kept = last.problem.horizon - 1

@@ -176,8 +176,8 @@ def backward_pass(
         _expand(derivatives, hessians, stage, work)
         _regularize(derivatives.luu[stage], mu, work)
         for i in range(n_controls):
-            work.room_below[i] = control_lower[i] - controls[stage, i]
-            work.room_above[i] = control_upper[i] - controls[stage, i]
+            work.room_below[i] = control_lower[stage, i] - controls[stage, i]
+            work.room_above[i] = control_upper[stage, i] - controls[stage, i]
         # work.k still holds k of the next stage: a close first guess.
         status, n_free = box_qp(
             work.Quu_regular, work.Qu[:n_controls], work.room_below, work.room_above, work.k, work.box

@@ -21,6 +21,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from experts.ddp.backward_pass import PASS_NOT_FINITE, PASS_NOT_POSITIVE_DEFINITE, PassResult
 from experts.ddp.multiple_shooting import MultipleShooting
@@ -35,6 +36,7 @@ from experts.problems.shooting_problem import (
     check_array,
     check_at_least,
     check_control_weights,
+    stage_bounds,
 )
 
 CONVERGED = "no step is predicted to reduce the cost"
@@ -99,6 +101,7 @@ class BoxDDP:
         callback: Callback | None = None,
         *,
         x_init: FloatArray | None = None,
+        parameters: ArrayLike | None = None,
     ) -> Solution:
         """Minimize the cost, starting from a guess of the controls, or of controls and states.
 
@@ -111,14 +114,19 @@ class BoxDDP:
             x_init: First guess of the states, shape (N + 1, n_x); the dynamics need not lead from one to the
                 next, nor need it begin at x0. The solve then begins by multiple shooting, see
                 `multiple_shooting`. None takes the rollout of the controls.
+            parameters: What varies in the problem, the same for all stages, shape (n_p,), or a row for each
+                stage and the end, (N + 1, n_p), entries as in `kernels.parameters`; None for nominal ones.
+                Nothing is compiled when they change.
 
         Returns:
             The best trajectory found, whatever the reason to stop; always a rollout of its controls from x0.
 
         Raises:
-            ValueError: If x0, u_init or x_init have the wrong shape, are not finite or out of bounds, an
-                input has no cost of its own, or states are given and the problem has no retraction.
+            ValueError: If x0, u_init, x_init or parameters have the wrong shape, are not finite or out of
+                bounds, an input has no cost of its own, or states are given and the problem has no
+                retraction.
         """
+        self.problem.parameters.set(parameters)
         initial_state, controls = self._check_start(x0, u_init)
         work, stop = self._work, None
         state = SolverState(Regularization(self.initial_regularization))
@@ -315,6 +323,7 @@ class BoxDDP:
             optimality=state.optimality,
             iterations=len(state.records),
             history=np.array(state.records, dtype=HISTORY_DTYPE),
+            parameters=self.problem.parameters.rows.copy(),
             problem=self.problem,
         )
 
@@ -330,19 +339,19 @@ class BoxDDP:
     def _check_start(self, x0: FloatArray | None, u_init: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         """Return the initial state and the first controls, or say what is wrong with them."""
         problem = self.problem
-        lower, upper = np.asarray(problem.control_lower), np.asarray(problem.control_upper)
+        lower, upper = stage_bounds(problem)
         state = np.asarray(problem.initial_state if x0 is None else x0, dtype=np.float64)
         check_array("x0", state, (problem.n_states,))
         shape = (problem.horizon, problem.n_controls)
         if u_init is None:
-            return state, np.broadcast_to(np.clip(0.0, lower, upper), shape)
+            return state, np.clip(0.0, lower, upper)
         controls = np.asarray(u_init, dtype=np.float64)
         check_array("u_init", controls, shape)
         outside = (controls < lower) | (controls > upper)
         if np.any(outside):
             k, i = (int(index[0]) for index in np.nonzero(outside))
             raise ValueError(
-                f"u_init[{k}, {i}] is {controls[k, i]}, outside [{lower[i]}, {upper[i]}], the bounds of "
-                f"input {i}; clip the guess to the bounds first"
+                f"u_init[{k}, {i}] is {controls[k, i]}, outside [{lower[k, i]}, {upper[k, i]}], the bounds "
+                f"of input {i}; clip the guess to the bounds first"
             )
         return state, controls

@@ -162,8 +162,8 @@ class MultipleShooting:
         horizon = len(self.gaps)
         self._initial_state[0], current.states[:], current.controls[:] = initial_state, states, controls
         self._run("difference", 1, current.states, self._initial_state, self.initial_gap)
-        steps = current.states, current.controls, self._time_step, self._landings, current.stage_costs
-        self._run("step_with_cost", horizon, *steps)
+        given = (current.states, *self.work.problem.parameters.inputs, current.controls, self._time_step)
+        self._run("step_with_cost", horizon, *given, self._landings, current.stage_costs)
         self._run("difference", horizon, current.states[1:], self._landings, self.gaps)
         end = current.states[-1:], *self.work.problem.terminal_inputs
         self._run("terminal_cost", 1, *end, current.terminal_cost)

@@ -31,6 +31,7 @@ class _Work(NamedTuple):
     control_columns: FloatArray  # controls of a stage, shape (n_u, LANES)
     end_state: FloatArray  # last state of a lane, shape (1, n_x)
     end_cost: FloatArray  # its terminal cost, shape (1,)
+    parameters: FloatArray  # of the stages, the same in every lane, shape (N, LANES, n_p)
 
 
 class _Kernels(NamedTuple):
@@ -39,7 +40,7 @@ class _Kernels(NamedTuple):
     difference: int  # `difference`; row 0 of its second buffer moves along with the stages
     difference_buffers: BufferTable  # reference state, states, deviations
     step: int  # `step_with_cost`; stage k has the rows from k LANES on
-    step_buffers: BufferTable  # states, controls, time step, states from stage 1 on, stage costs
+    step_buffers: BufferTable  # states, parameters, controls, time step, states from stage 1 on, costs
     terminal: int  # `terminal_cost`, of one row
     terminal_buffers: BufferTable  # last state, whatever else it reads, terminal cost
 
@@ -48,6 +49,7 @@ class ParallelRollouts:
     """Rolls out a control update with up to `LANES` step lengths at once."""
 
     def __init__(self, problem: ShootingProblem, time_step: FloatArray) -> None:
+        self._problem = problem
         horizon, n_x = problem.horizon, problem.n_states
         n_t, n_u = problem.n_tangent, problem.n_controls
         self._work = work = _Work(
@@ -61,7 +63,9 @@ class ParallelRollouts:
             control_columns=np.zeros((n_u, LANES)),
             end_state=np.zeros((1, n_x)),
             end_cost=np.zeros(1),
+            parameters=np.zeros((horizon, LANES, problem.parameters.rows.shape[1])),
         )
+        parameters = (work.parameters,) if problem.parameters.inputs else ()
         # Keeps the kernels' code and the arrays behind the tables alive.
         self._arrays = (time_step, *problem.terminal_inputs)
         self._code = difference, step, terminal = (
@@ -73,7 +77,9 @@ class ParallelRollouts:
             difference.address,
             buffer_table(work.reference, work.states, work.deviations),
             step.address,
-            buffer_table(work.states, work.controls, time_step, work.states[1:], work.stage_costs),
+            buffer_table(
+                work.states, *parameters, work.controls, time_step, work.states[1:], work.stage_costs
+            ),
             terminal.address,
             buffer_table(work.end_state, *problem.terminal_inputs, work.end_cost),
         )
@@ -90,6 +96,7 @@ class ParallelRollouts:
         alphas = np.zeros(LANES)
         alphas[: len(step_lengths)] = step_lengths
         states, controls = reference
+        self._work.parameters[:] = self._problem.parameters.rows[:-1, None]
         _roll_out(
             self._kernels,
             alphas,
@@ -177,5 +184,5 @@ def _apply_update(
         for lane in range(LANES):
             control = work.control_columns[i, lane]
             # A lane of NaN ends up in the box; its cost reveals it.
-            control = min(max(control, control_lower[i]), control_upper[i])
+            control = min(max(control, control_lower[stage, i]), control_upper[stage, i])
             work.controls[stage, lane, i] = control

@@ -6,7 +6,13 @@ import numpy as np
 
 from dq_space_arm_env.kernels.bound import buffer_table
 from experts.native.compilation import BufferTable, call_kernel, compiled, inlined
-from experts.problems.shooting_problem import RETRACTION_KERNEL_NAME, FloatArray, Kernel, ShootingProblem
+from experts.problems.shooting_problem import (
+    RETRACTION_KERNEL_NAME,
+    FloatArray,
+    Kernel,
+    ShootingProblem,
+    stage_bounds,
+)
 
 FINISHED = -1
 """Instead of a failing stage: every state and cost of the rollout is finite."""
@@ -75,7 +81,7 @@ def closed_loop_rollout(
                 control += gains[k, i, j] * deviations[k, j]
             if not np.isfinite(control):
                 return np.inf, k
-            controls[k, i] = min(max(control, control_lower[i]), control_upper[i])
+            controls[k, i] = min(max(control, control_lower[k, i]), control_upper[k, i])
         call_kernel(step, k, k + 1, step_buffers)
         if retract != NO_RETRACTION:
             call_kernel(retract, k, k + 1, retract_buffers)
@@ -131,14 +137,14 @@ class Trajectory:
         self.failing_stage = FINISHED
         self._deviations = np.zeros((problem.horizon, problem.n_tangent))
         self._time_step = np.array([problem.time_step])
-        self._bounds = (
-            np.array(problem.control_lower, dtype=np.float64),
-            np.array(problem.control_upper, dtype=np.float64),
-        )
-        self._step_buffers = buffer_table(
-            self.states, self.controls, self._time_step, self.states[1:], self.stage_costs
-        )
+        self._problem = problem
+        self._step_buffers = self._buffers_of_step(self.states[1:])
         self._terminal_buffers = buffer_table(self.states[-1:], *problem.terminal_inputs, self.terminal_cost)
+
+    def _buffers_of_step(self, landings: FloatArray) -> BufferTable:
+        """Buffers of a step that writes landings, shape (N, n_x)."""
+        given = (*self._problem.parameters.inputs, self.controls, self._time_step)
+        return buffer_table(self.states, *given, landings, self.stage_costs)
 
     def roll_out(self, kernels: Mapping[str, Kernel]) -> float:
         """Roll out the controls from the first state; return the total cost, inf if it is not finite."""
@@ -170,9 +176,7 @@ class Trajectory:
         step_buffers, retract, retract_buffers = self._step_buffers, NO_RETRACTION, buffer_table()
         if offsets is not None:
             landings = np.zeros_like(self.states[1:])
-            step_buffers = buffer_table(
-                self.states, self.controls, self._time_step, landings, self.stage_costs
-            )
+            step_buffers = self._buffers_of_step(landings)
             retract = kernels[RETRACTION_KERNEL_NAME].address
             retract_buffers = buffer_table(landings, offsets, self.states[1:])
         self.cost, self.failing_stage = closed_loop_rollout(
@@ -187,7 +191,7 @@ class Trajectory:
             reference[1],
             *policy,
             float(alpha),
-            *self._bounds,
+            *stage_bounds(self._problem),
             self.states,
             self.controls,
             self._deviations,

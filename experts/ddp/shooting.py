@@ -32,6 +32,7 @@ from experts.problems.shooting_problem import (
     SECOND_ORDER_KERNEL_NAMES,
     FloatArray,
     ShootingProblem,
+    stage_bounds,
 )
 
 BATCHED_KERNELS = ("linearize", "cost_derivatives", "lagrangian_hessian")
@@ -95,8 +96,6 @@ class ShootingWorkspace:
         self._time_step = np.array([problem.time_step])
         self._no_gaps = np.zeros((0, problem.n_tangent))
         self._pass_work = pass_workspace(problem.n_tangent, problem.n_controls)
-        self._lower = np.array(problem.control_lower, dtype=np.float64)
-        self._upper = np.array(problem.control_upper, dtype=np.float64)
         names = (*KERNEL_NAMES, *SECOND_ORDER_KERNEL_NAMES) if second_order else KERNEL_NAMES
         self._kernels = {name: problem.kernel(name, batched=name in BATCHED_KERNELS) for name in names}
         self._gauss_newton = gauss_newton_hessians(self.derivatives)
@@ -119,10 +118,10 @@ class ShootingWorkspace:
     @timed("derivatives")
     def differentiate(self) -> None:
         """Compute the derivatives along the current trajectory that Gauss-Newton needs."""
-        states, controls, d = self.current.states, self.current.controls, self.derivatives
-        horizon = self.problem.horizon
-        self._run("linearize", horizon, buffer_table(states, controls, self._time_step, d.A, d.B))
-        self._run("cost_derivatives", horizon, buffer_table(states, controls, d.lx, d.lu, d.lxx, d.luu))
+        states, d, horizon = self.current.states, self.derivatives, self.problem.horizon
+        given = (states, *self.problem.parameters.inputs, self.current.controls)
+        self._run("linearize", horizon, buffer_table(*given, self._time_step, d.A, d.B))
+        self._run("cost_derivatives", horizon, buffer_table(*given, d.lx, d.lu, d.lxx, d.luu))
         end = states[-1:], *self.problem.terminal_inputs
         self._run("terminal_cost_derivatives", 1, buffer_table(*end, d.terminal_lx, d.terminal_lxx))
         self._exact_is_current = False
@@ -132,10 +131,11 @@ class ShootingWorkspace:
         """Compute exact second derivatives along the current trajectory, unless they are current."""
         if self._exact_is_current:
             return
-        states, controls, exact = self.current.states, self.current.controls, self._exact
+        states, exact = self.current.states, self._exact
         find_costates(self.derivatives, self._costates)
-        buffers = (states, controls, self._costates, self._time_step, exact.xx, exact.ux, exact.uu)
-        self._run("lagrangian_hessian", self.problem.horizon, buffer_table(*buffers))
+        given = (states, *self.problem.parameters.inputs, self.current.controls, self._costates)
+        buffers = buffer_table(*given, self._time_step, exact.xx, exact.ux, exact.uu)
+        self._run("lagrangian_hessian", self.problem.horizon, buffers)
         end = states[-1:], *self.problem.terminal_inputs
         self._run("terminal_cost_hessian", 1, buffer_table(*end, exact.terminal_xx))
         self._exact_is_current = True
@@ -152,8 +152,7 @@ class ShootingWorkspace:
             self._exact if exact else self._gauss_newton,
             self._no_gaps if gaps is None else gaps,
             self.current.controls,
-            self._lower,
-            self._upper,
+            *stage_bounds(self.problem),
             float(mu),
             self._spare_update,
             self._pass_work,
@@ -192,7 +191,7 @@ class ShootingWorkspace:
     def try_steps(self, step_lengths: FloatArray) -> FloatArray:
         """Roll out up to `LANES` step lengths at once; return their costs, inf where not finite."""
         reference = self.current.states, self.current.controls
-        return self._parallel.run(step_lengths, reference, self.update, self._lower, self._upper)
+        return self._parallel.run(step_lengths, reference, self.update, *stage_bounds(self.problem))
 
     @timed("rollout")
     def choose(self, lane: int, cost: float) -> None:

@@ -20,7 +20,7 @@ from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.kernels.bound import address_of, buffer_table, one_row_call
 from experts.problems.arm_problem import as_problem
-from experts.problems.shooting_problem import FloatArray, ShootingProblem
+from experts.problems.shooting_problem import FloatArray, ShootingProblem, stage_bounds
 
 Policy = Callable[[FloatArray, int], FloatArray]
 
@@ -108,6 +108,7 @@ class Solution:
         optimality: Predicted reduction of an unregularized step, relative to the cost; inf where unknown.
         iterations: Number of iterations.
         history: One row per iteration, fields as in `IterationRecord`.
+        parameters: What varies, at every stage and the end, shape (N + 1, n_p).
         metadata: JSON values to be saved along, for example the resolved scene.
         problem: The problem solved; None after `load`.
     """
@@ -121,6 +122,7 @@ class Solution:
     optimality: float
     iterations: int
     history: NDArray[np.void]
+    parameters: FloatArray
     metadata: dict[str, Any] = field(default_factory=dict)
     problem: ShootingProblem | None = field(default=None, repr=False)
 
@@ -171,6 +173,7 @@ class Solution:
             controls=self.controls,
             feedback_gains=self.feedback_gains,
             history=self.history,
+            parameters=self.parameters,
             facts=np.array(json.dumps(facts)),
         )
         write_atomically(Path(path), content.getvalue())
@@ -190,6 +193,8 @@ class Solution:
         """
         where = os.fspath(path)
         arrays: dict[str, Any] = read_arrays(path, _ARRAYS)
+        if "parameters" not in arrays and np.ndim(arrays.get("states", ())) == 2:  # of a version without them
+            arrays["parameters"] = np.zeros((len(arrays["states"]), 0))
         missing = set(_ARRAYS) - set(arrays)
         if missing:
             raise ValueError(f"{where} is not a solution: it lacks {', '.join(sorted(missing))}")
@@ -206,7 +211,7 @@ class Solution:
         )
 
 
-_ARRAYS = ("states", "controls", "feedback_gains", "history", "facts")
+_ARRAYS = ("states", "controls", "feedback_gains", "history", "parameters", "facts")
 _FACTS: Mapping[str, tuple[Any, str]] = {
     "cost": (float | int, "a number"),
     "stop_reason": (str, "text"),
@@ -230,9 +235,12 @@ def _check(arrays: Mapping[str, NDArray[Any]], facts: Any, where: str) -> None:
         raise ValueError(
             f"{where}: facts: stop_reason is {shortened(facts['stop_reason'])}, it should be one of {reasons}"
         )
-    steps, axes = len(np.atleast_1d(arrays["controls"])), {"states": 2, "controls": 2, "feedback_gains": 3}
+    steps, axes = (
+        len(np.atleast_1d(arrays["controls"])),
+        {"states": 2, "controls": 2, "feedback_gains": 3, "parameters": 2},
+    )
     for name, count in axes.items():
-        array, rows = arrays[name], steps + (name == "states")
+        array, rows = arrays[name], steps + (name in ("states", "parameters"))
         if array.ndim != count or array.dtype.kind not in "iuf" or len(array) != rows:
             raise ValueError(
                 f"{where}: {name} has shape {array.shape} of {array.dtype}, it should have {count} axes of "
@@ -254,7 +262,8 @@ class FeedbackPolicy:
                 f"the problem needs gains {expected} and states ({horizon + 1}, {problem.n_states})"
             )
         self._solution = solution
-        self._lower, self._upper = problem.control_lower, problem.control_upper
+        with problem.parameters.being(solution.parameters):  # limits may be among them
+            self._lower, self._upper = stage_bounds(problem)
         self._difference = problem.kernel("difference")
         self._reference = np.zeros((1, problem.n_states))
         self._state = np.zeros((1, problem.n_states))
@@ -272,4 +281,4 @@ class FeedbackPolicy:
         self._find_deviation()
         control = self._solution.controls[k] + self._solution.feedback_gains[k] @ self._deviation[0]
         # Twice as fast as np.clip.
-        return np.asarray(np.minimum(np.maximum(control, self._lower), self._upper))
+        return np.asarray(np.minimum(np.maximum(control, self._lower[k]), self._upper[k]))

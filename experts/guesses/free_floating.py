@@ -41,14 +41,16 @@ class FreeFloatingArm:
     """Linear maps of a scene's robot.
 
     Attributes:
+        parameters: What varies in the scene, shape (n_p,).
         pose_entries: Those of the 8 numbers of the base's pose that a state stores.
         twist_entries: Those of the 6 numbers of the base's velocity that a state stores, n_b.
         momentum_entries: Those of the 6 numbers of the momentum that the base's velocity changes, n_b.
     """
 
-    def __init__(self, kernels: Kernels) -> None:
+    def __init__(self, kernels: Kernels, parameters: FloatArray | None = None) -> None:
         planar, entries = kernels.layout.planar, kernels.layout.state
         self.kernels = kernels
+        self.parameters = kernels.parameters.nominal if parameters is None else parameters
         self.pose_entries = list(PLANAR_POSE if planar else range(8))
         self.twist_entries = list(PLANAR_TWIST if planar else range(6))
         self.momentum_entries = list(_PLANAR_MOMENTUM if planar else range(6))
@@ -80,7 +82,7 @@ class FreeFloatingArm:
         moving = self.velocity_entries
         moved = np.repeat(states[:, None, :], len(moving), axis=1)
         moved[:, :, moving] = np.eye(len(moving))
-        momenta = self.kernels.momentum(moved.reshape(-1, states.shape[1]))
+        momenta = self.kernels.momentum(moved.reshape(-1, states.shape[1]), p=self.parameters)
         columns = momenta.reshape(len(states), len(moving), 6)[:, :, self.momentum_entries].transpose(0, 2, 1)
         n_base = len(self.twist_entries)
         return MomentumMap(columns[:, :, :n_base], columns[:, :, n_base:])
@@ -93,8 +95,9 @@ class FreeFloatingArm:
         if self.kernels.scene.tip_wrench is None:
             return np.zeros((len(states), len(self.momentum_entries)))
         still = np.zeros((len(states), self.kernels.n_u))
-        loaded = self.kernels.forward_dynamics(states, still)
-        added = loaded - self.kernels.forward_dynamics(states, still, np.zeros((len(states), 6)))
+        p, no_wrench = self.parameters, np.zeros((len(states), 6))
+        loaded = self.kernels.forward_dynamics(states, still, p=p)
+        added = loaded - self.kernels.forward_dynamics(states, still, no_wrench, p=p)
         by_velocity = np.concatenate(system, axis=2)
         load: FloatArray = by_velocity @ added[:, :, None]
         return load[:, :, 0]
@@ -110,7 +113,8 @@ class FreeFloatingArm:
         inputs = np.zeros((len(states), 1 + len(acting), self.kernels.n_u))
         inputs[:, range(1, 1 + len(acting)), acting] = 1.0
         repeated = np.repeat(states, 1 + len(acting), axis=0)
-        reached = self.kernels.forward_dynamics(repeated, inputs.reshape(len(repeated), -1))
+        forces = inputs.reshape(len(repeated), -1)
+        reached = self.kernels.forward_dynamics(repeated, forces, p=self.parameters)
         reached = reached.reshape(len(states), 1 + len(acting), -1)
         per_unit = reached[:, 1:] - reached[:, :1]
         missing = accelerations - reached[:, 0]

@@ -4,17 +4,20 @@ From zero controls a solve may end in a poor minimum, with joints wound up and t
 the controls of a maneuver solved for another start do little better, because their errors accumulate over the
 stages. The policy of a solved maneuver, u = u_k + K_k (x (-) x_k), rolled out from the new start, corrects
 itself: its trajectory lies in the valley of its own minimum. One good maneuver per scene is therefore enough,
-and worth some effort (`START_REGULARIZATIONS`).
+and worth some effort (`START_REGULARIZATIONS`). It serves other targets as well, as it is or moved along with
+the target: in empty space a maneuver may begin anywhere.
 
 Where a policy strays too far from its maneuver, kinematics provide a guess: one screw motion leads the tip to
 the target, and the arm follows (`screw_motion`).
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.rollout import FINISHED, Trajectory
@@ -23,7 +26,7 @@ from experts.ddp.solution import Callback, Solution, StopReason
 from experts.guesses.reaching import HasTolerances, reach
 from experts.guesses.screw_motion import ScrewMotion
 from experts.guesses.screw_motion import screw_motion as guess_screw_motion
-from experts.problems.arm_problem import ArmProblem
+from experts.problems.arm_problem import ArmProblem, WindowProblem
 from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array, check_at_least
 
 START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
@@ -129,13 +132,21 @@ class GuidedDDP:
             self._library = self._solve_initial_state()
         return tuple(self._library)
 
-    def solve(self, x0: FloatArray | None = None, callback: Callback | None = None) -> Solution:
+    def solve(
+        self,
+        x0: FloatArray | None = None,
+        callback: Callback | None = None,
+        *,
+        parameters: ArrayLike | None = None,
+    ) -> Solution:
         """Minimize the cost from a start.
 
         Args:
             x0: State at stage 0, shape (n_x,), units of the state; the problem's initial state if None.
             callback: Called with the record of every iteration from this start; it may raise
                 KeyboardInterrupt to end the solve.
+            parameters: What varies in the problem, shape (n_p,) or (N + 1, n_p), see `BoxDDP.solve`; None
+                for nominal ones.
 
         Returns:
             The best trajectory found; its cost is always the problem's own. `metadata["guess"]` names its
@@ -143,13 +154,17 @@ class GuidedDDP:
             and `metadata["attempts"]` lists guess, emphasis, cost, iterations and stop reason of each solve.
 
         Raises:
-            ValueError: If x0 has the wrong shape or is not finite, or an input has no cost of its own.
+            ValueError: If x0 or parameters have the wrong shape or are not finite, or an input has no cost of
+                its own.
             KeyboardInterrupt: If the user interrupts the preparation of the library.
         """
+        given = self.problem.parameters.checked(parameters)
+        library = self.library  # its preparation takes nominal parameters
+        self.problem.parameters.set(given)
         start = np.asarray(self.problem.initial_state if x0 is None else x0, dtype=np.float64)
         check_array("x0", start, (self.problem.n_states,))
         attempts: list[_Attempt] = []
-        for guess in self._guesses(start):
+        for guess in self._guesses(start, library):
             attempts.append(_Attempt(guess.name, self._solve_from(guess, start, callback)))
             if attempts[-1].solution.converged and not self._is_good(attempts[-1].solution):
                 attempts += self._reach(attempts[-1], start, callback)
@@ -184,16 +199,15 @@ class GuidedDDP:
             self._library.append(solution)
             self._vacancies -= 1
 
-    def _guesses(self, start: FloatArray) -> list[_Guess]:
+    def _guesses(self, start: FloatArray, library: Sequence[Solution]) -> list[_Guess]:
         """List the guesses to solve, cheapest rollout first; zero controls are the last resort."""
-        rollouts = [
-            _Guess(f"policy {i}", *follow(solution, self.problem, start), POLICY_REGULARIZATION)
-            for i, solution in enumerate(self.library)
-        ]
-        strayed = all(
-            guess.cost > STRAYED * solution.cost
-            for guess, solution in zip(rollouts, self.library, strict=True)
-        )
+        rollouts, strayed = [], True
+        for i, solution in enumerate(library):
+            known = {f"policy {i}": solution, f"policy {i}, moved": self._moved(solution)}
+            for name, policy in known.items():
+                if policy is not None:
+                    rollouts.append(_Guess(name, *follow(policy, self.problem, start), POLICY_REGULARIZATION))
+                    strayed = strayed and rollouts[-1].cost > STRAYED * solution.cost
         if strayed and self._kinematic_guess is not None:
             motion = self._kinematic_guess(start)
             rollouts.append(_Guess("screw motion", *track(self.problem, *motion), SCREW_REGULARIZATION))
@@ -204,9 +218,19 @@ class GuidedDDP:
         # The last of two or more attempts starts from zero controls.
         return [*ranked[: max(self.attempts - 1, 1)], zero][: self.attempts]
 
+    def _moved(self, solution: Solution) -> Solution | None:
+        """A solution moved rigidly from its target to the present one; None where they are the same."""
+        problem = self.problem
+        if not isinstance(problem, ArmProblem | WindowProblem) or not problem.parameters.inputs:
+            return None
+        if solution.parameters.shape != problem.parameters.rows.shape:
+            return None
+        states = problem.carried(solution.states, solution.parameters[-1])
+        return None if states is None else replace(solution, states=states)
+
     def _solve_from(self, guess: _Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
         self._solver.initial_regularization = guess.regularization
-        return self._solver.solve(start, guess.controls, callback)
+        return self._solver.solve(start, guess.controls, callback, parameters=self.problem.parameters.rows)
 
     def _is_good(self, solution: Solution) -> bool:
         """Whether a solution has converged, and ends within the tolerances if the problem has any."""
@@ -217,6 +241,7 @@ class GuidedDDP:
     def _solve_initial_state(self) -> list[Solution]:
         """Solve the problem's own initial state; no solution if every rollout diverges."""
         start = np.asarray(self.problem.initial_state, dtype=np.float64)
+        self.problem.parameters.set(None)
         solutions: list[Solution] = []
         for regularization in START_REGULARIZATIONS:
             solution = self._solve_from(_Guess("zero controls", None, np.inf, regularization), start)

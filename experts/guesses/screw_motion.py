@@ -20,7 +20,7 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses, screw
 from experts.guesses.free_floating import FreeFloatingArm, indices
 from experts.problems.arm_problem import ArmProblem
-from experts.problems.shooting_problem import FloatArray, check_array
+from experts.problems.shooting_problem import FloatArray, check_array, stage_bounds
 
 DURATION = 0.15
 """Default duration of the tip's path, as a share of the horizon: the cost rewards haste."""
@@ -74,18 +74,23 @@ def screw_motion(
     return motion.on_stages(motion.follow(start, tip_path(problem, start, end, times), times[1]))
 
 
+def free_floating_arm(problem: ArmProblem) -> FreeFloatingArm:
+    """The robot of a problem with its parameters at the start."""
+    return FreeFloatingArm(problem.kernels, problem.parameters.rows[0])
+
+
 def tip_path(problem: ArmProblem, start: FloatArray, duration: float, times: FloatArray) -> TipPath:
     """Lead the tip from its pose and velocity at the start to rest at the target.
 
     The pose is q_{G/I}(0) exp(d) exp(s w): w is the screw motion to the target, s rises from 0 to 1, and d
     starts with the tip's velocity, with the wrist at rest, and ends at 0; both with minimum jerk.
     """
-    arm, entries = FreeFloatingArm(problem.kernels), problem.kernels.layout.state
+    arm, entries = free_floating_arm(problem), problem.kernels.layout.state
     frames = problem.kernels.frame_poses(start[None])
     jacobian = arm.tip_jacobian(start[None], frames)
     drift = jacobian.base[0] @ start[entries.base_velocity] + jacobian.joints[0] @ start[entries.joint_rates]
     first = frames[0, -1]
-    way = screw.logarithm(dq.multiply(dq.conjugate(first), problem.scene.target.pose.dual_quaternion))
+    way = screw.logarithm(dq.multiply(dq.conjugate(first), tuple(problem.target.tolist())))
     t = np.minimum(times / duration, 1.0)
     rise, rise_rate = t**3 * (10.0 - 15.0 * t + 6.0 * t**2), 30.0 * (t * (1.0 - t)) ** 2 / duration
     fade = t * (1.0 - t) ** 3 * (1.0 + 3.0 * t) * duration
@@ -102,11 +107,11 @@ class _ArmMotion:
 
     def __init__(self, problem: ArmProblem) -> None:
         self.problem, self.kernels, self.layout = problem, problem.kernels, problem.kernels.layout
-        self.arm = FreeFloatingArm(problem.kernels)
+        self.arm = free_floating_arm(problem)
         n, wrist = self.layout.n_joints, self.layout.control.wrist_rate
         self._driven = [*self.layout.actuated_joints, *(n + i for i in range(wrist.stop - wrist.start))]
         self._limits = np.full(len(self._driven), np.inf)
-        self._limits[len(self.layout.actuated_joints) :] = problem.control_upper[wrist]
+        self._limits[len(self.layout.actuated_joints) :] = stage_bounds(problem)[1][:, wrist].min(axis=0)
 
     # The knots.
 
@@ -133,7 +138,11 @@ class _ArmMotion:
         Linear momentum is conserved: only thrusters could change it. A torque on the base, where there is
         one, removes angular momentum, which would turn the arm away from the target.
         """
-        momenta = np.repeat(self.kernels.momentum(start)[None, self.arm.momentum_entries], count, axis=0)
+        momenta = np.repeat(
+            self.kernels.momentum(start, p=self.arm.parameters)[None, self.arm.momentum_entries],
+            count,
+            axis=0,
+        )
         if indices(self.layout.control.base_torque):
             angular = [i for i, entry in enumerate(self.arm.momentum_entries) if entry >= 3]
             momenta[:, angular] *= np.linspace(1.0, 0.0, count)[:, None] ** 2

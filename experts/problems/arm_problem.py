@@ -8,16 +8,26 @@ from typing import Any
 import numpy as np
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
+from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
 from dq_space_arm_env.scene import INTEGRATORS
-from experts.problems.shooting_problem import FloatArray, Kernel, ShootingProblem, check_problem
+from dq_space_arm_env.scene.pose import PLANAR_POSE
+from experts.problems.shooting_problem import (
+    FloatArray,
+    Kernel,
+    ShootingProblem,
+    StageParameters,
+    check_problem,
+)
 
 
 class ArmProblem:
     """The maneuver of a scene in minimal coordinates, in double precision; implements `ShootingProblem`.
 
     Attributes:
-        terminal_inputs: Emphasis on the pose in the terminal cost, shape (1,); see `emphasized`.
+        parameters: What varies in the scene, as in `kernels.parameters`.
+        terminal_inputs: The last stage's parameters, if there are any, and the emphasis on the pose in the
+            terminal cost, shape (1,); see `emphasized`.
         has_second_order: Whether the registry of integrators names second derivatives for the scene's; the
             solver uses Gauss-Newton's model where there are none.
     """
@@ -32,11 +42,57 @@ class ArmProblem:
         self.n_states, self.n_tangent, self.n_controls = layout.n_x, layout.n_t, layout.n_u
         self.horizon = self.scene.simulation.steps
         self.time_step = self.scene.simulation.dt
-        self.control_lower: FloatArray = -layout.control_limit
-        self.control_upper: FloatArray = layout.control_limit
         self.initial_state: FloatArray = layout.initial_state
+        self.parameters = StageParameters(self.horizon, layout.parameters.nominal)
         self._emphasis: FloatArray = np.ones(1)
-        self.terminal_inputs: tuple[FloatArray, ...] = (self._emphasis,)
+        last = (rows[-1:] for rows in self.parameters.inputs)
+        self.terminal_inputs: tuple[FloatArray, ...] = (*last, self._emphasis)
+
+    @property
+    def control_upper(self) -> FloatArray:
+        """Limits of the inputs, shape (n_u,); (N, n_u) where a limit is a parameter."""
+        return self.limits(self.parameters)
+
+    @property
+    def control_lower(self) -> FloatArray:
+        """Lower bounds, the limits' negatives."""
+        return -self.control_upper
+
+    def limits(self, parameters: StageParameters) -> FloatArray:
+        """Limits of the inputs with given parameters of M stages, shape (n_u,) or (M, n_u)."""
+        layout = self.kernels.layout
+        if set(layout.control.limits).isdisjoint(layout.parameters.names):
+            return layout.control_limit
+        return layout.limits_with(parameters.rows[:-1])
+
+    @property
+    def target(self) -> FloatArray:
+        """Target q_{D/I} of the tip at the end, shape (8,)."""
+        return self.kernels.layout.target_with(self.parameters.rows[-1])
+
+    def carried(self, states: FloatArray, parameters: FloatArray) -> FloatArray | None:
+        """Move the states of a maneuver as the target has moved; None if it has not.
+
+        A rigid motion of base and target together leaves a maneuver what it is: nothing else is in space.
+
+        Args:
+            states: Shape (M, n_x).
+            parameters: Of the end of that maneuver, shape (n_p,).
+
+        Returns:
+            States that end at the present target where the others ended at theirs, shape (M, n_x).
+        """
+        layout = self.kernels.layout
+        before = layout.target_with(parameters)
+        if np.array_equal(before, self.target):
+            return None
+        stored, entries = list(PLANAR_POSE if layout.planar else range(8)), layout.state.pose
+        pose, moved = np.zeros((8, len(states))), states.copy()
+        pose[stored] = states[:, entries].T
+        # q_{D'/I} q_{D/I}* q_{e0/I}, with the new target D'
+        motion = dq.multiply(tuple(self.target.tolist()), dq.conjugate(tuple(before.tolist())))
+        moved[:, entries] = np.array(dq.multiply(motion, tuple(pose)))[stored].T
+        return moved
 
     @contextmanager
     def emphasized(self, emphasis: float) -> Iterator[None]:
@@ -56,7 +112,7 @@ class ArmProblem:
 
     def misses(self, state: FloatArray) -> float:
         """Larger of the tip's attitude and position error at a final state, relative to its tolerance."""
-        angle, distance = self.kernels.observation(state, [0.0])[1]
+        angle, distance = self.kernels.observation(state, [0.0], p=self.parameters.rows[-1])[1]
         success = self.scene.success
         return max(
             float(np.degrees(angle)) / success.attitude_error_deg, float(distance) / success.position_error
@@ -105,20 +161,37 @@ class WindowProblem:
 
     def __init__(self, maneuver: ArmProblem, horizon: int, model: tuple[FloatArray, ...] = ()) -> None:
         self.maneuver, self.horizon, self.ends_early = maneuver, horizon, bool(model)
+        self.parameters = StageParameters(horizon, maneuver.parameters.nominal)
         self.terminal_inputs = model or maneuver.terminal_inputs
         self.has_second_order = maneuver.has_second_order and not self.ends_early
         self.has_retraction = True
         self.n_states, self.n_tangent = maneuver.n_states, maneuver.n_tangent
         self.n_controls = maneuver.n_controls
         self.time_step = maneuver.time_step
-        self.control_lower: FloatArray = maneuver.control_lower
-        self.control_upper: FloatArray = maneuver.control_upper
         self.initial_state: FloatArray = maneuver.initial_state
+
+    @property
+    def control_upper(self) -> FloatArray:
+        """See `ArmProblem.control_upper`."""
+        return self.maneuver.limits(self.parameters)
+
+    @property
+    def control_lower(self) -> FloatArray:
+        """See `ArmProblem.control_lower`."""
+        return -self.control_upper
+
+    def begin_at(self, stage: int) -> None:
+        """Take the parameters of the maneuver's stages from a stage on."""
+        self.parameters.set(self.maneuver.parameters.rows[stage : stage + self.horizon + 1])
 
     def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return a kernel of `ShootingProblem`."""
         name = _QUADRATIC.get(name, name) if self.ends_early else name
         return self.maneuver.kernel(name, batched=batched)
+
+    def carried(self, states: FloatArray, parameters: FloatArray) -> FloatArray | None:
+        """See `ArmProblem.carried`."""
+        return self.maneuver.carried(states, parameters)
 
     def misses(self, state: FloatArray) -> float:
         """See `ArmProblem.misses`; 0 for a window after which the maneuver continues."""

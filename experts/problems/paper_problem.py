@@ -11,7 +11,7 @@ import numpy as np
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from experts.problems.arm_problem import in_double_precision
-from experts.problems.shooting_problem import FloatArray, Kernel
+from experts.problems.shooting_problem import FloatArray, Kernel, StageParameters
 
 
 class PaperProblem:
@@ -38,6 +38,7 @@ class PaperProblem:
         self.n_controls = layout.n_u
         self.horizon = self.scene.simulation.steps
         self.time_step = self.scene.simulation.dt
+        self.parameters = StageParameters(self.horizon)
         self.control_lower: FloatArray = -layout.control_limit
         self.control_upper: FloatArray = layout.control_limit
 

@@ -16,7 +16,10 @@ kernels. Every kernel works on rows (`experts.native.compilation`); its buffers,
 | `terminal_cost_hessian` | x (n_x); Lxx (n_t, n_t) |
 | `retract` | x (n_x), dx (n_t); x_next = x (+) dx (n_x) |
 
-The three kernels of the terminal cost read the arrays of `terminal_inputs`, a row each, after the state.
+What varies between solves, or from stage to stage, is an input as well: `step_with_cost`, `linearize`,
+`cost_derivatives` and `lagrangian_hessian` read the parameters of their stage, if the problem has any, right
+after the state. The three kernels of the terminal cost read the arrays of `terminal_inputs`, a row each,
+there.
 
 Output arrays of the derivative kernels start as zeros, and only the kernels write to them, so a kernel may
 skip entries that are always zero. The mixed derivative lux of the stage cost is taken to be zero.
@@ -28,10 +31,12 @@ u. `retract`, the inverse of `difference`, removes rounding errors from a pose; 
 states, and only problems with `has_retraction` need it.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 
@@ -47,6 +52,54 @@ KERNEL_NAMES = (
 SECOND_ORDER_KERNEL_NAMES = ("lagrangian_hessian", "terminal_cost_hessian")
 
 RETRACTION_KERNEL_NAME = "retract"
+
+
+class StageParameters:
+    """Parameters of the stages of a problem, as its kernels read them.
+
+    Attributes:
+        nominal: Values of a solve that is given none, shape (n_p,).
+        rows: Present values, shape (N + 1, n_p); the last row is that of the terminal cost.
+        inputs: The rows as an array to be read after the state; nothing for a problem without parameters.
+    """
+
+    def __init__(self, horizon: int, nominal: ArrayLike = ()) -> None:
+        self.nominal: FloatArray = np.array(nominal, dtype=np.float64)
+        self.rows: FloatArray = np.tile(self.nominal, (horizon + 1, 1))
+        self.inputs: tuple[FloatArray, ...] = (self.rows,) if self.nominal.size else ()
+
+    def checked(self, parameters: ArrayLike | None) -> FloatArray:
+        """Return parameters as rows, (N + 1, n_p).
+
+        Args:
+            parameters: The same for all stages, shape (n_p,), or one row per stage, (N + 1, n_p); None for
+                the nominal ones.
+
+        Raises:
+            ValueError: If they have another shape or are not finite.
+        """
+        given = self.nominal if parameters is None else np.asarray(parameters, dtype=np.float64)
+        if given.shape not in (self.nominal.shape, self.rows.shape):
+            raise ValueError(
+                f"parameters have shape {given.shape}; expected {self.nominal.shape}, or {self.rows.shape} "
+                "with a row for each stage"
+            )
+        check_array("parameters", given, given.shape)
+        return np.broadcast_to(given, self.rows.shape)
+
+    def set(self, parameters: ArrayLike | None) -> None:
+        """Change the present values; see `checked`."""
+        self.rows[:] = self.checked(parameters)
+
+    @contextmanager
+    def being(self, parameters: ArrayLike | None) -> Iterator[None]:
+        """Change the present values inside a `with` block; see `checked`."""
+        present = self.rows.copy()
+        self.set(parameters)
+        try:
+            yield
+        finally:
+            self.rows[:] = present
 
 
 class Kernel(Protocol):
@@ -81,12 +134,16 @@ class ShootingProblem(Protocol):
         """Duration of a stage, s."""
 
     @property
+    def parameters(self) -> StageParameters:
+        """What varies; `StageParameters(horizon)` if nothing does."""
+
+    @property
     def control_lower(self) -> FloatArray:
-        """Lower bounds of the inputs, -inf where there is none, shape (n_u,)."""
+        """Lower bounds of the inputs, -inf where there is none, shape (n_u,) or (N, n_u)."""
 
     @property
     def control_upper(self) -> FloatArray:
-        """Upper bounds of the inputs, +inf where there is none, shape (n_u,)."""
+        """Upper bounds of the inputs, +inf where there is none, shape (n_u,) or (N, n_u)."""
 
     @property
     def initial_state(self) -> FloatArray:
@@ -128,15 +185,24 @@ def check_problem(problem: ShootingProblem) -> None:
         raise ValueError(f"time_step is {problem.time_step}; it must be a positive number of seconds")
     for name in ("control_lower", "control_upper"):
         bound = np.asarray(getattr(problem, name))
-        if bound.shape != (problem.n_controls,):
+        if bound.shape not in ((problem.n_controls,), (problem.horizon, problem.n_controls)):
             raise ValueError(f"{name} has shape {bound.shape}; expected ({problem.n_controls},)")
-    crossed = ~(np.asarray(problem.control_lower) <= np.asarray(problem.control_upper))
-    if np.any(crossed):
-        i = int(np.argmax(crossed))
+    lower, upper = stage_bounds(problem)
+    crossed = np.argwhere(~(lower <= upper))
+    if len(crossed):
+        k, i = crossed[0]
         raise ValueError(
-            f"input {i} has bounds [{problem.control_lower[i]}, {problem.control_upper[i]}]; "
+            f"input {i} has bounds [{lower[k, i]}, {upper[k, i]}]; "
             "the lower one must not exceed the upper one"
         )
+
+
+def stage_bounds(problem: ShootingProblem) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper bounds of every stage, shape (N, n_u) each."""
+    shape = problem.horizon, problem.n_controls
+    bounds = (problem.control_lower, problem.control_upper)
+    lower, upper = (np.array(np.broadcast_to(bound, shape), dtype=np.float64) for bound in bounds)
+    return lower, upper
 
 
 def check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from experts.problems.shooting_problem import StageParameters
+
 Array = NDArray[np.float64]
 NATIVE_SIGNATURE = ctypes.CFUNCTYPE(
     None, ctypes.c_int64, ctypes.c_int64, ctypes.POINTER(ctypes.POINTER(ctypes.c_double))
@@ -64,6 +66,7 @@ class PythonProblem:
         return self.retract is not None
 
     def __post_init__(self) -> None:
+        self.parameters = StageParameters(self.horizon)
         x, t, u, one = (self.n_states,), (self.n_tangent,), (self.n_controls,), (1,)
         tt, tu, uu = t + t, t + u, u + u
 

@@ -97,6 +97,7 @@ def _solution() -> Solution:
         optimality=1e-9,
         iterations=2,
         history=np.zeros(2, dtype=HISTORY_DTYPE),
+        parameters=np.zeros((4, 0)),
         metadata={"scene": scene.model_dump(mode="json"), "emphasis": 1.0},
     )
 

@@ -9,7 +9,14 @@ import pytest
 
 import dq_space_arm_env  # noqa: F401 - registers the environment
 from dq_space_arm_env import load_scene
-from dq_space_arm_env.scene.start import draw_initial_state, episode_scene, number_of_draws, start_from_draws
+from dq_space_arm_env.scene.start import (
+    draw_initial_state,
+    episode_scene,
+    episode_start,
+    number_of_draws,
+    parameter_values,
+    start_from_draws,
+)
 from experts import BoxDDP, GuidedDDP, StopReason
 from experts.guesses.guided import START_REGULARIZATIONS, STRAYED, ZERO_REGULARIZATION, follow
 from experts.guesses.reaching import MOST_SOLVES
@@ -304,10 +311,11 @@ def test_success_is_what_the_environment_calls_so(paper):
 def test_a_library_serves_the_same_scene_with_another_target(seed):
     scene = load_scene("random-target")
     draws = np.random.default_rng(seed).uniform(-1.0, 1.0, number_of_draws(scene))
-    episode, start = episode_scene(scene, draws), start_from_draws(scene, draws)
+    start = start_from_draws(scene, draws)
+    p = parameter_values(scene, episode_start(scene, draws.tolist()))
     library = GuidedDDP(scene).library
-    solution = GuidedDDP(episode, library=library, screw_motion=False).solve(start)
-    alone = GuidedDDP(episode).solve(start)
+    solution = GuidedDDP(scene, library=library, screw_motion=False).solve(start, parameters=p)
+    alone = GuidedDDP(episode_scene(scene, p)).solve(start)
     assert solution.converged
     assert solution.metadata["guess"] == "policy 0"
     assert solution.cost <= 1.01 * alone.cost

@@ -47,6 +47,7 @@ class Spring:
             optimality=0.0,
             iterations=1,
             history=np.zeros(0),
+            parameters=np.zeros((2, 0)),
         )
 
 
