@@ -265,7 +265,7 @@ class _Work:
             progress=lambda done, total: announced(Advance("optimal costs", done, total)),
         )
         if name == RECEDING:
-            seconds = time_per_action(RecedingHorizon(known).policy, flown)
+            seconds = time_per_action(RecedingHorizon(known).policy(), flown)
         else:
             onboard = onboard_follower(known, feedback=name == FEEDBACK)
             seconds = time_per_action(onboard, flown, batched=False)

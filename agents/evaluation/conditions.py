@@ -4,8 +4,10 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 
+import numpy as np
+
 from dq_space_arm_env import Scene
-from dq_space_arm_env.environment.disturbances import with_masses
+from dq_space_arm_env.environment.disturbances import load_place
 
 WIDER = 1.5
 """Factor of the spread of starts."""
@@ -69,9 +71,12 @@ def _wide_starts(scene: Scene) -> Scene:
 
 def _with_load(factor: float) -> Callable[[Scene], Scene]:
     def change(scene: Scene) -> Scene:
-        if scene.payload is None and not scene.links:
+        place = load_place(scene)
+        if place is None:
             raise ValueError(f"scene {scene.name!r} has neither payload nor links: no load can be changed")
-        return with_masses(scene, factor)
+        load = scene.payload or scene.links[-1]
+        inertia = (factor * np.array(load.inertia)).tolist()
+        return scene.replace({f"{place}.mass": factor * load.mass, f"{place}.inertia": inertia})
 
     return change
 

@@ -5,6 +5,7 @@ states. Nobody tells them where the scene that they fly in differs.
 """
 
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 from time import perf_counter
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluation.plans import FloatArray, Plans
+from agents.evaluation.plans import FloatArray, Plans, drawn_parameters
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
 from dq_space_arm_env.scene import StateLayout
@@ -45,10 +46,11 @@ def plans_of(settings: Settings, result: ShardResult) -> tuple[Plans, FloatArray
     rows = arrays["index"] - problems.start
     states[rows], actions[rows] = arrays["states"], arrays["actions"]
     gains[rows] = arrays["feedback_gains"]
+    drawn = drawn_parameters(settings.scene, [settings.problem_seed(problem) for problem in problems])
     for row, start in zip(arrays["failures.index"] - problems.start, arrays["failures.start"], strict=True):
-        solution = expert_of(settings.scene).solver.solve(start)
+        solution = expert_of(settings.scene).solver.solve(start, parameters=drawn[row])
         states[row], actions[row], gains[row] = _parts(solution, layout)
-    return Plans(states, actions, gains, np.arange(len(problems))), np.array(result.solve_seconds)
+    return Plans(states, actions, gains, drawn, np.arange(len(problems))), np.array(result.solve_seconds)
 
 
 def _parts(solution: Solution, layout: StateLayout) -> tuple[FloatArray | float, ...]:
@@ -84,7 +86,6 @@ class RecedingHorizon:
     """The receding-horizon expert in B episodes: plans each from its start, and replans at every step.
 
     Attributes:
-        policy: The controller for `rollout`; it gives NaN in episodes that the expert cannot plan.
         planning_seconds: Mean time to plan a flight when the last episodes began, s.
     """
 
@@ -95,19 +96,27 @@ class RecedingHorizon:
             scene: The scene to plan in.
             horizon: Stages to look ahead.
         """
-        self.policy, self.planning_seconds = StateFeedback(self._act, self._begin), 0.0
-        self._scene, self._horizon = scene, horizon
+        self._scene, self._horizon, self.planning_seconds = scene, horizon, 0.0
         self._experts = [RecedingHorizonExpert(scene, horizon)]
         self._experts[0].reset(self._experts[0].maneuver.initial_state)
         self._lost: set[int] = set()
 
-    def _begin(self, environment: Any) -> None:
-        starts = environment.states
+    def policy(self, parameters: FloatArray | None = None) -> StateFeedback:
+        """Make the controller for `rollout`; it gives NaN in episodes that the expert cannot plan.
+
+        Args:
+            parameters: What varies in the scene to plan in, shape (B, n_p), units of the parameters; None for
+                nominal values.
+        """
+        return StateFeedback(self._act, lambda environment: self._begin(environment.states, parameters))
+
+    def _begin(self, starts: FloatArray, parameters: FloatArray | None) -> None:
         while len(self._experts) < len(starts):
             self._experts.append(RecedingHorizonExpert(self._scene, self._horizon))
         self._lost, began = set(), perf_counter()
         for index, start in enumerate(starts):
-            self._attempt(index, RecedingHorizonExpert.reset, start)
+            told = None if parameters is None else parameters[index]
+            self._attempt(index, partial(RecedingHorizonExpert.reset, parameters=told), start)
         self.planning_seconds = (perf_counter() - began) / len(starts)
 
     def _act(self, states: FloatArray, stage: int) -> FloatArray:

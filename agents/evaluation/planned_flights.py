@@ -28,6 +28,7 @@ from agents.evaluation.expert_costs import (
 )
 from agents.evaluation.kept_results import CachedGroups, Row
 from agents.evaluation.plan_followers import FEEDBACK, RECEDING, RecedingHorizon, follower, plans_of
+from agents.evaluation.plans import drawn_parameters
 from agents.policies.flying import Flights, FloatArray, fly
 from dq_space_arm_env import Scene
 from experts.demonstrations.executors import Executor
@@ -129,7 +130,8 @@ def fly_receding(
         assert controller is not None
         rows: list[Row] = []
         for seed in files.seeds(group):
-            flights = fly(controller.policy, flown, [seed])
+            told = drawn_parameters(settings.scene, [seed])
+            flights = fly(controller.policy(told), flown, [seed])
             rows += _rows([seed], flights, np.array([controller.planning_seconds]))
             done += 1
             progress(Advance(stage, done, total))

@@ -9,8 +9,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env import Kernels
-from experts.demonstrations.reading import Demonstration
+from dq_space_arm_env import DQSpaceArmVectorEnv, Kernels, Scene
+from dq_space_arm_env.scene import StateLayout
+from experts.demonstrations import Demonstrations
 
 FloatArray = NDArray[np.float64]
 
@@ -29,10 +30,11 @@ class Plans:
     states: FloatArray  # shape (M, N + 1, n_x), units of the state
     actions: FloatArray  # fractions of the limits, shape (M, N, n_u)
     gains: NDArray[np.float32]  # d action / d deviation in tangent coordinates, shape (M, N, n_u, n_t)
+    parameters: FloatArray  # what varied in the scene as it was planned in, shape (M, n_p)
     chosen: NDArray[np.int64]  # the plan of each flight, shape (B,)
 
     @classmethod
-    def of(cls, demonstrations: Sequence[Demonstration]) -> Self:
+    def of(cls, demonstrations: Demonstrations) -> Self:
         """Plans of demonstrations, one flight each, copied to memory."""
         shape = (len(demonstrations), *demonstrations[0].feedback_gains.shape)
         gains = np.empty(shape, dtype=np.float32)
@@ -41,7 +43,8 @@ class Plans:
             row[:] = each.feedback_gains
             states.append(each.states)
             actions.append(each.actions)
-        return cls(np.stack(states), np.stack(actions), gains, np.arange(len(gains)))
+        drawn = drawn_parameters(demonstrations.scene, demonstrations.column("seed").tolist())
+        return cls(np.stack(states), np.stack(actions), gains, drawn, np.arange(len(gains)))
 
     def choose(self, chosen: ArrayLike) -> Self:
         """The same plans for other flights: the number of the plan of each, in [0, M)."""
@@ -56,6 +59,11 @@ class Plans:
         """Initial states of the flights, shape (B, n_x), units of the state."""
         return np.asarray(self.states[self.chosen, 0])
 
+    @property
+    def known(self) -> FloatArray:
+        """What varies in each flight as its plan knows it, shape (B, n_p), units of the parameters."""
+        return np.asarray(self.parameters[self.chosen])
+
     def planned(self, stage: int) -> FloatArray:
         """Planned actions a_k of stage k, fractions of the limits, shape (B, n_u)."""
         return np.asarray(self.actions[self.chosen, stage])
@@ -65,3 +73,12 @@ class Plans:
         deviation = kernels.difference(self.states[self.chosen, stage], measured)
         feedback = (self.gains[self.chosen, stage] @ deviation[:, :, None])[:, :, 0]
         return Followed(np.clip(self.planned(stage) + feedback, -1.0, 1.0), deviation)
+
+
+def drawn_parameters(scene: Scene, seeds: Sequence[int]) -> FloatArray:
+    """What `env.reset(seed=seed)` draws besides the state, shape (B, n_p), units of the parameters."""
+    if not StateLayout.of(scene).n_p:
+        return np.zeros((len(seeds), 0))
+    environment = DQSpaceArmVectorEnv(len(seeds), scene)
+    environment.reset(seed=list(seeds))
+    return environment.parameters.astype(np.float64)

@@ -33,15 +33,16 @@ class CorrectionObserver:
         self._dt, self._steps = scene.simulation.dt, scene.simulation.steps
         self._share = min(1.0, self._dt / memory)
         self.average: FloatArray | None = None
+        self._parameters: FloatArray | None = None
 
     @staticmethod
     def size(kernels: Kernels) -> int:
         """Entries of an observation."""
         return kernels.n_x + 1 + 2 * kernels.n_t + kernels.n_u
 
-    def reset(self) -> None:
-        """Clear the average."""
-        self.average = None
+    def reset(self, parameters: FloatArray | None = None) -> None:
+        """Clear the average; what varies in the plans' scene, shape (B, n_p), is nominal unless given."""
+        self.average, self._parameters = None, parameters
 
     def authority(self) -> FloatArray:
         """Share of corrections that counts, in [0, 1], shape (B, 1): it grows with the averaged deviation."""
@@ -55,7 +56,7 @@ class CorrectionObserver:
             self.average = np.zeros_like(followed.deviation)
         self.average += self._share * (followed.deviation - self.average)
         time_left = np.full((len(measured), 1), (self._steps - stage) * self._dt)
-        seen = self._kernels.observation(measured, time_left)[0]
+        seen = self._kernels.observation(measured, time_left, p=self._parameters)[0]
         deviations = (np.arcsinh(each / SMALL) for each in (followed.deviation, self.average))
         parts = (seen, *deviations, followed.action)
         return np.concatenate(parts, axis=1).astype(np.float32)
@@ -120,7 +121,7 @@ def correcting(
             held = policy(seen)
         return corrected(followed.action, held, scale, observer.authority())
 
-    return StateFeedback(act, lambda environment: observer.reset())
+    return StateFeedback(act, lambda environment: observer.reset(plans.known))
 
 
 def corrected(

@@ -15,8 +15,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from agents.configuration.residual import Mismatch
 from agents.evaluation.plans import FloatArray, Followed, Plans
 from agents.residual.corrections import CorrectionObserver, corrected
-from dq_space_arm_env import Scene
-from dq_space_arm_env.environment.disturbances import Disturbances, MassMismatchVectorEnv
+from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
+from dq_space_arm_env.environment.disturbances import Disturbances, with_loads
 from experts.demonstrations import Demonstrations
 
 Info = dict[str, Any]
@@ -68,9 +68,9 @@ class ResidualVecEnv(VecEnv):
         Raises:
             ValueError: If the scene has no masses to change.
         """
-        factors = np.resize(np.array(mismatch.mass_factors), copies)
         # The corrected flights and, after them, their twins: one batch is faster.
-        self._worlds = MassMismatchVectorEnv(scene, np.tile(factors, 2).tolist())
+        self._factors = np.tile(np.resize(np.array(mismatch.mass_factors), copies), 2)
+        self._worlds = DQSpaceArmVectorEnv(2 * copies, with_loads(scene, self._factors)[0])
         self._plans, self._scene, self._mismatch = Plans.of(demonstrations), scene, mismatch
         self._scale, self._power = np.asarray(action_scale, dtype=np.float64), cost_power
         self._observer = CorrectionObserver(scene, memory, full_authority)
@@ -95,10 +95,12 @@ class ResidualVecEnv(VecEnv):
         self._plans = self._plans.choose(np.tile(chosen, 2))
         noise, push = self._rng.random((2, count))
         self._disturb(mismatch.noise * noise, mismatch.push * push)
-        self._worlds.reset(self._plans.starts)
+        _, parameters = with_loads(self._scene, self._factors, self._plans.known)
+        # What diverges restarts at the next step, in some other world, and is not counted.
+        self._worlds.reset(options={"initial_state": self._plans.starts, "parameters": parameters})
         self._stage, self._cost, self._returns = 0, np.zeros(2 * count), np.zeros(count)
         self._flying, self._success = np.ones(2 * count, dtype=np.bool_), np.zeros(2 * count, dtype=np.bool_)
-        self._observer.reset()
+        self._observer.reset(self._plans.known[:count])
         return self._observe()
 
     def _disturb(self, noise: FloatArray, push: FloatArray) -> None:
@@ -151,6 +153,7 @@ class ResidualVecEnv(VecEnv):
         self._cost, self._returns = state["cost"].copy(), state["returns"].copy()
         self._flying, self._success = state["flying"].copy(), state["success"].copy()
         self._uncorrected = state["uncorrected"].copy()
+        self._observer.reset(self._plans.known[: self.num_envs])
         self._observer.average = state["average"].copy()
 
     def _observe(self) -> NDArray[np.float32]:

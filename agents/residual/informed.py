@@ -1,6 +1,6 @@
 """Optimal costs of an expert that knows the true masses, and meets neither noise nor pushes.
 
-Solved in groups of starts, once for each mass, and cached: an interrupted computation resumes.
+Solved in groups of starts, in one scene for all masses, and cached: an interrupted computation resumes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from agents.evaluation.plan_followers import follower
 from agents.evaluation.planned_flights import agents_source
 from agents.evaluation.plans import FloatArray, Plans
 from dq_space_arm_env import Scene
-from dq_space_arm_env.environment.disturbances import with_masses
+from dq_space_arm_env.environment.disturbances import with_loads
 from dq_space_arm_env.environment.rollouts import rollout
 from experts import BoxDDP
 from experts.demonstrations import Demonstrations
@@ -46,11 +46,12 @@ def informed_costs(
     if mass_factor == 1.0:
         costs, count = demonstrations.column("cost").astype(np.float64), len(seeds)
         return OptimalCosts(seeds, costs, np.ones(count, dtype=np.bool_), np.full(count, np.nan))
-    changed = with_masses(scene, mass_factor)
+    changed, parameters = with_loads(scene, np.full(len(plans), mass_factor), plans.known)
     follows_from = {
         "plans": dict(demonstrations.settings),
         "seeds": seeds.tolist(),
-        "solved in": changed.content_hash(),
+        "solved in": scene.content_hash(),
+        "mass factor": mass_factor,
         "agents": agents_source(SOURCES),
     }
     columns = ("seed", "cost", "is_success", "seconds")
@@ -60,24 +61,27 @@ def informed_costs(
     solver = BoxDDP(problem) if files.missing else None
     for group in files.missing:
         assert solver is not None
-        few = plans.choose(plans.chosen[group * _GROUP : (group + 1) * _GROUP])
-        flown = rollout(
-            follower(scene, few, feedback=True),
-            scene,
-            starts=few.starts,
-            mass_factors=[mass_factor] * len(few),
-            record=True,
-        )
+        rows = slice(group * _GROUP, (group + 1) * _GROUP)
+        few = plans.choose(plans.chosen[rows])
+        following = follower(scene, few, feedback=True)
+        flown = rollout(following, changed, starts=few.starts, parameters=parameters[rows], record=True)
         assert flown.controls is not None
-        starts = zip(files.seeds(group), few.starts, flown.controls, strict=True)
+        starts = zip(files.seeds(group), few.starts, flown.controls, flown.parameters, strict=True)
         files.add(group, [_solved(problem, solver, *start) for start in starts])
         progress(len(files.rows), len(seeds))
     return OptimalCosts.of(files.rows)
 
 
-def _solved(problem: ArmProblem, solver: BoxDDP, seed: int, start: FloatArray, guess: FloatArray) -> Row:
+def _solved(
+    problem: ArmProblem,
+    solver: BoxDDP,
+    seed: int,
+    start: FloatArray,
+    guess: FloatArray,
+    parameters: FloatArray,
+) -> Row:
     began = perf_counter()
-    solution = solver.solve(x0=start, u_init=guess)
+    solution = solver.solve(x0=start, u_init=guess, parameters=parameters)
     return {
         "seed": seed,
         "cost": solution.cost if solution.converged else None,

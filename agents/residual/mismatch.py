@@ -12,7 +12,7 @@ from agents.configuration.residual import Mismatch
 from agents.evaluation.conditions import PAYLOAD_CHANGE
 from agents.evaluation.plans import Plans
 from dq_space_arm_env import Scene
-from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances
+from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances, with_loads
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
 
 NOISE = 0.01
@@ -85,11 +85,12 @@ def fly_mismatched(
     factors, noise, push = (np.broadcast_to(np.asarray(value, np.float64), (drawn,)) for value in worlds[:3])
     rng = np.random.default_rng([worlds.seed, 1])
     disturbances = _First(count, scene, rng, push=push, pushes=worlds.pushes, measurement=noise)
+    flown, parameters = with_loads(scene, factors[:count], plans.known)
     return rollout(
         controller,
-        scene,
+        flown,
         starts=plans.starts,
-        mass_factors=factors[:count].tolist(),
+        parameters=parameters,
         disturbances=disturbances,
         progress=progress,
     )

@@ -33,7 +33,6 @@ from agents.zoo.finding import PolicyError, policy_path
 from agents.zoo.shelf import file_hash
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.results import Destination
-from dq_space_arm_env.environment.disturbances import with_masses
 from dq_space_arm_env.environment.rollouts import StateFeedback
 from experts.demonstrations import Demonstrations, generate_demonstrations
 
@@ -126,7 +125,7 @@ def _controllers(
         controllers[name] = lambda plans, policy=policy: correction(policy, scene, plans)  # type: ignore[misc]
     if receding_starts:
         expert = RecedingHorizon(scene, horizon)
-        controllers[RECEDING] = lambda plans: expert.policy
+        controllers[RECEDING] = lambda plans: expert.policy(plans.known)
     return controllers
 
 
@@ -220,13 +219,12 @@ class _Work:
         policy: tuple[ExportedPolicy, Path] | None,
     ) -> Evaluation:
         """Fly a controller from the first starts, or read its finished row."""
-        flown_in = with_masses(self.scene, condition.mass_factor)
         seeds = self.demonstrations.column("seed")[:starts]
         content = {
             "controller": name,
             "policy": None if policy is None else file_hash(policy[1]),
             "condition": condition._asdict(),
-            "flown in": flown_in.content_hash(),
+            "scene": self.scene.content_hash(),
             "plans": dict(self.demonstrations.settings),  # tolerances, seeds, and the experts' code
             "starts": seeds.tolist(),
             "pushes": PUSHES,
@@ -245,7 +243,7 @@ class _Work:
             alone = fly_mismatched(controller(one), self.scene, one, worlds)
             evaluation = Evaluation(
                 policy=name,
-                scene=flown_in.name,
+                scene=self.scene.name,
                 condition=condition.name,
                 seeds=seeds,
                 flights=Flights.of(flown),

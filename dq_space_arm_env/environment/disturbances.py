@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
-from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.parameters import body_numbers, is_part
 
 FloatArray = NDArray[np.float64]
 
@@ -97,123 +94,48 @@ class Disturbances:
         return push
 
 
-class MassMismatchVectorEnv:
-    """B episodes of a scene whose masses differ from the scene's, one native vector environment per factor.
-
-    It has what `rollout` needs of a `DQSpaceArmVectorEnv`; episodes begin at given states.
-
-    Attributes:
-        scene: The nominal scene.
-        kernels: Its functions.
-        mass_factors: Factor of mass and inertia of the payload, or of the last link without one, shape (B,).
-    """
-
-    def __init__(self, scene: Scene, mass_factors: Sequence[float]) -> None:
-        self.scene, self.kernels = scene, compile_scene(scene)
-        self.mass_factors = np.array(mass_factors, dtype=np.float64)
-        self.num_envs = len(self.mass_factors)
-        if scene.payload is None and not scene.links and (self.mass_factors != 1.0).any():
-            raise ValueError(
-                f"scene {scene.name!r} has neither payload nor links: mass_factors should be 1 alone"
-            )
-        self._groups: list[tuple[DQSpaceArmVectorEnv, NDArray[np.int64]]] = []
-        for factor in np.unique(self.mass_factors):
-            rows, changed = np.flatnonzero(self.mass_factors == factor), with_masses(scene, float(factor))
-            environment = DQSpaceArmVectorEnv(len(rows), changed, autoreset_mode=AutoresetMode.NEXT_STEP)
-            self._groups.append((environment, rows))
-
-    @property
-    def states(self) -> FloatArray:
-        """The states, shape (B, n_x), units as in `kernels.layout.state`."""
-        return np.asarray(self._joined([environment.states for environment, _ in self._groups]))
-
-    @property
-    def targets(self) -> FloatArray:
-        """Poses q_{D/I} of the targets, shape (B, 8)."""
-        return np.asarray(self._joined([environment.targets for environment, _ in self._groups]))
-
-    def reset(self, starts: ArrayLike) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Begin episodes at given states, shape (B, n_x); returns observations and info."""
-        states = np.asarray(starts, dtype=np.float64)
-        results = [env.reset(options={"initial_state": states[rows]}) for env, rows in self._groups]
-        observations, infos = zip(*results, strict=True)
-        return self._joined(observations), _JoinedInfo(self._joined, infos)
-
-    def step(
-        self, actions: NDArray[Any]
-    ) -> tuple[NDArray[Any], FloatArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Apply actions, fractions of the limits, shape (B, n_u), for one time step."""
-        results = [environment.step(actions[rows]) for environment, rows in self._groups]
-        *arrays, infos = zip(*results, strict=True)
-        observations, rewards, terminated, truncated = (self._joined(parts) for parts in arrays)
-        return observations, rewards, terminated, truncated, _JoinedInfo(self._joined, infos)
-
-    def perturb(self, increments: FloatArray) -> None:
-        """Displace the states, see `DQSpaceArmVectorEnv.perturb`."""
-        for environment, rows in self._groups:
-            environment.perturb(increments[rows])
-
-    def observe(self, states: FloatArray) -> NDArray[Any]:
-        """Observations of given states, shape (B, n_x), at the present times."""
-        return self._joined([environment.observe(states[rows]) for environment, rows in self._groups])
-
-    def get_state(self) -> dict[str, NDArray[Any]]:
-        """Copy what all later steps depend on, see `DQSpaceArmVectorEnv.get_state`."""
-        return {
-            f"{place}.{name}": array
-            for place, (environment, _) in enumerate(self._groups)
-            for name, array in environment.get_state().items()
-        }
-
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Go on where `get_state` was called, see `DQSpaceArmVectorEnv.set_state`."""
-        for place, (environment, _) in enumerate(self._groups):
-            prefix = f"{place}."
-            part = {name.removeprefix(prefix): state[name] for name in state if name.startswith(prefix)}
-            environment.set_state(part)
-
-    def _joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        """Arrays of the groups in the order of the episodes."""
-        if len(parts) == 1:
-            return parts[0]
-        joined = np.empty((self.num_envs, *parts[0].shape[1:]), parts[0].dtype)
-        for part, (_, rows) in zip(parts, self._groups, strict=True):
-            joined[rows] = part
-        return joined
+def load_place(scene: Scene) -> str | None:
+    """Name the body whose mass differs: "payload", or the last link without one; None for a base alone."""
+    if scene.payload is not None:
+        return "payload"
+    return f"links.{len(scene.links) - 1}" if scene.links else None
 
 
-class _JoinedInfo(dict[str, Any]):
-    """Info of all groups; entries are joined when they are read, because training reads few."""
-
-    def __init__(
-        self, join: Callable[[Sequence[NDArray[Any]]], NDArray[Any]], infos: Sequence[dict[str, Any]]
-    ) -> None:
-        super().__init__()
-        self._join, self._infos = join, infos
-
-    def __missing__(self, key: str) -> NDArray[Any]:
-        self[key] = joined = self._join([info[key] for info in self._infos])
-        return joined
-
-
-def with_masses(scene: Scene, factor: float) -> Scene:
+def with_loads(
+    scene: Scene, factors: ArrayLike, parameters: ArrayLike | None = None
+) -> tuple[Scene, FloatArray]:
     """Multiply mass and inertia of the payload, or of the last link if there is no payload.
 
+    One compiled scene serves all factors: mass and inertia are among its parameters.
+
     Args:
-        scene: A scene with a payload or a link, unless the factor is 1.
-        factor: The factor, dimensionless.
+        scene: A scene with a payload or a link, unless all factors are 1.
+        factors: Factors of B episodes, shape (B,), dimensionless.
+        parameters: What else varies, shape (n_p,) or (B, n_p), units of the parameters; nominal values
+            by default.
 
     Returns:
-        The changed scene.
+        The scene to fly in, and the parameters of each episode in it, shape (B, n_p').
+
+    Raises:
+        ValueError: If there is no mass to multiply.
     """
-    if factor == 1.0:
-        return scene
-    if scene.payload is not None:
-        return scene.replace(payload=_scaled(scene.payload.model_dump(), factor))
-    links = [link.model_dump() for link in scene.links]
-    return scene.replace(links=[*links[:-1], _scaled(links[-1], factor)])
-
-
-def _scaled(body: dict[str, Any], factor: float) -> dict[str, Any]:
-    inertia = (factor * np.array(body["inertia"])).tolist()
-    return {**body, "mass": factor * body["mass"], "inertia": inertia}
+    factors, place = np.asarray(factors, dtype=np.float64), load_place(scene)
+    numbers = () if place is None else body_numbers(scene, place)
+    names = [
+        number.name
+        for number in numbers
+        if number.nominal and any(is_part(number.name, f"{place}.{part}") for part in ("mass", "inertia"))
+    ]
+    if not names and (factors != 1.0).any():
+        raise ValueError(
+            f"scene {scene.name!r} has neither payload nor links: mass_factors should be 1 alone"
+        )
+    flown, known = scene.replace(parameters=[*scene.parameters, *names]), StateLayout.of(scene).parameters
+    varying = StateLayout.of(flown).parameters
+    rows = np.tile(varying.nominal, (len(factors), 1))
+    rows[:, [varying.names.index(name) for name in known.names]] = (
+        known.nominal if parameters is None else parameters
+    )
+    rows[:, [varying.names.index(name) for name in names]] *= factors[:, None]
+    return flown, rows

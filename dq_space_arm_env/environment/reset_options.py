@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -161,8 +162,14 @@ def _checked_target(kernels: Kernels, target: Any) -> Array:
 def _checked_parameters(kernels: Kernels, parameters: Any) -> Array:
     """Parameters with which the scene is valid: a mass may not be negative."""
     values = _finite("parameters", parameters, kernels.n_p)
-    episode_scene(kernels.scene, values.tolist())
+    _check_values(kernels, tuple(values.tolist()))
     return values
+
+
+@lru_cache(maxsize=1024)
+def _check_values(kernels: Kernels, parameters: tuple[float, ...]) -> None:
+    """Raise SceneError for parameters that no scene may have; episodes often share theirs."""
+    episode_scene(kernels.scene, parameters)
 
 
 def _finite(name: str, value: Any, size: int) -> Array:

@@ -13,14 +13,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances, MassMismatchVectorEnv
+from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances
 from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.task.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Environment = DQSpaceArmVectorEnv | MassMismatchVectorEnv
 
 COST_TERMS = (
     "cost_pose",
@@ -50,7 +49,7 @@ class StateFeedback:
     """
 
     act: Callable[[FloatArray, int], ArrayLike]
-    begin: Callable[[Environment], object] = lambda environment: None
+    begin: Callable[[DQSpaceArmVectorEnv], object] = lambda environment: None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +59,7 @@ class Rollout:
     Attributes:
         scene: The scene.
         seeds: Of the episodes; None if they began at given states.
+        parameters: What varies, as drawn or given, shape (B, n_p), units of the parameters.
         targets: Poses q_{D/I}, shape (B, 8), dimensionless and m.
         rewards: Shape (B, N), dimensionless; zero after the end of an episode.
         cost_terms: Sums of the terms of the cost by their names in `info`, shape (B,) each, dimensionless.
@@ -81,6 +81,7 @@ class Rollout:
 
     scene: Scene
     seeds: tuple[int, ...] | None
+    parameters: FloatArray
     targets: FloatArray
     rewards: FloatArray
     cost_terms: dict[str, FloatArray]
@@ -135,7 +136,7 @@ def rollout(
     seeds: Sequence[int] | None = None,
     *,
     starts: ArrayLike | None = None,
-    mass_factors: Sequence[float] | None = None,
+    parameters: ArrayLike | None = None,
     disturbances: Disturbances | None = None,
     record: bool = False,
     steps: int | None = None,
@@ -149,8 +150,8 @@ def rollout(
         seeds: One per episode: they begin where `env.reset(seed=seed)` does.
         starts: States to begin at instead, shape (B, n_x), units of the state; with neither, one episode
             begins at the scene's nominal state.
-        mass_factors: Factors of mass and inertia of the payload, or of the last link without one, one per
-            start; the policy is not told.
+        parameters: What varies, shape (n_p,) or (B, n_p), units of the parameters, instead of what is drawn;
+            nominal with starts. The policy is not told.
         disturbances: Pushes and noise. The policy sees measured states or their observations.
         record: Whether to keep states, observations and controls.
         steps: Number of steps at most; the scene's by default.
@@ -164,7 +165,7 @@ def rollout(
     """
     if seeds is not None and starts is not None:
         raise ValueError("seeds and starts exclude each other")
-    environment, observation, info = _begin(scene, seeds, starts, mass_factors)
+    environment, observation, info = _begin(scene, seeds, starts, parameters)
     if (begin := getattr(policy, "begin", None)) is not None:
         begin(environment)
     log = _Log(environment, observation, info, steps or scene.simulation.steps, record)
@@ -192,21 +193,19 @@ def rollout(
 
 
 def _begin(
-    scene: Scene, seeds: Sequence[int] | None, starts: ArrayLike | None, mass_factors: Sequence[float] | None
-) -> tuple[Environment, NDArray[Any], dict[str, Any]]:
+    scene: Scene, seeds: Sequence[int] | None, starts: ArrayLike | None, parameters: ArrayLike | None
+) -> tuple[DQSpaceArmVectorEnv, NDArray[Any], dict[str, Any]]:
     """The environment at the start of the episodes, with its observations and info."""
-    if mass_factors is not None:
-        mismatched = MassMismatchVectorEnv(scene, mass_factors)
-        if starts is None:
-            raise ValueError("mass_factors need starts")
-        return mismatched, *mismatched.reset(starts)
-    if seeds is not None:
-        # What diverges restarts at the next step and flies along without being counted.
-        environment = DQSpaceArmVectorEnv(len(seeds), scene, autoreset_mode=AutoresetMode.NEXT_STEP)
-        return environment, *environment.reset(seed=[int(seed) for seed in seeds])
-    options = {"nominal": True} if starts is None else {"initial_state": np.asarray(starts)}
-    environment = DQSpaceArmVectorEnv(1 if starts is None else len(np.asarray(starts)), scene)
-    return environment, *environment.reset(seed=0, options=options)
+    options: dict[str, Any] = {} if parameters is None else {"parameters": np.asarray(parameters)}
+    if starts is not None:
+        options["initial_state"] = np.asarray(starts)
+    elif seeds is None:
+        options["nominal"] = True
+    drawn = [0] if seeds is None else [int(seed) for seed in seeds]
+    count = len(drawn) if starts is None else len(options["initial_state"])
+    # What diverges restarts at the next step and flies along without being counted.
+    environment = DQSpaceArmVectorEnv(count, scene, autoreset_mode=AutoresetMode.NEXT_STEP)
+    return environment, *environment.reset(seed=0 if seeds is None else drawn, options=options)
 
 
 class _Log:
@@ -214,7 +213,7 @@ class _Log:
 
     def __init__(
         self,
-        environment: Environment,
+        environment: DQSpaceArmVectorEnv,
         observation: NDArray[Any],
         info: dict[str, Any],
         steps: int,
@@ -223,6 +222,7 @@ class _Log:
         count, layout = environment.num_envs, environment.kernels.layout
         self._environment, self._layout, self.steps = environment, layout, steps
         self.state, self.targets = environment.states, environment.targets
+        self.parameters = environment.parameters
         self.initial_errors = np.stack([info["attitude_error"], info["position_error"]], axis=1)
         self.rewards, self.action_seconds = np.zeros((count, steps)), np.zeros(steps)
         self.cost_terms = {name: np.zeros(count) for name in COST_TERMS}
@@ -298,6 +298,7 @@ class _Log:
         return Rollout(
             scene=scene,
             seeds=None if seeds is None else tuple(int(seed) for seed in seeds),
+            parameters=self.parameters,
             targets=self.targets,
             rewards=self.rewards,
             cost_terms=self.cost_terms,

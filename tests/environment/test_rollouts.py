@@ -5,9 +5,9 @@ import pytest
 from short_scenes import short
 
 from dq_space_arm_env import DQSpaceArmEnv, compile_scene
-from dq_space_arm_env.environment.disturbances import Disturbances, MassMismatchVectorEnv, with_masses
+from dq_space_arm_env.environment.disturbances import Disturbances, with_loads
 from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
-from dq_space_arm_env.scene import InitialState, Spread
+from dq_space_arm_env.scene import InitialState, Spread, StateLayout
 from dq_space_arm_env.task.trajectory import Trajectory
 
 
@@ -138,17 +138,43 @@ def test_pushes_change_velocities_and_noise_only_what_is_measured(scene):
 def test_masses_differ_from_the_scene(scene):
     start = np.tile(compile_scene(scene).layout.initial_state, (3, 1))
     factors = [1.3, 1.0, 1.3]
-    flown = rollout(wave, scene, starts=start, mass_factors=factors)
-    alone = [rollout(wave, with_masses(scene, factor), starts=start[:1]).cost[0] for factor in factors]
-    np.testing.assert_allclose(flown.cost, alone, rtol=1e-12)
-    uniform = rollout(wave, scene, starts=start, mass_factors=[1.3] * 3)
-    np.testing.assert_allclose(uniform.cost, alone[0], rtol=1e-12)
-    assert with_masses(scene, 1.3).links[-1].mass == pytest.approx(1.3 * scene.links[-1].mass)
+    flown_in, parameters = with_loads(scene, factors)
+    flown = rollout(wave, flown_in, starts=start, parameters=parameters)
+    np.testing.assert_array_equal(flown.parameters, parameters)
+    last = len(scene.links) - 1
+    heavy = scene.replace(
+        {
+            f"links.{last}.mass": 1.3 * scene.links[last].mass,
+            f"links.{last}.inertia": (1.3 * np.array(scene.links[last].inertia)).tolist(),
+        }
+    )
+    alone = [rollout(wave, world, starts=start[:1]).cost[0] for world in (heavy, scene)]
+    assert alone[0] != pytest.approx(alone[1], rel=1e-6)
+    # Constants are rounded otherwise than inputs.
+    np.testing.assert_allclose(flown.cost, [alone[0], alone[1], alone[0]], rtol=1e-12)
+
+
+def test_other_masses_leave_what_else_varies():
+    """A payload's factor multiplies the mass that was drawn; the target stays the drawn one."""
+    scene = short("payload", 5).replace(spread={"target_position": 0.1, "payload_mass": 0.2})
+    drawn = rollout(lambda seen: np.zeros((len(seen), 9)), scene, [3, 4]).parameters
+    flown_in, parameters = with_loads(scene, [0.5, 1.0], drawn)
+    known, varying = (StateLayout.of(each).parameters for each in (scene, flown_in))
+    mass, inertia = varying.indices("payload.mass"), varying.indices("payload.inertia")
+    rest = varying.indices("target.pose")
+    np.testing.assert_array_equal(parameters[:, rest], drawn[:, known.indices("target.pose")])
+    np.testing.assert_array_equal(parameters[:, mass], drawn[:, known.indices("payload.mass")] * [[0.5], [1]])
+    np.testing.assert_array_equal(parameters[0, inertia], 0.5 * varying.nominal[inertia])
+    assert sorted([*rest, *mass, *inertia]) == list(range(len(varying.names)))
+
+
+def test_a_base_alone_has_no_mass_to_change(scene):
     bare = scene.replace(
         links=[], actuators={"joint_torque": None}, initial_state=InitialState(), spread=Spread()
     )
     with pytest.raises(ValueError, match="has neither payload nor links"):
-        MassMismatchVectorEnv(bare, [1.3])
+        with_loads(bare, [1.0, 1.3])
+    assert with_loads(bare, [1.0])[0] == bare
 
 
 def test_equal_generators_draw_equal_disturbances(scene):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dq_space_arm_env import Scene
-from dq_space_arm_env.environment.disturbances import Disturbances
+from dq_space_arm_env.environment.disturbances import Disturbances, with_loads
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
@@ -66,8 +66,11 @@ def fly(problem: ArmProblem, control: Control, world: World, seed: int) -> Rollo
     rng = np.random.default_rng(seed)
     found = Disturbances(scene, rng, push=world.push, pushes=PUSHES, evenly=True, measurement=world.noise)
     policy = StateFeedback(lambda states, stage: (control(states[0], stage) / limits)[None])
+    parameters = None
+    if world.mass_factor != 1.0:
+        scene, parameters = with_loads(scene, [world.mass_factor])
     starts = problem.initial_state[None]
-    return rollout(policy, scene, starts=starts, mass_factors=(world.mass_factor,), disturbances=found)
+    return rollout(policy, scene, starts=starts, parameters=parameters, disturbances=found)
 
 
 def cost_of(flight: Rollout) -> float:
