@@ -5,9 +5,10 @@ from functools import cached_property
 
 import numpy as np
 
-from dq_space_arm_env import Scene, compile_scene
+from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.viewing.replay.flights import frame_poses
 from experts.problems.shooting_problem import FloatArray
 
 _AT_LIMIT = 1.0 - 1e-9
@@ -42,7 +43,7 @@ class ActuatorHistory:
 
 @dataclass(frozen=True, eq=False)
 class Maneuver:
-    """A trajectory of a scene."""
+    """A trajectory of a scene; of an episode's scene, where target or masses are drawn. Compiles nothing."""
 
     scene: Scene
     states: FloatArray
@@ -56,7 +57,7 @@ class Maneuver:
     @cached_property
     def frames(self) -> FloatArray:
         """Poses of base, joint frames, wrist frame (if any) and tip, shape (N + 1, frames, 8), m."""
-        return compile_scene(self.scene).frame_poses(self.states)
+        return frame_poses(self.scene, StateLayout.of(self.scene), self.states)
 
     @cached_property
     def error_pose(self) -> FloatArray:

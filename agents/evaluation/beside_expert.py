@@ -11,9 +11,10 @@ import numpy as np
 
 from agents.policies.flying import time_per_action
 from agents.zoo.finding import ActingPolicy, check_fit
-from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
+from dq_space_arm_env import Scene
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.environment.rollouts import rollout
+from dq_space_arm_env.scene.start import episode_scene
 from experts.guesses.guided import GuidedDDP
 from experts.maneuver import Maneuver
 from experts.problems.arm_problem import ArmProblem
@@ -74,15 +75,9 @@ class SideBySide:
 def fly_beside_expert(policy: ActingPolicy, scene: Scene, seeds: list[int | None]) -> list[SideBySide]:
     """Fly an agent, and solve from the same starts; None is the nominal start.
 
-    Raises PolicyError if the policy does not fit the scene, and ValueError if the scene draws a target or
-    masses, or the policy gives NaN.
+    Raises PolicyError if the policy does not fit the scene, and ValueError if the policy gives NaN.
     """
     check_fit(policy, scene)
-    if DQSpaceArmVectorEnv(1, scene).parameters.size:
-        raise ValueError(
-            f"scene {scene.name!r} draws more than the start for each episode; the expert would have to be "
-            "compiled for each: take a scene whose spread has no target, masses or inertias"
-        )
     problem = ArmProblem(scene)
     solver = GuidedDDP(problem)
     action_seconds = time_per_action(policy.act_once, scene, batched=policy.batched)
@@ -91,13 +86,14 @@ def fly_beside_expert(policy: ActingPolicy, scene: Scene, seeds: list[int | None
         flown = rollout(policy.act, scene, None if seed is None else [seed], record=True)
         if flown.policy_failed[0]:
             raise ValueError(f"{policy.label} gives NaN in place of an action")
-        path = flown.trajectory()
-        maneuver = Maneuver(scene, path.states, path.controls)
+        path, parameters = flown.trajectory(), flown.parameters[0]
+        flown_in = episode_scene(scene, parameters.tolist())
+        maneuver = Maneuver(flown_in, path.states, path.controls)
         agent = Side(policy.label, maneuver, path.cost, path.is_success, action_seconds)
         started = perf_counter()
-        solution = solver.solve(path.states[0])
+        solution = solver.solve(path.states[0], parameters=parameters)
         seconds = perf_counter() - started
-        maneuver = Maneuver(scene, solution.states, solution.controls)
+        maneuver = Maneuver(flown_in, solution.states, solution.controls)
         success = problem.is_success(solution.states[-1])
         expert = Side("expert", maneuver, solution.cost, success, seconds)
         pairs.append(SideBySide(seed, agent, expert, solution.converged))

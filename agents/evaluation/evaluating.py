@@ -203,8 +203,7 @@ def evaluate(
         SceneError: If the scene cannot be loaded.
         PolicyError, PolicyFileError: If the policy is of no known kind, does not fit the scene, or cannot be
             read.
-        ValueError: If an argument is out of range; if the expert is asked for in a scene that draws targets
-            or masses, which it cannot solve in bulk; if the policy's actions do not fit the scene.
+        ValueError: If an argument is out of range, or the policy's actions do not fit the scene.
     """
     acting, given = as_policy(policy, label, trust=trust), load_scene(scene)
     flown = scene_under(given, condition)

@@ -15,6 +15,7 @@ from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.environment.disturbances import Disturbances
 from dq_space_arm_env.environment.rollouts import Policy, StateFeedback, rollout
 from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.task.trajectory import Trajectory
 
 FILES = (".npy", ".json", ".npz")  # that a state is read from
@@ -22,7 +23,6 @@ _NOISE = 1  # stream of random numbers that belongs to a seed
 OWN = "the scene's own"
 _UNREADABLE = (TypeError, ValueError, KeyError, IndexError, OverflowError)
 """What reading numbers from a text or a file raises."""
-_PARTS_OF_SCENE = ("target", "base_mass", "base_inertia", "link_", "payload")
 
 
 class Pilot(NamedTuple):
@@ -36,8 +36,14 @@ class Start(NamedTuple):
     """The beginning of an episode."""
 
     state: NDArray[np.float64]  # shape (n_x,), units of the state
-    scene: Scene  # with the target and the masses of this episode, where they are drawn
+    scene: Scene
+    parameters: NDArray[np.float64]  # what varies in the scene, such as a drawn target, shape (n_p,)
     title: str  # for tables
+
+    @property
+    def episode_scene(self) -> Scene:
+        """The scene with the parameters of this episode as constants."""
+        return episode_scene(self.scene, self.parameters.tolist()) if self.parameters.size else self.scene
 
 
 def begin(scene: Scene, seed: int | None = None, given: str | NDArray[np.float64] | None = None) -> Start:
@@ -47,25 +53,19 @@ def begin(scene: Scene, seed: int | None = None, given: str | NDArray[np.float64
     """
     if seed is not None and given is not None:
         raise ValueError("--seed and --start exclude each other: a start is drawn, or given")
-    # Masses, inertias and targets, unlike states, are part of the scene that an expert solves.
-    draws_scene = any(
-        width for name, width in scene.spread.model_dump().items() if name.startswith(_PARTS_OF_SCENE)
-    )
-    if seed is None and given is None and not draws_scene:
-        return Start(np.array(StateLayout.of(scene).initial_state), scene, OWN)
+    if seed is None and given is None:
+        layout = StateLayout.of(scene)
+        return Start(np.array(layout.initial_state), scene, np.array(layout.parameters.nominal), OWN)
     env = DQSpaceArmEnv(scene)
     if seed is not None:
         env.reset(seed=seed)
         title = f"drawn with seed {seed}"
-    elif given is not None:
+    else:
         state = read_state(given, env.kernels.n_x) if isinstance(given, str) else given
         env.reset(options={"initial_state": state})
         title = "given"
-    else:
-        env.reset(options={"nominal": True})
-        title = OWN
-    # Where nothing of the scene is drawn, the scene itself: its machine code is in the cache.
-    return Start(np.asarray(env.state, dtype=np.float64), env.episode_scene if draws_scene else scene, title)
+    state, parameters = (np.asarray(each, dtype=np.float64) for each in (env.state, env.parameters))
+    return Start(state, scene, parameters, title)
 
 
 def fly(

@@ -42,7 +42,7 @@ def load_policy(policy: str, start: Start, console: Console, seed: int | None, t
         from experts import RecedingHorizonExpert
 
         expert = RecedingHorizonExpert(start.scene)
-        expert.reset(start.state)
+        expert.reset(start.state, parameters=start.parameters)
         return Pilot("receding horizon", StateFeedback(lambda states, step: expert(states[0])[None]))
     if name == "plan":
         actions = layout.to_action(_plan(start, console).controls)
@@ -60,7 +60,8 @@ def _plan(start: Start, console: Console) -> Solution:
     from experts.report import SolveProgress
 
     with SolveProgress(console) as progress:
-        return GuidedDDP(start.scene).solve(start.state, callback=progress.update)
+        solver = GuidedDDP(start.scene)
+        return solver.solve(start.state, callback=progress.update, parameters=start.parameters)
 
 
 def _read(path: Path, scene: Scene) -> Solution:

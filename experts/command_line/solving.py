@@ -47,7 +47,7 @@ class SolveRun:
         """Attitude error [deg] and position error [m] at the end; inf where the motion has diverged."""
         if not math.isfinite(self.solution.cost):
             return math.inf, math.inf
-        maneuver = Maneuver(self.start.scene, self.solution.states[-1:], self.solution.controls[-1:])
+        maneuver = Maneuver(self.start.episode_scene, self.solution.states[-1:], self.solution.controls[-1:])
         return math.degrees(maneuver.angle[-1]), float(maneuver.distance[-1])
 
     @property
@@ -84,18 +84,18 @@ def solve(
     began = perf_counter()
     with SolveProgress(console) as progress:
         begun = begin(scene, seed, start)
-        solver: BoxDDP | GuidedDDP = (
-            GuidedDDP(begun.scene, **limits) if guided else BoxDDP(begun.scene, **limits)
-        )
+        solver: BoxDDP | GuidedDDP = GuidedDDP(scene, **limits) if guided else BoxDDP(scene, **limits)
         before = None
         if isinstance(solver, GuidedDDP):
             # Solve the library now, to time this solve alone.
             before = sum(known.iterations for known in solver.library)
         prepared = perf_counter()
         progress.start()
-        solution = solver.solve(begun.state, callback=progress.update)
+        solution = solver.solve(begun.state, callback=progress.update, parameters=begun.parameters)
     solved = perf_counter()
-    solution.metadata |= {"scene": begun.scene.model_dump(mode="json"), "start": begun.title}
+    # The files are of the episode's scene, where what was drawn is constant.
+    solution.parameters = solution.parameters[:, :0]
+    solution.metadata |= {"scene": begun.episode_scene.model_dump(mode="json"), "start": begun.title}
     name = type(solver).__name__
     return SolveRun(scene, begun, name, solution, prepared - began, before, solved - prepared)
 
@@ -105,12 +105,12 @@ def save(run: SolveRun, folder: Path, *, figures: bool) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / name for name in ("solution.npz", "scene.yaml", "summary.json")]
     run.solution.save(files[0])
-    write_atomically(files[1], run.start.scene.to_yaml())
+    write_atomically(files[1], run.start.episode_scene.to_yaml())
     write_atomically(files[2], to_json({**record(run), **provenance()}))
     if figures and math.isfinite(run.solution.cost):
         from experts.figures import write_figures
 
-        maneuver = Maneuver(run.start.scene, run.solution.states, run.solution.controls)
+        maneuver = Maneuver(run.start.episode_scene, run.solution.states, run.solution.controls)
         files += write_figures(maneuver, folder)
     return files
 

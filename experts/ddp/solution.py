@@ -262,7 +262,8 @@ class FeedbackPolicy:
                 f"the problem needs gains {expected} and states ({horizon + 1}, {problem.n_states})"
             )
         self._solution = solution
-        with problem.parameters.being(solution.parameters):  # limits may be among them
+        # Limits may be among the parameters; without any, the solution was made with constants.
+        with problem.parameters.being(solution.parameters if solution.parameters.size else None):
             self._lower, self._upper = stage_bounds(problem)
         self._difference = problem.kernel("difference")
         self._reference = np.zeros((1, problem.n_states))

@@ -14,14 +14,13 @@ from dq_space_arm_env.scene import Scene
 from experts.ddp.solution import StopReason
 from experts.guesses.guided import GuidedDDP
 from experts.maneuver import Maneuver
-from experts.problems.shooting_problem import FloatArray
 from experts.report.effort import Announce, Effort
 
 _QUANTILES = {"least": 0.0, "median": 0.5, "90 %": 0.9, "most": 1.0}
 
 
 def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[Row]]:
-    """Solve from the starts of `env.reset(seed=)`; target and masses are the scene's."""
+    """Solve the episodes of `env.reset(seed=)`."""
     announce("the scene's own start", 0, effort.starts + 1)
     expert = GuidedDDP(scene, max_iterations=effort.max_iterations)
     _ = expert.library  # solved now, so that it does not count as time of the first start
@@ -31,16 +30,17 @@ def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[
     for seed in range(effort.starts if any(scene.spread.model_dump().values()) else 1):
         announce(f"start {seed}", seed + 1, effort.starts + 1)
         env.reset(seed=seed)
-        rows.append(_solve(scene, expert, np.asarray(env.state, dtype=np.float64), seed))
+        rows.append(_solve(expert, env, seed))
     return {"starts": rows}
 
 
-def _solve(scene: Scene, expert: GuidedDDP, start: FloatArray, seed: int) -> Row:
+def _solve(expert: GuidedDDP, env: DQSpaceArmEnv, seed: int) -> Row:
     began = perf_counter()
-    solution = expert.solve(start)
+    solution = expert.solve(np.asarray(env.state, dtype=np.float64), parameters=env.parameters)
     seconds = perf_counter() - began
     if solution.stop_reason is StopReason.INTERRUPTED:
         raise KeyboardInterrupt
+    scene = env.episode_scene
     end = Maneuver(scene, solution.states[-1:], solution.controls[-1:])
     angle, distance = float(np.degrees(end.angle[-1])), float(end.distance[-1])
     attempts = solution.metadata.get("attempts", ())

@@ -167,5 +167,41 @@ def test_a_start_is_that_of_the_environment_with_its_drawn_target(scene: Scene) 
     scene = load_scene("random-target")
     env = DQSpaceArmEnv(scene)
     env.reset(seed=1)
-    assert begin(scene, 1).scene == env.episode_scene
+    begun = begin(scene, 1)
+    assert (begun.scene, begun.episode_scene) == (scene, env.episode_scene)
+    assert begun.parameters.tolist() == env.parameters.tolist()
     assert env.episode_scene.target != scene.target
+
+
+def test_drawn_targets_and_masses_are_compiled_once(
+    scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawing = scene.replace(spread={"target_position": 0.05, "link_masses": 0.2})
+    file, folder = tmp_path / "drawing.yaml", tmp_path / "solved"
+    drawing.to_yaml(file)
+
+    def solved_and_flown(seed: int) -> float:
+        drawn = ["--seed", str(seed), "--json"]
+        main(["solve", str(file), *drawn, "--out", str(folder)])
+        cost: float = documents(capsys)["cost"]
+        for policy in ("plan", "gains", "receding", str(folder / "solution.npz")):
+            main(["simulate", str(file), *drawn, "--policy", policy])
+            assert documents(capsys)["cost"] == pytest.approx(cost, rel=1e-6)
+        return cost
+
+    solved_and_flown(1)
+
+    def refuse(*arguments: object) -> None:
+        raise AssertionError("compiled again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("dq_space_arm_env.compiler.build.build_program", refuse)
+        cost = solved_and_flown(3)
+    # The files are of the episode's scene, and show its target.
+    env = DQSpaceArmEnv(drawing)
+    env.reset(seed=3)
+    assert load_scene(folder / "scene.yaml") == env.episode_scene
+    solution = str(folder / "solution.npz")
+    assert Trajectory.load(solution).scene == env.episode_scene
+    main(["simulate", str(folder / "scene.yaml"), "--start", solution, "--policy", solution, "--json"])
+    assert documents(capsys)["cost"] == pytest.approx(cost, rel=1e-9)

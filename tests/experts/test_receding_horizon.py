@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
+from dq_space_arm_env.scene import StateLayout
 from experts import BoxDDP, GuidedDDP, RecedingHorizonExpert
 from experts.problems.arm_problem import ArmProblem
 from experts.receding_horizon import ManeuverPlan, _convex_part
@@ -127,6 +128,59 @@ def test_an_iteration_lowers_the_cost_of_what_lies_ahead(short_scene):
         costs[iterations] = kept, expert._work.current.cost
     assert costs[1][0] == pytest.approx(costs[0][0], rel=1e-6)
     assert costs[1][1] < 0.9999 * costs[0][1]
+
+
+CHANGE = 60
+"""Stage at which what varies changes, of 150."""
+
+
+@pytest.fixture(scope="module")
+def varying():
+    """An expert of a maneuver of 15 s; the target and the load of the last link are inputs."""
+    load = [f"links.1.{part}" for part in ("mass", "inertia")]
+    scene = load_scene("planar").replace(
+        simulation={"dt": 0.1, "steps": 150}, parameters=["target.pose", *load]
+    )
+    return RecedingHorizonExpert(scene, horizon=30)
+
+
+def fly_with_change(expert, later, told):
+    """Cost of an episode whose parameters change, and miss by the later ones; the expert may be told."""
+    kernels, maneuver = expert.maneuver.kernels, expert.maneuver
+    x, cost, p = kernels.layout.initial_state, 0.0, kernels.parameters.nominal
+    expert.reset(x)
+    for k in range(maneuver.horizon):
+        if k == CHANGE:
+            p = later
+            if told:
+                expert.inform(later)
+        u = expert(x) * kernels.layout.control_limit
+        cost += kernels.cost(x, u, p=p)
+        x = kernels.step(x, u, p=p)
+    with maneuver.parameters.being(later):
+        return cost + kernels.terminal_cost(x, p=later), maneuver.misses(x)
+
+
+def test_a_new_target_in_mid_flight_is_reached(varying):
+    """The old plan ends where the target was."""
+    scene = varying.maneuver.scene
+    moved = scene.replace({"target.pose.position": np.add(scene.target.pose.position, [0.2, 0.3, 0.0])})
+    later = StateLayout.of(moved).parameters.nominal
+    _, unaware = fly_with_change(varying, later, told=False)
+    _, informed = fly_with_change(varying, later, told=True)
+    assert unaware > 2.0
+    assert informed <= 1.0
+
+
+def test_a_new_mass_in_mid_flight_is_planned_with(varying):
+    """The last link grabs something four times as heavy as itself; not to know it costs effort."""
+    parameters = varying.maneuver.kernels.parameters
+    later = parameters.nominal.copy()
+    later[parameters.indices("links.1")] *= 5.0
+    unaware, _ = fly_with_change(varying, later, told=False)
+    informed, missed = fly_with_change(varying, later, told=True)
+    assert informed < unaware
+    assert missed <= 1.0
 
 
 def test_negative_curvature_is_cut_off_and_the_rest_stays():

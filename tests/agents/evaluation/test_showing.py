@@ -9,7 +9,7 @@ from agents.evaluation import evaluate, evaluation_seeds
 from agents.evaluation.beside_expert import fly_beside_expert
 from agents.policies import ExportedPolicy
 from agents.zoo.finding import as_policy
-from dq_space_arm_env import load_scene
+from dq_space_arm_env import DQSpaceArmEnv
 from dq_space_arm_env.command_line import main
 from experts import GuidedDDP
 from experts.problems.arm_problem import ArmProblem
@@ -23,7 +23,8 @@ class Expert:
         self.solver = GuidedDDP(self.problem)
 
     def begin(self, environment):
-        self.actions = self.solver.solve(environment.states[0]).controls / self.problem.control_upper
+        solution = self.solver.solve(environment.states[0], parameters=environment.parameters[0])
+        self.actions = solution.controls / self.problem.control_upper
         self.stage = 0
 
     def __call__(self, observations):
@@ -64,10 +65,17 @@ def test_a_flight_is_that_of_an_evaluation(exported, quick):
     json.dumps(pair.record(), allow_nan=False)
 
 
-def test_a_scene_that_draws_its_target_is_refused():
-    scene = load_scene("random-target").replace(simulation={"dt": 0.015, "steps": 4})
-    with pytest.raises(ValueError, match="draws more than the start for each episode"):
-        fly_beside_expert(as_policy(lambda observations: np.zeros((1, 12))), scene, [0])
+def test_the_expert_knows_what_an_episode_draws(quick):
+    """Target and masses are inputs of the machine code: they are given to a solve."""
+    scene = quick.replace(spread={"target_position": 0.2, "link_masses": 0.3})
+    (pair,) = fly_beside_expert(as_policy(Expert(scene)), scene, [5])
+    assert pair.converged
+    assert pair.cost_gap == pytest.approx(0.0, abs=1e-9)
+    assert pair.expert.is_success
+    env = DQSpaceArmEnv(scene)
+    env.reset(seed=5)
+    assert pair.agent.maneuver.scene == pair.expert.maneuver.scene == env.episode_scene
+    assert pair.agent.record()["position_error"] == pytest.approx(pair.expert.record()["position_error"])
 
 
 def test_the_verb_writes_numbers_and_pictures(exported, tmp_path, capsys):

@@ -11,7 +11,7 @@ from agents.configuration import ConfigurationError, load_configuration
 from agents.configuration.residual import Mismatch
 from agents.evaluation.comparison_tables import mismatch_table, notes, record
 from agents.evaluation.plan_followers import FEEDBACK, OPEN_LOOP, RECEDING, RecedingHorizon, follower
-from agents.evaluation.plans import Plans
+from agents.evaluation.plans import Followed, Plans, drawn_parameters
 from agents.policies import ExportedPolicy
 from agents.residual.corrections import (
     SMALL,
@@ -23,11 +23,12 @@ from agents.residual.corrections import (
 )
 from agents.residual.mismatch import Condition, Worlds, fly_mismatched
 from agents.residual.mismatch_comparison import compare_under_mismatch, read_corrections
-from dq_space_arm_env import compile_scene, load_scene
+from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.command_line import main
+from dq_space_arm_env.environment.rollouts import rollout
 
 HEAVY = 1.3
-"""The one factor of masses that is compiled for these tests."""
+"""A factor of masses."""
 CALM = Worlds(1.0, 0.0, 0.0, 6.0, seed=0)
 ROUGH = Worlds(HEAVY, 0.01, 0.02, 6.0, seed=3)
 SETTINGS = {"repeat": 10, "memory": 0.5, "full_authority": 0.1}
@@ -283,6 +284,34 @@ def test_the_receding_horizon_plans_every_flight_and_pays_no_more_than_the_plan(
     planned = fly_with_gains(small_scene, few, CALM)
     assert (replanned.cost < planned.cost * (1.0 + 1e-3)).all()
     assert (replanned.cost > 0.9 * planned.cost).all()
+
+
+@pytest.fixture(scope="module")
+def drawing(small_scene):
+    """A scene whose episodes differ in target and masses, and what the first three of them draw."""
+    scene = small_scene.replace(spread={"target_position": 0.3, "link_masses": 0.3})
+    return scene, drawn_parameters(scene, [0, 1, 2])
+
+
+def test_corrections_see_the_target_of_each_plan(drawing):
+    scene, drawn = drawing
+    environment = DQSpaceArmVectorEnv(len(drawn), scene)
+    expected, _ = environment.reset(seed=[0, 1, 2])
+    kernels = environment.kernels
+    still = Followed(np.zeros((len(drawn), kernels.n_u)), np.zeros((len(drawn), kernels.n_t)))
+    observer = CorrectionObserver(scene, memory=0.5, full_authority=0.1)
+    observer.reset(drawn)
+    seen = observer(0, environment.states, still)
+    np.testing.assert_allclose(seen[:, : kernels.n_x + 1], expected, rtol=1e-6, atol=1e-6)
+
+
+def test_the_receding_horizon_plans_with_what_it_is_told(drawing):
+    scene, drawn = drawing
+    expert = RecedingHorizon(scene, 20)
+    told, untold = (rollout(expert.policy(known), scene, [0, 1, 2]) for known in (drawn, None))
+    np.testing.assert_array_equal(told.parameters, drawn)
+    assert told.is_success.all()
+    assert (told.position_error < untold.position_error).all()
 
 
 def test_a_policy_that_does_not_fit_is_refused(small_scene):

@@ -28,7 +28,6 @@ pytestmark = pytest.mark.agents
 COPIES, REPEAT, TOTAL = 8, 10, 4800
 SEEN = {"repeat": REPEAT, "memory": 0.5, "full_authority": 0.1}
 HEAVY = 1.3
-"""As in the tests of controllers, which compile it as well."""
 EVERY = {"evaluate_every": 2400, "checkpoint_every": 2400}
 ALGORITHMS = {
     "residual-PPO": {"n_steps": 15, "batch_size": 60, "n_epochs": 2, "log_std_init": -2.0},
@@ -190,6 +189,3 @@ def test_a_folder_or_a_scene_that_does_not_fit_is_refused(configuration, tmp_pat
         train_residual(configuration(seed=1), tmp_path / "run")
     with pytest.raises(DemonstrationsError, match="demonstrations of another scene than 'paper'"):
         train_residual(configuration(scene="paper"), tmp_path / "other")
-    generated = {"problems": 2}
-    with pytest.raises(ValueError, match="draws more than the start"):
-        train_residual(configuration(scene="random-target", demonstrations=generated), tmp_path / "random")
