@@ -164,7 +164,8 @@ def step_call(
 ) -> KernelCall:
     """A step of many states at once, shapes (B, n_x) and (B, n_u), into an array of its own."""
     kernel = kernels.kernel("step", integrator=integrator)
-    arrays = {"x": states, "u": controls, "h": np.array([step], states.dtype)}
+    parameters = np.tile(kernels.parameters.nominal.astype(states.dtype), (len(states), 1))
+    arrays = {"x": states, "u": controls, "parameters": parameters, "h": np.array([step], states.dtype)}
     return KernelCall(kernel, {**arrays, kernel.outputs[0].name: np.zeros_like(states)})
 
 

@@ -16,7 +16,7 @@ from dq_space_arm_env.scene import INTEGRATORS
 from experts import GuidedDDP
 from experts.report import expert_trials, integrator_precision, part_costs, scene_report, stability_envelope
 from experts.report.effort import Announce, Effort
-from experts.report.integrator_precision import Motion, observed_order, reference_end
+from experts.report.integrator_precision import Motion, observed_order, reference_end, step_call
 from experts.report.stability_envelope import SLOW, largest, on_springs
 
 pytestmark = pytest.mark.slow  # every integrator and variant of a scene is compiled
@@ -114,11 +114,26 @@ def test_parts_that_are_left_out_cost_nothing(spread_scene: Scene) -> None:
     assert fewer["step_operations"] < whole["step_operations"]
 
 
-def test_starts_are_those_of_the_seeds(spread_scene: Scene) -> None:
-    rows = expert_trials.measure(spread_scene, EFFORT, announce)["starts"]
-    env = DQSpaceArmEnv(spread_scene)
+@pytest.fixture
+def drawing(spread_scene: Scene) -> Scene:
+    """Draws target and masses as well."""
+    return spread_scene.replace(spread={"target_position": 0.02, "link_masses": 0.2})
+
+
+def test_a_timed_step_is_that_of_the_kernels(drawing: Scene) -> None:
+    kernels = compile_scene(drawing)
+    states, controls = part_costs.moving_states(kernels, 3)
+    call = step_call(kernels, "rk4", states, controls, 0.05)
+    call(len(states))
+    found = call._kept[-1]
+    np.testing.assert_allclose(found, kernels.step(states, controls, 0.05, "rk4"), rtol=1e-12, atol=1e-14)
+
+
+def test_starts_are_those_of_the_seeds(drawing: Scene) -> None:
+    rows = expert_trials.measure(drawing, EFFORT, announce)["starts"]
+    env = DQSpaceArmEnv(drawing)
     env.reset(seed=2)
-    expected = GuidedDDP(spread_scene).solve(np.asarray(env.state))
+    expected = GuidedDDP(drawing).solve(np.asarray(env.state), parameters=env.parameters)
     assert [row["seed"] for row in rows] == [0, 1, 2]
     assert rows[2]["cost"] == pytest.approx(expected.cost, rel=1e-9)
     assert all(row["converged"] and row["success"] for row in rows)
