@@ -6,7 +6,8 @@ disk; the next process loads it without tracing, compiling or importing CasADi.
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, cached_property
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import walk
 from dq_space_arm_env.kernels.library import KernelLibrary
-from dq_space_arm_env.scene import Scene, load_scene
+from dq_space_arm_env.scene import INTEGRATORS, Scene, load_scene
 
 if TYPE_CHECKING:
     from dq_space_arm_env.kernels.adaptive import IntegratedMotion
@@ -102,7 +103,7 @@ class Kernels(KernelLibrary):
         kernel = self.kernel("walk", integrator=self._integrator(integrator), lanes=1)
         carries_momentum = any(spec.name == "momentum" for spec in kernel.inputs)
         momentum = self.momentum(start) if carries_momentum else None
-        return walk(kernel, start, momentum, inputs, self._time_step(dt).astype(self.dtype), steps, every)
+        return walk(kernel, start, momentum, inputs, self._time_step(dt), steps, every)
 
     def linearize(
         self, x: ArrayLike, u: ArrayLike, dt: float | None = None, integrator: str | None = None
@@ -320,17 +321,21 @@ class Kernels(KernelLibrary):
         return self.call("state_from_observation", observation=observation)[0]
 
     def _integrator(self, name: str | None) -> str | None:
-        from dq_space_arm_env.scene import INTEGRATORS
-
         if name is not None and name not in INTEGRATORS:
             raise ValueError(f"integrator: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
         return name
 
     def _time_step(self, dt: float | None) -> Array:
-        step = self.scene.simulation.dt if dt is None else float(dt)
-        if not np.isfinite(step):
+        if dt is None:
+            return self._scene_time_step
+        step = float(dt)
+        if not isfinite(step):
             raise ValueError(f"dt: {step} is not a finite time step in s")
-        return np.array([step])
+        return np.array([step], self.dtype)
+
+    @cached_property
+    def _scene_time_step(self) -> Array:
+        return np.array([self.scene.simulation.dt], self.dtype)
 
 
 @cache

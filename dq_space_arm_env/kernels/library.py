@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.common.code_cache import cache_directory, cache_key
 from dq_space_arm_env.common.host_machine import host_machine
 from dq_space_arm_env.compiler import native
-from dq_space_arm_env.kernels.bound import BoundKernel, rows_of
+from dq_space_arm_env.kernels.bound import BoundKernel, SingleRowCalls, rows_of
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.schema import Scene
 
@@ -43,6 +43,7 @@ class KernelLibrary:
         self.dtype = np.dtype(scene.simulation.precision)
         self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
         self._paper_kernels: dict[tuple[str, int], BoundKernel] = {}
+        self._single_row_calls: dict[tuple[str, str | None], SingleRowCalls] = {}
         self._announced = False
 
     @cached_property
@@ -112,6 +113,9 @@ class KernelLibrary:
 
     def call(self, name: str, integrator: str | None = None, **inputs: ArrayLike) -> tuple[Array, ...]:
         """Run a program on one row or a batch; outputs take the form of the inputs."""
+        single = self._single_row_calls.get((name, integrator))
+        if single is not None and (results := single.results(inputs)) is not None:
+            return results
         rows, batched, arrays = rows_of(inputs, self.dtype)
         kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)
         ordered = []
@@ -123,9 +127,11 @@ class KernelLibrary:
                     f"scene {self.scene.name!r} has {spec.stride}"
                 )
             ordered.append(np.ascontiguousarray(array))
-        results = [np.zeros((rows, spec.stride), self.dtype) for spec in kernel.outputs]
-        kernel([*ordered, *results], rows, self.threads)
-        return tuple(result if batched else result[0] for result in results)
+        outputs = [np.zeros((rows, spec.stride), self.dtype) for spec in kernel.outputs]
+        kernel([*ordered, *outputs], rows, self.threads)
+        if not batched:
+            self._single_row_calls.setdefault((name, integrator), SingleRowCalls(kernel))
+        return tuple(output if batched else output[0] for output in outputs)
 
     def _announce(self) -> None:
         """Explain, once, why the first use of a scene takes a moment."""
