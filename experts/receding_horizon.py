@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.common.real_arrays import real_array
-from dq_space_arm_env.scene.start import PLANAR_POSE
+from dq_space_arm_env.scene.pose import PLANAR_POSE
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.shooting import ShootingWorkspace, line_search
 from experts.ddp.solution import Policy, Solution, StopReason

@@ -2,13 +2,13 @@
 
 A `Chain` is a base, revolute links in series, an optional massless wrist, and a tip frame. Link frames are
 the joint frames of the paper: frame i is fixed in the distal body i+1, with its z axis along the joint axis.
-A payload is merged into the body that holds it. Masses and inertias are numbers, or symbols where a scene
-randomizes them per episode.
+A payload is merged into the body that holds it. Masses, inertias, stiffness and damping are numbers, or
+symbols where they are parameters of the scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +21,13 @@ from dq_space_arm_env.algebra.vectors import (
     subtract,
     transpose,
 )
+from dq_space_arm_env.scene.parameters import center_name, inertia_name
 
 if TYPE_CHECKING:
     from dq_space_arm_env.scene import Base, Link, Payload, Pose, Scene
-    from dq_space_arm_env.scene.start import MassFactors
 
 Scalar = Any
+Given = Mapping[str, Scalar]
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 
@@ -55,9 +56,9 @@ class RevoluteLink:
 
     body: RigidBody  # in the joint frame
     joint: Placement  # joint frame at zero angle in the parent's frame (base center of mass, or joint frame)
-    stiffness: float  # N m/rad
+    stiffness: Scalar  # N m/rad
     rest_angle: float  # of the spring, rad
-    damping: float  # N m s/rad
+    damping: Scalar  # N m s/rad
 
 
 @dataclass(frozen=True)
@@ -73,15 +74,21 @@ class Chain:
     heaviest: int = 0  # body of greatest nominal mass: 0 is the base, i link i
 
     @classmethod
-    def from_scene(cls, scene: Scene, masses: MassFactors | None = None) -> Chain:
-        """Collect a scene's constants, its masses and inertias scaled by `masses` if given."""
-        wrench = scene.tip_wrench
-        bodies = _link_bodies(scene, masses)
+    def from_scene(cls, scene: Scene, given: Given | None = None) -> Chain:
+        """Collect a scene's constants; numbers `given` by name (`scene.parameters`) replace its own."""
+        wrench, given = scene.tip_wrench, given or {}
+        bodies = _link_bodies(scene, given)
         return cls(
-            base=_rigid_body(scene.base, (0.0, 0.0, 0.0), *_base_factors(masses)),
+            base=_rigid_body(scene.base, "base", (0.0, 0.0, 0.0), given),
             links=tuple(
-                RevoluteLink(body, _placement(link.joint), link.stiffness, link.rest_angle, link.damping)
-                for body, link in zip(bodies, scene.links, strict=True)
+                RevoluteLink(
+                    body,
+                    _placement(link.joint),
+                    given.get(f"links.{index}.stiffness", link.stiffness),
+                    link.rest_angle,
+                    given.get(f"links.{index}.damping", link.damping),
+                )
+                for index, (body, link) in enumerate(zip(bodies, scene.links, strict=True))
             ),
             wrist=None if scene.wrist is None else _placement(scene.wrist.frame),
             tip=_placement(scene.tip),
@@ -99,32 +106,30 @@ def _heaviest(scene: Scene) -> int:
     return masses.index(max(masses))
 
 
-def _base_factors(masses: MassFactors | None) -> tuple[Scalar, Scalar]:
-    return (1.0, 1.0) if masses is None else (masses.base_mass, masses.base_inertia)
-
-
-def _link_bodies(scene: Scene, masses: MassFactors | None) -> list[RigidBody]:
+def _link_bodies(scene: Scene, given: Given) -> list[RigidBody]:
     """Mass properties of the links in their joint frames, with the payload merged into the last one."""
-    ones = (1.0,) * len(scene.links)
-    factors = (ones, ones) if masses is None else (masses.link_masses, masses.link_inertias)
     bodies = [
-        _rigid_body(link, link.center_of_mass, mass, inertia)
-        for link, mass, inertia in zip(scene.links, *factors, strict=True)
+        _rigid_body(link, f"links.{index}", link.center_of_mass, given)
+        for index, link in enumerate(scene.links)
     ]
     if scene.payload is not None:
         if not bodies:
             raise ValueError("payload: a scene without links cannot hold one; add its mass to the base")
-        factor = (1.0, 1.0) if masses is None else (masses.payload_mass, masses.payload_inertia)
-        payload = _rigid_body(scene.payload, scene.payload.center_of_mass, *factor)
+        payload = _rigid_body(scene.payload, "payload", scene.payload.center_of_mass, given)
         bodies[-1] = _merged(bodies[-1], _moved(payload, scene.tip))
     return bodies
 
 
-def _rigid_body(
-    body: Base | Link | Payload, center_of_mass: Vector, mass: Scalar, inertia: Scalar
-) -> RigidBody:
-    rows = tuple(tuple(inertia * entry for entry in row) for row in body.inertia)
-    return RigidBody(mass * body.mass, center_of_mass, rows)
+def _rigid_body(body: Base | Link | Payload, place: str, center_of_mass: Vector, given: Given) -> RigidBody:
+    """Mass properties of the body at a place of the scene."""
+    return RigidBody(
+        given.get(f"{place}.mass", body.mass),
+        tuple(given.get(center_name(place, i), entry) for i, entry in enumerate(center_of_mass)),
+        tuple(
+            tuple(given.get(inertia_name(place, i, j), entry) for j, entry in enumerate(row))
+            for i, row in enumerate(body.inertia)
+        ),
+    )
 
 
 def _placement(pose: Pose) -> Placement:

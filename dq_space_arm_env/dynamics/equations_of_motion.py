@@ -17,7 +17,7 @@ from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
 from dq_space_arm_env.dynamics.minimal import Accelerations, Wrenches
 from dq_space_arm_env.dynamics.vector_field import PoseCoordinates, spread
 from dq_space_arm_env.scene.layout import StateLayout
-from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
+from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 
 Scalar = Any
 

@@ -24,7 +24,7 @@ from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_s
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene, load_scene
-from dq_space_arm_env.scene.start import episode_scene, target_entries
+from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT, REPORT
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 
@@ -231,7 +231,6 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self._observation, self._report, self._flags = (
             arrays[name] for name in ("observation", "report", "flags")
         )
-        self._given_target: Array | None = None
         self._action_shape = self._action.shape
 
     @property
@@ -242,10 +241,9 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     @property
     def parameters(self) -> Array:
-        """What the scene drew for this episode besides the state, as the equations of motion read it; a copy.
+        """What varies between episodes besides the state: target, masses, and whatever the scene names, shape (n_p,); a copy.
 
-        Shape (n_p,), empty for a scene that draws states only; `EpisodeParameters.of(scene).names` of
-        `dq_space_arm_env.task.parameters` names the entries. `ResetNeeded` before the first reset.
+        `kernels.parameters` has the names and units of the entries. `ResetNeeded` before the first reset.
         """
         self._require_reset("reading the parameters")
         return self._parameters.copy()
@@ -254,29 +252,24 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     def target(self) -> Array:
         """Pose q_{D/I} of this episode's target, shape (8,), dimensionless and m; a copy. `ResetNeeded` before the first reset."""
         self._require_reset("reading the target")
-        target = np.array(self.scene.target.pose.dual_quaternion, dtype=self.kernels.dtype)
-        entries = list(target_entries(self.scene))
-        target[entries] = self._parameters[: len(entries)]
-        return target
+        return self.kernels.layout.target_with(self._parameters)
 
     @property
     def episode_scene(self) -> Scene:
-        """The scene with the target, masses and inertias of this episode, without a spread. `ResetNeeded` before the first reset."""
+        """The scene with the parameters of this episode as constants, without a spread. `ResetNeeded` before the first reset."""
         self._require_reset("asking for the episode's scene")
-        given = None if self._given_target is None else self._given_target.tolist()
-        return episode_scene(self.scene, self._draws.tolist(), given)
+        return episode_scene(self.scene, self._parameters.tolist())
 
     def get_state(self) -> dict[str, Array]:
         """Copy what all later steps and resets depend on.
 
         Returns:
             Arrays by name, for `set_state`, of this environment or another of the same scene: the state "x", shape (n_x,); "memory" of the
-            step (number, sign of the error, stage cost), "parameters", "draws", and "target", NaN unless it was given, shape (8,);
+            step (number, sign of the error, stage cost), and "parameters";
             whether the episode is "over"; and the state of the random "generator". `ResetNeeded` before the first reset.
         """
         self._require_reset("get_state()")
-        target = np.full(8, np.nan) if self._given_target is None else self._given_target
-        state = {**self._kept(), "target": target, "over": np.array(self._over)}
+        state = {**self._kept(), "over": np.array(self._over)}
         return {name: array.copy() for name, array in state.items()} | {
             "generator": generator_state(self.np_random.bit_generator)
         }
@@ -292,20 +285,18 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         """
         expected = {
             **self._kept(),
-            "target": np.empty(8),
             "over": np.array(True),
             "generator": np.empty(4, np.uint64),
         }
         found = checked_state(state, expected)
         for name, array in self._kept().items():
             array[...] = found[name]
-        self._given_target = None if np.isnan(found["target"]).any() else found["target"].copy()
         self._begun, self._over = True, bool(found["over"])
         self.np_random = generator_of(found["generator"])
         self._trail = []
 
     def _kept(self) -> dict[str, Array]:
-        return {"x": self._x, "memory": self._memory, "parameters": self._parameters, "draws": self._draws}
+        return {"x": self._x, "memory": self._memory, "parameters": self._parameters}
 
     def _require_reset(self, what: str) -> None:
         if not self._begun:
@@ -364,7 +355,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         Args:
             seed: Seed of the random start; None keeps the generator.
             options: {"nominal": True} for the scene's initial state, or {"initial_state": x} with x of shape (n_x,);
-                {"target": q} for the target q_{D/I} of shape (8,), in a scene that draws it; {"state": s} alone to go on in the
+                {"target": q} for the target q_{D/I} of shape (8,), in a scene where it varies; {"parameters": p} for all that varies,
+                shape (n_p,), entries as in `kernels.parameters`; {"state": s} alone to go on in the
                 middle of an episode, see `get_state`, with its generator unless a seed is given.
 
         Returns:
@@ -372,7 +364,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
         Raises:
             ValueError: If an option is unknown or excludes another; if state or target has a wrong shape, is not finite, or its pose is not a unit dual quaternion; or if the
-                scene's target is not drawn.
+                scene's target does not vary; or if no scene may have the parameters (`SceneError`).
         """
         saved = saved_state(options or {})
         if saved is not None:
@@ -394,7 +386,6 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self._draws[:] = self.np_random.uniform(-1.0, 1.0, self._draws.shape) if drawn else 0.0
         self._start.on_rows(_ROW)
         start.apply(self.kernels, self._x, self._parameters)
-        self._given_target = start.target
         self._begun, self._over = True, False
         self._trail = []
 

@@ -1,4 +1,4 @@
-"""The options of `reset`: initial state and target given instead of drawn."""
+"""The options of `reset`: initial state, target and parameters given instead of drawn."""
 
 from __future__ import annotations
 
@@ -12,35 +12,37 @@ from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import Scene, StateLayout
-from dq_space_arm_env.scene.start import PLANAR_POSE, target_entries
+from dq_space_arm_env.scene.parameters import TARGET, target_entries
+from dq_space_arm_env.scene.pose import PLANAR_POSE
+from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.task.step_report import STATE_LIMIT
 
 Array = NDArray[Any]
 
-_OPTIONS = ("nominal", "initial_state", "target", "state")
+_OPTIONS = ("nominal", "initial_state", "target", "parameters", "state")
 
 
 class GivenStart(NamedTuple):
     """The part of a start that is given, for one episode or for B; None for what is drawn.
 
-    With a state come the scene's nominal masses, and its nominal target unless that is given too.
+    With a state come nominal parameters unless they are given too.
     """
 
     state: Array | None = None  # shape (n_x,) or (B, n_x), units of the state
     target: Array | None = None  # q_{D/I}, shape (8,) or (B, 8), dimensionless and m
+    parameters: Array | None = None  # shape (n_p,) or (B, n_p), units of the parameters
 
     def apply(self, kernels: Kernels, x: Array, parameters: Array) -> None:
         """Overwrite drawn states, (n_x,) or (B, n_x), and parameters, (n_p,) or (B, n_p), in place."""
         if self.state is not None:
             x[...] = self.state
-        target = self.target
-        if target is not None:
-            entries = list(target_entries(kernels.scene))
-            parameters[..., : len(entries)] = target[..., entries]
-        elif self.state is not None:
-            target = np.array(kernels.scene.target.pose.dual_quaternion)
-        if target is not None:
-            _give_sign_of_target(kernels, x, target)
+        if self.parameters is not None:
+            parameters[...] = self.parameters
+        if self.target is not None:
+            where = kernels.parameters.indices(TARGET)
+            parameters[..., where] = self.target[..., target_entries(kernels.scene)]
+        if any(given is not None for given in self):
+            _give_sign_of_target(kernels, x, kernels.layout.target_with(parameters))
 
 
 def saved_state(options: dict[str, Any]) -> Any:
@@ -57,7 +59,8 @@ def given_start(kernels: Kernels, options: dict[str, Any]) -> GivenStart:
 
     Raises:
         ValueError: If an option is unknown; if a number is missing or not finite; if the pose of the base or
-            the target is not a unit dual quaternion; or if the scene's target is a constant.
+            the target is not a unit dual quaternion; if the scene's target is a constant; or if no scene may
+            have the parameters (`SceneError`).
     """
     unknown = set(options) - set(_OPTIONS)
     if unknown:
@@ -69,7 +72,12 @@ def given_start(kernels: Kernels, options: dict[str, Any]) -> GivenStart:
         state = _checked_state(kernels, state)
     elif options.get("nominal", False):
         state = kernels.layout.initial_state
-    return GivenStart(state, None if target is None else _checked_target(kernels, target))
+    parameters = options.get("parameters")
+    return GivenStart(
+        state,
+        None if target is None else _checked_target(kernels, target),
+        None if parameters is None else _checked_parameters(kernels, parameters),
+    )
 
 
 def _checked_state(kernels: Kernels, state: Any) -> Array:
@@ -134,10 +142,11 @@ def check_scene(scene: Scene) -> None:
 def _checked_target(kernels: Kernels, target: Any) -> Array:
     """A target with its rounding errors removed, if it is a pose that the compiled code can take."""
     entries = target_entries(kernels.scene)
-    if not entries:
+    if len(kernels.parameters.indices(TARGET)) != len(entries):
         raise ValueError(
             f"options: target; scene {kernels.scene.name!r} has the same in every episode, a constant of its "
-            "machine code: give the scene a spread of target_position or target_rotation"
+            "machine code: give the scene a spread of target_position or target_rotation, or add target.pose "
+            "to its parameters"
         )
     pose = _unit_pose("target is a pose", _finite("target", target, 8))
     fixed = [index for index in range(8) if index not in entries]
@@ -147,6 +156,13 @@ def _checked_target(kernels: Kernels, target: Any) -> Array:
         )
     pose[fixed] = 0.0
     return pose
+
+
+def _checked_parameters(kernels: Kernels, parameters: Any) -> Array:
+    """Parameters with which the scene is valid: a mass may not be negative."""
+    values = _finite("parameters", parameters, kernels.n_p)
+    episode_scene(kernels.scene, values.tolist())
+    return values
 
 
 def _finite(name: str, value: Any, size: int) -> Array:

@@ -79,7 +79,6 @@ class SubEnvironments:
             "x": self.x,
             "memory": self._memory,
             "parameters": self.parameters,
-            "draws": self._draws,
             "generator": self._generators,
         }
 

@@ -23,7 +23,6 @@ from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_s
 from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene
-from dq_space_arm_env.scene.start import target_entries
 from dq_space_arm_env.task.step_report import REPORT
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 from dq_space_arm_env.viewing.trails import Trails
@@ -140,11 +139,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
     @property
     def targets(self) -> Array:
         """Poses q_{D/I} of the targets, shape (num_envs, 8), real part dimensionless, dual part m; a copy."""
-        target = np.array(self.scene.target.pose.dual_quaternion, dtype=self.kernels.dtype)
-        targets = np.tile(target, (self.num_envs, 1))
-        entries = list(target_entries(self.scene))
-        targets[:, entries] = self._envs.parameters[:, : len(entries)]
-        return targets
+        return self.kernels.layout.target_with(self._envs.parameters)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -221,7 +216,11 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
 
     def _given_starts(self, rows: Rows, options: dict[str, Any]) -> GivenStart:
         """Starts that the options give: the same for all, or arrays with a row for each."""
-        shapes = {"initial_state": self._envs.x.shape, "target": (self.num_envs, 8)}
+        shapes = {
+            "initial_state": self._envs.x.shape,
+            "target": (self.num_envs, 8),
+            "parameters": self._envs.parameters.shape,
+        }
         each = {
             name: options[name]
             for name, shape in shapes.items()

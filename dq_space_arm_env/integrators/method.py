@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from dq_space_arm_env.compiler.program import Program
+from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics.vector_field import TwiceDifferentiableField, VectorField
 
 Scalar = Any
@@ -39,6 +39,13 @@ class TwiceDifferentiableIntegrator(Integrator, Protocol):
         triangle (n_t + n_u, n_t + n_u), whose nonzeros the buffer holds by column.
         """
         ...
+
+
+def program_inputs(field: VectorField, *buffers: Buffer) -> list[Buffer]:
+    """Inputs of a program that evaluates the field, its parameters, if any, after the first of them."""
+    if not field.parameters:
+        return list(buffers)
+    return [buffers[0], Buffer("parameters", len(field.parameters)), *buffers[1:]]
 
 
 def graph_inputs(field: VectorField, **symbols: Sequence[Scalar]) -> dict[str, Sequence[Scalar]]:

@@ -16,6 +16,7 @@ from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.compiler.graph import Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics.vector_field import split_state
+from dq_space_arm_env.integrators.method import program_inputs
 from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
 from dq_space_arm_env.scene import INTEGRATORS, Scene, StateLayout
 from dq_space_arm_env.validation import did_you_mean
@@ -29,7 +30,8 @@ class CasadiDynamics:
 
     States, inputs and units are those of `layout`. The inputs are not clipped to their limits,
     `layout.control_limit`. Nothing normalizes the pose q_{e0/I}: constrain a state that a solver may
-    choose to |q_r| = 1, q_r . q_d = 0, which `step` and the flow of `xdot` preserve.
+    choose to |q_r| = 1, q_r . q_d = 0, which `step` and the flow of `xdot` preserve. In a scene with
+    parameters, every function takes them after the state: `step` is (x, parameters, u, h).
 
     Attributes:
         scene: The scene.
@@ -57,7 +59,7 @@ def casadi_dynamics(scene: Scene, integrator: str | None = None) -> CasadiDynami
     """Write a scene's dynamics as CasADi functions.
 
     Args:
-        scene: A validated scene; its nominal target, masses and inertias are constants of the functions.
+        scene: A validated scene.
         integrator: Name of the integrator of `step`; the scene's by default. One that takes a fixed number
             of stages: CasADi cannot differentiate a loop that ends when tolerances are met.
 
@@ -101,8 +103,10 @@ def _state_derivative(programs: ScenePrograms) -> Program:
         pose = field.pose.reduced(dual_quaternion.derivative(equations.base_pose(x), twist))
         return {"xdot": [*pose, *field.rates(y, u)]}
 
-    program = Program("xdot", [Buffer("x", field.n_x), Buffer("u", field.n_u)], [Buffer("xdot", field.n_x)])
-    program.call(trace("xdot_graph", {"x": field.n_x, "u": field.n_u}, outputs))
+    inputs = program_inputs(field, Buffer("x", field.n_x), Buffer("u", field.n_u))
+    program = Program("xdot", inputs, [Buffer("xdot", field.n_x)])
+    sizes = {"x": field.n_x, "u": field.n_u}
+    program.call(trace("xdot_graph", sizes, outputs, parameters=field.parameters))
     return program
 
 

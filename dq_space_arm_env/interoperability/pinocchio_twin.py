@@ -14,7 +14,7 @@ from dq_space_arm_env.dynamics.chain import Chain, Placement, RigidBody
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.interoperability.exporting import tip_from_last_link
 from dq_space_arm_env.scene import Scene, StateLayout
-from dq_space_arm_env.scene.start import PLANAR_POSE
+from dq_space_arm_env.scene.pose import PLANAR_POSE
 
 Array = NDArray[np.float64]
 

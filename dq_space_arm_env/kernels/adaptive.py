@@ -82,9 +82,10 @@ class _Stepper:
     def __init__(self, kernels: KernelLibrary, x: Array, tolerances: Array, step: float) -> None:
         self.x, self.step, self.error = x.copy(), step, 1e-4
         self.u, self._h = np.zeros(kernels.n_u, kernels.dtype), np.zeros(1, kernels.dtype)
+        self.p = np.zeros(kernels.n_p, kernels.dtype)
         self.x_next, self.dense = np.zeros_like(x), np.zeros((4, kernels.n_t), kernels.dtype)
         self._error = np.zeros(1, kernels.dtype)
-        arrays = {"x": self.x, "u": self.u, "h": self._h, "tolerances": tolerances}
+        arrays = {"x": self.x, "parameters": self.p, "u": self.u, "h": self._h, "tolerances": tolerances}
         arrays |= {"x_next": self.x_next, "error": self._error, "dense": self.dense}
         self._run = KernelCall(kernels.kernel("measured_step", lanes=1), arrays).of_one_row()
 
@@ -113,9 +114,11 @@ def integrate(
     atol: float,
     times: ArrayLike | None = None,
     max_steps: int = 100_000,
+    p: ArrayLike | None = None,
 ) -> IntegratedMotion:
     """See `Kernels.integrate`."""
     start, held = _checked(kernels, x, u)
+    parameters = kernels.parameter_rows(p, len(held))
     tolerances = np.array([_positive("rtol", rtol), _positive("atol", atol)], kernels.dtype)
     if not np.isfinite(duration) or duration == 0.0:
         raise ValueError(f"duration: {duration} should be a finite time in s other than zero")
@@ -128,8 +131,8 @@ def integrate(
     ends, states = [0.0], [start]
     coefficients: list[Array] = []
     rejected = 0
-    for begin, end, control in _intervals(held, duration):
-        stepper.u[:] = control
+    for begin, end, control, given in _intervals(held, parameters, duration):
+        stepper.u[:], stepper.p[:] = control, given
         t = begin
         while t != end:
             # Stretch the last step rather than leave a sliver.
@@ -156,10 +159,12 @@ def integrate(
     return IntegratedMotion(wanted, curve(wanted), len(coefficients), rejected, curve)
 
 
-def _intervals(held: Array, duration: float) -> Iterator[tuple[float, float, Array]]:
-    """Begin, end and input of each interval with a constant input."""
+def _intervals(
+    held: Array, parameters: Array, duration: float
+) -> Iterator[tuple[float, float, Array, Array]]:
+    """Begin, end, input and parameters of each interval in which these are constant."""
     marks = np.linspace(0.0, duration, len(held) + 1).tolist()
-    yield from zip(marks[:-1], marks[1:], held, strict=True)
+    yield from zip(marks[:-1], marks[1:], held, parameters, strict=True)
 
 
 def _checked(kernels: KernelLibrary, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:

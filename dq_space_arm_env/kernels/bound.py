@@ -210,21 +210,23 @@ def walk(
     kernel: BoundKernel,
     start: Array,
     momentum: Array | None,
-    inputs: Array,
+    inputs: Mapping[str, Array],
     h: Array,
-    steps: int,
     every: int,
 ) -> Array:
     """Take many steps in a row; machine code walks down rows that it has just written.
 
-    A kernel that hands on the momentum besides the state takes that of the start, (6,). Returns the start,
-    and the states after every so many steps, shape (steps // every + 1, n_x).
+    The inputs are arrays with a row for each step. A kernel that hands on the momentum besides the state
+    takes that of the start, (6,). Returns the start, and the states after every so many steps, shape (steps
+    // every + 1, n_x).
     """
-    rows, dtype = min(steps, _ROWS), start.dtype
+    steps, dtype = len(next(iter(inputs.values()))), start.dtype
+    rows = min(steps, _ROWS)
     states, momenta = np.empty((rows + 1, len(start)), dtype), np.empty((rows + 1, 6), dtype)
-    states[0], held = start, np.empty((rows, inputs.shape[-1]), dtype)
+    states[0] = start
+    held = {name: np.empty((rows, array.shape[1]), dtype) for name, array in inputs.items()}
     # Each row's successor is the row below it.
-    arrays = {"x": states, "x_next": states[1:], "u": held, "h": h}
+    arrays = {"x": states, "x_next": states[1:], **held, "h": h}
     if momentum is not None:
         momenta[0] = momentum
         arrays |= {"momentum": momenta, "momentum_next": momenta[1:]}
@@ -233,7 +235,8 @@ def walk(
     result[0] = start
     for done in range(0, steps, rows):
         count = min(rows, steps - done)
-        held[:count] = inputs if inputs.ndim == 1 else inputs[done : done + count]
+        for name, array in inputs.items():
+            held[name][:count] = array[done : done + count]
         call(count)
         kept = np.arange(done // every + 1, (done + count) // every + 1)
         result[kept] = states[kept * every - done]

@@ -28,7 +28,7 @@ from dq_space_arm_env.dynamics.minimal import (
 )
 from dq_space_arm_env.dynamics.vector_field import spread
 from dq_space_arm_env.kernels.kernels import Kernels
-from dq_space_arm_env.scene.start import PLANAR_TWIST
+from dq_space_arm_env.scene.pose import PLANAR_TWIST
 
 Scalar = Any
 Vector3 = Sequence[Scalar]

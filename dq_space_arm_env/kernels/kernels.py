@@ -26,7 +26,10 @@ Array = NDArray[Any]
 
 
 class Kernels(KernelLibrary):
-    """The compiled functions of a scene, with its nominal target, masses and inertias.
+    """The compiled functions of a scene.
+
+    What varies in the scene, by its spread or its list of `parameters`, is an argument p of every function
+    that may depend on it; the rest are constants of the machine code.
 
     Every function takes one state (n_x,) or a batch (B, n_x), and returns results of the same form, arrays of
     the scene's precision. Batches run on vector instructions, several states at a time, and give the same
@@ -41,10 +44,17 @@ class Kernels(KernelLibrary):
         n_x: Number of states.
         n_t: Number of tangent coordinates.
         n_u: Number of inputs.
+        n_p: Number of parameters.
+        parameters: Names, units and nominal values of the parameters.
     """
 
     def step(
-        self, x: ArrayLike, u: ArrayLike, dt: float | None = None, integrator: str | None = None
+        self,
+        x: ArrayLike,
+        u: ArrayLike,
+        dt: float | None = None,
+        integrator: str | None = None,
+        p: ArrayLike | None = None,
     ) -> Array:
         """Advance states by one time step under constant inputs.
 
@@ -53,6 +63,7 @@ class Kernels(KernelLibrary):
             u: Inputs, shape (n_u,) or (B, n_u), units of `layout.control`; not clipped to the limits.
             dt: Time step, s; the scene's by default.
             integrator: Name of the integrator; the scene's by default.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             States, shape (n_x,) or (B, n_x).
@@ -60,7 +71,7 @@ class Kernels(KernelLibrary):
         Raises:
             ValueError: If dt is not a finite number, or the integrator is unknown.
         """
-        return self.call("step", self._integrator(integrator), x=x, u=u, h=self._time_step(dt))[0]
+        return self.call("step", self._integrator(integrator), x=x, u=u, h=self._time_step(dt), p=p)[0]
 
     def simulate(
         self,
@@ -70,6 +81,7 @@ class Kernels(KernelLibrary):
         dt: float | None = None,
         integrator: str | None = None,
         every: int = 1,
+        p: ArrayLike | None = None,
     ) -> Array:
         """Take many steps in a row without returning to Python.
 
@@ -84,6 +96,8 @@ class Kernels(KernelLibrary):
             dt: Time step, s; the scene's by default.
             integrator: Name of the integrator; the scene's by default.
             every: Number of steps between the states returned.
+            p: Parameters, shape (n_p,) for constant ones, or (steps, n_p), units of `parameters`; nominal
+                ones by default.
 
         Returns:
             States, the start first, shape (steps // every + 1, n_x).
@@ -102,11 +116,18 @@ class Kernels(KernelLibrary):
             )
         kernel = self.kernel("walk", integrator=self._integrator(integrator), lanes=1)
         carries_momentum = any(spec.name == "momentum" for spec in kernel.inputs)
-        momentum = self.momentum(start) if carries_momentum else None
-        return walk(kernel, start, momentum, inputs, self._time_step(dt), steps, every)
+        given = self.parameter_rows(p, steps)
+        momentum = self.momentum(start, p=given[0]) if carries_momentum else None
+        held = {"u": np.broadcast_to(inputs, (steps, self.n_u)), "parameters": given}
+        return walk(kernel, start, momentum, held, self._time_step(dt), every)
 
     def linearize(
-        self, x: ArrayLike, u: ArrayLike, dt: float | None = None, integrator: str | None = None
+        self,
+        x: ArrayLike,
+        u: ArrayLike,
+        dt: float | None = None,
+        integrator: str | None = None,
+        p: ArrayLike | None = None,
     ) -> tuple[Array, Array]:
         """Exact derivatives of a step in tangent coordinates: dx+ = A dx + B du.
 
@@ -115,6 +136,7 @@ class Kernels(KernelLibrary):
             u: Inputs, shape (n_u,) or (B, n_u).
             dt: Time step, s; the scene's by default.
             integrator: Name of the integrator; the scene's by default.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             A, shape (n_t, n_t) or (B, n_t, n_t), and B, shape (n_t, n_u) or (B, n_t, n_u).
@@ -122,7 +144,7 @@ class Kernels(KernelLibrary):
         Raises:
             ValueError: As for `step`.
         """
-        a, b = self.call("linearize", self._integrator(integrator), x=x, u=u, h=self._time_step(dt))
+        a, b = self.call("linearize", self._integrator(integrator), x=x, u=u, h=self._time_step(dt), p=p)
         return _matrices(a, self.n_t, self.n_t), _matrices(b, self.n_t, self.n_u)
 
     def integrate(
@@ -135,6 +157,7 @@ class Kernels(KernelLibrary):
         atol: float | None = None,
         times: ArrayLike | None = None,
         max_steps: int = 100_000,
+        p: ArrayLike | None = None,
     ) -> IntegratedMotion:
         """Integrate one state over any time with adaptive steps and dense output.
 
@@ -149,6 +172,8 @@ class Kernels(KernelLibrary):
                 (1e-6 in single precision).
             times: Times to return states at, shape (k,), s; the ends of the steps by default.
             max_steps: Most steps to try.
+            p: Parameters, shape (n_p,), or (N, n_p) for the parts of the duration, units of `parameters`;
+                nominal ones by default.
 
         Returns:
             Times, states, numbers of steps, and the state at any time between as a function.
@@ -169,9 +194,12 @@ class Kernels(KernelLibrary):
             atol=default_atol if atol is None else atol,
             times=times,
             max_steps=max_steps,
+            p=p,
         )
 
-    def forward_dynamics(self, x: ArrayLike, u: ArrayLike, w_tip: ArrayLike | None = None) -> Array:
+    def forward_dynamics(
+        self, x: ArrayLike, u: ArrayLike, w_tip: ArrayLike | None = None, p: ArrayLike | None = None
+    ) -> Array:
         """Accelerations, those of eq. (20), by the scene's formulation.
 
         Args:
@@ -179,28 +207,30 @@ class Kernels(KernelLibrary):
             u: Inputs, shape (n_u,) or (B, n_u).
             w_tip: Force [N], then torque [N m] at the tip in tip axes (16), shape (6,) or (B, 6); the scene's
                 by default.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Dual acceleration of the base in base axes, angular [rad/s^2] then linear [m/s^2], then joint
             accelerations [rad/s^2], shape (6 + n,) or (B, 6 + n); (3 + n) for a planar base.
         """
         if w_tip is None:
-            return self.call("forward_dynamics", x=x, u=u)[0]
-        return self.call("forward_dynamics_with_tip_wrench", x=x, u=u, w_tip=w_tip)[0]
+            return self.call("forward_dynamics", x=x, u=u, p=p)[0]
+        return self.call("forward_dynamics_with_tip_wrench", x=x, u=u, w_tip=w_tip, p=p)[0]
 
-    def reaction_wrenches(self, x: ArrayLike, u: ArrayLike) -> Array:
+    def reaction_wrenches(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
         """The paper's T (21): wrenches of body i on body i+1, in joint axes about the joint origin.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
             u: Inputs, shape (n_u,) or (B, n_u).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             fx, fy, fz [N], tx, ty [N m] joint by joint, shape (5 n,) or (B, 5 n).
         """
-        return self.call("reaction_wrenches", x=x, u=u)[0]
+        return self.call("reaction_wrenches", x=x, u=u, p=p)[0]
 
-    def mass_matrix(self, x: ArrayLike) -> Array:
+    def mass_matrix(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Mass matrix M in minimal coordinates: M a + h = f, with h from `bias_forces`.
 
         The accelerations a are those of `forward_dynamics`: base angular [rad/s^2], base linear [m/s^2], both
@@ -210,18 +240,20 @@ class Kernels(KernelLibrary):
 
         Args:
             x: States, shape (n_x,) or (B, n_x); only the joint angles matter.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Symmetric matrices, shape (6 + n, 6 + n) or (B, 6 + n, 6 + n), (3 + n) for a planar base; kg m^2
             where torque meets rotation, kg m where it meets translation, kg where force does.
         """
-        return _matrices(self.call("mass_matrix", x=x)[0], self._n_velocities, self._n_velocities)
+        return _matrices(self.call("mass_matrix", x=x, p=p)[0], self._n_velocities, self._n_velocities)
 
-    def bias_forces(self, x: ArrayLike) -> Array:
+    def bias_forces(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Bias h of M a + h = f: velocity-dependent forces, joint springs and dampers.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Generalized forces in the order of `mass_matrix`, torque [N m] and force [N] on the base, base
@@ -229,9 +261,9 @@ class Kernels(KernelLibrary):
             the accelerations of `forward_dynamics` at zero; for a base alone that is a force m omega x v,
             since its velocity has components in turning axes. The scene's wrench at the tip is not included.
         """
-        return self.call("bias_forces", x=x)[0]
+        return self.call("bias_forces", x=x, p=p)[0]
 
-    def tip_jacobian(self, x: ArrayLike) -> Array:
+    def tip_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Body Jacobian J of the tip: its twist is J (base velocity, joint rates, wrist's Euler rates).
 
         A wrench at the tip in tip axes, torque then force, adds J' times itself to the generalized forces of
@@ -239,6 +271,7 @@ class Kernels(KernelLibrary):
 
         Args:
             x: States, shape (n_x,) or (B, n_x); only the angles matter.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Twists in tip axes, angular [rad/s] then linear [m/s], per unit of the base's angular [rad/s] and
@@ -246,9 +279,9 @@ class Kernels(KernelLibrary):
             [rad/s], if there is a wrist; shape (6, 6 + n + 3) or (B, 6, 6 + n + 3). A planar base has 3
             columns: omega_z, v_x, v_y.
         """
-        return _matrices(self.call("tip_jacobian", x=x)[0], 6, self._n_velocities + self._n_wrist)
+        return _matrices(self.call("tip_jacobian", x=x, p=p)[0], 6, self._n_velocities + self._n_wrist)
 
-    def generalized_jacobian(self, x: ArrayLike) -> Array:
+    def generalized_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Generalized Jacobian of the free-floating arm, J_m - J_b H_b^-1 H_bm.
 
         It maps rates of joints and wrist to the tip's twist where the total momentum is zero (Umetani &
@@ -256,95 +289,103 @@ class Kernels(KernelLibrary):
 
         Args:
             x: States, shape (n_x,) or (B, n_x); only the angles matter.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Twists in tip axes, angular [rad/s] then linear [m/s], per unit of each joint rate and of each
             Euler rate psi, theta, phi [rad/s], if there is a wrist; shape (6, n + 3) or (B, 6, n + 3).
         """
         columns = self.layout.n_joints + self._n_wrist
-        return _matrices(self.call("generalized_jacobian", x=x)[0], 6, columns)
+        return _matrices(self.call("generalized_jacobian", x=x, p=p)[0], 6, columns)
 
-    def tip_twist(self, x: ArrayLike, u: ArrayLike | None = None) -> Array:
+    def tip_twist(self, x: ArrayLike, u: ArrayLike | None = None, p: ArrayLike | None = None) -> Array:
         """Twist of the tip with respect to the inertial frame, in tip axes.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
             u: Inputs, shape (n_u,) or (B, n_u), zero by default; only the wrist's Euler rates matter.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Angular velocity [rad/s], then linear velocity [m/s], shape (6,) or (B, 6).
         """
         u = np.zeros(self.n_u, self.dtype) if u is None else u
-        return self.call("tip_twist", x=x, u=u)[0]
+        return self.call("tip_twist", x=x, u=u, p=p)[0]
 
-    def tip_pose(self, x: ArrayLike) -> Array:
+    def tip_pose(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Pose of the tip q_{G/I}, eq. (27).
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Unit dual quaternions, shape (8,) or (B, 8), real part dimensionless, dual part m.
         """
-        return self.call("tip_pose", x=x)[0]
+        return self.call("tip_pose", x=x, p=p)[0]
 
-    def frame_poses(self, x: ArrayLike) -> Array:
+    def frame_poses(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Poses of base, joint frames, wrist frame (if any) and tip with respect to the inertial frame.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Unit dual quaternions, shape (frames, 8) or (B, frames, 8), real part dimensionless, dual part m.
         """
-        poses = self.call("frame_poses", x=x)[0]
+        poses = self.call("frame_poses", x=x, p=p)[0]
         return poses.reshape(*poses.shape[:-1], -1, 8)
 
-    def momentum(self, x: ArrayLike) -> Array:
+    def momentum(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Momentum of the whole system in inertial axes.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Linear momentum [kg m/s], then angular momentum about the system's center of mass [kg m^2/s],
             shape (6,) or (B, 6).
         """
-        return self.call("momentum", x=x)[0]
+        return self.call("momentum", x=x, p=p)[0]
 
-    def energy(self, x: ArrayLike) -> Any:
+    def energy(self, x: ArrayLike, p: ArrayLike | None = None) -> Any:
         """Kinetic energy and the potential energy of joint springs.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Energy, J, a number or shape (B,).
         """
-        return self.call("energy", x=x)[0][..., 0]
+        return self.call("energy", x=x, p=p)[0][..., 0]
 
-    def cost(self, x: ArrayLike, u: ArrayLike) -> Any:
+    def cost(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Any:
         """Stage cost of the paper (section V), without a factor dt.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
             u: Inputs, shape (n_u,) or (B, n_u).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Cost, dimensionless, a number or shape (B,).
         """
-        return self.call("cost", x=x, u=u)[0][..., 0]
+        return self.call("cost", x=x, u=u, p=p)[0][..., 0]
 
-    def terminal_cost(self, x: ArrayLike) -> Any:
+    def terminal_cost(self, x: ArrayLike, p: ArrayLike | None = None) -> Any:
         """Terminal cost of the paper (section V).
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Cost, dimensionless, a number or shape (B,).
         """
-        return self.call("terminal_cost", x=x)[0][..., 0]
+        return self.call("terminal_cost", x=x, p=p)[0][..., 0]
 
     def difference(self, x_reference: ArrayLike, x: ArrayLike) -> Array:
         """Tangent coordinates of x seen from a reference: the inverse of `retract`.
@@ -370,43 +411,48 @@ class Kernels(KernelLibrary):
         """
         return self.call("retract", x=x, dx=dx)[0]
 
-    def observation(self, x: ArrayLike, time_left: ArrayLike) -> tuple[Array, Array]:
+    def observation(
+        self, x: ArrayLike, time_left: ArrayLike, p: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
         """Observation of a state, and the tip's errors.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
             time_left: Time to the end of the episode, shape (1,) or (B, 1), s.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Observation, entries as documented in `DQSpaceArmEnv`, and (attitude error [rad], position error
             [m]), shape (2,) or (B, 2).
         """
-        observation, errors = self.call("observation", x=x, time_left=time_left)
+        observation, errors = self.call("observation", x=x, time_left=time_left, p=p)
         return observation, errors
 
-    def observation_jacobian(self, x: ArrayLike) -> Array:
+    def observation_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Exact derivative of the observation in tangent coordinates, of observation(retract(x, z)) by z.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             Derivatives at z = 0, shape (n_x + 1, n_t) or (B, n_x + 1, n_t), units of the observation per unit
             of `layout.tangent`. The time left has no derivative: its row is zero.
         """
-        return _matrices(self.call("observation_jacobian", x=x)[0], self.n_x + 1, self.n_t)
+        return _matrices(self.call("observation_jacobian", x=x, p=p)[0], self.n_x + 1, self.n_t)
 
-    def state_from_observation(self, observation: ArrayLike) -> Array:
-        """The state behind an observation of the scene with its nominal target.
+    def state_from_observation(self, observation: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """The state behind an observation.
 
         Args:
             observation: Shape (n_x + 1,) or (B, n_x + 1), entries as documented in `DQSpaceArmEnv`; the error
                 pose need not have exactly unit norm.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
             States, shape (n_x,) or (B, n_x), units of `layout.state`.
         """
-        return self.call("state_from_observation", observation=observation)[0]
+        return self.call("state_from_observation", observation=observation, p=p)[0]
 
     @property
     def _n_velocities(self) -> int:

@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.code_cache import cache_directory, cache_key
 from dq_space_arm_env.common.host_machine import host_machine
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.compiler import native
 from dq_space_arm_env.kernels.bound import BoundKernel, SingleRowCalls, rows_of
-from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.scene.layout import ParameterEntries, StateLayout
 from dq_space_arm_env.scene.schema import Scene
 
 if TYPE_CHECKING:
@@ -39,7 +40,8 @@ class KernelLibrary:
         if threads < 1:
             raise ValueError(f"threads: {threads}, should be at least 1")
         self.scene, self.threads, self.layout = scene, threads, StateLayout.of(scene)
-        self.n_x, self.n_t, self.n_u = self.layout.n_x, self.layout.n_t, self.layout.n_u
+        layout = self.layout
+        self.n_x, self.n_t, self.n_u, self.n_p = layout.n_x, layout.n_t, layout.n_u, layout.n_p
         self.dtype = np.dtype(scene.simulation.precision)
         self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
         self._paper_kernels: dict[tuple[str, int], BoundKernel] = {}
@@ -111,12 +113,29 @@ class KernelLibrary:
         """Arithmetic operations of a program per state, after folding and sharing subexpressions."""
         return self.kernel(name, integrator=integrator).operation_count
 
-    def call(self, name: str, integrator: str | None = None, **inputs: ArrayLike) -> tuple[Array, ...]:
-        """Run a program on one row or a batch; outputs take the form of the inputs."""
+    @property
+    def parameters(self) -> ParameterEntries:
+        """Names, units and nominal values of the parameters p, the numbers that vary in the scene."""
+        return self.layout.parameters
+
+    @cached_property
+    def _nominal_parameters(self) -> Array:
+        return self.parameters.nominal.astype(self.dtype)
+
+    def call(
+        self, name: str, integrator: str | None = None, *, p: ArrayLike | None = None, **inputs: ArrayLike
+    ) -> tuple[Array, ...]:
+        """Run a program on one row or a batch; outputs take the form of the inputs.
+
+        Parameters p, (n_p,) or (B, n_p), have their nominal values by default.
+        """
         single = self._single_row_calls.get((name, integrator))
-        if single is not None and (results := single.results(inputs)) is not None:
-            return results
-        rows, batched, arrays = rows_of(inputs, self.dtype)
+        if single is not None and (p is None or self.n_p):
+            parameters = self._nominal_parameters if p is None else p
+            if (results := single.results({**inputs, "parameters": parameters})) is not None:
+                return results
+        rows, batched, arrays = rows_of(inputs if p is None else {**inputs, "p": p}, self.dtype)
+        arrays["parameters"] = self.parameter_rows(arrays.pop("p", None), rows)
         kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)
         ordered = []
         for spec in kernel.inputs:
@@ -132,6 +151,19 @@ class KernelLibrary:
         if not batched:
             self._single_row_calls.setdefault((name, integrator), SingleRowCalls(kernel))
         return tuple(output if batched else output[0] for output in outputs)
+
+    def parameter_rows(self, p: ArrayLike | None, rows: int) -> Array:
+        """Parameters of so many rows, (rows, n_p), from p of shape (n_p,) or (rows, n_p); None for nominal.
+
+        Raises ValueError for another shape.
+        """
+        given = self._nominal_parameters if p is None else real_array("p", p, self.dtype)
+        if given.shape not in ((self.n_p,), (rows, self.n_p)):
+            raise ValueError(
+                f"p: shape {given.shape}, should be ({self.n_p},) or ({rows}, {self.n_p}); the parameters of "
+                f"scene {self.scene.name!r} are {', '.join(self.parameters.names) or 'none'}"
+            )
+        return np.broadcast_to(given, (rows, self.n_p))
 
     def _announce(self) -> None:
         """Explain, once, why the first use of a scene takes a moment."""

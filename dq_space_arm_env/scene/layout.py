@@ -1,14 +1,14 @@
-"""Layout of the state, the tangent and the controls of a scene.
+"""Layout of the state, the tangent, the controls and the parameters of a scene.
 
 State: base pose, joint angles, wrist angles, base velocity, joint rates. Tangent: the same, with a twist
 increment of the base in base axes (rotation, then translation) in place of the pose. Controls: base force,
-base torque, joint torques of the actuated joints, wrist rates. What a scene does not have is missing; the
-order stays.
+base torque, joint torques of the actuated joints, wrist rates. Parameters: target, bodies from base to
+payload, weights, limits. What a scene does not have is missing; the order stays.
 A planar base keeps only what is not zero by construction: q_r0, q_r3, q_d1, q_d2 of its pose, and omega_z,
 v_x, v_y.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +16,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dq_space_arm_env.common.real_arrays import real_array
-from dq_space_arm_env.scene.maneuver import AxisLimits
+from dq_space_arm_env.scene.parameters import (
+    CONTROL_UNITS,
+    TARGET,
+    ControlNumbers,
+    control_numbers,
+    is_part,
+    parameters,
+)
+from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.scene.start import PLANAR_POSE, Array, free_axes, initial_state, is_planar
+from dq_space_arm_env.scene.start import Array, free_axes, initial_state, is_planar
 
 _AXES = ("x", "y", "z")
 _EULER_ANGLES = ("psi", "theta", "phi")
@@ -66,11 +74,35 @@ class ControlEntries(_Entries):
     base_torque: slice  # base axes, 3 numbers (planar: z)
     joint_torque: slice  # actuated joints, base to tip
     wrist_rate: slice  # Euler rates psi, theta, phi
+    limits: tuple[str, ...]  # name of each control's limit in the scene
+    weights: tuple[str, ...]  # name of each control's weight in the cost
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ParameterEntries(_Entries):
+    """The entries of the parameters p, the numbers that vary; none in a scene of constants.
+
+    Attributes:
+        nominal: The scene's own values, shape (n_p,), units of the parameters.
+    """
+
+    nominal: Array
+
+    def indices(self, path: str) -> list[int]:
+        """Find parameters.
+
+        Args:
+            path: A name, or a path to what has several: "links.0.mass", "target.pose", "base.inertia".
+
+        Returns:
+            Their indices; empty if there are none.
+        """
+        return [index for index, name in enumerate(self.names) if is_part(name, path)]
 
 
 @dataclass(frozen=True, eq=False)
 class StateLayout:
-    """The layout of a scene's state, tangent and controls.
+    """The layout of a scene's state, tangent, controls and parameters.
 
     Attributes:
         planar: Whether the base moves in its x-y plane only.
@@ -80,6 +112,8 @@ class StateLayout:
         state: Entries of the state x.
         tangent: Entries of the tangent of the state.
         control: Entries of the controls u.
+        parameters: Entries of the parameters p.
+        target: The scene's nominal target q_{D/I}, shape (8,), real part dimensionless, dual part m.
         control_limit: Largest magnitude of each control, shape (n_u,), units of the controls; inf: unlimited.
         control_weight: Weight of each squared control in the cost, shape (n_u,), 1/unit^2.
         initial_state: The scene's nominal start with the sign rule applied, shape (n_x,), units of the state.
@@ -92,6 +126,8 @@ class StateLayout:
     state: StateEntries
     tangent: TangentEntries
     control: ControlEntries
+    parameters: ParameterEntries
+    target: Array
     control_limit: Array
     control_weight: Array
     initial_state: Array
@@ -110,6 +146,41 @@ class StateLayout:
     def n_u(self) -> int:
         """Number of controls."""
         return len(self.control.names)
+
+    @property
+    def n_p(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters.names)
+
+    def target_with(self, parameters: Array) -> Array:
+        """Target where it may be a parameter.
+
+        Args:
+            parameters: Shape (..., n_p), units of `parameters`.
+
+        Returns:
+            q_{D/I}, shape (..., 8), real part dimensionless, dual part m, of the type of the parameters.
+        """
+        target = np.tile(self.target.astype(parameters.dtype), (*parameters.shape[:-1], 1))
+        where = self.parameters.indices(TARGET)
+        if where:
+            target[..., PLANAR_POSE if self.planar else range(8)] = parameters[..., where]
+        return target
+
+    def limits_with(self, parameters: Array) -> Array:
+        """Limits of the controls where some may be parameters.
+
+        Args:
+            parameters: Shape (..., n_p), units of `parameters`.
+
+        Returns:
+            Largest magnitudes, shape (..., n_u), N, N m, rad/s.
+        """
+        limits = np.broadcast_to(self.control_limit, (*parameters.shape[:-1], self.n_u)).copy()
+        for index, name in enumerate(self.control.limits):
+            if name in self.parameters.names:
+                limits[..., index] = parameters[..., self.parameters.names.index(name)]
+        return limits
 
     def to_control(self, action: ArrayLike) -> Array:
         """Scale actions to controls.
@@ -136,7 +207,8 @@ class StateLayout:
     @classmethod
     def of(cls, scene: Scene) -> "StateLayout":
         """Lay out a scene."""
-        control, limit, weight = _lay_out_controls(scene)
+        controls = control_numbers(scene)
+        every_control = [each for numbers in controls.values() for each in numbers]
         return cls(
             planar=is_planar(scene),
             n_joints=len(scene.links),
@@ -144,9 +216,11 @@ class StateLayout:
             has_wrist=scene.wrist is not None,
             state=_lay_out_state(scene),
             tangent=_lay_out_tangent(scene),
-            control=control,
-            control_limit=_constant(limit),
-            control_weight=_constant(weight),
+            control=_lay_out_controls(controls),
+            parameters=_lay_out_parameters(scene),
+            target=_constant(scene.target.pose.dual_quaternion),
+            control_limit=_constant([control.limit.nominal for control in every_control]),
+            control_weight=_constant([control.weight.nominal for control in every_control]),
             initial_state=_constant(initial_state(scene)),
         )
 
@@ -204,55 +278,31 @@ def _lay_out_tangent(scene: Scene) -> TangentEntries:
     return TangentEntries(rotation=rotation, translation=translation, **motion, **entries.collected())
 
 
-def _lay_out_controls(scene: Scene) -> tuple[ControlEntries, list[float], list[float]]:
-    """Entries, limits and weights of the controls."""
-    entries, actuators, cost = _Collector(), scene.actuators, scene.cost
-    limits: list[float] = []
-    weights: list[float] = []
-
-    def add(unit: str, inputs: Sequence[_Input]) -> slice:
-        limits.extend(limit for _, limit, _ in inputs)
-        weights.extend(weight for _, _, weight in inputs)
-        return entries.add(unit, [name for name, _, _ in inputs])
-
-    turning, moving = free_axes(scene)
-    force_names = [f"base force {axis}" for axis in _AXES]
-    torque_names = [f"base torque {axis}" for axis in _AXES]
-    rate_names = [f"wrist {angle} rate" for angle in _EULER_ANGLES]
-    force = add("N", _axis_inputs(force_names, actuators.base_force, cost.base_force, moving))
-    torque = add("N m", _axis_inputs(torque_names, actuators.base_torque, cost.base_torque, turning))
-    joint = add("N m", _joint_inputs(scene))
-    rate = add("rad/s", _axis_inputs(rate_names, actuators.wrist_rate, cost.wrist_rate, range(3)))
-    control = ControlEntries(
-        base_force=force, base_torque=torque, joint_torque=joint, wrist_rate=rate, **entries.collected()
+def _lay_out_controls(controls: Mapping[str, Sequence[ControlNumbers]]) -> ControlEntries:
+    entries = _Collector()
+    slices = {
+        field: entries.add(CONTROL_UNITS[field], [number.name for number in numbers])
+        for field, numbers in controls.items()
+    }
+    everything = [number for numbers in controls.values() for number in numbers]
+    return ControlEntries(
+        base_force=slices["base_force"],
+        base_torque=slices["base_torque"],
+        joint_torque=slices["joint_torque"],
+        wrist_rate=slices["wrist_rate"],
+        limits=tuple(each.limit.name for each in everything),
+        weights=tuple(each.weight.name for each in everything),
+        **entries.collected(),
     )
-    return control, limits, weights
 
 
-_Input = tuple[str, float, float]  # name, limit, weight
-
-
-def _axis_inputs(
-    names: Sequence[str], actuator: AxisLimits | None, weights: Sequence[float], axes: Sequence[int]
-) -> list[_Input]:
-    if actuator is None:
-        return []
-    return [(names[axis], actuator.limit[axis], weights[axis]) for axis in axes]
-
-
-def _joint_inputs(scene: Scene) -> list[_Input]:
-    motors = scene.actuators.joint_torque
-    if motors is None:
-        return []
-    return [
-        (
-            f"{link.name} torque",
-            motors.limit if link.torque_limit is None else link.torque_limit,
-            scene.cost.joint_torque,
-        )
-        for link in scene.links
-        if link.actuated
-    ]
+def _lay_out_parameters(scene: Scene) -> ParameterEntries:
+    found = parameters(scene)
+    return ParameterEntries(
+        names=tuple(number.name for number in found),
+        units=tuple(number.unit for number in found),
+        nominal=_constant([number.nominal for number in found]),
+    )
 
 
 def _actuated_joints(scene: Scene) -> tuple[int, ...]:

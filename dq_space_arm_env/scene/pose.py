@@ -13,6 +13,10 @@ from dq_space_arm_env.validation.problems import Model, problem
 Quaternion = tuple[float, float, float, float]
 Matrix3 = tuple[Three, Three, Three]
 
+# Entries that a planar base keeps of its pose (q_r0, q_r3, q_d1, q_d2) and velocity (omega_z, v_x, v_y).
+PLANAR_POSE = (0, 3, 5, 6)
+PLANAR_TWIST = (2, 3, 4)
+
 _UNIT_TOLERANCE = 1e-6
 # Normalizing twice must change nothing, or a scene would not survive its own YAML: what one normalization
 # leaves of |q| - 1 is below this, and is left alone.

@@ -15,8 +15,10 @@ from pydantic import Field, StrictStr, ValidationError, ValidationInfo, field_va
 
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.shown_text import shortened
+from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
 from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
+from dq_space_arm_env.scene.parameters import is_part, numbers, parents
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.scene.simulation import Simulation
 from dq_space_arm_env.validation.changes import ChangeError, merged, nested
@@ -57,6 +59,12 @@ class Scene(Model):
     spread: Spread = Field(
         default_factory=Spread, description="half-widths of the random draws of each episode"
     )
+    parameters: tuple[StrictStr, ...] = Field(
+        default=(),
+        exclude_if=lambda paths: not paths,
+        description="numbers that are inputs of the machine code, besides those with a spread: paths such as "
+        "links.0.mass, base.inertia, target.pose, cost, actuators; all others are constants",
+    )
     success: Success = Field(
         default_factory=Success, description="tolerances that count as reaching the target"
     )
@@ -91,6 +99,7 @@ class Scene(Model):
         yield from self._actuator_problems()
         yield from self._part_problems()
         yield from self._cost_problems()
+        yield from self._parameter_problems()
         if self.base.motion == "planar":
             yield from self._planar_problems()
 
@@ -155,6 +164,18 @@ class Scene(Model):
                     f"{cost:.3g}, it must be at most {_LARGEST_COST:g}: lower it or actuators.{name}.limit"
                 )
                 yield Problem(("cost", name), weight, sentence)
+
+    def _parameter_problems(self) -> Iterator[Problem]:
+        """Find paths that lead to no number that may vary."""
+        names = [number.name for number in numbers(self)]
+        for index, path in enumerate(self.parameters):
+            if not any(is_part(name, path) for name in names):
+                paths = dict.fromkeys(part for name in names for part in parents(name))
+                sentence = (
+                    f"leads to no number that may vary; {did_you_mean(path, paths)}"
+                    "such are target.pose, base, links.0, payload, cost, actuators, and what is in them"
+                )
+                yield Problem(("parameters", index), path, sentence)
 
     def _planar_problems(self) -> Iterator[Problem]:
         """Find what leaves the x-y plane or turns about another axis than z."""

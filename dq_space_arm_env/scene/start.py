@@ -10,15 +10,20 @@ from numpy.typing import NDArray
 from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.algebra.quaternion import multiply
 from dq_space_arm_env.algebra.scalars import select
-from dq_space_arm_env.scene.bodies import Base, Link, Payload
 from dq_space_arm_env.scene.maneuver import Spread
+from dq_space_arm_env.scene.parameters import (
+    Number,
+    drawn_factors,
+    has_target_spread,
+    inertia_paths,
+    parameters,
+    target_entries,
+    target_numbers,
+)
+from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from dq_space_arm_env.scene.schema import Scene
 
 Array = NDArray[np.float64]
-
-# Entries that a planar base keeps of its pose (q_r0, q_r3, q_d1, q_d2) and velocity (omega_z, v_x, v_y).
-PLANAR_POSE = (0, 3, 5, 6)
-PLANAR_TWIST = (2, 3, 4)
 
 _Z = (0.0, 0.0, 1.0)
 
@@ -26,24 +31,11 @@ Scalar = Any
 
 
 @dataclass(frozen=True)
-class MassFactors:
-    """Factors of masses, and of inertias about centers of mass."""
-
-    base_mass: Scalar
-    base_inertia: Scalar
-    link_masses: tuple[Scalar, ...]  # base to tip
-    link_inertias: tuple[Scalar, ...]
-    payload_mass: Scalar = 1.0
-    payload_inertia: Scalar = 1.0
-
-
-@dataclass(frozen=True)
 class EpisodeStart:
     """Draws of an episode, over plain scalars: numbers, arrays, or symbols."""
 
     state: list[Scalar]
-    target: tuple[Scalar, ...]
-    masses: MassFactors
+    drawn: dict[str, Scalar]  # parameters by name
 
 
 def is_planar(scene: Scene) -> bool:
@@ -69,25 +61,10 @@ def draw_initial_state(scene: Scene, rng: np.random.Generator) -> Array:
 def number_of_draws(scene: Scene) -> int:
     """Count the random numbers that a start takes: all of the state, and whatever else has a spread."""
     turning, moving = free_axes(scene)
-    start, spread = scene.initial_state, scene.spread
+    start = scene.initial_state
     base = len(turning) + len(moving)
     states = 2 * base + 2 * len(start.joint_angles) + len(start.wrist_angles)
-    bodies = (spread.base_mass, spread.base_inertia, spread.payload_mass, spread.payload_inertia)
-    links = (spread.link_masses, spread.link_inertias)
-    masses = sum(width > 0 for width in bodies) + len(scene.links) * sum(width > 0 for width in links)
-    return states + (base if has_target_spread(scene) else 0) + masses
-
-
-def has_target_spread(scene: Scene) -> bool:
-    """Tell whether the target is drawn for each episode."""
-    return bool(scene.spread.target_rotation or scene.spread.target_position)
-
-
-def target_entries(scene: Scene) -> tuple[int, ...]:
-    """Indices of the target's eight numbers that may differ between episodes; none without a spread."""
-    if not has_target_spread(scene):
-        return ()
-    return PLANAR_POSE if is_planar(scene) else tuple(range(8))
+    return states + (base if has_target_spread(scene) else 0) + sum(1 for _ in drawn_factors(scene))
 
 
 def start_from_draws(scene: Scene, draws: Array) -> Array:
@@ -99,7 +76,7 @@ def start_from_draws(scene: Scene, draws: Array) -> Array:
 
 
 def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
-    """Turn draws in [-1, 1] into state, target and masses.
+    """Turn draws in [-1, 1] into state and drawn parameters.
 
     The draws come in this order, components in the order of the state, also where the spread is zero: base
     rotation vector (in base axes: q_{e0/I} = nominal * exp), base position (in inertial axes), joint angles,
@@ -128,11 +105,16 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     linear = spread_out(start.base_velocity[3:], spread.base_linear_velocity, moving)
     joint_rates = spread_out(start.joint_rates, spread.joint_rates, joints)
     target = scene.target.pose.dual_quaternion
+    drawn: dict[str, Scalar] = {}
     if has_target_spread(scene):
         turned = rotations.exponential(spread_out((0.0, 0.0, 0.0), spread.target_rotation, turning))
         moved = spread_out(scene.target.pose.position, spread.target_position, moving)
         target_rotation = multiply(scene.target.pose.rotation, turned)
         target = tuple(poses.from_rotation_and_position(target_rotation, moved))
+        drawn |= {number.name: target[index] for number, index in _indexed_target(scene)}
+    for half_width, numbers in drawn_factors(scene):
+        factor = 1.0 + half_width * next(columns)
+        drawn |= {number.name: factor * number.nominal for number in numbers}
     # q and -q are one pose, but the cost |q_{G/I} - q_{D/I}|^2 sees two: the base quaternion gets the sign
     # for which the real part of q_{G/I} has a non-negative product with that of q_{D/I}.
     tip = multiply(rotation, _tip_rotation(scene, joint_angles, wrist_angles))
@@ -144,49 +126,34 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
         pose = [pose[index] for index in PLANAR_POSE]
         velocity = [velocity[index] for index in PLANAR_TWIST]
     state = [*pose, *joint_angles, *wrist_angles, *velocity, *joint_rates]
-    return EpisodeStart(state, target, _drawn_masses(scene, columns))
+    return EpisodeStart(state, drawn)
 
 
-def _drawn_masses(scene: Scene, draws: Iterator[Scalar]) -> MassFactors:
-    spread = scene.spread
-
-    def factor(half_width: float) -> Scalar:
-        return 1.0 + half_width * next(draws) if half_width else 1.0
-
-    return MassFactors(
-        base_mass=factor(spread.base_mass),
-        base_inertia=factor(spread.base_inertia),
-        link_masses=tuple(factor(spread.link_masses) for _ in scene.links),
-        link_inertias=tuple(factor(spread.link_inertias) for _ in scene.links),
-        payload_mass=factor(spread.payload_mass),
-        payload_inertia=factor(spread.payload_inertia),
-    )
+def parameter_values(scene: Scene, start: EpisodeStart) -> list[Scalar]:
+    """All parameters at a start, (n_p,): drawn ones, and the others' nominal values."""
+    return [start.drawn.get(number.name, number.nominal) for number in parameters(scene)]
 
 
-def episode_scene(scene: Scene, draws: Sequence[float], target: Sequence[float] | None = None) -> Scene:
-    """Scene of one episode: drawn (or given) target, drawn masses, no spread, nominal initial state."""
-    start = episode_start(scene, list(draws))
-    masses = start.masses
-    changes: dict[str, Any] = {
-        "spread": Spread(),
-        "base": _scaled(scene.base, masses.base_mass, masses.base_inertia),
-        "links": [
-            _scaled(link, mass, inertia)
-            for link, mass, inertia in zip(scene.links, masses.link_masses, masses.link_inertias, strict=True)
-        ],
-    }
-    if scene.payload is not None:
-        changes["payload"] = _scaled(scene.payload, masses.payload_mass, masses.payload_inertia)
-    if has_target_spread(scene):
-        pose = {"dual_quaternion": start.target if target is None else target}
-        changes["target"] = {"pose": pose, "base_velocity": scene.target.base_velocity}
-    return scene.replace(**changes)
+def episode_scene(scene: Scene, values: Sequence[float]) -> Scene:
+    """The scene in which the parameters, (n_p,), are constants; SceneError for what no scene may have."""
+    changes: dict[str, Any] = {"spread": Spread(), "parameters": ()}
+    target, places = list(scene.target.pose.dual_quaternion), dict(_indexed_target(scene))
+    for number, value in zip(parameters(scene), values, strict=True):
+        if number in places:
+            target[places[number]] = float(value)
+            changes["target.pose"] = {"dual_quaternion": target}
+        changes |= dict.fromkeys(number.paths, float(value))
+        if is_planar(scene) and number.name.endswith(".inertia.zz"):  # the rest of the inertia in proportion
+            place = number.name.removesuffix(".inertia.zz")
+            changes |= {
+                path: float(value) / number.nominal * entry for path, entry in inertia_paths(scene, place)
+            }
+    return scene.replace(changes)
 
 
-def _scaled(body: Base | Link | Payload, mass: float, inertia: float) -> dict[str, Any]:
-    """Scale mass and inertia of a body."""
-    rows = tuple(tuple(inertia * entry for entry in row) for row in body.inertia)
-    return {**body.model_dump(), "mass": mass * body.mass, "inertia": rows}
+def _indexed_target(scene: Scene) -> Iterator[tuple[Number, int]]:
+    """The numbers of the target with their indices in the dual quaternion."""
+    return zip(target_numbers(scene), target_entries(scene), strict=True)
 
 
 def _tip_rotation(scene: Scene, joint_angles: Sequence[Any], wrist_angles: Sequence[Any]) -> Sequence[Any]:

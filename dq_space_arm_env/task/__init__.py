@@ -2,6 +2,5 @@
 
 equations    cost and observation over plain scalars
 episode      a step of the environment: actions, reward, success, end
-parameters   target and masses that a scene draws for each episode
 trajectory   the record of a maneuver and its file
 """

@@ -16,8 +16,8 @@ import casadi
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.scene.start import episode_start, parameter_values
 from dq_space_arm_env.task.equations import SceneEquations, total, weighted_square
-from dq_space_arm_env.task.parameters import EpisodeParameters
 from dq_space_arm_env.task.step_report import MEMORY, REPORT, STATE_LIMIT
 
 Scalar = Any
@@ -29,17 +29,17 @@ DEGREES = 180.0 / math.pi
 
 def start(scene: Scene, draws: Scalars) -> Outputs:
     """State, memory and parameters at the start, from draws in [-1, 1]."""
-    state, parameters = EpisodeParameters.values(scene, draws)
-    begun = {"x": state, "memory": [0.0] * len(MEMORY)}
-    return {**begun, "parameters": parameters} if parameters else begun
+    begun = episode_start(scene, draws)
+    parameters = parameter_values(scene, begun)
+    outputs = {"x": begun.state, "memory": [0.0] * len(MEMORY)}
+    return {**outputs, "parameters": parameters} if parameters else outputs
 
 
 def command(equations: SceneEquations, action: Scalars) -> Outputs:
     """Inputs in N, N m, rad/s, from an action that is clipped to [-1, 1]."""
-    limits = equations.layout.control_limit.tolist()
     # Ordered such that NaN passes: if two numbers do not compare, fmin and fmax take the second.
     clipped = [casadi.fmin(1.0, casadi.fmax(-1.0, value)) for value in action]
-    return {"u": [limit * value for limit, value in zip(limits, clipped, strict=True)]}
+    return {"u": [limit * value for limit, value in zip(equations.control_limits, clipped, strict=True)]}
 
 
 def observe(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:

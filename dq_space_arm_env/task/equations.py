@@ -11,9 +11,11 @@ along by continuity.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import casadi
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import kinematics
@@ -21,8 +23,8 @@ from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.scene.parameters import target_entries, target_numbers, weight_name
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.task.parameters import EpisodeParameters
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -37,20 +39,22 @@ class SceneEquations:
     target: Scalars  # q_{D/I}, 8 numbers or symbols
     layout: StateLayout
     field: SpaceArmField
+    given: Mapping[str, Scalar]  # the parameters by name
 
     @classmethod
-    def nominal(cls, scene: Scene) -> SceneEquations:
-        """Equations with the scene's own target, masses and inertias."""
-        chain, layout = Chain.from_scene(scene), StateLayout.of(scene)
-        field = SpaceArmField(chain, layout, formulation=scene.simulation.formulation)
-        return cls(scene, chain, scene.target.pose.dual_quaternion, layout, field)
-
-    @classmethod
-    def parametric(cls, scene: Scene) -> SceneEquations:
-        """Equations with symbols, `field.parameters`, for what the scene draws for each episode."""
-        parameters, layout = EpisodeParameters.of(scene), StateLayout.of(scene)
-        field = SpaceArmField(parameters.chain, layout, parameters.symbols, scene.simulation.formulation)
-        return cls(scene, parameters.chain, parameters.target, layout, field)
+    def of(cls, scene: Scene, parameters: Scalars | None = None) -> SceneEquations:
+        """Equations of a scene with symbols, `field.parameters`, for what varies; or with given values."""
+        layout = StateLayout.of(scene)
+        symbols: list[Scalar] = []
+        if parameters is None:
+            parameters = symbols = [casadi.SX.sym(f"parameter_{i}") for i in range(layout.n_p)]
+        given = dict(zip(layout.parameters.names, parameters, strict=True))
+        target = list(scene.target.pose.dual_quaternion)
+        for number, index in zip(target_numbers(scene), target_entries(scene), strict=True):
+            target[index] = given.get(number.name, number.nominal)
+        chain = Chain.from_scene(scene, given)
+        field = SpaceArmField(chain, layout, symbols, scene.simulation.formulation)
+        return cls(scene, chain, target, layout, field, given)
 
     def y(self, x: Scalars) -> Scalars:
         """State without the pose."""
@@ -67,12 +71,11 @@ class SceneEquations:
 
     def state_cost_terms(self, x: Scalars) -> list[Scalar]:
         """Pose and base velocity: the stage cost's terms of the state."""
-        cost = self.scene.cost
-        return [self._pose_cost(x, cost.pose), self._velocity_cost(x, cost.base_velocity)]
+        return [self._pose_cost(x, "pose"), self._velocity_cost(x, "base_velocity")]
 
     def effort(self, u: Scalars) -> Scalar:
         """Effort u' R u, the stage cost's term of the input."""
-        return weighted_square(u, [0.0] * self.field.n_u, self.layout.control_weight.tolist())
+        return weighted_square(u, [0.0] * self.field.n_u, self.control_weights)
 
     def cost_terms(self, x: Scalars, u: Scalars) -> list[Scalar]:
         """Pose, base velocity and effort: the terms of the stage cost."""
@@ -80,15 +83,31 @@ class SceneEquations:
 
     def terminal_cost_terms(self, x: Scalars) -> list[Scalar]:
         """Pose and base velocity: the terms of the terminal cost."""
-        cost = self.scene.cost
-        return [self._pose_cost(x, cost.terminal_pose), self._velocity_cost(x, cost.terminal_base_velocity)]
+        return [self._pose_cost(x, "terminal_pose"), self._velocity_cost(x, "terminal_base_velocity")]
 
-    def _pose_cost(self, x: Scalars, weights: Sequence[float]) -> Scalar:
-        return weighted_square(self.tip(x), self.target, weights)
+    def _pose_cost(self, x: Scalars, field: str) -> Scalar:
+        return weighted_square(self.tip(x), self.target, self.state_weights(field))
 
-    def _velocity_cost(self, x: Scalars, weights: Sequence[float]) -> Scalar:
-        motion = self.field.motion(self.y(x))
-        return weighted_square((*motion.angular, *motion.linear), self.scene.target.base_velocity, weights)
+    def _velocity_cost(self, x: Scalars, field: str) -> Scalar:
+        motion, references = self.field.motion(self.y(x)), self.scene.target.base_velocity
+        return weighted_square((*motion.angular, *motion.linear), references, self.state_weights(field))
+
+    def state_weights(self, field: str) -> list[Scalar]:
+        """Weights of the state in the cost by their field in the scene, such as "terminal_pose"."""
+        nominal = getattr(self.scene.cost, field)
+        return [self.given.get(weight_name(field, index), weight) for index, weight in enumerate(nominal)]
+
+    @property
+    def control_weights(self) -> list[Scalar]:
+        """Weights of the squared inputs in the cost, n_u."""
+        names, nominal = self.layout.control.weights, self.layout.control_weight.tolist()
+        return [self.given.get(name, weight) for name, weight in zip(names, nominal, strict=True)]
+
+    @property
+    def control_limits(self) -> list[Scalar]:
+        """Largest magnitudes of the inputs, n_u."""
+        names, nominal = self.layout.control.limits, self.layout.control_limit.tolist()
+        return [self.given.get(name, limit) for name, limit in zip(names, nominal, strict=True)]
 
     def observe(self, x: Scalars, time_left: Scalar) -> dict[str, list[Scalar]]:
         """Observation, and the tip's errors: angle in rad, distance in m."""
@@ -109,16 +128,18 @@ class SceneEquations:
 
 
 def weighted_square(
-    values: Sequence[Scalar], references: Sequence[Scalar], weights: Sequence[float]
+    values: Sequence[Scalar], references: Sequence[Scalar], weights: Sequence[Scalar]
 ) -> Scalar:
     """Sum of w (value - reference)^2, a term of the cost."""
     # Squares that share a weight are added first: fewer products, and stage and terminal cost share the sums.
-    sums: dict[float, Scalar] = {}
+    # Weights that are symbols compare by identity.
+    sums: dict[Scalar, tuple[Scalar, Scalar]] = {}
     for value, reference, weight in zip(values, references, weights, strict=True):
         error = value - reference
-        sums[weight] = sums.get(weight, 0.0) + error * error
+        key = id(weight) if isinstance(weight, casadi.SX) else weight
+        sums[key] = weight, sums.get(key, (weight, 0.0))[1] + error * error
     result: Scalar = 0.0
-    for weight, squares in sums.items():
+    for weight, squares in sums.values():
         result = result + weight * squares
     return result
 

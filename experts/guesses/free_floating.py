@@ -15,7 +15,7 @@ from dq_space_arm_env import Kernels
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics.kinematics import wrist_rate_matrix
-from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
+from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from experts.problems.shooting_problem import FloatArray
 
 _PLANAR_MOMENTUM = (0, 1, 5)  # P_x, P_y, L_z

@@ -69,13 +69,15 @@ def drawn(scene, rng):
 
 def accelerations(scene, x, u):
     """Accelerations of base and joints by the scene's own equations."""
-    equations = SceneEquations.nominal(scene)
+    equations = SceneEquations.of(scene, StateLayout.of(scene).parameters.nominal.tolist())
     return np.array(equations.field.accelerations(equations.y(x.tolist()), u.tolist()), dtype=float)
 
 
 def tip_pose(scene, x):
     """Rotation matrix and position of the tip, by the scene's own equations."""
-    rotation, position = poses.to_matrix(SceneEquations.nominal(scene).tip(x.tolist()))
+    rotation, position = poses.to_matrix(
+        SceneEquations.of(scene, StateLayout.of(scene).parameters.nominal.tolist()).tip(x.tolist())
+    )
     return np.array(rotation), np.array(position)
 
 

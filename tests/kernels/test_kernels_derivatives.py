@@ -50,6 +50,7 @@ def complex_step_jacobians(kernels, x, u, integrator):
     x_lanes = [moved(layout, x, row) for row in np.eye(kernels.n_t)] + [x] * kernels.n_u
     u_lanes = [u] * kernels.n_t + [u + 1j * H * row for row in np.eye(kernels.n_u)]
     inputs = {"x": np.array(x_lanes).T, "u": np.array(u_lanes).T, "h": h}
+    inputs["parameters"] = kernels.parameters.nominal
     # Derivatives of adaptive methods are those of the steps taken, with their lengths held fixed.
     buffers = interpreter.evaluate_program(program, inputs, np.complex128, frozen=("taken", "substep_time"))
     x_next = buffers["x_next"].T
@@ -85,9 +86,9 @@ def test_linearization_agrees_with_complex_steps(scene, integrator, draw):
 def test_machine_code_agrees_with_the_interpreted_graph(scene, draw):
     kernels, states, inputs = draw(scene, 2)
     program = ScenePrograms(kernels.scene).build("step", "rk4")
-    h = [kernels.scene.simulation.dt]
+    given = {"h": [kernels.scene.simulation.dt], "parameters": kernels.parameters.nominal}
     for x, u in zip(states, inputs, strict=True):
-        expected = interpreter.evaluate_program(program, {"x": x, "u": u, "h": h}, np.longdouble)["x_next"]
+        expected = interpreter.evaluate_program(program, {"x": x, "u": u, **given}, np.longdouble)["x_next"]
         found = kernels.step(x, u, integrator="rk4")
         np.testing.assert_allclose(found, expected.astype(float), rtol=1e-13, atol=1e-13)
 
@@ -104,7 +105,8 @@ def test_cost_derivatives_agree_with_complex_steps(scene, draw):
     for k, (x, u) in enumerate(zip(states, inputs, strict=True)):
 
         def gradient(program, variations, fixed):
-            result = interpreter.evaluate_program(program, {**fixed, **variations}, np.complex128)
+            given = {**fixed, **variations, "parameters": kernels.parameters.nominal}
+            result = interpreter.evaluate_program(program, given, np.complex128)
             return result["cost"][0].imag / H
 
         along_x = {"x": np.array([moved(layout, x, row) for row in np.eye(kernels.n_t)]).T}

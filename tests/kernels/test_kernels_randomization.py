@@ -6,9 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
-from dq_space_arm_env.scene import Spread
-from dq_space_arm_env.scene.start import episode_scene, episode_start, number_of_draws
-from dq_space_arm_env.task.parameters import EpisodeParameters
+from dq_space_arm_env.scene import Spread, StateLayout
+from dq_space_arm_env.scene.start import episode_scene, episode_start, number_of_draws, parameter_values
 
 TARGETS = {"joint_angles": 0.5, "target_rotation": 0.4, "target_position": 0.3}
 MASSES = {"base_mass": 0.2, "base_inertia": 0.3, "link_masses": 0.4, "link_inertias": 0.5}
@@ -18,6 +17,10 @@ PAYLOAD = {"payload_mass": 0.6, "payload_inertia": 0.7}
 def spread_out(name):
     scene = load_scene(name)
     return scene.replace(spread=TARGETS | MASSES | (PAYLOAD if scene.payload else {}))
+
+
+def drawn_scene(scene, draws):
+    return episode_scene(scene, parameter_values(scene, episode_start(scene, draws.tolist())))
 
 
 def make(scene):
@@ -49,12 +52,12 @@ def test_episodes_differ_in_what_is_drawn():
     for seed in range(3):
         env.reset(seed=seed)
         drawn.append(env.parameters)
-    names = EpisodeParameters.of(env.scene).names
+    names = env.kernels.parameters.names
     assert len(names) == len(drawn[0])
     assert (np.ptp(drawn, axis=0) > 0).all()
-    mass = names.index("base mass")
     scene = env.episode_scene
-    assert scene.base.mass == pytest.approx(drawn[-1][mass], rel=1e-15)
+    assert scene.base.mass == drawn[-1][names.index("base.mass")]
+    assert scene.payload.inertia[1][1] == drawn[-1][names.index("payload.inertia.yy")]
     assert abs(scene.base.mass / 105 - 1) <= 0.2
 
 
@@ -70,15 +73,20 @@ def test_a_given_start_has_the_nominal_target_and_masses(options):
     np.testing.assert_allclose(found, nominal, atol=1e-15)
 
 
-def test_only_what_the_equations_read_is_a_parameter():
+def test_what_is_drawn_is_a_parameter():
     paper, payload = load_scene("paper"), load_scene("payload")
-    assert EpisodeParameters.of(paper).names == ()
+    assert names_of(paper) == []
     # The target is a parameter as a whole, so that it can be set to any.
-    moved = EpisodeParameters.of(paper.replace(spread={"target_position": 0.1})).names
-    assert moved == tuple(f"target q_{part}{index}" for part in "rd" for index in range(4))
-    heavier = EpisodeParameters.of(payload.replace(spread={"payload_mass": 0.1})).names
-    # The payload's mass moves the last link's center of mass along x, and counts for its inertia.
-    assert heavier == ("link 3 mass", "link 3 center of mass x", "link 3 inertia yy", "link 3 inertia zz")
+    moved = names_of(paper.replace(spread={"target_position": 0.1}))
+    assert moved == [f"target.pose.q_{part}{index}" for part in "rd" for index in range(4)]
+    assert names_of(payload.replace(spread={"payload_mass": 0.1})) == ["payload.mass"]
+    # What is zero stays zero under a factor.
+    turned = names_of(payload.replace(spread={"base_inertia": 0.1}))
+    assert turned == ["base.inertia.xx", "base.inertia.yy", "base.inertia.zz"]
+
+
+def names_of(scene):
+    return list(StateLayout.of(scene).parameters.names)
 
 
 def test_a_scene_that_draws_states_only_pays_nothing():
@@ -106,24 +114,26 @@ def test_copies_have_parameters_of_their_own():
 def test_drawn_bodies_keep_their_proportions():
     scene = spread_out("payload")
     draws = np.random.default_rng(0).uniform(-1, 1, number_of_draws(scene))
-    masses = episode_start(scene, draws.tolist()).masses
-    drawn = episode_scene(scene, draws.tolist())
-    bodies = zip((scene.base, *scene.links), (drawn.base, *drawn.links), strict=True)
-    mass_factors = (masses.base_mass, *masses.link_masses)
-    inertia_factors = (masses.base_inertia, *masses.link_inertias)
-    for (nominal, body), mass, inertia in zip(bodies, mass_factors, inertia_factors, strict=True):
+    drawn = drawn_scene(scene, draws)
+    bodies = zip(
+        (scene.base, *scene.links, scene.payload), (drawn.base, *drawn.links, drawn.payload), strict=True
+    )
+    # The last draws: base, masses of the links, inertias of the links, payload.
+    n = len(scene.links)
+    widths = np.array([0.2, 0.3, *[0.4] * n, *[0.5] * n, 0.6, 0.7])
+    factors = 1.0 + widths * draws[-len(widths) :]
+    masses = [factors[0], *factors[2 : 2 + n], factors[-2]]
+    inertias = [factors[1], *factors[2 + n : 2 + 2 * n], factors[-1]]
+    for (nominal, body), mass, inertia in zip(bodies, masses, inertias, strict=True):
         assert body.mass == pytest.approx(mass * nominal.mass, rel=1e-15)
         np.testing.assert_allclose(body.inertia, inertia * np.array(nominal.inertia), rtol=1e-15)
     assert not any(drawn.spread.model_dump().values())
-    # The last draws are the payload's.
-    assert masses.payload_mass == pytest.approx(1 + 0.6 * draws[-2], rel=1e-15)
-    assert masses.payload_inertia == pytest.approx(1 + 0.7 * draws[-1], rel=1e-15)
 
 
 def test_a_drawn_target_is_turned_in_its_axes_and_moved_in_inertial_ones():
     scene = load_scene("random-target")
     draws = np.random.default_rng(1).uniform(-1, 1, number_of_draws(scene))
-    drawn = episode_scene(scene, draws.tolist()).target.pose
+    drawn = drawn_scene(scene, draws).target.pose
     nominal = scene.target.pose
     expected = nominal.position + scene.spread.target_position * draws[-3:]
     np.testing.assert_allclose(drawn.position, expected, atol=1e-14)

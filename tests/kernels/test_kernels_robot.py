@@ -186,3 +186,13 @@ def test_a_base_without_joints_has_them_too(draw):
     assert not mass[:3, 3:].any()
     assert kernels.generalized_jacobian(states[0]).shape == (6, 0)
     assert kernels.tip_jacobian(states).shape == (2, 6, 6)
+
+
+def test_masses_that_vary_are_those_given(draw):
+    scene = load_scene("payload").replace(spread={"base_mass": 0.2, "link_masses": 0.3, "payload_mass": 0.4})
+    kernels, states, inputs = draw(scene, 3)
+    p = kernels.parameters.nominal * np.random.default_rng(0).uniform(0.8, 1.2, (3, kernels.n_p))
+    mass, bias = kernels.mass_matrix(states, p), kernels.bias_forces(states, p)
+    assert not np.array_equal(mass, kernels.mass_matrix(states))
+    solved = np.linalg.solve(mass, (forces(kernels, inputs) - bias)[..., None])[..., 0]
+    assert relative_error(kernels.forward_dynamics(states, inputs, np.zeros(6), p), solved) < 1e-11

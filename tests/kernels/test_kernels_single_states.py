@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import Kernels, compile_scene, load_scene
+from dq_space_arm_env.scene import Spread
 
 FORMS = {
     "list": lambda row: row.tolist(),
@@ -106,3 +107,21 @@ def test_kernels_that_nobody_called_yet_can_be_copied(draw):
     expected = compile_scene("paper").step(states[0], inputs[0])
     for copied in (copy.deepcopy(fresh), pickle.loads(pickle.dumps(fresh))):
         np.testing.assert_array_equal(copied.step(states[0], inputs[0]), expected)
+
+
+def test_parameters_are_those_of_each_call(draw):
+    """Nominal ones unless given, call after call, and checked as in batches."""
+    kernels, states, inputs = draw(load_scene("paper").replace(spread={"base_mass": 0.2}), 1)
+    x, u, nominal = states[0], inputs[0], kernels.parameters.nominal
+    heavier = 1.5 * nominal
+    expected = {p.tobytes(): kernels.step(x[None], u[None], p=p)[0] for p in (nominal, heavier)}
+    assert not np.array_equal(*expected.values())
+    for p in (None, heavier, None, nominal, heavier.tolist(), None):
+        found = kernels.step(x, u, p=p)
+        np.testing.assert_array_equal(found, expected[np.array(nominal if p is None else p).tobytes()])
+    with pytest.raises(ValueError, match="p: shape"):
+        kernels.step(x, u, p=np.zeros(len(nominal) + 1))
+    constant = compile_scene(load_scene("paper").replace(spread=Spread()))
+    constant.step(x, u)
+    with pytest.raises(ValueError, match="p: shape"):
+        constant.step(x, u, p=np.ones(1))

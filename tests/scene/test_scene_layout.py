@@ -85,7 +85,7 @@ class TestSizes:
         assert layout.initial_state.shape == (layout.n_x,)
         assert layout.control_limit.shape == layout.control_weight.shape == (layout.n_u,)
         for entries in (layout.state, layout.tangent, layout.control):
-            besides = ("names", "units", "angular_velocity", "linear_velocity")
+            besides = ("names", "units", "angular_velocity", "linear_velocity", "limits", "weights")
             parts = [getattr(entries, field.name) for field in fields(entries) if field.name not in besides]
             indices = [index for part in parts for index in range(part.start, part.stop)]
             assert sorted(indices) == list(range(len(entries.names)))

@@ -15,7 +15,6 @@ from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.scene.start import episode_scene, number_of_draws
 from dq_space_arm_env.task import episode
 from dq_space_arm_env.task.equations import SceneEquations
-from dq_space_arm_env.task.parameters import EpisodeParameters
 from dq_space_arm_env.task.step_report import FLAGS, REPORT
 
 interpreter = pytest.importorskip("graph_interpreter")
@@ -27,7 +26,7 @@ DT, STEPS = 0.05, 60
 def equations(request: Any, short_scene: Scene) -> SceneEquations:
     scene = short_scene if request.param == "short" else load_scene(request.param)
     simulation = scene.simulation.model_copy(update={"dt": DT, "steps": STEPS})
-    return SceneEquations.parametric(scene.replace(simulation=simulation))
+    return SceneEquations.of(scene.replace(simulation=simulation))
 
 
 def run(function: Callable[..., Any], **inputs: Any) -> dict[str, np.ndarray]:
@@ -147,7 +146,7 @@ def test_a_step_to_what_is_no_state_stays_and_pays_for_all_that_is_left(
 
 
 def test_a_state_within_the_tolerances_is_a_success(short_scene: Scene) -> None:
-    nominal = SceneEquations.nominal(short_scene)
+    nominal = SceneEquations.of(short_scene)
     tip = tip_of(nominal, nominal.layout.initial_state)
     for angle, distance, success in (
         (0.9, 0.0, True),
@@ -159,7 +158,7 @@ def test_a_state_within_the_tolerances_is_a_success(short_scene: Scene) -> None:
         moved = [distance * short_scene.success.position_error, 0.0, 0.0]
         aside = np.add(poses.position(tip.tolist()), moved)
         pose = {"position": aside.tolist(), "rotation": {"axis": [0, 0, 1], "angle": turn}}
-        equations = SceneEquations.nominal(short_scene.replace(target={"pose": pose}))
+        equations = SceneEquations.of(short_scene.replace(target={"pose": pose}))
         x = nominal.layout.initial_state
         seen = run(partial(episode.observe, equations), x=x, memory=[0.0] * 3)
         assert seen["flags"].tolist() == [0.0, success, 0.0]
@@ -179,9 +178,10 @@ def test_parameters_are_what_the_episodes_scene_says(name: str) -> None:
     scene = load_scene(name)
     draws = np.random.default_rng(4).uniform(-1.0, 1.0, number_of_draws(scene))
     begun = run(lambda draws: episode.start(scene, draws), draws=draws)
-    parameters = EpisodeParameters.of(scene)
-    assert begun["parameters"].shape == (len(parameters.symbols),) == (len(set(parameters.names)),)
-    parametric, known = SceneEquations.parametric(scene), SceneEquations.nominal(episode_scene(scene, draws))
+    parametric = SceneEquations.of(scene)
+    names = parametric.layout.parameters.names
+    assert begun["parameters"].shape == (len(names),) == (len(set(names)),)
+    known = SceneEquations.of(episode_scene(scene, begun["parameters"]))
     y = np.random.default_rng(5).uniform(-1.0, 1.0, known.field.n_y).tolist()
     u = np.random.default_rng(6).uniform(-1.0, 1.0, known.field.n_u).tolist()
     symbols = casadi.vertcat(*parametric.field.parameters)

@@ -10,7 +10,7 @@ from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.scene import StateLayout
-from dq_space_arm_env.scene.start import PLANAR_POSE
+from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.viewing.replay.curves import panels
 from dq_space_arm_env.viewing.replay.flights import MOST_FLIGHTS, prepare, verdict
 

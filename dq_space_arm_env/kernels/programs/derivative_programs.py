@@ -20,7 +20,11 @@ from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.integrators import integrator_of
-from dq_space_arm_env.integrators.method import TwiceDifferentiableIntegrator
+from dq_space_arm_env.integrators.method import (
+    TwiceDifferentiableIntegrator,
+    graph_inputs,
+    program_inputs,
+)
 from dq_space_arm_env.task.equations import SceneEquations
 
 Scalar = Any
@@ -37,14 +41,14 @@ class DerivativePrograms:
         self.chain = equations.chain
 
     def _state_cost_derivatives(
-        self, x: Scalars, pose: Scalars, velocity: Scalars, emphasis: Scalar = 1.0
+        self, x: Scalars, weights: tuple[Scalars, Scalars], emphasis: Scalar = 1.0
     ) -> tuple[Any, Any]:
         """Gradient and Gauss-Newton Hessian of the state's cost in tangent coordinates, sparse SX.
 
-        An emphasis multiplies the weights of the pose. The tip's pose moves with the base by q_{e0/I} d
-        q_{G/e0} / 2 for a twist increment d, and with the angles by (27).
+        The weights are those of pose and velocity; an emphasis multiplies the first. The tip's pose moves
+        with the base by q_{e0/I} d q_{G/e0} / 2 for a twist increment d, and with the angles by (27).
         """
-        field = self.field
+        field, (pose, velocity) = self.field, weights
         motion = field.motion(self.equations.y(x))
         arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
         base = self.equations.base_pose(x)
@@ -60,8 +64,8 @@ class DerivativePrograms:
         by_angles = casadi.mtimes(matrix(left), casadi.jacobian(column(*arm), angles))
         others = zeros(8, field.n_t - len(directions) - self._angle_count())
         by_state = casadi.sparsify(casadi.horzcat(*directions, by_angles, others))
-        error = column(*tip) - casadi.DM(self.scene.target.pose.dual_quaternion)
-        weighted = emphasis * casadi.mtimes(casadi.diag(casadi.DM(pose)), by_state)
+        error = column(*tip) - column(*self.equations.target)
+        weighted = emphasis * casadi.mtimes(casadi.diag(column(*pose)), by_state)
         gradient = 2.0 * casadi.mtimes(weighted.T, error)
         hessian = 2.0 * casadi.mtimes(by_state.T, weighted)
         start = field.n_t - field.n_y
@@ -72,27 +76,35 @@ class DerivativePrograms:
             hessian[start + index, start + index] += 2.0 * weight
         return gradient, casadi.sparsify(hessian)
 
+    def _stage_weights(self) -> tuple[Scalars, Scalars]:
+        weights = self.equations.state_weights
+        return weights("pose"), weights("base_velocity")
+
+    def _terminal_weights(self) -> tuple[Scalars, Scalars]:
+        weights = self.equations.state_weights
+        return weights("terminal_pose"), weights("terminal_base_velocity")
+
     def _angle_count(self) -> int:
         return self.layout.n_joints + (3 if self.layout.has_wrist else 0)
 
     def cost(self) -> Program:
         """Gradient and Gauss-Newton Hessian of the stage cost."""
-        field, cost = self.field, self.scene.cost
+        field = self.field
         x, u = symbols("x", field.n_x), symbols("u", field.n_u)
-        gradient, hessian = self._state_cost_derivatives(x, cost.pose, cost.base_velocity)
-        weights = (2.0 * self.layout.control_weight).tolist()
+        gradient, hessian = self._state_cost_derivatives(x, self._stage_weights())
+        weights = [2.0 * weight for weight in self.equations.control_weights]
         outputs = {
             "lx": casadi.densify(gradient).nonzeros(),
             "lu": [weight * value for weight, value in zip(weights, u, strict=True)],
             "lxx": hessian.nonzeros(),
             "luu": weights,
         }
-        graph = graph_of("cost_derivatives_graph", {"x": x, "u": u}, outputs)
+        graph = graph_of("cost_derivatives_graph", graph_inputs(field, x=x, u=u), outputs)
         n_t, n_u = field.n_t, field.n_u
         diagonal = tuple(range(0, n_u * n_u, n_u + 1))
         program = Program(
             "cost_derivatives",
-            [Buffer("x", field.n_x), Buffer("u", n_u)],
+            program_inputs(field, Buffer("x", field.n_x), Buffer("u", n_u)),
             [
                 Buffer("lx", n_t),
                 Buffer("lu", n_u),
@@ -105,16 +117,15 @@ class DerivativePrograms:
 
     def terminal_cost(self) -> Program:
         """Gradient and Gauss-Newton Hessian of the terminal cost, with an emphasis on its pose."""
-        field, cost = self.field, self.scene.cost
+        field = self.field
         x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
-        gradient, hessian = self._state_cost_derivatives(
-            x, cost.terminal_pose, cost.terminal_base_velocity, emphasis
-        )
+        gradient, hessian = self._state_cost_derivatives(x, self._terminal_weights(), emphasis)
         outputs = {"lx": casadi.densify(gradient).nonzeros(), "lxx": hessian.nonzeros()}
-        graph = graph_of("terminal_cost_derivatives_graph", {"x": x, "emphasis": [emphasis]}, outputs)
+        inputs = graph_inputs(field, x=x, emphasis=[emphasis])
+        graph = graph_of("terminal_cost_derivatives_graph", inputs, outputs)
         program = Program(
             "terminal_cost_derivatives",
-            [Buffer("x", field.n_x), Buffer("emphasis", 1)],
+            program_inputs(field, Buffer("x", field.n_x), Buffer("emphasis", 1)),
             [Buffer("lx", field.n_t), sparse_buffer("lxx", hessian.sparsity())],
         )
         program.call(graph)
@@ -123,9 +134,8 @@ class DerivativePrograms:
     def linearize(self, integrator: str) -> Program:
         """A and B of a step."""
         field = self.field
-        program = Program(
-            "linearize", [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)], []
-        )
+        inputs = [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)]
+        program = Program("linearize", program_inputs(field, *inputs), [])
         a, b = integrator_of(self.scene.simulation, integrator).append_linearization(program, field)
         program.outputs = [sparse_buffer("A", a), sparse_buffer("B", b)]
         return program
@@ -136,21 +146,14 @@ class DerivativePrograms:
         if not isinstance(method, TwiceDifferentiableIntegrator):
             name = integrator or self.scene.simulation.integrator
             raise ValueError(f"integrator: {name!r} has no second derivatives, which this asks for")
-        field, layout, cost = self.field, self.layout, self.scene.cost
-        program = Program(
-            "lagrangian_hessian",
-            [
-                Buffer("x", field.n_x),
-                Buffer("u", field.n_u),
-                Buffer("multiplier", field.n_t),
-                Buffer("h", 1, shared=True),
-            ],
-            [],
-        )
+        field = self.field
+        inputs = [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("multiplier", field.n_t)]
+        inputs.append(Buffer("h", 1, shared=True))
+        program = Program("lagrangian_hessian", program_inputs(field, *inputs), [])
         pattern = method.append_curvature(program, field)
         curvature, x = casadi.SX.sym("curvature", pattern), symbols("x", field.n_x)
-        state = self._state_cost_hessian(x, cost.pose, cost.base_velocity)
-        effort = casadi.SX(casadi.diag(casadi.DM(2.0 * layout.control_weight)))
+        state = self._state_cost_hessian(x, self._stage_weights())
+        effort = casadi.diag(column(*(2.0 * weight for weight in self.equations.control_weights)))
         total = curvature + casadi.triu(casadi.diagcat(state, effort))
         hessian = casadi.sparsify(casadi.triu2symm(total))
         blocks = {
@@ -159,27 +162,27 @@ class DerivativePrograms:
             "Luu": hessian[field.n_t :, field.n_t :],
         }
         outputs = {name: block.nonzeros() for name, block in blocks.items()}
-        inputs = {"x": x, "curvature": curvature.nonzeros()}
-        program.call(graph_of("lagrangian_hessian_graph", inputs, outputs))
+        given = graph_inputs(field, x=x, curvature=curvature.nonzeros())
+        program.call(graph_of("lagrangian_hessian_graph", given, outputs))
         program.outputs = [sparse_buffer(name, block.sparsity()) for name, block in blocks.items()]
         return program
 
     def terminal_cost_hessian(self) -> Program:
         """Exact Hessian of the terminal cost, with an emphasis on its pose."""
-        field, cost = self.field, self.scene.cost
+        field = self.field
         x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
-        hessian = self._state_cost_hessian(x, cost.terminal_pose, cost.terminal_base_velocity, emphasis)
+        hessian = self._state_cost_hessian(x, self._terminal_weights(), emphasis)
         program = Program(
             "terminal_cost_hessian",
-            [Buffer("x", field.n_x), Buffer("emphasis", 1)],
+            program_inputs(field, Buffer("x", field.n_x), Buffer("emphasis", 1)),
             [sparse_buffer("Lxx", hessian.sparsity())],
         )
-        inputs = {"x": x, "emphasis": [emphasis]}
+        inputs = graph_inputs(field, x=x, emphasis=[emphasis])
         program.call(graph_of("terminal_cost_hessian_graph", inputs, {"Lxx": hessian.nonzeros()}))
         return program
 
     def _state_cost_hessian(
-        self, x: Scalars, pose: Scalars, velocity: Scalars, emphasis: Scalar = 1.0
+        self, x: Scalars, weights: tuple[Scalars, Scalars], emphasis: Scalar = 1.0
     ) -> Matrix:
         """Exact Hessian of the state's cost: Gauss-Newton's, plus the residual times the tip's curvature.
 
@@ -187,7 +190,7 @@ class DerivativePrograms:
         dual quaternion products.
         """
         field, n = self.field, len(self.field.pose.directions)
-        hessian = self._state_cost_derivatives(x, pose, velocity, emphasis)[1]
+        hessian = self._state_cost_derivatives(x, weights, emphasis)[1]
         base = self.equations.base_pose(x)
         increment, angles = symbols("d", n), symbols("angle", self._angle_count())
         n_joints = self.layout.n_joints
@@ -197,11 +200,11 @@ class DerivativePrograms:
         turned = [a + 0.5 * b for a, b in zip(half, square, strict=True)]
         turned[0] = turned[0] + 1.0
         tip = column(*dq.multiply(base, dq.multiply(turned, arm)))
-        error = column(*self.equations.tip(x)) - casadi.DM(self.scene.target.pose.dual_quaternion)
+        error = column(*self.equations.tip(x)) - column(*self.equations.target)
         residual = casadi.SX.sym("residual", 8)
         moved = column(*increment, *angles)
         curvature = casadi.hessian(casadi.dot(residual, tip), moved)[0]
-        weighted = casadi.densify(2.0 * emphasis * casadi.DM(pose) * error)
+        weighted = casadi.densify(2.0 * emphasis * column(*weights[0]) * error)
         values = column(*[0.0] * n, *self.equations.y(x)[: len(angles)])
         curvature = casadi.substitute(
             [curvature], [casadi.vertcat(residual, moved)], [casadi.densify(casadi.vertcat(weighted, values))]

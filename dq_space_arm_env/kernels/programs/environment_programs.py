@@ -1,7 +1,7 @@
 """The programs of the environments: start an episode, observe, step, and compare goals.
 
-The equations are those of `task.episode`; here they become programs. Target, masses and inertias are inputs
-(`parameters`) where the scene draws them for each episode; other scenes have no such input.
+The equations are those of `task.episode`; here they become programs. What varies in a scene is an
+input, `parameters`; a scene in which nothing does has no such input.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from functools import partial
 from dq_space_arm_env.compiler.graph import Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.integrators import integrator_of
+from dq_space_arm_env.integrators.method import program_inputs
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import number_of_draws
 from dq_space_arm_env.task import episode
@@ -24,18 +25,12 @@ class EnvironmentPrograms:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self.equations = SceneEquations.parametric(scene)
+        self.equations = SceneEquations.of(scene)
         self._parameters = self.equations.field.parameters
 
     def build(self, name: str, integrator: str) -> Program:
         """Trace one of `PROGRAMS`; KeyError for an unknown program or integrator."""
         return PROGRAMS[name](self, integrator)
-
-    def _inputs(self, *buffers: Buffer) -> list[Buffer]:
-        """Inputs of a program, the parameters after the first of them."""
-        if not self._parameters:
-            return list(buffers)
-        return [buffers[0], Buffer("parameters", len(self._parameters)), *buffers[1:]]
 
     def _start(self, integrator: str) -> Program:
         """From draws to initial states, memory and parameters, for the listed sub-environments."""
@@ -53,7 +48,7 @@ class EnvironmentPrograms:
         sizes = {"x": self.equations.field.n_x, "memory": len(MEMORY)}
         observe = partial(episode.observe, self.equations)
         graph = trace("observe_graph", sizes, observe, parameters=self._parameters)
-        inputs = self._inputs(*(Buffer(name, size) for name, size in sizes.items()))
+        inputs = program_inputs(self.equations.field, *(Buffer(name, size) for name, size in sizes.items()))
         program = Program("environment_observe", inputs, _outputs(graph), indexed=True)
         program.call(graph)
         return program
@@ -75,7 +70,7 @@ class EnvironmentPrograms:
         equations, simulation = self.equations, self.scene.simulation
         n_x, n_u, n_memory = equations.field.n_x, equations.field.n_u, len(MEMORY)
         inputs = Buffer("x", n_x), Buffer("memory", n_memory), Buffer("action", n_u, dtype=actions)
-        program = Program(name, self._inputs(*inputs), [])
+        program = Program(name, program_inputs(equations.field, *inputs), [])
         program.call(trace("inputs_graph", {"action": n_u}, partial(episode.command, equations)))
         program.call(trace("time_step_graph", {}, lambda: {"h": [simulation.dt]}))
         integrator_of(simulation, integrator).append_step(program, equations.field)

@@ -1,4 +1,4 @@
-"""Programs of the paper's own formulation: 46 states with the tip's pose appended."""
+"""Programs of the paper's own formulation, 46 states with the tip's pose appended; nothing varies."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from dq_space_arm_env.dynamics import newton_euler
 from dq_space_arm_env.dynamics.paper_field import PaperField
 from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.kernels.programs.derivative_programs import sparse_buffer
-from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
+from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.task.equations import weighted_square
+from dq_space_arm_env.task.equations import SceneEquations, weighted_square
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -28,9 +28,9 @@ class PaperPrograms:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        minimal = ScenePrograms(scene)
-        self.layout = minimal.layout
-        self.field = PaperField(minimal.field)
+        self.layout = StateLayout.of(scene)
+        nominal = SceneEquations.of(scene, self.layout.parameters.nominal.tolist())
+        self.field = PaperField(nominal.field)
 
     def build(self, name: str) -> Program:
         """Trace a program by name.

@@ -1,7 +1,7 @@
 """The programs of a scene, one per function of `Kernels`, traced on demand.
 
 A program's inputs are arrays with one row per state: `x` (n_x), `u` (n_u), and others by name; `h`, the time
-step in s, is shared by all rows.
+step in s, is shared by all rows. What varies in a scene is an input as well, `parameters` (n_p).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.integrators.dormand_prince import append_measured_step
+from dq_space_arm_env.integrators.method import program_inputs
 from dq_space_arm_env.integrators.momentum import MomentumPreserving
 from dq_space_arm_env.kernels.programs.derivative_programs import DerivativePrograms
 from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
@@ -34,7 +35,7 @@ class ScenePrograms:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self.equations = SceneEquations.nominal(scene)
+        self.equations = SceneEquations.of(scene)
         self.chain, self.layout = self.equations.chain, self.equations.layout
         self.field = self.equations.field
         derivatives = self._derivatives = DerivativePrograms(self.equations)
@@ -83,12 +84,16 @@ class ScenePrograms:
 
     # Functions of a state, and of an input.
 
-    def _program(self, name: str, outputs: Callable[..., Mapping[str, Scalars]], **sizes: int) -> Program:
-        """Program of a single graph."""
-        graph = trace(name + "_graph", sizes, outputs)
+    def _program(
+        self, name: str, outputs: Callable[..., Mapping[str, Scalars]], varies: bool = True, **sizes: int
+    ) -> Program:
+        """Program of a single graph; `varies` if it may depend on parameters."""
+        inputs = [Buffer(key, size) for key, size in sizes.items()]
+        parameters = self.field.parameters if varies else ()
+        graph = trace(name + "_graph", sizes, outputs, parameters=parameters)
         program = Program(
             name,
-            [Buffer(key, size) for key, size in graph.inputs],
+            program_inputs(self.field, *inputs) if varies else inputs,
             [Buffer(key, size) for key, size in graph.outputs],
         )
         program.call(graph)
@@ -195,7 +200,7 @@ class ScenePrograms:
             rest = [a - b for a, b in zip(self.equations.y(x), self.equations.y(x_reference), strict=True)]
             return {"dx": [*(twist[i] for i in field.pose.directions), *rest]}
 
-        return self._program("difference", outputs, x_reference=field.n_x, x=field.n_x)
+        return self._program("difference", outputs, varies=False, x_reference=field.n_x, x=field.n_x)
 
     def _retract(self) -> Program:
         field = self.field
@@ -205,7 +210,7 @@ class ScenePrograms:
             pose = field.pose.moved(split_state(field, x)[0], field.pose.full_twist(dx[:n]))
             return {"x_next": [*pose, *(a + b for a, b in zip(self.equations.y(x), dx[n:], strict=True))]}
 
-        return self._program("retract", outputs, x=field.n_x, dx=field.n_t)
+        return self._program("retract", outputs, varies=False, x=field.n_x, dx=field.n_t)
 
     # Observations.
 
@@ -245,12 +250,17 @@ class ScenePrograms:
         """A step alone, or with its cost."""
         field = self.field
         x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
-        program = Program(name, [x, u, h], [Buffer("x_next", field.n_x)])
+        program = Program(name, program_inputs(field, x, u, h), [Buffer("x_next", field.n_x)])
         integrator_of(self.scene.simulation, integrator).append_step(program, field)
         if name == "step_with_cost":
             sizes = {"x": field.n_x, "u": field.n_u}
             program.call(
-                trace("cost_graph", sizes, lambda x, u: {"cost": [total(self.equations.cost_terms(x, u))]})
+                trace(
+                    "cost_graph",
+                    sizes,
+                    lambda x, u: {"cost": [total(self.equations.cost_terms(x, u))]},
+                    parameters=field.parameters,
+                )
             )
             program.outputs = [*program.outputs, Buffer("cost", 1)]
         return program
@@ -261,7 +271,7 @@ class ScenePrograms:
         inputs = [Buffer("x", field.n_x), Buffer("u", field.n_u)]
         inputs += [Buffer(name, size, shared=True) for name, size in (("h", 1), ("tolerances", 2))]
         outputs = [Buffer("x_next", field.n_x), Buffer("error", 1), Buffer("dense", 4 * field.n_t)]
-        program = Program("measured_step", inputs, outputs)
+        program = Program("measured_step", program_inputs(field, *inputs), outputs)
         append_measured_step(program, field)
         return program
 
@@ -270,10 +280,10 @@ class ScenePrograms:
         field, method = self.field, integrator_of(self.scene.simulation, integrator)
         x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
         if not isinstance(method, MomentumPreserving):
-            program = Program("walk", [x, u, h], [Buffer("x_next", field.n_x)])
+            program = Program("walk", program_inputs(field, x, u, h), [Buffer("x_next", field.n_x)])
             method.append_step(program, field)
             return program
         outputs = [Buffer("x_next", field.n_x), Buffer("momentum_next", 6)]
-        program = Program("walk", [x, Buffer("momentum", 6), u, h], outputs)
+        program = Program("walk", program_inputs(field, x, Buffer("momentum", 6), u, h), outputs)
         method.append_walk(program, field)
         return program

@@ -12,7 +12,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.scene import Scene, StateLayout
-from dq_space_arm_env.scene.start import PLANAR_POSE
+from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.task.step_report import STATE_LIMIT
 from dq_space_arm_env.task.trajectory import Trajectory
 

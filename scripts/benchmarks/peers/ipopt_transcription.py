@@ -17,6 +17,7 @@ import casadi
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.task.equations import SceneEquations
 
 _OFFSETS = (0.0, 0.5, 0.5, 1.0)
@@ -35,7 +36,7 @@ class Transcription:
 
 def transcribe(scene: Scene) -> Transcription:
     """Write a maneuver as a program over all its states and controls."""
-    equations = SceneEquations.nominal(scene)
+    equations = SceneEquations.of(scene, StateLayout.of(scene).parameters.nominal.tolist())
     n_x, n_u, n = equations.layout.n_x, equations.layout.n_u, scene.simulation.steps
     step, step_jacobian, step_hessian = _step(equations)
     stage, terminal = _costs(equations)

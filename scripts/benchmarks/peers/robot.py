@@ -8,7 +8,7 @@ import numpy as np
 
 from dq_space_arm_env import Kernels
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
+from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from experts.problems.shooting_problem import FloatArray
 
 

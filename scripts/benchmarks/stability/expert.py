@@ -12,7 +12,7 @@ from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.dynamics.vector_field import PoseCoordinates
 from dq_space_arm_env.scene import InitialState
-from dq_space_arm_env.scene.start import PLANAR_POSE, PLANAR_TWIST
+from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.solution import StopReason
 from experts.guesses.guided import GuidedDDP

@@ -1,0 +1,220 @@
+"""The parameters of a scene: numbers that are inputs of its machine code rather than constants of it.
+
+Those are the numbers that its spread draws for each episode, and those that it names under `parameters`.
+Whatever varies is known by its path in the scene: "links.0.mass", "base.inertia.xx", "target.pose.q_r0".
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+from dq_space_arm_env.scene.bodies import Base, Link, Payload
+from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
+
+Scene = Any  # `schema.Scene`, which finds mistakes in its list of parameters by this file
+
+TARGET = "target.pose"
+_AXES = ("x", "y", "z")
+_EULER_ANGLES = ("psi", "theta", "phi")
+_LOWER_TRIANGLE = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
+_POSE = tuple(f"q_{part}{index}" for part in "rd" for index in range(4))
+_TWIST = tuple(f"{kind}_{axis}" for kind in ("omega", "v") for axis in _AXES)
+CONTROL_UNITS = {"base_force": "N", "base_torque": "N m", "joint_torque": "N m", "wrist_rate": "rad/s"}
+_STATE_WEIGHTS = {
+    "pose": (_POSE, PLANAR_POSE),
+    "terminal_pose": (_POSE, PLANAR_POSE),
+    "base_velocity": (_TWIST, PLANAR_TWIST),
+    "terminal_base_velocity": (_TWIST, PLANAR_TWIST),
+}
+
+
+class Number(NamedTuple):
+    """A number of a scene that may be a parameter."""
+
+    name: str  # its path, with a word for the place in a list
+    unit: str  # "1" for dimensionless
+    nominal: float
+    # Those of the number itself, for `Scene.replace`; a target and a planar inertia change as a whole.
+    paths: tuple[str, ...]
+
+
+class ControlNumbers(NamedTuple):
+    """The numbers of a control; joints may share theirs."""
+
+    name: str  # of the control
+    limit: Number
+    weight: Number
+
+
+def parameters(scene: Scene) -> tuple[Number, ...]:
+    """The parameters of a scene: target, bodies from base to payload, weights, limits."""
+    drawn = _drawn(scene)
+    return tuple(
+        number
+        for number in numbers(scene)
+        if number.name in drawn or any(is_part(number.name, path) for path in scene.parameters)
+    )
+
+
+def is_part(name: str, path: str) -> bool:
+    """Tell whether a path leads to a number, or to something that it is part of."""
+    return name == path or name.startswith(path + ".")
+
+
+def parents(name: str) -> Iterator[str]:
+    """A number's name, and the paths of everything that it is part of."""
+    while name:
+        yield name
+        name = name.rpartition(".")[0]
+
+
+def numbers(scene: Scene) -> Iterator[Number]:
+    """All numbers of a scene that may be parameters; a planar scene has those of its plane only."""
+    yield from target_numbers(scene)
+    yield from body_numbers(scene, "base")
+    for index, link in enumerate(scene.links):
+        place = f"links.{index}"
+        yield from body_numbers(scene, place)
+        yield _number(f"{place}.stiffness", "N m/rad", link.stiffness)
+        yield _number(f"{place}.damping", "N m s/rad", link.damping)
+    if scene.payload is not None:
+        yield from body_numbers(scene, "payload")
+    for field, (entries, planar) in _STATE_WEIGHTS.items():
+        weights = getattr(scene.cost, field)
+        for index in planar if _is_planar(scene) else range(len(entries)):
+            yield _number(weight_name(field, index), "1", weights[index], f"cost.{field}.{index}")
+    controls = [each for numbers in control_numbers(scene).values() for each in numbers]
+    yield from dict.fromkeys(control.weight for control in controls)
+    yield from dict.fromkeys(control.limit for control in controls)
+
+
+def _number(name: str, unit: str, nominal: float, *paths: str) -> Number:
+    return Number(name, unit, nominal, paths or (name,))
+
+
+def weight_name(field: str, index: int) -> str:
+    """Name of a weight of the state in the cost, for example of ("pose", 0)."""
+    return f"cost.{field}.{_STATE_WEIGHTS[field][0][index]}"
+
+
+def target_numbers(scene: Scene) -> Iterator[Number]:
+    """The numbers of the target's dual quaternion; in a planar scene four of them are zero."""
+    pose = scene.target.pose.dual_quaternion
+    for index in target_entries(scene):
+        yield Number(f"{TARGET}.{_POSE[index]}", "1" if index < 4 else "m", pose[index], ())
+
+
+def target_entries(scene: Scene) -> tuple[int, ...]:
+    """Indices of the target's eight numbers that are not zero whatever the target."""
+    return PLANAR_POSE if _is_planar(scene) else tuple(range(8))
+
+
+def body_numbers(scene: Scene, place: str) -> Iterator[Number]:
+    """Mass, center of mass and inertia of the body at a place: "base", "links.0", "payload"."""
+    planar, body = _is_planar(scene), _body(scene, place)
+    yield _number(f"{place}.mass", "kg", body.mass)
+    center = () if isinstance(body, Base) else body.center_of_mass
+    for index, value in enumerate(center[:2] if planar else center):
+        yield _number(center_name(place, index), "m", value, f"{place}.center_of_mass.{index}")
+    for i, j in ((2, 2),) if planar else _LOWER_TRIANGLE:
+        paths = tuple(dict.fromkeys((f"{place}.inertia.{i}.{j}", f"{place}.inertia.{j}.{i}")))
+        yield Number(inertia_name(place, i, j), "kg m^2", body.inertia[i][j], () if planar else paths)
+
+
+def center_name(place: str, index: int) -> str:
+    """Name of a coordinate of a body's center of mass."""
+    return f"{place}.center_of_mass.{_AXES[index]}"
+
+
+def inertia_name(place: str, row: int, column: int) -> str:
+    """Name of an entry of a body's inertia, a symmetric matrix."""
+    return f"{place}.inertia.{_AXES[min(row, column)]}{_AXES[max(row, column)]}"
+
+
+def inertia_paths(scene: Scene, place: str) -> Iterator[tuple[str, float]]:
+    """Paths and values of all entries of a body's inertia."""
+    for i, row in enumerate(_body(scene, place).inertia):
+        yield from ((f"{place}.inertia.{i}.{j}", entry) for j, entry in enumerate(row))
+
+
+def _body(scene: Scene, place: str) -> Base | Link | Payload:
+    kind, _, index = place.partition(".")
+    body: Base | Link | Payload = scene.links[int(index)] if index else getattr(scene, kind)
+    return body
+
+
+def drawn_factors(scene: Scene) -> Iterator[tuple[float, list[Number]]]:
+    """Half-widths of the factors that the spread draws for bodies, in order, each with what it scales."""
+    spread = scene.spread
+    links = [f"links.{index}" for index in range(len(scene.links))]
+    for width, quantity, places in (
+        (spread.base_mass, "mass", ["base"]),
+        (spread.base_inertia, "inertia", ["base"]),
+        (spread.link_masses, "mass", links),
+        (spread.link_inertias, "inertia", links),
+        (spread.payload_mass, "mass", ["payload"]),
+        (spread.payload_inertia, "inertia", ["payload"]),
+    ):
+        for place in places if width else ():
+            found = (each for each in body_numbers(scene, place) if is_part(each.name, f"{place}.{quantity}"))
+            yield width, [number for number in found if number.nominal]
+
+
+def has_target_spread(scene: Scene) -> bool:
+    """Tell whether the target is drawn for each episode."""
+    return bool(scene.spread.target_rotation or scene.spread.target_position)
+
+
+def _drawn(scene: Scene) -> set[str]:
+    """Names of what the spread draws; of the target all of it, even if only its position is drawn."""
+    target = target_numbers(scene) if has_target_spread(scene) else ()
+    scaled = (number for _, group in drawn_factors(scene) for number in group)
+    return {number.name for number in (*target, *scaled)}
+
+
+def control_numbers(scene: Scene) -> dict[str, list[ControlNumbers]]:
+    """The controls by actuator, in order; an absent one, or one without joints, has none."""
+    planar = _is_planar(scene)
+    axes = {"base_force": (0, 1), "base_torque": (2,)} if planar else {}
+    return {
+        field: [
+            *(
+                _joint_controls(scene)
+                if field == "joint_torque"
+                else _axis_controls(scene, field, axes.get(field, range(3)))
+            )
+        ]
+        for field in CONTROL_UNITS
+    }
+
+
+def _axis_controls(scene: Scene, field: str, axes: Sequence[int]) -> Iterator[ControlNumbers]:
+    actuator, weights = getattr(scene.actuators, field), getattr(scene.cost, field)
+    limit, weight = f"actuators.{field}.limit", f"cost.{field}"
+    of_wrist = field == "wrist_rate"
+    for axis in axes if actuator is not None else ():
+        entry = (_EULER_ANGLES if of_wrist else _AXES)[axis]
+        yield ControlNumbers(
+            f"wrist {entry} rate" if of_wrist else f"{field.replace('_', ' ')} {entry}",
+            _number(f"{limit}.{entry}", CONTROL_UNITS[field], actuator.limit[axis], f"{limit}.{axis}"),
+            _number(f"{weight}.{entry}", _per_square(field), weights[axis], f"{weight}.{axis}"),
+        )
+
+
+def _joint_controls(scene: Scene) -> Iterator[ControlNumbers]:
+    motors, field = scene.actuators.joint_torque, "joint_torque"
+    weight = _number("cost.joint_torque", _per_square(field), scene.cost.joint_torque)
+    for index, link in enumerate(scene.links):
+        if motors is None or not link.actuated:
+            continue
+        limit = _number("actuators.joint_torque.limit", CONTROL_UNITS[field], motors.limit)
+        if link.torque_limit is not None:
+            limit = _number(f"links.{index}.torque_limit", CONTROL_UNITS[field], link.torque_limit)
+        yield ControlNumbers(f"{link.name} torque", limit, weight)
+
+
+def _per_square(field: str) -> str:
+    return f"({CONTROL_UNITS[field]})^-2"
+
+
+def _is_planar(scene: Scene) -> bool:
+    return bool(scene.base.motion == "planar")
