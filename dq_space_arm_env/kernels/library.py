@@ -131,8 +131,10 @@ class KernelLibrary:
         """
         single = self._single_row_calls.get((name, integrator))
         if single is not None and (p is None or self.n_p):
-            parameters = self._nominal_parameters if p is None else p
-            if (results := single.results({**inputs, "parameters": parameters})) is not None:
+            given = inputs
+            if self.n_p:
+                given = {**inputs, "parameters": self._nominal_parameters if p is None else p}
+            if (results := single.results(given)) is not None:
                 return results
         rows, batched, arrays = rows_of(inputs if p is None else {**inputs, "p": p}, self.dtype)
         arrays["parameters"] = self.parameter_rows(arrays.pop("p", None), rows)
