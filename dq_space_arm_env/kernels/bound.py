@@ -98,6 +98,49 @@ class KernelCall:
         return call
 
 
+class SingleRowCalls:
+    """Calls of a kernel for one row, with arrays prepared beforehand: they cost little more than their work.
+
+    Every call takes a set of arrays from a pool and puts it back: threads never share one.
+    """
+
+    def __init__(self, kernel: BoundKernel) -> None:
+        """Take a kernel whose code works on one row at a time."""
+        self._kernel = kernel
+        self._idle: list[_PreparedCall] = []
+
+    def results(self, given: Mapping[str, ArrayLike]) -> tuple[Array, ...] | None:
+        """Run on inputs by name; None unless each is an array of exactly its shape and element type."""
+        try:  # `pop` and `append` are atomic
+            call = self._idle.pop()
+        except IndexError:
+            call = self._prepare()
+        inputs, outputs, run = call
+        try:
+            for name, view in inputs:
+                value = given[name]
+                if type(value) is not np.ndarray:
+                    return None
+                view[:] = value  # copies; ValueError if shape or element type differ
+            run()
+            return tuple([array.copy() for array in outputs])
+        except ValueError:
+            return None
+        finally:
+            self._idle.append(call)
+
+    def _prepare(self) -> _PreparedCall:
+        kernel = self._kernel
+        specs = (*kernel.inputs, *kernel.outputs)
+        arrays: dict[str, Any] = {spec.name: np.zeros(spec.stride, spec.dtype) for spec in specs}
+        inputs: list[tuple[str, Any]] = [(spec.name, memoryview(arrays[spec.name])) for spec in kernel.inputs]
+        outputs = [arrays[spec.name] for spec in kernel.outputs]
+        return inputs, outputs, KernelCall(kernel, arrays).of_one_row()
+
+
+# Views of the inputs by name, outputs, and the function that computes these from those.
+_PreparedCall = tuple[list[tuple[str, Any]], list[Array], Callable[[], None]]
+
 _ONE_ROW = ctypes.PYFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
 
 
