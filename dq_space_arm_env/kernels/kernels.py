@@ -147,6 +147,65 @@ class Kernels(KernelLibrary):
         a, b = self.call("linearize", self._integrator(integrator), x=x, u=u, h=self._time_step(dt), p=p)
         return _matrices(a, self.n_t, self.n_t), _matrices(b, self.n_t, self.n_u)
 
+    def linearize_parameters(
+        self,
+        x: ArrayLike,
+        u: ArrayLike,
+        dt: float | None = None,
+        integrator: str | None = None,
+        p: ArrayLike | None = None,
+    ) -> Array:
+        """Exact derivative of a step by the parameters, in tangent coordinates: dx+ = P dp.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u).
+            dt: Time step, s; the scene's by default.
+            integrator: Name of the integrator; the scene's by default.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            P, shape (n_t, n_p) or (B, n_t, n_p).
+
+        Raises:
+            ValueError: As for `step`, or if the scene has no parameters.
+        """
+        by_parameters = self.call(
+            "linearize_parameters", self._integrator(integrator), x=x, u=u, h=self._time_step(dt), p=p
+        )[0]
+        return by_parameters.reshape(*by_parameters.shape[:-1], self.n_t, self.n_p)
+
+    def cost_by_parameters(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Exact gradient of the stage cost by the parameters.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Gradients, shape (n_p,) or (B, n_p).
+
+        Raises:
+            ValueError: If the scene has no parameters.
+        """
+        return self.call("cost_by_parameters", x=x, u=u, p=p)[0]
+
+    def terminal_cost_by_parameters(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Exact gradient of the terminal cost by the parameters.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Gradients, shape (n_p,) or (B, n_p).
+
+        Raises:
+            ValueError: If the scene has no parameters.
+        """
+        return self.call("terminal_cost_by_parameters", x=x, p=p)[0]
+
     def integrate(
         self,
         x: ArrayLike,

@@ -223,6 +223,7 @@ _STEPS = (
     "step_with_cost",
     "walk",
     "linearize",
+    "linearize_parameters",
     "lagrangian_hessian",
     "environment_step",
     "environment_step_float32_actions",

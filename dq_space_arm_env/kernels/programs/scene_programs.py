@@ -21,6 +21,7 @@ from dq_space_arm_env.integrators.dormand_prince import append_measured_step
 from dq_space_arm_env.integrators.method import program_inputs
 from dq_space_arm_env.integrators.momentum import MomentumPreserving
 from dq_space_arm_env.kernels.programs.derivative_programs import DerivativePrograms
+from dq_space_arm_env.kernels.programs.parameter_programs import ParameterPrograms
 from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
 from dq_space_arm_env.kernels.programs.robot_programs import RobotPrograms
 from dq_space_arm_env.scene.schema import Scene
@@ -78,6 +79,8 @@ class ScenePrograms:
             return self._walk(integrator)
         if name == "linearize":
             return self._derivatives.linearize(integrator)
+        if name in ("linearize_parameters", "cost_by_parameters", "terminal_cost_by_parameters"):
+            return ParameterPrograms(self.equations).build(name, integrator)
         if name == "lagrangian_hessian":
             return self._derivatives.lagrangian_hessian(integrator)
         return self._builders[name]()
