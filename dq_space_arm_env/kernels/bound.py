@@ -104,9 +104,9 @@ class SingleRowCalls:
     Every call takes a set of arrays from a pool and puts it back: threads never share one.
     """
 
-    def __init__(self, kernel: BoundKernel) -> None:
-        """Take a kernel whose code works on one row at a time."""
-        self._kernel = kernel
+    def __init__(self, kernel: BoundKernel, constant: Mapping[str, Array]) -> None:
+        """Take a kernel whose code works on one row at a time, and inputs that are the same in every call."""
+        self._kernel, self._constant = kernel, constant
         self._idle: list[_PreparedCall] = []
 
     def results(self, given: Mapping[str, ArrayLike]) -> tuple[Array, ...] | None:
@@ -115,15 +115,15 @@ class SingleRowCalls:
             call = self._idle.pop()
         except IndexError:
             call = self._prepare()
-        inputs, outputs, run = call
+        inputs, copies, run = call
         try:
             for name, view in inputs:
                 value = given[name]
-                if type(value) is not np.ndarray:
+                if type(value) is not _ARRAY:
                     return None
                 view[:] = value  # copies; ValueError if shape or element type differ
             run()
-            return tuple([array.copy() for array in outputs])
+            return (copies[0](),) if len(copies) == 1 else tuple([copy() for copy in copies])
         except ValueError:
             return None
         finally:
@@ -133,13 +133,19 @@ class SingleRowCalls:
         kernel = self._kernel
         specs = (*kernel.inputs, *kernel.outputs)
         arrays: dict[str, Any] = {spec.name: np.zeros(spec.stride, spec.dtype) for spec in specs}
-        inputs: list[tuple[str, Any]] = [(spec.name, memoryview(arrays[spec.name])) for spec in kernel.inputs]
-        outputs = [arrays[spec.name] for spec in kernel.outputs]
-        return inputs, outputs, KernelCall(kernel, arrays).of_one_row()
+        inputs: list[tuple[str, Any]] = []
+        for spec in kernel.inputs:
+            if spec.name in self._constant:
+                arrays[spec.name][:] = self._constant[spec.name]
+            else:
+                inputs.append((spec.name, memoryview(arrays[spec.name])))
+        copies = [arrays[spec.name].copy for spec in kernel.outputs]
+        return inputs, copies, KernelCall(kernel, arrays).of_one_row()
 
 
-# Views of the inputs by name, outputs, and the function that computes these from those.
-_PreparedCall = tuple[list[tuple[str, Any]], list[Array], Callable[[], None]]
+# Views of the inputs by name, functions that copy the outputs, and the one that computes these from those.
+_PreparedCall = tuple[list[tuple[str, Any]], list[Callable[[], Array]], Callable[[], None]]
+_ARRAY = np.ndarray
 
 _ONE_ROW = ctypes.PYFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
 

@@ -6,7 +6,7 @@ disk; the next process loads it without tracing, compiling or importing CasADi.
 
 from __future__ import annotations
 
-from functools import cache, cached_property
+from functools import cache
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,7 +71,7 @@ class Kernels(KernelLibrary):
         Raises:
             ValueError: If dt is not a finite number, or the integrator is unknown.
         """
-        return self.call("step", self._integrator(integrator), x=x, u=u, h=self._time_step(dt), p=p)[0]
+        return self._step_call("step", x, u, dt, integrator, p)[0]
 
     def simulate(
         self,
@@ -144,7 +144,7 @@ class Kernels(KernelLibrary):
         Raises:
             ValueError: As for `step`.
         """
-        a, b = self.call("linearize", self._integrator(integrator), x=x, u=u, h=self._time_step(dt), p=p)
+        a, b = self._step_call("linearize", x, u, dt, integrator, p)
         return _matrices(a, self.n_t, self.n_t), _matrices(b, self.n_t, self.n_u)
 
     def linearize_parameters(
@@ -170,10 +170,8 @@ class Kernels(KernelLibrary):
         Raises:
             ValueError: As for `step`, or if the scene has no parameters.
         """
-        by_parameters = self.call(
-            "linearize_parameters", self._integrator(integrator), x=x, u=u, h=self._time_step(dt), p=p
-        )[0]
-        return by_parameters.reshape(*by_parameters.shape[:-1], self.n_t, self.n_p)
+        by_parameters = self._step_call("linearize_parameters", x, u, dt, integrator, p)[0]
+        return _matrices(by_parameters, self.n_t, self.n_p)
 
     def cost_by_parameters(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Exact gradient of the stage cost by the parameters.
@@ -523,22 +521,32 @@ class Kernels(KernelLibrary):
         """Number of the wrist's Euler rates."""
         return 3 if self.layout.has_wrist else 0
 
+    def _step_call(
+        self,
+        name: str,
+        x: ArrayLike,
+        u: ArrayLike,
+        dt: float | None,
+        integrator: str | None,
+        p: ArrayLike | None,
+    ) -> tuple[Array, ...]:
+        """Run a program of a step."""
+        if integrator is not None:
+            integrator = self._integrator(integrator)
+        if dt is None:
+            return self.call(name, integrator, x=x, u=u, p=p)
+        return self.call(name, integrator, x=x, u=u, h=self._time_step(dt), p=p)
+
     def _integrator(self, name: str | None) -> str | None:
         if name is not None and name not in INTEGRATORS:
             raise ValueError(f"integrator: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
         return name
 
     def _time_step(self, dt: float | None) -> Array:
-        if dt is None:
-            return self._scene_time_step
-        step = float(dt)
+        step = self.scene.simulation.dt if dt is None else float(dt)
         if not isfinite(step):
             raise ValueError(f"dt: {step} is not a finite time step in s")
         return np.array([step], self.dtype)
-
-    @cached_property
-    def _scene_time_step(self) -> Array:
-        return np.array([self.scene.simulation.dt], self.dtype)
 
 
 def _matrices(entries: Array, rows: int, columns: int) -> Array:

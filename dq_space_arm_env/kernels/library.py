@@ -45,7 +45,7 @@ class KernelLibrary:
         self.dtype = np.dtype(scene.simulation.precision)
         self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
         self._paper_kernels: dict[tuple[str, int], BoundKernel] = {}
-        self._single_row_calls: dict[tuple[str, str | None], SingleRowCalls] = {}
+        self._single_row_calls: dict[tuple[str, str | None, bool, bool], SingleRowCalls] = {}
         self._announced = False
 
     @cached_property
@@ -119,25 +119,26 @@ class KernelLibrary:
         return self.layout.parameters
 
     @cached_property
-    def _nominal_parameters(self) -> Array:
-        return self.parameters.nominal.astype(self.dtype)
+    def _defaults(self) -> dict[str, Array]:
+        """Inputs of kernels that a call may leave out: the time step and the nominal parameters."""
+        inputs = {"h": [self.scene.simulation.dt], "parameters": self.parameters.nominal}
+        return {name: np.array(values, self.dtype) for name, values in inputs.items()}
 
     def call(
         self, name: str, integrator: str | None = None, *, p: ArrayLike | None = None, **inputs: ArrayLike
     ) -> tuple[Array, ...]:
         """Run a program on one row or a batch; outputs take the form of the inputs.
 
-        Parameters p, (n_p,) or (B, n_p), have their nominal values by default.
+        Parameters p, (n_p,) or (B, n_p), are nominal by default, and the time step h is the scene's.
         """
-        single = self._single_row_calls.get((name, integrator))
-        if single is not None and (p is None or self.n_p):
-            given = inputs
-            if self.n_p:
-                given = {**inputs, "parameters": self._nominal_parameters if p is None else p}
-            if (results := single.results(given)) is not None:
+        key = name, integrator, "h" in inputs, p is None
+        single = self._single_row_calls.get(key)
+        if single is not None:
+            results = single.results(inputs if p is None else {**inputs, "parameters": p})
+            if results is not None:
                 return results
         rows, batched, arrays = rows_of(inputs if p is None else {**inputs, "p": p}, self.dtype)
-        arrays["parameters"] = self.parameter_rows(arrays.pop("p", None), rows)
+        arrays = {**self._defaults, **arrays, "parameters": self.parameter_rows(arrays.get("p"), rows)}
         kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)
         ordered = []
         for spec in kernel.inputs:
@@ -151,7 +152,9 @@ class KernelLibrary:
         outputs = [np.zeros((rows, spec.stride), self.dtype) for spec in kernel.outputs]
         kernel([*ordered, *outputs], rows, self.threads)
         if not batched:
-            self._single_row_calls.setdefault((name, integrator), SingleRowCalls(kernel))
+            given = {"h": "h" in inputs, "parameters": p is not None}
+            constant = {each: array for each, array in self._defaults.items() if not given[each]}
+            self._single_row_calls.setdefault(key, SingleRowCalls(kernel, constant))
         return tuple(output if batched else output[0] for output in outputs)
 
     def parameter_rows(self, p: ArrayLike | None, rows: int) -> Array:
@@ -159,7 +162,7 @@ class KernelLibrary:
 
         Raises ValueError for another shape.
         """
-        given = self._nominal_parameters if p is None else real_array("p", p, self.dtype)
+        given = self._defaults["parameters"] if p is None else real_array("p", p, self.dtype)
         if given.shape not in ((self.n_p,), (rows, self.n_p)):
             raise ValueError(
                 f"p: shape {given.shape}, should be ({self.n_p},) or ({rows}, {self.n_p}); the parameters of "
