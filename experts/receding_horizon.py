@@ -50,7 +50,7 @@ class ManeuverPlan:
 
     @classmethod
     def make(cls, maneuver: ArmProblem, state: FloatArray, stage: int, known: Solution) -> Self:
-        """Plan from a state at a stage; the policy of a known solution from that stage on is a guess.
+        """Plan from a state at a stage; the policy of a known solution that began no later is a guess.
 
         Raises:
             RuntimeError: If the maneuver cannot be simulated or differentiated from this state.
@@ -58,7 +58,9 @@ class ManeuverPlan:
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         problem.begin_at(stage)
         # At stage 0 the problem is the maneuver itself, which adds the tip's screw motion to the guesses.
-        solver = GuidedDDP(maneuver if stage == 0 else problem, library=[known])
+        solver = GuidedDDP(
+            maneuver if stage == 0 else problem, library=[_last_stages(known, problem.horizon)]
+        )
         solution = solver.solve(state, parameters=problem.parameters.rows)
         emphasis = float(solution.metadata["emphasis"])
         exact = problem.has_second_order
@@ -77,14 +79,14 @@ class ManeuverPlan:
         return cls(stage, solution, solution.policy(), emphasis, work.update.Vx_all, hessians)
 
 
-def _from_stage(solution: Solution, stage: int) -> Solution:
-    """The rest of a maneuver."""
+def _last_stages(solution: Solution, count: int) -> Solution:
+    """The last stages of a maneuver."""
     return replace(
         solution,
-        states=solution.states[stage:],
-        controls=solution.controls[stage:],
-        feedback_gains=solution.feedback_gains[stage:],
-        parameters=solution.parameters[stage:],
+        states=solution.states[-count - 1 :],
+        controls=solution.controls[-count:],
+        feedback_gains=solution.feedback_gains[-count:],
+        parameters=solution.parameters[-count - 1 :],
     )
 
 
@@ -309,15 +311,14 @@ class RecedingHorizonExpert:
         if self._nominal is None:
             with self.maneuver.parameters.being(None):
                 self._nominal = BoxDDP(self.maneuver).solve()
-        self.plan = ManeuverPlan.make(self.maneuver, state, stage, _from_stage(self._nominal, stage))
+        self.plan = ManeuverPlan.make(self.maneuver, state, stage, self._nominal)
         self._work, self._next_stage, self.fallbacks, self.dropouts = None, stage, 0, 0
         self._informed = False
 
     def _plan_anew(self, state: FloatArray, stage: int) -> None:
         """Plan the rest of the episode with other parameters; the present plan's policy is a guess."""
         assert self.plan is not None
-        known = _from_stage(self.plan.solution, stage - self.plan.first_stage)
-        self.plan = ManeuverPlan.make(self.maneuver, state, stage, known)
+        self.plan = ManeuverPlan.make(self.maneuver, state, stage, self.plan.solution)
         self._work, self._informed = None, False
 
     def _window(self, plan: ManeuverPlan, stage: int) -> ShootingWorkspace:

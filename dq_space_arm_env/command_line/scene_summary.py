@@ -39,6 +39,14 @@ def record(scene: Scene) -> dict[str, Any]:
                 strict=True,
             )
         ],
+        "parameters": [
+            {**entry, "nominal": nominal}
+            for entry, nominal in zip(
+                _entries(layout.parameters.names, layout.parameters.units),
+                layout.parameters.nominal.tolist(),
+                strict=True,
+            )
+        ],
         "left_out": list(left_out(scene)),
         "scene": scene.model_dump(mode="json"),
     }
@@ -73,6 +81,16 @@ def print_scene(console: Console, scene: Scene) -> None:
     ]
     heading = ("entry", "", "limit", "unit", "weight")
     _print(console, f"Inputs, {layout.n_u} numbers", heading, inputs, right=(2, 4))
+    varies = layout.parameters
+    if varies.names:
+        rows = [
+            (str(i), name, f"{nominal:g}", unit)
+            for i, (name, nominal, unit) in enumerate(
+                zip(varies.names, varies.nominal, varies.units, strict=True)
+            )
+        ]
+        title = f"Parameters, {layout.n_p} numbers that vary"
+        _print(console, title, ("entry", "", "nominal", "unit"), rows, right=(2,))
     _print(console, "Task", ("", ""), list(_task(scene)))
     absent = [(part,) for part in left_out(scene)] or [("nothing",)]
     _print(console, "Not in this scene: no states, no operations", ("",), absent)

@@ -71,6 +71,34 @@ _OPERATION_NAMES = {
 }
 
 
+EXPRESSIONS: Mapping[str, Callable[..., Expression]] = {
+    "add": lambda a, b: a + b,
+    "subtract": lambda a, b: a - b,
+    "multiply": lambda a, b: a * b,
+    "divide": lambda a, b: a / b,
+    "negate": lambda a: -a,
+    "square": lambda a: a * a,
+    "twice": lambda a: 2 * a,
+    "invert": lambda a: 1 / a,
+    "sqrt": casadi.sqrt,
+    "sin": casadi.sin,
+    "cos": casadi.cos,
+    "arctan2": casadi.atan2,
+    "absolute": casadi.fabs,
+    "minimum": casadi.fmin,
+    "maximum": casadi.fmax,
+    "less": casadi.lt,
+    "less_equal": casadi.le,
+    "equal": casadi.eq,
+    "not_equal": casadi.ne,
+    "not": casadi.logic_not,
+    "and": casadi.logic_and,
+    "or": casadi.logic_or,
+    "if_else_zero": lambda condition, a: casadi.if_else(condition, a, 0.0),
+}
+"""Operations of nodes as CasADi expressions of their arguments."""
+
+
 def trace(
     name: str,
     inputs: Mapping[str, int],

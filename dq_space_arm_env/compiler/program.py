@@ -81,6 +81,7 @@ class Program:
     calls: list[Call] = field(default_factory=list)  # a buffer that is neither input nor output is scratch
     indexed: bool = False  # a list says which rows to work on
     loops: list[Loop] = field(default_factory=list)  # the buffers they touch live through all passes
+    held: set[str] = field(default_factory=set)  # buffers that derivatives take as constants, see `tangent`
 
     def call(self, graph: Graph, **bindings: str) -> None:
         """Append a call; `bindings` map names of the graph to buffers of other names."""

@@ -13,6 +13,7 @@ from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
+from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
 from dq_space_arm_env.dynamics.minimal import Accelerations, Wrenches
 from dq_space_arm_env.dynamics.vector_field import PoseCoordinates, spread
 from dq_space_arm_env.scene.layout import StateLayout
@@ -173,6 +174,27 @@ class EquationsOfMotion:
         turning = subtract(solved.linear, cross(motion.angular, motion.linear))
         dual = [*solved.angular, *turning]
         return [*(dual[i] for i in self.pose.directions), *solved.joints]
+
+    def mass_matrix(self, y: Sequence[Scalar]) -> list[list[Scalar]]:
+        """Mass matrix by the accelerations (free directions, joints), symmetric."""
+        rotations = minimal.joint_rotations(self.chain, self.motion(y).joint_angles)
+        free = (*self.pose.directions, *range(6, 6 + len(self.chain.links)))
+        whole = mass_matrix(self.chain, rotations)
+        return [[whole[i][j] for j in free] for i in free]
+
+    def bias_forces(self, y: Sequence[Scalar]) -> list[Scalar]:
+        """Generalized forces (free directions, joints) that keep the accelerations (20) zero, without a load.
+
+        Where v' = 0, an inertial observer sees the acceleration omega x v.
+        """
+        motion = self.motion(y)
+        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        given = Accelerations(ZERO, cross(motion.angular, motion.linear), [0.0] * len(self.chain.links))
+        needed = minimal.inverse_dynamics(self.chain, rotations, motion.angular, motion.joint_rates, given)
+        passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
+        dual = [*needed.torque, *needed.force]
+        joints = [bias - other for bias, other in zip(needed.joints, passive, strict=True)]
+        return [*(dual[i] for i in self.pose.directions), *joints]
 
     def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
         """Time derivative of y: rates of joints and wrist, base and joint accelerations."""

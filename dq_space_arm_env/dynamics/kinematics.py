@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra.poses import to_matrix
 from dq_space_arm_env.algebra.scalars import cos, sin
 from dq_space_arm_env.algebra.vectors import (
     add,
@@ -18,7 +19,7 @@ from dq_space_arm_env.algebra.vectors import (
     transposed_matrix_vector,
 )
 from dq_space_arm_env.dynamics.chain import Chain
-from dq_space_arm_env.dynamics.minimal import shift_wrench
+from dq_space_arm_env.dynamics.minimal import ZERO, shift_wrench
 
 Scalar = Any
 DualQuaternion = Sequence[Scalar]
@@ -111,6 +112,38 @@ def tip_pose_rate(
         turning = matrix_vector(wrist_rate_matrix(wrist_angles), wrist_rates)
         rate = dq.add(rate, contribution(poses[-2], (*turning, 0.0, 0.0, 0.0)))
     return rate
+
+
+def tip_jacobian(
+    chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
+) -> list[list[Scalar]]:
+    """Columns of the tip's body Jacobian: base (angular, linear), joints, Euler rates of the wrist.
+
+    Each is the tip's twist (angular, linear) in tip axes per unit velocity: Ad(q_{G/X}*) of an axis in its
+    frame X.
+    """
+    columns: list[list[Scalar]] = []
+    relative: DualQuaternion = chain.tip.dual_quaternion  # q_{G/X}, from the tip's side of X = e_n to e0
+    if chain.wrist is not None:
+        rates = wrist_rate_matrix(wrist_angles)
+        columns = [_carried_to_tip(relative, axis, ZERO) for axis in zip(*rates, strict=True)]
+        wrist = dq.multiply(chain.wrist.dual_quaternion, wrist_rotation(wrist_angles))
+        relative = dq.multiply(wrist, relative)
+    for link, angle in zip(reversed(chain.links), reversed(list(joint_angles)), strict=True):
+        columns.insert(0, _carried_to_tip(relative, (0.0, 0.0, 1.0), ZERO))
+        joint = dq.multiply(link.joint.dual_quaternion, axis_rotation(2, angle))
+        relative = dq.multiply(joint, relative)
+    axes = [[1.0 if j == i else 0.0 for j in range(3)] for i in range(3)]
+    turning = [_carried_to_tip(relative, axis, ZERO) for axis in axes]
+    moving = [_carried_to_tip(relative, ZERO, axis) for axis in axes]
+    return [*turning, *moving, *columns]
+
+
+def _carried_to_tip(relative: DualQuaternion, angular: Vector3, linear: Vector3) -> list[Scalar]:
+    """Twist of G, in its axes, fixed to a frame X with the given twist; `relative` is q_{G/X}."""
+    rotation, position = to_matrix(relative)
+    swept = add(linear, cross(angular, position))  # v + omega x p
+    return [*transposed_matrix_vector(rotation, angular), *transposed_matrix_vector(rotation, swept)]
 
 
 @dataclass(frozen=True)

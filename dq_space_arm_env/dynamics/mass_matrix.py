@@ -131,6 +131,28 @@ class MassMatrix:
         return omega, subtract([entry / self._mass for entry in linear], cross(omega, self.center))
 
 
+def mass_matrix(chain: Chain, rotations: Sequence[Sequence[Vector3]]) -> list[list[Scalar]]:
+    """The mass matrix by (angular, linear, joints), the base's about the origin of its frame, (6 + n, 6 + n).
+
+    [J, [d]x, T; [d]x', m E, F; T', F', H] with the first moment d of all bodies and the joints' columns T, F.
+    """
+    mass, moment, inertia, columns, joint_block = _composite_bodies(chain, rotations)
+    n = len(columns)
+    result: list[list[Scalar]] = [[0.0] * (6 + n) for _ in range(6 + n)]
+    for i in range(3):
+        unit = [1.0 if j == i else 0.0 for j in range(3)]
+        lever = cross(moment, unit)  # torque per unit of linear acceleration
+        for j in range(3):
+            result[i][j] = inertia[i][j]
+            result[j][3 + i] = result[3 + i][j] = lever[j]
+        result[3 + i][3 + i] = mass
+    for i, (force, torque) in enumerate(columns):
+        for j, entry in enumerate((*torque, *force)):
+            result[6 + i][j] = result[j][6 + i] = entry
+        result[6 + i][6:] = joint_block[i]
+    return result
+
+
 def _shifted_inertia(inertia: Sequence[Vector3], mass: Scalar, p: Vector3, d: Vector3) -> list[list[Scalar]]:
     """Add mass (p.p E - p p') + 2 p.d E - p d' - d p': parallel axes for a shift p and first moment d."""
     trace = mass * dot(p, p) + 2.0 * dot(p, d)

@@ -46,9 +46,9 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
     episode ends are those of `DQSpaceArmEnv`. Entries of `info` are arrays of shape (num_envs,), each with a
     mask of the same name preceded by an underscore (read-only where True everywhere). `reset(seed=s)` seeds
     sub-environment i with s + i; a list gives each its own seed. `options` may hold "reset_mask", a bool
-    array of shape (num_envs,), to reset only some; "initial_state" and "target" may have a row per
-    sub-environment, shapes (num_envs, n_x) and (num_envs, 8). Actions in float32, the type of the action
-    space, are used without a copy.
+    array of shape (num_envs,), to reset only some; "initial_state", "target" and "parameters" may have a row
+    per sub-environment, shapes (num_envs, n_x), (num_envs, 8) and (num_envs, n_p). Actions in float32, the
+    type of the action space, are used without a copy.
 
     The autoreset mode determines what follows the end of an episode: the next step resets (`NEXT_STEP`, the
     default), the same step resets and `info` holds `final_obs` and `final_info` (`SAME_STEP`), or the caller

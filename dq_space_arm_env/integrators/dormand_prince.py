@@ -119,6 +119,7 @@ class _Substeps:
             return {"taken": [taken], "substep_time": [taken * h[0]]}
 
         program.call(trace(f"{self.prefix}_length", {"h": 1, "left": 1, "substep": 1}, length))
+        program.held |= {"taken", "substep_time"}
 
     def append_attempt(
         self, program: Program, x: str = "state", h: str = "substep_time", state_tried: str = "state_tried"

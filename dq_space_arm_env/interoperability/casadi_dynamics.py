@@ -6,14 +6,14 @@ wherever its functions do: `Opti`, `nlpsol`, generated C.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import casadi
 
 from dq_space_arm_env.algebra import dual_quaternion
-from dq_space_arm_env.compiler.graph import Graph, trace
+from dq_space_arm_env.compiler.graph import EXPRESSIONS, Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators.method import program_inputs
@@ -135,32 +135,5 @@ def _evaluated(graph: Graph, arguments: Sequence[Sequence[Scalar]]) -> list[list
         elif node.operation == "input":
             values.append(arguments[node.slot[0]][node.slot[1]])
         else:
-            values.append(_OPERATIONS[node.operation](*(values[i] for i in node.arguments)))
+            values.append(EXPRESSIONS[node.operation](*(values[i] for i in node.arguments)))
     return [[values[i] for i in indices] for indices in graph.results]
-
-
-_OPERATIONS: dict[str, Callable[..., Scalar]] = {
-    "add": lambda a, b: a + b,
-    "subtract": lambda a, b: a - b,
-    "multiply": lambda a, b: a * b,
-    "divide": lambda a, b: a / b,
-    "negate": lambda a: -a,
-    "square": lambda a: a * a,
-    "twice": lambda a: a + a,
-    "invert": lambda a: 1.0 / a,
-    "sqrt": casadi.sqrt,
-    "sin": casadi.sin,
-    "cos": casadi.cos,
-    "arctan2": casadi.atan2,
-    "absolute": casadi.fabs,
-    "minimum": casadi.fmin,
-    "maximum": casadi.fmax,
-    "less": lambda a, b: a < b,
-    "less_equal": lambda a, b: a <= b,
-    "equal": lambda a, b: a == b,
-    "not_equal": lambda a, b: a != b,
-    "not": casadi.logic_not,
-    "and": casadi.logic_and,
-    "or": casadi.logic_or,
-    "if_else_zero": lambda condition, a: casadi.if_else(condition, a, 0.0),
-}

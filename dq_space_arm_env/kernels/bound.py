@@ -98,6 +98,55 @@ class KernelCall:
         return call
 
 
+class SingleRowCalls:
+    """Calls of a kernel for one row, with arrays prepared beforehand: they cost little more than their work.
+
+    Every call takes a set of arrays from a pool and puts it back: threads never share one.
+    """
+
+    def __init__(self, kernel: BoundKernel, constant: Mapping[str, Array]) -> None:
+        """Take a kernel whose code works on one row at a time, and inputs that are the same in every call."""
+        self._kernel, self._constant = kernel, constant
+        self._idle: list[_PreparedCall] = []
+
+    def results(self, given: Mapping[str, ArrayLike]) -> tuple[Array, ...] | None:
+        """Run on inputs by name; None unless each is an array of exactly its shape and element type."""
+        try:  # `pop` and `append` are atomic
+            call = self._idle.pop()
+        except IndexError:
+            call = self._prepare()
+        inputs, copies, run = call
+        try:
+            for name, view in inputs:
+                value = given[name]
+                if type(value) is not _ARRAY:
+                    return None
+                view[:] = value  # copies; ValueError if shape or element type differ
+            run()
+            return (copies[0](),) if len(copies) == 1 else tuple([copy() for copy in copies])
+        except ValueError:
+            return None
+        finally:
+            self._idle.append(call)
+
+    def _prepare(self) -> _PreparedCall:
+        kernel = self._kernel
+        specs = (*kernel.inputs, *kernel.outputs)
+        arrays: dict[str, Any] = {spec.name: np.zeros(spec.stride, spec.dtype) for spec in specs}
+        inputs: list[tuple[str, Any]] = []
+        for spec in kernel.inputs:
+            if spec.name in self._constant:
+                arrays[spec.name][:] = self._constant[spec.name]
+            else:
+                inputs.append((spec.name, memoryview(arrays[spec.name])))
+        copies = [arrays[spec.name].copy for spec in kernel.outputs]
+        return inputs, copies, KernelCall(kernel, arrays).of_one_row()
+
+
+# Views of the inputs by name, functions that copy the outputs, and the one that computes these from those.
+_PreparedCall = tuple[list[tuple[str, Any]], list[Callable[[], Array]], Callable[[], None]]
+_ARRAY = np.ndarray
+
 _ONE_ROW = ctypes.PYFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
 
 

@@ -7,6 +7,7 @@ disk; the next process loads it without tracing, compiling or importing CasADi.
 from __future__ import annotations
 
 from functools import cache
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import walk
 from dq_space_arm_env.kernels.library import KernelLibrary
-from dq_space_arm_env.scene import Scene, load_scene
+from dq_space_arm_env.scene import INTEGRATORS, Scene, load_scene
 
 if TYPE_CHECKING:
     from dq_space_arm_env.kernels.adaptive import IntegratedMotion
@@ -70,7 +71,7 @@ class Kernels(KernelLibrary):
         Raises:
             ValueError: If dt is not a finite number, or the integrator is unknown.
         """
-        return self.call("step", self._integrator(integrator), x=x, u=u, h=self._time_step(dt), p=p)[0]
+        return self._step_call("step", x, u, dt, integrator, p)[0]
 
     def simulate(
         self,
@@ -118,7 +119,7 @@ class Kernels(KernelLibrary):
         given = self.parameter_rows(p, steps)
         momentum = self.momentum(start, p=given[0]) if carries_momentum else None
         held = {"u": np.broadcast_to(inputs, (steps, self.n_u)), "parameters": given}
-        return walk(kernel, start, momentum, held, self._time_step(dt).astype(self.dtype), every)
+        return walk(kernel, start, momentum, held, self._time_step(dt), every)
 
     def linearize(
         self,
@@ -143,9 +144,65 @@ class Kernels(KernelLibrary):
         Raises:
             ValueError: As for `step`.
         """
-        a, b = self.call("linearize", self._integrator(integrator), x=x, u=u, h=self._time_step(dt), p=p)
-        lead = a.shape[:-1]
-        return a.reshape(*lead, self.n_t, self.n_t), b.reshape(*lead, self.n_t, self.n_u)
+        a, b = self._step_call("linearize", x, u, dt, integrator, p)
+        return _matrices(a, self.n_t, self.n_t), _matrices(b, self.n_t, self.n_u)
+
+    def linearize_parameters(
+        self,
+        x: ArrayLike,
+        u: ArrayLike,
+        dt: float | None = None,
+        integrator: str | None = None,
+        p: ArrayLike | None = None,
+    ) -> Array:
+        """Exact derivative of a step by the parameters, in tangent coordinates: dx+ = P dp.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u).
+            dt: Time step, s; the scene's by default.
+            integrator: Name of the integrator; the scene's by default.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            P, shape (n_t, n_p) or (B, n_t, n_p).
+
+        Raises:
+            ValueError: As for `step`, or if the scene has no parameters.
+        """
+        by_parameters = self._step_call("linearize_parameters", x, u, dt, integrator, p)[0]
+        return _matrices(by_parameters, self.n_t, self.n_p)
+
+    def cost_by_parameters(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Exact gradient of the stage cost by the parameters.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Gradients, shape (n_p,) or (B, n_p).
+
+        Raises:
+            ValueError: If the scene has no parameters.
+        """
+        return self.call("cost_by_parameters", x=x, u=u, p=p)[0]
+
+    def terminal_cost_by_parameters(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Exact gradient of the terminal cost by the parameters.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Gradients, shape (n_p,) or (B, n_p).
+
+        Raises:
+            ValueError: If the scene has no parameters.
+        """
+        return self.call("terminal_cost_by_parameters", x=x, p=p)[0]
 
     def integrate(
         self,
@@ -229,6 +286,88 @@ class Kernels(KernelLibrary):
             fx, fy, fz [N], tx, ty [N m] joint by joint, shape (5 n,) or (B, 5 n).
         """
         return self.call("reaction_wrenches", x=x, u=u, p=p)[0]
+
+    def mass_matrix(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Mass matrix M in minimal coordinates: M a + h = f, with h from `bias_forces`.
+
+        The accelerations a are those of `forward_dynamics`: base angular [rad/s^2], base linear [m/s^2], both
+        in base axes, then joints [rad/s^2]. The generalized forces f are dual to them: torque on the base
+        about its center of mass [N m], force [N], both in base axes, then joint torques [N m]. Inputs u have
+        the base's force before its torque.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x); only the joint angles matter.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Symmetric matrices, shape (6 + n, 6 + n) or (B, 6 + n, 6 + n), (3 + n) for a planar base; kg m^2
+            where torque meets rotation, kg m where it meets translation, kg where force does.
+        """
+        return _matrices(self.call("mass_matrix", x=x, p=p)[0], self._n_velocities, self._n_velocities)
+
+    def bias_forces(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Bias h of M a + h = f: velocity-dependent forces, joint springs and dampers.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Generalized forces in the order of `mass_matrix`, torque [N m] and force [N] on the base, base
+            axes, then joint torques [N m], shape (6 + n,) or (B, 6 + n); (3 + n) for a planar base. They hold
+            the accelerations of `forward_dynamics` at zero; for a base alone that is a force m omega x v,
+            since its velocity has components in turning axes. The scene's wrench at the tip is not included.
+        """
+        return self.call("bias_forces", x=x, p=p)[0]
+
+    def tip_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Body Jacobian J of the tip: its twist is J (base velocity, joint rates, wrist's Euler rates).
+
+        A wrench at the tip in tip axes, torque then force, adds J' times itself to the generalized forces of
+        `mass_matrix` (the columns before the wrist's).
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x); only the angles matter.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Twists in tip axes, angular [rad/s] then linear [m/s], per unit of the base's angular [rad/s] and
+            linear velocity [m/s] in base axes, of each joint rate and of each Euler rate psi, theta, phi
+            [rad/s], if there is a wrist; shape (6, 6 + n + 3) or (B, 6, 6 + n + 3). A planar base has 3
+            columns: omega_z, v_x, v_y.
+        """
+        return _matrices(self.call("tip_jacobian", x=x, p=p)[0], 6, self._n_velocities + self._n_wrist)
+
+    def generalized_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Generalized Jacobian of the free-floating arm, J_m - J_b H_b^-1 H_bm.
+
+        It maps rates of joints and wrist to the tip's twist where the total momentum is zero (Umetani &
+        Yoshida, IEEE Transactions on Robotics and Automation 5, 1989).
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x); only the angles matter.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Twists in tip axes, angular [rad/s] then linear [m/s], per unit of each joint rate and of each
+            Euler rate psi, theta, phi [rad/s], if there is a wrist; shape (6, n + 3) or (B, 6, n + 3).
+        """
+        columns = self.layout.n_joints + self._n_wrist
+        return _matrices(self.call("generalized_jacobian", x=x, p=p)[0], 6, columns)
+
+    def tip_twist(self, x: ArrayLike, u: ArrayLike | None = None, p: ArrayLike | None = None) -> Array:
+        """Twist of the tip with respect to the inertial frame, in tip axes.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u), zero by default; only the wrist's Euler rates matter.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Angular velocity [rad/s], then linear velocity [m/s], shape (6,) or (B, 6).
+        """
+        u = np.zeros(self.n_u, self.dtype) if u is None else u
+        return self.call("tip_twist", x=x, u=u, p=p)[0]
 
     def tip_pose(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Pose of the tip q_{G/I}, eq. (27).
@@ -346,6 +485,19 @@ class Kernels(KernelLibrary):
         observation, errors = self.call("observation", x=x, time_left=time_left, p=p)
         return observation, errors
 
+    def observation_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Exact derivative of the observation in tangent coordinates, of observation(retract(x, z)) by z.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Derivatives at z = 0, shape (n_x + 1, n_t) or (B, n_x + 1, n_t), units of the observation per unit
+            of `layout.tangent`. The time left has no derivative: its row is zero.
+        """
+        return _matrices(self.call("observation_jacobian", x=x, p=p)[0], self.n_x + 1, self.n_t)
+
     def state_from_observation(self, observation: ArrayLike, p: ArrayLike | None = None) -> Array:
         """The state behind an observation.
 
@@ -359,18 +511,47 @@ class Kernels(KernelLibrary):
         """
         return self.call("state_from_observation", observation=observation, p=p)[0]
 
-    def _integrator(self, name: str | None) -> str | None:
-        from dq_space_arm_env.scene import INTEGRATORS
+    @property
+    def _n_velocities(self) -> int:
+        """Number of generalized velocities: base and joints."""
+        return self.layout.n_joints + (3 if self.layout.planar else 6)
 
+    @property
+    def _n_wrist(self) -> int:
+        """Number of the wrist's Euler rates."""
+        return 3 if self.layout.has_wrist else 0
+
+    def _step_call(
+        self,
+        name: str,
+        x: ArrayLike,
+        u: ArrayLike,
+        dt: float | None,
+        integrator: str | None,
+        p: ArrayLike | None,
+    ) -> tuple[Array, ...]:
+        """Run a program of a step."""
+        if integrator is not None:
+            integrator = self._integrator(integrator)
+        if dt is None:
+            return self.call(name, integrator, x=x, u=u, p=p)
+        return self.call(name, integrator, x=x, u=u, h=self._time_step(dt), p=p)
+
+    def _integrator(self, name: str | None) -> str | None:
         if name is not None and name not in INTEGRATORS:
             raise ValueError(f"integrator: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
         return name
 
     def _time_step(self, dt: float | None) -> Array:
         step = self.scene.simulation.dt if dt is None else float(dt)
-        if not np.isfinite(step):
+        if not isfinite(step):
             raise ValueError(f"dt: {step} is not a finite time step in s")
-        return np.array([step])
+        return np.array([step], self.dtype)
+
+
+def _matrices(entries: Array, rows: int, columns: int) -> Array:
+    """Give matrices, stored row by row, their shape."""
+    return entries.reshape(*entries.shape[:-1], rows, columns)
 
 
 @cache

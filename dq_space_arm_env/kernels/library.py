@@ -20,7 +20,7 @@ from dq_space_arm_env.common.code_cache import cache_directory, cache_key
 from dq_space_arm_env.common.host_machine import host_machine
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.compiler import native
-from dq_space_arm_env.kernels.bound import BoundKernel, rows_of
+from dq_space_arm_env.kernels.bound import BoundKernel, SingleRowCalls, rows_of
 from dq_space_arm_env.scene.layout import ParameterEntries, StateLayout
 from dq_space_arm_env.scene.schema import Scene
 
@@ -45,6 +45,7 @@ class KernelLibrary:
         self.dtype = np.dtype(scene.simulation.precision)
         self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
         self._paper_kernels: dict[tuple[str, int], BoundKernel] = {}
+        self._single_row_calls: dict[tuple[str, str | None, bool, bool], SingleRowCalls] = {}
         self._announced = False
 
     @cached_property
@@ -117,15 +118,27 @@ class KernelLibrary:
         """Names, units and nominal values of the parameters p, the numbers that vary in the scene."""
         return self.layout.parameters
 
+    @cached_property
+    def _defaults(self) -> dict[str, Array]:
+        """Inputs of kernels that a call may leave out: the time step and the nominal parameters."""
+        inputs = {"h": [self.scene.simulation.dt], "parameters": self.parameters.nominal}
+        return {name: np.array(values, self.dtype) for name, values in inputs.items()}
+
     def call(
         self, name: str, integrator: str | None = None, *, p: ArrayLike | None = None, **inputs: ArrayLike
     ) -> tuple[Array, ...]:
         """Run a program on one row or a batch; outputs take the form of the inputs.
 
-        Parameters p, (n_p,) or (B, n_p), have their nominal values by default.
+        Parameters p, (n_p,) or (B, n_p), are nominal by default, and the time step h is the scene's.
         """
+        key = name, integrator, "h" in inputs, p is None
+        single = self._single_row_calls.get(key)
+        if single is not None:
+            results = single.results(inputs if p is None else {**inputs, "parameters": p})
+            if results is not None:
+                return results
         rows, batched, arrays = rows_of(inputs if p is None else {**inputs, "p": p}, self.dtype)
-        arrays["parameters"] = self.parameter_rows(arrays.pop("p", None), rows)
+        arrays = {**self._defaults, **arrays, "parameters": self.parameter_rows(arrays.get("p"), rows)}
         kernel = self.kernel(name, integrator=integrator, lanes=1 if rows == 1 else None)
         ordered = []
         for spec in kernel.inputs:
@@ -136,16 +149,20 @@ class KernelLibrary:
                     f"scene {self.scene.name!r} has {spec.stride}"
                 )
             ordered.append(np.ascontiguousarray(array))
-        results = [np.zeros((rows, spec.stride), self.dtype) for spec in kernel.outputs]
-        kernel([*ordered, *results], rows, self.threads)
-        return tuple(result if batched else result[0] for result in results)
+        outputs = [np.zeros((rows, spec.stride), self.dtype) for spec in kernel.outputs]
+        kernel([*ordered, *outputs], rows, self.threads)
+        if not batched:
+            given = {"h": "h" in inputs, "parameters": p is not None}
+            constant = {each: array for each, array in self._defaults.items() if not given[each]}
+            self._single_row_calls.setdefault(key, SingleRowCalls(kernel, constant))
+        return tuple(output if batched else output[0] for output in outputs)
 
     def parameter_rows(self, p: ArrayLike | None, rows: int) -> Array:
         """Parameters of so many rows, (rows, n_p), from p of shape (n_p,) or (rows, n_p); None for nominal.
 
         Raises ValueError for another shape.
         """
-        given = self.parameters.nominal.astype(self.dtype) if p is None else real_array("p", p, self.dtype)
+        given = self._defaults["parameters"] if p is None else real_array("p", p, self.dtype)
         if given.shape not in ((self.n_p,), (rows, self.n_p)):
             raise ValueError(
                 f"p: shape {given.shape}, should be ({self.n_p},) or ({rows}, {self.n_p}); the parameters of "
@@ -209,6 +226,7 @@ _STEPS = (
     "step_with_cost",
     "walk",
     "linearize",
+    "linearize_parameters",
     "lagrangian_hessian",
     "environment_step",
     "environment_step_float32_actions",

@@ -38,6 +38,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.common.real_arrays import real_array
+
 FloatArray = NDArray[np.float64]
 
 KERNEL_NAMES = (
@@ -78,7 +80,7 @@ class StageParameters:
         Raises:
             ValueError: If they have another shape or are not finite.
         """
-        given = self.nominal if parameters is None else np.asarray(parameters, dtype=np.float64)
+        given = self.nominal if parameters is None else real_array("parameters", parameters, np.float64)
         if given.shape not in (self.nominal.shape, self.rows.shape):
             raise ValueError(
                 f"parameters have shape {given.shape}; expected {self.nominal.shape}, or {self.rows.shape} "

@@ -152,6 +152,23 @@ def kernel_case(
     return Case(subject, run)
 
 
+FUNCTION = "function of Kernels"
+
+
+def function_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
+    """Functions of `Kernels` called from Python, which checks arguments and makes arrays for the results."""
+    kernels, cases = PLAIN.compile(scene), []
+    for batch in batch_sizes:
+        x, u = moving_states(kernels, batch)
+        arguments = (x, u) if batch > 1 else (x[0], u[0])
+        dynamics = Subject(what=DYNAMICS, engine=OURS, way=FUNCTION, batch=batch)
+        cases.append(Case(dynamics, partial(kernels.forward_dynamics, *arguments)))
+        for name in COMPARED_INTEGRATORS:
+            step = Subject(what=STEP, engine=OURS, way=FUNCTION, integrator=name, batch=batch)
+            cases.append(Case(step, partial(kernels.step, *arguments, integrator=name)))
+    return cases
+
+
 def _episodes(kernels: Kernels, count: int) -> dict[str, np.ndarray]:
     """Inputs of the environment's step besides state and action, for episodes that have just begun."""
     start = kernels.kernel("environment_start")

@@ -49,9 +49,12 @@ def test_show_has_states_and_inputs(name: str, capsys: pytest.CaptureFixture[str
     assert [entry["name"] for entry in record["states"]] == list(layout.state.names)
     assert [entry["name"] for entry in record["inputs"]] == list(layout.control.names)
     assert [entry["limit"] for entry in record["inputs"]] == layout.control_limit.tolist()
+    varies = {entry["name"]: entry["nominal"] for entry in record["parameters"]}
+    assert varies == dict(zip(layout.parameters.names, layout.parameters.nominal.tolist(), strict=True))
     assert load_scene(record["scene"]) == load_scene(name)
     assert main(["scenes", "show", name]) == SUCCESS
     output = capsys.readouterr().out
+    assert ("Parameters, " in output) == (name in ("random-masses", "random-target"))
     assert f"State, {layout.n_x} numbers; tangent, {layout.n_t}" in output
     assert f"Inputs, {layout.n_u} numbers" in output
 

@@ -5,6 +5,16 @@ import numpy as np
 from dq_space_arm_env.compiler.graph import Graph
 from dq_space_arm_env.compiler.program import Program
 
+
+def _arctan2(y, x):
+    """Angle of (x, y); a complex step turns it by (x dy - y dx) / (x^2 + y^2)."""
+    angle = np.arctan2(np.real(y), np.real(x))
+    if not (np.iscomplexobj(y) or np.iscomplexobj(x)):
+        return angle
+    turn = np.real(x) * np.imag(y) - np.real(y) * np.imag(x)
+    return angle + 1j * np.divide(turn, np.real(x) ** 2 + np.real(y) ** 2)
+
+
 _OPERATIONS = {
     "add": lambda a, b: a + b,
     "subtract": lambda a, b: a - b,
@@ -17,8 +27,8 @@ _OPERATIONS = {
     "sqrt": np.sqrt,
     "sin": np.sin,
     "cos": np.cos,
-    "arctan2": np.arctan2,
-    "absolute": np.abs,
+    "arctan2": _arctan2,
+    "absolute": lambda a: np.where(np.real(a) < 0, -a, a) if np.iscomplexobj(a) else np.abs(a),
     "minimum": np.minimum,
     "maximum": np.maximum,
     "less": lambda a, b: np.real(a) < np.real(b),
@@ -41,7 +51,8 @@ def evaluate_graph(graph: Graph, inputs: list[np.ndarray], dtype) -> list[np.nda
         elif node.operation == "input":
             values.append(inputs[node.slot[0]][node.slot[1]])
         else:
-            values.append(_OPERATIONS[node.operation](*(values[i] for i in node.arguments)))
+            value = np.asarray(_OPERATIONS[node.operation](*(values[i] for i in node.arguments)))
+            values.append(value.astype(dtype) if value.dtype == bool else value)  # truth is 0 or 1
     lanes = next((value.shape[1:] for value in inputs if value.ndim == 2), ())
     return [
         np.array([np.broadcast_to(values[i], lanes) for i in indices], dtype=dtype).reshape(-1, *lanes)

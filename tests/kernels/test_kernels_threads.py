@@ -1,6 +1,7 @@
 """Work shared among threads: every row once, the same bits, and no wait for a helper that never ran."""
 
 import os
+import sys
 import threading
 
 import numpy as np
@@ -101,3 +102,29 @@ def test_work_is_done_where_no_more_threads_can_be_started(monkeypatch):
 def test_no_thread_at_all_is_refused():
     with pytest.raises(ValueError, match="threads: 0, should be at least 1"):
         Kernels(load_scene("paper"), threads=0)
+
+
+def test_threads_that_share_the_kernels_get_their_own_results(draw):
+    kernels, states, inputs = draw("paper", 4)
+    expected = [kernels.step(x, u) for x, u in zip(states, inputs, strict=True)]
+    start, wrong = threading.Barrier(len(states), timeout=30), []
+
+    def work(x, u, result):
+        start.wait()
+        for _ in range(3000):
+            if not np.array_equal(kernels.step(x, u), result):
+                wrong.append(x)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # s: between any two instructions of the interpreter
+    try:
+        workers = [
+            threading.Thread(target=work, args=case) for case in zip(states, inputs, expected, strict=True)
+        ]
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert not wrong

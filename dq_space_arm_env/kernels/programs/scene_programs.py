@@ -21,7 +21,9 @@ from dq_space_arm_env.integrators.dormand_prince import append_measured_step
 from dq_space_arm_env.integrators.method import program_inputs
 from dq_space_arm_env.integrators.momentum import MomentumPreserving
 from dq_space_arm_env.kernels.programs.derivative_programs import DerivativePrograms
+from dq_space_arm_env.kernels.programs.parameter_programs import ParameterPrograms
 from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
+from dq_space_arm_env.kernels.programs.robot_programs import RobotPrograms
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.task.equations import SceneEquations, total
 
@@ -39,6 +41,7 @@ class ScenePrograms:
         self.field = self.equations.field
         derivatives = self._derivatives = DerivativePrograms(self.equations)
         quadratic = QuadraticPrograms(self.equations)
+        robot = RobotPrograms(self.equations, self._program)
         self._builders: Mapping[str, Callable[[], Program]] = {
             "forward_dynamics": self._forward_dynamics,
             "forward_dynamics_with_tip_wrench": self._forward_dynamics_with_tip_wrench,
@@ -47,6 +50,11 @@ class ScenePrograms:
             "frame_poses": self._frame_poses,
             "momentum": self._momentum,
             "energy": self._energy,
+            "mass_matrix": robot.mass_matrix,
+            "bias_forces": robot.bias_forces,
+            "tip_jacobian": robot.tip_jacobian,
+            "generalized_jacobian": robot.generalized_jacobian,
+            "tip_twist": robot.tip_twist,
             "cost": self._cost,
             "terminal_cost": self._terminal_cost,
             "emphasized_terminal_cost": self._emphasized_terminal_cost,
@@ -59,6 +67,7 @@ class ScenePrograms:
             "retract": self._retract,
             "measured_step": self._measured_step,
             "observation": self._observation,
+            "observation_jacobian": robot.observation_jacobian,
             "state_from_observation": self._state_from_observation,
         }
 
@@ -70,6 +79,8 @@ class ScenePrograms:
             return self._walk(integrator)
         if name == "linearize":
             return self._derivatives.linearize(integrator)
+        if name in ("linearize_parameters", "cost_by_parameters", "terminal_cost_by_parameters"):
+            return ParameterPrograms(self.equations).build(name, integrator)
         if name == "lagrangian_hessian":
             return self._derivatives.lagrangian_hessian(integrator)
         return self._builders[name]()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dq_space_arm_env.common.tables import Column
 from scripts.benchmarks.harness import Benchmark, Picture, Table, time_column
-from scripts.benchmarks.subjects import SCALAR, UNWRAPPED
+from scripts.benchmarks.subjects import FUNCTION, SCALAR, UNWRAPPED
 from scripts.benchmarks.throughput.measurement import measure
 
 
@@ -102,7 +102,7 @@ BENCHMARK = Benchmark(
                 "log": "xy",
                 "labels": {"batch": "states per call, or environments", "states_per_second": "per second"},
             },
-            where=lambda row: row["way"] not in (SCALAR, UNWRAPPED),
+            where=lambda row: row["way"] not in (FUNCTION, SCALAR, UNWRAPPED),
         ),
     ),
     packages=("pin", "mujoco"),

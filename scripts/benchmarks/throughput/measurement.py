@@ -29,6 +29,7 @@ from scripts.benchmarks.subjects import (
     Subject,
     environment_cases,
     fastest,
+    function_cases,
     kernel_cases,
     time_cases,
 )
@@ -63,7 +64,12 @@ def measure_scene(scene: Scene, effort: Effort, peaks: Mapping[str, float]) -> I
     kernels = PLAIN.compile(scene)
     peers, notes = peers_of(kernels)
     yield from map(note, notes)
-    cases = [*kernel_cases(scene, effort.batch_sizes), *environment_cases(scene, effort.batch_sizes)]
+    sizes = effort.batch_sizes
+    cases = [
+        *kernel_cases(scene, sizes),
+        *function_cases(scene, sizes),
+        *environment_cases(scene, sizes),
+    ]
     for peer in peers:
         cases += peer.cases(*moving_states(kernels, TRAINING_COPIES))
     timings = [_row(scene, timing, peaks) for timing in time_cases(cases, effort.kernel_timing)]

@@ -49,7 +49,7 @@ def run_pass(
 ) -> tuple[PassResult, Update]:
     horizon, n_tangent, n_controls = d.B.shape
     update = allocate_update(horizon, n_tangent, n_controls)
-    bound = np.full(n_controls, limit)
+    bound = np.full((horizon, n_controls), limit)
     work = pass_workspace(n_tangent, n_controls)
     hessians = hessians or gauss_newton_hessians(d)
     outcome = backward_pass(d, hessians, NO_GAPS, controls, -bound, bound, regularization, update, work)
@@ -147,7 +147,7 @@ def test_the_value_function_is_kept_at_every_stage_where_asked_for(limit: float)
     d = random_derivatives(3, 9, 6, 4)
     controls = np.random.default_rng(1).uniform(-0.2, 0.2, size=d.lu.shape)
     update = allocate_update(9, 6, 4, keep_values=True)
-    bound = np.full(4, limit)
+    bound = np.full((9, 4), limit)
     hessians = gauss_newton_hessians(d)
     backward_pass(d, hessians, NO_GAPS, controls, -bound, bound, 2.0, update, pass_workspace(6, 4))
     for stage in range(9):
@@ -246,7 +246,7 @@ def test_gaps_shift_the_value_gradient(limit: float) -> None:
     d = random_derivatives(5, 9, 6, 4)
     controls = np.random.default_rng(1).uniform(-0.2, 0.2, size=d.lu.shape)
     gaps = np.zeros((9, 6))
-    plain, bound = run_pass(d, controls, limit, 2.0)[1], np.full(4, limit)
+    plain, bound = run_pass(d, controls, limit, 2.0)[1], np.full(controls.shape, limit)
     for last in (np.zeros(6), np.random.default_rng(2).normal(size=6)):
         gaps[-1] = last
         update, work = allocate_update(9, 6, 4), pass_workspace(6, 4)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dq_space_arm_env import load_scene
 from experts import BoxDDP
 from experts.ddp.parallel_rollouts import LANES
 from experts.ddp.shooting import SHORTER_STEPS, ShootingWorkspace, line_search
@@ -12,8 +13,11 @@ from experts.problems.arm_problem import ArmProblem
 @pytest.fixture(scope="module")
 def prepared():
     """A workspace with an update, some of whose inputs meet their bounds."""
-    problem = ArmProblem("no-wrist")  # nine inputs: no whole number of tiles
-    problem.control_lower, problem.control_upper = problem.control_lower / 20.0, problem.control_upper / 20.0
+    scene = load_scene("no-wrist")  # nine inputs: no whole number of tiles
+    problem = ArmProblem(scene.replace(parameters=["actuators", "target.pose"]))
+    names = problem.kernels.parameters.names
+    is_limit = np.array([name.startswith("actuators") for name in names])
+    problem.parameters.set(problem.parameters.nominal / np.where(is_limit, 20.0, 1.0))
     work = ShootingWorkspace(problem, second_order=False)
     work.start(problem.initial_state, np.zeros((problem.horizon, problem.n_controls)))
     work.differentiate()

@@ -3,6 +3,7 @@ import pytest
 
 from dq_space_arm_env.kernels.bound import buffer_table
 from experts.ddp.rollout import FINISHED, NO_RETRACTION, closed_loop_rollout, rollout
+from experts.problems.shooting_problem import stage_bounds
 
 
 class Arrays:
@@ -49,8 +50,7 @@ class Arrays:
             feedforward,
             gains,
             alpha,
-            self.problem.control_lower,
-            self.problem.control_upper,
+            *stage_bounds(self.problem),
             self.states,
             self.controls,
             deviations,
