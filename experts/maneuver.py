@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dq_space_arm_env import Scene, compile_scene
+from dq_space_arm_env import Kernels, Scene, compile_scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import StateLayout
 from experts.problems.shooting_problem import FloatArray
@@ -47,6 +47,7 @@ class Maneuver:
     scene: Scene
     states: FloatArray
     controls: FloatArray
+    kernels: Kernels | None = None  # those of a scene with the same geometry spare compiling the scene's own
 
     @cached_property
     def time(self) -> FloatArray:
@@ -56,7 +57,7 @@ class Maneuver:
     @cached_property
     def frames(self) -> FloatArray:
         """Poses of base, joint frames, wrist frame (if any) and tip, shape (N + 1, frames, 8), m."""
-        return compile_scene(self.scene).frame_poses(self.states)
+        return (self.kernels or compile_scene(self.scene)).frame_poses(self.states)
 
     @cached_property
     def error_pose(self) -> FloatArray:

@@ -5,6 +5,7 @@ states. Nobody tells them where the scene that they fly in differs.
 """
 
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 from time import perf_counter
 from typing import Any
@@ -20,7 +21,7 @@ from experts import RecedingHorizonExpert
 from experts.ddp.solution import Solution
 from experts.demonstrations.outcomes import expert_of
 from experts.demonstrations.settings import Settings
-from experts.demonstrations.shard import ShardResult
+from experts.demonstrations.shard import PARAMETERS, ShardResult
 from experts.problems.arm_problem import ArmProblem
 
 OPEN_LOOP, FEEDBACK, RECEDING = "open-loop plan", "plan with gains", "receding horizon"
@@ -45,16 +46,18 @@ def plans_of(settings: Settings, result: ShardResult) -> tuple[Plans, FloatArray
     rows = arrays["index"] - problems.start
     states[rows], actions[rows] = arrays["states"], arrays["actions"]
     gains[rows] = arrays["feedback_gains"]
-    for row, start in zip(arrays["failures.index"] - problems.start, arrays["failures.start"], strict=True):
-        solution = expert_of(settings.scene).solver.solve(start)
+    failed = arrays["failures.index"] - problems.start
+    varied = arrays.get(f"failures.{PARAMETERS}", np.zeros((len(failed), 0)))
+    for row, start, parameters in zip(failed, arrays["failures.start"], varied, strict=True):
+        solution = expert_of(settings.scene).solver.solve(start, parameters=parameters)
         states[row], actions[row], gains[row] = _parts(solution, layout)
     return Plans(states, actions, gains, np.arange(len(problems))), np.array(result.solve_seconds)
 
 
 def _parts(solution: Solution, layout: StateLayout) -> tuple[FloatArray | float, ...]:
     """States, actions and gains of a solution; zeros if one is not finite."""
-    gains = solution.feedback_gains / layout.control_limit[:, None]
-    parts = (solution.states, layout.to_action(solution.controls), gains)
+    limits = layout.limits_with(solution.parameters[0])
+    parts = (solution.states, solution.controls / limits, solution.feedback_gains / limits[:, None])
     return parts if all(np.isfinite(part).all() for part in parts) else (0.0, 0.0, 0.0)
 
 
@@ -86,6 +89,8 @@ class RecedingHorizon:
     Attributes:
         policy: The controller for `rollout`; it gives NaN in episodes that the expert cannot plan.
         planning_seconds: Mean time to plan a flight when the last episodes began, s.
+        parameters: What varies in the scene to plan in, a row for each of the next episodes, shape (B, n_p);
+            None for nominal ones.
     """
 
     def __init__(self, scene: Scene, horizon: int = 100) -> None:
@@ -97,6 +102,7 @@ class RecedingHorizon:
         """
         self.policy, self.planning_seconds = StateFeedback(self._act, self._begin), 0.0
         self._scene, self._horizon = scene, horizon
+        self.parameters: FloatArray | None = None
         self._experts = [RecedingHorizonExpert(scene, horizon)]
         self._experts[0].reset(self._experts[0].maneuver.initial_state)
         self._lost: set[int] = set()
@@ -107,7 +113,8 @@ class RecedingHorizon:
             self._experts.append(RecedingHorizonExpert(self._scene, self._horizon))
         self._lost, began = set(), perf_counter()
         for index, start in enumerate(starts):
-            self._attempt(index, RecedingHorizonExpert.reset, start)
+            varied = None if self.parameters is None else self.parameters[index]
+            self._attempt(index, partial(RecedingHorizonExpert.reset, parameters=varied), start)
         self.planning_seconds = (perf_counter() - began) / len(starts)
 
     def _act(self, states: FloatArray, stage: int) -> FloatArray:

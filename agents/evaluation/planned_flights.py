@@ -32,7 +32,7 @@ from agents.policies.flying import Flights, FloatArray, fly
 from dq_space_arm_env import Scene
 from experts.demonstrations.executors import Executor
 from experts.demonstrations.settings import Settings, software
-from experts.demonstrations.shard import Task
+from experts.demonstrations.shard import Task, draw_starts
 
 _SOURCES = (
     *(f"evaluation/{name}.py" for name in ("conditions", "evaluating", "expert_costs", "plan_followers")),
@@ -129,6 +129,7 @@ def fly_receding(
         assert controller is not None
         rows: list[Row] = []
         for seed in files.seeds(group):
+            controller.parameters = draw_starts(settings.scene, [seed]).parameters
             flights = fly(controller.policy, flown, [seed])
             rows += _rows([seed], flights, np.array([controller.planning_seconds]))
             done += 1

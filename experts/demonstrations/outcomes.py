@@ -69,7 +69,8 @@ class Outcome:
     @property
     def parameters(self) -> FloatArray:
         """What varied in the scene, the same at every stage, shape (n_p,)."""
-        return self.solution.parameters[0]
+        first: FloatArray = self.solution.parameters[0]
+        return first
 
 
 class Retry(NamedTuple):

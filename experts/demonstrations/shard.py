@@ -290,7 +290,7 @@ def _failure_arrays(problem: ArmProblem, outcomes: Sequence[Outcome]) -> Arrays:
 
 
 def tip_errors(kernels: Kernels, states: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Attitude error [deg] and position error [m] of states with parameters of shape (n, n_p); (n, 2)."""
+    """Attitude error [deg] and position error [m] of states, shape (n, 2); parameters (n_p,) or (n, n_p)."""
     if not len(states):
         return np.zeros((0, 2))
     _, errors = kernels.observation(states, np.zeros((len(states), 1)), p=parameters)

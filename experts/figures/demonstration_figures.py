@@ -97,11 +97,10 @@ def samples(demonstrations: Demonstrations, count: int) -> bytes:
 
 def _draw_sample(column: Any, demonstrations: Demonstrations, demonstration: Demonstration) -> None:
     """Start, end, errors, and inputs at a limit, one below the other."""
-    maneuver = Maneuver(
-        demonstrations.scene,
-        demonstration.states,
-        demonstrations.kernels.layout.to_control(demonstration.actions),
-    )
+    kernels = demonstrations.kernels
+    limits = kernels.layout.limits_with(demonstration.parameters)
+    scene, controls = demonstration.episode_scene, demonstration.actions * limits
+    maneuver = Maneuver(scene, demonstration.states, controls, kernels)
     start, end, attitude, position, limits = column
     last = len(maneuver.time) - 1
     painter = SnapshotPainter(maneuver, [0, last], numbered=False)
