@@ -71,7 +71,8 @@ class EnvironmentPrograms:
         n_x, n_u, n_memory = equations.field.n_x, equations.field.n_u, len(MEMORY)
         inputs = Buffer("x", n_x), Buffer("memory", n_memory), Buffer("action", n_u, dtype=actions)
         program = Program(name, program_inputs(equations.field, *inputs), [])
-        program.call(trace("inputs_graph", {"action": n_u}, partial(episode.command, equations)))
+        command = partial(episode.command, equations)  # a limit may be a parameter
+        program.call(trace("inputs_graph", {"action": n_u}, command, parameters=self._parameters))
         program.call(trace("time_step_graph", {}, lambda: {"h": [simulation.dt]}))
         integrator_of(simulation, integrator).append_step(program, equations.field)
         sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": n_memory}

@@ -10,7 +10,7 @@ from agents.configuration.imitation import Cloning, Dagger  # noqa: E402
 from agents.imitation import Making, aggregate, clone  # noqa: E402
 from agents.imitation.aggregation import CORRECTIONS  # noqa: E402
 from agents.imitation.labels import Solver, label_by_gains  # noqa: E402
-from agents.imitation.samples import NAMES, Corrections, Mixture  # noqa: E402
+from agents.imitation.samples import COLUMNS, NAMES, Corrections, Mixture  # noqa: E402
 from agents.imitation.trainer import CheckpointError, TrainingAdvance  # noqa: E402
 from dq_space_arm_env.environment.rollouts import rollout  # noqa: E402
 
@@ -113,7 +113,7 @@ def test_labels_follow_the_dynamics(some):
 
 def corrections(count, value):
     *rest, gains = (np.full((count, *shape), value) for shape in ((3,), (4,), (2,), (2, 3)))
-    return Corrections(*rest, gains.astype(np.float32))
+    return Corrections(*rest, gains.astype(np.float32), np.zeros((count, 0)))
 
 
 def test_a_mixture_keeps_its_shares():
@@ -127,7 +127,7 @@ def test_a_mixture_keeps_its_shares():
 
 
 def test_corrections_are_gone_through_once():
-    whole = Corrections(*(np.arange(10.0)[:, None] for _ in NAMES))
+    whole = Corrections(*(np.arange(10.0)[:, None] for _ in COLUMNS))
     for seed in (None, 3):
         batches = whole.batches(4, ("states",), seed=seed, drop_last=False)
         rows = [batch.arrays["states"][:, 0] for batch in batches]
