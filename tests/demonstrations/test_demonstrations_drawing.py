@@ -19,6 +19,7 @@ from demonstration_files import (
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.command_line import main
 from experts import BoxDDP, StopReason, generate_demonstrations, load_demonstrations
+from experts.command_line.recorded_demonstrations import read_demonstration
 from experts.demonstrations import Demonstrations, DemonstrationsError, SerialExecutor
 from experts.demonstrations.data_card import data_card
 from experts.demonstrations.facts import gather
@@ -217,6 +218,14 @@ def _again(folder: Path) -> list[str]:
     load_demonstrations(folder).scene.to_yaml(folder.parent / "scene.yaml")
     sizes = ["-n", str(N), "--seed", str(SEED), "--shard-size", str(SHARD_SIZE), "--workers", "1"]
     return ["--scene", str(folder.parent / "scene.yaml"), "--out", str(folder), *sizes]
+
+
+def test_a_replayed_demonstration_shows_its_own_target(drawn: Demonstrations):
+    flight = read_demonstration(f"{drawn.path}#4", None)
+    env = gymnasium.make("DQSpaceArm-v0", scene=drawn.scene)
+    env.reset(seed=drawn[4].seed)
+    np.testing.assert_array_equal(flight.target, env.unwrapped.target)
+    assert not np.allclose(flight.target, drawn.kernels.layout.target, atol=1e-3)
 
 
 def test_minari_has_the_parameters_in_every_row_and_gives_them_back(
