@@ -38,7 +38,7 @@ from experts.demonstrations.folder import MANIFEST, SETTINGS, SHARDS
 from experts.demonstrations.minari_export import MINARI_MISSING, check_dataset_id
 from experts.demonstrations.outcomes import GUESSES, REASONS
 from experts.demonstrations.settings import FORMAT, SHARD_SIZE
-from experts.demonstrations.shard import NOTES
+from experts.demonstrations.shard import NOTES, PARAMETERS
 from experts.demonstrations.tensors import pack
 
 GAINS = "feedback_gains"
@@ -143,7 +143,9 @@ def _settings(place: Path, dataset_id: str) -> tuple[dict[str, Any], int]:
 def _shapes(kernels: Kernels) -> Shapes:
     """Shapes of an episode's arrays: what is not of them is not read."""
     n, n_u = kernels.scene.simulation.steps, kernels.n_u
+    varied = {f"infos/{PARAMETERS}": (n + 1, kernels.n_p)} if kernels.n_p else {}
     return {
+        **varied,
         "observations": (n + 1, kernels.n_x + 1),
         "actions": (n, n_u),
         "rewards": (n,),
@@ -175,6 +177,7 @@ def packed_episodes(path: Path, episodes: Sequence[int], shapes: Shapes) -> byte
     }
     content = {
         "states": arrays.pop("infos/state"),
+        **_varied(arrays.pop(f"infos/{PARAMETERS}", None)),
         **arrays,
         GAINS: gains[:, :-1].astype(np.float32),
         "index": np.array([_number(each, "problem") for each in facts], dtype=np.int64),
@@ -224,6 +227,15 @@ def _number(facts: dict[str, Any], name: str) -> np.number[Any]:
     if not isinstance(value, np.number) or not np.isfinite(value):
         raise UnreadableError(f"{name}: {shortened(value)}, should be a number")
     return value
+
+
+def _varied(parameters: NDArray[np.float64] | None) -> dict[str, NDArray[Any]]:
+    """Parameters of episodes, (M, N + 1, n_p), as a column, and none of failures; nothing without any."""
+    if parameters is None:
+        return {}
+    if not (parameters == parameters[:, :1]).all():
+        raise UnreadableError("infos/parameters: should be the same in every row of an episode")
+    return {PARAMETERS: parameters[:, 0], f"failures.{PARAMETERS}": np.zeros((0, parameters.shape[-1]))}
 
 
 def _no_failures(n_x: int) -> dict[str, NDArray[Any]]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluation.plans import FloatArray, Plans, drawn_parameters
+from agents.evaluation.plans import FloatArray, Plans
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
 from dq_space_arm_env.scene import StateLayout
@@ -46,17 +46,17 @@ def plans_of(settings: Settings, result: ShardResult) -> tuple[Plans, FloatArray
     rows = arrays["index"] - problems.start
     states[rows], actions[rows] = arrays["states"], arrays["actions"]
     gains[rows] = arrays["feedback_gains"]
-    drawn = drawn_parameters(settings.scene, [settings.problem_seed(problem) for problem in problems])
+    varied = draw_starts(settings.scene, [settings.problem_seed(problem) for problem in problems]).parameters
     for row, start in zip(arrays["failures.index"] - problems.start, arrays["failures.start"], strict=True):
-        solution = expert_of(settings.scene).solver.solve(start, parameters=drawn[row])
+        solution = expert_of(settings.scene).solver.solve(start, parameters=varied[row])
         states[row], actions[row], gains[row] = _parts(solution, layout)
-    return Plans(states, actions, gains, drawn, np.arange(len(problems))), np.array(result.solve_seconds)
+    return Plans(states, actions, gains, varied, np.arange(len(problems))), np.array(result.solve_seconds)
 
 
 def _parts(solution: Solution, layout: StateLayout) -> tuple[FloatArray | float, ...]:
     """States, actions and gains of a solution; zeros if one is not finite."""
-    gains = solution.feedback_gains / layout.control_limit[:, None]
-    parts = (solution.states, layout.to_action(solution.controls), gains)
+    limits = layout.limits_with(solution.parameters[0])
+    parts = (solution.states, solution.controls / limits, solution.feedback_gains / limits[:, None])
     return parts if all(np.isfinite(part).all() for part in parts) else (0.0, 0.0, 0.0)
 
 
@@ -87,6 +87,8 @@ class RecedingHorizon:
 
     Attributes:
         planning_seconds: Mean time to plan a flight when the last episodes began, s.
+        parameters: What varies in the scene to plan in, a row for each of the next episodes, shape (B, n_p);
+            None for nominal ones.
     """
 
     def __init__(self, scene: Scene, horizon: int = 100) -> None:

@@ -28,12 +28,11 @@ from agents.evaluation.expert_costs import (
 )
 from agents.evaluation.kept_results import CachedGroups, Row
 from agents.evaluation.plan_followers import FEEDBACK, RECEDING, RecedingHorizon, follower, plans_of
-from agents.evaluation.plans import drawn_parameters
 from agents.policies.flying import Flights, FloatArray, fly
 from dq_space_arm_env import Scene
 from experts.demonstrations.executors import Executor
 from experts.demonstrations.settings import Settings, software
-from experts.demonstrations.shard import Task
+from experts.demonstrations.shard import Task, draw_starts
 
 _SOURCES = (
     *(f"evaluation/{name}.py" for name in ("conditions", "evaluating", "expert_costs", "plan_followers")),
@@ -130,7 +129,7 @@ def fly_receding(
         assert controller is not None
         rows: list[Row] = []
         for seed in files.seeds(group):
-            told = drawn_parameters(settings.scene, [seed])
+            told = draw_starts(settings.scene, [seed]).parameters
             flights = fly(controller.policy(told), flown, [seed])
             rows += _rows([seed], flights, np.array([controller.planning_seconds]))
             done += 1

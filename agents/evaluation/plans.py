@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env import DQSpaceArmVectorEnv, Kernels, Scene
-from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env import Kernels
 from experts.demonstrations import Demonstrations
 
 FloatArray = NDArray[np.float64]
@@ -38,13 +36,14 @@ class Plans:
         """Plans of demonstrations, one flight each, copied to memory."""
         shape = (len(demonstrations), *demonstrations[0].feedback_gains.shape)
         gains = np.empty(shape, dtype=np.float32)
-        states, actions = [], []
+        states, actions, varied = [], [], []
         for row, each in zip(gains, demonstrations, strict=True):
             row[:] = each.feedback_gains
             states.append(each.states)
             actions.append(each.actions)
-        drawn = drawn_parameters(demonstrations.scene, demonstrations.column("seed").tolist())
-        return cls(np.stack(states), np.stack(actions), gains, drawn, np.arange(len(gains)))
+            varied.append(each.parameters)
+        parts = np.stack(states), np.stack(actions), gains, np.stack(varied)
+        return cls(*parts, np.arange(len(gains)))
 
     def choose(self, chosen: ArrayLike) -> Self:
         """The same plans for other flights: the number of the plan of each, in [0, M)."""
@@ -73,12 +72,3 @@ class Plans:
         deviation = kernels.difference(self.states[self.chosen, stage], measured)
         feedback = (self.gains[self.chosen, stage] @ deviation[:, :, None])[:, :, 0]
         return Followed(np.clip(self.planned(stage) + feedback, -1.0, 1.0), deviation)
-
-
-def drawn_parameters(scene: Scene, seeds: Sequence[int]) -> FloatArray:
-    """What `env.reset(seed=seed)` draws besides the state, shape (B, n_p), units of the parameters."""
-    if not StateLayout.of(scene).n_p:
-        return np.zeros((len(seeds), 0))
-    environment = DQSpaceArmVectorEnv(len(seeds), scene)
-    environment.reset(seed=list(seeds))
-    return environment.parameters.astype(np.float64)

@@ -25,7 +25,7 @@ from agents.configuration.imitation import Dagger
 from agents.imitation.cloning import Cloned, Making, fingerprint
 from agents.imitation.labels import Solver, label_by_gains
 from agents.imitation.objective import Objective
-from agents.imitation.samples import NAMES, Corrections, Mixture, Statistics
+from agents.imitation.samples import COLUMNS, Corrections, Mixture, Statistics
 from agents.imitation.trainer import CheckpointError, Progress, Record, Spent, Trainer, Watch, torch_threads
 from agents.policies.exported import ExportedPolicy
 from agents.policies.network import PolicyNetwork
@@ -35,6 +35,7 @@ from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import Status
 from dq_space_arm_env.environment.rollouts import rollout
 from experts.demonstrations import Demonstrations
+from experts.demonstrations.shard import PARAMETERS
 
 CORRECTIONS = "corrections.npz"
 _MOST_BYTES = 2**31  # all labels of a run fit into memory
@@ -185,7 +186,7 @@ def _corrections(
     done, corrections = make()
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        arrays = {name: getattr(corrections, name) for name in NAMES}
+        arrays = {name: array for name in COLUMNS if (array := getattr(corrections, name)).size}
         facts = json.dumps({"identity": identity, "round": done._asdict()})
         content = io.BytesIO()
         np.savez(content, allow_pickle=False, facts=np.array(facts), **arrays)
@@ -195,10 +196,11 @@ def _corrections(
 
 def _read(path: Path, identity: dict[str, Any]) -> tuple[Round, Corrections]:
     try:
-        content = read_arrays(path, (*NAMES, "facts"), _MOST_BYTES)
+        content = read_arrays(path, (*COLUMNS, "facts"), _MOST_BYTES)
         facts = parse_json(str(content["facts"]), "facts")
-        done, corrections = Round(**facts["round"]), Corrections(*(content[name] for name in NAMES))
-        found, arrays = facts["identity"], [content[name] for name in NAMES]
+        content.setdefault(PARAMETERS, np.zeros((len(content["states"]), 0)))
+        arrays = [content[name] for name in COLUMNS]
+        found, done, corrections = facts["identity"], Round(**facts["round"]), Corrections(*arrays)
         if len({array.shape[:1] for array in arrays}) != 1 or any(
             array.dtype.kind != "f" for array in arrays
         ):

@@ -37,6 +37,7 @@ def label_by_gains(demonstrations: Demonstrations, visits: Rollout) -> Correctio
                 visits.observations[i, steps],
                 np.clip(wanted, -1.0, 1.0),
                 np.where(free[:, :, None], gains, np.float32(0.0)),
+                np.tile(demonstration.parameters, (len(states), 1)),
             )
         )
     return Corrections.joined(parts)
@@ -90,12 +91,14 @@ class Solver:
     def _plan(
         self, demonstration: Demonstration, state: FloatArray, stage: int, end: int
     ) -> Corrections | None:
-        maneuver, limits = self._maneuver, self._maneuver.control_upper
+        maneuver, parameters = self._maneuver, demonstration.parameters
+        limits = self._kernels.layout.limits_with(parameters)
+        maneuver.parameters.set(parameters)  # its end is that of the window
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
-        guess = self._followed(demonstration, state, stage) * limits
+        guess = self._followed(demonstration, state, stage, limits) * limits
         # The demonstration's own weight on the final pose: without it some plans miss the target.
         with maneuver.emphasized(float(demonstration.facts["emphasis"])):
-            solution = BoxDDP(problem).solve(x0=state, u_init=guess)
+            solution = BoxDDP(problem).solve(x0=state, u_init=guess, parameters=parameters)
         if not solution.converged:
             return None
         steps = slice(0, end - stage)
@@ -104,17 +107,19 @@ class Solver:
         gains = solution.feedback_gains[steps] / limits[:, None]
         return Corrections(
             states,
-            self._kernels.observation(states, left[:, None])[0],
+            self._kernels.observation(states, left[:, None], p=parameters)[0],
             solution.controls[steps] / limits,
             gains.astype(np.float32),
+            np.tile(parameters, (len(states), 1)),
         )
 
-    def _followed(self, demonstration: Demonstration, state: FloatArray, stage: int) -> FloatArray:
+    def _followed(
+        self, demonstration: Demonstration, state: FloatArray, stage: int, limits: FloatArray
+    ) -> FloatArray:
         """Actions of the demonstration's feedback policy, rolled out from a state."""
         actions = demonstration.actions[stage:].copy()
-        limits = self._maneuver.control_upper
         for k in range(len(actions)):
             deviation = self._kernels.difference(demonstration.states[stage + k], state)
             actions[k] = np.clip(actions[k] + demonstration.feedback_gains[stage + k] @ deviation, -1.0, 1.0)
-            state = self._kernels.step(state, actions[k] * limits)
+            state = self._kernels.step(state, actions[k] * limits, p=demonstration.parameters)
         return actions

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents.configuration.imitation import ObjectiveWeights
-from agents.imitation.samples import Statistics
+from agents.imitation.samples import COLUMNS, NAMES, Statistics
 from agents.policies.network import PolicyNetwork
 from dq_space_arm_env.kernels import Kernels
 from experts.demonstrations.reading import Batch
+from experts.demonstrations.shard import PARAMETERS
 from experts.problems.shooting_problem import FloatArray
 
 STEP = 1e-5  # of central differences, relative to the direction: truncation and rounding errors near 1e-10
@@ -51,7 +52,7 @@ class Objective:
     def needs(self) -> tuple[str, ...]:
         """Names of the arrays that a batch must have."""
         if self._weights.needs_gains:
-            return ("states", "observations", "actions", "feedback_gains")
+            return COLUMNS if self._kernels.n_p else NAMES
         return ("observations", "actions")
 
     def __call__(self, network: PolicyNetwork, batch: Batch, rng: np.random.Generator) -> Losses:
@@ -62,7 +63,8 @@ class Objective:
         gain, augmentation = none, none
         if weights.gain_weight:
             directions = self._directions(arrays["states"], rng)
-            change = observation_change(self._kernels, arrays["states"], arrays["observations"], directions)
+            seen = arrays["states"], arrays["observations"]
+            change = observation_change(self._kernels, *seen, directions, arrays.get(PARAMETERS))
             tangent = torch.from_numpy((change * network.observation_scale.numpy()).astype(np.float32))
             outputs, slopes = network.forward_with_tangent(normalized, tangent)
             gain = self._gain_error(network, slopes, batch, directions)
@@ -91,18 +93,23 @@ class Objective:
         arrays = batch.arrays
         directions = self._weights.augmentation_scale * self._directions(arrays["states"], rng)
         states = self._kernels.retract(arrays["states"], directions)
-        observations = self._kernels.observation(states, arrays["observations"][:, -1:])[0]
+        time_left, parameters = arrays["observations"][:, -1:], arrays.get(PARAMETERS)
+        observations = self._kernels.observation(states, time_left, p=parameters)[0]
         wanted = np.clip(arrays["actions"] + _times(arrays["feedback_gains"], directions), -1.0, 1.0)
         return _action_error(network, network(network.normalized(observations)), wanted)
 
 
 def observation_change(
-    kernels: Kernels, states: FloatArray, observations: FloatArray, directions: FloatArray
+    kernels: Kernels,
+    states: FloatArray,
+    observations: FloatArray,
+    directions: FloatArray,
+    parameters: FloatArray | None = None,
 ) -> FloatArray:
     """Directional derivative d/de o(x (+) e d) at e = 0, shape (B, n_obs), one direction per state."""
     time_left = observations[:, -1:]
     ahead, behind = (
-        kernels.observation(kernels.retract(states, sign * STEP * directions), time_left)[0]
+        kernels.observation(kernels.retract(states, sign * STEP * directions), time_left, p=parameters)[0]
         for sign in (1.0, -1.0)
     )
     return np.asarray((ahead - behind) / (2.0 * STEP))

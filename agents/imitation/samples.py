@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from experts.demonstrations import Demonstrations
 from experts.demonstrations.reading import Batch
+from experts.demonstrations.shard import PARAMETERS
 from experts.problems.shooting_problem import FloatArray
 
 NAMES = ("states", "observations", "actions", "feedback_gains")
+COLUMNS = (*NAMES, PARAMETERS)  # the last one without columns where nothing varies in the scene
 SPREAD_STAGES = 50  # at which the spread of demonstrations is measured
 
 
@@ -93,17 +95,18 @@ class Corrections:
     observations: FloatArray  # (M, n_obs)
     actions: FloatArray  # (M, n_u), fractions of the limits
     feedback_gains: NDArray[np.float32]  # (M, n_u, n_t)
+    parameters: FloatArray  # what varies in the scene, (M, n_p)
 
     def __len__(self) -> int:
         return len(self.states)
 
     @classmethod
     def joined(cls, parts: Sequence["Corrections"]) -> "Corrections":
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in NAMES))
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS))
 
     def thinned(self, every: int) -> "Corrections":
         """Keep one time step in `every`."""
-        return Corrections(*(getattr(self, name)[::every].copy() for name in NAMES))
+        return Corrections(*(getattr(self, name)[::every].copy() for name in COLUMNS))
 
     def batches(
         self, size: int, names: Sequence[str], *, seed: int | None, drop_last: bool

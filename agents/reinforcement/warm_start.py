@@ -127,7 +127,10 @@ def _flights(
     """The columns of `Flown` for each successful flight."""
     plain = DQSpaceArmVecEnv(len(chosen), scene)
     environment = settings.around(plain)
-    plain.set_options({"initial_state": np.array([each.states[0] for each in chosen])})
+    options = {"initial_state": np.array([each.states[0] for each in chosen])}
+    if data.kernels.n_p:
+        options["parameters"] = np.array([each.parameters for each in chosen])
+    plain.set_options(options)
     observation = environment.reset()
     unit = action_limits(environment)
     columns: list[tuple[NDArray[Any], ...]] = []
@@ -154,14 +157,15 @@ def _mean_action(
 ) -> SingleArray:
     """Mean feedback action clip(a_k + G_k (x (-) x_k)) over a hold from given states, shape (B, n_u)."""
     kernels = data.kernels
-    total = np.zeros((len(chosen), kernels.n_u))
+    total, parameters = np.zeros((len(chosen), kernels.n_u)), np.array([each.parameters for each in chosen])
+    limits = kernels.layout.limits_with(parameters)
     stages = range(stage, min(stage + hold, data.scene.simulation.steps))
     for at in stages:
         deviation = data.tangent(np.array([each.states[at] for each in chosen]), states)
         gains = np.array([each.feedback_gains[at] for each in chosen])
         nominal = np.array([each.actions[at] for each in chosen])
         actions = np.clip(nominal + np.einsum("bij,bj->bi", gains, deviation), -1.0, 1.0)
-        states = kernels.step(states, kernels.layout.to_control(actions))
+        states = kernels.step(states, actions * limits, p=parameters)
         total += actions
     mean: SingleArray = (total / len(stages)).astype(np.float32)
     return mean

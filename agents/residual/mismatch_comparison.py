@@ -28,7 +28,14 @@ from agents.policies import ExportedPolicy
 from agents.policies.flying import Flights
 from agents.residual.corrections import correction, correction_settings
 from agents.residual.informed import SOURCES, informed_costs
-from agents.residual.mismatch import CONDITIONS, PUSHES, Condition, Worlds, fly_mismatched
+from agents.residual.mismatch import (
+    CONDITIONS,
+    PUSHES,
+    Condition,
+    Worlds,
+    check_plannable,
+    fly_mismatched,
+)
 from agents.zoo.finding import PolicyError, policy_path
 from agents.zoo.shelf import file_hash
 from dq_space_arm_env import Scene, load_scene
@@ -90,6 +97,7 @@ def compare_under_mismatch(
         raise ValueError(f"receding_starts: {receding_starts}, should be at least 0, which leaves it out")
     scene = scene or demonstrations.scene
     check_scene(demonstrations, scene)
+    check_plannable(scene)
     found = read_corrections(policies, scene)
     work = _Work(
         demonstrations, Plans.of(demonstrations), scene, seed, receding_horizon, KeptRows(out), progress
@@ -183,6 +191,7 @@ def evaluation_plans(
     The few starts at which the expert fails are left out.
     """
     evaluation_seeds(scene, n)  # the seeds that RESERVED_SEED gives; refuses a wrong n
+    check_plannable(scene)
     if not 0.0 < tolerance_scale <= 1.0:
         raise ValueError(f"tolerance_scale: {tolerance_scale}, should be above 0, and 1 at most")
     plans = generate_demonstrations(

@@ -117,6 +117,7 @@ def show(console: Console, folder: Path) -> dict[str, Any]:
     shown = [tables.contents(facts)]
     if len(facts.demonstrations):
         shown += [tables.distributions(facts), tables.guesses(facts)]
+        shown += [tables.parameters(facts)] if facts.demonstrations.kernels.n_p else []
     if len(facts.failures["index"]):
         shown.append(tables.failure_reasons(facts))
     for table in shown:

@@ -24,6 +24,8 @@ def read_demonstration(source: str, label: str | None) -> Trajectory | None:
         demonstration, scene = demonstrations[int(number)], demonstrations.scene
     except DemonstrationsError as error:
         raise ValueError(str(error)) from error
-    controls = StateLayout.of(scene).to_control(demonstration.actions)
+    layout, parameters = StateLayout.of(scene), demonstration.parameters
+    controls = demonstration.actions * layout.limits_with(parameters)
+    target = layout.target_with(parameters) if layout.n_p else None
     name = label or f"demonstration {number}"
-    return Trajectory(name, np.array(demonstration.states), controls, scene=scene)
+    return Trajectory(name, np.array(demonstration.states), controls, target=target, scene=scene)

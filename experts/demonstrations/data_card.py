@@ -14,7 +14,7 @@ from dq_space_arm_env.common.tables import TextTable
 from dq_space_arm_env.validation import dump_yaml
 from experts.demonstrations import facts as tables
 from experts.demonstrations.facts import Facts
-from experts.demonstrations.shard import FAILURES, SUMMARIES, TRAJECTORIES
+from experts.demonstrations.shard import FAILURES, PARAMETERS, SUMMARIES, TRAJECTORIES, with_parameters
 
 MEANINGS = {
     "states": "states of the environment, including the last one",
@@ -32,6 +32,7 @@ MEANINGS = {
     "start_errors": "of the tip: attitude [deg] and position [m]",
     "final_errors": "the same at the end",
     "clamped_share": "share of the inputs, over all stages, at a limit",
+    PARAMETERS: "what varied in the scene; `demonstration.episode_scene` is the scene with these numbers",
 }
 """Meanings of the arrays of a demonstration."""
 
@@ -145,7 +146,7 @@ for action in dataset[0].actions:
 def data_card(facts: Facts, minari_id: str | None = None) -> str:
     """Fill in the template; minari_id names the Minari data set that the card goes with."""
     demonstrations, settings = facts.demonstrations, facts.demonstrations.settings
-    success = demonstrations.scene.success
+    success, layout = demonstrations.scene.success, demonstrations.kernels.layout
     return _TEMPLATE.substitute(
         scene=markdown_text(demonstrations.scene.name),
         pretty_name=_pretty_name(demonstrations.scene.name),
@@ -157,8 +158,8 @@ def data_card(facts: Facts, minari_id: str | None = None) -> str:
         failures=_failures(facts),
         emphasized=int((facts.emphases != 1.0).sum()),
         numbers=_numbers(facts),
-        arrays="\n\n".join(_arrays(facts).markdown()),
-        failure_columns=", ".join(FAILURES).replace("_", " "),
+        arrays="\n\n".join(line for table in _arrays(facts) for line in table.markdown()),
+        failure_columns=", ".join(with_parameters(FAILURES, layout)).replace("_", " "),
         minari=_FILES if minari_id is None else _MINARI.replace("$id", minari_id),
         problems=facts.problems,
         seed=settings["seed"],
@@ -196,7 +197,8 @@ def _numbers(facts: Facts) -> str:
     return "\n\n".join(tables.distributions(facts, with_times=False).markdown())
 
 
-def _arrays(facts: Facts) -> TextTable:
+def _arrays(facts: Facts) -> list[TextTable]:
+    """The arrays of a demonstration, and what varies in the scene if anything does."""
     simulation, layout = facts.demonstrations.scene.simulation, facts.demonstrations.kernels.layout
     n, n_x = simulation.steps, layout.n_x
     shapes = {
@@ -207,12 +209,14 @@ def _arrays(facts: Facts) -> TextTable:
         "feedback_gains": (n, layout.n_u, layout.n_t),
         "start_errors": (2,),
         "final_errors": (2,),
+        PARAMETERS: (layout.n_p,),
     }
     rows = (
         (f"`{name}`", str(shapes.get(name, "a number")), MEANINGS[name])
-        for name in (*TRAJECTORIES, *SUMMARIES)
+        for name in with_parameters((*TRAJECTORIES, *SUMMARIES), layout)
     )
-    return TextTable("Its arrays", ("array", "shape", "meaning"), tuple(rows))
+    arrays = TextTable("Its arrays", ("array", "shape", "meaning"), tuple(rows))
+    return [arrays, tables.parameters(facts)] if layout.n_p else [arrays]
 
 
 def _size_category(count: int) -> str:

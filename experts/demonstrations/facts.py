@@ -17,7 +17,7 @@ from dq_space_arm_env.common.tables import TextTable
 from experts.demonstrations import Demonstrations
 from experts.demonstrations.folder import LOG
 from experts.demonstrations.outcomes import GUESSES
-from experts.demonstrations.shard import tip_errors
+from experts.demonstrations.shard import PARAMETERS, tip_errors
 from experts.problems.shooting_problem import FloatArray
 
 _LOG_BYTES = 2**26  # of a part: tens of thousands of shards
@@ -76,7 +76,9 @@ class Facts:
 def gather(demonstrations: Demonstrations) -> Facts:
     """Collect the numbers of a complete folder."""
     log, failures = read_log(demonstrations), demonstrations.failures()
-    failures["start_errors"] = tip_errors(demonstrations.kernels, failures["start"])
+    kernels, start = demonstrations.kernels, failures["start"]
+    varied = failures.get(PARAMETERS, np.zeros((len(start), 0)))
+    failures["start_errors"] = tip_errors(kernels, start, varied)
     some = np.unique(np.linspace(0, len(demonstrations) - 1, REPLAYED).astype(np.int64))
     gaps = [_return_gap(demonstrations, int(position)) for position in some if len(demonstrations)]
     guesses = np.array(GUESSES)[demonstrations.column("guess")]
@@ -178,6 +180,20 @@ def _distribution(quantity: Quantity) -> tuple[str, ...]:
     numbers = (values.min(), *np.quantile(values, SHARES), values.max(), values.mean())
     bound = "" if quantity.bound is None else number(quantity.bound)
     return (quantity.label, *(number(float(value)) for value in numbers), bound)
+
+
+def parameters(facts: Facts) -> TextTable:
+    """One row for each number that varies in the scene; no row where nothing does."""
+    found = facts.demonstrations.kernels.parameters
+    headings = ("", "unit", "nominal", "least", "mean", "most")
+    columns = facts.demonstrations.column(PARAMETERS).T if found.names and len(facts.demonstrations) else ()
+    rows = tuple(
+        (name, unit, *map(number, (nominal, *map(float, (values.min(), values.mean(), values.max())))))
+        for name, unit, nominal, values in zip(
+            found.names, found.units, found.nominal.tolist(), columns, strict=False
+        )
+    )
+    return TextTable("Parameters\nwhat varies between problems besides the start", headings, rows, right=2)
 
 
 def guesses(facts: Facts) -> TextTable:

@@ -2,7 +2,8 @@
 
 An episode holds observations, actions, rewards and terminations. Its `infos` have a row for each observation:
 errors of the tip as in the environment's `info`, the state, and the feedback gain, which is zero at the end,
-where no action is taken. Its metadata hold the seed for `env.reset(seed=seed)`, the cost, and other numbers.
+where no action is taken; where something varies in the scene, the parameters as well, the same in every row.
+Its metadata hold the seed for `env.reset(seed=seed)`, the cost, and other numbers.
 `recover_environment()` makes the environment with the complete scene, wherever that came from.
 
 Actions are float64, and so is the data set's action space, although the environment's own is float32: it
@@ -27,7 +28,9 @@ import numpy as np
 import dq_space_arm_env
 from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.worker_process import WorkerLostError, WorkerProcess
+from dq_space_arm_env.scene.layout import ParameterEntries
 from experts.demonstrations.reading import Demonstration, Demonstrations
+from experts.demonstrations.shard import PARAMETERS, tip_errors
 from experts.demonstrations.tensors import DemonstrationsError
 
 ALGORITHM = "Control-limited differential dynamic programming (box-DDP)"
@@ -44,7 +47,8 @@ _DESCRIPTION = """\
 {count} optimal maneuvers of scene {name!r} in DQSpaceArm-v0, from random starts: converged, successful, \
 and replayed in the environment. The environment reset with an episode's seed, and given its actions \
 (float64), repeats its rewards. infos has a row for each observation: attitude_error [deg] and \
-position_error [m] of the tip, is_success, state{gains}."""
+position_error [m] of the tip, is_success, state{parameters}{gains}."""
+_PARAMETERS = ", parameters of the episode ({})"
 _GAINS = """, and feedback_gains G of the optimal policy clip(action + G @ deviation, -1, 1), where the \
 deviation from the state is env.unwrapped.kernels.difference(state, other_state); zero in rows of inputs \
 at a limit"""
@@ -95,7 +99,12 @@ def export_to_minari(
         raise DemonstrationsError(f"{demonstrations.path} has no demonstration to export")
     origin = {"author": author, "author_email": author_email, "code_permalink": code_permalink}
     count, scene = len(demonstrations), demonstrations.scene.name
-    described = _DESCRIPTION.format(count=count, name=scene, gains=_GAINS if feedback_gains else "")
+    described = _DESCRIPTION.format(
+        count=count,
+        name=scene,
+        parameters=_named(demonstrations.kernels.parameters),
+        gains=_GAINS if feedback_gains else "",
+    )
     try:
         with _staging(dataset_id, overwrite) as folder, closing(WorkerProcess(quiet=True)) as worker:
             worker.assign(_create, folder, dataset_id, demonstrations.settings, described, origin)
@@ -112,6 +121,12 @@ def export_to_minari(
             f"the data set cannot be written: {reason}; nothing of it remains"
         ) from error
     return minari.load_dataset(dataset_id)
+
+
+def _named(found: ParameterEntries) -> str:
+    """Names and units of the parameters for the description; nothing where there are none."""
+    names = (f"{name} [{unit}]" for name, unit in zip(found.names, found.units, strict=True))
+    return _PARAMETERS.format(", ".join(names)) if found.names else ""
 
 
 def check_dataset_id(dataset_id: str) -> None:
@@ -255,14 +270,16 @@ def _infos(
 ) -> dict[str, Any]:
     """Return arrays with N + 1 rows."""
     states, success = demonstration.states, demonstrations.scene.success
-    _, errors = demonstrations.kernels.observation(states, np.zeros((len(states), 1)))
-    attitude, position = np.degrees(errors[:, 0]), errors[:, 1]
+    parameters = demonstration.parameters
+    attitude, position = tip_errors(demonstrations.kernels, states, parameters).T
     infos = {
         "state": states,
         "attitude_error": attitude,
         "position_error": position,
         "is_success": (attitude <= success.attitude_error_deg) & (position <= success.position_error),
     }
+    if parameters.size:
+        infos[PARAMETERS] = np.tile(parameters, (len(states), 1))
     if feedback_gains:
         gains = demonstration.feedback_gains
         infos["feedback_gains"] = np.concatenate([gains, np.zeros_like(gains[:1])])

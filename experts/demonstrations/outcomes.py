@@ -4,7 +4,8 @@ A solver finds a local minimum, and nearby starts may end in different ones, wit
 led the other way round. A neighbor's policy may know a better way: rolled out from this start,
 at a hundredth of the cost of a solve, it ends in the neighbor's valley. Where such a rollout is cheaper than
 the solution, or nearly as cheap but elsewhere, the problem is solved again from there, and the cheaper
-solution is kept. Where the solver failed, the best neighbor is tried in any case.
+solution is kept. Where the solver failed, the best neighbor is tried in any case. A neighbor with another
+target is followed as it is, and moved along with the target.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import numpy as np
 from dq_space_arm_env import Scene
 from experts.ddp.rollout import Trajectory
 from experts.ddp.solution import Solution, StopReason
-from experts.guesses.guided import GuidedDDP
+from experts.guesses.guided import GuidedDDP, follow, policies
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 
@@ -46,7 +47,7 @@ class Expert(NamedTuple):
     """A solver and its problem."""
 
     problem: ArmProblem
-    solver: GuidedDDP  # its solutions depend on nothing but the start
+    solver: GuidedDDP  # its solutions depend on nothing but start and parameters
 
 
 @dataclass(eq=False)
@@ -65,6 +66,12 @@ class Outcome:
         """Whether it is a demonstration."""
         return self.reason == StopReason.CONVERGED.value
 
+    @property
+    def parameters(self) -> FloatArray:
+        """What varied in the scene, the same at every stage, shape (n_p,)."""
+        first: FloatArray = self.solution.parameters[0]
+        return first
+
 
 class Retry(NamedTuple):
     """A problem to be solved once more, starting with a neighbor's policy."""
@@ -82,9 +89,9 @@ def expert_of(scene: Scene) -> Expert:
     return Expert(problem, solver)
 
 
-def solve(expert: Expert, index: int, seed: int, start: FloatArray) -> Outcome:
-    """Solve a problem."""
-    solution = expert.solver.solve(start)
+def solve(expert: Expert, index: int, seed: int, start: FloatArray, parameters: FloatArray) -> Outcome:
+    """Solve a problem: a start, (n_x,), and what varies in its scene, (n_p,)."""
+    solution = expert.solver.solve(start, parameters=parameters)
     name = solution.metadata["guess"]
     guess = GUESSES[0] if name.startswith(GUESSES[0]) else name
     return Outcome(index, seed, start, solution, guess, _judge(expert.problem, solution))
@@ -108,7 +115,7 @@ def solve_again(expert: Expert, outcomes: list[Outcome], retries: list[Retry]) -
             attempts=1,
             max_iterations=MOST_ITERATIONS,
         )
-        solution = guide.solve(old.start)
+        solution = guide.solve(old.start, parameters=old.parameters)
         reason = _judge(expert.problem, solution)
         new = Outcome(old.index, old.seed, old.start, solution, NEIGHBOR, reason)
         cheaper = solution.cost < (1.0 - LEAST_GAIN) * old.solution.cost
@@ -129,24 +136,27 @@ class _NeighborCheck:
 
     def __init__(self, problem: ArmProblem, outcomes: list[Outcome]) -> None:
         self._problem, self._outcomes = problem, outcomes
-        self._trial = Trajectory(problem)
-        names = ("difference", "step_with_cost", "terminal_cost")
-        self._kernels = {name: problem.kernel(name) for name in names}
         self._good = [i for i, outcome in enumerate(outcomes) if outcome.is_good]
         starts = np.array([outcome.start for outcome in outcomes])
         nominal = np.broadcast_to(problem.initial_state, starts.shape)
         tangents = problem.kernels.difference(nominal, starts)
-        spread = tangents.std(axis=0)
-        self._places = tangents / np.where(spread > 0.0, spread, 1.0)
+        self._places = _in_units_of_spread(tangents)
+        if problem.parameters.inputs:
+            drawn = np.array([outcome.parameters for outcome in outcomes])
+            self._places = np.hstack([self._places, _in_units_of_spread(drawn)])
         self._joints = problem.kernels.layout.tangent.joint_angles
 
     def better_way(self, i: int) -> int | None:
         """Find the neighbor whose policy does best from start i, if that makes a second solve worthwhile."""
         outcome, ways = self._outcomes[i], []
+        self._problem.parameters.set(outcome.parameters)
         for j in self._nearest(i):
-            cost = self._follow(j, outcome.start)
-            if np.isfinite(cost) and (not outcome.is_good or self._is_better(cost, outcome.solution)):
-                ways.append((cost, j))
+            for policy in policies(self._outcomes[j].solution, self._problem).values():
+                trial = follow(policy, self._problem, outcome.start)
+                if np.isfinite(trial.cost) and (
+                    not outcome.is_good or self._is_better(trial, outcome.solution)
+                ):
+                    ways.append((trial.cost, j))
         return min(ways)[1] if ways else None
 
     def _nearest(self, i: int) -> list[int]:
@@ -154,19 +164,17 @@ class _NeighborCheck:
         distances = np.linalg.norm(self._places[others] - self._places[i], axis=1)
         return [int(j) for j in others[np.argsort(distances, kind="stable")[:NEIGHBORS]]]
 
-    def _follow(self, j: int, start: FloatArray) -> float:
-        """Roll out a policy into the trial; return its cost, inf if it is not finite."""
-        solution = self._outcomes[j].solution
-        self._trial.states[0] = start
-        reference = solution.states, solution.controls
-        policy = np.zeros_like(solution.controls), solution.feedback_gains
-        return self._trial.follow(self._kernels, reference, policy, alpha=0.0)
-
-    def _is_better(self, cost: float, solution: Solution) -> bool:
-        """Whether the trial points to a better minimum than a solution."""
-        if cost > NEARLY_AS_CHEAP * solution.cost:
+    def _is_better(self, trial: Trajectory, solution: Solution) -> bool:
+        """Whether a rollout points to a better minimum than a solution."""
+        if trial.cost > NEARLY_AS_CHEAP * solution.cost:
             return False
-        if cost < CHEAPER * solution.cost:
+        if trial.cost < CHEAPER * solution.cost:
             return True
-        apart = self._problem.kernels.difference(solution.states, self._trial.states)
+        apart = self._problem.kernels.difference(solution.states, trial.states)
         return bool(np.linalg.norm(apart[:, self._joints], axis=1).max() > ELSEWHERE)
+
+
+def _in_units_of_spread(rows: FloatArray) -> FloatArray:
+    """Divide columns by their standard deviation, those that do not vary aside."""
+    spread = rows.std(axis=0)
+    return np.asarray(rows / np.where(spread > 0.0, spread, 1.0))

@@ -17,23 +17,22 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from dq_space_arm_env import Scene, compile_scene
-from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping, read_text
-from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.validation import problem_list
-from experts.demonstrations.folder import (
-    MANIFEST,
-    SETTINGS,
-    SHARD_NAME,
-    SHARDS,
-    manifest_of,
-    manifest_text,
-    sha256_of,
-)
+from dq_space_arm_env.validation.problems import SceneError
+from experts.demonstrations.descriptions import checked_descriptions
+from experts.demonstrations.folder import SETTINGS, SHARDS
 from experts.demonstrations.outcomes import GUESSES, REASONS
-from experts.demonstrations.settings import FORMAT
-from experts.demonstrations.shard import FAILURES, SUMMARIES, TRAJECTORIES, check_arrays
+from experts.demonstrations.shard import (
+    FAILURES,
+    PARAMETERS,
+    SUMMARIES,
+    TRAJECTORIES,
+    check_arrays,
+    with_parameters,
+)
 from experts.demonstrations.tensors import DemonstrationsError, Tensors, map_tensors
 from experts.problems.shooting_problem import FloatArray
 
@@ -49,7 +48,7 @@ class Demonstration:
 
     Attributes:
         index: Number of its problem.
-        seed: `env.reset(seed=seed)` starts at the same state.
+        seed: `env.reset(seed=seed)` starts at the same state, and draws the same parameters.
         cost: J; the sum of the rewards is -J.
         states: Shape (N + 1, n_x), units of the state.
         observations: Observations of the environment, shape (N + 1, n_obs).
@@ -57,6 +56,8 @@ class Demonstration:
         rewards: Shape (N,).
         feedback_gains: G of a = clip(a_k + G_k (x (-) x_k)) for actions a, float32, shape (N, n_u, n_t); zero
             in the rows of inputs at a limit.
+        parameters: What varied in the scene, shape (n_p,), entries and units as in `kernels.parameters`.
+        scene: The scene of all of them, in double precision.
         facts: The other numbers about it, by the names of `shard.SUMMARIES`; guess and stop reason in words.
     """
 
@@ -68,7 +69,21 @@ class Demonstration:
     actions: FloatArray
     rewards: FloatArray
     feedback_gains: NDArray[np.float32]
+    parameters: FloatArray
+    scene: Scene
     facts: Mapping[str, Any]
+
+    @property
+    def episode_scene(self) -> Scene:
+        """The scene with everything drawn as plain numbers, as `env.unwrapped.episode_scene` has it.
+
+        Raises:
+            DemonstrationsError: If no scene may have these parameters, for example a negative mass.
+        """
+        try:
+            return episode_scene(self.scene, self.parameters.tolist())
+        except SceneError as error:
+            raise DemonstrationsError(f"demonstration {self.index} is damaged: {error}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +105,7 @@ class _Files:
     """The shards of a folder, some of them mapped."""
 
     def __init__(self, folder: Path, shards: Sequence[Mapping[str, Any]], scene: Scene) -> None:
-        self._layout, self._horizon = StateLayout.of(scene), scene.simulation.steps
+        self.layout, self._horizon = StateLayout.of(scene), scene.simulation.steps
         self._sizes = [int(shard["demonstrations"]) for shard in shards]
         self.paths = [folder / SHARDS / shard["file"] for shard in shards]
         self.ends = list(accumulate(self._sizes))
@@ -98,7 +113,7 @@ class _Files:
 
     def _map(self, shard: int) -> Tensors:
         tensors, path = map_tensors(self.paths[shard]), self.paths[shard]
-        check_arrays(path, tensors.arrays, self._layout, self._horizon)
+        check_arrays(path, tensors.arrays, self.layout, self._horizon)
         if len(tensors.arrays["index"]) != self._sizes[shard]:
             raise DemonstrationsError(
                 f"{path} holds {len(tensors.arrays['index'])} demonstrations, its manifest says "
@@ -171,7 +186,9 @@ class Demonstrations(Sequence[Demonstration]):
         facts: dict[str, Any] = {name: arrays[name][row].tolist() for name in SUMMARIES}
         facts["stop_reason"], facts["guess"] = REASONS[facts["stop_reason"]], GUESSES[facts["guess"]]
         named = {name: facts.pop(name) for name in ("index", "seed", "cost")}
-        return Demonstration(**named, **{name: arrays[name][row] for name in TRAJECTORIES}, facts=facts)
+        named |= {name: arrays[name][row] for name in TRAJECTORIES}
+        varied = arrays[PARAMETERS][row] if self._files.layout.n_p else np.zeros(0)
+        return Demonstration(**named, parameters=varied, scene=self.scene, facts=facts)
 
     def select(self, positions: ArrayLike) -> Self:
         """Select demonstrations.
@@ -192,15 +209,15 @@ class Demonstrations(Sequence[Demonstration]):
         """Read one number about every demonstration into memory.
 
         Args:
-            name: One of `shard.SUMMARIES`, for example "cost" or "seed".
+            name: One of `shard.SUMMARIES`, for example "cost" or "seed"; "parameters" if the scene has any.
 
         Returns:
-            Shape (len(self),), or (len(self), 2) for the tip's errors.
+            Shape (len(self),), or (len(self), 2) for the tip's errors, (len(self), n_p) for parameters.
 
         Raises:
             ValueError: If there is no such column.
         """
-        _check_names((name,), SUMMARIES)
+        _check_names((name,), with_parameters(SUMMARIES, self._files.layout))
         return self._files.column(name)[self._places]
 
     def failures(self) -> dict[str, NDArray[Any]]:
@@ -208,9 +225,11 @@ class Demonstrations(Sequence[Demonstration]):
 
         Returns:
             `index`, `seed`, `cost` and, in words, `reason`, each of shape (F,); `start`, states at stage 0,
-            shape (F, n_x); `final_errors` of the tip, attitude [deg] and position [m], shape (F, 2).
+            shape (F, n_x); `final_errors` of the tip, attitude [deg] and position [m], shape (F, 2); and
+            `parameters` if the scene has any, shape (F, n_p).
         """
-        columns = {name: self._files.column(f"failures.{name}") for name in FAILURES}
+        names = with_parameters(FAILURES, self._files.layout)
+        columns = {name: self._files.column(f"failures.{name}") for name in names}
         reasons = columns.pop("stop_reason")
         return {**columns, "reason": np.array(REASONS)[reasons]}
 
@@ -250,7 +269,7 @@ class Demonstrations(Sequence[Demonstration]):
         Args:
             size: Time steps of a batch.
             names: Arrays to read, of `shard.TRAJECTORIES`; states and observations without the last, at which
-                no action is taken.
+                no action is taken. Also "parameters" if the scene has any, those of the demonstration.
             seed: Seed of the order; None for the order of problems and stages.
             drop_last: Whether to omit a smaller last batch.
 
@@ -262,7 +281,7 @@ class Demonstrations(Sequence[Demonstration]):
         """
         if size < 1:
             raise ValueError(f"size: {size}, should be at least 1")
-        _check_names(names, TRAJECTORIES)
+        _check_names(names, with_parameters(TRAJECTORIES, self._files.layout))
         return self._batches(size, tuple(names), seed, drop_last)
 
     def _batches(
@@ -291,9 +310,10 @@ class Demonstrations(Sequence[Demonstration]):
             mine = positions == position
             for name in names:
                 source = tensors.arrays[name][row]
+                rows = source[None] if name == PARAMETERS else source[stages[mine]]
                 if name not in arrays:
-                    arrays[name] = np.empty((len(steps), *source.shape[1:]), source.dtype)
-                arrays[name][mine] = source[stages[mine]]
+                    arrays[name] = np.empty((len(steps), *rows.shape[1:]), rows.dtype)
+                arrays[name][mine] = rows
         return Batch(positions, stages, arrays)
 
     def tangent(self, reference: ArrayLike, states: ArrayLike) -> FloatArray:
@@ -336,120 +356,11 @@ def load_demonstrations(path: str | os.PathLike[str], *, verify: bool = False) -
         DemonstrationsError: If there is no such folder, it is not complete, or a file is damaged.
     """
     folder = Path(path)
-    if not (folder / SETTINGS).exists():
-        raise DemonstrationsError(f"{folder} holds no demonstrations: it has no {SETTINGS}")
-    if not (folder / MANIFEST).exists():
-        raise DemonstrationsError(
-            f"{folder} is not complete: it has no {MANIFEST}; run the command that began it again to resume"
-        )
-    settings, manifest = (_read_json(folder / name) for name in (SETTINGS, MANIFEST))
-    if settings.get("format") != FORMAT:
-        raise DemonstrationsError(
-            f"{folder} has format {shortened(settings.get('format'))}, this version reads {FORMAT}: generate "
-            "it again"
-        )
-    _check_fields(folder / SETTINGS, settings, _SETTINGS)
-    _check_fields(folder / MANIFEST, manifest, _MANIFEST)
-    paths = [_checked_file(folder, shard, verify) for shard in manifest["shards"]]
-    held = sum(shard["demonstrations"] for shard in manifest["shards"])
-    if manifest["demonstrations"] != held:
-        raise DemonstrationsError(
-            f"{folder / MANIFEST} has {manifest['demonstrations']} demonstrations, its shards have {held}; "
-            f"{_REMEDY}"
-        )
-    if verify:
-        _verify_descriptions(folder, paths, manifest)
+    settings, manifest = checked_descriptions(folder, verify)
     try:
         return Demonstrations(folder, settings, manifest)
     except ValidationError as error:
         raise DemonstrationsError(problem_list(f"{folder / SETTINGS}: scene", error)) from error
-
-
-_REMEDY = "run the command that made the folder again to repair it"
-_Fields = Mapping[str, tuple[type, str]]
-_SETTINGS: _Fields = {
-    "scene": (dict, "a mapping"),
-    "problems": (int, "a whole number"),
-    "seed": (int, "a whole number"),
-    "shard_size": (int, "a whole number"),
-    "source": (str, "text"),
-    "versions": (dict, "a mapping"),
-}
-_MANIFEST: _Fields = {
-    "settings_sha256": (str, "text"),
-    "demonstrations": (int, "a whole number"),
-    "failures": (dict, "a mapping"),
-    "shards": (list, "a list"),
-}
-_SHARD: _Fields = {
-    "file": (str, "text"),
-    "sha256": (str, "text"),
-    "bytes": (int, "a whole number"),
-    "demonstrations": (int, "a whole number"),
-    "failures": (int, "a whole number"),
-}
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return read_mapping(path)
-    except UnreadableError as error:
-        raise DemonstrationsError(f"{path} cannot be read ({error}); generate it again") from error
-
-
-def _check_fields(path: Path, content: Any, fields: _Fields) -> None:
-    """Refuse a mapping whose entries are missing or of another kind; whole numbers are 0 or greater."""
-    if not isinstance(content, dict):
-        raise DemonstrationsError(f"{path} holds {shortened(content, 60)}, it should be a mapping; {_REMEDY}")
-    for name, (kind, wanted) in fields.items():
-        value: Any = content.get(name)
-        right = isinstance(value, kind) and not isinstance(value, bool)
-        if not right or (isinstance(value, int) and not 0 <= value < 2**63):
-            raise DemonstrationsError(
-                f"{path}: {name} is {shortened(value)}, it should be {wanted}; {_REMEDY}"
-            )
-
-
-def _checked_file(folder: Path, shard: Any, verify: bool) -> Path:
-    """Path of a shard, whose entry in the manifest and whose file fit each other."""
-    _check_fields(folder / MANIFEST, shard, _SHARD)
-    name = SHARD_NAME.fullmatch(shard["file"])
-    if name is None or name[2] != shard["sha256"]:
-        raise DemonstrationsError(
-            f"{folder / MANIFEST}: file is {shortened(shard['file'])}, it should be a number and the hash "
-            f"{shortened(shard['sha256'])}, in the folder {SHARDS}; {_REMEDY}"
-        )
-    path = folder / SHARDS / name[0]
-    if not path.is_file():
-        raise DemonstrationsError(f"{path} is missing; {_REMEDY}")
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise DemonstrationsError(f"{path} is a link out of the folder, it should be a file in it; {_REMEDY}")
-    size = path.stat().st_size
-    if size != shard["bytes"]:
-        raise DemonstrationsError(f"{path} has {size} bytes instead of {shard['bytes']}; {_REMEDY}")
-    if verify and sha256_of(path) != shard["sha256"]:
-        raise DemonstrationsError(f"{path} is damaged: its hash is not that of the manifest; {_REMEDY}")
-    return path
-
-
-def _verify_descriptions(folder: Path, paths: list[Path], manifest: Mapping[str, Any]) -> None:
-    """Compare settings and manifest with what follows from the files; the shards are checked already."""
-    if sha256_of(folder / SETTINGS) != manifest["settings_sha256"]:
-        raise DemonstrationsError(
-            f"{folder / SETTINGS} is not what the demonstrations were made with: its hash is not that of the "
-            f"manifest; restore it, or generate them again"
-        )
-    try:
-        made = manifest_text(manifest_of(folder / SETTINGS, paths))
-        kept = read_text(folder / MANIFEST)
-    except (KeyError, TypeError, ValueError) as error:
-        raise DemonstrationsError(
-            f"{folder}: a shard has other arrays than a shard should ({error})"
-        ) from error
-    if made != kept:
-        raise DemonstrationsError(
-            f"{folder / MANIFEST} is damaged: it is not what follows from settings and shards; {_REMEDY}"
-        )
 
 
 def _check_names(names: Sequence[str], known: Sequence[str]) -> None:

@@ -42,12 +42,7 @@ class Settings:
             if value < least:
                 raise ValueError(f"{name}: {value}, should be at least {least}")
         resolved = in_double_precision(load_scene(scene))
-        if DQSpaceArmVectorEnv(1, resolved).parameters.size:
-            raise ValueError(
-                f"scene {resolved.name!r} draws more than the start of each episode, but target and masses "
-                "are constants in the expert's machine code: every problem would take seconds to compile. "
-                "Choose a scene whose spread has no target, masses or inertias"
-            )
+        DQSpaceArmVectorEnv(1, resolved)  # refuses a scene without normalized actions
         if n > 1 and not any(resolved.spread.model_dump().values()):
             raise ValueError(
                 f"scene {resolved.name!r} has no spread, so all {n} problems would be the same: give it a "

@@ -16,11 +16,14 @@ Arrays of a shard with M demonstrations and F failures, N stages:
 | `emphasis` | (M,) | factor of the final pose's weights, see `experts.guesses.reaching` |
 | `start_errors`, `final_errors` | (M, 2) | of the tip: attitude [deg] and position [m] |
 | `clamped_share` | (M,) | share of the inputs, over all stages, at a limit |
+| `parameters` | (M, n_p) | what varied in the scene, units of the parameters |
 | `failures.index`, `.seed`, `.stop_reason`, `.cost` | (F,) | of the problems that failed |
 | `failures.start` | (F, n_x) | state at stage 0, units of the state |
 | `failures.final_errors` | (F, 2) | as planned |
+| `failures.parameters` | (F, n_p) | what varied in the scene |
 
-Gains are control-limited: rows of inputs at a limit are zero.
+Gains are control-limited: rows of inputs at a limit are zero. Only scenes in which something varies, by their
+spread or by their list of parameters, have `parameters`.
 """
 
 import hashlib
@@ -71,11 +74,20 @@ SUMMARIES = (
 """Arrays with a few numbers for each demonstration."""
 FAILURES = ("index", "seed", "stop_reason", "cost", "start", "final_errors")
 """Arrays with a few numbers for each failure."""
+PARAMETERS = "parameters"
+"""Array of demonstrations and of failures where something varies in the scene, see `with_parameters`."""
 NOTES = {"guesses": GUESSES, "reasons": REASONS}
 REPLAY_TOLERANCE = 1e-9
 """Largest difference between cost and return, relative to the cost."""
 
 Arrays = dict[str, NDArray[Any]]
+
+
+class Starts(NamedTuple):
+    """What episodes begin with."""
+
+    states: FloatArray  # shape (B, n_x), units of the state
+    parameters: FloatArray  # shape (B, n_p), units of the parameters
 
 
 class Task(NamedTuple):
@@ -122,8 +134,8 @@ def make_shard(task: Task) -> ShardResult:
     seeds = [settings.problem_seed(problem) for problem in problems]
     starts = draw_starts(settings.scene, seeds)
     clock.lap("draws")
-    for problem, seed, start in zip(problems, seeds, starts, strict=True):
-        outcomes.append(solve(expert, problem, seed, start))
+    for problem, seed, *start in zip(problems, seeds, *starts, strict=True):
+        outcomes.append(solve(expert, problem, seed, *start))
         solve_seconds.append(clock.lap("solves"))
     retries = find_better_ways(expert, outcomes)
     clock.lap("neighbors")
@@ -141,11 +153,17 @@ def make_shard(task: Task) -> ShardResult:
     return ShardResult(task.shard, content, digest, platform.node(), *counts, solve_seconds, clock.seconds)
 
 
+def with_parameters(names: tuple[str, ...], layout: StateLayout) -> tuple[str, ...]:
+    """Names of arrays, and the parameters if the scene has any."""
+    return (*names, PARAMETERS) if layout.n_p else names
+
+
 def check_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], layout: StateLayout, horizon: int) -> None:
     """Raise DemonstrationsError where a shard has other arrays than those of its scene."""
     sizes = {"n_x": layout.n_x, "n_u": layout.n_u, "n_t": layout.n_t, "n_obs": layout.n_x + 1}
-    sizes |= {"N": horizon, "N + 1": horizon + 1, "2": 2}
-    for name, (dtype, *axes) in _ARRAYS.items():
+    sizes |= {"n_p": layout.n_p, "N": horizon, "N + 1": horizon + 1, "2": 2}
+    varying = _VARYING if layout.n_p else {}
+    for name, (dtype, *axes) in {**_ARRAYS, **varying}.items():
         first = "failures.index" if name.startswith("failures.") else "index"
         array, counted = arrays.get(name), arrays.get(first)
         rows = () if counted is None else counted.shape[:1]
@@ -160,6 +178,9 @@ def check_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], layout: StateLa
             raise DemonstrationsError(
                 f"{path}: {name} has entries beyond {len(known) - 1}; generate it again"
             )
+    for name in varying:
+        if not np.isfinite(arrays[name]).all():
+            raise DemonstrationsError(f"{path}: {name} should be finite; generate it again")
 
 
 _ARRAYS: Mapping[str, tuple[str, ...]] = {  # type, and axes after the first
@@ -185,13 +206,17 @@ _ARRAYS: Mapping[str, tuple[str, ...]] = {  # type, and axes after the first
     "failures.start": ("float64", "n_x"),
     "failures.final_errors": ("float64", "2"),
 }
+_VARYING: Mapping[str, tuple[str, ...]] = {
+    PARAMETERS: ("float64", "n_p"),
+    f"failures.{PARAMETERS}": ("float64", "n_p"),
+}
 
 
-def draw_starts(scene: Scene, seeds: Sequence[int]) -> FloatArray:
-    """Return the states that `env.reset(seed=...)` starts at, shape (len(seeds), n_x)."""
+def draw_starts(scene: Scene, seeds: Sequence[int]) -> Starts:
+    """Draw what `env.reset(seed=...)` draws, for B seeds."""
     environment = DQSpaceArmVectorEnv(len(seeds), scene)
     environment.reset(seed=list(seeds))
-    return environment.states
+    return Starts(environment.states, environment.parameters)
 
 
 def replay(scene: Scene, seeds: Sequence[int], actions: FloatArray) -> Rollout:
@@ -209,7 +234,7 @@ def _verified_episodes(expert: Expert, outcomes: list[Outcome]) -> tuple[FloatAr
         good = [outcome for outcome in outcomes if outcome.is_good]
         actions = np.empty((len(good), problem.horizon, problem.n_controls))
         for row, outcome in zip(actions, good, strict=True):
-            np.divide(outcome.solution.controls, problem.control_upper, out=row)
+            np.divide(outcome.solution.controls, _limits(problem, outcome), out=row)
         if not good:
             return actions, replay(problem.scene, [0], np.zeros((1, *actions.shape[1:])))
         episodes = replay(problem.scene, [outcome.seed for outcome in good], actions)
@@ -222,12 +247,17 @@ def _verified_episodes(expert: Expert, outcomes: list[Outcome]) -> tuple[FloatAr
             good[i].reason = REPLAY_DIFFERS
 
 
+def _limits(problem: ArmProblem, outcome: Outcome) -> FloatArray:
+    """Limits of the inputs, which may be parameters, shape (n_u,)."""
+    return problem.kernels.layout.limits_with(outcome.parameters)
+
+
 def _demonstration_arrays(
     problem: ArmProblem, outcomes: Sequence[Outcome], actions: FloatArray, episodes: Rollout
 ) -> Arrays:
     gains = np.empty((*actions.shape, problem.n_tangent), dtype=np.float32)
     for row, outcome in zip(gains, outcomes, strict=True):
-        limits = problem.control_upper[:, None]
+        limits = _limits(problem, outcome)[:, None]
         np.divide(outcome.solution.feedback_gains, limits, out=row, casting="same_kind")
     count = len(outcomes)
     assert episodes.states is not None
@@ -239,7 +269,7 @@ def _demonstration_arrays(
         "actions": actions,
         "rewards": episodes.rewards[:count],
         "feedback_gains": gains,
-        **_common(outcomes),
+        **_common(problem, outcomes),
         "iterations": np.array([outcome.solution.iterations for outcome in outcomes], dtype=np.int64),
         "guess": np.array([GUESSES.index(outcome.guess) for outcome in outcomes], dtype=np.uint8),
         "emphasis": np.array(
@@ -254,21 +284,29 @@ def _demonstration_arrays(
 def _failure_arrays(problem: ArmProblem, outcomes: Sequence[Outcome]) -> Arrays:
     ends = np.array([outcome.solution.states[-1] for outcome in outcomes]).reshape(-1, problem.n_states)
     starts = np.array([outcome.start for outcome in outcomes]).reshape(-1, problem.n_states)
-    errors = tip_errors(problem.kernels, ends)
-    arrays = {**_common(outcomes), "start": starts, "final_errors": errors}
+    errors = tip_errors(problem.kernels, ends, _parameters(problem, outcomes))
+    arrays = {**_common(problem, outcomes), "start": starts, "final_errors": errors}
     return {f"failures.{name}": array for name, array in arrays.items()}
 
 
-def tip_errors(kernels: Kernels, states: FloatArray) -> FloatArray:
-    """Return attitude error [deg] and position error [m] of states, shape (n, 2)."""
+def tip_errors(kernels: Kernels, states: FloatArray, parameters: FloatArray) -> FloatArray:
+    """Attitude error [deg] and position error [m] of states, shape (n, 2); parameters (n_p,) or (n, n_p)."""
     if not len(states):
         return np.zeros((0, 2))
-    _, errors = kernels.observation(states, np.zeros((len(states), 1)))
+    _, errors = kernels.observation(states, np.zeros((len(states), 1)), p=parameters)
     return np.stack([np.degrees(errors[:, 0]), errors[:, 1]], axis=1)
 
 
-def _common(outcomes: Sequence[Outcome]) -> Arrays:
+def _parameters(problem: ArmProblem, outcomes: Sequence[Outcome]) -> FloatArray:
+    """What varied, shape (len(outcomes), n_p)."""
+    rows = np.array([outcome.parameters for outcome in outcomes], dtype=np.float64)
+    return rows.reshape(len(outcomes), problem.kernels.n_p)
+
+
+def _common(problem: ArmProblem, outcomes: Sequence[Outcome]) -> Arrays:
+    varied = {PARAMETERS: _parameters(problem, outcomes)} if problem.kernels.n_p else {}
     return {
+        **varied,
         "index": np.array([outcome.index for outcome in outcomes], dtype=np.int64),
         "seed": np.array([outcome.seed for outcome in outcomes], dtype=np.int64),
         "cost": np.array([outcome.solution.cost for outcome in outcomes], dtype=np.float64),

@@ -97,11 +97,9 @@ def samples(demonstrations: Demonstrations, count: int) -> bytes:
 
 def _draw_sample(column: Any, demonstrations: Demonstrations, demonstration: Demonstration) -> None:
     """Start, end, errors, and inputs at a limit, one below the other."""
-    maneuver = Maneuver(
-        demonstrations.scene,
-        demonstration.states,
-        demonstrations.kernels.layout.to_control(demonstration.actions),
-    )
+    limits = demonstrations.kernels.layout.limits_with(demonstration.parameters)
+    controls = demonstration.actions * limits
+    maneuver = Maneuver(demonstration.episode_scene, demonstration.states, controls)
     start, end, attitude, position, limits = column
     last = len(maneuver.time) - 1
     painter = SnapshotPainter(maneuver, [0, last], numbered=False)

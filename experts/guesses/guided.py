@@ -203,11 +203,12 @@ class GuidedDDP:
         """List the guesses to solve, cheapest rollout first; zero controls are the last resort."""
         rollouts, strayed = [], True
         for i, solution in enumerate(library):
-            known = {f"policy {i}": solution, f"policy {i}, moved": self._moved(solution)}
-            for name, policy in known.items():
-                if policy is not None:
-                    rollouts.append(_Guess(name, *follow(policy, self.problem, start), POLICY_REGULARIZATION))
-                    strayed = strayed and rollouts[-1].cost > STRAYED * solution.cost
+            for name, policy in policies(solution, self.problem).items():
+                trial = follow(policy, self.problem, start)
+                rollouts.append(
+                    _Guess(f"policy {i}{name}", trial.controls, trial.cost, POLICY_REGULARIZATION)
+                )
+                strayed = strayed and trial.cost > STRAYED * solution.cost
         if strayed and self._kinematic_guess is not None:
             motion = self._kinematic_guess(start)
             rollouts.append(_Guess("screw motion", *track(self.problem, *motion), SCREW_REGULARIZATION))
@@ -217,16 +218,6 @@ class GuidedDDP:
         zero = _Guess("zero controls", None, np.inf, ZERO_REGULARIZATION)
         # The last of two or more attempts starts from zero controls.
         return [*ranked[: max(self.attempts - 1, 1)], zero][: self.attempts]
-
-    def _moved(self, solution: Solution) -> Solution | None:
-        """A solution moved rigidly from its target to the present one; None where they are the same."""
-        problem = self.problem
-        if not isinstance(problem, ArmProblem | WindowProblem) or not problem.parameters.inputs:
-            return None
-        if solution.parameters.shape != problem.parameters.rows.shape:
-            return None
-        states = problem.carried(solution.states, solution.parameters[-1])
-        return None if states is None else replace(solution, states=states)
 
     def _solve_from(self, guess: _Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
         self._solver.initial_regularization = guess.regularization
@@ -252,15 +243,26 @@ class GuidedDDP:
         return [best] if np.isfinite(best.cost) else []
 
 
-def follow(solution: Solution, problem: ShootingProblem, x0: FloatArray) -> tuple[FloatArray, float]:
-    """Roll out the policy of a solution from another start; return controls (N, n_u) and cost."""
+def policies(solution: Solution, problem: ShootingProblem) -> dict[str, Solution]:
+    """A solution as it is, and moved rigidly from its target to the present one where they differ."""
+    found = {"": solution}
+    if not isinstance(problem, ArmProblem | WindowProblem) or not problem.parameters.inputs:
+        return found
+    if solution.parameters.shape != problem.parameters.rows.shape:
+        return found
+    states = problem.carried(solution.states, solution.parameters[-1])
+    return found if states is None else {**found, ", moved": replace(solution, states=states)}
+
+
+def follow(solution: Solution, problem: ShootingProblem, x0: FloatArray) -> Trajectory:
+    """Roll out the policy of a solution from another start; the cost is inf if it is not finite."""
     trial = Trajectory(problem)
     trial.states[0] = x0
     kernels = {name: problem.kernel(name) for name in ("difference", "step_with_cost", "terminal_cost")}
     reference = np.ascontiguousarray(solution.states), solution.controls
     policy = np.zeros_like(solution.controls), solution.feedback_gains
-    cost = trial.follow(kernels, reference, policy, alpha=0.0)
-    return trial.controls, cost
+    trial.follow(kernels, reference, policy, alpha=0.0)
+    return trial
 
 
 def _check_sizes(name: str, solution: Solution, problem: ShootingProblem) -> None:

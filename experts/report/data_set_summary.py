@@ -67,6 +67,8 @@ def _contents(facts: Facts) -> Section:
         section.notes.append(f"There are no demonstrations: all {facts.problems} problems failed.")
         return section
     section.tables.append(tables.distributions(facts))
+    if facts.demonstrations.kernels.n_p:
+        section.tables.append(tables.parameters(facts))
     section.notes.append(
         f"The returns of {facts.replayed} demonstrations differ from -J by at most a relative "
         f"{facts.return_gap:.1e}."

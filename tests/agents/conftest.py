@@ -59,6 +59,17 @@ def demonstrations(small_scene: Scene, tmp_path_factory: pytest.TempPathFactory)
     return made
 
 
+@pytest.fixture(scope="session")
+def drawn(small_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Demonstrations:
+    """Demonstrations with a target and masses of their own, which nobody changes."""
+    spread = {"target_rotation": 0.2, "target_position": 0.15, "base_mass": 0.1, "link_masses": 0.1}
+    scene = small_scene.replace(name="drawing", spread=spread)
+    folder = tmp_path_factory.mktemp("demonstrations") / "drawn"
+    made = generate_demonstrations(scene, 6, folder, SEED, executor=SerialExecutor())
+    assert made is not None
+    return made
+
+
 @pytest.fixture(scope="module", autouse=True)
 def results_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A cache of evaluations for each file of tests; compiled kernels stay in theirs."""

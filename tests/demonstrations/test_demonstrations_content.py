@@ -121,8 +121,6 @@ def test_single_precision_is_taken_in_double(quick_scene: Scene, tmp_path: Path)
         ({"shard_size": 0}, "shard_size: 0, should be at least 1"),
         ({"part": (3, 2)}, "1 <= i <= k"),
         ({"workers": 0}, "workers: 0, should be at least 1"),
-        ({"scene": "random-target"}, "target and masses are constants"),
-        ({"scene": "random-masses"}, "target and masses are constants"),
         ({"scene": load_scene("planar").replace(spread=Spread())}, "would be the same"),
     ],
 )

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from demonstration_files import solved_problems
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.environment.rollouts import Rollout
@@ -14,9 +15,7 @@ from experts.demonstrations.outcomes import (
     NEIGHBOR,
     Expert,
     Outcome,
-    expert_of,
     find_better_ways,
-    solve,
     solve_again,
 )
 from experts.demonstrations.settings import Settings
@@ -26,11 +25,7 @@ from experts.problems.shooting_problem import FloatArray
 
 @pytest.fixture
 def solved(quick_scene: Scene) -> tuple[Expert, list[Outcome]]:
-    settings = Settings.of(quick_scene, 16, 3, 16)
-    expert = expert_of(settings.scene)
-    seeds = [settings.problem_seed(problem) for problem in range(16)]
-    starts = draw_starts(settings.scene, seeds)
-    return expert, [solve(expert, i, seeds[i], start) for i, start in enumerate(starts)]
+    return solved_problems(Settings.of(quick_scene, 16, 3, 16))
 
 
 def spoil(expert: Expert, outcome: Outcome) -> Outcome:
@@ -96,7 +91,7 @@ def test_failures_are_recorded_and_never_mixed_in(hard: Demonstrations):
     angle, distance = failures["final_errors"][list(failures["reason"]).index("missed_target")]
     assert angle > success.attitude_error_deg or distance > success.position_error
     starts = draw_starts(hard.scene, failures["seed"].tolist())
-    np.testing.assert_array_equal(failures["start"], starts)
+    np.testing.assert_array_equal(failures["start"], starts.states)
 
 
 def test_what_the_environment_charges_otherwise_is_a_failure(

@@ -18,7 +18,7 @@ from experts.demonstrations import Demonstrations, SerialExecutor, shard
 from experts.demonstrations import facts as tables
 from experts.demonstrations.data_card import MEANINGS, data_card
 from experts.demonstrations.facts import Facts, gather
-from experts.demonstrations.shard import SUMMARIES, TRAJECTORIES
+from experts.demonstrations.shard import PARAMETERS, SUMMARIES, TRAJECTORIES
 from experts.problems.shooting_problem import FloatArray
 from experts.report.data_set_summary import sections, shortcomings, write_summary
 
@@ -168,7 +168,8 @@ def test_the_card_follows_from_the_data_alone(facts: Facts, folder: Path):
     assert data_card(gather(load_demonstrations(folder))) == card
     assert card.startswith("---\npretty_name: ")
     assert "$" not in card
-    assert set(MEANINGS) == {*TRAJECTORIES, *SUMMARIES}
+    assert set(MEANINGS) == {*TRAJECTORIES, *SUMMARIES, PARAMETERS}
+    assert "parameters" not in card
     assert facts.demonstrations.settings["source"] in card
     assert "| `feedback_gains` | (150, 6, 12) |" in card
 

@@ -10,23 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from demonstration_files import replace_first_shard, rewrite
 
 from experts import load_demonstrations
 from experts.demonstrations import DemonstrationsError
-from experts.demonstrations.shard import NOTES
-from experts.demonstrations.tensors import map_tensors, pack
 
 
 def refusal(folder: Path, **options: bool) -> str:
     with pytest.raises(DemonstrationsError) as caught:
         load_demonstrations(folder, **options)
     return str(caught.value)
-
-
-def rewrite(file: Path, change: Callable[[Any], Any]) -> None:
-    content = json.loads(file.read_text())
-    changed = change(content)
-    file.write_text(json.dumps(content if changed is None else changed, indent=2) + "\n")
 
 
 def test_a_sound_folder_is_verified(folder: Path) -> None:
@@ -121,22 +114,6 @@ def test_malformed_settings(folder: Path, change: Callable[[Any], Any]) -> None:
     sentence = refusal(folder)
     assert str(folder) in sentence
     assert len(sentence) < 1000
-
-
-def replace_first_shard(folder: Path, **changes: Any) -> None:
-    """Write other arrays into the first shard, with a manifest that fits."""
-    shard = min((folder / "shards").iterdir())
-    arrays = {name: array.copy() for name, array in map_tensors(shard).arrays.items()} | changes
-    content = pack({name: array for name, array in arrays.items() if array is not None}, NOTES)
-    digest = hashlib.sha256(content).hexdigest()
-    shard.unlink()
-    (folder / "shards" / f"000000-{digest}.safetensors").write_bytes(content)
-
-    def update(manifest: Any) -> None:
-        name = f"000000-{digest}.safetensors"
-        manifest["shards"][0].update(file=name, sha256=digest, bytes=len(content))
-
-    rewrite(folder / "manifest.json", update)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from agents.configuration.imitation import Cloning, Dagger  # noqa: E402
 from agents.imitation import Making, aggregate, clone  # noqa: E402
 from agents.imitation.aggregation import CORRECTIONS  # noqa: E402
 from agents.imitation.labels import Solver, label_by_gains  # noqa: E402
-from agents.imitation.samples import NAMES, Corrections, Mixture  # noqa: E402
+from agents.imitation.samples import COLUMNS, NAMES, Corrections, Mixture  # noqa: E402
 from agents.imitation.trainer import CheckpointError, TrainingAdvance  # noqa: E402
 from dq_space_arm_env.environment.rollouts import rollout  # noqa: E402
 
@@ -104,6 +104,36 @@ def test_new_plans_begin_where_the_flight_went_and_are_optimal(some):
         np.testing.assert_allclose(again.actions[begin:end], rest, atol=2e-3)
 
 
+def test_plans_know_the_target_and_the_masses_of_each_flight(drawn):
+    flights = flown(drawn)
+    np.testing.assert_allclose(flights.cost, drawn.column("cost"), rtol=1e-9)
+    for labels in (
+        label_by_gains(drawn, flights),
+        Solver(drawn.scene).label(drawn, flights, 1, np.random.default_rng(0))[0],
+    ):
+        simulation = drawn.scene.simulation
+        stages = simulation.steps - np.rint(labels.observations[:, -1] / simulation.dt).astype(int)
+        firsts = [*np.flatnonzero(np.diff(stages, prepend=-2) != 1), len(stages)]
+        assert len(firsts) == len(drawn) + 1
+        for demonstration, begin, end in zip(drawn, firsts[:-1], firsts[1:], strict=True):
+            rest = slice(stages[begin], -1)
+            np.testing.assert_allclose(
+                labels.actions[begin:end], demonstration.actions[rest.start :], atol=2e-3
+            )
+            np.testing.assert_allclose(
+                labels.observations[begin:end], demonstration.observations[rest], atol=1e-2
+            )
+            assert (labels.parameters[begin:end] == demonstration.parameters).all()
+
+
+def test_a_network_learns_from_flights_to_other_targets(drawn, tmp_path):
+    cloned = clone(drawn, CLONING, making=MAKING)
+    first = aggregate(cloned, drawn, dagger(), tmp_path, making=MAKING)
+    again = aggregate(cloned, drawn, dagger(), tmp_path, making=MAKING)  # reads its labels
+    assert first.rounds == again.rounds
+    assert (tmp_path / "round-00" / CORRECTIONS).is_file()
+
+
 def test_labels_follow_the_dynamics(some):
     labels, _ = Solver(some.scene).label(some[:1], flown(some[:1], 0.02), 1, np.random.default_rng(0))
     limits = some.kernels.layout.control_limit
@@ -113,7 +143,7 @@ def test_labels_follow_the_dynamics(some):
 
 def corrections(count, value):
     *rest, gains = (np.full((count, *shape), value) for shape in ((3,), (4,), (2,), (2, 3)))
-    return Corrections(*rest, gains.astype(np.float32))
+    return Corrections(*rest, gains.astype(np.float32), np.zeros((count, 0)))
 
 
 def test_a_mixture_keeps_its_shares():
@@ -127,7 +157,7 @@ def test_a_mixture_keeps_its_shares():
 
 
 def test_corrections_are_gone_through_once():
-    whole = Corrections(*(np.arange(10.0)[:, None] for _ in NAMES))
+    whole = Corrections(*(np.arange(10.0)[:, None] for _ in COLUMNS))
     for seed in (None, 3):
         batches = whole.batches(4, ("states",), seed=seed, drop_last=False)
         rows = [batch.arrays["states"][:, 0] for batch in batches]

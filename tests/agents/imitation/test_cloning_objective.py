@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch")
 
 from agents.configuration.imitation import ObjectiveWeights  # noqa: E402
 from agents.imitation.objective import Objective, observation_change  # noqa: E402
-from agents.imitation.samples import NAMES, Statistics  # noqa: E402
+from agents.imitation.samples import COLUMNS, NAMES, Statistics  # noqa: E402
 from agents.policies import PolicyNetwork  # noqa: E402
 from dq_space_arm_env import compile_scene, load_scene  # noqa: E402
 from experts.demonstrations.reading import Batch  # noqa: E402
@@ -70,6 +70,26 @@ def test_the_derivative_of_the_observation_is_exact(scene):
     np.testing.assert_allclose(found, reference, atol=1e-8)
     assert np.abs(reference).max() > 0.1
     np.testing.assert_array_equal(found[:, -1], 0.0)
+
+
+def test_observations_around_a_demonstration_are_relative_to_its_own_target(drawn):
+    statistics = Statistics.of(drawn)
+    objective = Objective(drawn.kernels, statistics, ObjectiveWeights(augmentation_weight=1.0))
+    assert objective.needs == COLUMNS
+    batch = next(drawn.batches(50, COLUMNS, seed=0))
+    states, observations, parameters = (
+        batch.arrays[name] for name in ("states", "observations", "parameters")
+    )
+    directions = np.random.default_rng(0).normal(size=(50, drawn.kernels.n_t))
+    found = observation_change(drawn.kernels, states, observations, directions, parameters)
+    step = 1e-4
+    moved = drawn.kernels.retract(states, step * directions)
+    after = drawn.kernels.observation(moved, observations[:, -1:], p=parameters)[0]
+    np.testing.assert_allclose((after - observations) / step, found, atol=1e-2)
+    nominal = observation_change(drawn.kernels, states, observations, directions)
+    assert np.abs(nominal - found).max() > 0.05
+    network = PolicyNetwork(observations.shape[1], drawn.kernels.n_u, hidden=())
+    assert torch.isfinite(objective(network, batch, np.random.default_rng(0)).total)
 
 
 def test_a_policy_with_the_right_gains_has_no_gain_loss(demonstrations, statistics, batch):

@@ -57,6 +57,13 @@ def trained(demonstrations, small_file, tmp_path_factory):
     return train(configuration(demonstrations, small_file), tmp_path_factory.mktemp("run"))
 
 
+def test_a_demonstration_is_flown_again_to_its_own_target(drawn, small_file):
+    settings = configuration(drawn, small_file, action_repeat=1)
+    flown = fly_again(drawn, drawn.scene, make_environment(settings, drawn.scene))
+    returns = flown.rewards.reshape(len(drawn), -1).sum(axis=1, dtype=np.float64) / 0.01
+    np.testing.assert_allclose(returns, -drawn.column("cost"), rtol=1e-5)
+
+
 def test_a_demonstration_flown_again_is_what_the_environment_does(demonstrations, small_scene, small_file):
     environment = make_environment(configuration(demonstrations, small_file), small_scene)
     flown = fly_again(demonstrations[:4], small_scene, environment)

@@ -53,7 +53,8 @@ class WithGoal:
 
 def test_following_a_solution_is_a_rollout_of_its_policy(unicycle):
     solution = BoxDDP(unicycle).solve()
-    controls, cost = follow(solution, unicycle, ELSEWHERE)
+    followed = follow(solution, unicycle, ELSEWHERE)
+    controls, cost = followed.controls, followed.cost
     policy, state, expected_cost = solution.policy(), ELSEWHERE, 0.0
     for k, u in enumerate(controls):
         np.testing.assert_allclose(u, policy(state, k), rtol=1e-12, atol=1e-12)
@@ -103,7 +104,7 @@ def drifting(unicycle, x0):
 def test_a_screw_motion_is_solved_first_if_its_rollout_is_cheaper_than_that_of_a_policy_astray(unicycle):
     far = BoxDDP(unicycle).solve(np.array([0.0, 1.0, 0.05, 0.05]))
     good = BoxDDP(unicycle, max_iterations=8).solve(ELSEWHERE)
-    rollout = follow(far, unicycle, ELSEWHERE)[1]
+    rollout = follow(far, unicycle, ELSEWHERE).cost
     assert rollout > max(STRAYED * far.cost, good.cost)
     solver = with_screw_motion(GuidedDDP(unicycle, library=[far]), good.states, good.controls)
     assert names(solver.solve(ELSEWHERE)) == ["screw motion"]
@@ -121,7 +122,7 @@ def test_a_policy_with_the_cheaper_rollout_comes_first_all_the_same(unicycle):
 
 def test_where_a_policy_is_near_no_screw_motion_is_asked_for(unicycle):
     near = BoxDDP(unicycle).solve()
-    assert follow(near, unicycle, ELSEWHERE)[1] < STRAYED * near.cost
+    assert follow(near, unicycle, ELSEWHERE).cost < STRAYED * near.cost
     solver = GuidedDDP(WithGoal(unicycle, False), library=[near], attempts=3, reach_target=False)
     solution = with_screw_motion(solver, *drifting(unicycle, ELSEWHERE)).solve(ELSEWHERE)
     assert names(solution) == ["policy 0", "zero controls"]
