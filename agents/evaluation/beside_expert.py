@@ -80,8 +80,8 @@ def fly_beside_expert(policy: ActingPolicy, scene: Scene, seeds: list[int | None
     check_fit(policy, scene)
     if DQSpaceArmVectorEnv(1, scene).parameters.size:
         raise ValueError(
-            f"scene {scene.name!r} draws more than the start for each episode; the expert would have to be "
-            "compiled for each: take a scene whose spread has no target, masses or inertias"
+            f"scene {scene.name!r} draws more than the start for each episode, but the expert beside an "
+            "agent plans for nominal targets and masses: take a scene whose spread has none of them"
         )
     problem = ArmProblem(scene)
     solver = GuidedDDP(problem)
