@@ -183,17 +183,16 @@ def _distribution(quantity: Quantity) -> tuple[str, ...]:
 
 
 def parameters(facts: Facts) -> TextTable:
-    """One row for each number that varies in the scene; no row where nothing does."""
-    found = facts.demonstrations.kernels.parameters
+    """One row for each number that varies in the scene."""
+    found, rows = facts.demonstrations.kernels.parameters, []
+    columns = facts.demonstrations.column(PARAMETERS).T if len(facts.demonstrations) else ()
+    names = zip(found.names, found.units, found.nominal, strict=True)
+    for (name, unit, nominal), values in zip(names, columns, strict=False):
+        numbers = (nominal, values.min(), values.mean(), values.max())
+        rows.append((name, unit, *(number(float(value)) for value in numbers)))
     headings = ("", "unit", "nominal", "least", "mean", "most")
-    columns = facts.demonstrations.column(PARAMETERS).T if found.names and len(facts.demonstrations) else ()
-    rows = tuple(
-        (name, unit, *map(number, (nominal, *map(float, (values.min(), values.mean(), values.max())))))
-        for name, unit, nominal, values in zip(
-            found.names, found.units, found.nominal.tolist(), columns, strict=False
-        )
-    )
-    return TextTable("Parameters\nwhat varies between problems besides the start", headings, rows, right=2)
+    title = "Parameters\nwhat varies between problems besides the start"
+    return TextTable(title, headings, tuple(rows), right=2)
 
 
 def guesses(facts: Facts) -> TextTable:

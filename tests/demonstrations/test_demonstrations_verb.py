@@ -108,9 +108,17 @@ def shards(out: Path) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
-def test_killed_at_random_moments_it_ends_with_the_same_bytes(scene_file: str, workers: int, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("workers", "spread"), [(1, {}), (2, {}), (2, {"target_position": 0.15, "base_mass": 0.1})]
+)
+def test_killed_at_random_moments_it_ends_with_the_same_bytes(
+    scene_file: str, workers: int, spread: dict[str, float], tmp_path: Path
+):
     rng, n = np.random.default_rng(workers), 80
+    if spread:  # draws more than the start
+        scene = load_scene(scene_file).replace(spread=spread)
+        scene_file = str(tmp_path / "drawing.yaml")
+        scene.to_yaml(scene_file)
     whole, out = tmp_path / "whole", tmp_path / "killed"
     size = ["--shard-size", "4", "--workers", "1"]
     assert run(["--scene", scene_file, "-n", str(n), *size, "--out", str(whole)]) == 0
