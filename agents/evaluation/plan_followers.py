@@ -21,7 +21,7 @@ from experts import RecedingHorizonExpert
 from experts.ddp.solution import Solution
 from experts.demonstrations.outcomes import expert_of
 from experts.demonstrations.settings import Settings
-from experts.demonstrations.shard import ShardResult
+from experts.demonstrations.shard import ShardResult, draw_starts
 from experts.problems.arm_problem import ArmProblem
 
 OPEN_LOOP, FEEDBACK, RECEDING = "open-loop plan", "plan with gains", "receding horizon"
@@ -87,8 +87,6 @@ class RecedingHorizon:
 
     Attributes:
         planning_seconds: Mean time to plan a flight when the last episodes began, s.
-        parameters: What varies in the scene to plan in, a row for each of the next episodes, shape (B, n_p);
-            None for nominal ones.
     """
 
     def __init__(self, scene: Scene, horizon: int = 100) -> None:

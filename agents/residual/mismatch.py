@@ -14,7 +14,6 @@ from agents.evaluation.plans import Plans
 from dq_space_arm_env import Scene
 from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances, with_loads
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
-from dq_space_arm_env.scene import StateLayout
 
 NOISE = 0.01
 """Standard deviation of the noise on every tangent coordinate, rad, m, rad/s, m/s."""
@@ -46,15 +45,6 @@ CONDITIONS = {
     )
 }
 """Noise and pushes of the receding-horizon benchmark, with the masses of the evaluation protocol."""
-
-
-def check_plannable(scene: Scene) -> None:
-    """Raise ValueError for a scene in which something varies: corrections fly plans of one robot."""
-    if StateLayout.of(scene).n_p:
-        raise ValueError(
-            f"scene {scene.name!r} draws more than the start of each episode, or names parameters, but "
-            "corrections fly plans of one robot and target: take a scene in which neither varies"
-        )
 
 
 class Worlds(NamedTuple):

@@ -33,7 +33,6 @@ from agents.residual.mismatch import (
     PUSHES,
     Condition,
     Worlds,
-    check_plannable,
     fly_mismatched,
 )
 from agents.zoo.finding import PolicyError, policy_path
@@ -97,7 +96,6 @@ def compare_under_mismatch(
         raise ValueError(f"receding_starts: {receding_starts}, should be at least 0, which leaves it out")
     scene = scene or demonstrations.scene
     check_scene(demonstrations, scene)
-    check_plannable(scene)
     found = read_corrections(policies, scene)
     work = _Work(
         demonstrations, Plans.of(demonstrations), scene, seed, receding_horizon, KeptRows(out), progress
@@ -191,7 +189,6 @@ def evaluation_plans(
     The few starts at which the expert fails are left out.
     """
     evaluation_seeds(scene, n)  # the seeds that RESERVED_SEED gives; refuses a wrong n
-    check_plannable(scene)
     if not 0.0 < tolerance_scale <= 1.0:
         raise ValueError(f"tolerance_scale: {tolerance_scale}, should be above 0, and 1 at most")
     plans = generate_demonstrations(

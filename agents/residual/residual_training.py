@@ -22,7 +22,7 @@ from agents.reinforcement.reinforcement_training import Trained, action_scale, m
 from agents.reinforcement.training_progress import Progress
 from agents.residual.corrections import correction
 from agents.residual.environment import ResidualVecEnv
-from agents.residual.mismatch import Worlds, check_plannable, fly_mismatched
+from agents.residual.mismatch import Worlds, fly_mismatched
 from agents.run_folder import BEST, DEMONSTRATIONS, RunFolder
 from dq_space_arm_env import Scene, load_scene
 from experts.demonstrations import Demonstrations
@@ -40,7 +40,6 @@ def train_residual(
 ) -> Trained:
     """Train a correction; an interrupted run resumes from its last checkpoint."""
     scene = load_scene(configuration.scene)
-    check_plannable(scene)
     folder = RunFolder(Path(out), configuration)
     demonstrations = prepare_demonstrations(configuration.demonstrations, scene, folder.path / DEMONSTRATIONS)
     practiced, kept = split(demonstrations, configuration.schedule.evaluation_episodes)

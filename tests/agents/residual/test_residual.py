@@ -11,7 +11,7 @@ from agents.configuration import ConfigurationError, load_configuration
 from agents.configuration.residual import Mismatch
 from agents.evaluation.comparison_tables import mismatch_table, notes, record
 from agents.evaluation.plan_followers import FEEDBACK, OPEN_LOOP, RECEDING, RecedingHorizon, follower
-from agents.evaluation.plans import Followed, Plans, drawn_parameters
+from agents.evaluation.plans import Followed, Plans
 from agents.policies import ExportedPolicy
 from agents.residual.corrections import (
     SMALL,
@@ -26,6 +26,7 @@ from agents.residual.mismatch_comparison import compare_under_mismatch, read_cor
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.environment.rollouts import rollout
+from experts.demonstrations.shard import draw_starts
 
 HEAVY = 1.3
 """A factor of masses."""
@@ -290,7 +291,7 @@ def test_the_receding_horizon_plans_every_flight_and_pays_no_more_than_the_plan(
 def drawing(small_scene):
     """A scene whose episodes differ in target and masses, and what the first three of them draw."""
     scene = small_scene.replace(spread={"target_position": 0.3, "link_masses": 0.3})
-    return scene, drawn_parameters(scene, [0, 1, 2])
+    return scene, draw_starts(scene, [0, 1, 2]).parameters
 
 
 def test_corrections_see_the_target_of_each_plan(drawing):

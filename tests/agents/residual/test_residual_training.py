@@ -123,9 +123,12 @@ def test_a_flight_that_diverges_is_charged_for_the_rest(unscaled, small_scene):
     assert not total[1:].any()
 
 
-def test_the_environment_and_the_controller_see_and_do_the_same(configuration, small_scene, demonstrations):
-    """A policy that corrects by what it sees costs the same in both, with nothing drawn at random."""
-    kernels = compile_scene(small_scene)
+@pytest.mark.parametrize("name", ["demonstrations", "drawn"])
+def test_the_environment_and_the_controller_see_and_do_the_same(name, configuration, request):
+    """A policy that corrects by what it sees costs the same in both, also where targets are drawn."""
+    demonstrations = request.getfixturevalue(name)
+    scene = demonstrations.scene
+    kernels = compile_scene(scene)
     weights = 0.05 * np.random.default_rng(0).standard_normal((CorrectionObserver.size(kernels), 6))
 
     def policy(seen):
@@ -133,13 +136,13 @@ def test_the_environment_and_the_controller_see_and_do_the_same(configuration, s
 
     heavy = {"mass_factors": [HEAVY], "noise": 0.0, "push": 0.0}
     settings = configuration(mismatch=heavy)
-    environment = make_residual_environment(settings, small_scene, demonstrations[:1])
+    environment = make_residual_environment(settings, scene, demonstrations[:1])
     observations = environment.reset()
-    for _ in range(small_scene.simulation.steps // REPEAT):
+    for _ in range(scene.simulation.steps // REPEAT):
         observations, _, _, infos = environment.step(policy(observations))
     plans = Plans.of(demonstrations[:1])
-    controller = correcting(small_scene, plans, policy, action_scale=environment.action_space.high, **SEEN)
-    flown = fly_mismatched(controller, small_scene, plans, Worlds(HEAVY, 0.0, 0.0, 6.0, seed=0))
+    controller = correcting(scene, plans, policy, action_scale=environment.action_space.high, **SEEN)
+    flown = fly_mismatched(controller, scene, plans, Worlds(HEAVY, 0.0, 0.0, 6.0, seed=0))
     np.testing.assert_allclose([info["cost"] for info in infos], flown.cost[0], rtol=1e-6)
     assert abs(flown.cost[0] / infos[0]["twin_cost"] - 1.0) > 1e-4
 
