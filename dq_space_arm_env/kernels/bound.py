@@ -91,7 +91,13 @@ class KernelCall:
         self._function(0, len(rows), self._pointer)
 
     def of_one_row(self) -> Callable[[], None]:
-        """Make a function that runs the kernel on row 0, see `one_row_call`; it keeps the arrays alive."""
+        """Make a function that runs the kernel on row 0, see `one_row_call`; it keeps the arrays alive.
+
+        Raises ValueError if an array is missing: the code would write to address 0.
+        """
+        missing = [name for name, position in self._slots.items() if not self._buffers[position]]
+        if missing:
+            raise ValueError(f"the kernel has no array for {', '.join(missing)}")
         call = one_row_call(self._kernel.address, self._pointer)
         function: Any = call.func
         function.call = self  # keeps code and arrays alive
