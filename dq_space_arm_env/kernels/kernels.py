@@ -1,4 +1,4 @@
-"""Functions on states, compiled for one scene: dynamics, steps, derivatives, cost, kinematics.
+"""Functions on states, compiled for one scene: steps, derivatives, cost, observation, coordinates.
 
 `compile_scene` returns the `Kernels` of a scene. Each function is compiled at its first call and kept on
 disk; the next process loads it without tracing, compiling or importing CasADi.
@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import walk
-from dq_space_arm_env.kernels.library import KernelLibrary
+from dq_space_arm_env.kernels.library import matrices
+from dq_space_arm_env.kernels.robot_kernels import RobotKernels
 from dq_space_arm_env.scene import INTEGRATORS, Scene, load_scene
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 
-class Kernels(KernelLibrary):
+class Kernels(RobotKernels):
     """The compiled functions of a scene.
 
     What varies in the scene, by its spread or its list of `parameters`, is an argument p of every function
@@ -145,7 +146,7 @@ class Kernels(KernelLibrary):
             ValueError: As for `step`.
         """
         a, b = self._step_call("linearize", x, u, dt, integrator, p)
-        return _matrices(a, self.n_t, self.n_t), _matrices(b, self.n_t, self.n_u)
+        return matrices(a, self.n_t, self.n_t), matrices(b, self.n_t, self.n_u)
 
     def linearize_parameters(
         self,
@@ -171,7 +172,7 @@ class Kernels(KernelLibrary):
             ValueError: As for `step`, or if the scene has no parameters.
         """
         by_parameters = self._step_call("linearize_parameters", x, u, dt, integrator, p)[0]
-        return _matrices(by_parameters, self.n_t, self.n_p)
+        return matrices(by_parameters, self.n_t, self.n_p)
 
     def cost_by_parameters(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Exact gradient of the stage cost by the parameters.
@@ -254,171 +255,6 @@ class Kernels(KernelLibrary):
             p=p,
         )
 
-    def forward_dynamics(
-        self, x: ArrayLike, u: ArrayLike, w_tip: ArrayLike | None = None, p: ArrayLike | None = None
-    ) -> Array:
-        """Accelerations, those of eq. (20), by the scene's formulation.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            u: Inputs, shape (n_u,) or (B, n_u).
-            w_tip: Force [N], then torque [N m] at the tip in tip axes (16), shape (6,) or (B, 6); the scene's
-                by default.
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Dual acceleration of the base in base axes, angular [rad/s^2] then linear [m/s^2], then joint
-            accelerations [rad/s^2], shape (6 + n,) or (B, 6 + n); (3 + n) for a planar base.
-        """
-        if w_tip is None:
-            return self.call("forward_dynamics", x=x, u=u, p=p)[0]
-        return self.call("forward_dynamics_with_tip_wrench", x=x, u=u, w_tip=w_tip, p=p)[0]
-
-    def reaction_wrenches(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """The paper's T (21): wrenches of body i on body i+1, in joint axes about the joint origin.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            u: Inputs, shape (n_u,) or (B, n_u).
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            fx, fy, fz [N], tx, ty [N m] joint by joint, shape (5 n,) or (B, 5 n).
-        """
-        return self.call("reaction_wrenches", x=x, u=u, p=p)[0]
-
-    def mass_matrix(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Mass matrix M in minimal coordinates: M a + h = f, with h from `bias_forces`.
-
-        The accelerations a are those of `forward_dynamics`: base angular [rad/s^2], base linear [m/s^2], both
-        in base axes, then joints [rad/s^2]. The generalized forces f are dual to them: torque on the base
-        about its center of mass [N m], force [N], both in base axes, then joint torques [N m]. Inputs u have
-        the base's force before its torque.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x); only the joint angles matter.
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Symmetric matrices, shape (6 + n, 6 + n) or (B, 6 + n, 6 + n), (3 + n) for a planar base; kg m^2
-            where torque meets rotation, kg m where it meets translation, kg where force does.
-        """
-        return _matrices(self.call("mass_matrix", x=x, p=p)[0], self._n_velocities, self._n_velocities)
-
-    def bias_forces(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Bias h of M a + h = f: velocity-dependent forces, joint springs and dampers.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Generalized forces in the order of `mass_matrix`, torque [N m] and force [N] on the base, base
-            axes, then joint torques [N m], shape (6 + n,) or (B, 6 + n); (3 + n) for a planar base. They hold
-            the accelerations of `forward_dynamics` at zero; for a base alone that is a force m omega x v,
-            since its velocity has components in turning axes. The scene's wrench at the tip is not included.
-        """
-        return self.call("bias_forces", x=x, p=p)[0]
-
-    def tip_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Body Jacobian J of the tip: its twist is J (base velocity, joint rates, wrist's Euler rates).
-
-        A wrench at the tip in tip axes, torque then force, adds J' times itself to the generalized forces of
-        `mass_matrix` (the columns before the wrist's).
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x); only the angles matter.
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Twists in tip axes, angular [rad/s] then linear [m/s], per unit of the base's angular [rad/s] and
-            linear velocity [m/s] in base axes, of each joint rate and of each Euler rate psi, theta, phi
-            [rad/s], if there is a wrist; shape (6, 6 + n + 3) or (B, 6, 6 + n + 3). A planar base has 3
-            columns: omega_z, v_x, v_y.
-        """
-        return _matrices(self.call("tip_jacobian", x=x, p=p)[0], 6, self._n_velocities + self._n_wrist)
-
-    def generalized_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Generalized Jacobian of the free-floating arm, J_m - J_b H_b^-1 H_bm.
-
-        It maps rates of joints and wrist to the tip's twist where the total momentum is zero (Umetani &
-        Yoshida, IEEE Transactions on Robotics and Automation 5, 1989).
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x); only the angles matter.
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Twists in tip axes, angular [rad/s] then linear [m/s], per unit of each joint rate and of each
-            Euler rate psi, theta, phi [rad/s], if there is a wrist; shape (6, n + 3) or (B, 6, n + 3).
-        """
-        columns = self.layout.n_joints + self._n_wrist
-        return _matrices(self.call("generalized_jacobian", x=x, p=p)[0], 6, columns)
-
-    def tip_twist(self, x: ArrayLike, u: ArrayLike | None = None, p: ArrayLike | None = None) -> Array:
-        """Twist of the tip with respect to the inertial frame, in tip axes.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            u: Inputs, shape (n_u,) or (B, n_u), zero by default; only the wrist's Euler rates matter.
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Angular velocity [rad/s], then linear velocity [m/s], shape (6,) or (B, 6).
-        """
-        u = np.zeros(self.n_u, self.dtype) if u is None else u
-        return self.call("tip_twist", x=x, u=u, p=p)[0]
-
-    def tip_pose(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Pose of the tip q_{G/I}, eq. (27).
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Unit dual quaternions, shape (8,) or (B, 8), real part dimensionless, dual part m.
-        """
-        return self.call("tip_pose", x=x, p=p)[0]
-
-    def frame_poses(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Poses of base, joint frames, wrist frame (if any) and tip with respect to the inertial frame.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Unit dual quaternions, shape (frames, 8) or (B, frames, 8), real part dimensionless, dual part m.
-        """
-        poses = self.call("frame_poses", x=x, p=p)[0]
-        return poses.reshape(*poses.shape[:-1], -1, 8)
-
-    def momentum(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Momentum of the whole system in inertial axes.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Linear momentum [kg m/s], then angular momentum about the system's center of mass [kg m^2/s],
-            shape (6,) or (B, 6).
-        """
-        return self.call("momentum", x=x, p=p)[0]
-
-    def energy(self, x: ArrayLike, p: ArrayLike | None = None) -> Any:
-        """Kinetic energy and the potential energy of joint springs.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Energy, J, a number or shape (B,).
-        """
-        return self.call("energy", x=x, p=p)[0][..., 0]
-
     def cost(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Any:
         """Stage cost of the paper (section V), without a factor dt.
 
@@ -496,7 +332,7 @@ class Kernels(KernelLibrary):
             Derivatives at z = 0, shape (n_x + 1, n_t) or (B, n_x + 1, n_t), units of the observation per unit
             of `layout.tangent`. The time left has no derivative: its row is zero.
         """
-        return _matrices(self.call("observation_jacobian", x=x, p=p)[0], self.n_x + 1, self.n_t)
+        return matrices(self.call("observation_jacobian", x=x, p=p)[0], self.n_x + 1, self.n_t)
 
     def state_from_observation(self, observation: ArrayLike, p: ArrayLike | None = None) -> Array:
         """The state behind an observation.
@@ -510,16 +346,6 @@ class Kernels(KernelLibrary):
             States, shape (n_x,) or (B, n_x), units of `layout.state`.
         """
         return self.call("state_from_observation", observation=observation, p=p)[0]
-
-    @property
-    def _n_velocities(self) -> int:
-        """Number of generalized velocities: base and joints."""
-        return self.layout.n_joints + (3 if self.layout.planar else 6)
-
-    @property
-    def _n_wrist(self) -> int:
-        """Number of the wrist's Euler rates."""
-        return 3 if self.layout.has_wrist else 0
 
     def _step_call(
         self,
@@ -547,11 +373,6 @@ class Kernels(KernelLibrary):
         if not isfinite(step):
             raise ValueError(f"dt: {step} is not a finite time step in s")
         return np.array([step], self.dtype)
-
-
-def _matrices(entries: Array, rows: int, columns: int) -> Array:
-    """Give matrices, stored row by row, their shape."""
-    return entries.reshape(*entries.shape[:-1], rows, columns)
 
 
 @cache

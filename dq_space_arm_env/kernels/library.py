@@ -181,6 +181,11 @@ class KernelLibrary:
             )
 
 
+def matrices(entries: Array, rows: int, columns: int) -> Array:
+    """Give matrices, stored row by row, their shape."""
+    return entries.reshape(*entries.shape[:-1], rows, columns)
+
+
 class _StandardError(logging.StreamHandler[TextIO]):
     """Writes to the present standard error, not the one at the logger's creation."""
 
