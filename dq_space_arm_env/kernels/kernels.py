@@ -46,7 +46,6 @@ class Kernels(RobotKernels):
         n_t: Number of tangent coordinates.
         n_u: Number of inputs.
         n_p: Number of parameters.
-        parameters: Names, units and nominal values of the parameters.
     """
 
     def step(
