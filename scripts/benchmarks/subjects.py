@@ -160,12 +160,16 @@ def function_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
     kernels, cases = PLAIN.compile(scene), []
     for batch in batch_sizes:
         x, u = moving_states(kernels, batch)
-        arguments = (x, u) if batch > 1 else (x[0], u[0])
-        dynamics = Subject(what=DYNAMICS, engine=OURS, way=FUNCTION, batch=batch)
-        cases.append(Case(dynamics, partial(kernels.forward_dynamics, *arguments)))
+        x, u = (x, u) if batch > 1 else (x[0], u[0])
+        count = kernels.operation_count("forward_dynamics")
+        dynamics = Subject(what=DYNAMICS, engine=OURS, way=FUNCTION, batch=batch, operations=count)
+        cases.append(Case(dynamics, partial(kernels.forward_dynamics, x, u)))
         for name in COMPARED_INTEGRATORS:
-            step = Subject(what=STEP, engine=OURS, way=FUNCTION, integrator=name, batch=batch)
-            cases.append(Case(step, partial(kernels.step, *arguments, integrator=name)))
+            count = kernels.operation_count("step", integrator=name)
+            step = Subject(
+                what=STEP, engine=OURS, way=FUNCTION, integrator=name, batch=batch, operations=count
+            )
+            cases.append(Case(step, partial(kernels.step, x, u, integrator=name)))
     return cases
 
 

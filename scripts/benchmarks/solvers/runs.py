@@ -111,7 +111,7 @@ def guided_ddp(problem: ArmProblem, solver: GuidedDDP) -> Solve:
 
     def solve(x0: FloatArray | None) -> SolverRun:
         start = problem.initial_state if x0 is None else x0
-        first_cost = min((follow(member, problem, start)[1] for member in library), default=np.inf)
+        first_cost = min((follow(member, problem, start).cost for member in library), default=np.inf)
         return _timed_run(GUIDED, problem, x0, partial(solver.solve, x0), first_cost)
 
     return solve
@@ -205,5 +205,5 @@ class Search:
             yield uninterrupted(self._hybrid.solve(x0))
         start = self._problem.initial_state if x0 is None else x0
         for member in self._library[:1]:
-            controls, _ = follow(member, self._problem, start)
-            yield uninterrupted(self._gauss_newton.solve(x0, controls))
+            guess = follow(member, self._problem, start).controls
+            yield uninterrupted(self._gauss_newton.solve(x0, guess))

@@ -17,7 +17,7 @@ from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.solution import StopReason
 from experts.guesses.guided import GuidedDDP
 from experts.problems.arm_problem import ArmProblem
-from experts.problems.shooting_problem import FloatArray
+from experts.problems.shooting_problem import FloatArray, StageParameters
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.stability.cases import Case, Handled, Outcome, refusal
 from scripts.benchmarks.stability.scenes import walk
@@ -73,15 +73,13 @@ def _scene(**changes: Any) -> Scene:
 def _short(steps: int = _STEPS) -> ArmProblem:
     """The maneuver; changes outside the machine code need no new compilation."""
     problem = ArmProblem(_scene())
-    problem.horizon = steps
+    problem.horizon, problem.parameters = steps, StageParameters(steps)
     return problem
 
 
 def _with_limits(limit: float) -> ArmProblem:
-    problem = _short()
-    problem.control_upper = np.full(problem.n_controls, limit)
-    problem.control_lower = -problem.control_upper
-    return problem
+    actuators = ("base_force", "base_torque", "joint_torque")
+    return ArmProblem(_scene(actuators={name: {"limit": limit} for name in actuators}))
 
 
 def _with_spread_weights() -> ArmProblem:
