@@ -54,7 +54,8 @@ class KernelCall:
     """A kernel with the addresses of its arrays, for repeated calls.
 
     Arrays given once are kept alive; others take their place before a call. All must be C-contiguous, with
-    the shape and element type of the kernel's `ArraySpec`s.
+    the shape and element type of the kernel's `ArraySpec`s. A call without all of them is a ValueError: the
+    code would read and write at address 0.
     """
 
     def __init__(self, kernel: BoundKernel, arrays: Mapping[str, Array]) -> None:
@@ -66,6 +67,7 @@ class KernelCall:
             self._slots[spec.name] = position
             # That of an array by column is followed by the columns' distance.
             position += 2 if spec.by_column else 1
+        self._missing = set(self._slots)
         self._buffers = (ctypes.c_int64 * position)()
         self._pointer = ctypes.addressof(self._buffers)
         self._kept = [array for name, array in arrays.items() if name in self._slots]
@@ -80,24 +82,27 @@ class KernelCall:
         """Replace arrays by others of the same shape, which the caller keeps alive."""
         for name, array in arrays.items():
             self._buffers[self._slots[name]] = address_of(array)
+        if self._missing:
+            self._missing.difference_update(arrays)
+
+    def _require_arrays(self) -> None:
+        if self._missing:
+            raise ValueError(f"the kernel has no array for {', '.join(sorted(self._missing))}")
 
     def __call__(self, rows: int, threads: int = 1) -> None:
         """Run on rows 0 .. rows - 1."""
+        self._require_arrays()
         run_shared(self._function, rows, self._pointer, threads)
 
     def on_rows(self, rows: NDArray[np.int64]) -> None:
         """Run an indexed kernel on the rows of a list, shape (k,)."""
+        self._require_arrays()
         self._buffers[0] = address_of(rows)
         self._function(0, len(rows), self._pointer)
 
     def of_one_row(self) -> Callable[[], None]:
-        """Make a function that runs the kernel on row 0, see `one_row_call`; it keeps the arrays alive.
-
-        Raises ValueError if an array is missing: the code would write to address 0.
-        """
-        missing = [name for name, position in self._slots.items() if not self._buffers[position]]
-        if missing:
-            raise ValueError(f"the kernel has no array for {', '.join(missing)}")
+        """Make a function that runs the kernel on row 0, see `one_row_call`; it keeps the arrays alive."""
+        self._require_arrays()
         call = one_row_call(self._kernel.address, self._pointer)
         function: Any = call.func
         function.call = self  # keeps code and arrays alive

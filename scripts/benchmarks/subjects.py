@@ -129,6 +129,7 @@ def kernel_case(
     kernel = kernels.kernel(PROGRAMS[what], integrator=integrator or None, lanes=lanes)
     x, u = moving_states(kernels, batch)
     inputs = {"x": x, "u": u, "action": u / finite_limits(kernels), "h": np.array([scene.simulation.dt])}
+    inputs["parameters"] = np.tile(kernels.parameters.nominal, (batch, 1))
     if what == ENVIRONMENT:
         inputs |= _episodes(kernels, batch)
     arrays = {spec.name: np.ascontiguousarray(inputs[spec.name], spec.dtype) for spec in kernel.inputs}

@@ -227,6 +227,7 @@ def _step_cases(
     for lanes, own, result in ((1, line, line[1:]), (None, x, np.zeros_like(x))):
         kernel, count = method.step_kernel(kernels, lanes), len(result)
         arrays = {"x": own, "u": np.ascontiguousarray(inputs[:count]), "h": np.array([case.hold / per_hold])}
+        arrays["parameters"] = np.tile(kernels.parameters.nominal, (count, 1))
         call = KernelCall(kernel, {**arrays, kernel.outputs[0].name: result})
         subject = Subject(what=STEP, engine=OURS, way="rows", integrator=method.name, batch=count)
         cases.append(Case(subject, partial(call, count)))

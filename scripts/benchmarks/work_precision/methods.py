@@ -88,7 +88,8 @@ class Walk:
         self._start = method.own_state(kernels, case.start[None])[0]
         self._states = np.zeros((_ROWS + 1, len(self._start)))
         self._inputs, self._step = np.zeros((_ROWS, kernels.n_u)), np.zeros(1)
-        arrays = {"x": self._states, "u": self._inputs, "h": self._step}
+        nominal = np.tile(kernels.parameters.nominal, (_ROWS, 1))
+        arrays = {"x": self._states, "parameters": nominal, "u": self._inputs, "h": self._step}
         self._call = KernelCall(kernel, {**arrays, kernel.outputs[0].name: self._states[1:]})
 
     def run(self, per_hold: int) -> None:
