@@ -54,14 +54,15 @@ def test_a_part_never_makes_a_scene_cheaper(name: str) -> None:
             assert (count >= whole[program]) if added else (count <= whole[program]), (title, program)
 
 
-def test_starts_that_are_not_random_change_no_step_and_masses_only_that_of_the_environment() -> None:
+def test_random_starts_change_no_step_targets_that_of_the_environment_and_masses_hardly_any() -> None:
     variants = feature_variants(load_scene("paper"))
     whole = operations(variants["paper, as it is"])
     assert operations(variants["without random starts"]) == whole
-    for title in ("with random target", "with random masses"):
-        changed = operations(variants[title]).items() - whole.items()
-        assert dict(changed).keys() == {"environment"}
-        assert dict(changed)["environment"] > whole["environment"]
+    changed = dict(operations(variants["with random target"]).items() - whole.items())
+    assert changed.keys() == {"environment"}
+    assert whole["environment"] < changed["environment"] < 1.02 * whole["environment"]
+    for program, count in operations(variants["with random masses"]).items():
+        assert whole[program] < count < 1.1 * whole[program], program
 
 
 # States, tangent states, inputs, entries of an observation; the pose has 8 numbers and 6 directions.
