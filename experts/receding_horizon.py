@@ -27,7 +27,7 @@ from experts.ddp.shooting import ShootingWorkspace, line_search
 from experts.ddp.solution import Policy, Solution, StopReason
 from experts.guesses.guided import GuidedDDP
 from experts.problems.arm_problem import ArmProblem, WindowProblem, as_problem
-from experts.problems.shooting_problem import FloatArray, check_array, check_at_least, stage_bounds
+from experts.problems.shooting_problem import FloatArray, check_array, check_at_least
 
 WORTHWHILE = 1e-12
 """A smaller predicted reduction, relative to the plan's cost, is not tried: rounding would decide."""
@@ -238,8 +238,8 @@ class RecedingHorizonExpert:
             self.fallbacks += 1
         self.dropouts += dropped
         self._next_stage = stage + 1
-        action: FloatArray = self.control / stage_bounds(self.maneuver)[1][stage]
-        return action
+        limits = self.maneuver.control_upper
+        return self.control / (limits if limits.ndim == 1 else limits[stage])
 
     def _checked(self, observation_or_state: ArrayLike) -> FloatArray:
         """Return an observation or a state, or raise for another shape; its numbers may be wrong."""

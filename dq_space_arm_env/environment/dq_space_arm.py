@@ -99,7 +99,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     `reset(seed=...)` draws the initial state from the scene's spread, uniformly per component, and the target, masses and inertias where they have a spread
     (scenes `random-target` and `random-masses`). `options={"nominal": True}` starts at the scene's initial state, `options={"initial_state": x}` at a state x
     (`env.unwrapped.kernels.layout.state` names its entries); both keep target and masses nominal. `options={"target": q}`, alone or with either,
-    sets the target of a scene that draws it. `options={"state": s}` goes on in the middle of an episode, where `s = env.unwrapped.get_state()` was called, to the
+    sets the target of a scene in which it varies, `options={"parameters": p}` all that varies (`kernels.parameters` names its entries). `options={"state": s}` goes on in the middle of an episode, where `s = env.unwrapped.get_state()` was called, to the
     same bits; `copy.deepcopy` and `pickle` keep a running episode likewise. `env.unwrapped.episode_scene` is the scene of the running episode with everything drawn or given as plain numbers:
     what an optimal controller may know.
 

@@ -167,7 +167,7 @@ class Scene(Model):
 
     def _parameter_problems(self) -> Iterator[Problem]:
         """Find paths that lead to no number that may vary."""
-        names = [number.name for number in numbers(self)]
+        names = [number.name for number in numbers(self)] if self.parameters else []
         for index, path in enumerate(self.parameters):
             if not any(is_part(name, path) for name in names):
                 paths = dict.fromkeys(part for name in names for part in parents(name))

@@ -44,6 +44,7 @@ class ArmProblem:
         self.time_step = self.scene.simulation.dt
         self.initial_state: FloatArray = layout.initial_state
         self.parameters = StageParameters(self.horizon, layout.parameters.nominal)
+        self._limits_vary = not set(layout.control.limits).isdisjoint(layout.parameters.names)
         self._emphasis: FloatArray = np.ones(1)
         last = (rows[-1:] for rows in self.parameters.inputs)
         self.terminal_inputs: tuple[FloatArray, ...] = (*last, self._emphasis)
@@ -61,9 +62,7 @@ class ArmProblem:
     def limits(self, parameters: StageParameters) -> FloatArray:
         """Limits of the inputs with given parameters of M stages, shape (n_u,) or (M, n_u)."""
         layout = self.kernels.layout
-        if set(layout.control.limits).isdisjoint(layout.parameters.names):
-            return layout.control_limit
-        return layout.limits_with(parameters.rows[:-1])
+        return layout.limits_with(parameters.rows[:-1]) if self._limits_vary else layout.control_limit
 
     @property
     def target(self) -> FloatArray:
@@ -182,7 +181,7 @@ class WindowProblem:
 
     def begin_at(self, stage: int) -> None:
         """Take the parameters of the maneuver's stages from a stage on."""
-        self.parameters.set(self.maneuver.parameters.rows[stage : stage + self.horizon + 1])
+        self.parameters.rows[:] = self.maneuver.parameters.rows[stage : stage + self.horizon + 1]
 
     def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return a kernel of `ShootingProblem`."""

@@ -33,12 +33,6 @@ class ParameterPrograms:
                 "`parameters`, for example links.0.mass"
             )
 
-    def build(self, name: str, integrator: str) -> Program:
-        """Trace a program by name."""
-        if name == "linearize_parameters":
-            return self.linearize(integrator)
-        return self.cost() if name == "cost_by_parameters" else self.terminal_cost()
-
     def linearize(self, integrator: str) -> Program:
         """P, the derivative of the next state in tangent coordinates, n_t by n_p."""
         field, n_p = self.field, len(self.parameters)

@@ -63,6 +63,8 @@ class ScenePrograms:
             "terminal_cost_hessian": derivatives.terminal_cost_hessian,
             "quadratic_cost": quadratic.cost,
             "quadratic_cost_derivatives": quadratic.cost_derivatives,
+            "cost_by_parameters": lambda: ParameterPrograms(self.equations).cost(),
+            "terminal_cost_by_parameters": lambda: ParameterPrograms(self.equations).terminal_cost(),
             "difference": self._difference,
             "retract": self._retract,
             "measured_step": self._measured_step,
@@ -79,8 +81,8 @@ class ScenePrograms:
             return self._walk(integrator)
         if name == "linearize":
             return self._derivatives.linearize(integrator)
-        if name in ("linearize_parameters", "cost_by_parameters", "terminal_cost_by_parameters"):
-            return ParameterPrograms(self.equations).build(name, integrator)
+        if name == "linearize_parameters":
+            return ParameterPrograms(self.equations).linearize(integrator)
         if name == "lagrangian_hessian":
             return self._derivatives.lagrangian_hessian(integrator)
         return self._builders[name]()
