@@ -20,7 +20,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache
 from itertools import islice
-from time import sleep
+from time import monotonic, sleep
 from typing import Any
 
 from dq_space_arm_env import Scene
@@ -42,7 +42,7 @@ LONGEST_PAUSE = 10.0
 """Time before the last repetitions, s; the first follow sooner. A cluster takes seconds to notice that a
 machine is gone, and gives it tasks until then."""
 CONNECTION_SECONDS = 10.0
-"""Time after which a cluster counts as unreachable."""
+"""Time after which a cluster counts as unreachable, and cancelled tasks are left to it."""
 
 RemoteTask = Callable[[dict[str, Any], bytes], ShardResult | str]
 
@@ -156,8 +156,17 @@ def _run_on(ray: Any, tasks: Iterable[Task]) -> Generator[ShardResult]:
             del ready  # frees the cluster's copy
             yield result
     finally:
-        for reference in under_way:
-            ray.cancel(reference, force=True)
+        _cancel(ray, list(under_way))
+
+
+def _cancel(ray: Any, references: list[Any]) -> None:
+    """End tasks. Ray can lose the order for one that is just starting, which would then go on for minutes."""
+    last = monotonic() + CONNECTION_SECONDS
+    with suppress(ray.exceptions.RayError):  # of a cluster that is lost
+        while references and monotonic() < last:
+            for reference in references:
+                ray.cancel(reference, force=True)
+            _, references = ray.wait(references, num_returns=len(references), timeout=0.5, fetch_local=False)
 
 
 class _ShardLost(Exception):  # noqa: N818 - an event, not a mistake

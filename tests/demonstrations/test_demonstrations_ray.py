@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,9 @@ def machines() -> Iterator[LocalCluster]:
     folder = tempfile.mkdtemp(prefix="ray-", dir="/tmp")
     # Ray notes the address of a cluster here, whatever its own folder, and expects the folder to exist.
     Path("/tmp/ray").mkdir(exist_ok=True)
-    cluster = LocalCluster(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_worker_niceness", "0")  # 15 by default: other tests would starve its tasks
+        cluster = LocalCluster(folder)
     try:
         yield cluster
     finally:
@@ -200,7 +203,7 @@ class _Cluster:
         LocalRayletDiedError = type("LocalRayletDiedError", (RayError,), {})
 
     def __init__(self, outcome: Callable[[int, int], str | None]) -> None:
-        self.outcome, self.attempts = outcome, []
+        self.outcome, self.attempts, self.orders_to_end = outcome, [], Counter()
 
     def cluster_resources(self) -> dict[str, float]:
         return {"CPU": 2.0}
@@ -217,8 +220,15 @@ class _Cluster:
 
         return lambda function: Remote()
 
-    def wait(self, references: list[Any]) -> tuple[list[Any], list[Any]]:
-        return references[:1], references[1:]
+    def wait(
+        self, references: list[Any], num_returns: int = 1, **options: Any
+    ) -> tuple[list[Any], list[Any]]:
+        if not self.orders_to_end:
+            return references[:num_returns], references[num_returns:]
+        ended = [
+            reference for reference in references if self.orders_to_end[reference] > 1
+        ]  # the first is lost
+        return ended, [reference for reference in references if reference not in ended]
 
     def get(self, reference: tuple[int, int]) -> Any:
         failure = self.outcome(*reference)
@@ -226,8 +236,9 @@ class _Cluster:
             raise getattr(self.exceptions, failure)(f"{failure}: gone\nand more")
         return reference
 
-    def cancel(self, reference: Any, force: bool) -> None:
-        pass
+    def cancel(self, reference: tuple[int, int], force: bool) -> None:
+        assert force
+        self.orders_to_end[reference] += 1
 
 
 def test_losses_are_counted_shard_by_shard(tasks: list[Task], monkeypatch: pytest.MonkeyPatch):
@@ -248,6 +259,14 @@ def test_a_lost_cluster_is_not_a_shard_lost_eleven_times(tasks: list[Task]):
     with pytest.raises(DemonstrationsError, match=r"^the Ray cluster cannot go on: LocalRayletDiedError"):
         list(ray_executor._run_on(cluster, tasks))
     assert len(cluster.attempts) <= len(tasks)
+
+
+def test_tasks_that_miss_the_order_to_end_get_it_again(tasks: list[Task]):
+    cluster = _Cluster(lambda shard, attempt: None)
+    results = ray_executor._run_on(cluster, tasks)
+    next(results)
+    results.close()
+    assert cluster.orders_to_end == {(task.shard, 1): 2 for task in tasks[1:]}
 
 
 @pytest.mark.ray
@@ -271,7 +290,7 @@ def test_few_tasks_are_under_way_and_they_end_with_the_generator(cluster: LocalC
         assert len(taken) <= most
         wait_until(lambda: "CPU" not in ray.available_resources())
         results.close()
-        wait_until(lambda: ray.available_resources().get("CPU") == 3.0, 30.0)
+        wait_until(lambda: ray.available_resources().get("CPU") == 3.0)
     finally:
         ray.shutdown()
 

@@ -1,7 +1,10 @@
 """Derivatives of steps and costs by the parameters of an episode, against complex steps."""
 
+from itertools import product
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
@@ -32,8 +35,43 @@ EVERYTHING = {
 
 
 def scene_of(name):
-    """A scene of the package, or one with all that may be drawn: paper+, planar+."""
+    """A scene of the package, one with all that may be drawn (paper+, planar+), or by a seed a random one."""
+    if isinstance(name, int):
+        return random_scene(name)
     return load_scene(name[:-1]).replace(spread=EVERYTHING) if name.endswith("+") else load_scene(name)
+
+
+def random_body(rng):
+    """Point masses on the axes a, b, c of a turned frame."""
+    turn = Rotation.random(random_state=rng).as_matrix()
+    masses = rng.uniform(0.1, 1.0, 3)
+    inertia = turn @ np.diag(masses.sum() - masses) @ turn.T
+    center = rng.normal(scale=0.3, size=3).tolist()
+    return {
+        "mass": rng.uniform(1, 9),
+        "center_of_mass": center,
+        "inertia": (0.5 * (inertia + inertia.T)).tolist(),
+    }
+
+
+def random_scene(seed):
+    """Bodies, springs and frames at random; all but the frames are parameters, and target and weights."""
+    rng = np.random.default_rng(seed)
+    places = [f"links.{index}" for index in range(rng.integers(1, 5))]
+    links = []
+    for name in places:
+        rotation = Rotation.random(random_state=rng).as_quat(scalar_first=True).tolist()
+        joint = {"position": rng.normal(scale=0.5, size=3).tolist(), "rotation": rotation}
+        springs = dict(zip(("stiffness", "rest_angle", "damping"), rng.uniform(0.1, 5.0, 3), strict=True))
+        links.append(random_body(rng) | springs | {"name": name, "joint": joint})
+    base = random_body(rng)
+    at_rest = [0.0] * len(links)
+    return load_scene("payload" if rng.integers(2) else "paper").replace(
+        base={name: base[name] for name in ("mass", "inertia")},
+        links=links,
+        initial_state={"joint_angles": at_rest, "joint_rates": at_rest},
+        parameters=["target.pose", "base", *places, "cost"],
+    )
 
 
 def point(scene, seed=0):
@@ -83,15 +121,15 @@ DEFAULT = (
     ("planar+", "dormand_prince"),
     ("planar+", "rodas4"),
     ("planar+", "momentum_rosenbrock"),
+    (0, "rk4"),
 )
 
 
 def cases():
     """Every method with each kind of parameters; by default, one method of each kind."""
-    for scene in ("random-masses", "random-target", "paper+", "planar+"):
-        for integrator in INTEGRATORS:
-            marks = () if (scene, integrator) in DEFAULT else pytest.mark.slow
-            yield pytest.param(scene, integrator, marks=marks)
+    scenes = ("random-masses", "random-target", "paper+", "planar+")
+    for case in (*product(scenes, INTEGRATORS), *product((0, 1, 2), ("rk4", "symplectic_euler", "rodas4"))):
+        yield pytest.param(*case, marks=() if case in DEFAULT else pytest.mark.slow)
 
 
 @pytest.mark.parametrize(("name", "integrator"), list(cases()))
@@ -112,7 +150,7 @@ def test_a_step_is_differentiated_by_parameters(name, integrator):
 
 
 @pytest.mark.parametrize(
-    "name", ["random-target", "random-masses", pytest.param("planar+", marks=pytest.mark.slow)]
+    "name", ["random-target", "random-masses", 0, pytest.param("planar+", marks=pytest.mark.slow)]
 )
 def test_costs_are_differentiated_by_parameters(name):
     scene = scene_of(name)
