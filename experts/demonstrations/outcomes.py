@@ -17,7 +17,8 @@ import numpy as np
 from dq_space_arm_env import Scene
 from experts.ddp.rollout import Trajectory
 from experts.ddp.solution import Solution, StopReason
-from experts.guesses.guided import GuidedDDP, follow, policies
+from experts.guesses.guided import GuidedDDP
+from experts.guesses.policies import follow, policies
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 

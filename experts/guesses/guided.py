@@ -9,10 +9,13 @@ the target: in empty space a maneuver may begin anywhere.
 
 Where a policy strays too far from its maneuver, kinematics provide a guess: one screw motion leads the tip to
 the target, and the arm follows (`screw_motion`).
+
+All of this happens in few, long steps first, where a solve takes a tenth of the time and several guesses can
+be compared. The policy found there, followed in the problem's own steps, is a few iterations away from their
+minimum. Nothing is compiled for it: the length of a step is an input of the kernels.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -20,13 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from experts.ddp.box_ddp import BoxDDP
-from experts.ddp.rollout import FINISHED, Trajectory
-from experts.ddp.shooting import ShootingWorkspace
-from experts.ddp.solution import Callback, Solution, StopReason
-from experts.guesses.reaching import HasTolerances, reach
+from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason
+from experts.guesses.policies import coarsened, follow, policies, refined, track
+from experts.guesses.reaching import HasTolerances, Reached, reach, solve_emphasized
 from experts.guesses.screw_motion import ScrewMotion
 from experts.guesses.screw_motion import screw_motion as guess_screw_motion
-from experts.problems.arm_problem import ArmProblem, WindowProblem
+from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array, check_at_least
 
 START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
@@ -39,8 +41,12 @@ SCREW_REGULARIZATION = 1e2
 """First regularization from a screw motion: the arm is not wound up, and long steps rarely wind it up."""
 ZERO_REGULARIZATION = 1e4
 """First regularization from zero controls: short first steps rarely end in a poor minimum."""
-REACH_REGULARIZATION = 0.0
-"""First regularization after an increase of the emphasis: the last minimum is near."""
+NEAR_REGULARIZATION = 0.0
+"""First regularization after an increase of the emphasis, or of the number of steps: the minimum is near."""
+LARGEST_COARSENING = 8
+"""Most steps in a long one."""
+NEAR_ITERATIONS = 10
+"""Long steps are short enough if their policy is within so many iterations of the problem's own minimum."""
 
 
 class _Guess(NamedTuple):
@@ -50,6 +56,8 @@ class _Guess(NamedTuple):
     controls: FloatArray | None  # shape (N, n_u); None for zeros
     cost: float  # of their rollout; inf if not finite or unknown
     regularization: float  # first one of the solve
+    emphasis: float = 1.0  # factor of the final pose's weights
+    interrupted: bool = False  # whether the user stopped the solve that led to it
 
 
 class _Attempt(NamedTuple):
@@ -57,7 +65,7 @@ class _Attempt(NamedTuple):
 
     guess: str
     solution: Solution
-    emphasis: float = 1.0  # factor of the final pose's weights
+    emphasis: float = 1.0
 
 
 class GuidedDDP:
@@ -79,6 +87,8 @@ class GuidedDDP:
         reach_target: bool = True,
         remember: int = 0,
         attempts: int = 2,
+        compare: bool = False,
+        coarsening: int | None = None,
         max_iterations: int = 200,
         tolerance: float = 1e-7,
         second_order: str | None = None,
@@ -96,6 +106,11 @@ class GuidedDDP:
             remember: Number of converged solutions that may join the library. With 0 a solution depends on
                 its start alone, otherwise also on those solved before.
             attempts: Most guesses to solve for a start.
+            compare: Whether to solve that many, and keep the best solution, rather than stop at the first
+                that converges within the tolerances. In long steps they are always compared.
+            coarsening: Steps in a long one, in which a maneuver is solved first; it divides the number of
+                stages. 1 leaves that out. None tries 8 and less on first use, and takes the first that is
+                fine enough for the problem's own initial state; arms only.
             max_iterations: Most iterations from one guess.
             tolerance: See `BoxDDP`.
             second_order: See `BoxDDP`.
@@ -116,21 +131,41 @@ class GuidedDDP:
         self._kinematic_guess: Callable[[FloatArray], ScrewMotion] | None = None
         if screw_motion and isinstance(self.problem, ArmProblem):
             self._kinematic_guess = partial(guess_screw_motion, self.problem)
+        self.compare = compare
         self._vacancies = remember
         self._library = None if library is None else list(library)
         for i, solution in enumerate(self._library or ()):
             _check_sizes(f"library[{i}]", solution, self.problem)
+        self._coarse: GuidedDDP | None = None
+        self._coarsening = (
+            1 if coarsening is None and not isinstance(self.problem, ArmProblem) else coarsening
+        )
+        if self._coarsening is not None and self._coarsening != 1:
+            self._coarse = self._in_long_steps(self._coarsening)
 
     @property
     def library(self) -> tuple[Solution, ...]:
-        """The solved maneuvers whose policies are guesses; the first access may solve them.
+        """The maneuvers whose policies are guesses; the first access may solve them, in long steps if any.
 
         Raises:
             KeyboardInterrupt: If the user interrupts that solve.
         """
+        if self.coarsening > 1 and self._coarse is not None:
+            return tuple(refined(solution, self.problem) for solution in self._coarse.library)
         if self._library is None:
             self._library = self._solve_initial_state()
         return tuple(self._library)
+
+    @property
+    def coarsening(self) -> int:
+        """Steps in a long one, in which a maneuver is solved first; 1 for none. The first access tries some.
+
+        Raises:
+            KeyboardInterrupt: If the user interrupts that.
+        """
+        if self._coarsening is None:
+            self._coarsening = self._find_coarsening()
+        return self._coarsening
 
     def solve(
         self,
@@ -159,47 +194,58 @@ class GuidedDDP:
             KeyboardInterrupt: If the user interrupts the preparation of the library.
         """
         given = self.problem.parameters.checked(parameters)
-        library = self.library  # its preparation takes nominal parameters
+        _ = self.coarsening  # finding it takes nominal parameters, and so does the preparation of the library
+        if self._coarse is None:
+            _ = self.library
         self.problem.parameters.set(given)
         start = np.asarray(self.problem.initial_state if x0 is None else x0, dtype=np.float64)
         check_array("x0", start, (self.problem.n_states,))
         attempts: list[_Attempt] = []
-        for guess in self._guesses(start, library):
-            attempts.append(_Attempt(guess.name, self._solve_from(guess, start, callback)))
-            if attempts[-1].solution.converged and not self._is_good(attempts[-1].solution):
-                attempts += self._reach(attempts[-1], start, callback)
+        for guess in self._guesses(start, callback):
+            attempts += self._attempts(guess, start, callback)
             last = attempts[-1].solution
-            if self._is_good(last) or last.stop_reason is StopReason.INTERRUPTED:
+            if last.stop_reason is StopReason.INTERRUPTED or (self._is_good(last) and not self.compare):
                 break
         # An emphasis that did not help is dropped.
         good = [attempt for attempt in attempts if self._is_good(attempt.solution)]
         plain = [attempt for attempt in attempts if attempt.emphasis == 1.0]
-        best = min(good or plain, key=lambda attempt: attempt.solution.cost)
+        best = min(good or plain or attempts, key=lambda attempt: attempt.solution.cost)
         solution = best.solution
         solution.metadata["guess"], solution.metadata["emphasis"] = best.guess, best.emphasis
         solution.metadata["attempts"] = [_summary(attempt) for attempt in attempts]
         self._remember(solution)
         return solution
 
-    def _reach(self, attempt: _Attempt, start: FloatArray, callback: Callback | None) -> list[_Attempt]:
-        """Lead a minimum that ends outside the tolerances to the target."""
-        if not self.reach_target or self._target is None:
-            return []
+    def _attempts(self, guess: _Guess, start: FloatArray, callback: Callback | None) -> list[_Attempt]:
+        """Solve from a guess, and lead a minimum that ends outside the tolerances to the target."""
+        found = Reached(guess.emphasis, self._solve_from(guess, start, callback))
+        attempts = [_Attempt(guess.name, found.solution, found.emphasis)]
+        solution, target = found.solution, self._target
+        if not solution.converged or self._is_good(solution) or not self.reach_target or target is None:
+            return attempts
 
         def solve(controls: FloatArray) -> Solution:
-            return self._solve_from(_Guess("", controls, np.inf, REACH_REGULARIZATION), start, callback)
+            return self._solve_from(_Guess("", controls, np.inf, NEAR_REGULARIZATION), start, callback)
 
-        steps = reach(self._target, attempt.solution, solve)
-        return [_Attempt(attempt.guess, step.solution, step.emphasis) for step in steps]
+        steps = reach(target, found, solve)
+        return attempts + [_Attempt(guess.name, step.solution, step.emphasis) for step in steps]
 
     def _remember(self, solution: Solution) -> None:
         """Add a solution to the library if there is room and it is new."""
         known = solution.iterations == 0  # its guess, a policy, was already optimal
+        if self._coarse is not None:
+            return  # it has the library
         if self._vacancies > 0 and self._library is not None and solution.converged and not known:
             self._library.append(solution)
             self._vacancies -= 1
 
-    def _guesses(self, start: FloatArray, library: Sequence[Solution]) -> list[_Guess]:
+    def _guesses(self, start: FloatArray, callback: Callback | None) -> Iterator[_Guess]:
+        """Make the guesses to solve, one after another."""
+        if self._coarse is not None:
+            yield from self._coarse_guess(self._coarse, start, callback)
+        yield from self._own_guesses(start, self.library)
+
+    def _own_guesses(self, start: FloatArray, library: Sequence[Solution]) -> list[_Guess]:
         """List the guesses to solve, cheapest rollout first; zero controls are the last resort."""
         rollouts, strayed = [], True
         for i, solution in enumerate(library):
@@ -219,15 +265,81 @@ class GuidedDDP:
         # The last of two or more attempts starts from zero controls.
         return [*ranked[: max(self.attempts - 1, 1)], zero][: self.attempts]
 
+    def _coarse_guess(
+        self, coarse: "GuidedDDP", start: FloatArray, callback: Callback | None
+    ) -> Iterator[_Guess]:
+        """Solve in long steps, and follow the policy in the problem's own; nothing if that diverges."""
+        factor = self.problem.horizon // coarse.problem.horizon
+
+        def report(record: IterationRecord) -> None:
+            """Relate costs to the problem's own stages."""
+            costs = {name: factor * getattr(record, name) for name in ("cost", "expected_decrease")}
+            if callback is not None:
+                callback(record._replace(**costs))
+
+        found = coarse.solve(start, report, parameters=self.problem.parameters.rows[::factor])
+        interrupted = found.stop_reason is StopReason.INTERRUPTED
+        trial = follow(refined(found, self.problem), self.problem, start)
+        if np.isfinite(trial.cost):
+            name, emphasis = found.metadata["guess"], found.metadata["emphasis"]
+            yield _Guess(name, trial.controls, trial.cost, NEAR_REGULARIZATION, emphasis, interrupted)
+
     def _solve_from(self, guess: _Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
+        """Solve with the guess's emphasis; the cost is the problem's own."""
+
+        def solve() -> Solution:
+            return self._solver.solve(
+                start, guess.controls, callback, parameters=self.problem.parameters.rows
+            )
+
+        callback = _interrupt if guess.interrupted else callback
         self._solver.initial_regularization = guess.regularization
-        return self._solver.solve(start, guess.controls, callback, parameters=self.problem.parameters.rows)
+        if self._target is None or guess.emphasis == 1.0:
+            return solve()
+        return solve_emphasized(self._target, guess.emphasis, solve).solution
 
     def _is_good(self, solution: Solution) -> bool:
         """Whether a solution has converged, and ends within the tolerances if the problem has any."""
         if not solution.converged:
             return False
         return self._target is None or self._target.misses(solution.states[-1]) <= 1.0
+
+    def _in_long_steps(self, factor: int) -> "GuidedDDP":
+        """Make the solver in long steps, with the settings of this one; its library is this one's."""
+        known = self._library
+        return GuidedDDP(
+            cast(ArmProblem, self.problem).coarsened(factor),
+            library=None if known is None else [coarsened(member, factor) for member in known],
+            screw_motion=self._kinematic_guess is not None,
+            reach_target=self.reach_target,
+            remember=self._vacancies,
+            attempts=self.attempts,
+            compare=True,
+            coarsening=1,
+            max_iterations=self._solver.max_iterations,
+            tolerance=self._solver.tolerance,
+            second_order=self._solver.second_order.value,
+        )
+
+    def _find_coarsening(self) -> int:
+        """Find the longest steps whose policy leads to the minimum in the problem's own."""
+        problem, most = self.problem, self._solver.max_iterations
+        problem.parameters.set(None)
+        for factor in range(LARGEST_COARSENING, 1, -1):
+            if problem.horizon % factor == 0:
+                coarse = self._in_long_steps(factor)
+                for guess in self._coarse_guess(coarse, problem.initial_state, None):
+                    self._solver.max_iterations = NEAR_ITERATIONS
+                    try:
+                        solution = self._solve_from(guess, problem.initial_state)
+                    finally:
+                        self._solver.max_iterations = most
+                    if solution.stop_reason is StopReason.INTERRUPTED:
+                        raise KeyboardInterrupt
+                    if solution.converged:
+                        self._coarse = coarse
+                        return factor
+        return 1
 
     def _solve_initial_state(self) -> list[Solution]:
         """Solve the problem's own initial state; no solution if every rollout diverges."""
@@ -243,26 +355,9 @@ class GuidedDDP:
         return [best] if np.isfinite(best.cost) else []
 
 
-def policies(solution: Solution, problem: ShootingProblem) -> dict[str, Solution]:
-    """A solution as it is, and moved rigidly from its target to the present one where they differ."""
-    found = {"": solution}
-    if not isinstance(problem, ArmProblem | WindowProblem) or not problem.parameters.inputs:
-        return found
-    if solution.parameters.shape != problem.parameters.rows.shape:
-        return found
-    states = problem.carried(solution.states, solution.parameters[-1])
-    return found if states is None else {**found, ", moved": replace(solution, states=states)}
-
-
-def follow(solution: Solution, problem: ShootingProblem, x0: FloatArray) -> Trajectory:
-    """Roll out the policy of a solution from another start; the cost is inf if it is not finite."""
-    trial = Trajectory(problem)
-    trial.states[0] = x0
-    kernels = {name: problem.kernel(name) for name in ("difference", "step_with_cost", "terminal_cost")}
-    reference = np.ascontiguousarray(solution.states), solution.controls
-    policy = np.zeros_like(solution.controls), solution.feedback_gains
-    trial.follow(kernels, reference, policy, alpha=0.0)
-    return trial
+def _interrupt(record: IterationRecord) -> None:
+    """End a solve as the user ended the one before."""
+    raise KeyboardInterrupt
 
 
 def _check_sizes(name: str, solution: Solution, problem: ShootingProblem) -> None:
@@ -284,27 +379,3 @@ def _summary(attempt: _Attempt) -> dict[str, Any]:
         "iterations": solution.iterations,
         "stop_reason": solution.stop_reason.value,
     }
-
-
-def track(problem: ShootingProblem, states: FloatArray, controls: FloatArray) -> tuple[FloatArray, float]:
-    """Follow a trajectory that need not obey the dynamics; return controls (N, n_u) and cost of the rollout.
-
-    The feedback is a linear-quadratic regulator around the guess: dynamics linearized along it, deviations
-    weighted with the Gauss-Newton Hessian of the problem's own cost. Motion that does not affect the cost,
-    such as that of the arm around a fixed tip, may deviate freely.
-    """
-    check_array("states", states, (problem.horizon + 1, problem.n_states))
-    check_array("controls", controls, (problem.horizon, problem.n_controls))
-    work = ShootingWorkspace(problem, second_order=False)
-    work.current.states[:], work.current.controls[:] = states, controls
-    work.trial.states[0] = states[0]
-    work.differentiate()
-    # Without gradients the guess itself has the least cost, and k vanishes.
-    derivatives = work.derivatives
-    for gradient in (derivatives.lx, derivatives.lu, derivatives.terminal_lx):
-        gradient[:] = 0.0
-    if not work.backward_pass(0.0).completed:
-        return work.current.controls.copy(), np.inf
-    cost = work.try_step(0.0)
-    finite = work.trial.failing_stage == FINISHED
-    return work.trial.controls.copy(), cost if finite else np.inf

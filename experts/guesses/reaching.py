@@ -13,6 +13,7 @@ r is updated from solve to solve.
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple, Protocol
 
 from experts.ddp.solution import Solution
@@ -50,27 +51,35 @@ class Reached(NamedTuple):
     solution: Solution  # with the problem's own cost, without the emphasis
 
 
+def solve_emphasized(problem: HasTolerances, emphasis: float, solve: Callable[[], Solution]) -> Reached:
+    """Minimize a problem with an emphasis; `solve` does so in its current form."""
+    with problem.emphasized(emphasis):
+        solution = solve()
+        excess = problem.end_cost(solution.states[-1])
+    excess -= problem.end_cost(solution.states[-1])
+    note = f"{solution.message}; the final pose has {emphasis:.3g} times its weight"
+    return Reached(emphasis, replace(solution, cost=solution.cost - excess, message=note))
+
+
 def reach(
-    problem: HasTolerances, solution: Solution, solve: Callable[[FloatArray], Solution]
+    problem: HasTolerances, begun: Reached, solve: Callable[[FloatArray], Solution]
 ) -> Iterator[Reached]:
     """Raise the emphasis until a maneuver ends within the tolerances; yield every solve.
 
     `solve` minimizes the problem in its current form from given controls, shape (N, n_u). The last solve
     succeeds, does not converge, or reaches a limit.
     """
-    first = problem.misses(solution.states[-1])
-    emphasis, response = 1.0, FIRST_RESPONSE
+    (first, solution), response, rise = begun, FIRST_RESPONSE, 1.0
+    emphasis, first_error = first, problem.misses(solution.states[-1])
     for _ in range(MOST_SOLVES):
-        needed = 1.0 + response * (first / AIM - 1.0)
-        emphasis = min(max(needed, SMALLEST_RISE * emphasis), LARGEST_EMPHASIS)
-        with problem.emphasized(emphasis):
-            solution = solve(solution.controls)
-            excess = problem.end_cost(solution.states[-1])
-        excess -= problem.end_cost(solution.states[-1])
-        note = f"{solution.message}; the final pose has {emphasis:.3g} times its weight"
-        yield Reached(emphasis, replace(solution, cost=solution.cost - excess, message=note))
+        needed = 1.0 - response + (first - 1.0 + response) * first_error / AIM
+        emphasis = min(max(needed, rise * emphasis), LARGEST_EMPHASIS)
+        reached = solve_emphasized(problem, emphasis, partial(solve, solution.controls))
+        yield reached
+        solution, rise = reached.solution, SMALLEST_RISE
         error = problem.misses(solution.states[-1])
         if error <= 1.0 or not solution.converged or emphasis == LARGEST_EMPHASIS:
             return
-        if error < first:
-            response = (emphasis - 1.0) / (first / error - 1.0)
+        if error < first_error:
+            ratio = first_error / error
+            response = (emphasis - 1.0 - ratio * (first - 1.0)) / (ratio - 1.0)

@@ -1,5 +1,6 @@
 """A scene as a shooting problem: its kernels, bounds, horizon and start under the names the solver uses."""
 
+import copy
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -43,11 +44,34 @@ class ArmProblem:
         self.horizon = self.scene.simulation.steps
         self.time_step = self.scene.simulation.dt
         self.initial_state: FloatArray = layout.initial_state
-        self.parameters = StageParameters(self.horizon, layout.parameters.nominal)
         self._limits_vary = not set(layout.control.limits).isdisjoint(layout.parameters.names)
-        self._emphasis: FloatArray = np.ones(1)
+        self._make_inputs(coarsening=1)
+
+    def _make_inputs(self, coarsening: int) -> None:
+        """Allocate what may change between solves: parameters, and the emphasis on the final pose."""
+        self.parameters = StageParameters(self.horizon, self.kernels.layout.parameters.nominal)
+        self._usual_emphasis = 1.0 / coarsening
+        self._emphasis: FloatArray = np.full(1, self._usual_emphasis)
         last = (rows[-1:] for rows in self.parameters.inputs)
         self.terminal_inputs: tuple[FloatArray, ...] = (*last, self._emphasis)
+
+    def coarsened(self, factor: int) -> "ArmProblem":
+        """Return the same maneuver in fewer, longer steps; its costs are smaller by the factor.
+
+        Only stages count in the cost, not their duration: the final pose loses weight as they become fewer.
+
+        Args:
+            factor: Steps in one of the longer steps; it divides the number of stages.
+
+        Raises:
+            ValueError: If it does not.
+        """
+        if factor < 1 or self.horizon % factor:
+            raise ValueError(f"factor is {factor}; it must divide the {self.horizon} stages")
+        coarse = copy.copy(self)
+        coarse.horizon, coarse.time_step = self.horizon // factor, self.time_step * factor
+        coarse._make_inputs(factor)
+        return coarse
 
     @property
     def control_upper(self) -> FloatArray:
@@ -96,11 +120,11 @@ class ArmProblem:
     @contextmanager
     def emphasized(self, emphasis: float) -> Iterator[None]:
         """Multiply the weights of the tip's final pose inside a `with` block."""
-        self._emphasis[0] = emphasis
+        self._emphasis[0] = emphasis * self._usual_emphasis
         try:
             yield
         finally:
-            self._emphasis[0] = 1.0
+            self._emphasis[0] = self._usual_emphasis
 
     def end_cost(self, state: FloatArray) -> float:
         """Terminal cost of a final state, shape (n_x,), with the current emphasis."""

@@ -18,7 +18,8 @@ from dq_space_arm_env.scene.start import (
     start_from_draws,
 )
 from experts import BoxDDP, GuidedDDP, StopReason
-from experts.guesses.guided import START_REGULARIZATIONS, STRAYED, ZERO_REGULARIZATION, follow
+from experts.guesses.guided import START_REGULARIZATIONS, STRAYED, ZERO_REGULARIZATION
+from experts.guesses.policies import follow
 from experts.guesses.reaching import MOST_SOLVES
 from experts.guesses.screw_motion import ScrewMotion
 

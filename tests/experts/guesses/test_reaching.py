@@ -8,7 +8,7 @@ import pytest
 
 from experts import BoxDDP, GuidedDDP
 from experts.ddp.solution import Solution, StopReason
-from experts.guesses.reaching import LARGEST_EMPHASIS, MOST_SOLVES, SMALLEST_RISE, reach
+from experts.guesses.reaching import LARGEST_EMPHASIS, MOST_SOLVES, SMALLEST_RISE, Reached, reach
 from experts.problems.arm_problem import ArmProblem
 from scripts.benchmarks.solvers.runs import roll_out
 
@@ -59,7 +59,7 @@ def test_the_emphasis_is_hardly_larger_than_it_must_be(g, tolerance):
     plain = spring.solve()
     if spring.misses(plain.states[-1]) <= 1.0:
         pytest.skip("within the tolerance without any emphasis")
-    steps = list(reach(spring, plain, lambda controls: spring.solve()))
+    steps = list(reach(spring, Reached(1.0, plain), lambda controls: spring.solve()))
     least = (10.0 / tolerance - 10.0) / g
     if least > LARGEST_EMPHASIS:
         assert steps[-1].emphasis == LARGEST_EMPHASIS
@@ -72,7 +72,7 @@ def test_the_emphasis_is_hardly_larger_than_it_must_be(g, tolerance):
 
 def test_costs_are_the_problems_own():
     spring = Spring(1.0, 0.1)
-    for step in reach(spring, spring.solve(), lambda controls: spring.solve()):
+    for step in reach(spring, Reached(1.0, spring.solve()), lambda controls: spring.solve()):
         x = step.solution.states[-1, 0]
         assert step.solution.cost == pytest.approx(10.0 * (x - 1.0) ** 2 + x**2, rel=1e-12)
         assert f"{step.emphasis:.3g} times its weight" in step.solution.message
@@ -80,7 +80,9 @@ def test_costs_are_the_problems_own():
 
 def test_it_ends_where_a_solve_does_not_converge():
     spring = Spring(1.0, 1e-3)
-    steps = list(reach(spring, spring.solve(), lambda controls: spring.solve(StopReason.PLATEAU)))
+    steps = list(
+        reach(spring, Reached(1.0, spring.solve()), lambda controls: spring.solve(StopReason.PLATEAU))
+    )
     assert len(steps) == 1
 
 
@@ -106,7 +108,7 @@ def test_a_maneuver_whose_minimum_misses_the_target_reaches_it_for_a_little_more
     assert problem.is_success(solution.states[-1])
     assert solution.metadata["emphasis"] > 1.0
     assert cheapest.cost < solution.cost < 1.001 * cheapest.cost
-    assert [attempt["guess"] for attempt in solution.metadata["attempts"]] == ["policy 0", "policy 0"]
+    assert len(solution.metadata["attempts"]) == 1  # the emphasis is found in long steps
     assert problem.terminal_inputs[0][0] == 1.0
     assert roll_out(problem, start, solution.controls).cost == pytest.approx(solution.cost, rel=1e-9)
 

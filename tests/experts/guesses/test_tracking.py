@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experts import BoxDDP
-from experts.guesses.guided import track
+from experts.guesses.policies import track
 
 
 def test_what_obeys_the_dynamics_is_repeated(unicycle):
