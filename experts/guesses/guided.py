@@ -58,6 +58,7 @@ class _Guess(NamedTuple):
     regularization: float  # first one of the solve
     emphasis: float = 1.0  # factor of the final pose's weights
     interrupted: bool = False  # whether the user stopped the solve that led to it
+    long_steps: tuple[dict[str, Any], ...] = ()  # the attempts in long steps that led to it
 
 
 class _Attempt(NamedTuple):
@@ -186,7 +187,8 @@ class GuidedDDP:
         Returns:
             The best trajectory found; its cost is always the problem's own. `metadata["guess"]` names its
             guess, `metadata["emphasis"]` is the factor of the final pose's weights at which it is a minimum,
-            and `metadata["attempts"]` lists guess, emphasis, cost, iterations and stop reason of each solve.
+            and `metadata["attempts"]` lists guess, emphasis, cost, iterations and stop reason of each solve,
+            `metadata["long_steps"]` those in long steps before.
 
         Raises:
             ValueError: If x0 or parameters have the wrong shape or are not finite, or an input has no cost of
@@ -201,7 +203,9 @@ class GuidedDDP:
         start = np.asarray(self.problem.initial_state if x0 is None else x0, dtype=np.float64)
         check_array("x0", start, (self.problem.n_states,))
         attempts: list[_Attempt] = []
+        long_steps: tuple[dict[str, Any], ...] = ()
         for guess in self._guesses(start, callback):
+            long_steps += guess.long_steps
             attempts += self._attempts(guess, start, callback)
             last = attempts[-1].solution
             if last.stop_reason is StopReason.INTERRUPTED or (self._is_good(last) and not self.compare):
@@ -213,6 +217,7 @@ class GuidedDDP:
         solution = best.solution
         solution.metadata["guess"], solution.metadata["emphasis"] = best.guess, best.emphasis
         solution.metadata["attempts"] = [_summary(attempt) for attempt in attempts]
+        solution.metadata["long_steps"] = list(long_steps)
         self._remember(solution)
         return solution
 
@@ -282,7 +287,12 @@ class GuidedDDP:
         trial = follow(refined(found, self.problem), self.problem, start)
         if np.isfinite(trial.cost):
             name, emphasis = found.metadata["guess"], found.metadata["emphasis"]
-            yield _Guess(name, trial.controls, trial.cost, NEAR_REGULARIZATION, emphasis, interrupted)
+            long_steps = tuple(
+                {**attempt, "cost": factor * attempt["cost"]} for attempt in found.metadata["attempts"]
+            )
+            yield _Guess(
+                name, trial.controls, trial.cost, NEAR_REGULARIZATION, emphasis, interrupted, long_steps
+            )
 
     def _solve_from(self, guess: _Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
         """Solve with the guess's emphasis; the cost is the problem's own."""

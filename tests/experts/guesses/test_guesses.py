@@ -19,7 +19,7 @@ from dq_space_arm_env.scene.start import (
 )
 from experts import BoxDDP, GuidedDDP, StopReason
 from experts.guesses.guided import START_REGULARIZATIONS, STRAYED, ZERO_REGULARIZATION
-from experts.guesses.policies import follow
+from experts.guesses.policies import coarsened, follow, refined
 from experts.guesses.reaching import MOST_SOLVES
 from experts.guesses.screw_motion import ScrewMotion
 
@@ -353,3 +353,68 @@ def test_a_second_guess_helps_where_the_first_does_not_converge():
     assert both.converged
     assert both.metadata["guess"] == "zero controls"
     assert both.cost < first.cost
+
+
+# Long steps ------------------------------------------------------------------------------------------------
+
+
+def test_a_policy_in_longer_steps_is_itself_again_in_the_shorter_ones(paper):
+    problem, solution = paper.problem, BoxDDP(paper.problem, max_iterations=3).solve()
+    coarse = coarsened(solution, 8)
+    fine = refined(coarse, problem)
+    assert coarse.states.shape == (126, problem.n_states)
+    assert fine.states.shape == solution.states.shape
+    again = coarsened(fine, 8)
+    for name in ("states", "controls", "feedback_gains", "parameters"):
+        np.testing.assert_allclose(getattr(again, name), getattr(coarse, name), rtol=1e-14, atol=1e-14)
+    # Between its own states the policy stays close to the solution's.
+    position = problem.kernels.layout.state.joint_angles
+    assert np.abs(fine.states[:, position] - solution.states[:, position]).max() < 5e-3
+
+
+def test_costs_in_long_steps_are_those_of_fewer_stages(paper):
+    """The stages' costs fall by the factor, as their number does; so does the weight of the final pose."""
+    problem, start = paper.problem, random_start("paper", 0)
+    coarse = problem.coarsened(8)
+    assert (coarse.horizon, coarse.time_step) == (problem.horizon // 8, 8 * problem.time_step)
+    start[problem.kernels.layout.state.pose.stop :] = 0.0  # at rest only the pose costs
+    assert 8.0 * coarse.end_cost(start) == pytest.approx(problem.end_cost(start), rel=1e-12)
+    with coarse.emphasized(3.0), problem.emphasized(3.0):
+        assert 8.0 * coarse.end_cost(start) == pytest.approx(problem.end_cost(start), rel=1e-12)
+    assert 8.0 * coarse.end_cost(start) == pytest.approx(problem.end_cost(start), rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_long_steps_lead_to_the_same_minimum(paper, seed):
+    start = random_start("paper", seed)
+    solution = paper.solve(start)
+    alone = GuidedDDP("paper", coarsening=1).solve(start)
+    assert paper.coarsening == 8
+    assert solution.converged
+    assert solution.cost == pytest.approx(alone.cost, rel=1e-6)
+    assert solution.iterations < alone.iterations
+    assert {attempt["guess"] for attempt in solution.metadata["long_steps"]} >= {"zero controls"}
+    assert alone.metadata["long_steps"] == []
+
+
+def test_steps_too_long_for_a_scene_are_not_taken():
+    """Joints that turn within a long step: no policy of theirs survives."""
+    scene = load_scene("planar").replace(simulation={"dt": 0.3, "steps": 56})
+    solver = GuidedDDP(scene)
+    assert solver.coarsening == 1
+    assert solver.solve().metadata["long_steps"] == []
+
+
+def test_a_user_who_stops_it_in_long_steps_gets_the_trajectory_so_far(paper):
+    def interrupt(record):
+        raise KeyboardInterrupt
+
+    solution = paper.solve(random_start("paper", 1), callback=interrupt)
+    assert solution.stop_reason is StopReason.INTERRUPTED
+    assert np.isfinite(solution.cost)
+    assert len(solution.controls) == paper.problem.horizon
+
+
+def test_a_number_of_steps_that_does_not_divide_the_stages_is_refused():
+    with pytest.raises(ValueError, match="factor is 7; it must divide the 1000 stages"):
+        GuidedDDP("paper", coarsening=7)
