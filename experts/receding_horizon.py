@@ -11,9 +11,10 @@ neglect. Where the cheapest maneuver would end outside the tolerances, plan and 
 as much as reaching the target requires.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +23,6 @@ from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.pose import PLANAR_POSE
-from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.shooting import ShootingWorkspace, line_search
 from experts.ddp.solution import Policy, Solution, StopReason
 from experts.guesses.guided import GuidedDDP
@@ -49,18 +49,17 @@ class ManeuverPlan:
     Vxx: FloatArray
 
     @classmethod
-    def make(cls, maneuver: ArmProblem, state: FloatArray, stage: int, known: Solution) -> Self:
-        """Plan from a state at a stage; the policy of a known solution that began no later is a guess.
+    def make(cls, planner: GuidedDDP, state: FloatArray, stage: int, known: Sequence[Solution] = ()) -> Self:
+        """Plan from a state at a stage; after the first one, policies of known solutions are the guesses.
 
         Raises:
             RuntimeError: If the maneuver cannot be simulated or differentiated from this state.
         """
+        maneuver = cast(ArmProblem, planner.problem)
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         problem.begin_at(stage)
-        # At stage 0 the problem is the maneuver itself, which adds the tip's screw motion to the guesses.
-        solver = GuidedDDP(
-            maneuver if stage == 0 else problem, library=[_last_stages(known, problem.horizon)]
-        )
+        library = [_last_stages(solution, problem.horizon) for solution in known]
+        solver = GuidedDDP(problem, library=library) if stage > 0 else planner
         solution = solver.solve(state, parameters=problem.parameters.rows)
         emphasis = float(solution.metadata["emphasis"])
         exact = problem.has_second_order
@@ -152,7 +151,7 @@ class RecedingHorizonExpert:
         self.control: FloatArray = np.zeros(self.maneuver.n_controls)
         self.fallbacks = self.dropouts = 0
         self._next_stage, self._informed = 0, False
-        self._nominal: Solution | None = None
+        self._planner: GuidedDDP | None = None
         self._work: ShootingWorkspace | None = None
         self._model_state = np.zeros((1, self.maneuver.n_states))
         self._model_gradient = np.zeros((1, self.maneuver.n_tangent))
@@ -307,18 +306,22 @@ class RecedingHorizonExpert:
         return result
 
     def _begin(self, state: FloatArray, stage: int) -> None:
-        """Plan an episode, with the policy of the nominal maneuver as a guess."""
-        if self._nominal is None:
+        """Plan an episode."""
+        if self._planner is None:
+            self._planner = GuidedDDP(self.maneuver)
+        known: tuple[Solution, ...] = ()
+        if stage > 0:
             with self.maneuver.parameters.being(None):
-                self._nominal = BoxDDP(self.maneuver).solve()
-        self.plan = ManeuverPlan.make(self.maneuver, state, stage, self._nominal)
+                known = self._planner.library
+        self.plan = ManeuverPlan.make(self._planner, state, stage, known)
         self._work, self._next_stage, self.fallbacks, self.dropouts = None, stage, 0, 0
         self._informed = False
 
     def _plan_anew(self, state: FloatArray, stage: int) -> None:
         """Plan the rest of the episode with other parameters; the present plan's policy is a guess."""
+        assert self._planner is not None
         assert self.plan is not None
-        self.plan = ManeuverPlan.make(self.maneuver, state, stage, self.plan.solution)
+        self.plan = ManeuverPlan.make(self._planner, state, stage, [self.plan.solution])
         self._work, self._informed = None, False
 
     def _window(self, plan: ManeuverPlan, stage: int) -> ShootingWorkspace:

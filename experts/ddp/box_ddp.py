@@ -68,8 +68,8 @@ class BoxDDP:
             plateau_iterations: Consecutive idle iterations that end the solve.
             initial_regularization: First mu, in multiples of the control weights. Small values let the first
                 steps go so far that the solve may end in a poor minimum.
-            second_order: Second derivatives to use: "gauss_newton", "exact" or "hybrid". None takes the
-                hybrid if the problem has exact ones, else Gauss-Newton's.
+            second_order: Second derivatives to use: "gauss_newton", "exact", "hybrid" or "mirrored". None
+                takes the hybrid if the problem has exact ones, else Gauss-Newton's.
             threads: Most threads that compute derivatives. More than one pays only where a core is idle.
 
         Raises:
@@ -175,11 +175,13 @@ class BoxDDP:
 
     def _backward_passes(self, state: SolverState) -> Iterator[PassResult]:
         """Yield control updates to search along; the next one is asked for if no step was accepted."""
-        if self.second_order is SecondOrder.HYBRID and state.switch.tries_exact:
+        if self.second_order in (SecondOrder.HYBRID, SecondOrder.MIRRORED) and state.switch.tries_exact:
             direction = self._exact_backward_pass()
             if direction.status != PASS_NOT_POSITIVE_DEFINITE:
                 yield direction
             state.switch.postpone_exact()
+        if self.second_order is SecondOrder.MIRRORED:
+            self._work.mirror()
         yield self._regularized_backward_pass(
             state.regularization, exact=self.second_order is SecondOrder.EXACT
         )
@@ -187,7 +189,8 @@ class BoxDDP:
     def _exact_backward_pass(self) -> PassResult:
         """Use exact second derivatives under weak regularization only; the pass may fail."""
         self._work.differentiate_twice()
-        for mu in EXACT_MU:
+        # Unlike Gauss-Newton's, a mirrored model is worth more than an exact one, strongly regularized.
+        for mu in EXACT_MU[: 3 if self.second_order is SecondOrder.MIRRORED else None]:
             direction = self._work.backward_pass(mu, exact=True)
             if direction.status != PASS_NOT_POSITIVE_DEFINITE:
                 break

@@ -22,10 +22,11 @@ class Derivatives(NamedTuple):
 
 
 class Hessians(NamedTuple):
-    """Second derivatives for a backward pass, in tangent coordinates: Gauss-Newton's or exact ones.
+    """Second derivatives for a backward pass, in tangent coordinates.
 
-    Gauss-Newton's are those of the cost alone; exact ones those of the Lagrangian: the cost of a stage and
-    the curvature of its dynamics, weighted with the costates of `find_costates`.
+    Gauss-Newton's approximate those of the cost alone by convex ones; mirrored ones are those of the cost,
+    made convex; exact ones are those of the Lagrangian: the cost of a stage and the curvature of its
+    dynamics, weighted with the costates of `find_costates`.
     """
 
     xx: FloatArray  # shape (N, n_t, n_t)
@@ -56,6 +57,22 @@ def gauss_newton_hessians(derivatives: Derivatives) -> Hessians:
         uu=derivatives.luu,
         terminal_xx=derivatives.terminal_lxx,
     )
+
+
+def mirrored(matrices: FloatArray) -> FloatArray:
+    """Make symmetric matrices, shape (N, n, n), positive semidefinite: negative eigenvalues change sign.
+
+    Matrices that are not finite stay as they are.
+    """
+    if not np.isfinite(matrices).all():
+        return matrices
+    size = matrices.shape[1]
+    coupled = np.flatnonzero(np.any(matrices * ~np.eye(size, dtype=bool), axis=(0, 1)))
+    block = np.ix_(np.arange(len(matrices)), coupled, coupled)
+    values, vectors = np.linalg.eigh(matrices[block])
+    result = np.abs(matrices)  # right for the rows with nothing but a diagonal entry
+    result[block] = (vectors * np.abs(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return result
 
 
 def allocate_hessians(horizon: int, n_tangent: int, n_controls: int) -> Hessians:

@@ -6,6 +6,9 @@ balances error, as in a maneuver at the limits of the actuators. Newton's method
 finishes such a solve in a few steps. The hybrid starts with the former and tries the latter once steps slow
 down.
 
+Where the pose's cost bends much, Gauss-Newton's model creeps: it leaves out that curvature too, which is
+indefinite. The mirrored model keeps it, but changes the sign of negative eigenvalues of a stage's Hessian.
+
 The regularization mu follows Tassa's quadratic schedule: repeated increases accelerate, and so do repeated
 decreases. It reacts to the accepted step length, not to success alone: decreased after every success, as in
 the public release, it settles where only tiny steps are accepted.
@@ -46,6 +49,8 @@ class SecondOrder(StrEnum):
     """Those of cost and dynamics: Newton's method, full DDP."""
     HYBRID = "hybrid"
     """Gauss-Newton's until steps slow down, then exact ones wherever they yield a step."""
+    MIRRORED = "mirrored"
+    """As the hybrid, but first the exact ones of the cost alone, made convex: where it bends much."""
 
     @classmethod
     def of(cls, choice: str | None, has_second_order: bool) -> "SecondOrder":

@@ -19,10 +19,12 @@ from experts.ddp.backward_pass import (
     pass_workspace,
 )
 from experts.ddp.derivatives import (
+    Hessians,
     allocate_derivatives,
     allocate_hessians,
     find_costates,
     gauss_newton_hessians,
+    mirrored,
 )
 from experts.ddp.parallel_rollouts import LANES, ParallelRollouts
 from experts.ddp.rollout import FINISHED, Trajectory
@@ -102,6 +104,7 @@ class ShootingWorkspace:
         stages = problem.horizon if second_order else 0
         self._exact = allocate_hessians(stages, problem.n_tangent, problem.n_controls)
         self._costates = np.zeros((stages, problem.n_tangent))
+        self._mirrored: Hessians | None = None
         self._exact_is_current = False
         self._parallel = ParallelRollouts(problem, self._time_step)
         self.current = Trajectory(problem)
@@ -124,32 +127,52 @@ class ShootingWorkspace:
         self._run("cost_derivatives", horizon, buffer_table(*given, d.lx, d.lu, d.lxx, d.luu))
         end = states[-1:], *self.problem.terminal_inputs
         self._run("terminal_cost_derivatives", 1, buffer_table(*end, d.terminal_lx, d.terminal_lxx))
-        self._exact_is_current = False
+        self._exact_is_current, self._mirrored = False, None
 
     @timed("derivatives")
     def differentiate_twice(self) -> None:
         """Compute exact second derivatives along the current trajectory, unless they are current."""
         if self._exact_is_current:
             return
-        states, exact = self.current.states, self._exact
         find_costates(self.derivatives, self._costates)
+        self._find_hessians(self._exact)
+        self._exact_is_current = True
+
+    @timed("derivatives")
+    def mirror(self) -> None:
+        """Make the cost's exact second derivatives convex, unless that was done for this trajectory."""
+        if self._mirrored is not None:
+            return
+        n_tangent, exact = self.problem.n_tangent, self._exact
+        self._costates[:] = 0.0  # without them the Lagrangian is the cost
+        self._find_hessians(exact)
+        self._exact_is_current = False
+        upper = np.concatenate([exact.xx, exact.ux.transpose(0, 2, 1)], axis=2)
+        whole = mirrored(np.concatenate([upper, np.concatenate([exact.ux, exact.uu], axis=2)], axis=1))
+        xx, ux = whole[:, :n_tangent, :n_tangent], whole[:, n_tangent:, :n_tangent]
+        blocks = (xx, ux, whole[:, n_tangent:, n_tangent:], mirrored(exact.terminal_xx))
+        self._mirrored = Hessians(*map(np.ascontiguousarray, blocks))
+
+    def _find_hessians(self, found: Hessians) -> None:
+        """Run the kernels of second derivatives with the present costates."""
+        states = self.current.states
         given = (states, *self.problem.parameters.inputs, self.current.controls, self._costates)
-        buffers = buffer_table(*given, self._time_step, exact.xx, exact.ux, exact.uu)
+        buffers = buffer_table(*given, self._time_step, found.xx, found.ux, found.uu)
         self._run("lagrangian_hessian", self.problem.horizon, buffers)
         end = states[-1:], *self.problem.terminal_inputs
-        self._run("terminal_cost_hessian", 1, buffer_table(*end, exact.terminal_xx))
-        self._exact_is_current = True
+        self._run("terminal_cost_hessian", 1, buffer_table(*end, found.terminal_xx))
 
     @timed("backward_pass")
     def backward_pass(self, mu: float, *, exact: bool = False, gaps: FloatArray | None = None) -> PassResult:
         """Compute a control update; a pass that fails leaves the last update as it is.
 
-        Exact second derivatives need `differentiate_twice`. Gaps of the current trajectory, shape (N, n_t),
-        are closed by the update.
+        Exact second derivatives need `differentiate_twice`; otherwise those of `mirror` are used if it was
+        called, or else Gauss-Newton's. Gaps of the current trajectory, shape (N, n_t), are closed by the
+        update.
         """
         outcome = backward_pass(
             self.derivatives,
-            self._exact if exact else self._gauss_newton,
+            self._exact if exact else self._mirrored or self._gauss_newton,
             self._no_gaps if gaps is None else gaps,
             self.current.controls,
             *stage_bounds(self.problem),

@@ -114,6 +114,8 @@ def solve_again(expert: Expert, outcomes: list[Outcome], retries: list[Retry]) -
             library=[retry.neighbor],
             screw_motion=False,
             attempts=1,
+            coarsening=expert.solver.coarsening,
+            second_order=expert.solver.second_order,
             max_iterations=MOST_ITERATIONS,
         )
         solution = guide.solve(old.start, parameters=old.parameters)

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from experts.ddp.box_ddp import BoxDDP
+from experts.ddp.second_order import SecondOrder
 from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason
 from experts.guesses.policies import coarsened, follow, policies, refined, track
 from experts.guesses.reaching import HasTolerances, Reached, reach, solve_emphasized
@@ -45,8 +46,12 @@ NEAR_REGULARIZATION = 0.0
 """First regularization after an increase of the emphasis, or of the number of steps: the minimum is near."""
 LARGEST_COARSENING = 8
 """Most steps in a long one."""
-NEAR_ITERATIONS = 10
+NEAR_ITERATIONS = 20
 """Long steps are short enough if their policy is within so many iterations of the problem's own minimum."""
+CREEPING = 30
+"""Iterations in long steps beyond which Gauss-Newton's model creeps, and the mirrored one is tried."""
+CHEAPER = 0.999
+"""The mirrored model is taken if the cost of its minimum is below this share of Gauss-Newton's."""
 
 
 class _Guess(NamedTuple):
@@ -114,7 +119,8 @@ class GuidedDDP:
                 fine enough for the problem's own initial state; arms only.
             max_iterations: Most iterations from one guess.
             tolerance: See `BoxDDP`.
-            second_order: See `BoxDDP`.
+            second_order: See `BoxDDP`; where long steps are tried and Gauss-Newton's model creeps, None takes
+                the mirrored one if that finds a better minimum.
 
         Raises:
             ValueError: If a setting is out of range or unknown, the problem contradicts itself, or a solution
@@ -122,9 +128,12 @@ class GuidedDDP:
         """
         check_at_least("remember", remember, 0)
         check_at_least("attempts", attempts, 1)
-        self._solver = BoxDDP(
-            scene_or_problem, max_iterations=max_iterations, tolerance=tolerance, second_order=second_order
-        )
+        self._settings: dict[str, Any] = {
+            "max_iterations": max_iterations,
+            "tolerance": tolerance,
+            "second_order": second_order,
+        }
+        self._solver = BoxDDP(scene_or_problem, **self._settings)
         self.problem: ShootingProblem = self._solver.problem
         self.attempts = attempts
         self.reach_target = reach_target
@@ -133,6 +142,7 @@ class GuidedDDP:
         if screw_motion and isinstance(self.problem, ArmProblem):
             self._kinematic_guess = partial(guess_screw_motion, self.problem)
         self.compare = compare
+        self._chooses_model = second_order is None and self.problem.has_second_order
         self._vacancies = remember
         self._library = None if library is None else list(library)
         for i, solution in enumerate(self._library or ()):
@@ -167,6 +177,12 @@ class GuidedDDP:
         if self._coarsening is None:
             self._coarsening = self._find_coarsening()
         return self._coarsening
+
+    @property
+    def second_order(self) -> str:
+        """Second derivatives that it uses, see `BoxDDP`; found together with `coarsening`."""
+        _ = self.coarsening
+        return self._solver.second_order.value
 
     def solve(
         self,
@@ -326,30 +342,48 @@ class GuidedDDP:
             attempts=self.attempts,
             compare=True,
             coarsening=1,
-            max_iterations=self._solver.max_iterations,
-            tolerance=self._solver.tolerance,
-            second_order=self._solver.second_order.value,
+            **self._settings,
         )
 
     def _find_coarsening(self) -> int:
         """Find the longest steps whose policy leads to the minimum in the problem's own."""
-        problem, most = self.problem, self._solver.max_iterations
-        problem.parameters.set(None)
+        horizon = self.problem.horizon
         for factor in range(LARGEST_COARSENING, 1, -1):
-            if problem.horizon % factor == 0:
-                coarse = self._in_long_steps(factor)
-                for guess in self._coarse_guess(coarse, problem.initial_state, None):
-                    self._solver.max_iterations = NEAR_ITERATIONS
-                    try:
-                        solution = self._solve_from(guess, problem.initial_state)
-                    finally:
-                        self._solver.max_iterations = most
-                    if solution.stop_reason is StopReason.INTERRUPTED:
-                        raise KeyboardInterrupt
-                    if solution.converged:
-                        self._coarse = coarse
-                        return factor
+            if horizon % factor == 0:
+                coarse = self._with_best_model(factor)
+                if self._leads_to_minimum(coarse):
+                    self._coarse = coarse
+                    return factor
         return 1
+
+    def _with_best_model(self, factor: int) -> "GuidedDDP":
+        """Make the solver in long steps, with the mirrored model from now on if that pays."""
+        coarse = self._in_long_steps(factor)
+        if self._chooses_model and coarse.library and coarse.library[0].iterations > CREEPING:
+            settings = self._settings
+            self._settings = {**settings, "second_order": SecondOrder.MIRRORED.value}
+            mirrored = self._in_long_steps(factor)
+            if mirrored.library and mirrored.library[0].cost < CHEAPER * coarse.library[0].cost:
+                self._solver = BoxDDP(self.problem, **self._settings)
+                self._chooses_model = False
+                return mirrored
+            self._settings = settings
+        return coarse
+
+    def _leads_to_minimum(self, coarse: "GuidedDDP") -> bool:
+        """Whether the policy in long steps is near a minimum in the problem's own, from its own start."""
+        most, start = self._solver.max_iterations, self.problem.initial_state
+        self.problem.parameters.set(None)
+        for guess in self._coarse_guess(coarse, start, None):
+            self._solver.max_iterations = NEAR_ITERATIONS
+            try:
+                solution = self._solve_from(guess, start)
+            finally:
+                self._solver.max_iterations = most
+            if solution.stop_reason is StopReason.INTERRUPTED:
+                raise KeyboardInterrupt
+            return solution.converged
+        return False
 
     def _solve_initial_state(self) -> list[Solution]:
         """Solve the problem's own initial state; no solution if every rollout diverges."""

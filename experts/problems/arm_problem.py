@@ -38,7 +38,8 @@ class ArmProblem:
     def __init__(self, scene: Scene | str | Path, integrator: str | None = None) -> None:
         self.scene = in_double_precision(load_scene(scene), integrator)
         self.kernels = compile_scene(self.scene)
-        self.has_second_order = INTEGRATORS[self.scene.simulation.integrator].curvature is not None
+        self.integrator: str = self.scene.simulation.integrator
+        self.has_second_order = INTEGRATORS[self.integrator].curvature is not None
         layout = self.kernels.layout
         self.n_states, self.n_tangent, self.n_controls = layout.n_x, layout.n_t, layout.n_u
         self.horizon = self.scene.simulation.steps
@@ -59,6 +60,7 @@ class ArmProblem:
         """Return the same maneuver in fewer, longer steps; its costs are smaller by the factor.
 
         Only stages count in the cost, not their duration: the final pose loses weight as they become fewer.
+        The integrator is the one whose second derivatives serve the maneuver, so that they are exact.
 
         Args:
             factor: Steps in one of the longer steps; it divides the number of stages.
@@ -70,6 +72,7 @@ class ArmProblem:
             raise ValueError(f"factor is {factor}; it must divide the {self.horizon} stages")
         coarse = copy.copy(self)
         coarse.horizon, coarse.time_step = self.horizon // factor, self.time_step * factor
+        coarse.integrator = INTEGRATORS[self.integrator].curvature or self.integrator
         coarse._make_inputs(factor)
         return coarse
 
@@ -148,9 +151,9 @@ class ArmProblem:
     def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return a kernel of `ShootingProblem`."""
         name = "emphasized_terminal_cost" if name == "terminal_cost" else name
-        integrator = None
+        integrator: str | None = self.integrator
         if name == "lagrangian_hessian":
-            integrator = INTEGRATORS[self.scene.simulation.integrator].curvature
+            integrator = INTEGRATORS[self.integrator].curvature
         return self.kernels.kernel(name, integrator=integrator, lanes=None if batched else 1)
 
 

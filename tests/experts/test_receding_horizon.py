@@ -399,17 +399,18 @@ def test_the_plan_knows_what_remains_to_be_paid(plans):
     """The gradient of the remaining cost is what solves from displaced states say."""
     problem, plan = ArmProblem("paper"), plans["paper"]
     kernels = problem.kernels
-    made = ManeuverPlan.make(problem, plan.states[0], 0, plan)
+    planner = GuidedDDP(problem, library=[plan])
+    made = ManeuverPlan.make(planner, plan.states[0], 0)
     stage, size = 100, 1e-3
     direction = np.zeros(kernels.n_t)
     direction[[0, 4, 7, 13]] = 1.0, -0.5, 1.0, 0.3
     costs = [
-        ManeuverPlan.make(problem, kernels.retract(plan.states[stage], d), stage, plan).solution.cost
+        ManeuverPlan.make(planner, kernels.retract(plan.states[stage], d), stage, [plan]).solution.cost
         for d in (size * direction, -size * direction)
     ]
     slope = (costs[0] - costs[1]) / (2.0 * size)
     assert made.Vx[stage] @ direction == pytest.approx(slope, rel=1e-3)
-    remaining = ManeuverPlan.make(problem, plan.states[stage], stage, plan)
+    remaining = ManeuverPlan.make(planner, plan.states[stage], stage, [plan])
     np.testing.assert_allclose(remaining.Vxx[0], made.Vxx[stage], atol=1e-3 * np.abs(made.Vxx[stage]).max())
     assert np.linalg.eigvalsh(made.Vxx).min() > -1e-6
 

@@ -87,7 +87,12 @@ def costs_of(problem: ArmProblem, x0: FloatArray, guesses: Iterable[FloatArray])
     return np.array([roll_out(problem, x0, controls).cost for controls in guesses])
 
 
-TITLES = {SecondOrder.GAUSS_NEWTON: "Gauss-Newton", SecondOrder.EXACT: "exact", SecondOrder.HYBRID: "hybrid"}
+TITLES = {
+    SecondOrder.GAUSS_NEWTON: "Gauss-Newton",
+    SecondOrder.EXACT: "exact",
+    SecondOrder.HYBRID: "hybrid",
+    SecondOrder.MIRRORED: "mirrored",
+}
 """The variants of `BoxDDP` in tables."""
 GUIDED = "GuidedDDP"
 PAPERS_STATES = "paper's states"

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import list_scenes, load_scene
-from experts import BoxDDP, StopReason
+from experts import BoxDDP, GuidedDDP, StopReason
 from experts.ddp.backward_pass import PASS_COMPLETED
+from experts.ddp.derivatives import mirrored
 from experts.ddp.second_order import (
     LARGEST_MU,
     LONGEST_PAUSE,
@@ -79,7 +80,7 @@ def test_every_choice_ends_at_a_minimum(pendulum, name):
     solution = BoxDDP(pendulum, second_order=name).solve()
     assert solution.converged
     assert solution.optimality <= 1e-7
-    if name is not SecondOrder.HYBRID:
+    if name in (SecondOrder.GAUSS_NEWTON, SecondOrder.EXACT):
         assert np.all(solution.history["exact"] == (name is SecondOrder.EXACT))
 
 
@@ -200,7 +201,7 @@ def test_an_integrator_without_second_derivatives_leaves_gauss_newton():
     assert BoxDDP(problem).solve().cost < BoxDDP(problem, max_iterations=1).solve().cost
     with pytest.raises(ValueError, match="the problem has no exact second derivatives; gauss_newton needs"):
         BoxDDP(problem, second_order="exact")
-    plan = ManeuverPlan.make(problem, problem.initial_state, 5, BoxDDP(problem).solve())
+    plan = ManeuverPlan.make(GuidedDDP(problem), problem.initial_state, 5, [BoxDDP(problem).solve()])
     assert np.linalg.eigvalsh(plan.Vxx).min() > -1e-9
 
 
@@ -248,3 +249,37 @@ def test_is_exhausted_beyond_its_range() -> None:
     assert not regularization.exhausted
     regularization.increase()
     assert regularization.exhausted
+
+
+# The mirrored model ----------------------------------------------------------------------------------------
+
+
+def test_negative_eigenvalues_change_sign():
+    rng = np.random.default_rng(0)
+    matrices = rng.normal(size=(7, 6, 6))
+    matrices += matrices.transpose(0, 2, 1)
+    matrices[:, :, 4] = matrices[:, 4, :] = 0.0  # coupled with nothing
+    matrices[:, 4, 4] = -2.0
+    found = mirrored(matrices)
+    for before, after in zip(matrices, found, strict=True):
+        expected = np.sort(np.abs(np.linalg.eigvalsh(before)))
+        np.testing.assert_allclose(np.linalg.eigvalsh(after), expected, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(after @ after, before @ before, rtol=0, atol=1e-13)
+    positive = matrices @ matrices
+    np.testing.assert_allclose(mirrored(positive), positive, rtol=0, atol=1e-12)
+
+
+def test_the_mirrored_model_finds_the_same_minimum(pendulum):
+    mirrored_solution = BoxDDP(pendulum, second_order="mirrored").solve()
+    assert mirrored_solution.converged
+    assert mirrored_solution.cost == pytest.approx(BoxDDP(pendulum).solve().cost, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_the_mirrored_model_does_not_creep():
+    """Gauss-Newton's leaves out the curvature of the pose's cost."""
+    problem = ArmProblem("six-joint").coarsened(4)
+    solvers = (BoxDDP(problem, second_order=name, max_iterations=80) for name in ("mirrored", "hybrid"))
+    without_creeping, creeping = (solver.solve() for solver in solvers)
+    assert without_creeping.converged
+    assert without_creeping.cost < 0.95 * creeping.cost

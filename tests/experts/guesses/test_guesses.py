@@ -399,7 +399,7 @@ def test_long_steps_lead_to_the_same_minimum(paper, seed):
 
 def test_steps_too_long_for_a_scene_are_not_taken():
     """Joints that turn within a long step: no policy of theirs survives."""
-    scene = load_scene("planar").replace(simulation={"dt": 0.3, "steps": 56})
+    scene = load_scene("planar").replace(simulation={"dt": 1.0, "steps": 56})
     solver = GuidedDDP(scene)
     assert solver.coarsening == 1
     assert solver.solve().metadata["long_steps"] == []
