@@ -15,6 +15,7 @@ from experts import BoxDDP, CasadiProblem, runge_kutta
 
 CART, POLE, LENGTH, GRAVITY = 1.0, 0.2, 0.5, 9.81  # kg, kg, m, m/s^2; the pole's mass is at its end
 UPRIGHT = np.array([0.0, np.pi, 0.0, 0.0])  # position, m; angle from hanging, rad; their rates
+FORCE = 8.0  # largest force, N
 TIME_STEP = 0.02  # s
 
 
@@ -28,16 +29,16 @@ def rate(x: Any, u: Any) -> Any:
 
 
 def stage_cost(x: Any, u: Any) -> Any:
-    return TIME_STEP * (0.1 * x[0] ** 2 + 0.05 * u[0] ** 2)
+    weights = casadi.DM([1.0, 1.0, 0.1, 0.1])
+    return TIME_STEP * (casadi.dot(weights, (x - UPRIGHT) ** 2) + 0.1 * u[0] ** 2)
 
 
 def terminal_cost(x: Any) -> Any:
-    error = x - UPRIGHT
-    return casadi.dot(casadi.DM([100.0, 100.0, 10.0, 10.0]), error**2)
+    return casadi.dot(casadi.DM([100.0, 100.0, 10.0, 10.0]), (x - UPRIGHT) ** 2)
 
 
 def cart_pole() -> CasadiProblem:
-    """Make the problem: 3 s from hanging to upright, with a force of at most 6 N."""
+    """Make the problem: 3 s from hanging to upright, with a force of at most 8 N."""
     return CasadiProblem(
         runge_kutta(rate, TIME_STEP),
         stage_cost,
@@ -46,8 +47,8 @@ def cart_pole() -> CasadiProblem:
         n_controls=1,
         horizon=150,
         time_step=TIME_STEP,
-        control_lower=-6.0,
-        control_upper=6.0,
+        control_lower=-FORCE,
+        control_upper=FORCE,
     )
 
 
@@ -58,7 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
     milliseconds = 1e3 * float(np.median(solution.history["seconds"]))
     print(f"{solution.stop_reason} after {solution.iterations} iterations of {milliseconds:.2f} ms")
     print(f"cost {solution.cost:.6f}, final error {error:.1e}")
-    print(f"at a bound in {int((np.abs(solution.controls) == 6.0).sum())} of 150 stages")
+    print(f"at a bound in {int((np.abs(solution.controls) == FORCE).sum())} of 150 stages")
 
 
 if __name__ == "__main__":

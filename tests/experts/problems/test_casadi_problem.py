@@ -103,7 +103,7 @@ def test_functions_of_casadi_make_the_same_problem():
         casadi.Function("cost", [x, u], [cart_pole_example.stage_cost(x, u)]),
         casadi.Function("end", [x], [cart_pole_example.terminal_cost(x)]),
     )
-    settings = {"control_lower": -6.0, "control_upper": [6.0]}
+    settings = {"control_lower": -8.0, "control_upper": [8.0]}
     problem = CasadiProblem(step, cost, end, initial_state=[0] * 4, n_controls=1, horizon=150, **settings)
     expected, found = (BoxDDP(each, max_iterations=5).solve() for each in (plain, problem))
     assert found.cost == pytest.approx(expected.cost, rel=1e-9)
@@ -134,14 +134,14 @@ def optimum_of_ipopt(problem, example, solution, p=()):
 
 @pytest.mark.parametrize(
     ("second_order", "tolerance", "gap"),
-    [("gauss_newton", 1e-7, 1e-5), ("hybrid", 1e-12, 1e-7), ("exact", 1e-12, 1e-7)],
+    [("gauss_newton", 1e-7, 1e-5), ("hybrid", 1e-12, 1e-7)],
 )
 def test_cart_pole_swings_up_as_ipopt_does(second_order, tolerance, gap):
     problem = cart_pole()
     solution = BoxDDP(problem, second_order=second_order, tolerance=tolerance).solve()
     assert solution.converged
     assert np.abs(solution.states[-1] - cart_pole_example.UPRIGHT).max() < 0.02
-    assert np.abs(solution.controls).max() == 6.0
+    assert np.abs(solution.controls).max() == 8.0
     cost, controls = optimum_of_ipopt(problem, cart_pole_example, solution)
     assert solution.cost == pytest.approx(cost, rel=gap)
     np.testing.assert_allclose(solution.controls, controls, atol=20.0 * np.sqrt(gap))
