@@ -200,6 +200,14 @@ def test_every_solver_takes_the_problem():
     assert direct.policy()(direct.states[3], 3) == pytest.approx(direct.controls[3])
 
 
+def test_bounds_may_differ_from_stage_to_stage():
+    upper = np.linspace(0.1, 0.02, 20)[:, None] * [1.0, 1.0]
+    solution = BoxDDP(small(control_lower=-upper, control_upper=upper)).solve()
+    assert solution.converged
+    assert np.all(np.abs(solution.controls) <= upper)
+    assert np.any(np.abs(solution.controls) == upper)
+
+
 def test_parameters_may_differ_from_stage_to_stage():
     solver, rows = BoxDDP(small(), tolerance=1e-12), np.tile([0.7, 1.3], (21, 1))
     expected = solver.solve().cost
@@ -229,6 +237,8 @@ def test_parameters_may_differ_from_stage_to_stage():
         ({"control_upper": -1.0}, ValueError, "the lower one must not exceed the upper one"),
         ({"control_upper": "1"}, TypeError, "control_upper: of type"),
         ({"horizon": 0}, ValueError, "horizon is 0"),
+        ({"horizon": 10.0}, ValueError, r"horizon is 10\.0; it must be a whole number"),
+        ({"n_controls": -1}, ValueError, "n_controls is -1"),
         ({"time_step": -0.1}, ValueError, "time_step is -0.1"),
     ],
 )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from experts import BoxDDP, CasadiProblem, GuidedDDP, PythonProblem, runge_kutta
+from experts.problems.differences import hessian, jacobian
 
 STEP, HORIZON = 0.05, 40
 
@@ -99,6 +100,21 @@ def derivatives(twin):
 @pytest.fixture(scope="module")
 def expected(twin):
     return BoxDDP(twin, tolerance=1e-12).solve()
+
+
+def test_differences_have_the_digits_they_claim():
+    def curved(x):
+        return np.array([np.exp(x[0]) * np.sin(x[1]), x[0] * x[1]])
+
+    x = np.array([0.3, 0.8])
+    e, s, c = np.exp(0.3), np.sin(0.8), np.cos(0.8)
+    np.testing.assert_allclose(jacobian(curved, x), [[e * s, e * c], [0.8, 0.3]], rtol=3e-10)
+    bend = [[e * s, e * c], [e * c, -e * s]]
+    np.testing.assert_allclose(hessian(lambda x: curved(x)[0], x), bend, rtol=3e-7)
+    far = np.array([3.0, -200.0])  # the cost's rounding sets the error
+    found = hessian(lambda x: x @ x + x[0] * x[1], far)
+    np.testing.assert_allclose(found, [[2.0, 1.0], [1.0, 2.0]], atol=1e-7 * (far @ far))
+    np.testing.assert_allclose(jacobian(lambda x: x @ x, far), 2.0 * far, atol=1e-10 * (far @ far))
 
 
 def test_differences_lead_to_the_same_optimum(expected):
