@@ -196,8 +196,9 @@ def _static_single_assignment(function: casadi.Function) -> tuple[tuple[Node, ..
         elif operation in _OPERATION_NAMES:
             register[writes[0]] = add(Node(_OPERATION_NAMES[operation], tuple(register[r] for r in reads)))
         else:
+            names = (key for key, value in vars(casadi).items() if key[:3] == "OP_" and value == operation)
             raise NotImplementedError(
-                f"graph {function.name()!r} holds CasADi operation {operation}, "
+                f"graph {function.name()!r} holds CasADi operation {next(names, operation)}, "
                 "which the emitter has no instruction for"
             )
     return tuple(nodes), results
