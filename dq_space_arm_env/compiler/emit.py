@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from llvmlite import ir
 
 from dq_space_arm_env.compiler.elementary import arctangent2, sine_cosine
-from dq_space_arm_env.compiler.graph import Graph, Node, use_counts
+from dq_space_arm_env.compiler.graph import LIBRARY_FUNCTIONS, Graph, Node, use_counts
 from dq_space_arm_env.compiler.vector_builder import POINTER, Target, VectorBuilder
 
 _COMPARISONS = {"less": "<", "less_equal": "<=", "equal": "==", "not_equal": "!="}
@@ -129,6 +129,8 @@ class _GraphEmitter:
 
     def _emit_arithmetic(self, operation: str, values: list[ir.Value]) -> ir.Value:
         builder = self.builder
+        if operation in LIBRARY_FUNCTIONS:
+            return builder.library(LIBRARY_FUNCTIONS[operation], *values)
         match operation:
             case "multiply":
                 return builder.multiply(values[0], values[1])
@@ -146,6 +148,14 @@ class _GraphEmitter:
                 return builder.sqrt(values[0])
             case "absolute":
                 return builder.absolute(values[0])
+            case "sign":
+                zero, one = builder.constant(0.0), builder.constant(1.0)
+                size = builder.select(builder.compare("!=", values[0], zero), one, values[0])
+                return builder.negate_if(builder.compare("<", values[0], zero), size)
+            case "floor":
+                return builder.floor(values[0])
+            case "arctan":
+                return arctangent2(builder, values[0], builder.constant(1.0))
             case "arctan2":
                 return arctangent2(builder, values[0], values[1])
             case "minimum":

@@ -13,7 +13,7 @@ from typing import Any
 
 import casadi
 
-from dq_space_arm_env.compiler.graph import EXPRESSIONS, Graph, Node, graph_of
+from dq_space_arm_env.compiler.graph import EXPRESSIONS, LIBRARY_FUNCTIONS, Graph, Node, graph_of
 
 Expression = Any
 
@@ -24,6 +24,13 @@ COEFFICIENTS = ".coefficients"  # the buffer between both graphs
 def _arctan2(f: Expression, y: Expression, x: Expression) -> tuple[Expression, Expression]:
     scale = 1 / (x * x + y * y)
     return x * scale, -y * scale
+
+
+def _partials_by_casadi(operation: str, *arguments: Expression) -> tuple[Expression, ...]:
+    """Partial derivatives of an operation of the C library."""
+    symbols = [casadi.SX.sym(f"a_{i}") for i in range(len(arguments))]
+    value = EXPRESSIONS[operation](*symbols)
+    return tuple(casadi.substitute([casadi.jacobian(value, a) for a in symbols], symbols, list(arguments)))
 
 
 # For each argument of a node of value f, its partial derivative; CasADi folds 1 and -1.
@@ -39,6 +46,7 @@ _PARTIALS: Mapping[str, Callable[..., tuple[Expression, ...]]] = {
     "sqrt": lambda f, a: (0.5 / f,),
     "sin": lambda f, a: (casadi.cos(a),),
     "cos": lambda f, a: (-casadi.sin(a),),
+    "arctan": lambda f, a: (1 / (1 + a * a),),
     "arctan2": _arctan2,
     "absolute": lambda f, a: (casadi.lt(0, a) - casadi.lt(a, 0),),  # 0 at 0
 }
@@ -51,7 +59,7 @@ _SELECTIONS: Mapping[str, Callable[..., Expression]] = {
 }
 
 # Nodes that jump or stay: their derivative is zero.
-_PIECEWISE_CONSTANT = ("less", "less_equal", "equal", "not_equal", "not", "and", "or")
+_PIECEWISE_CONSTANT = ("sign", "floor", "less", "less_equal", "equal", "not_equal", "not", "and", "or")
 
 
 def dependencies(graph: Graph) -> dict[str, frozenset[str]]:
@@ -146,7 +154,11 @@ def _tangent(
         first, second = (_or_zero(change) for change in changes)
         return casadi.if_else(is_first, first, second)
     total: Expression = 0.0
-    for partial, change in zip(_PARTIALS[operation](value, *arguments), changes, strict=True):
+    if operation in LIBRARY_FUNCTIONS:
+        partials = _partials_by_casadi(operation, *arguments)
+    else:
+        partials = _PARTIALS[operation](value, *arguments)
+    for partial, change in zip(partials, changes, strict=True):
         if change is not None:
             total = total + partial * change
     return total

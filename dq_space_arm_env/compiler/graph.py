@@ -44,7 +44,27 @@ class Graph:
         return sum(node.operation not in ("input", "constant") for node in self.nodes)
 
 
+LIBRARY_FUNCTIONS: Mapping[str, str] = {
+    "exp": "exp",
+    "log": "log",
+    "power": "pow",
+    "tan": "tan",
+    "arcsin": "asin",
+    "arccos": "acos",
+    "sinh": "sinh",
+    "cosh": "cosh",
+    "tanh": "tanh",
+    "arcsinh": "asinh",
+    "arccosh": "acosh",
+    "arctanh": "atanh",
+    "log1p": "log1p",
+    "expm1": "expm1",
+}
+"""Operations that the C library computes, lane by lane, under its names, which are CasADi's too."""
+
 _OPERATION_NAMES = {
+    **{getattr(casadi, f"OP_{name.upper()}"): key for key, name in LIBRARY_FUNCTIONS.items()},
+    casadi.OP_CONSTPOW: "power",
     casadi.OP_ADD: "add",
     casadi.OP_SUB: "subtract",
     casadi.OP_MUL: "multiply",
@@ -56,8 +76,11 @@ _OPERATION_NAMES = {
     casadi.OP_SQRT: "sqrt",
     casadi.OP_SIN: "sin",
     casadi.OP_COS: "cos",
+    casadi.OP_ATAN: "arctan",
     casadi.OP_ATAN2: "arctan2",
     casadi.OP_FABS: "absolute",
+    casadi.OP_SIGN: "sign",
+    casadi.OP_FLOOR: "floor",
     casadi.OP_FMIN: "minimum",
     casadi.OP_FMAX: "maximum",
     casadi.OP_LT: "less",
@@ -72,6 +95,7 @@ _OPERATION_NAMES = {
 
 
 EXPRESSIONS: Mapping[str, Callable[..., Expression]] = {
+    **{key: getattr(casadi, name, casadi.power) for key, name in LIBRARY_FUNCTIONS.items()},
     "add": lambda a, b: a + b,
     "subtract": lambda a, b: a - b,
     "multiply": lambda a, b: a * b,
@@ -83,8 +107,11 @@ EXPRESSIONS: Mapping[str, Callable[..., Expression]] = {
     "sqrt": casadi.sqrt,
     "sin": casadi.sin,
     "cos": casadi.cos,
+    "arctan": casadi.atan,
     "arctan2": casadi.atan2,
     "absolute": casadi.fabs,
+    "sign": casadi.sign,
+    "floor": casadi.floor,
     "minimum": casadi.fmin,
     "maximum": casadi.fmax,
     "less": casadi.lt,
@@ -169,8 +196,9 @@ def _static_single_assignment(function: casadi.Function) -> tuple[tuple[Node, ..
         elif operation in _OPERATION_NAMES:
             register[writes[0]] = add(Node(_OPERATION_NAMES[operation], tuple(register[r] for r in reads)))
         else:
+            names = (key for key, value in vars(casadi).items() if key[:3] == "OP_" and value == operation)
             raise NotImplementedError(
-                f"graph {function.name()!r} holds CasADi operation {operation}, "
+                f"graph {function.name()!r} holds CasADi operation {next(names, operation)}, "
                 "which the emitter has no instruction for"
             )
     return tuple(nodes), results

@@ -74,6 +74,23 @@ class VectorBuilder:
             function = ir.Function(self.ir.module, signature, full_name)
         return self.ir.call(function, arguments)
 
+    def library(self, name: str, *arguments: ir.Value) -> ir.Value:
+        """Emit a call of a function of the C library for each lane."""
+        element = ELEMENTS[self.target.precision]
+        full_name = name if self.target.precision == "float64" else f"{name}f"
+        function = self.ir.module.globals.get(full_name)
+        if function is None:
+            signature = ir.FunctionType(element, [element] * len(arguments))
+            function = ir.Function(self.ir.module, signature, full_name)
+        if self.target.lanes == 1:
+            return self.ir.call(function, arguments)
+        result = ir.Constant(self.type, ir.Undefined)
+        for lane in range(self.target.lanes):
+            place = ir.IntType(32)(lane)
+            entries = [self.ir.extract_element(argument, place) for argument in arguments]
+            result = self.ir.insert_element(result, self.ir.call(function, entries), place)
+        return result
+
     def sqrt(self, a: ir.Value) -> ir.Value:
         return self._intrinsic("llvm.sqrt", a)
 

@@ -181,6 +181,18 @@ class KernelLibrary:
             )
 
 
+def compile_program(program: Program, lanes: int) -> BoundKernel:
+    """Compile a program that belongs to no scene, in double precision, or load it from the cache."""
+
+    def build() -> tuple[bytes, dict[str, Any]]:
+        from dq_space_arm_env.compiler.build import build_program
+
+        return build_program(program, lanes)
+
+    key = cache_key(repr(program), _source_hash(), str(lanes))
+    return BoundKernel(native.load_or_build(program.name, key, build))
+
+
 def matrices(entries: Array, rows: int, columns: int) -> Array:
     """Give matrices, stored row by row, their shape."""
     return entries.reshape(*entries.shape[:-1], rows, columns)

@@ -60,7 +60,8 @@ class BoxDDP:
         """Prepare the solver.
 
         Args:
-            scene_or_problem: A scene, or a `ShootingProblem`.
+            scene_or_problem: A scene, a `CasadiProblem` or `PythonProblem` of your own, or another
+                `ShootingProblem`.
             max_iterations: Most iterations of a solve.
             tolerance: Predicted reduction of an unregularized step, relative to the cost, below which the
                 solve has converged.
@@ -73,6 +74,7 @@ class BoxDDP:
             threads: Most threads that compute derivatives. More than one pays only where a core is idle.
 
         Raises:
+            TypeError: If scene_or_problem is neither a scene nor a problem.
             ValueError: If a setting is out of range, second_order is unknown or asks for derivatives that the
                 problem does not have, or the problem contradicts itself.
         """

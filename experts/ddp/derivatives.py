@@ -17,6 +17,7 @@ class Derivatives(NamedTuple):
     lu: FloatArray  # shape (N, n_u)
     lxx: FloatArray  # Hessian of the stage cost, positive semidefinite, shape (N, n_t, n_t)
     luu: FloatArray  # positive definite, shape (N, n_u, n_u)
+    lux: FloatArray  # shape (N, n_u, n_t), or (0, n_u, n_t) if it is zero
     terminal_lx: FloatArray  # shape (1, n_t)
     terminal_lxx: FloatArray  # positive semidefinite, shape (1, n_t, n_t)
 
@@ -35,7 +36,9 @@ class Hessians(NamedTuple):
     terminal_xx: FloatArray  # shape (1, n_t, n_t)
 
 
-def allocate_derivatives(horizon: int, n_tangent: int, n_controls: int) -> Derivatives:
+def allocate_derivatives(
+    horizon: int, n_tangent: int, n_controls: int, *, mixed: bool = False
+) -> Derivatives:
     return Derivatives(
         A=np.zeros((horizon, n_tangent, n_tangent)),
         B=np.zeros((horizon, n_tangent, n_controls)),
@@ -43,6 +46,7 @@ def allocate_derivatives(horizon: int, n_tangent: int, n_controls: int) -> Deriv
         lu=np.zeros((horizon, n_controls)),
         lxx=np.zeros((horizon, n_tangent, n_tangent)),
         luu=np.zeros((horizon, n_controls, n_controls)),
+        lux=np.zeros((horizon if mixed else 0, n_controls, n_tangent)),
         terminal_lx=np.zeros((1, n_tangent)),
         terminal_lxx=np.zeros((1, n_tangent, n_tangent)),
     )
@@ -50,10 +54,9 @@ def allocate_derivatives(horizon: int, n_tangent: int, n_controls: int) -> Deriv
 
 def gauss_newton_hessians(derivatives: Derivatives) -> Hessians:
     """Second derivatives of the cost alone, as views of the derivatives."""
-    _, n_tangent, n_controls = derivatives.B.shape
     return Hessians(
         xx=derivatives.lxx,
-        ux=np.zeros((0, n_controls, n_tangent)),
+        ux=derivatives.lux,
         uu=derivatives.luu,
         terminal_xx=derivatives.terminal_lxx,
     )

@@ -47,6 +47,7 @@ from experts.problems.shooting_problem import (
     FloatArray,
     check_array,
     check_control_weights,
+    native_calls,
 )
 
 MOST_ITERATIONS = 50
@@ -280,7 +281,8 @@ class MultipleShooting:
 
     def _run(self, name: str, rows: int, *arrays: FloatArray) -> None:
         """Run a kernel over the first rows of arrays."""
-        run_kernel(self._kernels[name].address, 0, rows, buffer_table(*arrays))
+        with native_calls(self.work.problem):
+            run_kernel(self._kernels[name].address, 0, rows, buffer_table(*arrays))
 
 
 def _next_level(level: int, alpha: float) -> int:
@@ -321,6 +323,9 @@ def change_of_cost(
                 curvature += derivatives.luu[k, i, j] * du[j]
             linear += derivatives.lu[k, i] * du[i]
             quadratic += 0.5 * du[i] * curvature
+            if derivatives.lux.shape[0] > 0:
+                for j in range(n_tangent):
+                    quadratic += du[i] * derivatives.lux[k, i, j] * dx[j]
         for i in range(n_tangent):
             curvature, moved = 0.0, gaps[k, i]
             for j in range(n_tangent):

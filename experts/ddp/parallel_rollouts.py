@@ -12,7 +12,7 @@ from dq_space_arm_env.kernels.bound import buffer_table
 from experts.ddp.backward_pass import Update
 from experts.native.compilation import BufferTable, call_kernel, compiled
 from experts.native.padded_algebra import FloatArray, add_product
-from experts.problems.shooting_problem import ShootingProblem
+from experts.problems.shooting_problem import ShootingProblem, native_calls
 
 LANES = 8
 """Step lengths per call: a whole number of vectors on any processor."""
@@ -97,17 +97,18 @@ class ParallelRollouts:
         alphas[: len(step_lengths)] = step_lengths
         states, controls = reference
         self._work.parameters[:] = self._problem.parameters.rows[:-1, None]
-        _roll_out(
-            self._kernels,
-            alphas,
-            states,
-            controls,
-            update.k,
-            update.K,
-            control_lower,
-            control_upper,
-            self._work,
-        )
+        with native_calls(self._problem):
+            _roll_out(
+                self._kernels,
+                alphas,
+                states,
+                controls,
+                update.k,
+                update.K,
+                control_lower,
+                control_upper,
+                self._work,
+            )
         return self._work.totals[: len(step_lengths)]
 
     def trajectory(self, lane: int) -> tuple[FloatArray, FloatArray]:

@@ -11,6 +11,7 @@ from experts.problems.shooting_problem import (
     FloatArray,
     Kernel,
     ShootingProblem,
+    native_calls,
     stage_bounds,
 )
 
@@ -148,15 +149,16 @@ class Trajectory:
 
     def roll_out(self, kernels: Mapping[str, Kernel]) -> float:
         """Roll out the controls from the first state; return the total cost, inf if it is not finite."""
-        self.cost, self.failing_stage = rollout(
-            kernels["step_with_cost"].address,
-            self._step_buffers,
-            kernels["terminal_cost"].address,
-            self._terminal_buffers,
-            self.states,
-            self.stage_costs,
-            self.terminal_cost,
-        )
+        with native_calls(self._problem):
+            self.cost, self.failing_stage = rollout(
+                kernels["step_with_cost"].address,
+                self._step_buffers,
+                kernels["terminal_cost"].address,
+                self._terminal_buffers,
+                self.states,
+                self.stage_costs,
+                self.terminal_cost,
+            )
         return self.cost
 
     def follow(
@@ -179,23 +181,24 @@ class Trajectory:
             step_buffers = self._buffers_of_step(landings)
             retract = kernels[RETRACTION_KERNEL_NAME].address
             retract_buffers = buffer_table(landings, offsets, self.states[1:])
-        self.cost, self.failing_stage = closed_loop_rollout(
-            kernels["difference"].address,
-            buffer_table(reference[0], self.states, self._deviations),
-            kernels["step_with_cost"].address,
-            step_buffers,
-            retract,
-            retract_buffers,
-            kernels["terminal_cost"].address,
-            self._terminal_buffers,
-            reference[1],
-            *policy,
-            float(alpha),
-            *stage_bounds(self._problem),
-            self.states,
-            self.controls,
-            self._deviations,
-            self.stage_costs,
-            self.terminal_cost,
-        )
+        with native_calls(self._problem):
+            self.cost, self.failing_stage = closed_loop_rollout(
+                kernels["difference"].address,
+                buffer_table(reference[0], self.states, self._deviations),
+                kernels["step_with_cost"].address,
+                step_buffers,
+                retract,
+                retract_buffers,
+                kernels["terminal_cost"].address,
+                self._terminal_buffers,
+                reference[1],
+                *policy,
+                float(alpha),
+                *stage_bounds(self._problem),
+                self.states,
+                self.controls,
+                self._deviations,
+                self.stage_costs,
+                self.terminal_cost,
+            )
         return self.cost

@@ -34,6 +34,7 @@ from experts.problems.shooting_problem import (
     SECOND_ORDER_KERNEL_NAMES,
     FloatArray,
     ShootingProblem,
+    native_calls,
     stage_bounds,
 )
 
@@ -92,7 +93,7 @@ class ShootingWorkspace:
         self.problem = problem
         self.time = WorkTime()
         self._threads = threads
-        self.derivatives = allocate_derivatives(*sizes)
+        self.derivatives = allocate_derivatives(*sizes, mixed=problem.has_mixed_cost)
         self.update: Update = allocate_update(*sizes, keep_values=keep_values)
         self._spare_update: Update = allocate_update(*sizes, keep_values=keep_values)
         self._time_step = np.array([problem.time_step])
@@ -124,7 +125,8 @@ class ShootingWorkspace:
         states, d, horizon = self.current.states, self.derivatives, self.problem.horizon
         given = (states, *self.problem.parameters.inputs, self.current.controls)
         self._run("linearize", horizon, buffer_table(*given, self._time_step, d.A, d.B))
-        self._run("cost_derivatives", horizon, buffer_table(*given, d.lx, d.lu, d.lxx, d.luu))
+        mixed = (d.lux,) if self.problem.has_mixed_cost else ()
+        self._run("cost_derivatives", horizon, buffer_table(*given, d.lx, d.lu, d.lxx, d.luu, *mixed))
         end = states[-1:], *self.problem.terminal_inputs
         self._run("terminal_cost_derivatives", 1, buffer_table(*end, d.terminal_lx, d.terminal_lxx))
         self._exact_is_current, self._mirrored = False, None
@@ -233,7 +235,8 @@ class ShootingWorkspace:
         def work_on(begin: int, end: int) -> None:
             run_kernel(address, begin, end, buffers)
 
-        share_rows(work_on, rows, self._threads, _STAGES_PER_BLOCK)
+        with native_calls(self.problem):
+            share_rows(work_on, rows, self._threads, _STAGES_PER_BLOCK)
 
 
 SHORTER_STEPS: FloatArray = np.float64(0.5) ** np.arange(1, LANES + 1)

@@ -102,7 +102,8 @@ class GuidedDDP:
         """Prepare the solver.
 
         Args:
-            scene_or_problem: A scene, or a `ShootingProblem`.
+            scene_or_problem: A scene, a `CasadiProblem` or `PythonProblem` of your own, or another
+                `ShootingProblem`.
             library: Solutions of this problem or a similar one, such as the scene with another target. None
                 solves the problem's own initial state, once, on first use; an empty library leaves the other
                 guesses.
@@ -123,6 +124,7 @@ class GuidedDDP:
                 the mirrored one if that finds a better minimum.
 
         Raises:
+            TypeError: If scene_or_problem is neither a scene nor a problem.
             ValueError: If a setting is out of range or unknown, the problem contradicts itself, or a solution
                 of the library is not finite or has other sizes than the problem.
         """

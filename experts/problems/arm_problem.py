@@ -1,7 +1,7 @@
 """A scene as a shooting problem: its kernels, bounds, horizon and start under the names the solver uses."""
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from experts.problems.shooting_problem import (
     Kernel,
     ShootingProblem,
     StageParameters,
+    check_interface,
     check_problem,
 )
 
@@ -34,8 +35,9 @@ class ArmProblem:
     """
 
     has_retraction = True
+    has_mixed_cost = False
 
-    def __init__(self, scene: Scene | str | Path, integrator: str | None = None) -> None:
+    def __init__(self, scene: Scene | str | Path | Mapping[str, Any], integrator: str | None = None) -> None:
         self.scene = in_double_precision(load_scene(scene), integrator)
         self.kernels = compile_scene(self.scene)
         self.integrator: str = self.scene.simulation.integrator
@@ -158,9 +160,15 @@ class ArmProblem:
 
 
 def as_problem(scene_or_problem: Any) -> ShootingProblem:
-    """Turn a scene into a problem, and check sizes and bounds; a problem passes unchanged."""
-    is_problem = hasattr(scene_or_problem, "kernel")
-    problem: ShootingProblem = scene_or_problem if is_problem else ArmProblem(scene_or_problem)
+    """Turn a scene into a problem, and check sizes and bounds; a problem passes unchanged.
+
+    Raises TypeError for what is neither, and ValueError for a problem that contradicts itself.
+    """
+    if isinstance(scene_or_problem, Scene | str | Path | Mapping):
+        problem: ShootingProblem = ArmProblem(scene_or_problem)
+    else:
+        check_interface(scene_or_problem)
+        problem = scene_or_problem
     check_problem(problem)
     return problem
 
@@ -185,12 +193,14 @@ class WindowProblem:
             n_t) and symmetric Hessian (1, n_t, n_t).
     """
 
+    has_retraction = True
+    has_mixed_cost = False
+
     def __init__(self, maneuver: ArmProblem, horizon: int, model: tuple[FloatArray, ...] = ()) -> None:
         self.maneuver, self.horizon, self.ends_early = maneuver, horizon, bool(model)
         self.parameters = StageParameters(horizon, maneuver.parameters.nominal)
         self.terminal_inputs = model or maneuver.terminal_inputs
         self.has_second_order = maneuver.has_second_order and not self.ends_early
-        self.has_retraction = True
         self.n_states, self.n_tangent = maneuver.n_states, maneuver.n_tangent
         self.n_controls = maneuver.n_controls
         self.time_step = maneuver.time_step

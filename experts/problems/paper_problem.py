@@ -20,6 +20,7 @@ class PaperProblem:
     terminal_inputs = ()
     has_second_order = False
     has_retraction = False
+    has_mixed_cost = False
 
     def __init__(self, scene: Scene | str | Path = "paper") -> None:
         """Load a scene.

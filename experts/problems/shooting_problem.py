@@ -10,7 +10,7 @@ kernels. Every kernel works on rows (`experts.native.compilation`); its buffers,
 | `step_with_cost` | x (n_x), u (n_u), h (one scalar for all rows); x_next (n_x), cost (1) |
 | `terminal_cost` | x (n_x); cost (1) |
 | `linearize` | x (n_x), u (n_u), h (one scalar for all rows); A (n_t, n_t), B (n_t, n_u) |
-| `cost_derivatives` | x (n_x), u (n_u); lx (n_t), lu (n_u), lxx (n_t, n_t), luu (n_u, n_u) |
+| `cost_derivatives` | x (n_x), u (n_u); lx (n_t), lu (n_u), lxx (n_t, n_t), luu (n_u, n_u), lux (n_u, n_t) |
 | `terminal_cost_derivatives` | x (n_x); lx (n_t), lxx (n_t, n_t) |
 | `lagrangian_hessian` | x, u, multiplier (n_t), h; Lxx (n_t, n_t), Lux (n_u, n_t), Luu (n_u, n_u) |
 | `terminal_cost_hessian` | x (n_x); Lxx (n_t, n_t) |
@@ -22,23 +22,25 @@ after the state. The three kernels of the terminal cost read the arrays of `term
 there.
 
 Output arrays of the derivative kernels start as zeros, and only the kernels write to them, so a kernel may
-skip entries that are always zero. The mixed derivative lux of the stage cost is taken to be zero.
+skip entries that are always zero. Only problems with `has_mixed_cost` have the mixed derivative lux of the
+stage cost; the others' is zero, and their kernel has no such buffer.
 
-lxx and luu may be convex approximations: Gauss-Newton's. `lagrangian_hessian` and `terminal_cost_hessian`
-give exact second derivatives, and only problems with `has_second_order` need them: Lxx, Lux and Luu are those
-of the stage cost + multiplier . (step(x (+) z, u) (-) step(x, u)) with respect to tangent state z and control
-u. `retract`, the inverse of `difference`, removes rounding errors from a pose; it serves guesses of the
-states, and only problems with `has_retraction` need it.
+lxx, luu and lux may be convex approximations: Gauss-Newton's. `lagrangian_hessian` and
+`terminal_cost_hessian` give exact second derivatives, and only problems with `has_second_order` need them:
+Lxx, Lux and Luu are those of the stage cost + multiplier . (step(x (+) z, u) (-) step(x, u)) with respect to
+tangent state z and control u. `retract`, the inverse of `difference`, removes rounding errors from a pose; it
+serves guesses of the states, and only problems with `has_retraction` need it.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Protocol
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.common.shown_text import shortened
 
 FloatArray = NDArray[np.float64]
 
@@ -160,6 +162,10 @@ class ShootingProblem(Protocol):
         """Whether the problem has the kernels `SECOND_ORDER_KERNEL_NAMES`."""
 
     @property
+    def has_mixed_cost(self) -> bool:
+        """Whether `cost_derivatives` writes lux."""
+
+    @property
     def has_retraction(self) -> bool:
         """Whether the problem has the kernel `RETRACTION_KERNEL_NAME`."""
 
@@ -176,6 +182,29 @@ class ShootingProblem(Protocol):
             The kernel.
         """
         ...
+
+
+def native_calls(problem: ShootingProblem) -> AbstractContextManager[None]:
+    """Surround native calls: a kernel written in Python raises after them what native code cannot pass on."""
+    surround: AbstractContextManager[None] = getattr(problem, "native_calls", nullcontext)()
+    return surround
+
+
+def check_interface(candidate: Any) -> None:
+    """Raise TypeError if an object is no `ShootingProblem`, and say what would be one."""
+    required = [name for name in vars(ShootingProblem) if not name.startswith("_")]
+    missing = [name for name in required if not hasattr(candidate, name)]
+    if not (missing or isinstance(candidate, type)):
+        return
+    reason = ""
+    if isinstance(candidate, type):
+        reason = "; it is a class, give an object of it"
+    elif hasattr(candidate, "kernel"):
+        reason = f"; it lacks {', '.join(missing)}"
+    raise TypeError(
+        f"{shortened(candidate)} is neither a scene nor a problem{reason}. Give a scene or its name, a "
+        "CasadiProblem or PythonProblem of your own functions, or whatever has all of ShootingProblem"
+    )
 
 
 def check_problem(problem: ShootingProblem) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dq_space_arm_env.compiler.graph import Graph
+from dq_space_arm_env.compiler.graph import LIBRARY_FUNCTIONS, Graph
 from dq_space_arm_env.compiler.program import Program
 
 
@@ -16,6 +16,10 @@ def _arctan2(y, x):
 
 
 _OPERATIONS = {
+    **{name: getattr(np, name) for name in LIBRARY_FUNCTIONS},
+    "arctan": np.arctan,
+    "sign": lambda a: np.sign(np.real(a)),
+    "floor": lambda a: np.floor(np.real(a)),
     "add": lambda a, b: a + b,
     "subtract": lambda a, b: a - b,
     "multiply": lambda a, b: a * b,

@@ -73,6 +73,27 @@ def test_every_operation_agrees_with_numpy(lanes, precision):
     np.testing.assert_allclose(found, expected, rtol=18 * eps, atol=2 * eps)
 
 
+def of_the_library(x):
+    """Functions that the C library computes, each within its domain; |x| < 1."""
+    names = ("exp", "log", "tan", "asin", "acos", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
+    shifted = {"log": x[0] + 1.5, "acosh": x[0] + 2.5}
+    functions = [getattr(casadi, name)(shifted.get(name, x[0])) for name in names]
+    powers = [(x[0] + 1.5) ** x[1], (x[0] + 1.5) ** 2.5, x[0] ** 3, casadi.log1p(x[1]), casadi.expm1(x[1])]
+    return {"y": [*functions, *powers, casadi.atan(3.0 * x[1]), casadi.sign(x[1]), casadi.floor(4.0 * x[1])]}
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_functions_of_the_library_agree_with_numpy_and_lanes_with_scalars(precision):
+    x = np.random.default_rng(0).uniform(-0.9, 0.9, size=(21, 2)).astype(precision)
+    x[0, 1] = 0.0
+    graph = trace("graph", {"x": 2}, of_the_library)
+    expected = np.array([evaluate_graph(graph, [row.astype(float)], np.float64)[0] for row in x])
+    size = expected.shape[1]
+    one, many = (evaluate(of_the_library, size, lanes, x, p) for lanes, p in EVERY_CODE if p == precision)
+    np.testing.assert_array_equal(one, many)
+    np.testing.assert_allclose(one, expected, rtol=20 * np.finfo(precision).eps, atol=0.0)
+
+
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("rows", [1, 2, 7, 8, 9, 16, 23, 33])
 def test_lanes_give_the_bits_of_the_scalar_code(rows, precision):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from graph_interpreter import evaluate_program
 from random_programs import random_program
+from test_compiler_native import of_the_library
 
 from dq_space_arm_env.compiler import native
 from dq_space_arm_env.compiler.build import build_program
@@ -51,6 +52,17 @@ def assert_derivatives(make, inputs, by, of, rtol=1e-12):
 
 
 # Against complex steps ------------------------------------------------------------------------------------
+
+
+def test_functions_of_the_library():
+    def program():
+        graph = trace("graph", {"x": 2}, of_the_library)
+        program = Program("program", [Buffer("x", 2)], [])
+        program.call(graph)
+        return program
+
+    for x in np.random.default_rng(0).uniform(-0.9, 0.9, size=(4, 2)):
+        assert_derivatives(program, {"x": x}, "x", "y")
 
 
 def everything(x, p):

@@ -53,6 +53,7 @@ class PythonProblem:
     cost_derivatives: Callable[[Array, Array], tuple[Array, Array, Array, Array]]
     terminal_cost_derivatives: Callable[[Array], tuple[Array, Array]]
     terminal_inputs: tuple[Array, ...] = ()
+    has_mixed_cost: bool = False
     lagrangian_hessian: Callable[[Array, Array, Array, float], tuple[Array, Array, Array]] | None = None
     terminal_cost_hessian: Callable[[Array], Array] | None = None
     retract: Callable[[Array, Array], Array] | None = None

@@ -33,13 +33,16 @@ from dq_space_arm_env import (
 )
 from experts import (
     BoxDDP,
+    CasadiProblem,
     GuidedDDP,
+    PythonProblem,
     RecedingHorizonExpert,
     ShootingProblem,
     Solution,
     StopReason,
     generate_demonstrations,
     load_demonstrations,
+    runge_kutta,
 )
 
 
@@ -70,10 +73,18 @@ def solve(scene: Scene) -> Solution:
     return other if control.size + action.size else Solution.load("solution.npz")
 
 
-def optimize(problem: ShootingProblem, kernels: Kernels) -> StopReason:
+def optimize(problem: ShootingProblem) -> StopReason:
     """Solve a problem of one's own."""
-    solution = BoxDDP(problem).solve(kernels.layout.initial_state)
-    return solution.stop_reason
+    return BoxDDP(problem).solve(problem.initial_state).stop_reason
+
+
+def own_problems() -> list[StopReason]:
+    """Write problems of one's own."""
+    step = runge_kutta(lambda x, u: [x[1], u[0]], 0.1)
+    given = step, lambda x, u: u[0] ** 2, lambda x: x[0] ** 2 + x[1] ** 2
+    symbolic = CasadiProblem(*given, initial_state=[1, 0], n_controls=1, horizon=9, control_upper=1.0)
+    plain = PythonProblem(*given, initial_state=np.ones(2), n_controls=1, horizon=9, parameters=())
+    return [optimize(symbolic), optimize(plain)]
 
 
 def other_engines(scene: Scene) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The examples run, show what their headers promise, and draw a picture."""
+"""The examples run, and show what their headers promise; most draw a picture."""
 
 import importlib
 import json
@@ -86,3 +86,22 @@ def test_train_ppo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(lines) >= 1
     assert f"{json.loads(lines[-1])['environment_steps']:,}" in printed
     assert is_picture(tmp_path / "train_ppo.png")
+
+
+def test_cart_pole(capsys: pytest.CaptureFixture[str]) -> None:
+    run("cart_pole")
+    printed = capsys.readouterr().out
+    assert rows(printed, r"^converged after (\d+) iterations of ([\d.]+) ms$")[0][0] < 100
+    [[cost, error]] = rows(printed, r"^cost ([\d.]+), final error (\S+)$")
+    assert cost == pytest.approx(24.0214, rel=1e-5)
+    assert error < 0.01
+    assert rows(printed, r"^at a bound in (\d+) of")[0][0] > 10
+
+
+def test_planar_quadrotor(capsys: pytest.CaptureFixture[str]) -> None:
+    run("planar_quadrotor")
+    pattern = r"converged after (\d+) iterations of [\d.]+ ms, cost ([\d.]+), final error (\S+)$"
+    first, second = rows(capsys.readouterr().out, pattern)
+    assert first[1] == pytest.approx(14.6355, rel=1e-5)
+    assert second[0] < first[0] < 50
+    assert max(first[2], second[2]) < 0.06

@@ -5,6 +5,7 @@ iterations      what an iteration costs, whole and in pieces
 accuracy        how soon solvers come close to the best known cost, from the same start
 random_starts   how often solvers converge, succeed, and find the best known minimum
 receding        the receding-horizon expert under disturbances
+own_problems    problems of one's own: cart-pole and planar quadrotor, beside Crocoddyl
 """
 
 from __future__ import annotations
@@ -23,12 +24,13 @@ from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, note, time_column
 from scripts.benchmarks.solvers.accuracy import NOMINAL_START, compare_solvers, contenders
 from scripts.benchmarks.solvers.iterations import measure_iterations
+from scripts.benchmarks.solvers.own_problems import measure_own_problems
 from scripts.benchmarks.solvers.random_starts import draw_starts, measure_starts
 from scripts.benchmarks.solvers.receding import measure_flights
 from scripts.benchmarks.solvers.runs import GAPS, Search, uninterrupted
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
 
-ITERATIONS, ACCURACY, STARTS, HORIZON = PARTS = ("iterations", "accuracy", "starts", "horizon")
+ITERATIONS, ACCURACY, STARTS, HORIZON, OWN = PARTS = ("iterations", "accuracy", "starts", "horizon", "own")
 
 
 def measure(effort: Effort) -> Iterator[Row]:
@@ -65,6 +67,8 @@ def measure(effort: Effort) -> Iterator[Row]:
                 yield from measure_starts(problem, guided, effort)
         if HORIZON in parts:
             yield from measure_flights(ArmProblem(scene), effort)
+    if OWN in parts:
+        yield from measure_own_problems(effort)
 
 
 def _compare(problem: ArmProblem, guided: GuidedDDP, effort: Effort) -> Iterator[Row]:
@@ -181,6 +185,21 @@ BENCHMARK = Benchmark(
                 Column("position_error_m", "error\nm"),
             ),
             by=("scene",),
+        ),
+        Table(
+            "own problems",
+            "Problem of one's own: {name}\nthe same kernels for all; best and median solve",
+            (
+                "solver",
+                Column("iterations", "itera-\ntions"),
+                Column("converged", "con-\nverged"),
+                Column("cost", "cost J", ".8g"),
+                Column("above_best", "above\nbest", ".0e"),
+                time_column("best_ms", "solve\nms"),
+                time_column("median_ms", "median"),
+                time_column("ms_per_iteration", "ms per\niter."),
+            ),
+            by=("name",),
         ),
     ),
     pictures=(

@@ -27,7 +27,7 @@ NO_GAPS = np.zeros((0, 1))
 
 def random_derivatives(seed: int, horizon: int, n_tangent: int, n_controls: int) -> Derivatives:
     rng = np.random.default_rng(seed)
-    d = allocate_derivatives(horizon, n_tangent, n_controls)
+    d = allocate_derivatives(horizon, n_tangent, n_controls, mixed=True)
     d.A[:] = np.eye(n_tangent) + 0.2 * rng.normal(size=d.A.shape) / np.sqrt(n_tangent)
     d.B[:] = 0.3 * rng.normal(size=d.B.shape)
     roots = rng.normal(size=(horizon + 1, n_tangent, n_tangent)) / np.sqrt(n_tangent)

@@ -1,0 +1,42 @@
+"""Problems of one's own beside Crocoddyl: rows, and the same optimum from the same kernels."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experts import BoxDDP
+from scripts.benchmarks.effort import QUICK
+from scripts.benchmarks.peers import crocoddyl_kernels
+from scripts.benchmarks.solvers.own_problems import measure_own_problems
+from scripts.benchmarks.solvers.runs import TITLES
+from scripts.examples.cart_pole import cart_pole
+from scripts.examples.planar_quadrotor import HOVER, planar_quadrotor
+
+
+def test_own_problems_are_measured_without_other_solvers() -> None:
+    found = list(measure_own_problems(replace(QUICK, max_iterations=100)))
+    rows = [row for row in found if row["table"] == "own problems"]
+    assert {row["name"] for row in rows} == {"cart-pole", "planar quadrotor"}
+    assert [row["solver"] for row in rows[:3]] == [f"BoxDDP, {title}" for title in TITLES.values()]
+    assert all(row["converged"] for row in rows if row["solver"] == "BoxDDP, hybrid")
+    assert all(row["status"] == "handled" for row in found if row["table"] == "claims")
+    assert [row["note"] for row in found if row["table"] == "notes"] == ["Other solvers are left out."]
+
+
+def test_crocoddyl_finds_the_same_optima_with_the_same_kernels() -> None:
+    sentence = crocoddyl_kernels.obstacle()
+    if sentence is not None:
+        pytest.skip(sentence)
+    for problem, first in ((cart_pole(), 0.0), (planar_quadrotor(), HOVER)):
+        controls = np.full((problem.horizon, problem.n_controls), first)
+        expected = BoxDDP(problem).solve(u_init=controls)
+        for method in crocoddyl_kernels.METHODS:
+            found, seconds, costs, converged = crocoddyl_kernels.solve_with_crocoddyl(
+                problem, controls, method=method, max_iterations=300
+            )
+            replayed = BoxDDP(problem, max_iterations=0).solve(u_init=found).cost
+            assert converged
+            assert np.all(np.diff(seconds) > 0.0)
+            assert replayed == pytest.approx(costs[-1], rel=1e-12)
+            assert replayed == pytest.approx(expected.cost, rel=1e-5)
