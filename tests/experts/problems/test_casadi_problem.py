@@ -253,7 +253,11 @@ def test_a_control_without_a_weight_is_refused():
         BoxDDP(problem).solve()
 
 
-@pytest.mark.parametrize("thing", [42, None, (1, 2), lambda x, u: x, CasadiProblem], ids=str)
+@pytest.mark.parametrize(
+    "thing",
+    [42, None, (1, 2), lambda x, u: x, CasadiProblem],
+    ids=["int", "None", "tuple", "function", "class"],
+)
 def test_what_is_no_problem_is_refused(thing):
     with pytest.raises(TypeError, match=r"neither a scene nor a problem.*Give a scene or its name"):
         BoxDDP(thing)
