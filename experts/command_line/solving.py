@@ -154,6 +154,10 @@ def table(run: SolveRun) -> Table:
     if run.preparation_iterations is not None:
         prepared += f"; the maneuver from its own start, {run.preparation_iterations} iterations"
     seconds = f"{run.solve_seconds:.2f} s"
+    long_steps = solution.metadata.get("long_steps", ())
+    if long_steps:
+        prepared += " in long steps"
+        seconds += f", after {sum(attempt['iterations'] for attempt in long_steps)} in long steps"
     if solution.converged and solution.iterations == 0:
         seconds += ": the initial guess is already optimal"
     rows = (

@@ -114,7 +114,7 @@ def solve_again(expert: Expert, outcomes: list[Outcome], retries: list[Retry]) -
             library=[retry.neighbor],
             screw_motion=False,
             attempts=1,
-            coarsening=expert.solver.coarsening,
+            coarsening=1,  # the rollout that promises more was in the problem's own steps
             second_order=expert.solver.second_order,
             max_iterations=MOST_ITERATIONS,
         )

@@ -46,7 +46,7 @@ NEAR_REGULARIZATION = 0.0
 """First regularization after an increase of the emphasis, or of the number of steps: the minimum is near."""
 LARGEST_COARSENING = 8
 """Most steps in a long one."""
-NEAR_ITERATIONS = 20
+NEAR_ITERATIONS = 10
 """Long steps are short enough if their policy is within so many iterations of the problem's own minimum."""
 CREEPING = 30
 """Iterations in long steps beyond which Gauss-Newton's model creeps, and the mirrored one is tried."""
