@@ -316,7 +316,7 @@ def test_a_library_serves_the_same_scene_with_another_target(seed):
     start = start_from_draws(scene, draws)
     p = parameter_values(scene, episode_start(scene, draws.tolist()))
     library = GuidedDDP(scene).library
-    solution = GuidedDDP(scene, library=library, screw_motion=False).solve(start, parameters=p)
+    solution = GuidedDDP(scene, library=library, screw_motion=False, attempts=1).solve(start, parameters=p)
     alone = GuidedDDP(episode_scene(scene, p)).solve(start)
     assert solution.converged
     assert solution.metadata["guess"] == "policy 0, moved"
@@ -347,7 +347,8 @@ def test_fifty_random_starts(paper):
 @pytest.mark.slow
 def test_a_second_guess_helps_where_the_first_does_not_converge():
     start = random_start("far", 31)
-    solvers = (GuidedDDP("far", attempts=attempts, max_iterations=100) for attempts in (1, 2))
+    settings = {"max_iterations": 100, "coarsening": 1}
+    solvers = (GuidedDDP("far", attempts=attempts, **settings) for attempts in (1, 2))
     first, both = (solver.solve(start) for solver in solvers)
     assert not first.converged
     assert both.converged
