@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from experts.ddp.backward_pass import PASS_NOT_FINITE, PASS_NOT_POSITIVE_DEFINITE, PassResult
 from experts.ddp.multiple_shooting import MultipleShooting
 from experts.ddp.rollout import FINISHED
-from experts.ddp.second_order import EXACT_MU, Regularization, SecondOrder, SolverState
+from experts.ddp.second_order import EXACT_MU, WEAK_EXACT_MU, Regularization, SecondOrder, SolverState
 from experts.ddp.shooting import ShootingWorkspace, WorkTime, line_search
 from experts.ddp.solution import HISTORY_DTYPE, Callback, IterationRecord, Solution, Stop, StopReason
 from experts.problems.arm_problem import as_problem
@@ -191,8 +191,7 @@ class BoxDDP:
     def _exact_backward_pass(self) -> PassResult:
         """Use exact second derivatives under weak regularization only; the pass may fail."""
         self._work.differentiate_twice()
-        # Unlike Gauss-Newton's, a mirrored model is worth more than an exact one, strongly regularized.
-        for mu in EXACT_MU[: 3 if self.second_order is SecondOrder.MIRRORED else None]:
+        for mu in WEAK_EXACT_MU if self.second_order is SecondOrder.MIRRORED else EXACT_MU:
             direction = self._work.backward_pass(mu, exact=True)
             if direction.status != PASS_NOT_POSITIVE_DEFINITE:
                 break

@@ -27,6 +27,8 @@ SLOW_STEPS = 2
 """Consecutive slow steps after which the hybrid tries the exact model."""
 EXACT_MU = (1e-3, 1e-1, 1e1, 1e3)
 """Regularizations with which the hybrid tries the exact model, in multiples of the control weights."""
+WEAK_EXACT_MU = EXACT_MU[:-1]
+"""The same beside the mirrored model, which is worth more than an exact one under strong regularization."""
 LONGEST_PAUSE = 8
 """Most iterations that the hybrid waits before it tries the exact model again."""
 

@@ -150,10 +150,11 @@ class GuidedDDP:
         for i, solution in enumerate(self._library or ()):
             _check_sizes(f"library[{i}]", solution, self.problem)
         self._coarse: GuidedDDP | None = None
-        self._coarsening = (
-            1 if coarsening is None and not isinstance(self.problem, ArmProblem) else coarsening
-        )
-        if self._coarsening is not None and self._coarsening != 1:
+        is_arm = isinstance(self.problem, ArmProblem)
+        self._coarsening = 1 if coarsening is None and not is_arm else coarsening
+        if self._coarsening not in (None, 1):
+            if not is_arm:
+                raise ValueError(f"coarsening is {coarsening!r}; only the maneuver of a scene has long steps")
             self._coarse = self._in_long_steps(self._coarsening)
 
     @property
@@ -163,7 +164,8 @@ class GuidedDDP:
         Raises:
             KeyboardInterrupt: If the user interrupts that solve.
         """
-        if self.coarsening > 1 and self._coarse is not None:
+        _ = self.coarsening  # may find the solver in long steps
+        if self._coarse is not None:
             return tuple(refined(solution, self.problem) for solution in self._coarse.library)
         if self._library is None:
             self._library = self._solve_initial_state()
@@ -255,9 +257,9 @@ class GuidedDDP:
 
     def _remember(self, solution: Solution) -> None:
         """Add a solution to the library if there is room and it is new."""
-        known = solution.iterations == 0  # its guess, a policy, was already optimal
         if self._coarse is not None:
             return  # it has the library
+        known = solution.iterations == 0  # its guess, a policy, was already optimal
         if self._vacancies > 0 and self._library is not None and solution.converged and not known:
             self._library.append(solution)
             self._vacancies -= 1
@@ -265,7 +267,9 @@ class GuidedDDP:
     def _guesses(self, start: FloatArray, callback: Callback | None) -> Iterator[_Guess]:
         """Make the guesses to solve, one after another."""
         if self._coarse is not None:
-            yield from self._coarse_guess(self._coarse, start, callback)
+            guess = self._coarse_guess(self._coarse, start, callback)
+            if guess is not None:
+                yield guess
         yield from self._own_guesses(start, self.library)
 
     def _own_guesses(self, start: FloatArray, library: Sequence[Solution]) -> list[_Guess]:
@@ -290,8 +294,8 @@ class GuidedDDP:
 
     def _coarse_guess(
         self, coarse: "GuidedDDP", start: FloatArray, callback: Callback | None
-    ) -> Iterator[_Guess]:
-        """Solve in long steps, and follow the policy in the problem's own; nothing if that diverges."""
+    ) -> _Guess | None:
+        """Solve in long steps, and follow the policy in the problem's own; None if that diverges."""
         factor = self.problem.horizon // coarse.problem.horizon
 
         def report(record: IterationRecord) -> None:
@@ -301,16 +305,19 @@ class GuidedDDP:
                 callback(record._replace(**costs))
 
         found = coarse.solve(start, report, parameters=self.problem.parameters.rows[::factor])
-        interrupted = found.stop_reason is StopReason.INTERRUPTED
         trial = follow(refined(found, self.problem), self.problem, start)
-        if np.isfinite(trial.cost):
-            name, emphasis = found.metadata["guess"], found.metadata["emphasis"]
-            long_steps = tuple(
-                {**attempt, "cost": factor * attempt["cost"]} for attempt in found.metadata["attempts"]
-            )
-            yield _Guess(
-                name, trial.controls, trial.cost, NEAR_REGULARIZATION, emphasis, interrupted, long_steps
-            )
+        if not np.isfinite(trial.cost):
+            return None
+        facts, attempts = found.metadata, found.metadata["attempts"]
+        return _Guess(
+            facts["guess"],
+            trial.controls,
+            trial.cost,
+            NEAR_REGULARIZATION,
+            facts["emphasis"],
+            interrupted=found.stop_reason is StopReason.INTERRUPTED,
+            long_steps=tuple({**attempt, "cost": factor * attempt["cost"]} for attempt in attempts),
+        )
 
     def _solve_from(self, guess: _Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
         """Solve with the guess's emphasis; the cost is the problem's own."""
@@ -376,16 +383,17 @@ class GuidedDDP:
         """Whether the policy in long steps is near a minimum in the problem's own, from its own start."""
         most, start = self._solver.max_iterations, self.problem.initial_state
         self.problem.parameters.set(None)
-        for guess in self._coarse_guess(coarse, start, None):
-            self._solver.max_iterations = NEAR_ITERATIONS
-            try:
-                solution = self._solve_from(guess, start)
-            finally:
-                self._solver.max_iterations = most
-            if solution.stop_reason is StopReason.INTERRUPTED:
-                raise KeyboardInterrupt
-            return solution.converged
-        return False
+        guess = self._coarse_guess(coarse, start, None)
+        if guess is None:
+            return False
+        self._solver.max_iterations = NEAR_ITERATIONS
+        try:
+            solution = self._solve_from(guess, start)
+        finally:
+            self._solver.max_iterations = most
+        if solution.stop_reason is StopReason.INTERRUPTED:
+            raise KeyboardInterrupt
+        return solution.converged
 
     def _solve_initial_state(self) -> list[Solution]:
         """Solve the problem's own initial state; no solution if every rollout diverges."""

@@ -68,10 +68,10 @@ class ArmProblem:
             factor: Steps in one of the longer steps; it divides the number of stages.
 
         Raises:
-            ValueError: If it does not.
+            ValueError: If it is no whole number, or does not.
         """
-        if factor < 1 or self.horizon % factor:
-            raise ValueError(f"factor is {factor}; it must divide the {self.horizon} stages")
+        if not isinstance(factor, int | np.integer) or factor < 1 or self.horizon % factor:
+            raise ValueError(f"factor is {factor!r}; it must divide the {self.horizon} stages")
         coarse = copy.copy(self)
         coarse.horizon, coarse.time_step = self.horizon // factor, self.time_step * factor
         coarse.integrator = INTEGRATORS[self.integrator].curvature or self.integrator

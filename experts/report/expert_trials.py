@@ -49,6 +49,7 @@ def _solve(expert: GuidedDDP, env: DQSpaceArmEnv, seed: int) -> Row:
         "converged": solution.converged,
         "success": angle <= scene.success.attitude_error_deg and distance <= scene.success.position_error,
         "iterations": sum(attempt["iterations"] for attempt in attempts) or solution.iterations,
+        "long_step_iterations": sum(a["iterations"] for a in solution.metadata.get("long_steps", ())),
         "seconds": seconds,
         "cost": solution.cost,
         "attitude_error_deg": angle,
@@ -110,5 +111,5 @@ def _quantiles(rows: Sequence[Row]) -> list[Row]:
                 for title, share in _QUANTILES.items()
             },
         }
-        for name in ("iterations", "seconds", "cost")
+        for name in ("iterations", "long_step_iterations", "seconds", "cost")
     ]

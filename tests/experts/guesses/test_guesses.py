@@ -417,5 +417,11 @@ def test_a_user_who_stops_it_in_long_steps_gets_the_trajectory_so_far(paper):
 
 
 def test_a_number_of_steps_that_does_not_divide_the_stages_is_refused():
-    with pytest.raises(ValueError, match="factor is 7; it must divide the 1000 stages"):
-        GuidedDDP("paper", coarsening=7)
+    for factor in (7, 0, -8, 2.5, 2.0):
+        with pytest.raises(ValueError, match=f"factor is {factor}; it must divide the 1000 stages"):
+            GuidedDDP("paper", coarsening=factor)
+
+
+def test_only_scenes_have_long_steps(unicycle):
+    with pytest.raises(ValueError, match="coarsening is 2; only the maneuver of a scene has long steps"):
+        GuidedDDP(unicycle, coarsening=2)
