@@ -19,31 +19,32 @@ is the quadratic model that every stage minimizes over du, within the bounds of 
 With exact second derivatives lxx, lux and luu are those of the Lagrangian, which include the curvature of the
 dynamics, V_x . f_xx and so on. Regularized, Quu + mu diag(luu) takes the place of Quu in k and K, so that mu
 is relative to the control weights; the update of V is exact for that k and K all the same. Matrices of a
-stage have padded rows (see `padded_algebra`).
+stage have padded rows (see `padded_algebra`). B and A, and what follows from them, stand side by side, in the
+order of the controls and the state: few wide products take less time than many narrow ones.
 """
 
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from experts.ddp.box_qp import NOT_POSITIVE_DEFINITE, BoxQPWorkspace, box_qp, box_qp_workspace
 from experts.ddp.derivatives import Derivatives, Hessians
 from experts.native.compilation import compiled, inlined
 from experts.native.padded_algebra import (
     FloatArray,
-    add_block,
-    add_product,
-    add_product_upper,
     add_vector_product,
-    copy_in,
     mirror_upper,
+    nonzero_rows,
+    padded,
     padded_zeros,
     prefetch,
     prefetch_to_write,
-    set_product,
-    solve_in_place,
+    set_product_sum,
+    set_product_sum_upper,
+    set_symmetric_product,
 )
-from experts.native.vector_tiles import copy_row_out, set_row_sum, set_vector_sum
+from experts.native.vector_tiles import copy_in, copy_row_out, set_row_sum, set_vector_sum
 
 PASS_COMPLETED = 0
 PASS_NOT_POSITIVE_DEFINITE = 1
@@ -84,18 +85,23 @@ class PassResult(NamedTuple):
 class PassWorkspace(NamedTuple):
     """Work arrays of one stage; nt and nu are row lengths, n_t and n_u rounded up to whole vectors."""
 
-    A: FloatArray  # shape (n_t, nt)
-    B: FloatArray  # shape (n_t, nu)
-    VA: FloatArray  # Vxx A, shape (n_t, nt)
-    VB: FloatArray  # Vxx B, shape (n_t, nu)
-    Vxx: FloatArray  # shape (n_t, nt); between expansion and update the upper triangle of Qxx
+    BA: FloatArray  # shape (n_t, nu + nt)
+    B: FloatArray  # a view, shape (n_t, nu)
+    A: FloatArray  # a view, shape (n_t, nt)
+    B_rows: NDArray[np.int64]  # where B may be nonzero, see `nonzero_rows`
+    A_rows: NDArray[np.int64]
+    VBA: FloatArray  # Vxx (B, A), shape (n_t, nu + nt)
+    VA: FloatArray  # a view, shape (n_t, nt)
+    Vxx: FloatArray  # upper triangle; between expansion and update that of Qxx; shape (n_t, nt)
     Vx: FloatArray  # shape (nt,)
-    Qx: FloatArray  # shape (nt,)
-    Qu: FloatArray  # shape (nu,)
-    Qux: FloatArray  # shape (n_u, nt)
-    Quu: FloatArray  # shape (n_u, nu)
-    Quu_regular: FloatArray  # Quu + mu diag(luu), shape (n_u, nu)
-    K: FloatArray  # rows of the free inputs, in their order, shape (n_u, nt)
+    gradient: FloatArray  # (Qu, Qx), shape (nu + nt,)
+    Qu: FloatArray  # a view, shape (nu,)
+    Qx: FloatArray  # a view, shape (nt,)
+    Quux: FloatArray  # Quu, regularized for the box QP, and Qux; shape (n_u, nu + nt)
+    Quu: FloatArray  # a view, shape (n_u, nu)
+    Qux: FloatArray  # a view, shape (n_u, nt)
+    diagonal: FloatArray  # of Quu without regularization, shape (n_u,)
+    K: FloatArray  # rows of the free inputs, in their order, a view of the box QP's system, shape (n_u, nt)
     coupling: FloatArray  # Qux - mu diag(luu) K of the free inputs, in their order, shape (n_u, nt)
     k: FloatArray  # shape (n_u,)
     slope: FloatArray  # Quu k + Qu, shape (nu,)
@@ -118,28 +124,44 @@ def allocate_update(horizon: int, n_tangent: int, n_controls: int, *, keep_value
     )
 
 
-def pass_workspace(n_tangent: int, n_controls: int) -> PassWorkspace:
-    """Allocate work arrays of zeros; the pass relies on the padding being zero and keeps it so."""
+def pass_workspace(
+    n_tangent: int, n_controls: int, patterns: tuple[NDArray[np.bool_], ...] | None = None
+) -> PassWorkspace:
+    """Allocate work arrays of zeros; the pass relies on the padding being zero and keeps it so.
+
+    The patterns say which entries of A and B may be nonzero; None: all.
+    """
+    dense = np.ones((n_tangent, n_tangent), np.bool_), np.ones((n_tangent, n_controls), np.bool_)
+    row = padded(n_controls) + n_tangent
+    BA, VBA = padded_zeros(n_tangent, row), padded_zeros(n_tangent, row)
+    Quux, gradient = padded_zeros(n_controls, row), padded_zeros(row)
+    box = box_qp_workspace(n_controls, right_sides=n_tangent)
+    A_rows, B_rows = (nonzero_rows(pattern) for pattern in patterns or dense)
     return PassWorkspace(
-        A=padded_zeros(n_tangent, n_tangent),
-        B=padded_zeros(n_tangent, n_controls),
-        VA=padded_zeros(n_tangent, n_tangent),
-        VB=padded_zeros(n_tangent, n_controls),
+        BA=BA,
+        B=BA[:, : padded(n_controls)],
+        A=BA[:, padded(n_controls) :],
+        B_rows=B_rows,
+        A_rows=A_rows,
+        VBA=VBA,
+        VA=VBA[:, padded(n_controls) :],
         Vxx=padded_zeros(n_tangent, n_tangent),
         Vx=padded_zeros(n_tangent),
-        Qx=padded_zeros(n_tangent),
-        Qu=padded_zeros(n_controls),
-        Qux=padded_zeros(n_controls, n_tangent),
-        Quu=padded_zeros(n_controls, n_controls),
-        Quu_regular=padded_zeros(n_controls, n_controls),
-        K=padded_zeros(n_controls, n_tangent),
+        gradient=gradient,
+        Qu=gradient[: padded(n_controls)],
+        Qx=gradient[padded(n_controls) :],
+        Quux=Quux,
+        Quu=Quux[:, : padded(n_controls)],
+        Qux=Quux[:, padded(n_controls) :],
+        diagonal=np.zeros(n_controls),
+        K=box.system[:, padded(n_controls) :],
         coupling=padded_zeros(n_controls, n_tangent),
         k=np.zeros(n_controls),
         slope=padded_zeros(n_controls),
         free_slope=np.zeros(n_controls),
         room_below=np.zeros(n_controls),
         room_above=np.zeros(n_controls),
-        box=box_qp_workspace(n_controls),
+        box=box,
     )
 
 
@@ -168,19 +190,26 @@ def backward_pass(
         work.Vx[i] = derivatives.terminal_lx[0, i]
     copy_in(work.Vxx, hessians.terminal_xx[0])
     work.k[:] = 0.0
+    work.box.sides[:] = 0
     linear, quadratic, clamped = 0.0, 0.0, 0
     for stage in range(horizon - 1, -1, -1):
         if gaps.shape[0] > 0:
             # Vx at x_k+1 becomes Vx where the step lands.
+            mirror_upper(work.Vxx, n_tangent)
             add_vector_product(work.Vx, work.Vxx, gaps[stage], n_tangent)
         _expand(derivatives, hessians, stage, work)
         _regularize(derivatives.luu[stage], mu, work)
         for i in range(n_controls):
             work.room_below[i] = control_lower[stage, i] - controls[stage, i]
             work.room_above[i] = control_upper[stage, i] - controls[stage, i]
-        # work.k still holds k of the next stage: a close first guess.
+        # The sides of the next stage are a close first guess, as is its k.
         status, n_free = box_qp(
-            work.Quu_regular, work.Qu[:n_controls], work.room_below, work.room_above, work.k, work.box
+            work.Quux,
+            work.Qu[:n_controls],
+            work.room_below,
+            work.room_above,
+            work.k,
+            work.box,
         )
         if status == NOT_POSITIVE_DEFINITE:
             failure = PASS_NOT_POSITIVE_DEFINITE if _is_finite(work) else PASS_NOT_FINITE
@@ -190,9 +219,9 @@ def backward_pass(
         quadratic += stage_quadratic
         clamped += n_controls - n_free
         prefetch_to_write(update.K[max(stage - 1, 0)])
-        _find_gains(derivatives.luu[stage], mu, n_free, work)
-        _update_value(n_tangent, n_free, work)
+        _update_value(derivatives.luu[stage], mu, n_free, work)
         _store(stage, n_tangent, n_free, update, work)
+    mirror_upper(work.Vxx, n_tangent)
     for i in range(n_tangent):
         update.Vx[i] = work.Vx[i]
         for j in range(n_tangent):
@@ -206,45 +235,49 @@ def backward_pass(
 def _expand(derivatives: Derivatives, hessians: Hessians, stage: int, work: PassWorkspace) -> None:
     """Expand Q to second order; the upper triangle of Qxx takes the place of Vxx."""
     n_tangent = derivatives.lx.shape[1]
-    copy_in(work.A, derivatives.A[stage])
     copy_in(work.B, derivatives.B[stage])
+    copy_in(work.A, derivatives.A[stage])
     earlier = max(stage - 1, 0)
     # Prefetches stand between the products: too many at once would stall the processor.
     prefetch(derivatives.A[earlier])
-    set_product(work.VA, work.Vxx, work.A, n_tangent)
     prefetch(derivatives.B[earlier])
-    set_product(work.VB, work.Vxx, work.B, n_tangent)
-    # Qxx = lxx + A' Vxx A
-    copy_in(work.Vxx, hessians.xx[stage])
-    prefetch(hessians.xx[earlier])
-    add_product_upper(work.Vxx, work.A, work.VA, n_tangent)
-    # Qux = lux + B' Vxx A
-    set_product(work.Qux, work.B, work.VA, n_tangent)
-    if hessians.ux.shape[0] > 0:
-        add_block(work.Qux, hessians.ux[stage])
-        prefetch(hessians.ux[earlier])
-    # Quu = luu + B' Vxx B
-    copy_in(work.Quu, hessians.uu[stage])
+    set_symmetric_product(work.VBA, work.Vxx, work.BA)
+    # (Quu, Qux) = (luu, lux) + B' Vxx (B, A)
     prefetch(hessians.uu[earlier])
-    add_product(work.Quu, work.B, work.VB, n_tangent)
-    # Qx = lx + A' Vx, Qu = lu + B' Vx
-    set_vector_sum(work.Qx, derivatives.lx[stage], work.A, work.Vx, n_tangent)
-    set_vector_sum(work.Qu, derivatives.lu[stage], work.B, work.Vx, n_tangent)
+    if hessians.ux.shape[0] > 0:
+        prefetch(hessians.ux[earlier])
+        copy_in(work.Quu, hessians.uu[stage])
+        copy_in(work.Qux, hessians.ux[stage])
+        set_product_sum(work.Quux, work.Quux, work.B, work.VBA, work.B_rows)
+    else:
+        set_product_sum(work.Quux, hessians.uu[stage], work.B, work.VBA, work.B_rows)
+    # Qxx = lxx + A' Vxx A
+    prefetch(hessians.xx[earlier])
+    set_product_sum_upper(work.Vxx, hessians.xx[stage], work.A, work.VA, work.A_rows)
+    # (Qu, Qx) = (lu, lx) + (B, A)' Vx
+    n_controls = derivatives.lu.shape[1]
+    for i in range(n_controls):
+        work.Qu[i] = derivatives.lu[stage, i]
+    for i in range(n_tangent):
+        work.Qx[i] = derivatives.lx[stage, i]
+    set_vector_sum(work.gradient, work.gradient, work.BA, work.Vx, n_tangent)
 
 
 @inlined
 def _regularize(luu: FloatArray, mu: float, work: PassWorkspace) -> None:
-    """Compute Quu + mu diag(luu)."""
-    copy_in(work.Quu_regular, work.Quu)
+    """Compute Quu + mu diag(luu), and keep the diagonal of Quu."""
     for i in range(luu.shape[0]):
-        work.Quu_regular[i, i] += mu * luu[i, i]
+        work.diagonal[i] = work.Quu[i, i]
+        work.Quu[i, i] += mu * luu[i, i]
 
 
 @inlined
 def _expected_change(work: PassWorkspace) -> tuple[float, float]:
-    """Compute k' Qu and 1/2 k' Quu k, and keep Quu k + Qu; Quu is not regularized here."""
+    """Compute k' Qu and 1/2 k' Quu k, and keep Quu k + Qu; Quu is no longer regularized."""
     linear, quadratic = 0.0, 0.0
     n_controls = work.k.shape[0]
+    for i in range(n_controls):
+        work.Quu[i, i] = work.diagonal[i]
     set_vector_sum(work.slope, work.Qu, work.Quu, work.k, n_controls)
     for i in range(n_controls):
         linear += work.k[i] * work.Qu[i]
@@ -253,30 +286,19 @@ def _expected_change(work: PassWorkspace) -> tuple[float, float]:
 
 
 @inlined
-def _find_gains(luu: FloatArray, mu: float, n_free: int, work: PassWorkspace) -> None:
-    """Solve (Quu + mu diag(luu)) K = -Qux for the free inputs."""
-    for a in range(n_free):
-        i = work.box.free[a]
-        set_row_sum(work.K, a, work.Qux, i, -2.0, work.Qux, i)  # -Qux
-    solve_in_place(work.box.factor, work.box.inverse_pivots, work.K, n_free)
-    for a in range(n_free):
-        i = work.box.free[a]
-        set_row_sum(work.coupling, a, work.Qux, i, -mu * luu[i, i], work.K, a)
-
-
-@inlined
-def _update_value(n_tangent: int, n_free: int, work: PassWorkspace) -> None:
+def _update_value(luu: FloatArray, mu: float, n_free: int, work: PassWorkspace) -> None:
     """Propagate the value function under the control update.
 
-    As (Quu + mu R) K = -Qux in the free rows, R = diag(luu), Vxx = Qxx + K' Quu K + K' Qux + Qux' K is
-    Qxx + K' (Qux - mu R K): one symmetric product instead of three.
+    As (Quu + mu R) K = -Qux in the free rows, which the box QP solved, R = diag(luu), Vxx = Qxx + K' Quu K +
+    K' Qux + Qux' K is Qxx + K' (Qux - mu R K): one symmetric product instead of three.
     """
     set_vector_sum(work.Vx, work.Qx, work.Qux, work.k, work.k.shape[0])
     for a in range(n_free):
-        work.free_slope[a] = work.slope[work.box.free[a]]
+        i = work.box.free[a]
+        work.free_slope[a] = work.slope[i]
+        set_row_sum(work.coupling, a, work.Qux, i, -mu * luu[i, i], work.K, a)
     set_vector_sum(work.Vx, work.Vx, work.K, work.free_slope, n_free)
-    add_product_upper(work.Vxx, work.K, work.coupling, n_free)
-    mirror_upper(work.Vxx, n_tangent)
+    set_product_sum_upper(work.Vxx, work.Vxx, work.K, work.coupling, n_free)
 
 
 @inlined
@@ -285,12 +307,13 @@ def _store(stage: int, n_tangent: int, n_free: int, update: Update, work: PassWo
     gains = update.K[stage]
     for i in range(work.k.shape[0]):
         update.k[stage, i] = work.k[i]
-        if work.box.clamped[i]:
+        if work.box.sides[i] != 0:
             for j in range(n_tangent):
                 gains[i, j] = 0.0
     for a in range(n_free):
         copy_row_out(gains, work.box.free[a], work.K, a)
     if update.Vx_all.shape[0] > 0:
+        mirror_upper(work.Vxx, n_tangent)
         for i in range(n_tangent):
             update.Vx_all[stage, i] = work.Vx[i]
             for j in range(n_tangent):

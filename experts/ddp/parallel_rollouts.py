@@ -11,7 +11,7 @@ import numpy as np
 from dq_space_arm_env.kernels.bound import buffer_table
 from experts.ddp.backward_pass import Update
 from experts.native.compilation import BufferTable, call_kernel, compiled
-from experts.native.padded_algebra import FloatArray, add_product
+from experts.native.padded_algebra import FloatArray, set_product_sum
 from experts.problems.shooting_problem import ShootingProblem, native_calls
 
 LANES = 8
@@ -180,7 +180,8 @@ def _apply_update(
             work.control_columns[i, lane] = (
                 reference_controls[stage, i] + alphas[lane] * feedforward[stage, i]
             )
-    add_product(work.control_columns, gains[stage].T, work.deviation_columns, n_tangent)
+    columns = work.control_columns
+    set_product_sum(columns, columns, gains[stage].T, work.deviation_columns, n_tangent)
     for i in range(n_controls):
         for lane in range(LANES):
             control = work.control_columns[i, lane]

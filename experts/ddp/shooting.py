@@ -7,6 +7,7 @@ from time import perf_counter
 from typing import ParamSpec, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
 from dq_space_arm_env.kernels.threads import share_rows
@@ -43,6 +44,9 @@ BATCHED_KERNELS = ("linearize", "cost_derivatives", "lagrangian_hessian")
 
 _STAGES_PER_BLOCK = 32
 """Stages that a thread differentiates at a time: enough to outweigh its overhead."""
+
+_UNWRITTEN = 1.2345e-300
+"""A number that no kernel computes."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -98,9 +102,10 @@ class ShootingWorkspace:
         self._spare_update: Update = allocate_update(*sizes, keep_values=keep_values)
         self._time_step = np.array([problem.time_step])
         self._no_gaps = np.zeros((0, problem.n_tangent))
-        self._pass_work = pass_workspace(problem.n_tangent, problem.n_controls)
         names = (*KERNEL_NAMES, *SECOND_ORDER_KERNEL_NAMES) if second_order else KERNEL_NAMES
         self._kernels = {name: problem.kernel(name, batched=name in BATCHED_KERNELS) for name in names}
+        self._patterns = self._find_patterns()
+        self._pass_work = pass_workspace(problem.n_tangent, problem.n_controls, self._patterns)
         self._gauss_newton = gauss_newton_hessians(self.derivatives)
         stages = problem.horizon if second_order else 0
         self._exact = allocate_hessians(stages, problem.n_tangent, problem.n_controls)
@@ -110,6 +115,18 @@ class ShootingWorkspace:
         self._parallel = ParallelRollouts(problem, self._time_step)
         self.current = Trajectory(problem)
         self.trial = Trajectory(problem)
+
+    def _find_patterns(self) -> tuple[NDArray[np.bool_], ...]:
+        """Which entries of A and B the kernel writes; the others are always zero."""
+        problem, blocks = self.problem, (self.derivatives.A, self.derivatives.B)
+        for block in blocks:
+            block[0] = _UNWRITTEN
+        given = (problem.initial_state, *problem.parameters.inputs, np.zeros(problem.n_controls))
+        self._run("linearize", 1, buffer_table(*given, self._time_step, *blocks))
+        patterns = tuple(block[0] != _UNWRITTEN for block in blocks)
+        for block in blocks:
+            block[0] = 0.0
+        return patterns
 
     @timed("rollout")
     def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
@@ -185,7 +202,7 @@ class ShootingWorkspace:
         result = PassResult(*outcome, float(mu), exact)
         if result.status == PASS_NOT_FINITE:
             # Its padding may hold NaN, which would spoil all later passes.
-            self._pass_work = pass_workspace(self.problem.n_tangent, self.problem.n_controls)
+            self._pass_work = pass_workspace(self.problem.n_tangent, self.problem.n_controls, self._patterns)
         if result.completed:
             self.update, self._spare_update = self._spare_update, self.update
         return result

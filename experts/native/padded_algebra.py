@@ -1,7 +1,7 @@
 """Small dense matrix operations for the backward pass, without BLAS: products, factorization, substitution.
 
-Every matrix is row-major, and its rows are padded to whole vectors of `LANES` numbers. Padding columns never
-mix with others, so their content does not matter. The register tiles of `vector_tiles` do the work.
+Every matrix is row-major. Rows of targets are padded to whole vectors of `LANES` numbers; padding columns
+never mix with others, so their content does not matter. The register tiles of `vector_tiles` do the work.
 """
 
 import numpy as np
@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from experts.native.compilation import compiled, inlined
 from experts.native.vector_code import LANES, TILE_ROWS
 from experts.native.vector_tiles import (
-    add_product_rows,
-    copy_row_in,
-    eliminate_rows,
+    factorize_rows,
     prefetch_line,
     prefetch_line_to_write,
-    set_product_rows,
-    substitute_backward,
-    substitute_forward,
+    substitute_rows,
+    sum_product_rows,
+    symmetric_product_rows,
 )
 
 FloatArray = NDArray[np.float64]
+Rows = int | NDArray[np.int64]
+"""Rows of the matrices of a product to sum over: the first ones, or those that `nonzero_rows` lists."""
 
 CACHE_LINE = 8
 """Numbers in one cache line."""
@@ -29,6 +29,7 @@ SMALLEST_PIVOT = 1e-14
 """A pivot below this share of its diagonal entry is rounding noise: the matrix is not positive definite."""
 
 
+@compiled
 def padded(size: int) -> int:
     """Round a row length up to whole vectors."""
     return -(-size // LANES) * LANES
@@ -41,6 +42,16 @@ def padded_zeros(*shape: int) -> FloatArray:
     memory = np.zeros(size + CACHE_LINE)
     start = -(memory.ctypes.data // memory.itemsize) % CACHE_LINE
     return memory[start : start + size].reshape(extents)
+
+
+def nonzero_rows(pattern: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """List the rows with nonzeros in every `TILE_ROWS` columns of a pattern: their number, then the rows."""
+    starts = range(0, pattern.shape[1], TILE_ROWS)
+    listed = np.zeros((len(starts), 1 + len(pattern)), dtype=np.int64)
+    for row, start in zip(listed, starts, strict=True):
+        (found,) = np.nonzero(pattern[:, start : start + TILE_ROWS].any(axis=1))
+        row[0], row[1 : 1 + len(found)] = len(found), found
+    return listed
 
 
 @inlined
@@ -58,30 +69,33 @@ def prefetch_to_write(array: FloatArray) -> None:
 
 
 @compiled
-def set_product(target: FloatArray, left: FloatArray, right: FloatArray, depth: int) -> None:
-    """Compute the product of a transposed matrix and a matrix: ``target = left' right``."""
-    rows = target.shape[0]
-    for i in range(0, rows, TILE_ROWS):
-        set_product_rows(target, rows, i, 0, left, right, depth)
+def set_symmetric_product(target: FloatArray, upper: FloatArray, right: FloatArray) -> None:
+    """Compute the product of a symmetric matrix, given on and above the diagonal, and a matrix."""
+    for i in range(0, target.shape[0], TILE_ROWS):
+        symmetric_product_rows(target, i, upper, right)
 
 
 @compiled
-def add_product(target: FloatArray, left: FloatArray, right: FloatArray, depth: int) -> None:
-    """Add the product of a transposed matrix and a matrix: ``target += left' right``."""
-    rows = target.shape[0]
-    for i in range(0, rows, TILE_ROWS):
-        add_product_rows(target, rows, i, 0, left, right, depth)
+def set_product_sum(
+    target: FloatArray, start: FloatArray, left: FloatArray, right: FloatArray, rows: Rows
+) -> None:
+    """Compute ``target = start + left' right``."""
+    n = target.shape[0]
+    for i in range(0, n, TILE_ROWS):
+        sum_product_rows(target, n, i, 0, start, left, right, rows)
 
 
 @compiled
-def add_product_upper(target: FloatArray, left: FloatArray, right: FloatArray, depth: int) -> None:
-    """Add a product known to be symmetric, on and above the diagonal only: ``target += left' right``.
+def set_product_sum_upper(
+    target: FloatArray, start: FloatArray, left: FloatArray, right: FloatArray, rows: Rows
+) -> None:
+    """Compute ``target = start + left' right``, known to be symmetric, on and above the diagonal only.
 
-    Vectors that the diagonal cuts are computed whole; entries below it are left undefined.
+    Vectors that the diagonal cuts are computed whole; entries before them are left undefined.
     """
-    rows = target.shape[0]
-    for i in range(0, rows, TILE_ROWS):
-        add_product_rows(target, rows, i, i - i % LANES, left, right, depth)
+    n = target.shape[0]
+    for i in range(0, n, TILE_ROWS):
+        sum_product_rows(target, n, i, i - i % LANES, start, left, right, rows)
 
 
 @compiled
@@ -91,22 +105,6 @@ def add_vector_product(target: FloatArray, matrix: FloatArray, vector: FloatArra
         row, factor = matrix[i], vector[i]
         for j in range(target.shape[0]):
             target[j] += factor * row[j]
-
-
-@inlined
-def copy_in(target: FloatArray, source: FloatArray) -> None:
-    """Copy a matrix into one with padded rows, and zero the padding."""
-    for i in range(source.shape[0]):
-        copy_row_in(target, i, source, i)
-
-
-@compiled
-def add_block(target: FloatArray, source: FloatArray) -> None:
-    """Add a matrix to the leading block of a larger one."""
-    for i in range(source.shape[0]):
-        target_row, source_row = target[i], source[i]
-        for j in range(source.shape[1]):
-            target_row[j] += source_row[j]
 
 
 @compiled
@@ -119,44 +117,19 @@ def mirror_upper(matrix: FloatArray, size: int) -> None:
 
 @compiled
 def factorize(matrix: FloatArray, inverse_pivots: FloatArray, size: int) -> bool:
-    """Overwrite a symmetric matrix by its factor U, ``matrix = U' D U``, with ones on the diagonal of U.
+    """Overwrite a symmetric matrix by its factor U, ``matrix = U' D^-1 U``, D being the diagonal of U.
 
-    The square roots of Cholesky's factor would lengthen the chain from one pivot to the next.
+    Further columns G, right sides, become D U'^-1 G on the way. The square roots of Cholesky's factor would
+    lengthen the chain from one pivot to the next.
     """
-    for i in range(size):
-        inverse_pivots[i] = SMALLEST_PIVOT * matrix[i, i]
-    for i in range(size):
-        pivot = matrix[i, i]
-        if not (pivot > inverse_pivots[i] and 0.0 < pivot < np.inf):
+    for i in range(0, size, TILE_ROWS):
+        if not factorize_rows(matrix, size, i, inverse_pivots, SMALLEST_PIVOT):
             return False
-        inverse_pivots[i] = 1.0 / pivot
-        for row in range(i + 1, size, TILE_ROWS):
-            eliminate_rows(matrix, size, row, row - row % LANES, i, inverse_pivots[i])
-    for i in range(size):
-        for j in range(i + 1, size):
-            matrix[i, j] *= inverse_pivots[i]
     return True
 
 
 @compiled
-def solve_in_place(factor: FloatArray, inverse_pivots: FloatArray, right_side: FloatArray, size: int) -> None:
-    """Solve ``U' D U X = right_side`` for many right sides at once, overwriting them by X."""
-    for i in range(0, size, TILE_ROWS):
-        substitute_forward(right_side, size, i, factor, inverse_pivots)
+def substitute(system: FloatArray, inverse_pivots: FloatArray, begin: int, size: int) -> None:
+    """Solve ``matrix X = -G``, with D U'^-1 G from `factorize` from a column on, overwriting them by X."""
     for i in range(size - TILE_ROWS, -TILE_ROWS, -TILE_ROWS):
-        substitute_backward(right_side, size, i, factor, inverse_pivots)
-
-
-@compiled
-def solve_vector_in_place(
-    factor: FloatArray, inverse_pivots: FloatArray, right_side: FloatArray, size: int
-) -> None:
-    """Solve ``U' D U x = right_side`` for one right side, overwriting it by x."""
-    for i in range(size):
-        for j in range(i + 1, size):
-            right_side[j] -= factor[i, j] * right_side[i]
-    for i in range(size):
-        right_side[i] *= inverse_pivots[i]
-    for i in range(size - 1, 0, -1):
-        for j in range(i):
-            right_side[j] -= factor[j, i] * right_side[i]
+        substitute_rows(system, size, i, begin, inverse_pivots)

@@ -15,8 +15,9 @@ LANES = host_machine().lanes
 
 TILE_ROWS = 3
 """Rows of a tile."""
-TILE_VECTORS = 3
-"""Vectors in a row of a tile: the nine sums hide the latency of an addition and fit in sixteen registers."""
+TILE_VECTORS = 5 if LANES == 8 else 3
+"""Most vectors in a row of a tile: nine sums hide the latency of an addition and fit in sixteen registers;
+processors with vectors of eight numbers have 32."""
 
 VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 ZERO = ir.Constant(VECTOR, [0.0] * LANES)
@@ -66,6 +67,10 @@ class Emitter:
         combine = self.builder.fadd if sign > 0 else self.builder.fsub
         return combine(total, product, flags=_CONTRACT)
 
+    def number(self, position: int, *indices: Any) -> Any:
+        """An entry of an array argument."""
+        return self.builder.load(self.entry(position, *indices))
+
     def add(self, position: Any, offset: int) -> Any:
         """An index plus an offset."""
         return self.builder.add(position, self.index(offset)) if offset else position
@@ -112,7 +117,7 @@ class Emitter:
         with cgutils.for_range_slice(self.builder, first, last, self.index(1), intp=self.index) as (step, _):
             vectors = self.load_row(row(step), len(slots[0]))
             for factor, totals in zip(factors(step), slots, strict=True):
-                spread = self.spread(self.builder.load(factor))
+                spread = self.spread(factor)
                 for total, vector in zip(totals, vectors, strict=True):
                     old = self.builder.load(total)
                     self.builder.store(self.multiply_add(old, spread, vector, sign), total)
@@ -127,12 +132,21 @@ class Emitter:
         for c, value in enumerate(values):
             self.store_vector(value, self._offset(pointer, c))
 
-    def load_masked(self, pointer: Any, n_numbers: Any) -> Any:
-        """Load n_numbers from an address into a vector, padded with zeros."""
+    def masks(self, position: int, column: Any, n_vectors: int) -> list[Any]:
+        """Masks of the vectors that begin at a column of an array argument, which may have fewer columns."""
+        extent = self.shape(position)[-1]
+        columns = [self.add(column, c * LANES) for c in range(n_vectors)]
+        return [self._mask(self.builder.sub(extent, first)) for first in columns]
+
+    def load_masked(self, pointer: Any, masks: list[Any]) -> list[Any]:
+        """Load the vectors of a tile's row, zeros where their masks are off."""
         arguments = [VECTOR.as_pointer(), _INT32, ir.VectorType(ir.IntType(1), LANES), VECTOR]
         load = self._masked_function("load", ir.FunctionType(VECTOR, arguments))
-        address = self.builder.bitcast(pointer, VECTOR.as_pointer())
-        return self.builder.call(load, [address, _INT32(8), self._mask(n_numbers), ZERO])
+        vectors = []
+        for c, mask in enumerate(masks):
+            address = self.builder.bitcast(self._offset(pointer, c), VECTOR.as_pointer())
+            vectors.append(self.builder.call(load, [address, _INT32(8), mask, ZERO]))
+        return vectors
 
     def store_masked(self, value: Any, pointer: Any, n_numbers: Any) -> None:
         """Store the first n_numbers of a vector at an address."""

@@ -9,7 +9,7 @@ mix with others, so their content does not matter. Rows need no padding: a tile 
 matrix repeats its outermost row instead, and the valid copy of a repeated row is stored last.
 """
 
-from typing import Any, Literal
+from typing import Any
 
 from llvmlite import ir
 from numba import types
@@ -19,141 +19,200 @@ from numba.extending import intrinsic
 from experts.native.vector_code import LANES, TILE_ROWS, ZERO, Emitter
 
 
-def _product_operation(start: Literal["target", "zero"]) -> Any:
-    """Build the primitive that computes some rows of a product.
-
-    It sets ``target[i:i+TILE_ROWS, begin:]`` to ``start + sum_l left[l, i:i+TILE_ROWS] right[l, begin:]``, l
-    running over [0, depth), for those of the rows that are less than n_rows.
-    """
-
-    def operation(
-        typing_context: Any, target: Any, n_rows: Any, i: Any, begin: Any, left: Any, right: Any, depth: Any
-    ) -> Any:
-        index = types.intp
-        signature = types.void(target, index, index, index, left, right, index)
-
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            emit = Emitter(context, builder, signature, arguments)
-            _, n_rows, i, begin, _, _, depth = arguments
-            last_row = emit.add(n_rows, -1)
-            rows = [emit.smaller(emit.add(i, r), last_row) for r in range(TILE_ROWS)]
-
-            def tile(j: Any, n_vectors: int) -> None:
-                pointers = [emit.entry(0, row, j) for row in rows]
-                sums = [[ZERO] * n_vectors for _ in rows]
-                if start == "target":
-                    sums = [emit.load_row(pointer, n_vectors) for pointer in pointers]
-                sums = emit.accumulate(
-                    sums,
-                    +1,
-                    emit.index(0),
-                    depth,
-                    lambda step: [emit.entry(4, step, row) for row in rows],
-                    lambda step: emit.entry(5, step, j),
-                )
-                for pointer, values in zip(pointers, sums, strict=True):
-                    emit.store_row(values, pointer)
-
-            emit.for_strips(begin, emit.shape(0)[1], tile)
-            return context.get_dummy_value()
-
-        return signature, generate
-
-    return intrinsic(operation)
-
-
-def _substitution_operation(backward: bool) -> Any:
-    """Build the primitive that solves some rows of a system with a unit triangle, those before being solved.
-
-    Forward, it solves rows i to i+TILE_ROWS of ``factor' X = target``, factor an upper triangle with a
-    diagonal of ones, [0, i) being solved, as far as there are n_rows. Backward, it solves ``factor X =
-    diag(scale) target``, [i+TILE_ROWS, n_rows) being solved, and i may be negative.
-    """
-
-    def operation(typing_context: Any, target: Any, n_rows: Any, i: Any, factor: Any, scale: Any) -> Any:
-        signature = types.void(target, types.intp, types.intp, factor, scale)
-
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            emit = Emitter(context, builder, signature, arguments)
-            _, n_rows, i, _, _ = arguments
-            order = list(range(TILE_ROWS))
-            if backward:
-                rows = [emit.larger(emit.add(i, r), emit.index(0)) for r in order]
-                solved = emit.add(i, TILE_ROWS), n_rows
-                order.reverse()
-            else:
-                rows = [emit.smaller(emit.add(i, r), emit.add(n_rows, -1)) for r in order]
-                solved = emit.index(0), i
-
-            def coefficient(row: Any, known: Any) -> Any:
-                return emit.entry(3, row, known) if backward else emit.entry(3, known, row)
-
-            def tile(j: Any, n_vectors: int) -> None:
-                pointers = [emit.entry(0, row, j) for row in rows]
-                sums = [emit.load_row(pointer, n_vectors) for pointer in pointers]
-                if backward:
-                    scales = [emit.spread(builder.load(emit.entry(4, row))) for row in rows]
-                    sums = [
-                        [builder.fmul(total, factor) for total in totals]
-                        for totals, factor in zip(sums, scales, strict=True)
-                    ]
-                sums = emit.accumulate(
-                    sums,
-                    -1,
-                    *solved,
-                    lambda step: [coefficient(row, step) for row in rows],
-                    lambda step: emit.entry(0, step, j),
-                )
-                for position, r in enumerate(order):
-                    for s in order[:position]:
-                        factor = emit.spread(builder.load(coefficient(rows[r], rows[s])))
-                        sums[r] = [
-                            emit.multiply_add(total, factor, known, -1)
-                            for total, known in zip(sums[r], sums[s], strict=True)
-                        ]
-                # Of identical rows, the one solved first is right.
-                for r in reversed(order):
-                    emit.store_row(sums[r], pointers[r])
-
-            emit.for_strips(emit.index(0), emit.shape(0)[1], tile)
-            return context.get_dummy_value()
-
-        return signature, generate
-
-    return intrinsic(operation)
-
-
-def _emit_eliminate_rows(
-    typing_context: Any, matrix: Any, n_rows: Any, i: Any, begin: Any, pivot: Any, scale: Any
+def _emit_sum_product_rows(
+    typing_context: Any,
+    target: Any,
+    n_rows: Any,
+    i: Any,
+    begin: Any,
+    start: Any,
+    left: Any,
+    right: Any,
+    steps: Any,
 ) -> Any:
-    """Emit ``matrix[i:i+TILE_ROWS, begin:] -= scale matrix[pivot, i:i+TILE_ROWS]' matrix[pivot, begin:]``.
+    """Emit ``target[i:i+TILE_ROWS, begin:] = start + sum_l left[l, i:i+TILE_ROWS]' right[l, begin:]``.
 
-    Only for those of the rows that are less than n_rows.
+    For those of the rows that are less than n_rows. The l are [0, steps); if ``steps`` is an array, its row
+    i / TILE_ROWS lists them, their number first. The start needs no padding; columns that it lacks are zero.
     """
-    index = types.intp
-    signature = types.void(matrix, index, index, index, index, types.float64)
+    index, listed = types.intp, isinstance(steps, types.Array)
+    signature = types.void(target, index, index, index, start, left, right, steps if listed else index)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         emit = Emitter(context, builder, signature, arguments)
-        _, n_rows, i, begin, pivot, scale = arguments
+        _, n_rows, i, begin, _, _, _, steps = arguments
         rows = [emit.smaller(emit.add(i, r), emit.add(n_rows, -1)) for r in range(TILE_ROWS)]
-        scaled = [builder.fmul(scale, builder.load(emit.entry(0, pivot, row))) for row in rows]
+        first, end, tile_number = emit.index(0), steps, builder.sdiv(i, emit.index(TILE_ROWS))
+        if listed:
+            first, end = emit.index(1), emit.add(emit.number(7, tile_number, emit.index(0)), 1)
+
+        def inner(step: Any) -> Any:
+            return emit.number(7, tile_number, step) if listed else step
+
+        def tile(j: Any, n_vectors: int) -> None:
+            masks = emit.masks(4, j, n_vectors)
+            sums = emit.accumulate(
+                [emit.load_masked(emit.entry(4, row, j), masks) for row in rows],
+                +1,
+                first,
+                end,
+                lambda step: [emit.number(5, inner(step), row) for row in rows],
+                lambda step: emit.entry(6, inner(step), j),
+            )
+            for row, values in zip(rows, sums, strict=True):
+                emit.store_row(values, emit.entry(0, row, j))
+
+        emit.for_strips(begin, emit.shape(0)[1], tile)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+def _emit_symmetric_product_rows(typing_context: Any, target: Any, i: Any, upper: Any, right: Any) -> Any:
+    """Emit ``target[i:i+TILE_ROWS] = symmetric[i:i+TILE_ROWS] right``, as far as there are such rows.
+
+    Of the symmetric matrix only the diagonal and what is above is read: elsewhere rounding errors would grow
+    from product to product.
+    """
+    signature = types.void(target, types.intp, upper, right)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        emit = Emitter(context, builder, signature, arguments)
+        i, (n_rows, n_columns) = arguments[1], emit.shape(0)
+        rows = [emit.smaller(emit.add(i, r), emit.add(n_rows, -1)) for r in range(TILE_ROWS)]
+        zero = ir.Constant(ir.DoubleType(), 0.0)
+
+        def tile(j: Any, n_vectors: int) -> None:
+            sums = emit.accumulate(
+                [[ZERO] * n_vectors for _ in rows],
+                +1,
+                emit.index(0),
+                i,
+                lambda step: [emit.number(2, step, row) for row in rows],
+                lambda step: emit.entry(3, step, j),
+            )
+            for s, step in enumerate(rows):
+                vectors = emit.load_row(emit.entry(3, step, j), n_vectors)
+                # A repeated row counts once.
+                repeated = builder.icmp_signed("==", step, rows[s - 1]) if s > 0 else cgutils.false_bit
+                for r, totals in enumerate(sums):
+                    entry = emit.number(2, rows[min(r, s)], rows[max(r, s)])
+                    factor = emit.spread(builder.select(repeated, zero, entry))
+                    sums[r] = [
+                        emit.multiply_add(total, factor, vector, +1)
+                        for total, vector in zip(totals, vectors, strict=True)
+                    ]
+            sums = emit.accumulate(
+                sums,
+                +1,
+                emit.add(rows[-1], 1),
+                n_rows,
+                lambda step: [emit.number(2, row, step) for row in rows],
+                lambda step: emit.entry(3, step, j),
+            )
+            for row, values in zip(rows, sums, strict=True):
+                emit.store_row(values, emit.entry(0, row, j))
+
+        emit.for_strips(emit.index(0), n_columns, tile)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+def _emit_substitute_rows(
+    typing_context: Any, system: Any, n_rows: Any, i: Any, begin: Any, inverse_pivots: Any
+) -> Any:
+    """Emit ``X[k] = -(X[k] + sum_l system[k, l] X[l]) * inverse_pivots[k]``, l > k.
+
+    X is ``system[:, begin:]``. For rows k from i+TILE_ROWS-1 down to i, which may be negative; those after
+    them are done.
+    """
+    signature = types.void(system, types.intp, types.intp, types.intp, inverse_pivots)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        emit = Emitter(context, builder, signature, arguments)
+        _, n_rows, i, begin, _ = arguments
+        rows = [emit.larger(emit.add(i, r), emit.index(0)) for r in reversed(range(TILE_ROWS))]
 
         def tile(j: Any, n_vectors: int) -> None:
             pointers = [emit.entry(0, row, j) for row in rows]
-            subtracted = emit.load_row(emit.entry(0, pivot, j), n_vectors)
-            sums = [
-                [
-                    emit.multiply_add(total, emit.spread(factor), vector, -1)
-                    for total, vector in zip(emit.load_row(pointer, n_vectors), subtracted, strict=True)
-                ]
-                for pointer, factor in zip(pointers, scaled, strict=True)
-            ]
-            for pointer, values in zip(pointers, sums, strict=True):
+            sums = emit.accumulate(
+                [emit.load_row(pointer, n_vectors) for pointer in pointers],
+                +1,
+                emit.add(i, TILE_ROWS),
+                n_rows,
+                lambda step: [emit.number(0, row, step) for row in rows],
+                lambda step: emit.entry(0, step, j),
+            )
+            for r, row in enumerate(rows):
+                for s in range(r):
+                    factor = emit.spread(emit.number(0, row, rows[s]))
+                    sums[r] = [
+                        emit.multiply_add(total, factor, known, +1)
+                        for total, known in zip(sums[r], sums[s], strict=True)
+                    ]
+                scale = emit.spread(builder.fneg(emit.number(4, row)))
+                sums[r] = [builder.fmul(total, scale) for total in sums[r]]
+            # Of identical rows, the one solved first is right.
+            for values, pointer in reversed(list(zip(sums, pointers, strict=True))):
                 emit.store_row(values, pointer)
 
         emit.for_strips(begin, emit.shape(0)[1], tile)
         return context.get_dummy_value()
+
+    return signature, generate
+
+
+def _emit_factorize_rows(
+    typing_context: Any, matrix: Any, n_rows: Any, i: Any, inverse_pivots: Any, smallest: Any
+) -> Any:
+    """Emit the elimination of rows i to i+TILE_ROWS of a symmetric matrix, [0, i) being eliminated.
+
+    ``Y[k] = matrix[k] - sum_l Y[l, k] Y[l] / Y[l, l]``, l < k, takes the place of row k on and right of the
+    diagonal, as far as there are n_rows, and 1 / Y[k, k] that of the inverse pivot. False if a pivot Y[k, k]
+    is no more than its share ``smallest`` of matrix[k, k], not positive, or not finite.
+    """
+    signature = types.boolean(matrix, types.intp, types.intp, inverse_pivots, types.float64)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        emit = Emitter(context, builder, signature, arguments)
+        _, n_rows, i, _, smallest = arguments
+        rows = [emit.smaller(emit.add(i, r), emit.add(n_rows, -1)) for r in range(TILE_ROWS)]
+        bounds = [builder.fmul(smallest, emit.number(0, row, row)) for row in rows]
+        sound = cgutils.alloca_once_value(builder, cgutils.true_bit)
+        zero, one, infinite = (ir.Constant(ir.DoubleType(), value) for value in (0.0, 1.0, float("inf")))
+
+        def tile(j: Any, n_vectors: int) -> None:
+            pointers = [emit.entry(0, row, j) for row in rows]
+            sums = emit.accumulate(
+                [emit.load_row(pointer, n_vectors) for pointer in pointers],
+                -1,
+                emit.index(0),
+                i,
+                lambda step: [builder.fmul(emit.number(0, step, row), emit.number(3, step)) for row in rows],
+                lambda step: emit.entry(0, step, j),
+            )
+            inverses: list[Any] = []
+            for r, row in enumerate(rows):
+                for s, known in enumerate(rows[:r]):
+                    # A repeated row is not subtracted from itself.
+                    repeated = builder.icmp_signed("==", known, row)
+                    entry = builder.select(repeated, zero, emit.number(0, known, row))
+                    factor = emit.spread(builder.fmul(entry, inverses[s]))
+                    sums[r] = [
+                        emit.multiply_add(total, factor, vector, -1)
+                        for total, vector in zip(sums[r], sums[s], strict=True)
+                    ]
+                emit.store_row(sums[r], pointers[r])
+                pivot = emit.number(0, row, row)
+                inverses.append(builder.fdiv(one, pivot))
+                builder.store(inverses[r], emit.entry(3, row))
+                for bound, relation in ((bounds[r], ">"), (zero, ">"), (infinite, "<")):
+                    fulfilled = builder.fcmp_ordered(relation, pivot, bound)
+                    builder.store(builder.and_(builder.load(sound), fulfilled), sound)
+
+        emit.for_strips(builder.sub(i, builder.srem(i, emit.index(LANES))), emit.shape(0)[1], tile)
+        return builder.load(sound)
 
     return signature, generate
 
@@ -166,17 +225,14 @@ def _emit_set_vector_sum(
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         emit = Emitter(context, builder, signature, arguments)
-        (n_start,) = emit.shape(1)
 
         def tile(j: Any, n_vectors: int) -> None:
-            columns = [emit.add(j, c * LANES) for c in range(n_vectors)]
-            starts = [emit.load_masked(emit.entry(1, k), builder.sub(n_start, k)) for k in columns]
             (sums,) = emit.accumulate(
-                [starts],
+                [emit.load_masked(emit.entry(1, j), emit.masks(1, j, n_vectors))],
                 +1,
                 emit.index(0),
                 arguments[4],
-                lambda step: [emit.entry(3, step)],
+                lambda step: [emit.number(3, step)],
                 lambda step: emit.entry(2, step, j),
             )
             emit.store_row(sums, emit.entry(0, j))
@@ -187,17 +243,38 @@ def _emit_set_vector_sum(
     return signature, generate
 
 
-def _emit_copy_row_in(typing_context: Any, target: Any, i: Any, source: Any, k: Any) -> Any:
-    """Emit ``target[i] = source[k]``, target with padded rows, whose padding becomes zero, source without."""
+def _emit_copy_in(typing_context: Any, target: Any, source: Any) -> Any:
+    """Emit ``target = source``, target with padded rows, whose padding becomes zero, source without."""
+    signature = types.void(target, source)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        emit = Emitter(context, builder, signature, arguments)
+        n_rows, _ = emit.shape(1)
+
+        def strip(j: Any, n_vectors: int) -> None:
+            masks = emit.masks(1, j, n_vectors)
+            with cgutils.for_range(builder, n_rows, intp=emit.index) as loop:
+                row = emit.load_masked(emit.entry(1, loop.index, j), masks)
+                emit.store_row(row, emit.entry(0, loop.index, j))
+
+        emit.for_strips(emit.index(0), emit.shape(0)[1], strip)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+def _emit_copy_row(typing_context: Any, target: Any, i: Any, source: Any, k: Any) -> Any:
+    """Emit ``target[i] = source[k]`` for matrices with padded rows; the target's may be longer."""
     signature = types.void(target, types.intp, source, types.intp)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         emit = Emitter(context, builder, signature, arguments)
         _, i, _, k = arguments
-        columns = emit.shape(2)[1]
-        with emit.for_vectors(columns) as j:
-            value = emit.load_masked(emit.entry(2, k, j), builder.sub(columns, j))
-            emit.store_vector(value, emit.entry(0, i, j))
+
+        def strip(j: Any, n_vectors: int) -> None:
+            emit.store_row(emit.load_row(emit.entry(2, k, j), n_vectors), emit.entry(0, i, j))
+
+        emit.for_strips(emit.index(0), emit.shape(2)[1], strip)
         return context.get_dummy_value()
 
     return signature, generate
@@ -263,13 +340,13 @@ def _emit_set_row_sum(
 
 
 # Untyped, so that calls are not checked against the functions that emit the code.
-set_product_rows: Any = _product_operation("zero")
-add_product_rows: Any = _product_operation("target")
-substitute_forward: Any = _substitution_operation(backward=False)
-substitute_backward: Any = _substitution_operation(backward=True)
-eliminate_rows: Any = intrinsic(_emit_eliminate_rows)
+sum_product_rows: Any = intrinsic(_emit_sum_product_rows)
+symmetric_product_rows: Any = intrinsic(_emit_symmetric_product_rows)
+factorize_rows: Any = intrinsic(_emit_factorize_rows)
+substitute_rows: Any = intrinsic(_emit_substitute_rows)
 set_vector_sum: Any = intrinsic(_emit_set_vector_sum)
-copy_row_in: Any = intrinsic(_emit_copy_row_in)
+copy_in: Any = intrinsic(_emit_copy_in)
+copy_row: Any = intrinsic(_emit_copy_row)
 copy_row_out: Any = intrinsic(_emit_copy_row_out)
 prefetch_line: Any = _prefetch_operation(write=False)
 prefetch_line_to_write: Any = _prefetch_operation(write=True)

@@ -5,19 +5,16 @@ import sys
 from pathlib import Path
 
 import pytest
-from mutation import ROOT, STAGES, mutants, name_of, outcomes
-
-pytestmark = pytest.mark.endurance
+from mutation import ROOT, STAGES, mutants, mutated, name_of, outcomes
 
 
 def test_every_mutant_has_its_line() -> None:
-    from mutation import mutated
-
     sources = {mutant["file"]: (ROOT / mutant["file"]).read_text(encoding="utf-8") for mutant in mutants()}
     stale = [name_of(mutant) for mutant in mutants() if mutated(sources[mutant["file"]], mutant) is None]
     assert not stale, "choose new ones in their place with mutant_selection.py"
 
 
+@pytest.mark.endurance
 def test_nearly_all_mutants_are_caught(tmp_path: Path) -> None:
     """Hours of work for one processor; `mutation.py --workers` shares it, and resumes."""
     results, runner = tmp_path / "results.jsonl", Path(__file__).with_name("mutation.py")

@@ -123,6 +123,19 @@ def random_hessians(d: Derivatives, seed: int) -> Hessians:
     )
 
 
+def test_pass_that_knows_what_is_zero_is_the_same() -> None:
+    d = random_derivatives(5, 20, 7, 4)
+    patterns = tuple(np.random.default_rng(5).uniform(size=block.shape[1:]) < 0.3 for block in (d.A, d.B))
+    for block, pattern in zip((d.A, d.B), patterns, strict=True):
+        block[:, ~pattern] = 0.0
+    controls, bound = np.zeros(d.lu.shape), np.full(d.lu.shape, 0.5)
+    updates = allocate_update(20, 7, 4), allocate_update(20, 7, 4)
+    for update, work in zip(updates, (pass_workspace(7, 4), pass_workspace(7, 4, patterns)), strict=True):
+        backward_pass(d, gauss_newton_hessians(d), NO_GAPS, controls, -bound, bound, 1.0, update, work)
+    for dense, sparse in zip(*updates, strict=True):
+        np.testing.assert_array_equal(sparse, dense)
+
+
 @pytest.mark.parametrize("limit", [np.inf, 0.2])
 @pytest.mark.parametrize(("n_tangent", "n_controls"), [(4, 3), (13, 5), (21, 12)])
 def test_second_derivatives_beyond_gauss_newton_enter_as_the_formulas_say(

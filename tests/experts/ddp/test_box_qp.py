@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experts.ddp.box_qp import NOT_POSITIVE_DEFINITE, SOLVED, box_qp, box_qp_workspace
+from experts.native.padded_algebra import padded_zeros
 
 Vector = np.ndarray
 
@@ -19,9 +20,11 @@ def solve(
     n = len(gradient)
     work = box_qp_workspace(n)
     minimizer = np.zeros(n) if guess is None else guess.copy()
-    status, n_free = box_qp(hessian, gradient, lower, upper, minimizer, work)
-    factor = np.triu(work.factor[:n_free, :n_free], 1) + np.eye(max(n_free, 0))
-    block = (factor.T / work.inverse_pivots[:n_free]) @ factor
+    padded_hessian = padded_zeros(n, n)
+    padded_hessian[:, :n] = hessian
+    status, n_free = box_qp(padded_hessian, gradient, lower, upper, minimizer, work)
+    factor = np.triu(work.system[:n_free, :n_free])
+    block = (factor.T * work.inverse_pivots[:n_free]) @ factor
     return status, minimizer, work.free[:n_free].copy(), block
 
 
