@@ -29,12 +29,13 @@ def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[
     # Without a spread, all starts are the scene's own.
     for seed in range(effort.starts if any(scene.spread.model_dump().values()) else 1):
         announce(f"start {seed}", seed + 1, effort.starts + 1)
-        env.reset(seed=seed)
-        rows.append(_solve(expert, env, seed))
+        rows.append(solve_episode(expert, env, seed))
     return {"starts": rows}
 
 
-def _solve(expert: GuidedDDP, env: DQSpaceArmEnv, seed: int) -> Row:
+def solve_episode(expert: GuidedDDP, env: DQSpaceArmEnv, seed: int) -> Row:
+    """Solve the episode that begins with a seed; KeyboardInterrupt if the user interrupts it."""
+    env.reset(seed=seed)
     began = perf_counter()
     solution = expert.solve(np.asarray(env.state, dtype=np.float64), parameters=env.parameters)
     seconds = perf_counter() - began

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import Scene
+from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from experts import BoxDDP, GuidedDDP, StopReason
 from experts.ddp.second_order import SecondOrder
 from experts.problems.arm_problem import ArmProblem
@@ -18,9 +19,9 @@ from scripts.benchmarks.solvers.accuracy import OURS, Contender, best_costs, com
 from scripts.benchmarks.solvers.iterations import measure_iterations
 from scripts.benchmarks.solvers.random_starts import (
     draw_starts,
+    judged,
     measure_starts,
-    missing_share,
-    summarize_starts,
+    summarized,
 )
 from scripts.benchmarks.solvers.receding import Control, World, cost_of, fly, measure_flights
 from scripts.benchmarks.solvers.runs import (
@@ -196,26 +197,34 @@ def test_iterations_are_those_of_the_solver(problem: ArmProblem) -> None:
 # Random starts ---------------------------------------------------------------------------------------------
 
 
-def made_up_start(index: int, cost: float, converged: bool, success: bool, reachable: bool) -> Row:
-    """A start whose best known cost is 100, solved by one solver in index + 1 iterations and seconds."""
-    start = {"scene": "short", "start": index, "solver": "made up", "cost": cost, "best_cost": 100.0}
-    times = {"iterations": index + 1, "seconds": index + 1.0}
-    return {**start, **times, "converged": converged, "is_success": success, "best_is_success": reachable}
+def solved(cost: float, good: bool = True, **others: Any) -> Row:
+    return {"cost": cost, "converged": True, "success": good, **others}
+
+
+@pytest.mark.parametrize(
+    ("ours", "best", "gap"),
+    [
+        (solved(101.0), solved(100.0), 0.01),
+        (solved(100.0), solved(101.0), 0.0),
+        (solved(100.0, good=False), solved(110.0), np.inf),  # the lower cost misses the target
+        (solved(110.0), solved(100.0, good=False), 0.0),
+        (solved(101.0, good=False), solved(100.0, good=False), 0.01),
+    ],
+)
+def test_a_minimum_is_judged_among_those_that_reach_the_target(ours: Row, best: Row, gap: float) -> None:
+    assert judged(ours, best)["gap"] == pytest.approx(gap)
 
 
 def test_shares_of_random_starts() -> None:
-    starts = [
-        made_up_start(0, 100.0, True, True, True),
-        made_up_start(1, 101.0, False, True, True),
-        made_up_start(2, 101.5, True, False, False),
-        made_up_start(3, 150.0, True, True, True),
+    counts = ("iterations", "long_step_iterations", "seconds")
+    rows = [
+        {"converged": i != 1, "success": i != 2, "gap": gap, **dict.fromkeys(counts, i + 1)}
+        for i, gap in enumerate((0.0, 0.9e-4, 1.1e-4, np.inf))
     ]
-    (summary,) = summarize_starts(starts)
-    shares = [summary[key] for key in ("converged", "succeeded", "both", "close_to_best")]
-    assert shares == [0.75, 0.75, 0.5, 0.5]
-    for key in ("iterations", "seconds"):
+    summary = summarized(rows)
+    assert [summary[key] for key in ("converged", "succeeded", "both", "close")] == [0.75, 0.75, 0.5, 0.5]
+    for key in counts:
         assert (summary[f"{key}_median"], summary[f"{key}_90"]) == pytest.approx((2.5, 3.7))
-    assert missing_share(starts) == 0.25
 
 
 def test_starts_of_a_seed_are_the_same_however_many(problem: ArmProblem) -> None:
@@ -224,19 +233,19 @@ def test_starts_of_a_seed_are_the_same_however_many(problem: ArmProblem) -> None
     assert not np.array_equal(few, draw_starts(problem, 2, 6))
 
 
-def test_random_starts_are_judged_by_the_best_of_many_guesses(problem: ArmProblem, guided: GuidedDDP) -> None:
-    rows = list(measure_starts(problem, guided, SHORT))
-    found = select(rows, table="random starts")
-    solvers = [TITLES[SecondOrder.GAUSS_NEWTON], TITLES[SecondOrder.HYBRID], GUIDED]
-    assert [(row["start"], row["solver"]) for row in found] == [(i, name) for i in (0, 1) for name in solvers]
-    assert all(row["best_cost"] <= row["cost"] for row in found)
-    assert len(select(rows, table="claims")) == 1
-    for row, state in zip(select(found, solver=GUIDED), draw_starts(problem, 2, 0), strict=True):
-        solution = guided.solve(state)
+def test_random_starts_are_the_episodes_of_the_environment(problem: ArmProblem, guided: GuidedDDP) -> None:
+    rows = list(measure_starts(problem, guided, 1.5, SHORT))
+    found, (summary,) = select(rows, table="random starts"), select(rows, table="start summaries")
+    env = DQSpaceArmEnv(problem.scene)
+    assert [row["seed"] for row in found] == [0, 1]
+    for row in found:
+        env.reset(seed=row["seed"])
+        solution = guided.solve(np.asarray(env.state, dtype=np.float64), parameters=env.parameters)
         assert row["cost"] == solution.cost
-        assert row["is_success"] == problem.is_success(solution.states[-1])
-        attempts = solution.metadata["attempts"]
-        assert row["iterations"] == sum(attempt["iterations"] for attempt in attempts)
+        assert row["success"] == problem.is_success(solution.states[-1])
+        assert row["gap"] >= 0.0
+    assert (summary["starts"], summary["preparation_s"]) == (2, 1.5)
+    assert len(select(rows, table="claims")) == 2
 
 
 # Receding horizon ------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 runs            one solve in the same terms for every solver; the project's own solvers in these terms
 iterations      what an iteration costs, whole and in pieces
 accuracy        how soon solvers come close to the best known cost, from the same start
-random_starts   how often solvers converge, succeed, and find the best known minimum
+random_starts   how often the expert converges, succeeds, and finds the best known minimum
 receding        the receding-horizon expert under disturbances
 own_problems    problems of one's own: cart-pole and planar quadrotor, beside Crocoddyl
 """
@@ -64,7 +64,7 @@ def measure(effort: Effort) -> Iterator[Row]:
             if ACCURACY in parts:
                 yield from _compare(problem, guided, effort)
             if STARTS in parts:
-                yield from measure_starts(problem, guided, effort)
+                yield from measure_starts(problem, guided, seconds, effort)
         if HORIZON in parts:
             yield from measure_flights(ArmProblem(scene), effort)
     if OWN in parts:
@@ -154,19 +154,21 @@ BENCHMARK = Benchmark(
         ),
         Table(
             "start summaries",
-            "Scene {scene}: {starts} random starts",
+            "GuidedDDP from random starts\nof `env.reset(seed=)`; best: of twelve further guesses",
             (
-                "solver",
-                Column("converged", format=".1%"),
+                "scene",
+                "starts",
+                Column("converged", "con-\nverged", ".1%"),
                 Column("succeeded", "success", ".1%"),
-                Column("both", format=".1%"),
-                Column("close_to_best", "within 1 %\nof the best", ".1%"),
-                Column("iterations_median", "iterations\nmedian", ".0f"),
+                Column("close", "within\n1e-4 of\nbest", ".1%"),
+                Column("iterations_median", "itera-\ntions,\nmedian", ".0f"),
                 Column("iterations_90", "90 %", ".0f"),
-                time_column("seconds_median", "seconds\nmedian"),
+                Column("coarsening", "long\nsteps"),
+                Column("long_step_iterations_median", "itera-\ntions,\nmedian", ".0f"),
+                time_column("seconds_median", "seconds,\nmedian"),
                 time_column("seconds_90", "90 %"),
+                time_column("preparation_s", "prepa-\nration"),
             ),
-            by=("scene",),
         ),
         Table(
             "flights",
