@@ -7,6 +7,8 @@ import numpy as np
 from experts.native.compilation import compiled
 from experts.native.padded_algebra import FloatArray, add_vector_product
 
+EPSILON = float(np.finfo(np.float64).eps)
+
 
 class Derivatives(NamedTuple):
     """Derivatives along a trajectory of N stages, in tangent coordinates."""
@@ -100,3 +102,26 @@ def find_costates(derivatives: Derivatives, costates: FloatArray) -> None:
         for j in range(n_tangent):
             costates[stage - 1, j] = derivatives.lx[stage, j]
         add_vector_product(costates[stage - 1], derivatives.A[stage], costates[stage], n_tangent)
+
+
+@compiled
+def change_by_rounding(derivatives: Derivatives, states: FloatArray) -> float:
+    """Estimate the change of the cost by roundings of the states, shape (N + 1, n_x).
+
+    Every tangent coordinate is taken to be off by a rounding of the state's largest entry; half the trace of
+    lxx is the expected second-order cost of random errors.
+    """
+    horizon, n_tangent = derivatives.lx.shape
+    change = 0.0
+    for k in range(horizon + 1):
+        lx = derivatives.lx[k] if k < horizon else derivatives.terminal_lx[0]
+        lxx = derivatives.lxx[k] if k < horizon else derivatives.terminal_lxx[0]
+        largest, slope, bend = 0.0, 0.0, 0.0
+        for i in range(states.shape[1]):
+            largest = max(largest, abs(states[k, i]))
+        for i in range(n_tangent):
+            slope += abs(lx[i])
+            bend += lxx[i, i]
+        digit = EPSILON * largest
+        change += digit * (slope + 0.5 * digit * bend)
+    return change

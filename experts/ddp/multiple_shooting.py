@@ -48,6 +48,7 @@ from experts.problems.shooting_problem import (
     check_array,
     check_control_weights,
     native_calls,
+    stage_bounds,
 )
 
 MOST_ITERATIONS = 50
@@ -159,8 +160,8 @@ class MultipleShooting:
 
     def begin(self, initial_state: FloatArray, states: FloatArray, controls: FloatArray) -> None:
         """Make a guess the current trajectory; compute its gaps and cost."""
-        current = self.work.current
-        horizon = len(self.gaps)
+        current, horizon = self.work.current, len(self.gaps)
+        self.work.bounds = stage_bounds(self.work.problem)
         self._initial_state[0], current.states[:], current.controls[:] = initial_state, states, controls
         self._run("difference", 1, current.states, self._initial_state, self.initial_gap)
         given = (current.states, *self.work.problem.parameters.inputs, current.controls, self._time_step)
@@ -250,7 +251,8 @@ class MultipleShooting:
         first_offset = (alpha - 1.0) * self.initial_gap
         self._run(RETRACTION_KERNEL_NAME, 1, self._initial_state, first_offset, trial.states)
         reference, policy = (current.states, current.controls), (update.k, update.K)
-        return trial.follow(self._kernels, reference, policy, alpha, offsets=(alpha - 1.0) * self.gaps)
+        offsets = (alpha - 1.0) * self.gaps
+        return trial.follow(self._kernels, reference, policy, alpha, self.work.bounds, offsets)
 
     def accept(self, alpha: float) -> None:
         """Make the trial of a step length the current trajectory."""

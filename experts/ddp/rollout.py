@@ -12,7 +12,6 @@ from experts.problems.shooting_problem import (
     Kernel,
     ShootingProblem,
     native_calls,
-    stage_bounds,
 )
 
 FINISHED = -1
@@ -167,13 +166,15 @@ class Trajectory:
         reference: tuple[FloatArray, FloatArray],
         policy: tuple[FloatArray, FloatArray],
         alpha: float,
+        bounds: tuple[FloatArray, FloatArray],
         offsets: FloatArray | None = None,
     ) -> float:
         """Roll out u = clip(u_ref + alpha k + K (x (-) x_ref)) from the first state; return the total cost.
 
         The reference is x_ref, shape (N + 1, n_x), and u_ref, shape (N, n_u); the policy is k, shape (N,
-        n_u), and K, shape (N, n_u, n_t). Offsets, shape (N, n_t), move each state from where its step lands,
-        in tangent coordinates there, and leave the negative offsets as gaps; None for a true rollout.
+        n_u), and K, shape (N, n_u, n_t); the bounds are those of `stage_bounds`. Offsets, shape (N, n_t),
+        move each state from where its step lands, in tangent coordinates there, and leave the negative
+        offsets as gaps; None for a true rollout.
         """
         step_buffers, retract, retract_buffers = self._step_buffers, NO_RETRACTION, buffer_table()
         if offsets is not None:
@@ -194,7 +195,7 @@ class Trajectory:
                 reference[1],
                 *policy,
                 float(alpha),
-                *stage_bounds(self._problem),
+                *bounds,
                 self.states,
                 self.controls,
                 self._deviations,

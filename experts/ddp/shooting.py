@@ -23,6 +23,7 @@ from experts.ddp.derivatives import (
     Hessians,
     allocate_derivatives,
     allocate_hessians,
+    change_by_rounding,
     find_costates,
     gauss_newton_hessians,
     mirrored,
@@ -87,6 +88,7 @@ class ShootingWorkspace:
         trial: The trajectory of the last step tried.
         update: Control update of the last backward pass.
         derivatives: Derivatives along the current trajectory, valid after `differentiate`.
+        bounds: Lower and upper bounds of the controls at every stage when the solve began.
         time: Durations since a new `WorkTime` was last assigned.
     """
 
@@ -104,8 +106,8 @@ class ShootingWorkspace:
         self._no_gaps = np.zeros((0, problem.n_tangent))
         names = (*KERNEL_NAMES, *SECOND_ORDER_KERNEL_NAMES) if second_order else KERNEL_NAMES
         self._kernels = {name: problem.kernel(name, batched=name in BATCHED_KERNELS) for name in names}
-        self._patterns = self._find_patterns()
-        self._pass_work = pass_workspace(problem.n_tangent, problem.n_controls, self._patterns)
+        self._patterns: tuple[NDArray[np.bool_], ...] | None = None  # of A and B; unknown
+        self._pass_work = pass_workspace(problem.n_tangent, problem.n_controls)
         self._gauss_newton = gauss_newton_hessians(self.derivatives)
         stages = problem.horizon if second_order else 0
         self._exact = allocate_hessians(stages, problem.n_tangent, problem.n_controls)
@@ -115,23 +117,12 @@ class ShootingWorkspace:
         self._parallel = ParallelRollouts(problem, self._time_step)
         self.current = Trajectory(problem)
         self.trial = Trajectory(problem)
-
-    def _find_patterns(self) -> tuple[NDArray[np.bool_], ...]:
-        """Which entries of A and B the kernel writes; the others are always zero."""
-        problem, blocks = self.problem, (self.derivatives.A, self.derivatives.B)
-        for block in blocks:
-            block[0] = _UNWRITTEN
-        given = (problem.initial_state, *problem.parameters.inputs, np.zeros(problem.n_controls))
-        self._run("linearize", 1, buffer_table(*given, self._time_step, *blocks))
-        patterns = tuple(block[0] != _UNWRITTEN for block in blocks)
-        for block in blocks:
-            block[0] = 0.0
-        return patterns
+        self.bounds = stage_bounds(problem)
 
     @timed("rollout")
     def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
         """Roll out given controls and make the result the current trajectory."""
-        trajectory = self.current
+        self.bounds, trajectory = stage_bounds(self.problem), self.current
         trajectory.states[0] = self.trial.states[0] = initial_state
         trajectory.controls[:] = controls
         trajectory.roll_out(self._kernels)
@@ -141,12 +132,24 @@ class ShootingWorkspace:
         """Compute the derivatives along the current trajectory that Gauss-Newton needs."""
         states, d, horizon = self.current.states, self.derivatives, self.problem.horizon
         given = (states, *self.problem.parameters.inputs, self.current.controls)
+        if self._patterns is None:
+            d.A[0], d.B[0] = _UNWRITTEN, _UNWRITTEN
         self._run("linearize", horizon, buffer_table(*given, self._time_step, d.A, d.B))
+        if self._patterns is None:
+            self._find_patterns()
         mixed = (d.lux,) if self.problem.has_mixed_cost else ()
         self._run("cost_derivatives", horizon, buffer_table(*given, d.lx, d.lu, d.lxx, d.luu, *mixed))
         end = states[-1:], *self.problem.terminal_inputs
         self._run("terminal_cost_derivatives", 1, buffer_table(*end, d.terminal_lx, d.terminal_lxx))
         self._exact_is_current, self._mirrored = False, None
+
+    def _find_patterns(self) -> None:
+        """Learn which entries of A and B the kernel writes; the others are always zero."""
+        blocks = self.derivatives.A[0], self.derivatives.B[0]
+        self._patterns = tuple(block != _UNWRITTEN for block in blocks)
+        for block, written in zip(blocks, self._patterns, strict=True):
+            block[~written] = 0.0
+        self._pass_work = pass_workspace(self.problem.n_tangent, self.problem.n_controls, self._patterns)
 
     @timed("derivatives")
     def differentiate_twice(self) -> None:
@@ -194,7 +197,7 @@ class ShootingWorkspace:
             self._exact if exact else self._mirrored or self._gauss_newton,
             self._no_gaps if gaps is None else gaps,
             self.current.controls,
-            *stage_bounds(self.problem),
+            *self.bounds,
             float(mu),
             self._spare_update,
             self._pass_work,
@@ -208,16 +211,8 @@ class ShootingWorkspace:
         return result
 
     def cost_rounding(self) -> float:
-        """Estimate how much rounding of the states changes the cost; smaller changes mean nothing.
-
-        Every tangent coordinate is taken to be off by a rounding of the state's largest entry; half the trace
-        of lxx is the expected second-order cost of random errors.
-        """
-        d, states = self.derivatives, self.current.states
-        digits = np.finfo(np.float64).eps * np.abs(states).max(axis=1)
-        slopes = np.append(np.abs(d.lx).sum(axis=1), np.abs(d.terminal_lx).sum())
-        bends = np.append(np.einsum("kii->k", d.lxx), np.trace(d.terminal_lxx[0]))
-        return float(digits @ slopes + 0.5 * (digits * digits) @ bends)
+        """Estimate how much rounding of the states changes the cost; smaller changes mean nothing."""
+        return change_by_rounding(self.derivatives, self.current.states)
 
     def restore_update(self) -> None:
         """Go back to the update before the last completed backward pass."""
@@ -227,13 +222,13 @@ class ShootingWorkspace:
     def try_step(self, alpha: float) -> float:
         """Roll out the control update into the trial trajectory; return its cost, inf if it is not finite."""
         reference, policy = (self.current.states, self.current.controls), (self.update.k, self.update.K)
-        return self.trial.follow(self._kernels, reference, policy, alpha)
+        return self.trial.follow(self._kernels, reference, policy, alpha, self.bounds)
 
     @timed("rollout")
     def try_steps(self, step_lengths: FloatArray) -> FloatArray:
         """Roll out up to `LANES` step lengths at once; return their costs, inf where not finite."""
         reference = self.current.states, self.current.controls
-        return self._parallel.run(step_lengths, reference, self.update, *stage_bounds(self.problem))
+        return self._parallel.run(step_lengths, reference, self.update, *self.bounds)
 
     @timed("rollout")
     def choose(self, lane: int, cost: float) -> None:

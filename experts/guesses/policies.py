@@ -9,7 +9,7 @@ from experts.ddp.rollout import FINISHED, Trajectory
 from experts.ddp.shooting import ShootingWorkspace
 from experts.ddp.solution import Solution
 from experts.problems.arm_problem import ArmProblem, WindowProblem
-from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array
+from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array, stage_bounds
 
 
 def policies(solution: Solution, problem: ShootingProblem) -> dict[str, Solution]:
@@ -66,7 +66,7 @@ def follow(solution: Solution, problem: ShootingProblem, x0: FloatArray) -> Traj
     kernels = {name: problem.kernel(name) for name in ("difference", "step_with_cost", "terminal_cost")}
     reference = np.ascontiguousarray(solution.states), solution.controls
     policy = np.zeros_like(solution.controls), solution.feedback_gains
-    trial.follow(kernels, reference, policy, alpha=0.0)
+    trial.follow(kernels, reference, policy, 0.0, stage_bounds(problem))
     return trial
 
 

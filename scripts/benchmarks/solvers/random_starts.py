@@ -96,7 +96,5 @@ def _judge(problem: ArmProblem, guided: GuidedDDP, effort: Effort) -> GuidedDDP:
         library=library,
         attempts=FURTHER_GUESSES,
         compare=True,
-        coarsening=guided.coarsening,
-        second_order=guided.second_order,
         max_iterations=effort.max_iterations,
     )
