@@ -308,7 +308,8 @@ class GuidedDDP:
         trial = follow(refined(found, self.problem), self.problem, start)
         if not np.isfinite(trial.cost):
             return None
-        facts, attempts = found.metadata, found.metadata["attempts"]
+        facts = found.metadata
+        attempts = facts["long_steps"] + facts["attempts"]  # those in steps twice as long come first
         return _Guess(
             facts["guess"],
             trial.controls,
@@ -339,7 +340,7 @@ class GuidedDDP:
             return False
         return self._target is None or self._target.misses(solution.states[-1]) <= 1.0
 
-    def _in_long_steps(self, factor: int) -> "GuidedDDP":
+    def _in_long_steps(self, factor: int, *, compare: bool = True) -> "GuidedDDP":
         """Make the solver in long steps, with the settings of this one; its library is this one's."""
         known = self._library
         return GuidedDDP(
@@ -349,7 +350,7 @@ class GuidedDDP:
             reach_target=self.reach_target,
             remember=self._vacancies,
             attempts=self.attempts,
-            compare=True,
+            compare=compare,
             coarsening=1,
             **self._settings,
         )
@@ -363,7 +364,23 @@ class GuidedDDP:
                 if self._leads_to_minimum(coarse):
                     self._coarse = coarse
                     return factor
+                halved = self._in_halved_steps(coarse)
+                if halved is not None and self._leads_to_minimum(halved):
+                    self._coarse = halved
+                    return factor // 2
         return 1
+
+    def _in_halved_steps(self, coarse: "GuidedDDP") -> "GuidedDDP | None":
+        """Make the solver in half the long steps, which begins where the long ones end; None if they are odd.
+
+        Where fast motions bend a narrow valley, most iterations lead along it: they are cheaper there.
+        """
+        factor = self.problem.horizon // coarse.problem.horizon
+        if factor % 2:
+            return None
+        halved = self._in_long_steps(factor // 2, compare=False)
+        halved._coarse, halved._coarsening = coarse, 2
+        return halved
 
     def _with_best_model(self, factor: int) -> "GuidedDDP":
         """Make the solver in long steps, with the mirrored model from now on if that pays."""
