@@ -32,7 +32,7 @@ WEAKEST_EXACT_MU = 1e-3
 STRONGEST_EXACT_MU = 1e2
 """Beyond it a step of the mirrored model is worth more than one of the exact model."""
 EXACT_MU_FACTOR = 4.0
-"""Change of that regularization from one step to the next: between 1e-3 and 1e2 each value has its valleys."""
+"""Change of that regularization from one step to the next."""
 HALF_STEP = 0.5
 """A step of the exact model below this length calls for more regularization: its model reached too far."""
 LONGEST_PAUSE = 8
