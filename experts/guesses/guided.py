@@ -379,10 +379,10 @@ class GuidedDDP:
 
         Where fast motions bend a narrow valley, most iterations lead along it: they are cheaper there. It is
         no use where long steps are so inaccurate that their policy strays in the problem's own, nor where
-        half of them are no whole number of those.
+        half of them are those, or no whole number of them.
         """
         factor = self.problem.horizon // coarse.problem.horizon
-        if factor % 2 or not coarse.library:
+        if factor % 2 or factor == 2 or not coarse.library:
             return None
         policy = refined(coarse.library[0], self.problem)
         if follow(policy, self.problem, self.problem.initial_state).cost > STRAYED * policy.cost:
