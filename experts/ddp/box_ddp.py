@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from experts.ddp.backward_pass import PASS_NOT_FINITE, PASS_NOT_POSITIVE_DEFINITE, PassResult
 from experts.ddp.multiple_shooting import MultipleShooting
 from experts.ddp.rollout import FINISHED
-from experts.ddp.second_order import EXACT_MU, WEAK_EXACT_MU, Regularization, SecondOrder, SolverState
+from experts.ddp.second_order import EXACT_MU, Regularization, SecondOrder, SolverState
 from experts.ddp.shooting import ShootingWorkspace, WorkTime, line_search
 from experts.ddp.solution import HISTORY_DTYPE, Callback, IterationRecord, Solution, Stop, StopReason
 from experts.problems.arm_problem import as_problem
@@ -166,9 +166,11 @@ class BoxDDP:
             alpha = line_search(work, direction)
             if alpha > 0.0:
                 break
-        # In the hybrid mu regularizes Gauss-Newton's model only.
+        # Beside another model the exact one has a regularization of its own.
         if direction.exact == (self.second_order is SecondOrder.EXACT):
             state.regularization.adapt(alpha)
+        else:
+            state.exact_regularization.adapt(alpha)
         state.moved = alpha > 0.0
         record = self._record(state, direction, cost, alpha, started)
         if callback is not None:
@@ -178,7 +180,7 @@ class BoxDDP:
     def _backward_passes(self, state: SolverState) -> Iterator[PassResult]:
         """Yield control updates to search along; the next one is asked for if no step was accepted."""
         if self.second_order in (SecondOrder.HYBRID, SecondOrder.MIRRORED) and state.switch.tries_exact:
-            direction = self._exact_backward_pass()
+            direction = self._exact_backward_pass(state)
             if direction.status != PASS_NOT_POSITIVE_DEFINITE:
                 yield direction
             state.switch.postpone_exact()
@@ -188,10 +190,16 @@ class BoxDDP:
             state.regularization, exact=self.second_order is SecondOrder.EXACT
         )
 
-    def _exact_backward_pass(self) -> PassResult:
+    def _exact_backward_pass(self, state: SolverState) -> PassResult:
         """Use exact second derivatives under weak regularization only; the pass may fail."""
         self._work.differentiate_twice()
-        for mu in WEAK_EXACT_MU if self.second_order is SecondOrder.MIRRORED else EXACT_MU:
+        if self.second_order is SecondOrder.MIRRORED:
+            remembered = state.exact_regularization
+            direction = self._work.backward_pass(remembered.mu, exact=True)
+            while direction.status == PASS_NOT_POSITIVE_DEFINITE and remembered.increase():
+                direction = self._work.backward_pass(remembered.mu, exact=True)
+            return direction
+        for mu in EXACT_MU:
             direction = self._work.backward_pass(mu, exact=True)
             if direction.status != PASS_NOT_POSITIVE_DEFINITE:
                 break

@@ -27,8 +27,14 @@ SLOW_STEPS = 2
 """Consecutive slow steps after which the hybrid tries the exact model."""
 EXACT_MU = (1e-3, 1e-1, 1e1, 1e3)
 """Regularizations with which the hybrid tries the exact model, in multiples of the control weights."""
-WEAK_EXACT_MU = EXACT_MU[:-1]
-"""The same beside the mirrored model, which is worth more than an exact one under strong regularization."""
+WEAKEST_EXACT_MU = 1e-3
+"""First and least regularization of the exact model beside the mirrored one."""
+STRONGEST_EXACT_MU = 1e2
+"""Beyond it a step of the mirrored model is worth more than one of the exact model."""
+EXACT_MU_FACTOR = 4.0
+"""Change of that regularization from one step to the next."""
+HALF_STEP = 0.5
+"""A step of the exact model below this length calls for more regularization: its model reached too far."""
 LONGEST_PAUSE = 8
 """Most iterations that the hybrid waits before it tries the exact model again."""
 
@@ -99,6 +105,31 @@ class Regularization:
 
 
 @dataclass
+class ExactRegularization:
+    """Regularization of the exact model beside the mirrored one, remembered from step to step.
+
+    In a narrow, bent valley the weakest one that leaves the model convex is not the best: its steps leave the
+    valley and are cut to a small length.
+    """
+
+    mu: float = WEAKEST_EXACT_MU
+
+    def increase(self) -> bool:
+        """Increase mu; False if it is as large as is useful."""
+        if self.mu * EXACT_MU_FACTOR > STRONGEST_EXACT_MU:
+            return False
+        self.mu *= EXACT_MU_FACTOR
+        return True
+
+    def adapt(self, alpha: float) -> None:
+        """React to an accepted step length."""
+        if alpha >= LONG_STEP:
+            self.mu = max(self.mu / EXACT_MU_FACTOR, WEAKEST_EXACT_MU)
+        elif alpha < HALF_STEP:
+            self.increase()
+
+
+@dataclass
 class HybridSwitch:
     """When the hybrid tries exact second derivatives."""
 
@@ -137,6 +168,7 @@ class SolverState:
 
     regularization: Regularization  # of the only model, or of Gauss-Newton's in the hybrid
     switch: HybridSwitch = field(default_factory=HybridSwitch)
+    exact_regularization: ExactRegularization = field(default_factory=ExactRegularization)
     first_cost: float = 0.0  # of the first trajectory without gaps
     moved: bool = True  # whether the trajectory has changed since it was differentiated
     optimality: float = np.inf  # predicted relative reduction of an unregularized step, inf where unknown

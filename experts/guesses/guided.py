@@ -12,7 +12,8 @@ the target, and the arm follows (`screw_motion`).
 
 All of this happens in few, long steps first, where a solve takes a tenth of the time and several guesses can
 be compared. The policy found there, followed in the problem's own steps, is a few iterations away from their
-minimum. Nothing is compiled for it: the length of a step is an input of the kernels.
+minimum; where it is more, a solve in half the long steps comes between. Nothing is compiled for it: the
+length of a step is an input of the kernels.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -116,8 +117,9 @@ class GuidedDDP:
             compare: Whether to solve that many, and keep the best solution, rather than stop at the first
                 that converges within the tolerances. In long steps they are always compared.
             coarsening: Steps in a long one, in which a maneuver is solved first; it divides the number of
-                stages. 1 leaves that out. None tries 8 and less on first use, and takes the first that is
-                fine enough for the problem's own initial state; arms only.
+                stages. 1 leaves that out. None tries 8 and less on first use, also halved before the
+                problem's own steps, and takes the first that is fine enough for the problem's own initial
+                state; arms only.
             max_iterations: Most iterations from one guess.
             tolerance: See `BoxDDP`.
             second_order: See `BoxDDP`; where long steps are tried and Gauss-Newton's model creeps, None takes
@@ -174,6 +176,8 @@ class GuidedDDP:
     @property
     def coarsening(self) -> int:
         """Steps in a long one, in which a maneuver is solved first; 1 for none. The first access tries some.
+
+        Solves in steps twice as long may come before; `metadata["long_steps"]` of a solution lists them too.
 
         Raises:
             KeyboardInterrupt: If the user interrupts that.
@@ -308,7 +312,8 @@ class GuidedDDP:
         trial = follow(refined(found, self.problem), self.problem, start)
         if not np.isfinite(trial.cost):
             return None
-        facts, attempts = found.metadata, found.metadata["attempts"]
+        facts = found.metadata
+        attempts = facts["long_steps"] + facts["attempts"]  # those in steps twice as long come first
         return _Guess(
             facts["guess"],
             trial.controls,
@@ -339,7 +344,7 @@ class GuidedDDP:
             return False
         return self._target is None or self._target.misses(solution.states[-1]) <= 1.0
 
-    def _in_long_steps(self, factor: int) -> "GuidedDDP":
+    def _in_long_steps(self, factor: int, *, compare: bool = True) -> "GuidedDDP":
         """Make the solver in long steps, with the settings of this one; its library is this one's."""
         known = self._library
         return GuidedDDP(
@@ -349,7 +354,7 @@ class GuidedDDP:
             reach_target=self.reach_target,
             remember=self._vacancies,
             attempts=self.attempts,
-            compare=True,
+            compare=compare,
             coarsening=1,
             **self._settings,
         )
@@ -363,7 +368,28 @@ class GuidedDDP:
                 if self._leads_to_minimum(coarse):
                     self._coarse = coarse
                     return factor
+                halved = self._in_halved_steps(coarse)
+                if halved is not None and self._leads_to_minimum(halved):
+                    self._coarse = halved
+                    return factor // 2
         return 1
+
+    def _in_halved_steps(self, coarse: "GuidedDDP") -> "GuidedDDP | None":
+        """Make the solver in half the long steps, which begins where the long ones end; None if it is no use.
+
+        Where fast motions bend a narrow valley, most iterations lead along it: they are cheaper there. It is
+        no use where long steps are so inaccurate that their policy strays in the problem's own, nor where
+        half of them are those, or no whole number of them.
+        """
+        factor = self.problem.horizon // coarse.problem.horizon
+        if factor % 2 or factor == 2 or not coarse.library:
+            return None
+        policy = refined(coarse.library[0], self.problem)
+        if follow(policy, self.problem, self.problem.initial_state).cost > STRAYED * policy.cost:
+            return None
+        halved = self._in_long_steps(factor // 2, compare=False)
+        halved._coarse, halved._coarsening = coarse, 2
+        return halved
 
     def _with_best_model(self, factor: int) -> "GuidedDDP":
         """Make the solver in long steps, with the mirrored model from now on if that pays."""

@@ -48,12 +48,12 @@ class ArmProblem:
         self.time_step = self.scene.simulation.dt
         self.initial_state: FloatArray = layout.initial_state
         self._limits_vary = not set(layout.control.limits).isdisjoint(layout.parameters.names)
-        self._make_inputs(coarsening=1)
+        self._make_inputs(usual_emphasis=1.0)
 
-    def _make_inputs(self, coarsening: int) -> None:
+    def _make_inputs(self, usual_emphasis: float) -> None:
         """Allocate what may change between solves: parameters, and the emphasis on the final pose."""
         self.parameters = StageParameters(self.horizon, self.kernels.layout.parameters.nominal)
-        self._usual_emphasis = 1.0 / coarsening
+        self._usual_emphasis = usual_emphasis
         self._emphasis: FloatArray = np.full(1, self._usual_emphasis)
         last = (rows[-1:] for rows in self.parameters.inputs)
         self.terminal_inputs: tuple[FloatArray, ...] = (*last, self._emphasis)
@@ -75,7 +75,7 @@ class ArmProblem:
         coarse = copy.copy(self)
         coarse.horizon, coarse.time_step = self.horizon // factor, self.time_step * factor
         coarse.integrator = INTEGRATORS[self.integrator].curvature or self.integrator
-        coarse._make_inputs(factor)
+        coarse._make_inputs(self._usual_emphasis / factor)
         return coarse
 
     @property

@@ -11,10 +11,14 @@ from experts import BoxDDP, GuidedDDP, StopReason
 from experts.ddp.backward_pass import PASS_COMPLETED
 from experts.ddp.derivatives import mirrored
 from experts.ddp.second_order import (
+    EXACT_MU_FACTOR,
     LARGEST_MU,
     LONGEST_PAUSE,
     MU_FACTOR,
     SMALLEST_MU,
+    STRONGEST_EXACT_MU,
+    WEAKEST_EXACT_MU,
+    ExactRegularization,
     HybridSwitch,
     Regularization,
     SecondOrder,
@@ -249,6 +253,20 @@ def test_is_exhausted_beyond_its_range() -> None:
     assert not regularization.exhausted
     regularization.increase()
     assert regularization.exhausted
+
+
+def test_the_exact_model_beside_the_mirrored_one_remembers_its_regularization():
+    remembered = ExactRegularization()
+    remembered.adapt(0.25)
+    assert remembered.mu == EXACT_MU_FACTOR * WEAKEST_EXACT_MU
+    remembered.adapt(0.5)
+    assert remembered.mu == EXACT_MU_FACTOR * WEAKEST_EXACT_MU
+    for _ in range(2):
+        remembered.adapt(1.0)
+    assert remembered.mu == WEAKEST_EXACT_MU
+    while remembered.increase():
+        pass
+    assert STRONGEST_EXACT_MU / EXACT_MU_FACTOR < remembered.mu <= STRONGEST_EXACT_MU
 
 
 # The mirrored model ----------------------------------------------------------------------------------------

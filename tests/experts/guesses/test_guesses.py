@@ -398,6 +398,59 @@ def test_long_steps_lead_to_the_same_minimum(paper, seed):
     assert alone.metadata["long_steps"] == []
 
 
+def test_twice_coarsened_is_coarsened_by_the_product(paper):
+    once, twice = paper.problem.coarsened(8), paper.problem.coarsened(2).coarsened(4)
+    assert (twice.horizon, twice.time_step) == (once.horizon, once.time_step)
+    start = random_start("paper", 0)
+    assert twice.end_cost(start) == once.end_cost(start)
+
+
+@pytest.fixture
+def halving(monkeypatch):
+    """A solver whose long steps do not lead to the minimum before they are halved."""
+    monkeypatch.setattr(GuidedDDP, "_leads_to_minimum", lambda self, coarse: coarse.problem.horizon == 250)
+    return GuidedDDP("paper")
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_halved_steps_lead_to_the_same_minimum(paper, halving, seed):
+    start = random_start("paper", seed)
+    usual, solution = paper.solve(start), halving.solve(start)
+    assert halving.coarsening == 4
+    assert solution.converged
+    assert solution.cost == pytest.approx(usual.cost, rel=1e-6)
+    # What was solved in the longest steps comes first, and costs are the problem's own.
+    longest, usual_longest = (
+        [attempt["cost"] for attempt in found.metadata["long_steps"]] for found in (solution, usual)
+    )
+    assert longest[: len(usual_longest)] == pytest.approx(usual_longest, rel=1e-12)
+    assert longest[len(usual_longest) :] == pytest.approx([solution.cost], rel=0.1)
+    assert len(halving.library[0].controls) == halving.problem.horizon
+
+
+def test_long_steps_whose_policy_strays_are_not_halved(monkeypatch):
+    monkeypatch.setattr(GuidedDDP, "_leads_to_minimum", lambda self, coarse: coarse.problem.horizon == 250)
+    monkeypatch.setattr("experts.guesses.guided.STRAYED", 0.5)
+    solver = GuidedDDP("paper")
+    assert solver.coarsening == 4
+    assert {attempt["guess"] for attempt in solver.solve().metadata["long_steps"]} == {
+        "policy 0",
+        "zero controls",
+    }
+    assert len(solver.solve().metadata["long_steps"]) == 2  # in steps of one length
+
+
+@pytest.mark.slow
+def test_solves_of_six_joints_converge():
+    solver = GuidedDDP("six-joint")
+    solutions = [solver.solve(random_start("six-joint", seed)) for seed in range(8)]
+    assert all(solution.converged for solution in solutions)
+    assert np.median([solution.iterations for solution in solutions]) <= 20
+    # Within 1 % of the best costs that are known of these starts.
+    best = np.array([400.16, 131.43, 331.82, 161.57, 129.41, 344.04, 104.79, 432.20])
+    assert np.all([solution.cost for solution in solutions] <= 1.01 * best)
+
+
 def test_steps_too_long_for_a_scene_are_not_taken():
     """Joints that turn within a long step: no policy of theirs survives."""
     scene = load_scene("planar").replace(simulation={"dt": 1.0, "steps": 56})
