@@ -99,7 +99,7 @@ class KernelLibrary:
 
     def _load(self, name: str, variant: str, lanes: int, trace: Callable[[], Program]) -> BoundKernel:
         """Load a kernel from the cache; trace and compile it if it is missing."""
-        parts = (self.scene.content_hash(), _source_hash(), name, variant, str(lanes))
+        parts = (self.scene.content_hash(), source_hash(), name, variant, str(lanes))
 
         def build() -> tuple[bytes, dict[str, Any]]:
             from dq_space_arm_env.compiler.build import build_program
@@ -189,7 +189,7 @@ def compile_program(program: Program, lanes: int) -> BoundKernel:
 
         return build_program(program, lanes)
 
-    key = cache_key(repr(program), _source_hash(), str(lanes))
+    key = cache_key(repr(program), source_hash(), str(lanes))
     return BoundKernel(native.load_or_build(program.name, key, build))
 
 
@@ -226,8 +226,12 @@ def _logger() -> logging.Logger:
 
 
 @cache
-def _source_hash() -> str:
-    """Hash of the source that kernels are made from: a changed model never meets an old kernel."""
+def source_hash() -> str:
+    """Hash of the source that kernels are made from: a changed model never meets an old kernel.
+
+    Returns:
+        A hexadecimal number.
+    """
     package = Path(__file__).parent.parent
     digest = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):

@@ -154,6 +154,14 @@ class Solution:
         Args:
             path: File in NumPy's npz format; its folder must exist.
         """
+        write_atomically(Path(path), self.to_bytes())
+
+    def to_bytes(self) -> bytes:
+        """The content of the file that `save` writes.
+
+        Returns:
+            An archive in NumPy's npz format.
+        """
         facts = {
             "cost": self.cost,
             "stop_reason": self.stop_reason.value,
@@ -176,7 +184,7 @@ class Solution:
             parameters=self.parameters,
             facts=np.array(json.dumps(facts)),
         )
-        write_atomically(Path(path), content.getvalue())
+        return content.getvalue()
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -191,17 +199,32 @@ class Solution:
         Raises:
             ValueError: If the file does not hold a solution.
         """
-        where = os.fspath(path)
-        arrays: dict[str, Any] = read_arrays(path, _ARRAYS)
-        if "parameters" not in arrays and np.ndim(arrays.get("states", ())) == 2:  # of a version without them
-            arrays["parameters"] = np.zeros((len(arrays["states"]), 0))
-        missing = set(_ARRAYS) - set(arrays)
+        return cls.from_arrays(read_arrays(path, _ARRAYS), os.fspath(path))
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], where: str) -> Self:
+        """Make a solution of the arrays of a file.
+
+        Args:
+            arrays: Those that `save` writes, by name, shapes as of the attributes.
+            where: Name of the file, for errors.
+
+        Returns:
+            The solution, without its problem.
+
+        Raises:
+            ValueError: If the arrays are no solution.
+        """
+        found: dict[str, Any] = dict(arrays)
+        if "parameters" not in found and np.ndim(found.get("states", ())) == 2:  # of a version without them
+            found["parameters"] = np.zeros((len(found["states"]), 0))
+        missing = set(_ARRAYS) - set(found)
         if missing:
             raise ValueError(f"{where} is not a solution: it lacks {', '.join(sorted(missing))}")
-        facts = parse_json(str(arrays.pop("facts")), f"{where}: facts")
-        _check(arrays, facts, where)
+        facts = parse_json(str(found.pop("facts")), f"{where}: facts")
+        _check(found, facts, where)
         return cls(
-            **arrays,
+            **found,
             cost=facts["cost"],
             stop_reason=StopReason(facts["stop_reason"]),
             message=facts["message"],

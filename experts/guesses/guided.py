@@ -27,6 +27,7 @@ from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.second_order import FIRST_MU, SecondOrder
 from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason
 from experts.guesses.policies import coarsened, follow, policies, refined, track
+from experts.guesses.preparation import Preparation, keep_preparation, preparation_key, read_preparation
 from experts.guesses.reaching import HasTolerances, Reached, reach, solve_emphasized
 from experts.guesses.screw_motion import ScrewMotion
 from experts.guesses.screw_motion import screw_motion as guess_screw_motion
@@ -93,7 +94,7 @@ class GuidedDDP:
         remember: int = 0,
         attempts: int = 2,
         compare: bool = False,
-        coarsening: int | None = None,
+        coarsening: int | Sequence[int] | None = None,
         max_iterations: int = 200,
         tolerance: float = 1e-7,
         second_order: str | None = None,
@@ -115,9 +116,10 @@ class GuidedDDP:
             compare: Whether to solve that many, and keep the best solution, rather than stop at the first
                 that converges within the tolerances. In long steps they are always compared.
             coarsening: Steps in a long one, in which a maneuver is solved first; it divides the number of
-                stages. 1 leaves that out. None tries 8 and less on first use, also halved before the
-                problem's own steps, and takes the first that is fine enough for the problem's own initial
-                state; arms only.
+                stages. Several are solved in one after another, the longest first, each a multiple of the
+                next. 1 leaves that out. None tries 8 and less on first use, also halved before the problem's
+                own steps, and takes the first that is fine enough for the problem's own initial state; arms
+                only.
             max_iterations: Most iterations from one guess.
             tolerance: See `BoxDDP`.
             second_order: See `BoxDDP`; where long steps are tried and Gauss-Newton's model creeps, None takes
@@ -150,12 +152,11 @@ class GuidedDDP:
         for i, solution in enumerate(self._library or ()):
             _check_sizes(f"library[{i}]", solution, self.problem)
         self._coarse: GuidedDDP | None = None
-        is_arm = isinstance(self.problem, ArmProblem)
-        self._coarsening = 1 if coarsening is None and not is_arm else coarsening
-        if self._coarsening not in (None, 1):
-            if not is_arm:
-                raise ValueError(f"coarsening is {coarsening!r}; only the maneuver of a scene has long steps")
-            self._coarse = self._in_long_steps(self._coarsening)
+        self._coarsening: tuple[int, ...] | None = None if isinstance(self.problem, ArmProblem) else ()
+        if coarsening is not None:
+            self._coarsening = self._check_coarsening(coarsening)
+            if self._coarsening:
+                self._coarse = self._in_long_steps(self._coarsening)
 
     @property
     def library(self) -> tuple[Solution, ...]:
@@ -172,17 +173,17 @@ class GuidedDDP:
         return tuple(self._library)
 
     @property
-    def coarsening(self) -> int:
-        """Steps in a long one, in which a maneuver is solved first; 1 for none. The first access tries some.
+    def coarsening(self) -> tuple[int, ...]:
+        """Steps in a long one, in which a maneuver is solved first, the longest first; empty for none.
 
-        Solves in steps twice as long may come before; `metadata["long_steps"]` of a solution lists them too.
+        The first access finds them, or reads what another process found.
 
         Raises:
             KeyboardInterrupt: If the user interrupts that.
         """
         if self._coarsening is None:
-            self._coarsening = self._find_coarsening()
-        return self._coarsening
+            self._prepare()
+        return cast(tuple[int, ...], self._coarsening)
 
     @property
     def second_order(self) -> str:
@@ -342,9 +343,22 @@ class GuidedDDP:
             return False
         return self._target is None or self._target.misses(solution.states[-1]) <= 1.0
 
-    def _in_long_steps(self, factor: int, *, compare: bool = True) -> "GuidedDDP":
+    def _check_coarsening(self, given: int | Sequence[int]) -> tuple[int, ...]:
+        """Return the factors that are more than 1; raise ValueError if one is no multiple of the next."""
+        factors = tuple(given) if isinstance(given, Sequence) else (given,)
+        for factor, next_one in zip(factors, (*factors[1:], 1), strict=True):
+            if not isinstance(factor, int | np.integer) or factor < 1 or factor % next_one:
+                raise ValueError(
+                    f"coarsening is {factors}; it must be whole numbers of steps, each a multiple of the next"
+                )
+        found = tuple(int(factor) for factor in factors if factor > 1)
+        if found and not isinstance(self.problem, ArmProblem):
+            raise ValueError(f"coarsening is {factors}; only the maneuver of a scene has long steps")
+        return found
+
+    def _in_long_steps(self, coarsening: Sequence[int]) -> "GuidedDDP":
         """Make the solver in long steps, with the settings of this one; its library is this one's."""
-        known = self._library
+        known, factor = self._library, coarsening[-1]
         return GuidedDDP(
             cast(ArmProblem, self.problem).coarsened(factor),
             library=None if known is None else [coarsened(member, factor) for member in known],
@@ -352,12 +366,45 @@ class GuidedDDP:
             reach_target=self.reach_target,
             remember=self._vacancies,
             attempts=self.attempts,
-            compare=compare,
-            coarsening=1,
+            compare=len(coarsening) == 1,
+            coarsening=[longer // factor for longer in coarsening[:-1]] or 1,
             **self._settings,
         )
 
-    def _find_coarsening(self) -> int:
+    def _prepare(self) -> None:
+        """Find how to solve this maneuver, or read what another process found."""
+        key, known = None, None
+        if self._library is None and self._vacancies == 0:
+            names = ("attempts", "reach_target")
+            settings = {**self._settings, **{name: getattr(self, name) for name in names}}
+            kinematic = self._kinematic_guess is not None
+            key = preparation_key(cast(ArmProblem, self.problem), {**settings, "screw_motion": kinematic})
+            known = read_preparation(key)
+        if known is None:
+            self._coarsening = self._find_coarsening()
+            if key is not None:
+                found = self._coarsening, self._solver.second_order.value, self._longest.library
+                keep_preparation(key, Preparation(*found))
+            return
+        if known.second_order != self._solver.second_order:
+            self._take_model(known.second_order)
+        if known.coarsening:
+            self._coarse = self._in_long_steps(known.coarsening)
+        self._longest._library = list(known.library)
+        self._coarsening = known.coarsening
+
+    @property
+    def _longest(self) -> "GuidedDDP":
+        """The solver in the longest steps, whose library is this one's."""
+        return self if self._coarse is None else self._coarse._longest
+
+    def _take_model(self, second_order: str) -> None:
+        """Solve with other second derivatives from now on."""
+        self._settings = {**self._settings, "second_order": second_order}
+        self._solver = BoxDDP(self.problem, **self._settings)
+        self._chooses_model = False
+
+    def _find_coarsening(self) -> tuple[int, ...]:
         """Find the longest steps whose policy leads to the minimum in the problem's own."""
         horizon = self.problem.horizon
         for factor in range(LARGEST_COARSENING, 1, -1):
@@ -365,12 +412,12 @@ class GuidedDDP:
                 coarse = self._with_best_model(factor)
                 if self._leads_to_minimum(coarse):
                     self._coarse = coarse
-                    return factor
+                    return (factor,)
                 halved = self._in_halved_steps(coarse)
                 if halved is not None and self._leads_to_minimum(halved):
                     self._coarse = halved
-                    return factor // 2
-        return 1
+                    return (factor, factor // 2)
+        return ()
 
     def _in_halved_steps(self, coarse: "GuidedDDP") -> "GuidedDDP | None":
         """Make the solver in half the long steps, which begins where the long ones end; None if it is no use.
@@ -385,20 +432,19 @@ class GuidedDDP:
         policy = refined(coarse.library[0], self.problem)
         if follow(policy, self.problem, self.problem.initial_state).cost > STRAYED * policy.cost:
             return None
-        halved = self._in_long_steps(factor // 2, compare=False)
-        halved._coarse, halved._coarsening = coarse, 2
+        halved = self._in_long_steps((factor, factor // 2))
+        halved._coarse = coarse
         return halved
 
     def _with_best_model(self, factor: int) -> "GuidedDDP":
         """Make the solver in long steps, with the mirrored model from now on if that pays."""
-        coarse = self._in_long_steps(factor)
+        coarse = self._in_long_steps((factor,))
         if self._chooses_model and coarse.library and coarse.library[0].iterations > CREEPING:
             settings = self._settings
             self._settings = {**settings, "second_order": SecondOrder.MIRRORED.value}
-            mirrored = self._in_long_steps(factor)
+            mirrored = self._in_long_steps((factor,))
             if mirrored.library and mirrored.library[0].cost < CHEAPER * coarse.library[0].cost:
-                self._solver = BoxDDP(self.problem, **self._settings)
-                self._chooses_model = False
+                self._take_model(SecondOrder.MIRRORED.value)
                 return mirrored
             self._settings = settings
         return coarse

@@ -241,8 +241,10 @@ def run_tests(tree: Path, tests: list[str], stage: str, mutant: dict[str, Any]) 
 
 def _keep_other_loops(file: str, mutant: str) -> None:
     """Compile anew only the loops of the mutated file, and those that inline it; keys hold all sources."""
+    from experts.guesses import guided
     from experts.native import loop_cache
 
+    guided.read_preparation = lambda key: None  # nor what the unmutated solver prepared
     changed = {Path(file).stem} | ({"backward_pass"} if file.endswith("box_qp.py") else set())
     loop_cache._source_hash = lambda of: mutant if Path(of).stem in changed else "as it is"
 

@@ -50,7 +50,7 @@ def measure_starts(
         ours, best = (solve_episode(solver, env, seed) for solver in (guided, judge))
         rows.append({"table": "random starts", "scene": scene, "solver": GUIDED, **judged(ours, best)})
         yield rows[-1]
-    facts = {"coarsening": guided.coarsening, "preparation_s": preparation}
+    facts = {"coarsening": ", ".join(map(str, guided.coarsening)), "preparation_s": preparation}
     summary = {"table": "start summaries", "scene": scene, **facts, **summarized(rows)}
     yield summary
     for remark, share, bound in (
@@ -94,7 +94,6 @@ def _judge(problem: ArmProblem, guided: GuidedDDP, effort: Effort) -> GuidedDDP:
     return GuidedDDP(
         problem,
         library=library,
-        attempts=FURTHER_GUESSES,
-        compare=True,
+        attempts=FURTHER_GUESSES,  # compared in long steps
         max_iterations=effort.max_iterations,
     )

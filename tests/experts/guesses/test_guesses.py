@@ -392,7 +392,7 @@ def test_long_steps_lead_to_the_same_minimum(paper, seed):
     start = random_start("paper", seed)
     solution = paper.solve(start)
     alone = GuidedDDP("paper", coarsening=1).solve(start)
-    assert paper.coarsening == 8
+    assert paper.coarsening == (8,)
     assert solution.converged
     assert solution.cost == pytest.approx(alone.cost, rel=1e-6)
     assert solution.iterations < alone.iterations
@@ -407,10 +407,17 @@ def test_twice_coarsened_is_coarsened_by_the_product(paper):
     assert twice.end_cost(start) == once.end_cost(start)
 
 
+def nothing_kept(monkeypatch):
+    """Neither read what processes prepared nor leave anything to them."""
+    monkeypatch.setattr("experts.guesses.guided.read_preparation", lambda key: None)
+    monkeypatch.setattr("experts.guesses.guided.keep_preparation", lambda key, preparation: None)
+
+
 @pytest.fixture
 def halving(monkeypatch):
     """A solver whose long steps do not lead to the minimum before they are halved."""
     monkeypatch.setattr(GuidedDDP, "_leads_to_minimum", lambda self, coarse: coarse.problem.horizon == 250)
+    nothing_kept(monkeypatch)
     return GuidedDDP("paper")
 
 
@@ -418,7 +425,7 @@ def halving(monkeypatch):
 def test_halved_steps_lead_to_the_same_minimum(paper, halving, seed):
     start = random_start("paper", seed)
     usual, solution = paper.solve(start), halving.solve(start)
-    assert halving.coarsening == 4
+    assert halving.coarsening == (8, 4)
     assert solution.converged
     assert solution.cost == pytest.approx(usual.cost, rel=1e-6)
     # What was solved in the longest steps comes first, and costs are the problem's own.
@@ -433,8 +440,9 @@ def test_halved_steps_lead_to_the_same_minimum(paper, halving, seed):
 def test_long_steps_whose_policy_strays_are_not_halved(monkeypatch):
     monkeypatch.setattr(GuidedDDP, "_leads_to_minimum", lambda self, coarse: coarse.problem.horizon == 250)
     monkeypatch.setattr("experts.guesses.guided.STRAYED", 0.5)
+    nothing_kept(monkeypatch)
     solver = GuidedDDP("paper")
-    assert solver.coarsening == 4
+    assert solver.coarsening == (4,)
     assert {attempt["guess"] for attempt in solver.solve().metadata["long_steps"]} == {
         "policy 0",
         "zero controls",
@@ -457,7 +465,7 @@ def test_steps_too_long_for_a_scene_are_not_taken():
     """Joints that turn within a long step: no policy of theirs survives."""
     scene = load_scene("planar").replace(simulation={"dt": 1.0, "steps": 56})
     solver = GuidedDDP(scene)
-    assert solver.coarsening == 1
+    assert solver.coarsening == ()
     assert solver.solve().metadata["long_steps"] == []
 
 
@@ -472,11 +480,54 @@ def test_a_user_who_stops_it_in_long_steps_gets_the_trajectory_so_far(paper):
 
 
 def test_a_number_of_steps_that_does_not_divide_the_stages_is_refused():
-    for factor in (7, 0, -8, 2.5, 2.0):
-        with pytest.raises(ValueError, match=f"factor is {factor}; it must divide the 1000 stages"):
-            GuidedDDP("paper", coarsening=factor)
+    with pytest.raises(ValueError, match="factor is 7; it must divide the 1000 stages"):
+        GuidedDDP("paper", coarsening=7)
+    for coarsening in (0, -8, 2.5, 2.0, (4, 3), (2, 4), ("8",)):
+        with pytest.raises(ValueError, match="it must be whole numbers of steps, each a multiple"):
+            GuidedDDP("paper", coarsening=coarsening)
 
 
 def test_only_scenes_have_long_steps(unicycle):
-    with pytest.raises(ValueError, match="coarsening is 2; only the maneuver of a scene has long steps"):
+    with pytest.raises(
+        ValueError, match=r"coarsening is \(2,\); only the maneuver of a scene has long steps"
+    ):
         GuidedDDP(unicycle, coarsening=2)
+
+
+@pytest.fixture
+def kept(monkeypatch, tmp_path):
+    """Lists the files of preparations in an empty cache."""
+    GuidedDDP("planar", library=[]).solve()  # compiles
+    monkeypatch.setattr("dq_space_arm_env.common.code_cache.cache_directory", lambda: tmp_path)
+    return lambda: list(tmp_path.glob("guided-ddp-*"))
+
+
+def test_another_process_reads_what_one_prepared_and_solves_the_same(monkeypatch, kept):
+    first = GuidedDDP("planar")
+    start = random_start("planar", 3)
+    expected = first.solve(start)
+    assert len(kept()) == 1
+    monkeypatch.setattr(GuidedDDP, "_find_coarsening", None)
+    second = GuidedDDP("planar")
+    assert (second.coarsening, second.second_order) == (first.coarsening, first.second_order)
+    assert second.solve(start).controls.tobytes() == expected.controls.tobytes()
+    np.testing.assert_array_equal(first.library[0].states, second.library[0].states)
+
+
+def test_other_settings_have_another_preparation(kept):
+    for settings in ({}, {"tolerance": 1e-6}, {"reach_target": False}, {"max_iterations": 100}):
+        _ = GuidedDDP("planar", **settings).coarsening
+    assert len(kept()) == 4
+    for settings in ({"remember": 1}, {"coarsening": 8}, {"library": []}):
+        GuidedDDP("planar", **settings).solve()
+    assert len(kept()) == 4
+
+
+def test_a_damaged_preparation_is_made_again(kept):
+    _ = GuidedDDP("planar").coarsening
+    (path,) = kept()
+    content = path.read_bytes()
+    path.write_bytes(content[:-100])
+    with pytest.warns(UserWarning, match="is damaged"):
+        _ = GuidedDDP("planar").coarsening
+    assert len(path.read_bytes()) == len(content)
