@@ -374,11 +374,11 @@ class GuidedDDP:
     def _prepare(self) -> None:
         """Find how to solve this maneuver, or read what another process found."""
         key, known = None, None
-        if self._library is None and self._vacancies == 0:
+        if type(self.problem) is ArmProblem and self._library is None and self._vacancies == 0:
             names = ("attempts", "reach_target")
             settings = {**self._settings, **{name: getattr(self, name) for name in names}}
             kinematic = self._kinematic_guess is not None
-            key = preparation_key(cast(ArmProblem, self.problem), {**settings, "screw_motion": kinematic})
+            key = preparation_key(self.problem, {**settings, "screw_motion": kinematic})
             known = read_preparation(key)
         if known is None:
             self._coarsening = self._find_coarsening()
