@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from experts.ddp.backward_pass import PASS_NOT_FINITE, PASS_NOT_POSITIVE_DEFINITE, PassResult
 from experts.ddp.multiple_shooting import MultipleShooting
 from experts.ddp.rollout import FINISHED
-from experts.ddp.second_order import EXACT_MU, FIRST_MU, Regularization, SecondOrder, SolverState
+from experts.ddp.second_order import EXACT_MU, Regularization, SecondOrder, SolverState
 from experts.ddp.shooting import ShootingWorkspace, WorkTime, line_search
 from experts.ddp.solution import HISTORY_DTYPE, Callback, IterationRecord, Solution, Stop, StopReason
 from experts.problems.arm_problem import as_problem
@@ -53,7 +53,7 @@ class BoxDDP:
         tolerance: float = 1e-7,
         plateau_decrease: float = 1e-8,
         plateau_iterations: int = 50,
-        initial_regularization: float = FIRST_MU,
+        initial_regularization: float = 1000.0,
         second_order: str | None = None,
         threads: int = 1,
     ) -> None:

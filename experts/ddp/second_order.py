@@ -38,8 +38,6 @@ HALF_STEP = 0.5
 LONGEST_PAUSE = 8
 """Most iterations that the hybrid waits before it tries the exact model again."""
 
-FIRST_MU = 1e4
-"""First regularization from zero controls: after short first steps a solve rarely ends in a poor minimum."""
 MU_FACTOR = 1.6
 SMALLEST_MU = 1e-6  # below it mu is zero
 LARGEST_MU = 1e10

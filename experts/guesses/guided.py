@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from experts.ddp.box_ddp import BoxDDP
-from experts.ddp.second_order import FIRST_MU, SecondOrder
+from experts.ddp.second_order import SecondOrder
 from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason
 from experts.guesses.policies import coarsened, follow, policies, refined, track
 from experts.guesses.preparation import Preparation, keep_preparation, preparation_key, read_preparation
@@ -42,6 +42,8 @@ STRAYED = 3.0
 """A policy whose rollout costs this many times its own maneuver has strayed too far from it."""
 SCREW_REGULARIZATION = 1e2
 """First regularization from a screw motion: the arm is not wound up, and long steps rarely wind it up."""
+ZERO_REGULARIZATION = 1e4
+"""First regularization from zero controls: short first steps rarely end in a poor minimum."""
 NEAR_REGULARIZATION = 0.0
 """First regularization after an increase of the emphasis, or of the number of steps: the minimum is near."""
 LARGEST_COARSENING = 8
@@ -291,7 +293,7 @@ class GuidedDDP:
         ranked = sorted(
             (guess for guess in rollouts if np.isfinite(guess.cost)), key=lambda guess: guess.cost
         )
-        zero = _Guess("zero controls", None, np.inf, FIRST_MU)
+        zero = _Guess("zero controls", None, np.inf, ZERO_REGULARIZATION)
         # The last of two or more attempts starts from zero controls.
         return [*ranked[: max(self.attempts - 1, 1)], zero][: self.attempts]
 
