@@ -1,8 +1,8 @@
-"""Tangent programs: exact derivatives of a program's results by one of its inputs, in forward mode.
+"""Tangent programs: exact derivatives of a program's results by some of its inputs, in forward mode.
 
-Beside each call of a graph stand calls of its tangent, one for each entry of the input (a direction). All
+Beside each call of a graph stand calls of its tangent, one for each entry of the inputs (a direction). All
 directions run the same machine code on other buffers: the tangent of buffer `k1` in direction 3 is `k1.3`.
-Buffers that do not depend on the input, or that no wanted result depends on, have no tangents.
+Buffers that do not depend on the inputs, or that no wanted result depends on, have no tangents.
 
 Loops repeat the tangents with the values, as long as the values ask for it. The result is the derivative of
 the passes taken. An iteration to a fixed point stops when the values have converged; their tangents converge
@@ -29,20 +29,20 @@ Names = tuple[str, ...]
 """Names of the tangent buffers of a buffer, one for each direction."""
 
 
-def append_tangents(program: Program, by: str, of: Sequence[str]) -> dict[str, Names | None]:
-    """Add the calls that compute the derivatives of some buffers by the entries of an input.
+def append_tangents(program: Program, by: Sequence[str], of: Sequence[str]) -> dict[str, Names | None]:
+    """Add the calls that compute the derivatives of some buffers by the entries of inputs.
 
     Append own calls on the tangent buffers, see `append_for_each`, and gather them in an output, see
     `append_matrix`.
 
     Args:
         program: The program, changed in place; its results stay the same up to rounding.
-        by: Name of the input, float numbers that no call overwrites.
+        by: Names of the inputs, float numbers that no call overwrites.
         of: Names of the buffers to differentiate, as they are after the last call.
 
     Returns:
-        For each of these buffers the names of its tangent buffers, one for each entry of the input; None if
-        it does not depend on the input.
+        For each of these buffers the names of its tangent buffers, one for each entry of the inputs, in their
+        order; None if it does not depend on them.
 
     Raises:
         ValueError: The program has no such input or buffers, overwrites the input, or has tangents already.
@@ -100,16 +100,16 @@ def append_matrix(program: Program, tangents: Names | None, shape: tuple[int, in
 class _Transformation:
     """The calls of a program with those of its tangents."""
 
-    def __init__(self, program: Program, by: str, of: Sequence[str]) -> None:
+    def __init__(self, program: Program, by: Sequence[str], of: Sequence[str]) -> None:
         self._program, self._by = program, by
         self._sizes = program.scratch_sizes()
         self._check(of)
         self._dependencies = {call.graph.name: dependencies(call.graph) for call in program.calls}
         self._live = self._active() & self._needed(of)
         self._graphs = self._tangent_graphs()
-        self._count = self._sizes[by]
+        self._count = sum(self._sizes[name] for name in by)
         self.calls: list[Call] = []
-        self._seeded = by not in self._live
+        self._seeded = not any(name in self._live for name in by)
         self._append_first_zeros()
         begins, places = {loop.begin for loop in program.loops}, []
         for number, call in enumerate(program.calls):
@@ -123,16 +123,17 @@ class _Transformation:
     def _check(self, of: Sequence[str]) -> None:
         program = self._program
         inputs = {buffer.name: buffer.dtype for buffer in program.inputs}
-        if self._by not in inputs or inputs[self._by] == "bool":
-            raise ValueError(f"program {program.name!r} has no input {self._by!r} of float numbers")
-        if f"{self._by}.0" in self._sizes or any(f"{name}.0" in self._sizes for name in of):
+        for name in self._by:
+            if name not in inputs or inputs[name] == "bool":
+                raise ValueError(f"program {program.name!r} has no input {name!r} of float numbers")
+        if any(f"{name}.0" in self._sizes for name in (*self._by, *of)):
             raise ValueError(f"program {program.name!r} has tangents already")
         for name in of:
             if name not in self._sizes:
                 raise ValueError(f"program {program.name!r} has no buffer {name!r} to differentiate")
         for call in program.calls:
-            if self._by in _buffers(call, call.graph.outputs).values():
-                raise ValueError(f"program {program.name!r}: {call.graph.name!r} overwrites {self._by!r}")
+            for name in set(self._by) & set(_buffers(call, call.graph.outputs).values()):
+                raise ValueError(f"program {program.name!r}: {call.graph.name!r} overwrites {name!r}")
 
     def names(self, buffer: str) -> Names | None:
         """Names of a buffer's tangents, None where they are zero."""
@@ -152,7 +153,7 @@ class _Transformation:
 
     def _active(self) -> set[str]:
         """Buffers that depend on the input."""
-        return _reached({self._by}, self._links())
+        return _reached(set(self._by), self._links())
 
     def _needed(self, of: Sequence[str]) -> set[str]:
         """Buffers on which the wanted ones depend."""
@@ -187,18 +188,21 @@ class _Transformation:
     def _append_first_zeros(self) -> None:
         """Append the tangents of other inputs, if calls overwrite these and give them others."""
         for buffer in self._program.inputs:
-            if buffer.name in self._live and buffer.name != self._by:
+            if buffer.name in self._live and buffer.name not in self._by:
                 self._append_zeros(buffer.name)
 
     def _append_seeds(self) -> None:
         """Append the directions themselves: the columns of the identity."""
-        if not self._seeded:
-            self._seeded = True
-            count = self._count
-            rows = {f"d{j}": [float(i == j) for i in range(count)] for j in range(count)}
-            graph = trace(f"{self._program.name}_{self._by}_directions", {}, lambda: rows)
-            names = self.names(self._by) or ()
-            self.calls.append(Call(graph, dict(zip(rows, names, strict=True))))
+        if self._seeded:
+            return
+        self._seeded, first = True, 0
+        for name in self._by:
+            size = self._sizes[name]
+            if name in self._live:
+                rows = {f"d{j}": [float(first + i == j) for i in range(size)] for j in range(self._count)}
+                graph = trace(f"{self._program.name}_{name}_directions", {}, lambda rows=rows: rows)
+                self.calls.append(Call(graph, dict(zip(rows, self.names(name) or (), strict=True))))
+            first += size
 
     def _append_zeros(self, buffer: str) -> None:
         size = self._sizes[buffer]

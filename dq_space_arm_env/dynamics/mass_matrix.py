@@ -83,18 +83,25 @@ class MassMatrix:
             linear = subtract(linear, scale(rate * inverse_mass, column))
         return Accelerations(angular, linear, rates)
 
-    def joint_inertia(self) -> list[list[Scalar]]:
-        """Inertia that the joints feel on the free base: the Schur complement, symmetric (n, n), kg m^2."""
-        count = len(self._axes)
-        joints = [row[count:] for row in self._reduced[count:]]
-        for j in range(len(joints)):
-            response = solve_ldl(self._locked_factor(), [row[count + j] for row in self._reduced[:count]])
-            for i in range(j, len(joints)):
-                entry = joints[i][j]
-                for k in range(count):
-                    entry = entry - self._reduced[count + i][k] * response[k]
-                joints[i][j] = joints[j][i] = entry
-        return joints
+    def canonical_momenta(
+        self, angular_velocity: Vector3, joint_rates: Sequence[Scalar]
+    ) -> tuple[Vector3, list[Scalar]]:
+        """Angular momentum about the center of mass, base axes, 3, and the joints' momenta dT/d(rates), n."""
+        count, velocities = len(self._axes), [*(angular_velocity[axis] for axis in self._axes), *joint_rates]
+        products = []
+        for row in self._reduced:
+            value: Scalar = 0.0
+            for entry, velocity in zip(row, velocities, strict=True):
+                value = value + entry * velocity
+            products.append(value)
+        angular: list[Scalar] = [0.0, 0.0, 0.0]
+        for axis, value in zip(self._axes, products, strict=False):
+            angular[axis] = value
+        return angular, products[count:]
+
+    def velocities(self, angular: Vector3, joint_momenta: Sequence[Scalar]) -> Accelerations:
+        """Angular velocity and joint rates for given momenta: the inverse of `canonical_momenta`."""
+        return self.solve(ZERO, angular, joint_momenta)
 
     def _locked_factor(self) -> LDLFactor:
         """Factors of the locked inertia, the leading block of the factorized matrix."""

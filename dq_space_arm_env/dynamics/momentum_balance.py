@@ -29,12 +29,6 @@ class SpaceArmMomentum:
         """Mass of the whole system, kg."""
         return sum((link.body.mass for link in self._chain.links), start=self._chain.base.mass)
 
-    @property
-    def springs(self) -> tuple[list[float], list[float]]:
-        """Stiffness [N m/rad] and damping [N m s/rad] of the joints, n each."""
-        links = self._chain.links
-        return [link.stiffness for link in links], [link.damping for link in links]
-
     def momentum(self, y: Scalars) -> tuple[Scalars, Scalars, Scalars]:
         """Linear momentum, angular momentum about the center of mass, and the latter in the base frame."""
         motion, mass_matrix = self._mass_matrix(y)
@@ -54,9 +48,20 @@ class SpaceArmMomentum:
         tip = self._field.tip_forces(motion, rotations, self._chain.tip_wrench)
         return add(inputs.force, tip.force), add(inputs.torque, tip.torque)
 
-    def joint_inertia(self, y: Scalars) -> list[list[Scalar]]:
-        """Inertia that the joints feel while the base floats freely."""
-        return self._mass_matrix(y)[1].joint_inertia()
+    def joint_torques(self, y: Scalars, u: Scalars) -> list[Scalar]:
+        """Torques of motors, springs and dampers on the joints, and what a wrench at the tip adds, n."""
+        motion = self._field.motion(y)
+        rotations = minimal.joint_rotations(self._chain, motion.joint_angles)
+        parts = (
+            self._field.inputs(u).joint_torques,
+            minimal.passive_torques(self._chain, motion.joint_angles, motion.joint_rates),
+            self._field.tip_forces(motion, rotations, self._chain.tip_wrench).joints,
+        )
+        return [sum(torques) for torques in zip(*parts, strict=True)]
+
+    def mass_matrix(self, y: Scalars) -> MassMatrix:
+        """The mass matrix at the joint angles."""
+        return self._mass_matrix(y)[1]
 
     def _mass_matrix(self, y: Scalars) -> tuple[Motion, MassMatrix]:
         motion = self._field.motion(y)

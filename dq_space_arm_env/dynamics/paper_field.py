@@ -18,13 +18,13 @@ from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
 from dq_space_arm_env.dynamics.equations_of_motion import Inputs
 from dq_space_arm_env.dynamics.newton_euler import PaperState, SchurComplement
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
-from dq_space_arm_env.dynamics.vector_field import DifferentiatedJacobian, split_state
+from dq_space_arm_env.dynamics.vector_field import split_state
 
 Scalar = Any
 Matrix = Any
 
 
-class PaperField(DifferentiatedJacobian):
+class PaperField:
     """Vector field of the paper's state with the tip's pose appended.
 
     For three links and a wrist: base pose (8), joint angles (3), wrist angles (3), dual velocities of the

@@ -23,21 +23,6 @@ class Residual:
     accelerations: Sequence[Scalar]  # symbols of a: angular and linear of the base, joints; 6 + n
     free: Sequence[int]  # accelerations that the base's directions of motion and the joints allow
 
-    def along(
-        self,
-        y: Sequence[Scalar],
-        accelerations: Sequence[Scalar],
-        direction: Sequence[Scalar],
-        change: Sequence[Scalar],
-    ) -> tuple[Matrix, Matrix]:
-        """Derivatives of T = R_y direction + R_a change, both held, by the free accelerations and by y."""
-        moves, changes = symbols("d", len(self.y)), symbols("b", len(self.accelerations))
-        along = casadi.jtimes(self.forces, column(*self.y), column(*moves))
-        along = along + casadi.jtimes(self.forces, column(*self.accelerations), column(*changes))
-        derivatives = [self._by_free(along), casadi.jacobian(along, column(*self.y))]
-        names = column(*self.y, *self.accelerations, *moves, *changes)
-        return _at(derivatives, names, column(*y, *accelerations, *direction, *change))
-
     def weighted(
         self, y: Sequence[Scalar], accelerations: Sequence[Scalar], weights: Sequence[Scalar]
     ) -> tuple[Matrix, Matrix]:

@@ -64,43 +64,6 @@ class SpaceArmField(EquationsOfMotion):
         by_u = columns(*inputs_one_by_one, rows=len(self.rate_indices))
         return rates, jacobian_y, casadi.vertcat(angles_by_u, by_u)
 
-    def jacobian_along(
-        self,
-        y: Sequence[Scalar],
-        u: Sequence[Scalar],
-        rates: Sequence[Scalar],
-        by_y: Matrix,
-        by_u: Matrix,
-        direction: Sequence[Scalar],
-    ) -> Matrix:
-        """Derivative of by_y times a fixed direction v with respect to (y, u), from first derivatives.
-
-        The residual R = M a + ID(y, 0) - f vanishes, and along v so does T = R_a b + R_y v, with b the change
-        of the accelerations along v. Differentiating T = 0 once more gives b_z = -M^-1 (T_y + T_a a_z), with
-        z = (y, u): the factorization of M is not differentiated.
-        """
-        rows, n_y = list(self.rate_indices), self.n_y
-        acceleration, by_state = self._inertial(y, rates, by_y, by_u)
-        # b = a_y v: the change of the accelerations along v.
-        along = casadi.densify(casadi.mtimes(by_state[:, :n_y], column(*direction))).nonzeros()
-        n = len(self.pose.directions)
-        change = [*self.pose.full_twist(along[:n]), *along[n:]]
-        by_accelerations, by_motion = self._residual(symbols("v", n_y)).along(
-            y, acceleration, direction, change
-        )
-        # T_z = T_y + T_a a_z.
-        total = casadi.horzcat(by_motion, zeros(by_motion.shape[0], self.n_u))
-        total = total + casadi.mtimes(by_accelerations, by_state)
-        inertia = self._inertia(self.motion(y), many=True)
-        columns_of_total = (dense_entries(total[:, i]) for i in range(total.shape[1]))
-        sides = (self._on_base([-entry for entry in entries]) for entries in columns_of_total)
-        responses = [self._response(inertia, side) for side in sides]
-        result = zeros(n_y, n_y + self.n_u)
-        result[rows, :] = columns(*(column(*entries) for entries in responses), rows=len(rows))
-        # omega x v is bilinear: its Jacobian changes along a direction like the Jacobian at that direction.
-        result[rows, :n_y] = result[rows, :n_y] + self._simple_jacobians(direction)[2]
-        return casadi.sparsify(result)
-
     def _inertial(
         self, y: Sequence[Scalar], rates: Sequence[Scalar], by_y: Matrix, by_u: Matrix
     ) -> tuple[list[Scalar], Matrix]:

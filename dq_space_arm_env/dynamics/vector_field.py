@@ -11,10 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import casadi
-
 from dq_space_arm_env.algebra import dual_quaternion, quaternion, screw
-from dq_space_arm_env.algebra.symbolic import column, symbols
 
 Scalar = Any
 Matrix = Any  # a CasADi SX matrix
@@ -72,21 +69,6 @@ class VectorField(Protocol):
         """Time derivative of y, its Jacobians by y (n_y, n_y) and u (n_y, n_u)."""
         ...
 
-    def jacobian_along(
-        self,
-        y: Sequence[Scalar],
-        u: Sequence[Scalar],
-        rates: Sequence[Scalar],
-        by_y: Matrix,
-        by_u: Matrix,
-        direction: Sequence[Scalar],
-    ) -> Matrix:
-        """Derivative of by_y times a fixed direction with respect to (y, u), SX (n_y, n_y + n_u).
-
-        The three arguments after u are what `linearized_rates` gives at (y, u).
-        """
-        ...
-
 
 class TwiceDifferentiableField(VectorField, Protocol):
     """Equations of motion with second derivatives, and with the pose apart from y."""
@@ -112,34 +94,6 @@ class TwiceDifferentiableField(VectorField, Protocol):
 def split_state(field: VectorField, x: Sequence[Scalar]) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
     """Stored numbers of the pose (none if it is part of y), and y."""
     return x[: field.n_x - field.n_y], x[field.n_x - field.n_y :]
-
-
-class DifferentiatedJacobian:
-    """Mixin: `jacobian_along` by differentiating the graph of the Jacobian."""
-
-    n_y: int
-    n_u: int
-
-    def linearized_rates(
-        self, y: Sequence[Scalar], u: Sequence[Scalar]
-    ) -> tuple[list[Scalar], Matrix, Matrix]:
-        """See `VectorField`."""
-        raise NotImplementedError
-
-    def jacobian_along(
-        self,
-        y: Sequence[Scalar],
-        u: Sequence[Scalar],
-        rates: Sequence[Scalar],
-        by_y: Matrix,
-        by_u: Matrix,
-        direction: Sequence[Scalar],
-    ) -> Matrix:
-        """See `VectorField`."""
-        free = symbols("v", self.n_y + self.n_u)
-        _, jacobian, _ = self.linearized_rates(free[: self.n_y], free[self.n_y :])
-        along = casadi.jacobian(casadi.mtimes(jacobian, column(*direction)), column(*free))
-        return casadi.sparsify(casadi.substitute(along, column(*free), casadi.densify(column(*y, *u))))
 
 
 def spread(values: Sequence[Scalar], positions: Sequence[int], size: int) -> list[Scalar]:

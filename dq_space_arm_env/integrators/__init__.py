@@ -15,7 +15,7 @@ def integrator_of(simulation: Simulation, name: str = "") -> Integrator:
     entry = INTEGRATORS[name or simulation.integrator]
     method, *parts = (_find(each) for each in entry.implementation)
     given = [part() if isinstance(part, type) else part for part in parts]
-    found: Integrator = method(*given, *(simulation.tolerances if entry.is_adaptive else ()))
+    found: Integrator = method(*given, *(simulation.tolerance_of(key) for key in entry.tolerances))
     return found
 
 

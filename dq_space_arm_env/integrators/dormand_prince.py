@@ -9,8 +9,7 @@ Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, section II.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,19 +21,14 @@ from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.dynamics.vector_field import VectorField, split_state
 from dq_space_arm_env.integrators.explicit_stages import ExplicitStages
 from dq_space_arm_env.integrators.munthe_kaas import combined, stage_slopes
+from dq_space_arm_env.integrators.substeps import Substeps, or_nan
 from dq_space_arm_env.integrators.tableaus import DORMAND_PRINCE_5, DORMAND_PRINCE_DENSE, DORMAND_PRINCE_ERROR
 
 Scalar = Any
 Scalars = Sequence[Scalar]
 
-SMALLEST_SUBSTEP = 1e-6
-"""Smallest substep, as a fraction of the step, before it is given up."""
 MOST_SUBSTEPS = 10_000
-"""So is one that needs more of them than this, rejected ones included."""
-STRETCH = 1.01
-"""Factor by which the last substep may exceed the chosen length."""
-SAFETY, SMALLEST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 5.0
-"""The next substep is 0.9 error^-3/16 times the last one, within these factors."""
+"""A step that needs more of them than this, rejected ones included, is given up."""
 
 
 @dataclass(frozen=True)
@@ -51,31 +45,45 @@ class DormandPrince:
     atol: float = 1e-10  # rad, m, rad/s and m/s
 
     def append_step(self, program: Program, field: VectorField) -> None:
-        substeps = _Substeps(field)
-        substeps.append_begin(program, (self.rtol, self.atol))
-        substeps.stages.append_first(program)
+        attempts = _Attempts(field)
+        substeps = self._begun(program, attempts)
+        attempts.stages.append_first(program)
         with program.repeated_while("unfinished"):
             substeps.append_length(program)
-            substeps.stages.append_later(program, h="substep_time")
-            substeps.append_attempt(program)
+            attempts.stages.append_later(program, h="substep_time")
+            attempts.append_attempt(program)
             substeps.append_choice(program, {"state": "state_tried", "y1": "y7", "k1": "k7"})
-        substeps.append_end(program)
+        substeps.append_end(program, state="x_next")
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
-        substeps = _Substeps(field)
-        substeps.append_begin(program, (self.rtol, self.atol))
-        substeps.stages.append_linearized_first(program)
+        attempts = _Attempts(field)
+        substeps = self._begun(program, attempts)
+        attempts.stages.append_linearized_first(program)
         names = {"state": "state_tried", "y1": "y7", "k1": "k7", "Y1": "Y7", "K1": "K7"}
         if field.pose is not None:
-            substeps.append_pose_begin(program)
+            attempts.append_pose_begin(program)
             names["pose_change"] = "pose_change_tried"
         with program.repeated_while("unfinished"):
             substeps.append_length(program)
-            substeps.stages.append_linearized_later(program, h="substep_time", is_carried=True)
-            substeps.append_attempt(program)
-            substeps.append_pose_attempt(program)
+            attempts.stages.append_linearized_later(program, h="substep_time", is_carried=True)
+            attempts.append_attempt(program)
+            attempts.append_pose_attempt(program)
             substeps.append_choice(program, names)
-        return substeps.append_linearized_end(program)
+        return attempts.append_linearized_end(program)
+
+    def _begun(self, program: Program, attempts: _Attempts) -> Substeps:
+        """Begin a step."""
+        tolerances = {"tolerances": [self.rtol, self.atol]}
+        program.call(trace(f"{attempts.prefix}_tolerances", {}, lambda: tolerances))
+        substeps = Substeps(attempts.prefix, _root, MOST_SUBSTEPS)
+        substeps.append_begin(program, state="x")
+        return substeps
+
+
+def _root(error: Scalar) -> Scalar:
+    """error^3/16, close to the fifth root."""
+    eighth = casadi.sqrt(casadi.sqrt(casadi.sqrt(error)))
+    return eighth * casadi.sqrt(eighth)
 
 
 def append_measured_step(program: Program, field: VectorField) -> None:
@@ -84,42 +92,19 @@ def append_measured_step(program: Program, field: VectorField) -> None:
     The error is that of `DormandPrince`, at most 1 within the tolerances (rtol, atol). `dense` has four
     tangent vectors d_n: the solution at a fraction theta of the step is x (+) sum_n theta^n d_n, to order 4.
     """
-    substeps = _Substeps(field)
-    substeps.stages.append(program)
-    substeps.append_attempt(program, x="x", h="h", state_tried="x_next")
-    program.call(substeps.dense_graph())
+    attempts = _Attempts(field)
+    attempts.stages.append(program)
+    attempts.append_attempt(program, x="x", h="h", state_tried="x_next")
+    program.call(attempts.dense_graph())
 
 
-class _Substeps:
-    """The calls of a time step that is divided into substeps.
-
-    Buffers: `state` and `left`, the present state and the fraction of the step left; `substep`, the fraction
-    to try next; `taken` and `substep_time`, the one being tried, as a fraction and in s; `tries`.
-    """
+class _Attempts:
+    """The calls that try a substep from buffer `state`."""
 
     def __init__(self, field: VectorField) -> None:
         self.field = field
         self.stages = ExplicitStages(field, DORMAND_PRINCE_5)
         self.prefix = self.stages.prefix
-
-    def append_begin(self, program: Program, tolerances: tuple[float, float]) -> None:
-        """Start at x; the whole step is tried first."""
-
-        def begin(x: Scalars) -> dict[str, Any]:
-            return {"state": x, "left": [1.0], "substep": [1.0], "tries": [0.0], "tolerances": tolerances}
-
-        program.call(trace(f"{self.prefix}_begin", {"x": self.field.n_x}, begin))
-
-    def append_length(self, program: Program) -> None:
-        """Length of the substep to try: at most what is left."""
-
-        def length(h: Scalars, left: Scalars, substep: Scalars) -> dict[str, Any]:
-            # A little more than was chosen, if a sliver would be left otherwise.
-            taken = casadi.if_else(left[0] <= STRETCH * substep[0], left[0], substep[0])
-            return {"taken": [taken], "substep_time": [taken * h[0]]}
-
-        program.call(trace(f"{self.prefix}_length", {"h": 1, "left": 1, "substep": 1}, length))
-        program.held |= {"taken", "substep_time"}
 
     def append_attempt(
         self, program: Program, x: str = "state", h: str = "substep_time", state_tried: str = "state_tried"
@@ -155,55 +140,6 @@ class _Substeps:
 
     def _stage_sizes(self) -> dict[str, int]:
         return {f"{name}{i}": self.field.n_y for name in "yk" for i in self.stages.numbers}
-
-    def append_choice(self, program: Program, names: Mapping[str, str]) -> None:
-        """Accept the attempt if its error is tolerable, and choose the next length.
-
-        `names` maps each buffer that moves on to the one tried.
-        """
-        sizes = program.scratch_sizes()
-
-        def choose(
-            error: Scalars, taken: Scalars, left: Scalars, tries: Scalars, **others: Scalars
-        ) -> dict[str, Any]:
-            # Written so that NaN is rejected: of two numbers that do not compare, the second is taken.
-            accepted = casadi.logic_and(error[0] <= 1.0, left[0] > 0.0)
-            remaining = casadi.if_else(accepted, left[0] - taken[0], left[0])
-            eighth = casadi.sqrt(casadi.sqrt(casadi.sqrt(error[0])))
-            factor = casadi.fmax(SAFETY / (eighth * casadi.sqrt(eighth)), SMALLEST_FACTOR)
-            substep = taken[0] * casadi.fmin(factor, LARGEST_FACTOR)
-            going = casadi.logic_and(remaining > 0.0, substep >= SMALLEST_SUBSTEP)
-            unfinished = casadi.logic_and(going, tries[0] < MOST_SUBSTEPS - 1.0)
-            kept = {
-                f"{old}_kept": [
-                    casadi.if_else(accepted, b, a) for a, b in zip(others[old], others[new], strict=True)
-                ]
-                for old, new in names.items()
-            }
-            # A lane that is given up goes no further, however long others in its block take.
-            following = casadi.if_else(unfinished, substep, 0.0)
-            scalars = {"left_kept": [remaining], "substep_kept": [following], "tries_kept": [tries[0] + 1.0]}
-            return {**kept, **scalars, "unfinished": [unfinished]}
-
-        values = {name: sizes[name] for pair in names.items() for name in pair}
-        scalars = dict.fromkeys(("error", "taken", "left", "tries"), 1)
-        program.call(trace(f"{self.prefix}_choice", {**scalars, **values}, choose))
-        # A graph may not write where it reads.
-        carried = {name: sizes[name] for name in (*names, "left", "substep", "tries")}
-
-        def move(**kept: Scalars) -> dict[str, Any]:
-            return {name: kept[f"{name}_kept"] for name in carried}
-
-        kept_sizes = {f"{name}_kept": size for name, size in carried.items()}
-        program.call(trace(f"{self.prefix}_move", kept_sizes, move))
-
-    def append_end(self, program: Program) -> None:
-        """The state at the end of the step; NaN if it was not reached."""
-
-        def end(state: Scalars, left: Scalars) -> dict[str, Any]:
-            return {"x_next": _or_nan(state, left[0])}
-
-        program.call(trace(f"{self.prefix}_end", {"state": self.field.n_x, "left": 1}, end))
 
     def dense_graph(self) -> Any:
         """Graph of the tangent vectors of the dense output."""
@@ -261,11 +197,6 @@ class _Substeps:
             total = casadi.vertcat(pose_change, casadi.horzcat(zeros(field.n_y, n), total))
         n_t = total.shape[0]  # a matrix of n_t + n_u columns
         a, b = total[:, :n_t], total[:, n_t:]
-        outputs = {"A": _or_nan(a.nonzeros(), left), "B": _or_nan(b.nonzeros(), left)}
+        outputs = {"A": or_nan(a.nonzeros(), left), "B": or_nan(b.nonzeros(), left)}
         program.call(graph_of(f"{self.prefix}_linearized_end", inputs, outputs))
         return a.sparsity(), b.sparsity()
-
-
-def _or_nan(values: Scalars, left: Scalar) -> list[Scalar]:
-    """The values, or NaN while part of the step is left."""
-    return [casadi.if_else(left > 0.0, math.nan, value) for value in values]

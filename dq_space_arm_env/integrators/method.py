@@ -28,6 +28,19 @@ class Integrator(Protocol):
 
 
 @runtime_checkable
+class MomentumIntegrator(Integrator, Protocol):
+    """A one-step method that keeps the total momentum, and can hand it on from step to step."""
+
+    def append_walk(self, program: Program, field: VectorField) -> None:
+        """Append the calls that turn buffers x, momentum, u, h into x_next, momentum_next.
+
+        The momentum is that of `Kernels.momentum`, 6 entries in inertial axes. It is handed on plus the
+        change in the step, so rounding errors of the states never enter it.
+        """
+        ...
+
+
+@runtime_checkable
 class TwiceDifferentiableIntegrator(Integrator, Protocol):
     """A one-step method with second derivatives."""
 

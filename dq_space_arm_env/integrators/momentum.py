@@ -16,20 +16,14 @@ from typing import Any
 
 import casadi
 
-from dq_space_arm_env.algebra import dual_quaternion, poses, quaternion, rotations, screw
+from dq_space_arm_env.algebra import dual_quaternion, poses, rotations, screw
 from dq_space_arm_env.algebra.dual_vectors import transform_matrix
 from dq_space_arm_env.algebra.symbolic import matrix, symbols, zeros
-from dq_space_arm_env.algebra.vectors import (
-    add,
-    matrix_vector,
-    skew_matrix,
-    subtract,
-    transposed_matrix_vector,
-)
+from dq_space_arm_env.algebra.vectors import skew_matrix
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
-from dq_space_arm_env.dynamics.vector_field import VectorField, composed, split_state
+from dq_space_arm_env.dynamics.vector_field import VectorField, split_state
 from dq_space_arm_env.integrators.method import Integrator, graph_inputs
 from dq_space_arm_env.integrators.momentum_coordinates import LocalState, MomentumCoordinates
 
@@ -47,40 +41,26 @@ class MomentumPreserving:
     def append_step(self, program: Program, field: VectorField) -> None:
         coordinates = _coordinates(field)
         x, center, local = _symbols(coordinates)
-        start = _start(coordinates, split_state(field, x)[1])
+        start = coordinates.start(split_state(field, x)[1])
         program.call(self._graph("enter", coordinates, {"x": x}, start))
         self._advance(program, coordinates)
         inputs = {"x": x, "center": center, "local_next": local}
-        outputs = {"x_next": _left(coordinates, x, center, coordinates.parts(local))}
+        outputs = {"x_next": coordinates.end(x, center, coordinates.parts(local))}
         program.call(self._graph("leave", coordinates, inputs, outputs))
 
     def append_walk(self, program: Program, field: VectorField) -> None:
-        """Append the calls that turn buffers x, momentum, u, h into x_next, momentum_next.
-
-        The momentum is that of `Kernels.momentum`, 6 entries in inertial axes. It is handed on plus the
-        change in the step, so rounding errors of the states never enter it.
-        """
+        """See `MomentumIntegrator`."""
         coordinates = _coordinates(field)
         x, center, local = _symbols(coordinates)
         momentum = symbols("momentum", 6)
-        stored, y = split_state(field, x)
-        attitude, _ = poses.to_matrix(coordinates.base.pose.full(stored))
-        entered = _start(coordinates, y)
-        state = coordinates.parts(entered["local"])
-        linear, angular = (transposed_matrix_vector(attitude, part) for part in (momentum[:3], momentum[3:]))
-        before = LocalState(
-            state.rotation, state.shape, state.displacement, linear, angular, state.joint_rates
-        )
-        entered["local"] = coordinates.joined(before)
+        entered = coordinates.start(split_state(field, x)[1], coordinates.turned_back(x, momentum))
         program.call(self._graph("carry_in", coordinates, {"x": x, "momentum": momentum}, entered))
         self._advance(program, coordinates)
         begun = symbols("b", coordinates.n_y)
         before, after = coordinates.parts(begun), coordinates.parts(local)
-        gained = [subtract(after.linear, before.linear), subtract(after.angular, before.angular)]
-        added = [entry for part in gained for entry in matrix_vector(attitude, part)]
         outputs = {
-            "x_next": _left(coordinates, x, center, after),
-            "momentum_next": [old + new for old, new in zip(momentum, added, strict=True)],
+            "x_next": coordinates.end(x, center, after),
+            "momentum_next": coordinates.handed_on(x, momentum, before, after),
         }
         inputs = {"x": x, "momentum": momentum, "center": center, "local": begun, "local_next": local}
         program.call(self._graph("carry_out", coordinates, inputs, outputs))
@@ -89,7 +69,7 @@ class MomentumPreserving:
         coordinates = _coordinates(field)
         x, center, local = _symbols(coordinates)
         y = split_state(field, x)[1]
-        program.call(self._graph("enter", coordinates, {"x": x}, _start(coordinates, y)))
+        program.call(self._graph("enter", coordinates, {"x": x}, coordinates.start(y)))
         inner = Program("linearization", [], [])
         patterns = self.method.append_linearization(inner, coordinates)
         _take_over(program, inner)
@@ -147,16 +127,6 @@ def _symbols(coordinates: MomentumCoordinates) -> tuple[list[Scalar], list[Scala
     return symbols("x", coordinates.base.n_x), symbols("c", 3), symbols("z", coordinates.n_y)
 
 
-def _start(coordinates: MomentumCoordinates, y: Scalars) -> dict[str, Scalars]:
-    """The local state at the start of a step, and the center of mass in the base frame."""
-    linear, angular, center = coordinates.balance.momentum(y)
-    zero = (0.0, 0.0, 0.0)
-    shape = [y[i] for i in coordinates.shape_indices]
-    joint_rates = [y[i] for i in coordinates.joint_indices]
-    state = LocalState(zero, shape, zero, linear, angular, joint_rates)
-    return {"local": coordinates.joined(state), "center": center}
-
-
 def _linearized_start(coordinates: MomentumCoordinates, y: Scalars) -> tuple[Matrix, Matrix]:
     """Derivatives of the local state at the start of a step, and of the center of mass, by y."""
     momentum, center = coordinates.momentum_jacobian(y)
@@ -169,34 +139,6 @@ def _linearized_start(coordinates: MomentumCoordinates, y: Scalars) -> tuple[Mat
     return casadi.sparsify(result), center
 
 
-def _ending(coordinates: MomentumCoordinates, state: LocalState) -> tuple[Scalars, Scalars, Scalars]:
-    """Linear and angular momentum and twist of the base in its axes at the end of a step.
-
-    Each vector is rotated as v + 2 r x (...), not by a matrix: the entries of a matrix near 1 round the same
-    way at every step of a steady rotation, and the momentum would shrink or grow with them.
-    """
-    back = quaternion.conjugate(rotations.exponential(state.rotation))
-    linear, angular = (rotations.rotate(back, part) for part in (state.linear, state.angular))
-    return linear, angular, coordinates.twist(state.shape, linear, angular, state.joint_rates)
-
-
-def _relative_pose(state: LocalState, before: Scalars, after: Scalars) -> Scalars:
-    """Pose of the base seen from the start of the step, given the centers of mass in the base frame."""
-    rotation = rotations.exponential(state.rotation)
-    position = subtract(add(state.displacement, before), rotations.rotate(rotation, after))
-    return poses.from_rotation_and_position(rotation, position)
-
-
-def _left(coordinates: MomentumCoordinates, x: Scalars, before: Scalars, state: LocalState) -> list[Scalar]:
-    """The state after a step from x, with the center of mass there."""
-    pose = coordinates.base.pose
-    end = coordinates.y(state.shape, _ending(coordinates, state)[2], state.joint_rates)
-    relative = _relative_pose(state, before, coordinates.balance.momentum(end)[2])
-    less_one = screw.exponential_minus_identity((*state.rotation, 0.0, 0.0, 0.0))[0]
-    moved = composed(pose.full(split_state(coordinates.base, x)[0]), (less_one, *relative[1:]))
-    return [*pose.reduced(moved), *end]
-
-
 def _linearized_left(
     coordinates: MomentumCoordinates, state: LocalState, before: Scalars
 ) -> tuple[Matrix, Matrix, Matrix]:
@@ -205,7 +147,7 @@ def _linearized_left(
     By the pose at the start, by the local state at the end, and by the center of mass at the start.
     """
     field, change = coordinates.base, casadi.SX.eye(coordinates.n_y)
-    linear, angular, twist = _ending(coordinates, state)
+    linear, angular, twist = coordinates.ending(state)
     y = coordinates.y(state.shape, twist, state.joint_rates)
     center = coordinates.balance.momentum(y)[2]
     jacobian = screw.exponential_right_jacobian((*state.rotation, 0.0, 0.0, 0.0))
@@ -230,7 +172,7 @@ def _linearized_left(
     rest[coordinates.joint_indices, :] = change[coordinates.joint_rates, :]
     by_local = casadi.vertcat(casadi.vertcat(turned, moved)[directions, :], rest)
     by_center = casadi.vertcat(casadi.vertcat(zeros(3, 3), back)[directions, :], zeros(field.n_y, 3))
-    backward = dual_quaternion.conjugate(_relative_pose(state, before, center))
+    backward = dual_quaternion.conjugate(coordinates.relative_pose(state, before, center))
     adjoint = matrix(transform_matrix(*poses.to_matrix(backward)))[directions, directions]
     by_pose = casadi.vertcat(adjoint, zeros(field.n_y, len(directions)))
     return by_pose, casadi.sparsify(by_local), casadi.sparsify(by_center)

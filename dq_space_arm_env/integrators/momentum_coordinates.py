@@ -20,6 +20,7 @@ from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra import poses, quaternion, rotations, screw
 from dq_space_arm_env.algebra.symbolic import column, columns, symbols, zeros
 from dq_space_arm_env.algebra.vectors import (
     add,
@@ -32,7 +33,7 @@ from dq_space_arm_env.algebra.vectors import (
     transposed_matrix_vector,
 )
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
-from dq_space_arm_env.dynamics.vector_field import DifferentiatedJacobian, spread
+from dq_space_arm_env.dynamics.vector_field import composed, split_state, spread
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -58,7 +59,7 @@ class LocalState:
     joint_rates: Scalars  # rad/s
 
 
-class MomentumCoordinates(DifferentiatedJacobian):
+class MomentumCoordinates:
     """Equations of motion in these coordinates: a `VectorField` with the pose as part of y."""
 
     pose = None
@@ -80,10 +81,6 @@ class MomentumCoordinates(DifferentiatedJacobian):
         )
         self.n_x = self.n_y = ends[-1]
         self.rate_indices = tuple(range(self.linear.start, self.n_y))
-        # Joint angles come before wrist angles.
-        self.stiff_angles = range(self.shape.start, self.shape.start + len(self.joint_indices))
-        self.stiff_rates = range(self.joint_rates.start, self.joint_rates.stop)
-        self.stiffness, self.damping = self.balance.springs
 
     def parts(self, local: Scalars) -> LocalState:
         """Name the parts of a state."""
@@ -120,18 +117,13 @@ class MomentumCoordinates(DifferentiatedJacobian):
         """The base's twist for a momentum in base axes."""
         return self.balance.base_twist(self.y(shape, [0.0] * 6, joint_rates), linear, angular)
 
-    def joint_inertia(self, y: Scalars) -> Sequence[Scalars]:
-        """Inertia that the joints feel while the base floats freely, symmetric (n, n)."""
-        state = self.parts(y)
-        return self.balance.joint_inertia(self.y(state.shape, [0.0] * 6, state.joint_rates))
-
     def _moving(self, state: LocalState) -> tuple[list[Scalar], list[Scalar]]:
         """The base's angular velocity, and y with it; no rate depends on the linear velocity."""
         angular = transposed_matrix_vector(rotation_matrix(state.rotation), state.angular)
         omega = self.twist(state.shape, (0.0, 0.0, 0.0), angular, state.joint_rates)[:3]
         return omega, self.y(state.shape, [*omega, 0.0, 0.0, 0.0], state.joint_rates)
 
-    def _momentum_rates(self, state: LocalState, u: Scalars) -> tuple[Scalars, Scalars]:
+    def momentum_rates(self, state: LocalState, u: Scalars) -> tuple[Scalars, Scalars]:
         """Rates of both momenta due to the external wrench, in start axes."""
         y = self.y(state.shape, [0.0] * 6, state.joint_rates)
         force, torque = self.balance.external_wrench(y, u)
@@ -145,7 +137,7 @@ class MomentumCoordinates(DifferentiatedJacobian):
         return self._joined_rates(state, omega, self.base.rates(moving, u), u)
 
     def _joined_rates(self, state: LocalState, omega: Scalars, rates: Scalars, u: Scalars) -> list[Scalar]:
-        linear, angular = self._momentum_rates(state, u)
+        linear, angular = self.momentum_rates(state, u)
         return self.joined(
             LocalState(
                 rotation_rate(state.rotation, omega),
@@ -218,6 +210,67 @@ class MomentumCoordinates(DifferentiatedJacobian):
                 entries[row] = value
             changes.append(column(*self.twist(shape, entries[:3], entries[3:], still)))
         return columns(*changes, rows=6)
+
+    # The way into these coordinates at the start of a step, and out of them at its end.
+
+    def start(self, y: Scalars, momentum: tuple[Scalars, Scalars] | None = None) -> dict[str, Scalars]:
+        """The local state at the start of a step, and the center of mass in the base frame.
+
+        The linear and angular momentum, base axes, are those of y unless given.
+        """
+        linear, angular, center = self.balance.momentum(y)
+        if momentum is not None:
+            linear, angular = momentum
+        zero = (0.0, 0.0, 0.0)
+        shape, joint_rates = ([y[i] for i in part] for part in (self.shape_indices, self.joint_indices))
+        state = LocalState(zero, shape, zero, linear, angular, joint_rates)
+        return {"local": self.joined(state), "center": center}
+
+    def _attitude(self, x: Scalars) -> Sequence[Scalars]:
+        return poses.to_matrix(self.base.pose.full(split_state(self.base, x)[0]))[0]
+
+    def turned_back(self, x: Scalars, momentum: Scalars) -> tuple[Scalars, Scalars]:
+        """Linear and angular momentum in base axes, from `Kernels.momentum`, 6 in inertial axes."""
+        linear, angular = (
+            transposed_matrix_vector(self._attitude(x), part) for part in (momentum[:3], momentum[3:])
+        )
+        return linear, angular
+
+    def turned_out(self, x: Scalars, linear: Scalars, angular: Scalars) -> list[Scalar]:
+        """Linear and angular momentum in inertial axes, 6: the inverse of `turned_back`."""
+        attitude = self._attitude(x)
+        return [entry for part in (linear, angular) for entry in matrix_vector(attitude, part)]
+
+    def handed_on(self, x: Scalars, momentum: Scalars, before: LocalState, after: LocalState) -> list[Scalar]:
+        """Momentum in inertial axes after a step from x: that before it, and the change in the step."""
+        gained = subtract(after.linear, before.linear), subtract(after.angular, before.angular)
+        added = self.turned_out(x, *gained)
+        return [old + new for old, new in zip(momentum, added, strict=True)]
+
+    def ending(self, state: LocalState) -> tuple[Scalars, Scalars, Scalars]:
+        """Linear and angular momentum and twist of the base in its axes at the end of a step.
+
+        Each vector is rotated as v + 2 r x (...), not by a matrix: the entries of a matrix near 1 round the
+        same way at every step of a steady rotation, and the momentum would shrink or grow with them.
+        """
+        back = quaternion.conjugate(rotations.exponential(state.rotation))
+        linear, angular = (rotations.rotate(back, part) for part in (state.linear, state.angular))
+        return linear, angular, self.twist(state.shape, linear, angular, state.joint_rates)
+
+    def relative_pose(self, state: LocalState, before: Scalars, after: Scalars) -> Scalars:
+        """Pose of the base seen from the start of the step, given the centers of mass in the base frame."""
+        rotation = rotations.exponential(state.rotation)
+        position = subtract(add(state.displacement, before), rotations.rotate(rotation, after))
+        return poses.from_rotation_and_position(rotation, position)
+
+    def end(self, x: Scalars, before: Scalars, state: LocalState) -> list[Scalar]:
+        """The state after a step from x, with the center of mass there."""
+        pose = self.base.pose
+        end = self.y(state.shape, self.ending(state)[2], state.joint_rates)
+        relative = self.relative_pose(state, before, self.balance.momentum(end)[2])
+        less_one = screw.exponential_minus_identity((*state.rotation, 0.0, 0.0, 0.0))[0]
+        moved = composed(pose.full(split_state(self.base, x)[0]), (less_one, *relative[1:]))
+        return [*pose.reduced(moved), *end]
 
 
 def _series(x: Scalar, coefficients: tuple[float, ...]) -> Scalar:

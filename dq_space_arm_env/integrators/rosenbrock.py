@@ -1,246 +1,208 @@
-"""Rosenbrock methods: implicit stability for joints of any stiffness, without iterations.
+"""Rosenbrock methods for joints of any stiffness: linearly implicit, in canonical momenta, with substeps.
 
-Each stage solves a linear system with the exact Jacobian J of the equations of motion, and all stages share
-its factors (Hairer & Wanner, Solving Ordinary Differential Equations II, IV.7). Both methods are L-stable: a
-vibration that the step cannot resolve dies within a few steps, and the arm moves on as if locked at its
-springs. The order then drops to about 3, as for all methods of this kind.
+Each stage solves a linear system with the exact Jacobian of the equations of motion, and all stages share its
+factors (Hairer & Wanner, Solving Ordinary Differential Equations II, IV.7). In canonical momenta
+(`canonical_coordinates`) the torques of springs and dampers are linear, so that Jacobian is right at any
+deflection and speed. A stage of the momenta, U = z_y W, follows from that of the rates,
 
-Two limits. While an unresolved vibration dies, the momentum changes: by a thousandth at once for joints of
-0.4 rad/s. And the torque of spring and damper at the start of a step must not be so large that it alone would
-turn the arm by a radian within gamma h, as when a damper of 1e6 N m s/rad meets a moving joint beside soft
-ones: J is then no guide to the motion within the step. There rodas4 is the safer method; rodas5p is the more
-accurate one for vibrations that the step resolves.
+    (z_y - gamma h F_y) W_i = gamma h F(z + sum a_ij U_j) + gamma sum c_ij U_j,
+
+where y has joint rates, z(y) the canonical momenta, and F = z'. With the angles eliminated first, the system
+of the rates is M + gamma h D + (gamma h)^2 K but for small terms: symmetric, positive definite.
+
+The last stage is the error of an embedded method. Where it exceeds the tolerance, the step is divided. Both
+methods are L-stable: a vibration that the substeps cannot resolve dies within a few of them, and the step
+says that it is not accurate. The total momentum is kept to rounding.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
 
-from dq_space_arm_env.algebra.symbolic import column, columns, dense_entries, symbols, zeros
+from dq_space_arm_env.algebra.symbolic import column, dense_entries, symbols
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
-from dq_space_arm_env.dynamics.vector_field import VectorField
+from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
+from dq_space_arm_env.dynamics.vector_field import VectorField, split_state
+from dq_space_arm_env.integrators.canonical_coordinates import CanonicalCoordinates
 from dq_space_arm_env.integrators.method import graph_inputs
 from dq_space_arm_env.integrators.rosenbrock_system import RosenbrockSystem
 from dq_space_arm_env.integrators.rosenbrock_tableaus import RosenbrockTableau
-from dq_space_arm_env.integrators.step_field import StepField
+from dq_space_arm_env.integrators.substeps import Substeps
+from dq_space_arm_env.integrators.tangent_linearization import append_tangent_linearization
 
 Scalar = Any
+Scalars = Sequence[Scalar]
 Matrix = Any
 
+MOST_SUBSTEPS = 500
+"""Tries of a step, rejected ones included; what is left then is taken in one substep, whatever its error."""
+SMALLEST, SMALLEST_FACTOR = 1e-12, 0.1
+"""Smallest length of a substep, relative to the step, and to the substep before."""
 
+
+@dataclass(frozen=True)
 class Rosenbrock:
-    """A Rosenbrock method, given by its tableau."""
+    """A Rosenbrock method, given by its tableau.
 
-    def __init__(self, tableau: RosenbrockTableau) -> None:
-        self.tableau = tableau
+    The error of a substep is the largest, over angles [rad], position [m], and velocities times the length of
+    the whole step, of the difference between both solutions. Derivatives are those of the substeps taken,
+    their lengths held fixed.
+    """
+
+    tableau: RosenbrockTableau
+    tolerance: float = 1e-6  # rad, m
 
     def append_step(self, program: Program, field: VectorField) -> None:
-        steps = _Graphs(self, StepField(field))
-        program.call(steps.first(), stage="stage0")
-        stage = steps.stage()
-        for number in range(1, self.tableau.stages):
-            program.call(steps.sums(number))
-            program.call(stage, offset=f"offset{number}", carried=f"carried{number}", stage=f"stage{number}")
-        program.call(steps.total())
+        graphs = _Graphs(self.tableau, field)
+        program.call(graphs.momentum())
+        self._append(program, graphs, "momentum_start")
+
+    def append_walk(self, program: Program, field: VectorField) -> None:
+        """See `MomentumIntegrator`."""
+        self._append(program, _Graphs(self.tableau, field), "momentum")
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
-        """See `Integrator`.
+        return append_tangent_linearization(program, field, self.append_step)
 
-        The derivative D_i of u_i by (y, u) solves a system with the same factors, (1 - gamma h J) D_i = gamma
-        h (F_i Z_i + G_i + (J u_i)') + gamma sum c_ij D_j: F_i and G_i are the Jacobians at the stage, Z_i the
-        derivative of its start, and (J u_i)' that of J u_i at fixed u_i.
-        """
-        steps = _LinearizedGraphs(self, StepField(field))
-        program.call(steps.at_start())
-        program.call(steps.coefficients())
-        graphs = (steps.stage(), steps.along(), steps.change())
-        accumulated, (total, a_pattern, b_pattern) = steps.accumulated(), steps.total_change()
-        own = ("offset", "carried", "offset_change", "carried_change", "stage", "change")
-        for number in range(self.tableau.stages):
-            # The sums' initial values and the inputs of the first stage are unwritten scratch: zero.
-            if number:
-                program.call(steps.sums(number))
-            for earlier in range(number):
-                before = f"{number}_{earlier}" if earlier else "_none"
-                after = f"{number}_{earlier + 1}" if earlier + 1 < number else f"{number}"
-                program.call(
-                    accumulated,
-                    weights=f"weights{number}_{earlier}",
-                    change=f"change{earlier}",
-                    offset=f"offset_change{before}",
-                    carried=f"carried_change{before}",
-                    new_offset=f"offset_change{after}",
-                    new_carried=f"carried_change{after}",
-                )
-            for graph in graphs:
-                program.call(graph, **{name: f"{name}{number}" for name in own})
-        program.call(total, **{name: f"{name}{self.tableau.stages - 1}" for name in own})
-        return a_pattern, b_pattern
+    def _append(self, program: Program, graphs: _Graphs, momentum: str) -> None:
+        """Append the substeps, from x and a buffer of the momentum to x_next and momentum_next."""
+        substeps = Substeps(
+            graphs.prefix, _fourth_root, MOST_SUBSTEPS, SMALLEST, SMALLEST_FACTOR, finishes=True
+        )
+        substeps.append_begin(program, state="x", momentum_here=momentum)
+        program.call(graphs.limit(self.tolerance))
+        first, stage = graphs.first(), graphs.stage()
+        with program.repeated_while("unfinished"):
+            substeps.append_length(program)
+            program.call(first, x="state", momentum="momentum_here", h="substep_time")
+            for number in range(1, self.tableau.stages):
+                program.call(graphs.sums(number))
+                names = {name: f"{name}{number}" for name in ("at", "carried", "rate_stage", "stage")}
+                program.call(stage, h="substep_time", **names)
+            program.call(graphs.total(), x="state", momentum="momentum_here")
+            moved = ("state", "momentum_here")
+            substeps.append_choice(program, {name: f"{name}_tried" for name in moved})
+        substeps.append_end(program, state="x_next", momentum_here="momentum_next")
+
+
+def _fourth_root(error: Scalar) -> Scalar:
+    """The embedded methods are of order 3 and 4; the lower one decides."""
+    return casadi.sqrt(casadi.sqrt(error))
 
 
 class _Graphs:
-    """Graphs of a step: first stage, sums before a stage, stage, and new state."""
+    """Graphs of a substep: start and first stage, sums before a stage, stage, new state with its error."""
 
-    def __init__(self, method: Rosenbrock, step: StepField) -> None:
-        self.step, self.field, self.tableau = step, step.field, method.tableau
-        self.prefix = f"{step.field.name}_rosenbrock{self.tableau.order}"
-        self.x, self.u = symbols("x", self.field.n_x), symbols("u", self.field.n_u)
+    def __init__(self, tableau: RosenbrockTableau, field: VectorField) -> None:
+        if not isinstance(field, SpaceArmField):
+            raise TypeError(f"equations {field.name!r} do not tell the momentum of the system")
+        self.tableau, self.field = tableau, field
+        self.prefix = f"{field.name}_rosenbrock{tableau.order}"
+        self.equations = CanonicalCoordinates(field)
+        self.given, self.n = self.equations.given, self.equations.n_y
+        self.rates = range(self.given.joint_rates.start, self.given.joint_rates.stop)
+        self.x, self.u, self.momentum_here = (
+            symbols(name, size) for name, size in (("x", field.n_x), ("u", field.n_u), ("momentum", 6))
+        )
         self.h = casadi.SX.sym("h")
-        self.start = step.start(self.x)
-        self.rates, self.by_z, self.by_u = step.linearized_rates(self.start, self.u)
-        self.system = RosenbrockSystem(self.tableau.gamma * self.h, self.by_z, self.field.n_y)
+        momentum = self.given.turned_back(self.x, self.momentum_here)
+        begun = self.given.start(split_state(field, self.x)[1], momentum)
+        self.center = begun["center"]
+        self.start, self.slope, by_y, slope_by_y = self.equations.linearized(begun["local"], self.u)
+        self.momenta_by_y = casadi.sparsify(by_y[list(self.rates), :])
+        self.system = RosenbrockSystem(by_y - tableau.gamma * self.h * slope_by_y, self._order())
 
-    def _graph(self, name: str, inputs: dict[str, Any], outputs: dict[str, Any]) -> Any:
-        given = graph_inputs(self.field, x=self.x, u=self.u, h=[self.h], **inputs)
-        return graph_of(f"{self.prefix}_{name}", given, outputs)
+    def _order(self) -> list[int]:
+        """Unknowns in the order of elimination: what hardly couples, joint angles, rotation, joint rates."""
+        given, n = self.given, len(self.rates)
+        angles = range(given.shape.start, given.shape.start + n)
+        last = [*angles, *range(given.rotation.start, given.rotation.stop), *self.rates]
+        return [*(i for i in range(self.n) if i not in last), *last]
+
+    def _graph(self, name: str, inputs: Mapping[str, Scalars], outputs: Mapping[str, Scalars]) -> Any:
+        return graph_of(f"{self.prefix}_{name}", graph_inputs(self.field, **inputs), outputs)
+
+    def momentum(self) -> Any:
+        """Graph of the momentum at the start of a step, inertial axes."""
+        linear, angular, _ = self.given.balance.momentum(split_state(self.field, self.x)[1])
+        outputs = {"momentum_start": self.given.turned_out(self.x, linear, angular)}
+        return self._graph("momentum", {"x": self.x}, outputs)
+
+    def limit(self, tolerance: float) -> Any:
+        """Graph of the tolerance and of what makes an error of a rate comparable with it."""
+        outputs = {"weights": [1.0 / tolerance, self.h / tolerance]}
+        return graph_of(f"{self.prefix}_limit", {"h": [self.h]}, outputs)
 
     def first(self) -> Any:
-        """Graph of the factors and the first stage."""
+        """Graph of the start of a substep, the factors, and the first stage."""
         scale = self.tableau.gamma * self.h
-        stage = self.system.solve([scale * rate for rate in self.rates])  # (1 - gamma h J) u_1 = gamma h f(y)
-        return self._graph("first", {}, {"factor": self.system.variables, "stage": stage})
+        stages = self._stages(self.system, self.momenta_by_y, [scale * rate for rate in self.slope])
+        outputs: dict[str, Scalars] = {"start": self.start, "center": self.center}
+        outputs |= {"factor": self.system.variables, "momenta_by_y": self.momenta_by_y.nonzeros()}
+        outputs |= {f"{name}0": stage for name, stage in stages.items()}
+        inputs = {"x": self.x, "momentum": self.momentum_here, "u": self.u, "h": [self.h]}
+        return self._graph("first", inputs, outputs)
 
     def stage(self) -> Any:
         """Graph of any other stage."""
-        known = self.system.renamed()
-        offset, carried = symbols("offset", self.step.n_z), symbols("carried", self.step.n_z)
-        z = [old + new for old, new in zip(self.start, offset, strict=True)]
-        rates, scale = self.step.rates(z, self.u), self.tableau.gamma * self.h
-        # (1 - gamma h J) u_i = gamma h f(y + sum a_ij u_j) + gamma sum c_ij u_j.
-        stage = known.solve([scale * rate + other for rate, other in zip(rates, carried, strict=True)])
-        inputs = {"factor": known.variables, "offset": offset, "carried": carried}
-        return self._graph("stage", inputs, {"stage": stage})
+        known, by_y = self.system.renamed(), casadi.SX.sym("by_y", self.momenta_by_y.sparsity())
+        at, carried, scale = symbols("at", self.n), symbols("carried", self.n), self.tableau.gamma * self.h
+        rates = self.equations.rates(at, self.u)
+        right = [scale * rate + other for rate, other in zip(rates, carried, strict=True)]
+        inputs = {"factor": known.variables, "momenta_by_y": by_y.nonzeros(), "u": self.u, "h": [self.h]}
+        return self._graph(
+            "stage", {**inputs, "at": at, "carried": carried}, self._stages(known, by_y, right)
+        )
+
+    def _stages(self, system: RosenbrockSystem, momenta_by_y: Matrix, right: Scalars) -> dict[str, Scalars]:
+        """A stage of the rates, W, and of the momenta, U."""
+        rate_stage = system.solve(right)
+        momenta = dense_entries(casadi.mtimes(momenta_by_y, casadi.densify(column(*rate_stage))))
+        stage = list(rate_stage)
+        stage[self.rates.start :] = momenta
+        return {"rate_stage": rate_stage, "stage": stage}
 
     def sums(self, number: int) -> Any:
-        """Graph of a stage's sums over the earlier ones: sum a_ij u_j, and gamma sum c_ij u_j."""
-        starts, gamma = self.tableau.starts, self.tableau.gamma
-        stages = [symbols(f"u{i}", self.step.n_z) for i in range(number)]
-        inputs = {f"stage{i}": stage for i, stage in enumerate(stages)}
-        if number > 1 and starts[number] == (*starts[number - 1], 1.0):
-            before = symbols("before", self.step.n_z)
-            inputs[f"offset{number - 1}"] = before
-            offset = [a + b for a, b in zip(before, stages[-1], strict=True)]
-        else:
-            offset = _combined(starts[number], stages)
-        carried = _combined([gamma * c for c in self.tableau.couplings[number]], stages)
-        outputs = {f"offset{number}": offset, f"carried{number}": carried}
+        """Graph of a stage's sums over the earlier ones: z + sum a_ij U_j, and gamma sum c_ij U_j."""
+        start, stages = symbols("z", self.n), [symbols(f"U{i}", self.n) for i in range(number)]
+        at, carried = list(start), [0.0] * self.n
+        for a, c, stage in zip(
+            self.tableau.starts[number], self.tableau.couplings[number], stages, strict=True
+        ):
+            at = [old + a * new for old, new in zip(at, stage, strict=True)]
+            carried = [old + (self.tableau.gamma * c) * new for old, new in zip(carried, stage, strict=True)]
+        inputs = {"start": start, **{f"stage{i}": stage for i, stage in enumerate(stages)}}
+        outputs = {f"at{number}": at, f"carried{number}": carried}
         return graph_of(f"{self.prefix}_sums{number}", inputs, outputs)
 
     def total(self) -> Any:
-        """Graph of the new state."""
-        last = self.tableau.stages - 1
-        offset, stage = symbols("offset", self.step.n_z), symbols("stage", self.step.n_z)
-        change = [a + b for a, b in zip(offset, stage, strict=True)]
-        inputs = {"x": self.x, f"offset{last}": offset, f"stage{last}": stage}
-        return graph_of(f"{self.prefix}_total", inputs, {"x_next": self.step.moved(self.x, change)})
-
-
-class _LinearizedGraphs(_Graphs):
-    """Graphs of a step with the derivatives of its stages by (y, u)."""
-
-    def __init__(self, method: Rosenbrock, step: StepField) -> None:
-        super().__init__(method, step)
-        field = self.field
-        self.identity = casadi.SX(step.n_z, field.n_y + field.n_u)
-        self.identity[: field.n_y, : field.n_y] = casadi.SX.eye(field.n_y)
-        self.along_pattern, self.pattern = self._patterns()
-
-    def _patterns(self) -> tuple[Any, Any]:
-        """Sparsity of the derivative of J u, and one that contains the derivative of any stage."""
-        n_z, n_y = self.step.n_z, self.field.n_y
-        _, by_z, by_u = self.step.linearized_rates(symbols("z", n_z), self.u)
-        along = self.step.jacobian_along(
-            self.start, self.u, self.rates, self.by_z, self.by_u, symbols("v", n_z)
-        )
-        reach = casadi.DM.eye(n_z)
-        for _ in range(n_z):
-            reach = _ones(reach + casadi.mtimes(_ones(by_z), reach))
-        direct = casadi.horzcat(_ones(by_z[:, :n_y]), _ones(by_u)) + _ones(along)
-        return along.sparsity(), casadi.mtimes(reach, _ones(direct)).sparsity()
-
-    def at_start(self) -> Any:
-        """Graph of the factors, rates and Jacobians at the start of the step."""
-        outputs = {"factor": self.system.variables, "rates": self.rates}
-        outputs |= {"by_z": self.by_z.nonzeros(), "by_u": self.by_u.nonzeros()}
-        return self._graph("start", {}, outputs)
-
-    def along(self) -> Any:
-        """Graph of the derivative of J u_i at fixed u_i."""
-        stage, rates = symbols("stage", self.step.n_z), symbols("rates", self.step.n_z)
-        by_z = casadi.SX.sym("by_z", self.by_z.sparsity())
-        by_u = casadi.SX.sym("by_u", self.by_u.sparsity())
-        along = self.step.jacobian_along(self.start, self.u, rates, by_z, by_u, stage)
-        inputs = {"stage": stage, "rates": rates, "by_z": by_z.nonzeros(), "by_u": by_u.nonzeros()}
-        return self._graph("along", inputs, {"along": casadi.project(along, self.along_pattern).nonzeros()})
-
-    def change(self) -> Any:
-        """Graph of the derivative of a stage."""
-        n_z, n_y, scale = self.step.n_z, self.field.n_y, self.tableau.gamma * self.h
-        known = self.system.renamed()
-        offset, along = symbols("offset", n_z), casadi.SX.sym("along", self.along_pattern)
-        changes = [casadi.SX.sym(name, self.pattern) for name in ("offset_change", "carried_change")]
-        z = [old + new for old, new in zip(self.start, offset, strict=True)]
-        _, by_z, by_u = self.step.linearized_rates(z, self.u)
-        moved = casadi.mtimes(by_z, self.identity + changes[0]) + along
-        right = scale * (moved + casadi.horzcat(zeros(n_z, n_y), by_u)) + changes[1]
-        solved = [column(*known.solve(dense_entries(right[:, i]))) for i in range(right.shape[1])]
-        change = casadi.project(columns(*solved, rows=n_z), self.pattern)
-        inputs = {"factor": known.variables, "offset": offset, "along": along.nonzeros()}
-        inputs |= {"offset_change": changes[0].nonzeros(), "carried_change": changes[1].nonzeros()}
-        return self._graph("change", inputs, {"change": change.nonzeros()})
-
-    def coefficients(self) -> Any:
-        """Graph of the constants of `accumulated`: a_ij and gamma c_ij for stages i and j < i."""
-        rows = zip(self.tableau.starts, self.tableau.couplings, strict=True)
-        gamma = self.tableau.gamma
-        outputs = {
-            f"weights{i}_{j}": [a, gamma * c]
-            for i, row in enumerate(rows)
-            for j, (a, c) in enumerate(zip(*row, strict=True))
-        }
-        return graph_of(f"{self.prefix}_coefficients", {}, outputs)
-
-    def accumulated(self) -> Any:
-        """Graph that adds a stage's contribution to the derivatives of the sums of a later one."""
-        names = ("offset", "carried", "change")
-        offset, carried, change = (casadi.SX.sym(name, self.pattern) for name in names)
-        weights = symbols("weight", 2)
-        outputs = {"new_offset": offset + weights[0] * change, "new_carried": carried + weights[1] * change}
-        return graph_of(
-            f"{self.prefix}_accumulated",
-            {
-                "weights": weights,
-                "offset": offset.nonzeros(),
-                "carried": carried.nonzeros(),
-                "change": change.nonzeros(),
-            },
-            {name: value.nonzeros() for name, value in outputs.items()},
-        )
-
-    def total_change(self) -> tuple[Any, Any, Any]:
-        """Graph of A and B, and their patterns."""
-        offset, stage = symbols("offset", self.step.n_z), symbols("stage", self.step.n_z)
-        changes = [casadi.SX.sym(name, self.pattern) for name in ("offset_change", "change")]
-        total = [a + b for a, b in zip(offset, stage, strict=True)]
-        a, b = self.step.moved_by(total, self.identity + changes[0] + changes[1])
-        inputs = {"offset": offset, "offset_change": changes[0].nonzeros()}
-        inputs |= {"stage": stage, "change": changes[1].nonzeros()}
-        graph = graph_of(f"{self.prefix}_total_change", inputs, {"A": a.nonzeros(), "B": b.nonzeros()})
-        return graph, a.sparsity(), b.sparsity()
-
-
-def _combined(weights: Sequence[float], vectors: Sequence[Sequence[Scalar]]) -> list[Scalar]:
-    """Weighted sum of vectors."""
-    total = [weights[0] * entry for entry in vectors[0]]
-    for weight, vector in zip(weights[1:], vectors[1:], strict=True):
-        total = [old + weight * entry for old, entry in zip(total, vector, strict=True)]
-    return total
-
-
-def _ones(pattern: Matrix) -> Any:
-    """Ones where a matrix has entries."""
-    return casadi.DM(pattern.sparsity(), 1.0)
+        """Graph of the new state and momentum, and of the error."""
+        given, last = self.given, self.tableau.stages - 1
+        start, at, stage, error = (symbols(name, self.n) for name in ("start", "at", "U", "W"))
+        center, weights = symbols("center", 3), symbols("weight", 2)
+        end = given.parts(self.equations.left([a + b for a, b in zip(at, stage, strict=True)]))
+        x_next = given.end(self.x, center, end)
+        momentum = given.handed_on(self.x, self.momentum_here, given.parts(start), end)
+        off = given.parts(error)
+        turning = given.twist(end.shape, (0.0, 0.0, 0.0), off.angular, off.joint_rates)[:3]
+        moving = [entry / given.balance.mass for entry in off.linear]
+        worst: Scalar = 0.0
+        for weight, entries in (
+            (weights[0], (*off.rotation, *off.shape, *off.displacement)),
+            (weights[1], (*off.joint_rates, *turning, *moving)),
+        ):
+            for entry in entries:
+                worst = casadi.fmax(weight * casadi.fabs(entry), worst)
+        # A maximum passes over NaN; of a comparison with NaN nothing is true.
+        size = casadi.sumsqr(column(*x_next))
+        worst = casadi.if_else(size < math.inf, worst, math.nan)
+        inputs = {"x": self.x, "momentum": self.momentum_here, "start": start, "center": center}
+        inputs |= {f"at{last}": at, f"stage{last}": stage, f"rate_stage{last}": error, "weights": weights}
+        outputs = {"state_tried": x_next, "momentum_here_tried": momentum, "error": [worst]}
+        return self._graph("total", inputs, outputs)

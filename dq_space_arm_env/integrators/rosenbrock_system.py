@@ -1,11 +1,4 @@
-"""The linear system of a Rosenbrock method, factorized once per step.
-
-y and Omega are solved for one after the other, because y' does not depend on Omega. In the system of y the
-angles come first: their rates are velocities, so their pivots are 1 and they leave a system for the
-velocities alone, 1 - gamma h J_v - (gamma h)^2 J_q. Springs K and dampers D make it 1 + M^-1 (gamma h D +
-(gamma h)^2 K), for which elimination without pivoting is as stable as for the mass matrix M (see
-`factorize_lu`).
-"""
+"""The linear system of a Rosenbrock method, factorized once per step."""
 
 from __future__ import annotations
 
@@ -21,35 +14,30 @@ Matrix = Any
 
 
 class RosenbrockSystem:
-    """(1 - scale J) x = b with a block lower triangular J."""
+    """A x = b with a sparse A, whose unknowns are eliminated in a given order, without pivoting."""
 
-    def __init__(self, scale: Scalar, jacobian: Matrix, split: int) -> None:
-        """Factorize; J, SX (n, n), is zero in the first `split` rows of the other columns."""
-        system = casadi.SX.eye(jacobian.shape[0]) - scale * jacobian
-        self._coupling = system[split:, :split]
-        self._factors = [_factorized(system[:split, :split]), _factorized(system[split:, split:])]
+    def __init__(self, system: Matrix, order: Sequence[int]) -> None:
+        """Factorize A, SX (n, n)."""
+        self._order = list(order)
+        self._factor = _factorized(system[self._order, self._order])
 
     @property
     def variables(self) -> list[Scalar]:
         """The entries of the factors that are not constants of the scene."""
-        parts = (self._coupling, *self._factors)
-        return [entry for part in parts for entry in part.nonzeros() if not entry.is_constant()]
+        return [entry for entry in self._factor.nonzeros() if not entry.is_constant()]
 
     def renamed(self) -> RosenbrockSystem:
         """The same with new symbols for `variables`, computed elsewhere."""
         known = RosenbrockSystem.__new__(RosenbrockSystem)
-        known._coupling = _renamed(self._coupling, "coupling")
-        known._factors = [_renamed(factor, f"factor{i}") for i, factor in enumerate(self._factors)]
+        known._order, known._factor = self._order, _renamed(self._factor, "factor")
         return known
 
     def solve(self, right: Sequence[Scalar]) -> list[Scalar]:
-        first, last = (_rows(factor) for factor in self._factors)
-        solved = solve_lu(first, right[: len(first)])
-        rest = [
-            value - sum((entry * x for entry, x in zip(row, solved, strict=True)), 0.0)
-            for row, value in zip(_rows(self._coupling), right[len(first) :], strict=True)
-        ]
-        return [*solved, *solve_lu(last, rest)]
+        solved = solve_lu(_rows(self._factor), [right[i] for i in self._order])
+        result: list[Scalar] = [0.0] * len(solved)
+        for i, value in zip(self._order, solved, strict=True):
+            result[i] = value
+        return result
 
 
 def _factorized(system: Matrix) -> Matrix:

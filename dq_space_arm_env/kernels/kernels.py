@@ -73,6 +73,38 @@ class Kernels(RobotKernels):
         """
         return self._step_call("step", x, u, dt, integrator, p)[0]
 
+    def checked_step(
+        self,
+        x: ArrayLike,
+        u: ArrayLike,
+        dt: float | None = None,
+        integrator: str | None = None,
+        p: ArrayLike | None = None,
+    ) -> tuple[Array, Array]:
+        """Advance states by one time step, and tell how accurate it is.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x), units of `layout.state`.
+            u: Inputs, shape (n_u,) or (B, n_u), units of `layout.control`; not clipped to the limits.
+            dt: Time step, s; the scene's by default.
+            integrator: Name of an adaptive integrator; the scene's by default.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            States as `step` gives them, and the largest estimated error of a substep in units of the
+            tolerance, shape () or (B,): above 1 where `rodas4` and `rodas5p` have tried their most substeps,
+            and NaN with the state where no finite state was found.
+
+        Raises:
+            ValueError: If dt is not a finite number, or the integrator is unknown or takes fixed steps.
+        """
+        name = integrator or self.scene.simulation.integrator
+        if name in INTEGRATORS and not INTEGRATORS[name].is_adaptive:
+            known = ", ".join(key for key, entry in INTEGRATORS.items() if entry.is_adaptive)
+            raise ValueError(f"integrator: {name!r} estimates no error; choose from {known}")
+        x_next, error = self._step_call("checked_step", x, u, dt, integrator, p)
+        return x_next, error[..., 0]
+
     def simulate(
         self,
         x: ArrayLike,
@@ -241,14 +273,14 @@ class Kernels(RobotKernels):
         """
         from dq_space_arm_env.kernels.adaptive import integrate
 
-        default_rtol, default_atol = self.scene.simulation.tolerances
+        default = self.scene.simulation.tolerance_of
         return integrate(
             self,
             x,
             u,
             duration,
-            rtol=default_rtol if rtol is None else rtol,
-            atol=default_atol if atol is None else atol,
+            rtol=default("rtol") if rtol is None else rtol,
+            atol=default("atol") if atol is None else atol,
             times=times,
             max_steps=max_steps,
             p=p,

@@ -245,6 +245,7 @@ _MODEL_SOURCES = ("algebra", "compiler", "dynamics", "integrators", "kernels", "
 _STEPS = (
     "step",
     "step_with_cost",
+    "checked_step",
     "walk",
     "linearize",
     "linearize_parameters",

@@ -27,8 +27,17 @@ class IntegratorEntry:
     # digits of them: those of methods of order 4 and above differ by O(dt^5). Gradients, which decide where
     # the solver ends, are always the method's own.
     curvature: str | None = None
-    is_adaptive: bool = False  # divides a time step until tolerances are met
+    tolerances: tuple[str, ...] = ()  # keys of `simulation`, by which it divides a time step
     keeps_momentum: bool = False  # to rounding, where no external wrench acts
+
+    @property
+    def is_adaptive(self) -> bool:
+        """Whether the method divides a time step until its tolerances are met."""
+        return bool(self.tolerances)
+
+    def within(self, tolerance: float) -> dict[str, float]:
+        """Keys of `simulation` for a tolerance; an absolute one beside a relative one is its hundredth."""
+        return {key: 0.01 * tolerance if key == "atol" else tolerance for key in self.tolerances}
 
     @property
     def is_stiff(self) -> bool:
@@ -80,13 +89,21 @@ INTEGRATORS: Mapping[str, IntegratorEntry] = {
             "dormand_prince",
             order=5,
             implementation=("dormand_prince.DormandPrince",),
-            is_adaptive=True,
+            tolerances=("rtol", "atol"),
         ),
         IntegratorEntry(
-            "rodas4", order=4, implementation=("rosenbrock.Rosenbrock", "rosenbrock_tableaus.RODAS4")
+            "rodas4",
+            order=4,
+            implementation=("rosenbrock.Rosenbrock", "rosenbrock_tableaus.RODAS4"),
+            tolerances=("tolerance",),
+            keeps_momentum=True,
         ),
         IntegratorEntry(
-            "rodas5p", order=5, implementation=("rosenbrock.Rosenbrock", "rosenbrock_tableaus.RODAS5P")
+            "rodas5p",
+            order=5,
+            implementation=("rosenbrock.Rosenbrock", "rosenbrock_tableaus.RODAS5P"),
+            tolerances=("tolerance",),
+            keeps_momentum=True,
         ),
         IntegratorEntry(
             "momentum_rk4",
@@ -95,12 +112,6 @@ INTEGRATORS: Mapping[str, IntegratorEntry] = {
             imaginary_interval=2.828,
             real_interval=2.785,
             curvature="rk4",
-            keeps_momentum=True,
-        ),
-        IntegratorEntry(
-            "momentum_rosenbrock",
-            order=3,
-            implementation=("momentum.MomentumPreserving", "rosenbrock_w.RosenbrockW"),
             keeps_momentum=True,
         ),
     )

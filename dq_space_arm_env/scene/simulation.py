@@ -10,8 +10,11 @@ from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
 from dq_space_arm_env.validation.fields import Positive, Steps, TimeStep
 from dq_space_arm_env.validation.problems import Model, Problem, problem
 
-TOLERANCES = {"float64": (1e-8, 1e-10), "float32": (1e-5, 1e-6)}
-"""Default relative and absolute tolerance of adaptive integrators, by precision."""
+TOLERANCES = {
+    "float64": {"rtol": 1e-8, "atol": 1e-10, "tolerance": 1e-6},
+    "float32": {"rtol": 1e-5, "atol": 1e-6, "tolerance": 1e-4},
+}
+"""Default tolerances of adaptive integrators, by precision and key."""
 SMALLEST_SINGLE_RTOL = 1e-6
 """Smallest relative tolerance that single precision can keep."""
 
@@ -35,13 +38,18 @@ class Simulation(Model):
     )
     rtol: Positive | None = Field(
         default=None,
-        description="relative tolerance of an adaptive integrator, of velocities and, in rad and m, of pose "
+        description="relative tolerance of `dormand_prince`, of velocities and, in rad and m, of pose "
         "and angles; absent: 1e-8, or 1e-5 in single precision",
     )
     atol: Positive | None = Field(
         default=None,
-        description="absolute tolerance of an adaptive integrator, rad, m, rad/s, m/s; absent: 1e-10, or "
+        description="absolute tolerance of `dormand_prince`, rad, m, rad/s, m/s; absent: 1e-10, or "
         "1e-6 in single precision",
+    )
+    tolerance: Positive | None = Field(
+        default=None,
+        description="largest error of a substep of `rodas4` and `rodas5p`, rad and m; absent: 1e-6, or 1e-4 "
+        "in single precision",
     )
 
     @field_validator("integrator")
@@ -55,18 +63,20 @@ class Simulation(Model):
 
     def _problems(self) -> Iterator[Problem]:
         """Find tolerances without use, or beyond single precision."""
-        adaptive = " or ".join(name for name, entry in INTEGRATORS.items() if entry.is_adaptive)
-        for name in ("rtol", "atol"):
-            value = getattr(self, name)
-            if value is not None and not INTEGRATORS[self.integrator].is_adaptive:
-                sentence = f"{self.integrator} takes fixed steps: remove it, or set integrator to {adaptive}"
-                yield Problem((name,), value, sentence)
+        entry = INTEGRATORS[self.integrator]
+        reason = "has other tolerances" if entry.is_adaptive else "takes fixed steps"
+        for key in TOLERANCES[self.precision]:
+            value = getattr(self, key)
+            if value is not None and key not in entry.tolerances:
+                users = " or ".join(name for name, each in INTEGRATORS.items() if key in each.tolerances)
+                yield Problem(
+                    (key,), value, f"{self.integrator} {reason}: remove it, or set integrator to {users}"
+                )
         if self.precision == "float32" and self.rtol is not None and self.rtol < SMALLEST_SINGLE_RTOL:
             sentence = f"must be at least {SMALLEST_SINGLE_RTOL:g} in single precision"
             yield Problem(("rtol",), self.rtol, sentence)
 
-    @property
-    def tolerances(self) -> tuple[float, float]:
-        """Relative and absolute tolerance of an adaptive integrator."""
-        rtol, atol = TOLERANCES[self.precision]
-        return (rtol if self.rtol is None else self.rtol, atol if self.atol is None else self.atol)
+    def tolerance_of(self, key: str) -> float:
+        """The tolerance under a key, the default of the precision if it is absent."""
+        given: float | None = getattr(self, key)
+        return TOLERANCES[self.precision][key] if given is None else given

@@ -139,7 +139,7 @@ def _variants(scene: Scene) -> Iterator[_Variant]:
             yield name, compile_scene(scene), None
             continue
         for tolerance in ACCURACIES:
-            changes = {"integrator": name, "rtol": tolerance, "atol": 0.01 * tolerance}
+            changes = {"integrator": name, **entry.within(tolerance)}
             yield name, compile_scene(with_simulation(scene, **changes)), tolerance
 
 

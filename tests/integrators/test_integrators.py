@@ -10,7 +10,7 @@ from dq_space_arm_env.scene import INTEGRATORS
 
 
 @pytest.mark.parametrize("scene", ["paper", "planar", "tip-load", "six-joint", "reaction-wheels"])
-@pytest.mark.parametrize("name", ["symplectic_euler", "rk4", "momentum_rk4", "momentum_rosenbrock"])
+@pytest.mark.parametrize("name", ["symplectic_euler", "rk4", "momentum_rk4"])
 def test_errors_fall_with_the_order_of_the_method(name, scene):
     order = INTEGRATORS[name].order
     first = 96 if order > 1 else 1024
@@ -25,7 +25,7 @@ def test_errors_fall_with_the_order_of_the_method(name, scene):
         ("rk4", 16, 2e-12),
         ("momentum_rk4", 1, 2e-8),
         ("momentum_rk4", 16, 2e-12),
-        ("momentum_rosenbrock", 16, 1e-9),
+        ("rodas4", 16, 2e-12),
     ],
 )
 def test_agrees_with_dop853_on_the_vector_field_of_8_and_22(name, refinement, tolerance):
@@ -79,7 +79,7 @@ def test_free_motion_of_1500_s_keeps_momentum_and_energy():
         assert np.ptp(states[:, kernels.layout.state.joint_angles], axis=0).min() > 1.0
 
 
-@pytest.mark.parametrize("name", ["momentum_rk4", "momentum_rosenbrock", "rodas4"])
+@pytest.mark.parametrize("name", ["momentum_rk4", "rodas4"])
 def test_an_environment_steps_by_the_method_that_its_scene_names(name):
     scene = load_scene("planar").replace(simulation={"dt": 0.015, "steps": 20, "integrator": name})
     kernels, env = compile_scene(scene), DQSpaceArmEnv(scene)

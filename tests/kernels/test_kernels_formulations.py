@@ -61,8 +61,7 @@ def test_second_derivatives_agree(draw):
     [
         ("dormand_prince", "minimal_coordinates"),
         ("momentum_rk4", "articulated_body"),
-        pytest.param("rodas4", "minimal_coordinates", marks=pytest.mark.slow),
-        pytest.param("momentum_rosenbrock", "articulated_body", marks=pytest.mark.slow),
+        pytest.param("rodas4", "articulated_body", marks=pytest.mark.slow),
     ],
 )
 def test_steps_of_other_methods_agree_to_1e_12(integrator, other, draw):

@@ -120,7 +120,7 @@ DEFAULT = (
     ("random-target", "rk4"),
     ("planar+", "dormand_prince"),
     ("planar+", "rodas4"),
-    ("planar+", "momentum_rosenbrock"),
+    ("planar+", "momentum_rk4"),
     (0, "rk4"),
 )
 

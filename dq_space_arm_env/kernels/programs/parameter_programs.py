@@ -7,14 +7,13 @@ from typing import Any
 
 import casadi
 
-from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra.symbolic import column, dense_entries, symbols
-from dq_space_arm_env.compiler.graph import Graph, graph_of
+from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.compiler.tangent import append_for_each, append_matrix, append_tangents
-from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.integrators.method import graph_inputs, program_inputs
+from dq_space_arm_env.integrators.tangent_linearization import tangent_graph
 from dq_space_arm_env.task.equations import SceneEquations, total
 
 Scalar = Any
@@ -39,9 +38,9 @@ class ParameterPrograms:
         inputs = [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)]
         program = Program("linearize_parameters", program_inputs(field, *inputs), [])
         integrator_of(self.equations.scene.simulation, integrator).append_step(program, field)
-        changes = append_tangents(program, "parameters", ["x_next"])["x_next"]
+        changes = append_tangents(program, ["parameters"], ["x_next"])["x_next"]
         if changes is not None:
-            graph = _tangent_coordinates(self.equations)
+            graph = tangent_graph(field)
             changes = append_for_each(program, graph, {"change": changes}, "dx_next")
         append_matrix(program, changes, (field.n_t, n_p), "P")
         program.outputs = [Buffer("P", field.n_t * n_p)]
@@ -68,14 +67,3 @@ class ParameterPrograms:
         program = Program(name, buffers, [Buffer("lp", len(self.parameters))])
         program.call(graph)
         return program
-
-
-def _tangent_coordinates(equations: SceneEquations) -> Graph:
-    """Graph of the tangent coordinates of a small change of x_next: twist 2 vec(q* dq), and dy."""
-    field = equations.field
-    x, change = symbols("x", field.n_x), symbols("change", field.n_x)
-    moved = field.pose.full(split_state(field, change)[0])
-    twist = dq.to_vector(dq.scale(2.0, dq.multiply(dq.conjugate(equations.base_pose(x)), moved)))
-    rest = split_state(field, change)[1]
-    outputs = {"dx_next": [*(twist[i] for i in field.pose.directions), *rest]}
-    return graph_of("tangent_coordinates", {"x_next": x, "change": change}, outputs)

@@ -18,8 +18,7 @@ from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.integrators.dormand_prince import append_measured_step
-from dq_space_arm_env.integrators.method import program_inputs
-from dq_space_arm_env.integrators.momentum import MomentumPreserving
+from dq_space_arm_env.integrators.method import MomentumIntegrator, program_inputs
 from dq_space_arm_env.kernels.programs.derivative_programs import DerivativePrograms
 from dq_space_arm_env.kernels.programs.parameter_programs import ParameterPrograms
 from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
@@ -75,7 +74,7 @@ class ScenePrograms:
 
     def build(self, name: str, integrator: str = "") -> Program:
         """Trace a program by name, with an integrator if it takes a step; KeyError if either is unknown."""
-        if name in ("step", "step_with_cost"):
+        if name in ("step", "step_with_cost", "checked_step"):
             return self._step(name, integrator)
         if name == "walk":
             return self._walk(integrator)
@@ -257,6 +256,8 @@ class ScenePrograms:
         x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
         program = Program(name, program_inputs(field, x, u, h), [Buffer("x_next", field.n_x)])
         integrator_of(self.scene.simulation, integrator).append_step(program, field)
+        if name == "checked_step":
+            program.outputs = [*program.outputs, Buffer("checked_error", 1)]
         if name == "step_with_cost":
             sizes = {"x": field.n_x, "u": field.n_u}
             program.call(
@@ -284,7 +285,7 @@ class ScenePrograms:
         """A step of many in a row; a momentum-preserving method hands on the momentum besides the state."""
         field, method = self.field, integrator_of(self.scene.simulation, integrator)
         x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
-        if not isinstance(method, MomentumPreserving):
+        if not isinstance(method, MomentumIntegrator):
             program = Program("walk", program_inputs(field, x, u, h), [Buffer("x_next", field.n_x)])
             method.append_step(program, field)
             return program

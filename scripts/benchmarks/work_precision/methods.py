@@ -39,10 +39,10 @@ class Method:
         return self.name in PAPER_TITLES
 
     def kernels(self, scene: Scene, tolerance: float | None = None) -> Kernels:
-        """The scene's kernels, with a relative tolerance and a hundredth of it as absolute one if given."""
+        """The scene's kernels, with the tolerance of an adaptive method if given."""
         changes: dict[str, object] = {"precision": "float64"}
         if tolerance is not None:
-            changes |= {"integrator": self.name, "rtol": tolerance, "atol": 0.01 * tolerance}
+            changes |= {"integrator": self.name, **INTEGRATORS[self.name].within(tolerance)}
         return compile_scene(scene.replace(simulation=changes))
 
     def step_kernel(self, kernels: Kernels, lanes: int | None) -> BoundKernel:
