@@ -17,6 +17,7 @@ from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.interoperability.urdf_elements import read_robot
+from dq_space_arm_env.scene import Simulation
 
 _OPTIONS = {
     r"spacecraft=\{'mass': \.\.\., 'inertia': \.\.\.\}": "--spacecraft-mass and --spacecraft-inertia",
@@ -99,6 +100,8 @@ def summary(imported: Imported, file: str, added: bool) -> Iterator[str]:
     yield f"  limits  {'; '.join(_limits(scene)) or 'no motors'}; edit actuators and links"
     yield f"  start   at rest, joints at {_numbers(scene.initial_state.joint_angles)} rad; edit initial_state"
     yield f"  target  {degrees:.3g} degrees and {meters:.3g} m from the start; edit target"
+    if scene.simulation.integrator != Simulation().integrator:
+        yield f"  steps   by {scene.simulation.integrator}: the joints' dampers are too stiff for others"
     yield "  spread  every episode is the same; edit spread before an agent is trained"
     word = quote(file)
     yield f"Next: `dq-space-arm solve {word}`; after edits first `dq-space-arm scenes validate {word}`"

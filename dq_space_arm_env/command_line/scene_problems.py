@@ -33,6 +33,13 @@ def check(source: str) -> list[LocatedProblem]:
     return []
 
 
+def step_advice(source: str) -> str | None:
+    """What the scene's integrator cannot follow, in a sentence; None where its steps are stable."""
+    from dq_space_arm_env.dynamics.step_stability import advice
+
+    return advice(load_scene(source))
+
+
 def _located(error: ValidationError, file: Path) -> list[LocatedProblem]:
     text = read_text(file) if file.is_file() else None
     found = []

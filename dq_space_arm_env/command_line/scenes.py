@@ -87,12 +87,14 @@ def show(scene: str, as_json: bool) -> None:
 @json_option
 def validate(files: tuple[str, ...], as_json: bool) -> int:
     """Check scene files; list every problem with its line and field. Exit status 1: problems found."""
-    from dq_space_arm_env.command_line.scene_problems import check
+    from dq_space_arm_env.command_line.scene_problems import check, step_advice
 
     found: list[dict[str, Any]] = []
     for file in files:
         problems = check(file)
-        found.append({"file": file, "valid": not problems, "problems": [each._asdict() for each in problems]})
+        advice = None if problems else step_advice(file)
+        listed = [each._asdict() for each in problems]
+        found.append({"file": file, "valid": not problems, "problems": listed, "advice": advice})
         if as_json:
             continue
         for problem in problems:
@@ -100,6 +102,8 @@ def validate(files: tuple[str, ...], as_json: bool) -> int:
             say(f"{where}: {problem.message}")
         if not problems:
             say(f"{file}: valid")
+        if advice is not None:
+            say(f"{file}: {advice}")
     if as_json:
         print_document(found)
     return SUCCESS if all(each["valid"] for each in found) else FAILURE

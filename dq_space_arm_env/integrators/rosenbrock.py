@@ -136,7 +136,7 @@ class _Graphs:
 
     def limit(self, tolerance: float) -> Any:
         """Graph of the tolerance and of what makes an error of a rate comparable with it."""
-        outputs = {"weights": [1.0 / tolerance, self.h / tolerance]}
+        outputs = {"weights": [1.0 / tolerance, casadi.fabs(self.h) / tolerance]}
         return graph_of(f"{self.prefix}_limit", {"h": [self.h]}, outputs)
 
     def first(self) -> Any:

@@ -14,6 +14,7 @@ from pydantic import Field, ValidationError
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.step_stability import stable
 from dq_space_arm_env.interoperability.rigid_body import Body, lumped, tidied
 from dq_space_arm_env.interoperability.urdf_arm import Arm, ArmJoint, arm_of
 from dq_space_arm_env.interoperability.urdf_elements import Pose, UrdfJoint, read_robot
@@ -56,7 +57,8 @@ def scene_from_urdf(
     transmissions and simulator settings are left out, Coulomb friction with a warning. Start: at rest, the
     base link's axes along the inertial ones, joints at zero, or midway between limits that exclude zero.
     Cost: the defaults, but with a weight of the joint torques that lets an arm of any size move within
-    seconds. Change anything else with `scene.replace(...)`.
+    seconds. Integrator: `rk4`, or `rodas4` for dampers too stiff for it. Change anything else with
+    `scene.replace(...)`.
 
     Args:
         source: Path of a URDF file, or its text, which begins with "<"; xacro has to be expanded before.
@@ -107,7 +109,7 @@ def scene_from_urdf(
         "initial_state": {"joint_angles": [_start(part.joint) for part in arm.joints]},
         "target": {"pose": {} if target is None else target},
     }
-    scene = _validated(data, robot.name)
+    scene = stable(_validated(data, robot.name))
     return scene if target is not None else scene.replace(target={"pose": _default_target(scene)})
 
 

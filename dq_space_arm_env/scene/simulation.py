@@ -48,6 +48,7 @@ class Simulation(Model):
     )
     tolerance: Positive | None = Field(
         default=None,
+        exclude_if=lambda value: value is None,  # the hash of a scene without it is as old as the scene
         description="largest error of a substep of `rodas4` and `rodas5p`, rad and m; absent: 1e-6, or 1e-4 "
         "in single precision",
     )

@@ -57,9 +57,12 @@ def solve(
     so far is always saved, flagged as not converged.
     """
     from dq_space_arm_env import load_scene
+    from dq_space_arm_env.dynamics.step_stability import advice
     from experts.command_line import solving
 
     loaded = load_scene(scene)
+    if (sentence := advice(loaded)) is not None:
+        message_console().print(f"{scene}: {sentence}", markup=False, soft_wrap=True)
     if figures:
         solving.check_figures()
     folder = out or solving.default_folder(loaded, seed)

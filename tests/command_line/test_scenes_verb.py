@@ -86,7 +86,26 @@ def test_problems_come_with_their_lines(tmp_path: Path, capsys: pytest.CaptureFi
     broken, paper = json.loads(capsys.readouterr().out)
     assert not broken["valid"]
     assert len(broken["problems"]) == len(found)
-    assert paper == {"file": "paper", "valid": True, "problems": []}
+    assert paper == {"file": "paper", "valid": True, "problems": [], "advice": None}
+
+
+def test_a_valid_scene_whose_steps_blow_up_is_told_what_to_take(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = load_scene("paper")
+    links = [link.model_dump() | {"damping": 300.0} for link in scene.links]
+    file = tmp_path / "damped.yaml"
+    file.write_text(scene.replace(links=links).to_yaml(), encoding="utf-8")
+    assert main(["scenes", "validate", str(file)]) == SUCCESS
+    printed = capsys.readouterr().out
+    assert (
+        "where rk4 is unstable in steps of 0.015 s: set simulation.integrator to rodas4, or dt to" in printed
+    )
+    file.write_text(
+        scene.replace(links=links, simulation={"integrator": "rodas4"}).to_yaml(), encoding="utf-8"
+    )
+    assert main(["scenes", "validate", str(file)]) == SUCCESS
+    assert capsys.readouterr().out == f"{file}: valid\n"
 
 
 @pytest.mark.parametrize(

