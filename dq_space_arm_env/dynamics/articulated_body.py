@@ -9,8 +9,12 @@ The cost is linear in the number of joints.
 The root is free, and rounding decides it. Eliminating a joint removes all inertia about its axis, exactly;
 but rotated to other axes and added to a lighter body, the remainder of a heavy body buries the little inertia
 that the light one has about that axis. Toward the heaviest body, light bodies are added to heavy ones
-instead, and extreme mass ratios cost no digits. A root next to the heaviest body, across its own joint, is as
-good: the axis of that joint is an axis of the root's frame, the last to be solved for.
+instead, and extreme mass ratios cost no digits. A root next to the heaviest body, across its own joint, is
+almost as good: the axis of that joint is an axis of the root's frame, the last to be solved for. But what the
+heaviest body hands across it is rounded in proportion to its mass.
+
+Seen from the root, a joint transmits what the articulated body beyond it needs of the acceleration at the
+joint: the axis drops out, and with it the own acceleration of a light body, however large.
 """
 
 from __future__ import annotations
@@ -78,6 +82,11 @@ class ArticulatedInertia:
             _symmetric(lambda i, j: dot(rotation[i], inertia[j])),
         )
 
+    def wrench(self, linear: Vector3, angular: Vector3) -> Wrench:
+        """Force and torque that an acceleration needs."""
+        force = add(matrix_vector(self.mass, linear), transposed_matrix_vector(self.coupling, angular))
+        return force, add(matrix_vector(self.coupling, linear), matrix_vector(self.inertia, angular))
+
     def plus(self, other: ArticulatedInertia) -> ArticulatedInertia:
         pairs = ((self.mass, other.mass), (self.coupling, other.coupling), (self.inertia, other.inertia))
         return ArticulatedInertia(*([add(a, b) for a, b in zip(*pair, strict=True)] for pair in pairs))
@@ -90,20 +99,21 @@ class _Joint:
     force: Vector3  # per angular acceleration, kg m
     torque: Vector3  # per angular acceleration, kg m^2
     inverse: Scalar  # of the inertia about the axis, 1/(kg m^2)
+    remainder: ArticulatedInertia  # of the body across the joint, none about the axis
 
     @classmethod
-    def eliminated(cls, body: ArticulatedInertia) -> tuple[_Joint, ArticulatedInertia]:
-        """Free a body about its z axis; the remainder has no inertia about it."""
+    def eliminated(cls, body: ArticulatedInertia) -> _Joint:
+        """Free a body about its z axis."""
         # I^a = I - U D^-1 U' with U = I s, D = s' I s and the axis s = z (Featherstone, table 7.1).
         force, torque = body.coupling[2], [row[2] for row in body.inertia]
-        joint = cls(force, torque, 1.0 / torque[2])
-        by_force, by_torque = scale(joint.inverse, force), scale(joint.inverse, torque)
+        inverse = 1.0 / torque[2]
+        by_force, by_torque = scale(inverse, force), scale(inverse, torque)
         mass = _symmetric(lambda i, j: body.mass[i][j] - force[i] * by_force[j])
         coupling = [[body.coupling[i][j] - by_torque[i] * force[j] for j in range(3)] for i in range(2)]
         inertia = _symmetric(
             lambda i, j: 0.0 if 2 in (i, j) else body.inertia[i][j] - torque[i] * by_torque[j]
         )
-        return joint, ArticulatedInertia(mass, [*coupling, ZERO], inertia)
+        return cls(force, torque, inverse, ArticulatedInertia(mass, [*coupling, ZERO], inertia))
 
     def passed(self, force: Vector3, torque: Vector3, own: Scalar) -> Wrench:
         """Share of a wrench on the body that crosses the joint.
@@ -134,12 +144,13 @@ class ArticulatedBodies:
         # From the base up to the root: the parent is carried by the joint, which turns backward.
         for i in range(self._root):
             body = bodies[i].shifted(scale(-1.0, self._positions[i])).rotated(transpose(rotations[i]))
-            self._joints[i], body = _Joint.eliminated(body)
-            bodies[i + 1] = bodies[i + 1].plus(body)
+            self._joints[i] = _Joint.eliminated(body)
+            bodies[i + 1] = bodies[i + 1].plus(self._joints[i].remainder)
         # From the tip down to the root.
         for i in reversed(range(self._root, len(rotations))):
-            self._joints[i], body = _Joint.eliminated(bodies[i + 1])
-            bodies[i] = bodies[i].plus(body.rotated(rotations[i]).shifted(self._positions[i]))
+            self._joints[i] = _Joint.eliminated(bodies[i + 1])
+            body = self._joints[i].remainder.rotated(rotations[i]).shifted(self._positions[i])
+            bodies[i] = bodies[i].plus(body)
         self._factor = factorize_ldl(_root_block(bodies[self._root], self._free))
 
     @property
@@ -149,27 +160,50 @@ class ArticulatedBodies:
 
     def accelerations(self, wrenches: Sequence[Wrench], joints: Sequence[Scalar]) -> Accelerations:
         """See `forward.Inertia`."""
-        acting, own = list(wrenches), list(joints)
+        return self._motion(wrenches, joints)[0]
+
+    def reactions(self, wrenches: Sequence[Wrench], joints: Sequence[Scalar]) -> list[Wrench]:
+        """Wrench that each joint transmits to its link, in joint axes, from those of `accelerations`."""
+        _, passed, reached = self._motion(wrenches, joints)
+        reactions = []
+        for i, ((force, torque), acceleration) in enumerate(zip(passed, reached, strict=True)):
+            # On the body beyond the joint: I^a a' + p^a (Featherstone, section 7.3, p^a = -passed).
+            needed = self._joints[i].remainder.wrench(*acceleration)
+            on_beyond = subtract(needed[0], force), subtract(needed[1], torque)
+            if i < self._root:  # where the link is on the root's side
+                on_beyond = scale(-1.0, on_beyond[0]), scale(-1.0, on_beyond[1])
+            reactions.append(on_beyond)
+        return reactions
+
+    def _motion(
+        self, wrenches: Sequence[Wrench], joints: Sequence[Scalar]
+    ) -> tuple[Accelerations, list[Wrench], list[tuple[Vector3, Vector3]]]:
+        """Accelerations; per joint, the wrench passed to the root and the acceleration that reaches it."""
+        acting, own, passed = list(wrenches), list(joints), [(ZERO, ZERO)] * len(joints)
         for i in range(self._root):
             force, torque = acting[i]
             torque = subtract(torque, cross(self._positions[i], force))
             force = transposed_matrix_vector(self._rotations[i], force)
             torque = transposed_matrix_vector(self._rotations[i], torque)
             own[i] = torque[2] - joints[i]
-            acting[i + 1] = _sum(acting[i + 1], self._joints[i].passed(force, torque, own[i]))
+            passed[i] = self._joints[i].passed(force, torque, own[i])
+            acting[i + 1] = _sum(acting[i + 1], passed[i])
         for i in reversed(range(self._root, len(joints))):
             force, torque = acting[i + 1]
             own[i] = torque[2] + joints[i]
-            passed = self._joints[i].passed(force, torque, own[i])
-            acting[i] = _sum(acting[i], shift_wrench(self._rotations[i], self._positions[i], *passed))
-        return self._outward(acting[self._root], own)
+            passed[i] = self._joints[i].passed(force, torque, own[i])
+            acting[i] = _sum(acting[i], shift_wrench(self._rotations[i], self._positions[i], *passed[i]))
+        accelerations, reached = self._outward(acting[self._root], own)
+        return accelerations, passed, reached
 
     def solve(self, force: Vector3, torque: Vector3, joints: Sequence[Scalar]) -> Accelerations:
         """See `forward.Inertia`."""
         return self.accelerations([(force, torque), *[(ZERO, ZERO)] * len(joints)], joints)
 
-    def _outward(self, acting: Wrench, own: Sequence[Scalar]) -> Accelerations:
-        """Accelerations of the root, then of everything it carries."""
+    def _outward(
+        self, acting: Wrench, own: Sequence[Scalar]
+    ) -> tuple[Accelerations, list[tuple[Vector3, Vector3]]]:
+        """Accelerations of the root, then of everything it carries, and those that reach the joints."""
         both = [*acting[0], *acting[1]]
         six: list[Scalar] = [0.0] * 6
         for index, value in zip(
@@ -177,22 +211,25 @@ class ArticulatedBodies:
         ):
             six[index] = value
         joints: list[Scalar] = [0.0] * len(own)
+        reached: list[tuple[Vector3, Vector3]] = [(ZERO, ZERO)] * len(own)
         linear: Vector3 = six[:3]
         angular: Vector3 = six[3:]
         for i in range(self._root, len(own)):
             rotation, position = self._rotations[i], self._positions[i]
             linear = transposed_matrix_vector(rotation, add(linear, cross(angular, position)))
             angular = transposed_matrix_vector(rotation, angular)
+            reached[i] = linear, angular
             joints[i] = self._joints[i].acceleration(own[i], linear, angular)
             angular = (*angular[:2], angular[2] + joints[i])
         linear, angular = six[:3], six[3:]
         for i in reversed(range(self._root)):
+            reached[i] = linear, angular
             # The body before the joint turns backward about the axis.
             turning = self._joints[i].acceleration(own[i], linear, angular)
             joints[i] = -turning
             angular = matrix_vector(self._rotations[i], (*angular[:2], angular[2] + turning))
             linear = subtract(matrix_vector(self._rotations[i], linear), cross(angular, self._positions[i]))
-        return Accelerations(angular, linear, joints)
+        return Accelerations(angular, linear, joints), reached
 
 
 def _symmetric(entry: Callable[[int, int], Scalar]) -> list[list[Scalar]]:

@@ -72,11 +72,12 @@ class Chain:
     tip_wrench: tuple[float, ...] | None  # force [N], torque [N m] at G, in G axes (16)
     planar: bool  # the base moves in its x-y plane only
     heaviest: int = 0  # body of greatest nominal mass: 0 is the base, i link i
+    heavy_base: bool = False  # its nominal mass is beyond 100 times the arm's
 
     @classmethod
     def from_scene(cls, scene: Scene, given: Given | None = None) -> Chain:
         """Collect a scene's constants; numbers `given` by name (`scene.parameters`) replace its own."""
-        wrench, given = scene.tip_wrench, given or {}
+        wrench, given, masses = scene.tip_wrench, given or {}, _nominal_masses(scene)
         bodies = _link_bodies(scene, given)
         return cls(
             base=_rigid_body(scene.base, "base", (0.0, 0.0, 0.0), given),
@@ -94,16 +95,17 @@ class Chain:
             tip=_placement(scene.tip),
             tip_wrench=None if wrench is None else (*wrench.force, *wrench.torque),
             planar=scene.base.motion == "planar",
-            heaviest=_heaviest(scene),
+            heaviest=masses.index(max(masses)),
+            heavy_base=masses[0] > 100.0 * sum(masses[1:]),
         )
 
 
-def _heaviest(scene: Scene) -> int:
-    """Index of the heaviest body; the base is 0."""
+def _nominal_masses(scene: Scene) -> list[float]:
+    """Masses of base and links, the last one's with the payload, kg."""
     masses = [scene.base.mass, *(link.mass for link in scene.links)]
     if scene.payload is not None:
         masses[-1] += scene.payload.mass
-    return masses.index(max(masses))
+    return masses
 
 
 def _link_bodies(scene: Scene, given: Given) -> list[RigidBody]:

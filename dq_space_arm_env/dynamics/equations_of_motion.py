@@ -11,7 +11,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.chain import Chain
-from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of
+from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of, reaction_wrenches
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
 from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
 from dq_space_arm_env.dynamics.minimal import Accelerations, Wrenches
@@ -145,17 +145,14 @@ class EquationsOfMotion:
     def _solve(
         self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None, inertia: Inertia
     ) -> Accelerations:
+        return forward_dynamics(self.chain, inertia, *self._driven(motion, inputs, wrench))
+
+    def _driven(self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None) -> tuple[Any, ...]:
+        """Rotations of the joints, angular velocity, joint rates, external wrenches and joint torques."""
         rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
         passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
-        return forward_dynamics(
-            self.chain,
-            inertia,
-            rotations,
-            motion.angular,
-            motion.joint_rates,
-            self._acting(motion, inputs, wrench),
-            [motor + other for motor, other in zip(inputs.joint_torques, passive, strict=True)],
-        )
+        torques = [motor + other for motor, other in zip(inputs.joint_torques, passive, strict=True)]
+        return rotations, motion.angular, motion.joint_rates, self._acting(motion, inputs, wrench), torques
 
     def accelerations(
         self, y: Sequence[Scalar], u: Sequence[Scalar], wrench: Sequence[Scalar] | None = None
@@ -202,9 +199,8 @@ class EquationsOfMotion:
 
     def reaction_wrenches(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
         """The paper's T (21): fx, fy, fz [N], tx, ty [N m] that each joint transmits, in joint axes, 5 n."""
-        motion = self.motion(y)
-        solved = self._solve(motion, self.inputs(u), self.chain.tip_wrench, self._inertia(motion))
-        reactions = self._reactions(motion, solved)
+        driven = self._driven(self.motion(y), self.inputs(u), self.chain.tip_wrench)
+        reactions = reaction_wrenches(self.chain, *driven)
         return [entry for force, torque in reactions for entry in (*force, *torque[:2])]
 
     def _missing_wrenches(self, motion: Motion, given: Accelerations) -> list[Any]:

@@ -1,4 +1,7 @@
-"""Forward dynamics: accelerations from everything that acts on the robot, by a choice of formulations."""
+"""Forward dynamics: accelerations and reactions from everything that acts on the robot.
+
+Accelerations come by a choice of formulations, reactions by articulated bodies.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +46,7 @@ def inertia_of(
             f"formulation: {formulation!r} is unknown; it must be articulated_body or minimal_coordinates"
         )
     root = chain.heaviest
-    if root == 0 and chain.links and (chain.planar or not many):
+    if root == 0 and chain.links and (chain.planar or not many) and not chain.heavy_base:
         # The first link is as good a root, and a faster one but for many right-hand sides in space.
         root = 1
     return ArticulatedBodies(chain, rotations, root)
@@ -58,12 +61,40 @@ def forward_dynamics(
     acting: Sequence[Wrench],
     joints: Sequence[Scalar],
 ) -> Accelerations:
-    """Accelerations of a motion under external wrenches (as in `Inertia.accelerations`) and joint torques.
+    """Accelerations of a motion under external wrenches (as in `Inertia.accelerations`) and joint torques."""
+    left = _left(chain, rotations, angular_velocity, joint_rates, acting)
+    return inertia.accelerations(left, joints)
 
-    Wrenches that the motion needs at zero acceleration are subtracted body by body: summed over the chain,
-    what acts on a light body would drown in what a heavy one needs.
+
+def reaction_wrenches(
+    chain: Chain,
+    rotations: Sequence[Sequence[Vector3]],
+    angular_velocity: Vector3,
+    joint_rates: Sequence[Scalar],
+    acting: Sequence[Wrench],
+    joints: Sequence[Scalar],
+) -> list[Wrench]:
+    """Wrench that each joint transmits to its link, in joint axes, under the same as `forward_dynamics`.
+
+    Rooted at the heaviest body, whatever the masses: a light base may accelerate a million times faster than
+    the link that drives it, and the link's acceleration would be their difference.
+    """
+    left = _left(chain, rotations, angular_velocity, joint_rates, acting)
+    return ArticulatedBodies(chain, rotations, chain.heaviest).reactions(left, joints)
+
+
+def _left(
+    chain: Chain,
+    rotations: Sequence[Sequence[Vector3]],
+    angular_velocity: Vector3,
+    joint_rates: Sequence[Scalar],
+    acting: Sequence[Wrench],
+) -> list[Wrench]:
+    """External wrenches, less those that the motion needs at zero acceleration.
+
+    They are subtracted body by body: summed over the chain, what acts on a light body would drown in what a
+    heavy one needs.
     """
     rest = Accelerations(ZERO, ZERO, [0.0] * len(chain.links))
     needed = body_wrenches(chain, rotations, angular_velocity, joint_rates, rest)
-    left = [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(acting, needed, strict=True)]
-    return inertia.accelerations(left, joints)
+    return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(acting, needed, strict=True)]
