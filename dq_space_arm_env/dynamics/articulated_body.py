@@ -9,12 +9,13 @@ The cost is linear in the number of joints.
 The root is free, and rounding decides it. Eliminating a joint removes all inertia about its axis, exactly;
 but rotated to other axes and added to a lighter body, the remainder of a heavy body buries the little inertia
 that the light one has about that axis. Toward the heaviest body, light bodies are added to heavy ones
-instead, and extreme mass ratios cost no digits. A root next to the heaviest body, across its own joint, is
-almost as good: the axis of that joint is an axis of the root's frame, the last to be solved for. But what the
-heaviest body hands across it is rounded in proportion to its mass.
+instead, and extreme mass ratios cost no digits. A root next to the heaviest body, across its own joint, is as
+good while that body is not far heavier: the joint's axis is an axis of the root's frame, the last to be
+solved for, but what the body hands across is rounded in proportion to its mass.
 
-Seen from the root, a joint transmits what the articulated body beyond it needs of the acceleration at the
-joint: the axis drops out, and with it the own acceleration of a light body, however large.
+Reaction wrenches need no difference of accelerations: a joint transmits what the articulated body beyond it,
+seen from the root, needs at the acceleration of the joint. About the axis it needs nothing, and how fast a
+light body turns there does not enter.
 """
 
 from __future__ import annotations
@@ -145,7 +146,8 @@ class ArticulatedBodies:
         for i in range(self._root):
             body = bodies[i].shifted(scale(-1.0, self._positions[i])).rotated(transpose(rotations[i]))
             self._joints[i] = _Joint.eliminated(body)
-            bodies[i + 1] = bodies[i + 1].plus(self._joints[i].remainder)
+            body = self._joints[i].remainder
+            bodies[i + 1] = bodies[i + 1].plus(body)
         # From the tip down to the root.
         for i in reversed(range(self._root, len(rotations))):
             self._joints[i] = _Joint.eliminated(bodies[i + 1])
@@ -163,23 +165,22 @@ class ArticulatedBodies:
         return self._motion(wrenches, joints)[0]
 
     def reactions(self, wrenches: Sequence[Wrench], joints: Sequence[Scalar]) -> list[Wrench]:
-        """Wrench that each joint transmits to its link, in joint axes, from those of `accelerations`."""
+        """Wrench that each joint transmits to its link, in joint axes, under the same as `accelerations`."""
         _, passed, reached = self._motion(wrenches, joints)
-        reactions = []
-        for i, ((force, torque), acceleration) in enumerate(zip(passed, reached, strict=True)):
-            # On the body beyond the joint: I^a a' + p^a (Featherstone, section 7.3, p^a = -passed).
+        reactions: list[Wrench] = []
+        for i, (given, acceleration) in enumerate(zip(passed, reached, strict=True)):
+            # The body beyond the joint is given I^a a' + p^a, where -p^a is passed on (Featherstone, 7.3).
             needed = self._joints[i].remainder.wrench(*acceleration)
-            on_beyond = subtract(needed[0], force), subtract(needed[1], torque)
-            if i < self._root:  # where the link is on the root's side
-                on_beyond = scale(-1.0, on_beyond[0]), scale(-1.0, on_beyond[1])
-            reactions.append(on_beyond)
+            plus, minus = (given, needed) if i < self._root else (needed, given)
+            reactions.append((subtract(plus[0], minus[0]), subtract(plus[1], minus[1])))
         return reactions
 
     def _motion(
         self, wrenches: Sequence[Wrench], joints: Sequence[Scalar]
     ) -> tuple[Accelerations, list[Wrench], list[tuple[Vector3, Vector3]]]:
         """Accelerations; per joint, the wrench passed to the root and the acceleration that reaches it."""
-        acting, own, passed = list(wrenches), list(joints), [(ZERO, ZERO)] * len(joints)
+        acting, own = list(wrenches), list(joints)
+        passed: list[Wrench] = [(ZERO, ZERO)] * len(joints)
         for i in range(self._root):
             force, torque = acting[i]
             torque = subtract(torque, cross(self._positions[i], force))

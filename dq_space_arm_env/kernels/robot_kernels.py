@@ -38,6 +38,9 @@ class RobotKernels(KernelLibrary):
     def reaction_wrenches(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
         """The paper's T (21): wrenches of body i on body i+1, in joint axes about the joint origin.
 
+        Articulated bodies give them whatever the scene's formulation, to rounding even where the base has
+        1e-12 or 1e12 times the mass of the arm.
+
         Args:
             x: States, shape (n_x,) or (B, n_x).
             u: Inputs, shape (n_u,) or (B, n_u).

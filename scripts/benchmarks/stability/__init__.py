@@ -21,6 +21,7 @@ from scripts.benchmarks.stability import (
     paper_form,
     payloads,
     poses,
+    reactions,
     stiff_joints,
     time_steps,
 )
@@ -28,6 +29,7 @@ from scripts.benchmarks.stability.cases import Case
 
 _MODULES = (
     masses,
+    reactions,
     motions,
     extreme_motions,
     stiff_joints,

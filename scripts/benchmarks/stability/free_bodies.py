@@ -8,7 +8,7 @@ the code under test.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,12 +16,8 @@ import mpmath
 import numpy as np
 from mpmath import mpf
 
-from dq_space_arm_env import Scene
 from experts.problems.shooting_problem import FloatArray
-from scripts.benchmarks.stability.references import DIGITS, Sample, column
-
-Matrix = Any  # of mpmath
-Vector = Any  # an mpmath matrix with one column
+from scripts.benchmarks.stability.references import DIGITS, Matrix, Sample, Vector, column, skew, turn
 
 
 class Solution(NamedTuple):
@@ -60,39 +56,27 @@ def free_bodies(sample: Sample) -> Solution:
         return _solved(sample, bodies, joints)
 
 
-def _turn(axis: int, angle: Any) -> Matrix:
-    c, s = mpmath.cos(mpf(angle)), mpmath.sin(mpf(angle))
-    turn, j, k = mpmath.eye(3), (axis + 1) % 3, (axis + 2) % 3
-    turn[j, j], turn[j, k], turn[k, j], turn[k, k] = c, -s, s, c
-    return turn
-
-
 def _rotation(quaternion: Sequence[float]) -> Matrix:
     """Rotation matrix w^2 E + v v' + 2 w [v] + [v]^2 of a quaternion (w, v), normalized."""
     q = column(quaternion)
     q /= mpmath.norm(q)
-    v, skew = q[1:4, 0], _skew(q[1:4, 0])
-    return q[0] ** 2 * mpmath.eye(3) + v * v.T + 2 * q[0] * skew + skew * skew
-
-
-def _skew(v: Vector) -> Matrix:
-    return mpmath.matrix([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    v, across = q[1:4, 0], skew(q[1:4, 0])
+    return q[0] ** 2 * mpmath.eye(3) + v * v.T + 2 * q[0] * across + across * across
 
 
 def _body(given: Any, axes: Matrix, origin: Vector, omega: Vector) -> _Body:
-    """Place the base, a link or a payload of the scene."""
-    inertia = axes * mpmath.matrix([[mpf(entry) for entry in row] for row in given.inertia]) * axes.T
+    """Place the base, a link or the payload of a scene."""
+    inertia = axes * mpmath.matrix(list(given.inertia)) * axes.T
     center = origin + axes * column(getattr(given, "center_of_mass", (0.0, 0.0, 0.0)))
     return _Body(mpf(given.mass), inertia, center, omega, mpmath.zeros(3, 1), mpmath.zeros(3, 1))
 
 
 def _cut_free(sample: Sample) -> tuple[list[_Body], list[_Joint]]:
-    scene, motion, where = sample.scene, sample.motion, sample.kernels.layout
-    planar = where.planar
-    actuated = dict(zip(where.actuated_joints, motion.joint_torques, strict=True))
+    scene, motion, layout = sample.scene, sample.motion, sample.kernels.layout
+    planar, actuated = layout.planar, dict(zip(layout.actuated_joints, motion.joint_torques, strict=True))
     axes, origin = mpmath.eye(3), mpmath.zeros(3, 1)
     omega = column([0.0, 0.0, *motion.angular] if planar else motion.angular)
-    bodies, joints = [_body(scene.base, axes, origin, omega)], []
+    bodies, joints = [_body(scene.base, axes, origin, omega)], list[_Joint]()
     for axis, value in zip((0, 1) if planar else (0, 1, 2), motion.force, strict=False):
         bodies[0].force[axis] = mpf(value)
     for axis, value in zip((2,) if planar else (0, 1, 2), motion.torque, strict=False):
@@ -100,20 +84,21 @@ def _cut_free(sample: Sample) -> tuple[list[_Body], list[_Joint]]:
     for index, link in enumerate(scene.links):
         angle, rate = mpf(motion.joint_angles[index]), mpf(motion.joint_rates[index])
         origin = origin + axes * column(link.joint.position)
-        axes = axes * _rotation(link.joint.rotation) * _turn(2, angle)
+        axes = axes * _rotation(link.joint.rotation) * turn(2, angle)
         omega = omega + axes[:, 2] * rate
         torque = mpf(actuated.get(index, 0.0)) - mpf(link.damping) * rate
-        joints.append(_Joint(axes, origin, rate, torque - mpf(link.stiffness) * (angle - mpf(link.rest_angle))))
+        torque -= mpf(link.stiffness) * (angle - mpf(link.rest_angle))
+        joints.append(_Joint(axes, origin, rate, torque))
         bodies.append(_body(link, axes, origin, omega))
     if scene.wrist is not None:
-        psi, theta, phi = sample.state[where.state.wrist_angles]
+        psi, theta, phi = sample.state[layout.state.wrist_angles]
         origin = origin + axes * column(scene.wrist.frame.position)
-        axes = axes * _rotation(scene.wrist.frame.rotation) * _turn(2, psi) * _turn(1, theta) * _turn(0, phi)
+        axes = axes * _rotation(scene.wrist.frame.rotation) * turn(2, psi) * turn(1, theta) * turn(0, phi)
     origin, axes = origin + axes * column(scene.tip.position), axes * _rotation(scene.tip.rotation)
     if scene.tip_wrench is not None:
         force = axes * column(scene.tip_wrench.force)
         bodies[-1].force += force
-        bodies[-1].torque += axes * column(scene.tip_wrench.torque) + _skew(origin - bodies[-1].center) * force
+        bodies[-1].torque += axes * column(scene.tip_wrench.torque) + skew(origin - bodies[-1].center) * force
     if scene.payload is not None:
         joints.append(_Joint(axes, origin, mpf(0), None))
         bodies.append(_body(scene.payload, axes, origin, omega))
@@ -121,34 +106,32 @@ def _cut_free(sample: Sample) -> tuple[list[_Body], list[_Joint]]:
 
 
 def _solved(sample: Sample, bodies: list[_Body], joints: list[_Joint]) -> Solution:
+    """Assemble and solve: six equations and unknowns per body, as many per joint as it transmits."""
     sizes = [6 if joint.torque is None else 5 for joint in joints]
     starts = [6 * len(bodies) + sum(sizes[:i]) for i in range(len(joints) + 1)]
     matrix, right = mpmath.zeros(starts[-1]), mpmath.zeros(starts[-1], 1)
     for i, body in enumerate(bodies):
-        # Unknowns and equations of a body: linear, then angular.
-        for axis in range(3):
-            matrix[6 * i + axis, 6 * i + axis] = body.mass
-            right[6 * i + axis] = body.force[axis]
+        # m a = f, J alpha = tau - omega x J omega, about the center of mass.
+        _add(matrix, 6 * i, 6 * i, body.mass * mpmath.eye(3))
         _add(matrix, 6 * i + 3, 6 * i + 3, body.inertia)
-        gyroscopic = _skew(body.omega) * (body.inertia * body.omega)
-        _add(right, 6 * i + 3, 0, body.torque - gyroscopic)
+        _add(right, 6 * i, 0, body.force)
+        _add(right, 6 * i + 3, 0, body.torque - skew(body.omega) * (body.inertia * body.omega))
     for i, joint in enumerate(joints):
         rows = starts[i]
         for j, sign in ((i, -1), (i + 1, 1)):
             body, lever = bodies[j], joint.origin - bodies[j].center
-            # Six directions of a wrench: force about the joint's origin, torque; the last is the motor's.
+            # Forces at the joint's origin and torques, about its axes; the last torque is the motor's.
             wrenches = mpmath.zeros(6)
             _add(wrenches, 0, 0, joint.axes)
-            _add(wrenches, 3, 0, _skew(lever) * joint.axes)
+            _add(wrenches, 3, 0, skew(lever) * joint.axes)
             _add(wrenches, 3, 3, joint.axes)
             _add(matrix, 6 * j, rows, -sign * wrenches[:, : sizes[i]])
-            # What the joint forbids is what it transmits: the same directions of the relative acceleration.
+            # Along what a joint transmits, the body before it and the one after it accelerate alike.
             _add(matrix, rows, 6 * j, sign * wrenches[:, : sizes[i]].T)
-            centripetal = joint.axes.T * (_skew(body.omega) * (_skew(body.omega) * lever))
-            _add(right, rows, 0, -sign * centripetal)
+            _add(right, rows, 0, -sign * joint.axes.T * (skew(body.omega) * (skew(body.omega) * lever)))
             if joint.torque is not None:
                 _add(right, 6 * j, 0, sign * joint.torque * wrenches[:, 5])
-        turning = joint.axes.T * (_skew(bodies[i].omega) * (joint.axes[:, 2] * joint.rate))
+        turning = joint.axes.T * (skew(bodies[i].omega) * (joint.axes[:, 2] * joint.rate))
         _add(right, rows + 3, 0, turning[: sizes[i] - 3, 0])
     solution = mpmath.lu_solve(matrix, right)
     return _named(sample, bodies, joints, solution, starts)
@@ -164,7 +147,7 @@ def _named(
     sample: Sample, bodies: list[_Body], joints: list[_Joint], solution: Vector, starts: list[int]
 ) -> Solution:
     planar, linear = sample.kernels.layout.planar, sample.motion.linear
-    turning = _skew(bodies[0].omega) * column([*linear, 0.0] if planar else linear)
+    turning = skew(bodies[0].omega) * column([*linear, 0.0] if planar else linear)
     base = [*solution[3:6, 0], *(solution[:3, 0] - turning)]
     found, reactions = [base[i] for i in ((2, 3, 4) if planar else range(6))], []
     for i, joint in enumerate(joints):
@@ -172,7 +155,7 @@ def _named(
             continue
         z = joint.axes[:, 2]
         relative = solution[6 * i + 9 : 6 * i + 12, 0] - solution[6 * i + 3 : 6 * i + 6, 0]
-        found.append((z.T * (relative - _skew(bodies[i].omega) * (z * joint.rate)))[0])
+        found.append((z.T * (relative - skew(bodies[i].omega) * (z * joint.rate)))[0])
         reactions.append([*solution[starts[i] : starts[i] + 5, 0], joint.torque])
     as_floats = [[float(entry) for entry in row] for row in reactions]
     return Solution(np.array([float(entry) for entry in found]), np.array(as_floats).reshape(-1, 6))

@@ -18,7 +18,7 @@ from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome
 from scripts.benchmarks.stability.masses import BACKWARD_BOUND, ROUNDING, judge
-from scripts.benchmarks.stability.references import DIGITS, FORMULATIONS, Sample, column
+from scripts.benchmarks.stability.references import DIGITS, FORMULATIONS, Sample, column, turn
 from scripts.benchmarks.stability.scenes import paper, random_state, with_links
 
 GROUP = "motions"
@@ -111,23 +111,14 @@ def _passive(formulation: str, effort: Effort) -> Outcome:
     return Handled(worst, f"forward error {forward:.1e}")
 
 
-def _turn(axis: int, angle: Any) -> Any:
-    """Rotation about a coordinate axis, with 50 digits."""
-    c, s = mpmath.cos(mpmath.mpf(angle)), mpmath.sin(mpmath.mpf(angle))
-    turn = mpmath.eye(3)
-    j, k = (axis + 1) % 3, (axis + 2) % 3
-    turn[j, j], turn[j, k], turn[k, j], turn[k, k] = c, -s, s, c
-    return turn
-
-
 def _tip_rotation(joint_angles: FloatArray, wrist_angles: FloatArray) -> FloatArray:
     """Rotation matrix of the paper's tip in base axes, by matrices with 50 digits."""
     with mpmath.workdps(DIGITS):
         rotation = mpmath.eye(3)
         for link, angle in zip(Chain.from_scene(load_scene("paper")).links, joint_angles, strict=True):
-            rotation = rotation * mpmath.matrix([list(row) for row in link.joint.rotation]) * _turn(2, angle)
+            rotation = rotation * mpmath.matrix([list(row) for row in link.joint.rotation]) * turn(2, angle)
         psi, theta, phi = column(wrist_angles)
-        rotation = rotation * _turn(2, psi) * _turn(1, theta) * _turn(0, phi)
+        rotation = rotation * turn(2, psi) * turn(1, theta) * turn(0, phi)
         return np.array([[float(rotation[i, j]) for j in range(3)] for i in range(3)])
 
 

@@ -59,17 +59,26 @@ def _square(rows: Sequence[Sequence[Any]]) -> Matrix:
     return mpmath.matrix([[mpf(entry) for entry in row] for row in rows])
 
 
-def _skew(v: Vector) -> Matrix:
+def skew(v: Vector) -> Matrix:
+    """The matrix of the vector product with v."""
     return mpmath.matrix([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
+def turn(axis: int, angle: Any) -> Matrix:
+    """Rotation about a coordinate axis."""
+    c, s = mpmath.cos(mpf(angle)), mpmath.sin(mpf(angle))
+    matrix = mpmath.eye(3)
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    matrix[j, j], matrix[j, k], matrix[k, j], matrix[k, k] = c, -s, s, c
+    return matrix
+
+
 def _cross(a: Vector, b: Vector) -> Vector:
-    return _skew(a) * b
+    return skew(a) * b
 
 
 def _turned(link: RevoluteLink, angle: float) -> Matrix:
-    c, s = mpmath.cos(mpf(angle)), mpmath.sin(mpf(angle))
-    return _square(link.joint.rotation) * mpmath.matrix([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return _square(link.joint.rotation) * turn(2, angle)
 
 
 def linear_system(chain: Chain, motion: Motion) -> LinearSystem:
@@ -103,15 +112,15 @@ def _linear_system(chain: Chain, motion: Motion) -> LinearSystem:
         lever = rotation * column(body.center_of_mass)
         center = origin + lever
         turning, moving = mpmath.zeros(3, size), mpmath.zeros(3, size)
-        turning[:, 0:3], moving[:, 0:3], moving[:, 3:6] = mpmath.eye(3), -_skew(center), mpmath.eye(3)
+        turning[:, 0:3], moving[:, 0:3], moving[:, 3:6] = mpmath.eye(3), -skew(center), mpmath.eye(3)
         for j, (axis, where) in enumerate(zip(axes, origins, strict=True)):
             turning[:, 6 + j], moving[:, 6 + j] = axis, _cross(axis, center - where)
         mass = mpf(body.mass)
         inertia = rotation * _square(body.inertia) * rotation.T
         force = mass * (a + _cross(alpha, lever) + _cross(omega, _cross(omega, lever)))
         torque = inertia * alpha + _cross(omega, inertia * omega)
-        spinning = _absolute(_skew(omega))
-        force_size = mass * (_absolute(a) + _absolute(_skew(alpha)) * _absolute(lever))
+        spinning = _absolute(skew(omega))
+        force_size = mass * (_absolute(a) + _absolute(skew(alpha)) * _absolute(lever))
         force_size += mass * (spinning * (spinning * _absolute(lever)))
         torque_size = _absolute(inertia) * _absolute(alpha)
         torque_size += spinning * (_absolute(inertia) * _absolute(omega))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,45 @@ def with_links(scene: Scene, **changes: Any) -> Scene:
 
 def with_base(scene: Scene, **changes: Any) -> Scene:
     return scene.replace(base=changes)
+
+
+def random_arm(masses: Sequence[float], seed: int, payload: float = 0.0) -> Scene:
+    """An arm of any shape: masses of base and links [kg], springs, dampers, motors, a wrench at the tip.
+
+    The inertias are those of clouds of points half a meter wide.
+    """
+    rng = np.random.default_rng(seed)
+
+    def body(mass: float, **place: Any) -> dict[str, Any]:
+        points = 0.25 * rng.normal(size=(6, 3))
+        points -= points.mean(axis=0)
+        inertia = mass / 6 * (np.sum(points**2) * np.eye(3) - points.T @ points)
+        return {"mass": mass, "inertia": inertia.tolist(), **place}
+
+    def pose() -> dict[str, Any]:
+        rotation = rng.normal(size=4)
+        rotation /= np.linalg.norm(rotation)
+        return {"position": rng.uniform(-1.0, 1.0, 3).tolist(), "rotation": rotation.tolist()}
+
+    def center() -> list[float]:
+        return [float(entry) for entry in rng.uniform(-0.5, 0.5, 3)]
+
+    passive = {"stiffness": 3.0, "rest_angle": 0.2, "damping": 0.5}
+    links = [
+        body(mass, name=f"link {i}", center_of_mass=center(), joint=pose(), **passive)
+        for i, mass in enumerate(masses[1:], start=1)
+    ]
+    given = {
+        "name": "random arm",
+        "base": body(masses[0]),
+        "links": links,
+        "tip": pose(),
+        "payload": body(payload, center_of_mass=center()) if payload else None,
+        "tip_wrench": {"force": center(), "torque": center()},
+        "actuators": {name: {"limit": 1.0} for name in ("base_force", "base_torque", "joint_torque")},
+        "target": {"pose": {"position": [1.0, 0.0, 0.0]}},
+    }
+    return Scene.model_validate(given)
 
 
 def sprung_joint(stiffness: float = 0.0, damping: float = 0.0) -> Scene:
