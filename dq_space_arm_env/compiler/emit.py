@@ -18,6 +18,10 @@ from dq_space_arm_env.compiler.vector_builder import POINTER, Target, VectorBuil
 
 _COMPARISONS = {"less": "<", "less_equal": "<=", "equal": "==", "not_equal": "!="}
 _LOGICAL = {"not", "and", "or", *_COMPARISONS}
+_LARGE_GRAPH = 40_000
+"""Nodes above which a function is divided into blocks: a single one takes LLVM three times as long."""
+_LONGEST_BLOCK = 1_000
+"""Nodes of such a block."""
 
 
 class _GraphEmitter:
@@ -25,7 +29,7 @@ class _GraphEmitter:
 
     def __init__(self, graph: Graph, builder: VectorBuilder, pointers: Sequence[ir.Value]) -> None:
         self.graph = graph
-        self.builder = builder
+        self.builder, self.pointers = builder, pointers
         self.inputs, outputs = pointers[: len(graph.inputs)], pointers[len(graph.inputs) :]
         self.places: dict[int, list[tuple[ir.Value, int]]] = {}
         for pointer, indices in zip(outputs, graph.results, strict=True):
@@ -40,11 +44,23 @@ class _GraphEmitter:
 
         A result is stored as soon as it is computed, to free its register.
         """
+        divided = len(self.graph.nodes) > _LARGE_GRAPH
         for index, node in enumerate(self.graph.nodes):
+            if divided and index % _LONGEST_BLOCK == 0:
+                self._begin_block()
             if not self._is_fusible(index) or index in self.places:
                 self.values[index] = self._emit(node)
             for pointer, position in self.places.get(index, ()):
                 self.builder.store(self.value(index), pointer, position)
+
+    def _begin_block(self) -> None:
+        """Continue in a new block if an address is not zero: LLVM would merge blocks without a condition."""
+        llvm, here = self.builder.ir, self.pointers[0]
+        following, end = (llvm.append_basic_block(name) for name in ("following", "unreached"))
+        llvm.cbranch(llvm.icmp_unsigned("!=", here, here.type(None)), following, end)
+        llvm.position_at_end(end)
+        llvm.ret_void()
+        llvm.position_at_end(following)
 
     def value(self, index: int) -> ir.Value:
         """The emitted value of a node, as a number in every lane."""

@@ -87,6 +87,15 @@ class Program:
         """Append a call; `bindings` map names of the graph to buffers of other names."""
         self.calls.append(Call(graph, bindings))
 
+    def append(self, other: Program, **buffers: str) -> None:
+        """Append the calls of another program; `buffers` map names of its buffers to others."""
+        if other.loops:
+            raise ValueError(f"program {other.name!r} has a loop, and cannot become part of {self.name!r}")
+        for call in other.calls:
+            names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
+            bound = {name: call.bindings.get(name, name) for name in names}
+            self.call(call.graph, **{name: buffers.get(buffer, buffer) for name, buffer in bound.items()})
+
     @contextmanager
     def repeated_while(self, condition: str) -> Iterator[None]:
         """Repeat the calls appended inside, at least once, while `condition` is set; see `Loop`."""

@@ -67,7 +67,7 @@ def casadi_dynamics(scene: Scene, integrator: str | None = None) -> CasadiDynami
         The functions.
 
     Raises:
-        ValueError: If the integrator is unknown or adaptive.
+        ValueError: If the integrator is unknown, adaptive or implicit.
     """
     name = scene.simulation.integrator if integrator is None else integrator
     if name not in INTEGRATORS:
@@ -75,18 +75,19 @@ def casadi_dynamics(scene: Scene, integrator: str | None = None) -> CasadiDynami
             f"integrator: {name!r} is unknown; {did_you_mean(name, INTEGRATORS)}It must be one of "
             f"{', '.join(INTEGRATORS)}"
         )
-    if INTEGRATORS[name].is_adaptive:
-        raise ValueError(
-            f"integrator: {name!r} divides a step as far as its tolerances ask, which CasADi cannot "
-            "differentiate; give one with a fixed number of stages, for example integrator='rk8'"
-        )
     programs = ScenePrograms(scene)
+    step = programs.build("step", name)
+    if step.loops:
+        raise ValueError(
+            f"integrator: {name!r} repeats calls until tolerances are met or stages converge, which CasADi "
+            "cannot differentiate; give one with a fixed number of stages, for example integrator='rk8'"
+        )
     return CasadiDynamics(
         scene=scene,
         layout=programs.layout,
         forward_dynamics=_function(programs.build("forward_dynamics")),
         xdot=_function(_state_derivative(programs)),
-        step=_function(programs.build("step", name)),
+        step=_function(step),
         tip_pose=_function(programs.build("tip_pose")),
         cost=_function(programs.build("cost")),
         terminal_cost=_function(programs.build("terminal_cost")),

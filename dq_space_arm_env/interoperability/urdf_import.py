@@ -24,7 +24,11 @@ from dq_space_arm_env.validation import Model, Positive, Vector3
 
 # Angle from the start of every joint at the default target, rad.
 _TARGET_OFFSET = 0.3
-# Natural frequency of the joint with the largest inertia under the default cost, rad/s.
+# Angle by which every joint of an arm that would begin in a singular pose is bent, rad.
+_BEND = 0.5
+# Smallest singular value of the tip's Jacobian, relative to the largest, below which a pose is singular.
+_SINGULAR = 0.01
+# Natural frequency of the joint that is the hardest to move under the default cost, rad/s.
 _FREQUENCY = 0.7
 
 
@@ -55,7 +59,8 @@ def scene_from_urdf(
 
     The efforts of the URDF limit the joint torques. Limits of joint angles and rates, shapes and meshes,
     transmissions and simulator settings are left out, Coulomb friction with a warning. Start: at rest, the
-    base link's axes along the inertial ones, joints at zero, or midway between limits that exclude zero.
+    base link's axes along the inertial ones, joints at zero, or midway between limits that exclude zero; an
+    arm that is singular there, as a straight one, begins with every joint bent by 0.5 rad.
     Cost: the defaults, but with a weight of the joint torques that lets an arm of any size move within
     seconds. Integrator: `rk4`, or `rodas4` for dampers too stiff for it. Change anything else with
     `scene.replace(...)`.
@@ -93,6 +98,7 @@ def scene_from_urdf(
     arm = arm_of(robot, tip, base, lock_branches, extra)
     _check_passive(arm, passive)
     _warn(arm)
+    angles = _start(arm)
     center = ", ".join(f"{number:.9g}" for number in arm.base_center)
     data: dict[str, Any] = {
         "name": robot.name if name is None else name,
@@ -105,8 +111,8 @@ def scene_from_urdf(
             "base_torque": None if base_torque is None else {"limit": base_torque},
             "joint_torque": _motors(arm, joint_torque, passive),
         },
-        "cost": {"joint_torque": _torque_weight(arm)},
-        "initial_state": {"joint_angles": [_start(part.joint) for part in arm.joints]},
+        "cost": {"joint_torque": _torque_weight(arm, angles)},
+        "initial_state": {"joint_angles": angles},
         "target": {"pose": {} if target is None else target},
     }
     scene = stable(_validated(data, robot.name))
@@ -175,32 +181,35 @@ def _warn(arm: Arm) -> None:
         )
 
 
-def _torque_weight(arm: Arm) -> float:
+def _torque_weight(arm: Arm, angles: Sequence[float]) -> float:
     """Weight of the joint torques with which the arm takes seconds.
 
-    The optimal regulator of an inertia I with the cost a theta^2 + b tau^2 has the natural frequency
-    (a / (b I^2))^(1/4). Turned by theta, a tip at distance d costs a = w (1 + d^2) / 4, w the pose's weight.
+    The optimal regulator of an inertia I with the damping c and the cost a theta^2 + b tau^2 moves within
+    1 / omega where a / b = omega^2 (I^2 omega^2 + c^2): without damper omega is its natural frequency,
+    without inertia its decay. Turned by theta, a tip at distance d costs a = w (1 + d^2) / 4, w the pose's
+    weight.
     """
     bodies: list[Body] = []
     tip, largest = arm.tip, (0.0, 0.0)
-    for part in reversed(arm.joints):
+    for part, angle in zip(reversed(arm.joints), reversed(angles), strict=True):
         bodies.append(part.body)
         moved = lumped(bodies)
         assert moved is not None
         x, y, _ = moved.center_of_mass
         distance = math.dist(poses.to_rotation_and_position(tip)[1], (0.0, 0.0, 0.0))
         about_axis = float(moved.inertia[2, 2] + moved.mass * (x * x + y * y))
-        largest = max(largest, (about_axis, distance))
+        largest = max(largest, (math.hypot(about_axis * _FREQUENCY, part.joint.damping), distance))
         # On to the frame before, the joint at its start.
-        bodies = [moved.seen_from(pose := _at_start(part))]
+        bodies = [moved.seen_from(pose := _turned(part, angle))]
         tip = tuple(dual_quaternion.multiply(pose, tip))
-    inertia, distance = largest
+    impedance, distance = largest  # N m s/rad
     pose_weight = Cost().pose[0]
-    return float(f"{0.25 * pose_weight * (1.0 + distance**2) / (inertia**2 * _FREQUENCY**4):.2g}")
+    return float(f"{0.25 * pose_weight * (1.0 + distance**2) / (impedance * _FREQUENCY) ** 2:.2g}")
 
 
-def _at_start(part: ArmJoint) -> Pose:
-    half = 0.5 * _start(part.joint)
+def _turned(part: ArmJoint, angle: float) -> Pose:
+    """Pose of a joint's frame, turned by an angle, in the frame before."""
+    half = 0.5 * angle
     turned = poses.from_rotation_and_position((math.cos(half), 0.0, 0.0, math.sin(half)), (0.0, 0.0, 0.0))
     return tuple(dual_quaternion.multiply(part.pose, turned))
 
@@ -240,10 +249,46 @@ def _pose(pose: Pose) -> dict[str, Any]:
     return {"position": tidied(np.array(position)).tolist(), "rotation": tidied(np.array(rotation)).tolist()}
 
 
-def _start(joint: UrdfJoint) -> float:
+def _start(arm: Arm) -> list[float]:
+    """Angles at the start, rad: at rest, or bent where that is singular and helps.
+
+    In a straight arm several joints do the same and none moves the tip along it: to first order the cost does
+    not tell which way to bend, and the solver creeps.
+    """
+    at_rest = [_at_rest(part.joint) for part in arm.joints]
+    bent = [_bent(part.joint) for part in arm.joints]
+    return bent if _dexterity(arm, at_rest) < _SINGULAR < _dexterity(arm, bent) else at_rest
+
+
+def _at_rest(joint: UrdfJoint) -> float:
     if joint.limits is None or joint.limits[0] <= 0.0 <= joint.limits[1]:
         return 0.0
     return 0.5 * (joint.limits[0] + joint.limits[1])
+
+
+def _bent(joint: UrdfJoint) -> float:
+    """Angle at rest and the bend, upward where the limits allow it."""
+    angle, (lower, upper) = _at_rest(joint), joint.limits or (-math.inf, math.inf)
+    return next((turned for turned in (angle + _BEND, angle - _BEND) if lower <= turned <= upper), angle)
+
+
+def _dexterity(arm: Arm, angles: Sequence[float]) -> float:
+    """Smallest singular value of the tip's Jacobian on a fixed base, relative to the largest.
+
+    Lengths are in units of the largest distance from a joint to the tip.
+    """
+    frame: Pose = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    axes, origins = [], []
+    for part, angle in zip(arm.joints, angles, strict=True):
+        frame = tuple(dual_quaternion.multiply(frame, _turned(part, angle)))
+        rotation, position = poses.to_matrix(frame)
+        axes.append([row[2] for row in rotation])
+        origins.append(position)
+    tip = poses.to_matrix(tuple(dual_quaternion.multiply(frame, arm.tip)))[1]
+    levers = np.array(tip) - np.array(origins)
+    reach = float(np.linalg.norm(levers, axis=1).max()) or 1.0
+    values = np.linalg.svd(np.hstack([axes, np.cross(axes, levers) / reach]), compute_uv=False)
+    return float(values[-1] / values[0])
 
 
 def _default_target(scene: Scene) -> dict[str, Any]:

@@ -21,7 +21,8 @@ class SolveProgress:
 
     def __enter__(self) -> Self:
         self._display.__enter__()
-        self._display.show("preparing (compiling a new scene takes about 15 s)", now=True)
+        told = "compiling a new scene takes half a minute, one with stiff joints two"
+        self._display.show(f"preparing ({told})", now=True)
         return self
 
     def __exit__(

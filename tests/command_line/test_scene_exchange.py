@@ -15,6 +15,7 @@ from dq_space_arm_env.common.console import SUCCESS, UNUSABLE
 
 ARM = str(Path(__file__).parents[2] / "scripts" / "examples" / "small-arm.urdf")
 HAND = ["import", ARM, "--tip", "hand"]
+ARMS = Path(__file__).parents[1] / "interoperability" / "arms"
 CARRIED = ["--spacecraft-mass", "80", "--spacecraft-inertia", "8", "8", "6"]
 SPACECRAFT = {"mass": 80, "inertia": [8, 8, 6]}
 
@@ -150,3 +151,40 @@ def test_the_maneuver_to_begin_with_is_solved_and_flown(
     plan = str(Path(solved["files"][0]))
     assert main(["simulate", "arm.yaml", "--policy", plan, "--json"]) == SUCCESS
     assert json.loads(capsys.readouterr().out)["is_success"]
+
+
+def heavy(arm: str, tip: str) -> object:
+    """An arm like others here, which compiles for half a minute or more."""
+    return pytest.param(arm, tip, marks=pytest.mark.endurance)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arm", "tip"),
+    [
+        ("z1", "link06"),
+        ("borinot-arm", "flying_arm_2__ee"),
+        ("so100", "gripper"),
+        heavy("open-manipulator-x", "end_effector_link"),
+        heavy("px100", "px100/ee_arm_link"),
+        heavy("so101", "gripper_frame_link"),
+        heavy("widowx", "gripper_rail_link"),
+        heavy("bravo7", "contact_point"),
+        heavy("hextilt-arm", "flying_arm_5__gripper"),
+        heavy("kinova-j2s6s200", "j2s6s200_end_effector"),
+        heavy("panda", "panda_hand_tcp"),
+        heavy("ur3e", "tool0"),
+        heavy("ur10", "tool0"),
+    ],
+)
+def test_arms_of_others_go_from_import_to_a_successful_maneuver(
+    arm: str, tip: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--tip", tip, "--joint-torque", "5", "--out", "arm.yaml", *CARRIED]
+    assert main(["scenes", "import", str(ARMS / f"{arm}.urdf"), *words]) == SUCCESS
+    assert main(["scenes", "validate", "arm.yaml"]) == SUCCESS
+    capsys.readouterr()
+    assert main(["solve", "arm.yaml", "--json"]) == SUCCESS
+    solved = json.loads(capsys.readouterr().out)
+    assert solved["converged"]
+    assert solved["is_success"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from graph_interpreter import evaluate_graph
 
-from dq_space_arm_env.compiler import native
+from dq_space_arm_env.compiler import emit, native
 from dq_space_arm_env.compiler.build import assembly, build_program
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
@@ -71,6 +71,16 @@ def test_every_operation_agrees_with_numpy(lanes, precision):
     # Differences of products lose what cancels: their error is relative to the products.
     found = evaluate(everything, expected.shape[1], lanes, x, precision)
     np.testing.assert_allclose(found, expected, rtol=18 * eps, atol=2 * eps)
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_a_function_in_blocks_computes_the_same_bits(lanes, monkeypatch):
+    x = np.random.default_rng(0).normal(size=(100, 3))
+    size = len(everything(casadi.SX.sym("x", 3).elements())["y"])
+    whole = evaluate(everything, size, lanes, x)
+    monkeypatch.setattr(emit, "_LARGE_GRAPH", 10)
+    monkeypatch.setattr(emit, "_LONGEST_BLOCK", 3)
+    np.testing.assert_array_equal(evaluate(everything, size, lanes, x), whole)
 
 
 def of_the_library(x):

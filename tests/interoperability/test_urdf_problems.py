@@ -180,13 +180,29 @@ def test_a_long_file_is_read_in_a_moment():
 
 
 def test_the_weight_of_the_torques_makes_arms_of_any_size_move_alike():
-    """The natural frequency (w (1 + d^2) / (4 b I^2))^(1/4) of an inertia I with its tip at distance d."""
+    """a / b = omega^2 (I^2 omega^2 + c^2) of an inertia I with the damping c, a = w (1 + d^2) / 4."""
     fixed = joint("f", "arm", "hand", "fixed", '<origin xyz="0 2 0"/>')
     text = robot(*GOOD, link("hand", ""), fixed)
     heavy = text.replace('ixx="1"', 'ixx="100"').replace('iyy="1"', 'iyy="100"')
-    for urdf, inertia in ((text, 1.0), (heavy, 100.0)):
+    damped = text.replace("<limit", '<dynamics damping="3"/><limit')
+    for urdf, inertia, damping in ((text, 1.0, 0.0), (heavy, 100.0, 0.0), (damped, 1.0, 3.0)):
         weight = scene_from_urdf(urdf, "hand").cost.joint_torque
-        assert (15 * (1 + 2**2) / (4 * weight * inertia**2)) ** 0.25 == pytest.approx(0.7, rel=0.01)
+        ratio = 0.7**2 * (inertia**2 * 0.7**2 + damping**2)
+        assert 15 * (1 + 2**2) / (4 * weight) == pytest.approx(ratio, rel=0.03)
+
+
+def test_a_straight_arm_begins_bent_within_its_limits():
+    ahead = '<origin xyz="0 1 0"/><limit effort="1" lower="-3" upper="{}"/>'
+    names = ["base", "one", "two", "three", "hand"]
+    kinds = [("continuous", "0"), ("revolute", "0.2"), ("revolute", "3"), ("fixed", "0")]
+    joints = [
+        joint(f"j{i}", names[i], names[i + 1], kind, ahead.format(upper))
+        for i, (kind, upper) in enumerate(kinds)
+    ]
+    scene = scene_from_urdf(robot(*map(link, names), *joints), "hand")
+    assert scene.initial_state.joint_angles == (0.5, -0.5, 0.5)
+    two = scene_from_urdf(robot(*map(link, names[:3]), *joints[:2]), "two")
+    assert two.initial_state.joint_angles == (0.0, 0.0)  # each moves the tip in its own way
 
 
 def test_digits_stay_as_they_were_given():
