@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,6 +80,7 @@ def simulate(
     from dq_space_arm_env.command_line.simulated_episode import (
         begin,
         fly,
+        numerical_error,
     )
 
     loaded = load_scene(scene)
@@ -90,16 +92,18 @@ def simulate(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         flight.save(out)
+    error = numerical_error(begun, flight)
     if as_json:
-        print_document({**flight.facts(), "file": None if out is None else str(out)})
+        known = {"numerical_error": error if math.isfinite(error) else None}
+        print_document({**flight.facts(), **known, "file": None if out is None else str(out)})
         return
     console = table_console()
-    console.print(_table(loaded, flight))
+    console.print(_table(loaded, flight, error))
     if out is not None:
         console.print(f"{out}: watch it with `dq-space-arm replay {out}`", markup=False, soft_wrap=True)
 
 
-def _table(scene: Scene, flight: Trajectory) -> Table:
+def _table(scene: Scene, flight: Trajectory, error: float) -> Table:
     from dq_space_arm_env.common.tables import plain_table
 
     success = scene.success
@@ -116,6 +120,7 @@ def _table(scene: Scene, flight: Trajectory) -> Table:
             f"tolerance {success.attitude_error_deg:g} deg",
         ),
         ("position error", f"{flight.position_error:.3g} m", f"tolerance {success.position_error:g} m"),
+        ("numerical error", f"{error:.1e}", "m or rad, of the tip at the end"),
         ("end", verdict, ""),
     )
     return plain_table(f"Scene {scene.name}, {flight.label}", ("", "", ""), rows)

@@ -14,6 +14,7 @@ from dq_space_arm_env.common.bounded_reading import read_json
 from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.environment.disturbances import Disturbances
 from dq_space_arm_env.environment.rollouts import Policy, StateFeedback, rollout
+from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.task.trajectory import Trajectory
@@ -86,6 +87,13 @@ def fly(
         disturbances = Disturbances(scene, np.random.default_rng([seed or 0, _NOISE]), inputs=noise)
     flown = rollout(pilot.policy, scene, seeds, starts=starts, disturbances=disturbances, record=True)
     return flown.trajectory(0, label or pilot.label, start.title)
+
+
+def numerical_error(start: Start, flight: Trajectory) -> float:
+    """How far the tip ends from where the same inputs truly bring it, m or rad, whichever is larger."""
+    inputs = flight.controls if flight.noise is None else flight.controls + flight.noise
+    errors = compile_scene(start.scene).numerical_error(flight.states, inputs, start.parameters)
+    return float(errors[-1])
 
 
 def read_state(text: str, size: int) -> NDArray[np.float64]:

@@ -54,10 +54,15 @@ class SpaceArmMomentum:
         rotations = minimal.joint_rotations(self._chain, motion.joint_angles)
         parts = (
             self._field.inputs(u).joint_torques,
-            minimal.passive_torques(self._chain, motion.joint_angles, motion.joint_rates),
+            self.passive_torques(y),
             self._field.tip_forces(motion, rotations, self._chain.tip_wrench).joints,
         )
         return [sum(torques) for torques in zip(*parts, strict=True)]
+
+    def passive_torques(self, y: Scalars) -> list[Scalar]:
+        """Torques of springs and dampers on the joints, n."""
+        motion = self._field.motion(y)
+        return minimal.passive_torques(self._chain, motion.joint_angles, motion.joint_rates)
 
     def mass_matrix(self, y: Scalars) -> MassMatrix:
         """The mass matrix at the joint angles."""

@@ -107,8 +107,12 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     1. Termination: the scene's number of steps (1000) is reached. The observation holds the time left and the task has a terminal cost, so this is the end of
        the task, not a truncation.
-    2. Termination: the simulation diverged (the state is not finite, or its norm exceeds 5e5). `info["diverged"]` is true, and the remaining steps are charged at
-       the cost of the last sound state, so ending early never pays.
+    2. Termination: the simulation diverged (the state is not finite, or its norm exceeds 5e5). `info["diverged"]` is true, and this and the remaining steps are
+       charged with a bound of what any motion from there could cost, so ending early never pays.
+
+    A step is divided where it would err by more than the scene's `simulation.tolerance` (1e-3 rad or m by default): motions too fast for the time step stay
+    sound, and slow ones cost an estimate. `info["step_error"]` is that estimate in units of the tolerance, 0 after a reset, NaN where nothing estimates it (`tolerance: off`, or a method
+    without an embedded one, or a step that is given up: the simulation diverged). Many accurate steps of a chaotic motion may still end elsewhere: `env.unwrapped.kernels.numerical_error(states, controls)` tells.
 
     ## Arguments
 
@@ -327,7 +331,9 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self._action[...] = action
         self._take_step()  # inputs, motion, observation, reward and end of the episode: task/episode.py
         over, success, diverged = self._flags.tolist()
-        reward, pose, velocity, control, end_pose, end_velocity, angle, distance = self._report.tolist()
+        reward, pose, velocity, control, end_pose, end_velocity, angle, distance, error = (
+            self._report.tolist()
+        )
         if over and np.isnan(self._action).any():
             raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
         self._over = over
@@ -342,6 +348,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             "terminal_cost_base_velocity": end_velocity,
             "attitude_error": angle,
             "position_error": distance,
+            "step_error": error,
             "is_success": success,
             "diverged": diverged,
         }

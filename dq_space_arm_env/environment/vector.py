@@ -452,7 +452,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
 
     def _info(self, result: StepResult, mask: Mask) -> dict[str, Any]:
         """Entries of `DQSpaceArmEnv`'s info, as arrays."""
-        _, pose, velocity, control, end_pose, end_velocity, angle, distance = result.report
+        _, pose, velocity, control, end_pose, end_velocity, angle, distance, error = result.report
         _, success, diverged = result.flags
         whole = mask is self._all
         return {
@@ -463,6 +463,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             "terminal_cost_base_velocity": end_velocity,
             "attitude_error": angle,
             "position_error": distance,
+            "step_error": error,
             "is_success": success,
             "diverged": diverged,
             **(self._masks if whole else {key: mask.copy() for key in self._masks}),

@@ -3,11 +3,12 @@
 from importlib import import_module
 from typing import Any
 
-from dq_space_arm_env.integrators.method import Integrator
+from dq_space_arm_env.integrators.divided_step import DividedStep
+from dq_space_arm_env.integrators.method import EmbeddedIntegrator, Integrator
 from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
 from dq_space_arm_env.scene.simulation import Simulation
 
-__all__ = ["Integrator", "integrator_of"]
+__all__ = ["Integrator", "checked_integrator_of", "integrator_of"]
 
 
 def integrator_of(simulation: Simulation, name: str = "") -> Integrator:
@@ -17,6 +18,21 @@ def integrator_of(simulation: Simulation, name: str = "") -> Integrator:
     given = [part() if isinstance(part, type) else part for part in parts]
     found: Integrator = method(*given, *(simulation.tolerance_of(key) for key in entry.tolerances))
     return found
+
+
+def checked_integrator_of(simulation: Simulation, name: str = "") -> Integrator | DividedStep | None:
+    """Build the integrator whose steps tell their error; None where nothing estimates it.
+
+    Methods that do not adapt their steps, but have an embedded one, are divided by the scene's tolerance.
+    """
+    name = name or simulation.integrator
+    if not simulation.estimates_error(name):
+        return None
+    method = integrator_of(simulation, name)
+    if INTEGRATORS[name].is_adaptive:
+        return method
+    assert isinstance(method, EmbeddedIntegrator)
+    return DividedStep(method, simulation.division)
 
 
 def _find(name: str) -> Any:

@@ -18,14 +18,12 @@ from typing import Any
 
 import casadi
 
-from dq_space_arm_env.algebra.symbolic import column, dense_entries, symbols
+from dq_space_arm_env.algebra.symbolic import column, columns, dense_entries, symbols
 from dq_space_arm_env.algebra.vectors import transposed_matrix_vector
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.integrators.momentum_coordinates import (
     LocalState,
     MomentumCoordinates,
-    rotation_matrix,
-    rotation_rate,
 )
 
 Scalar = Any
@@ -36,8 +34,8 @@ Matrix = Any
 class CanonicalCoordinates:
     """Equations of motion in these coordinates; `given` are those with joint rates."""
 
-    def __init__(self, field: SpaceArmField) -> None:
-        self.given = MomentumCoordinates(field)
+    def __init__(self, field: SpaceArmField, given: MomentumCoordinates | None = None) -> None:
+        self.given = MomentumCoordinates(field) if given is None else given
         self.balance, self.n_y = self.given.balance, self.given.n_y
 
     def entered(self, y: Scalars) -> list[Scalar]:
@@ -77,17 +75,39 @@ class CanonicalCoordinates:
             casadi.sparsify(rates_by_y),
         )
 
+    def passive_slopes(self, y: Scalars) -> tuple[Matrix, Matrix]:
+        """Stiffness K and damping D of the joints, SX (n, n), for a state y with joint rates."""
+        state = self.given.parts(y)
+        n = len(state.joint_rates)
+        free = column(*symbols("q", len(state.shape)), *symbols("v", n))
+        shape, rates = casadi.vertsplit(free)[: len(state.shape)], casadi.vertsplit(free)[len(state.shape) :]
+        torques = column(*self.balance.passive_torques(self.given.y(shape, [0.0] * 6, rates)))
+        slopes = casadi.substitute(
+            -casadi.jacobian(torques, free), free, casadi.densify(column(*state.shape, *state.joint_rates))
+        )
+        slopes = casadi.sparsify(slopes)
+        return slopes[:, :n], slopes[:, len(state.shape) :]
+
+    def inverse_inertia(self, y: Scalars) -> Matrix:
+        """Derivative of the joint rates by the canonical momenta, SX (n, n)."""
+        state = self.given.parts(y)
+        n, mass_matrix = len(state.joint_rates), self._mass_matrix(state.shape)
+        units = ([float(i == j) for i in range(n)] for j in range(n))
+        return columns(
+            *(column(*mass_matrix.velocities((0.0, 0.0, 0.0), unit).joints) for unit in units), rows=n
+        )
+
     def _mass_matrix(self, shape: Scalars) -> Any:
         return self.balance.mass_matrix(self.given.y(shape, [0.0] * 6, [0.0] * len(self.given.joint_indices)))
 
     def _turning(self, state: LocalState) -> list[Scalar]:
         """The base's angular velocity for given joint rates, base axes."""
-        angular = transposed_matrix_vector(rotation_matrix(state.rotation), state.angular)
+        angular = transposed_matrix_vector(self.given.rotation_matrix(state.rotation), state.angular)
         return self.given.twist(state.shape, (0.0, 0.0, 0.0), angular, state.joint_rates)[:3]
 
     def _velocities(self, state: LocalState) -> tuple[Scalars, Scalars]:
         """The base's angular velocity, base axes, and the joint rates for given canonical momenta."""
-        angular = transposed_matrix_vector(rotation_matrix(state.rotation), state.angular)
+        angular = transposed_matrix_vector(self.given.rotation_matrix(state.rotation), state.angular)
         solved = self._mass_matrix(state.shape).velocities(angular, state.joint_rates)
         return solved.angular, solved.joints
 
@@ -99,7 +119,7 @@ class CanonicalCoordinates:
         y = given.y(state.shape, [0.0] * 6, joint_rates)
         return given.joined(
             LocalState(
-                rotation_rate(state.rotation, omega),
+                given.rotation_rate(state.rotation, omega),
                 [*joint_rates, *given.base.inputs(u).wrist_rates],
                 [entry * (1.0 / self.balance.mass) for entry in state.linear],
                 linear,

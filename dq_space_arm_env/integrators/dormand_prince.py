@@ -21,8 +21,8 @@ from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.dynamics.vector_field import VectorField, split_state
 from dq_space_arm_env.integrators.explicit_stages import ExplicitStages
 from dq_space_arm_env.integrators.munthe_kaas import combined, stage_slopes
-from dq_space_arm_env.integrators.substeps import Substeps, or_nan
-from dq_space_arm_env.integrators.tableaus import DORMAND_PRINCE_5, DORMAND_PRINCE_DENSE, DORMAND_PRINCE_ERROR
+from dq_space_arm_env.integrators.substeps import Substeps, fifth_root, or_nan
+from dq_space_arm_env.integrators.tableaus import DORMAND_PRINCE_5, DORMAND_PRINCE_DENSE
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -75,15 +75,9 @@ class DormandPrince:
         """Begin a step."""
         tolerances = {"tolerances": [self.rtol, self.atol]}
         program.call(trace(f"{attempts.prefix}_tolerances", {}, lambda: tolerances))
-        substeps = Substeps(attempts.prefix, _root, MOST_SUBSTEPS)
+        substeps = Substeps(attempts.prefix, fifth_root, MOST_SUBSTEPS)
         substeps.append_begin(program, state="x")
         return substeps
-
-
-def _root(error: Scalar) -> Scalar:
-    """error^3/16, close to the fifth root."""
-    eighth = casadi.sqrt(casadi.sqrt(casadi.sqrt(error)))
-    return eighth * casadi.sqrt(eighth)
 
 
 def append_measured_step(program: Program, field: VectorField) -> None:
@@ -117,7 +111,7 @@ class _Attempts:
             stored, start = split_state(field, x)
             starts = [others[f"y{i}"] for i in stages.numbers]
             rates = [others[f"k{i}"] for i in stages.numbers]
-            errors = combined(DORMAND_PRINCE_ERROR, rates, h[0])
+            errors = combined(DORMAND_PRINCE_5.error, rates, h[0])
             moved = starts[-1]
             scaled = []
             for i, error in enumerate(errors):
@@ -127,7 +121,7 @@ class _Attempts:
             if field.pose is not None:
                 slopes = stage_slopes(field.pose, DORMAND_PRINCE_5, stages.twists(starts), h[0])
                 pose = field.pose.moved(stored, combined(DORMAND_PRINCE_5.weights, slopes, h[0]))
-                pose_errors = combined(DORMAND_PRINCE_ERROR, slopes, h[0])
+                pose_errors = combined(DORMAND_PRINCE_5.error, slopes, h[0])
                 scaled += [pose_errors[i] / (atol + rtol) for i in field.pose.directions]
             square: Scalar = 0.0
             for error in scaled:

@@ -20,11 +20,33 @@ Scalar = Any
 class ExplicitRungeKutta:
     """An explicit Runge-Kutta-Munthe-Kaas method with fixed steps."""
 
+    embedded_order = 5
+
     def __init__(self, tableau: ButcherTableau) -> None:
         self.tableau = tableau
 
     def append_step(self, program: Program, field: VectorField) -> None:
-        stages, tableau = ExplicitStages(field, self.tableau), self.tableau
+        self._append(program, field, self.tableau)
+
+    def append_embedded_step(self, program: Program, field: VectorField) -> None:
+        """See `EmbeddedIntegrator`."""
+        tableau = self.tableau.with_end
+        stages = self._append(program, field, tableau)
+
+        def estimate(h: list[Scalar], **others: list[Scalar]) -> dict[str, Any]:
+            error = combined(tableau.error, [others[f"k{i}"] for i in stages.numbers], h[0])
+            if field.pose is None:
+                return {"estimate": error}
+            twists = stages.twists([others[f"y{i}"] for i in stages.numbers])
+            moved = combined(tableau.error, stage_slopes(field.pose, tableau, twists, h[0]), h[0])
+            return {"estimate": [*(moved[i] for i in field.pose.directions), *error]}
+
+        sizes = {"h": 1, **{f"{name}{i}": field.n_y for name in "yk" for i in stages.numbers}}
+        program.call(trace(f"{stages.prefix}_estimate", sizes, estimate))
+
+    def _append(self, program: Program, field: VectorField, tableau: ButcherTableau) -> ExplicitStages:
+        """Append the step; returns its stages."""
+        stages = ExplicitStages(field, tableau)
         stages.append(program)
 
         def step(x: list[Scalar], h: list[Scalar], **others: list[Scalar]) -> dict[str, Any]:
@@ -43,6 +65,7 @@ class ExplicitRungeKutta:
         if field.pose is not None:
             sizes |= {f"y{i}": field.n_y for i in stages.numbers}
         program.call(trace(f"{stages.prefix}_sum", sizes, step))
+        return stages
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
         stages = ExplicitStages(field, self.tableau)

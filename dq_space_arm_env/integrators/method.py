@@ -41,6 +41,20 @@ class MomentumIntegrator(Integrator, Protocol):
 
 
 @runtime_checkable
+class EmbeddedIntegrator(Integrator, Protocol):
+    """A one-step method with another one, of lower order, that estimates its error."""
+
+    embedded_order: int  # at least 3
+
+    def append_embedded_step(self, program: Program, field: VectorField) -> None:
+        """Append the calls that turn x, u, h into x_next and `estimate`, the difference of both methods.
+
+        The estimate is in tangent coordinates: of the pose, if it is apart from y, then of y.
+        """
+        ...
+
+
+@runtime_checkable
 class TwiceDifferentiableIntegrator(Integrator, Protocol):
     """A one-step method with second derivatives."""
 

@@ -24,7 +24,7 @@ from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import VectorField, split_state
-from dq_space_arm_env.integrators.method import Integrator, graph_inputs
+from dq_space_arm_env.integrators.method import EmbeddedIntegrator, Integrator, graph_inputs
 from dq_space_arm_env.integrators.momentum_coordinates import LocalState, MomentumCoordinates
 
 Scalar = Any
@@ -38,6 +38,17 @@ class MomentumPreserving:
     def __init__(self, method: Integrator) -> None:
         self.method = method
 
+    @property
+    def embedded_order(self) -> int:
+        """Order of the inner method's embedded one."""
+        return self._embedded.embedded_order
+
+    @property
+    def _embedded(self) -> EmbeddedIntegrator:
+        if not isinstance(self.method, EmbeddedIntegrator):
+            raise TypeError(f"{type(self.method).__name__} does not estimate its error")
+        return self.method
+
     def append_step(self, program: Program, field: VectorField) -> None:
         coordinates = _coordinates(field)
         x, center, local = _symbols(coordinates)
@@ -47,6 +58,23 @@ class MomentumPreserving:
         inputs = {"x": x, "center": center, "local_next": local}
         outputs = {"x_next": coordinates.end(x, center, coordinates.parts(local))}
         program.call(self._graph("leave", coordinates, inputs, outputs))
+
+    def append_embedded_step(self, program: Program, field: VectorField) -> None:
+        """See `EmbeddedIntegrator`."""
+        coordinates = _coordinates(field)
+        x, center, local = _symbols(coordinates)
+        start = coordinates.start(split_state(field, x)[1])
+        program.call(self._graph("enter", coordinates, {"x": x}, start))
+        inner = Program("embedded_step", [], [])
+        self._embedded.append_embedded_step(inner, coordinates)
+        program.append(inner, **_BUFFERS)
+        estimate, end = symbols("e", coordinates.n_y), coordinates.parts(local)
+        inputs = {"x": x, "center": center, "local_next": local, "local_estimate": estimate}
+        outputs = {
+            "x_next": coordinates.end(x, center, end),
+            "estimate": coordinates.estimate(end, coordinates.parts(estimate)),
+        }
+        program.call(self._graph("leave_embedded", coordinates, inputs, outputs))
 
     def append_walk(self, program: Program, field: VectorField) -> None:
         """See `MomentumIntegrator`."""
@@ -72,7 +100,7 @@ class MomentumPreserving:
         program.call(self._graph("enter", coordinates, {"x": x}, coordinates.start(y)))
         inner = Program("linearization", [], [])
         patterns = self.method.append_linearization(inner, coordinates)
-        _take_over(program, inner)
+        program.append(inner, **_BUFFERS)
         # One more step, for the state that it leads to.
         self._advance(program, coordinates)
         by_start, by_input = (
@@ -93,7 +121,7 @@ class MomentumPreserving:
     def _advance(self, program: Program, coordinates: MomentumCoordinates) -> None:
         inner = Program("step", [], [])
         self.method.append_step(inner, coordinates)
-        _take_over(program, inner)
+        program.append(inner, **_BUFFERS)
 
     def _graph(
         self,
@@ -105,15 +133,13 @@ class MomentumPreserving:
         return graph_of(f"{coordinates.name}_{name}", graph_inputs(coordinates, **inputs), outputs)
 
 
-_BUFFERS = {"x": "local", "x_next": "local_next", "A": "local_A", "B": "local_B"}
-
-
-def _take_over(program: Program, inner: Program) -> None:
-    """Append the calls of a program whose x is the local state."""
-    for call in inner.calls:
-        names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
-        buffers = {name: call.bindings.get(name, name) for name in names}
-        program.call(call.graph, **{name: _BUFFERS.get(buffer, buffer) for name, buffer in buffers.items()})
+_BUFFERS = {
+    "x": "local",
+    "x_next": "local_next",
+    "A": "local_A",
+    "B": "local_B",
+    "estimate": "local_estimate",
+}
 
 
 def _coordinates(field: VectorField) -> MomentumCoordinates:

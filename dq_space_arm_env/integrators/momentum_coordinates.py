@@ -51,7 +51,7 @@ _COTANGENT = (1 / 1209600, 1 / 30240, 1 / 720, 1 / 12)
 class LocalState:
     """The parts of a state in these coordinates; vectors have 3 entries in start axes."""
 
-    rotation: Scalars  # rotation vector of the base, rad
+    rotation: Scalars  # rotation vector of the base, rad, or its coordinates in a subclass
     shape: Scalars  # joint and wrist angles, rad
     displacement: Scalars  # of the system's center of mass, m
     linear: Scalars  # momentum, kg m/s
@@ -69,11 +69,12 @@ class MomentumCoordinates:
         self.name = f"{field.name}_momentum"
         self.parameters, self.n_u = field.parameters, field.n_u
         self.turning = [axis for axis in field.pose.directions if axis < 3]
+        self.rotating = self._rotating()
         self.moving = [axis - 3 for axis in field.pose.directions if axis >= 3]
         twist = field.pose.twist_indices
         self.shape_indices = [i for i in range(field.n_y) if i not in field.rate_indices]
         self.joint_indices = [i for i in field.rate_indices if i not in twist]
-        sizes = [len(self.turning), len(self.shape_indices), len(self.moving), len(self.moving)]
+        sizes = [len(self.rotating), len(self.shape_indices), len(self.moving), len(self.moving)]
         sizes += [len(self.turning), len(self.joint_indices)]
         ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
         self.rotation, self.shape, self.displacement, self.linear, self.angular, self.joint_rates = (
@@ -82,10 +83,36 @@ class MomentumCoordinates:
         self.n_x = self.n_y = ends[-1]
         self.rate_indices = tuple(range(self.linear.start, self.n_y))
 
+    # The coordinates of the base's rotation.
+
+    identity: Scalars = (0.0, 0.0, 0.0)
+
+    def _rotating(self) -> list[int]:
+        """Entries of these coordinates that vary."""
+        return self.turning
+
+    def rotation_matrix(self, rotation: Scalars) -> list[list[Scalar]]:
+        """Rotation matrix of the base, from its axes to start axes."""
+        return rotation_matrix(rotation)
+
+    def rotation_rate(self, rotation: Scalars, omega: Scalars) -> Scalars:
+        """Time derivative of these coordinates; angular velocity in base axes."""
+        return rotation_rate(rotation, omega)
+
+    def quaternion(self, rotation: Scalars) -> Scalars:
+        """The rotation as a unit quaternion."""
+        return rotations.exponential(rotation)
+
+    def scalar_less_one(self, rotation: Scalars) -> Scalar:
+        """The scalar part of that quaternion less 1, without cancellation."""
+        return screw.exponential_minus_identity((*rotation, 0.0, 0.0, 0.0))[0]
+
+    # States.
+
     def parts(self, local: Scalars) -> LocalState:
         """Name the parts of a state."""
         return LocalState(
-            spread(local[self.rotation], self.turning, 3),
+            spread(local[self.rotation], self.rotating, len(self.identity)),
             local[self.shape],
             spread(local[self.displacement], self.moving, 3),
             spread(local[self.linear], self.moving, 3),
@@ -96,7 +123,7 @@ class MomentumCoordinates:
     def joined(self, state: LocalState) -> list[Scalar]:
         """Join the parts of a state; the inverse of `parts`."""
         return [
-            *(state.rotation[i] for i in self.turning),
+            *(state.rotation[i] for i in self.rotating),
             *state.shape,
             *(state.displacement[i] for i in self.moving),
             *(state.linear[i] for i in self.moving),
@@ -119,7 +146,7 @@ class MomentumCoordinates:
 
     def _moving(self, state: LocalState) -> tuple[list[Scalar], list[Scalar]]:
         """The base's angular velocity, and y with it; no rate depends on the linear velocity."""
-        angular = transposed_matrix_vector(rotation_matrix(state.rotation), state.angular)
+        angular = transposed_matrix_vector(self.rotation_matrix(state.rotation), state.angular)
         omega = self.twist(state.shape, (0.0, 0.0, 0.0), angular, state.joint_rates)[:3]
         return omega, self.y(state.shape, [*omega, 0.0, 0.0, 0.0], state.joint_rates)
 
@@ -128,7 +155,7 @@ class MomentumCoordinates:
         y = self.y(state.shape, [0.0] * 6, state.joint_rates)
         force, torque = self.balance.external_wrench(y, u)
         about_center = subtract(torque, cross(self.balance.momentum(y)[2], force))
-        attitude = rotation_matrix(state.rotation)
+        attitude = self.rotation_matrix(state.rotation)
         return matrix_vector(attitude, force), matrix_vector(attitude, about_center)
 
     def rates(self, y: Scalars, u: Scalars) -> list[Scalar]:
@@ -140,7 +167,7 @@ class MomentumCoordinates:
         linear, angular = self.momentum_rates(state, u)
         return self.joined(
             LocalState(
-                rotation_rate(state.rotation, omega),
+                self.rotation_rate(state.rotation, omega),
                 [rates[i] for i in self.shape_indices],
                 scale(1.0 / self.balance.mass, state.linear),
                 linear,
@@ -162,7 +189,7 @@ class MomentumCoordinates:
         rates, by_y, by_u = self.base.linearized_rates(moving, inputs)
         change = casadi.horzcat(casadi.SX.eye(self.n_y), zeros(self.n_y, self.n_u))
         momentum = column(
-            0.0, 0.0, 0.0, *transposed_matrix_vector(rotation_matrix(state.rotation), state.angular)
+            0.0, 0.0, 0.0, *transposed_matrix_vector(self.rotation_matrix(state.rotation), state.angular)
         )
         twist = self.twist_change(moving, casadi.jacobian(momentum, both), change)
         moved = zeros(self.base.n_y, self.n_y + self.n_u)
@@ -223,7 +250,7 @@ class MomentumCoordinates:
             linear, angular = momentum
         zero = (0.0, 0.0, 0.0)
         shape, joint_rates = ([y[i] for i in part] for part in (self.shape_indices, self.joint_indices))
-        state = LocalState(zero, shape, zero, linear, angular, joint_rates)
+        state = LocalState(self.identity, shape, zero, linear, angular, joint_rates)
         return {"local": self.joined(state), "center": center}
 
     def _attitude(self, x: Scalars) -> Sequence[Scalars]:
@@ -253,13 +280,13 @@ class MomentumCoordinates:
         Each vector is rotated as v + 2 r x (...), not by a matrix: the entries of a matrix near 1 round the
         same way at every step of a steady rotation, and the momentum would shrink or grow with them.
         """
-        back = quaternion.conjugate(rotations.exponential(state.rotation))
+        back = quaternion.conjugate(self.quaternion(state.rotation))
         linear, angular = (rotations.rotate(back, part) for part in (state.linear, state.angular))
         return linear, angular, self.twist(state.shape, linear, angular, state.joint_rates)
 
     def relative_pose(self, state: LocalState, before: Scalars, after: Scalars) -> Scalars:
         """Pose of the base seen from the start of the step, given the centers of mass in the base frame."""
-        rotation = rotations.exponential(state.rotation)
+        rotation = self.quaternion(state.rotation)
         position = subtract(add(state.displacement, before), rotations.rotate(rotation, after))
         return poses.from_rotation_and_position(rotation, position)
 
@@ -268,9 +295,17 @@ class MomentumCoordinates:
         pose = self.base.pose
         end = self.y(state.shape, self.ending(state)[2], state.joint_rates)
         relative = self.relative_pose(state, before, self.balance.momentum(end)[2])
-        less_one = screw.exponential_minus_identity((*state.rotation, 0.0, 0.0, 0.0))[0]
+        less_one = self.scalar_less_one(state.rotation)
         moved = composed(pose.full(split_state(self.base, x)[0]), (less_one, *relative[1:]))
         return [*pose.reduced(moved), *end]
+
+    def estimate(self, state: LocalState, error: LocalState) -> list[Scalar]:
+        """The error of a state in tangent coordinates of the given equations, but for terms of its square."""
+        turning = self.twist(state.shape, (0.0, 0.0, 0.0), error.angular, error.joint_rates)[:3]
+        twist = [*turning, *scale(1.0 / self.balance.mass, error.linear)]
+        pose = [*error.rotation, *error.displacement]
+        y = self.y(error.shape, twist, error.joint_rates)
+        return [*(pose[i] for i in self.base.pose.directions), *y]
 
 
 def _series(x: Scalar, coefficients: tuple[float, ...]) -> Scalar:

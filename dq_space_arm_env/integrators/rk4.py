@@ -41,19 +41,59 @@ def advance(y: Sequence[Scalar], stages: Sequence[Sequence[Scalar]], h: Scalar) 
     ]
 
 
-def pose_increment(pose: PoseCoordinates, twists: Sequence[Sequence[Scalar]], h: Scalar) -> list[Scalar]:
-    """Omega after one step, 6; stage i starts from Omega_i = RK4_OFFSETS[i] h w_{i-1}."""
+def pose_slopes(
+    pose: PoseCoordinates, twists: Sequence[Sequence[Scalar]], h: Scalar
+) -> list[Sequence[Scalar]]:
+    """Omega' at the stages, 6 entries each; stage i starts from Omega_i = RK4_OFFSETS[i] h w_{i-1}."""
     slopes: list[Sequence[Scalar]] = []
     for offset, free in zip(RK4_OFFSETS, twists, strict=True):
         omega = pose.full_twist(free)
         slopes.append(slope([offset * h * entry for entry in slopes[-1]], omega, 4) if slopes else omega)
-    return advance([0.0] * 6, slopes, h)
+    return slopes
+
+
+def pose_increment(pose: PoseCoordinates, twists: Sequence[Sequence[Scalar]], h: Scalar) -> list[Scalar]:
+    """Omega after one step, 6."""
+    return advance([0.0] * 6, pose_slopes(pose, twists, h), h)
 
 
 class RungeKuttaMuntheKaas4:
     """Classical Runge-Kutta for the velocities and angles, Munthe-Kaas for the pose."""
 
+    embedded_order = 3
+
     def append_step(self, program: Program, field: VectorField) -> None:
+        self._append_stages(program, field)
+
+    def append_embedded_step(self, program: Program, field: VectorField) -> None:
+        """See `EmbeddedIntegrator`: beside the step, one of order 3 with the rates k5 at its end.
+
+        Its weights are 1/6, 1/3, 1/3, 0, 1/6: the difference is h (k4 - k5) / 6.
+        """
+        rates = self._append_stages(program, field)
+        program.call(rates, x="x_next", k="k0", rates="k5", offset="offset1")
+
+        def estimate(
+            x: list[Scalar], x_next: list[Scalar], h: list[Scalar], k5: list[Scalar], **k: list[Scalar]
+        ) -> dict[str, Any]:
+            sixth = h[0] * (1 / 6)
+            error = [sixth * (last - end) for last, end in zip(k["k4"], k5, strict=True)]
+            if field.pose is None:
+                return {"estimate": error}
+            start, end = (split_state(field, each)[1] for each in (x, x_next))
+            slopes = pose_slopes(field.pose, stage_twists(field.pose, start, list(k.values()), h[0]), h[0])
+            there = field.pose.full_twist([end[i] for i in field.pose.twist_indices])
+            slopes.append(slope(advance([0.0] * 6, slopes, h[0]), there, 4))
+            moved = [sixth * (slopes[3][i] - slopes[4][i]) for i in field.pose.directions]
+            return {"estimate": [*moved, *error]}
+
+        sizes = {"x": field.n_x, "x_next": field.n_x, "h": 1}
+        sizes |= {f"k{i}": field.n_y for i in range(1, 6)}
+        program.call(trace(f"{field.name}_rk4_estimate", sizes, estimate))
+
+    def _append_stages(self, program: Program, field: VectorField) -> Any:
+        """The step; returns the graph of its stages."""
+
         def stage(x: list[Scalar], u: list[Scalar], k: list[Scalar], offset: list[Scalar]) -> dict[str, Any]:
             y = [entry + offset[0] * rate for entry, rate in zip(split_state(field, x)[1], k, strict=True)]
             return {"rates": field.rates(y, u)}
@@ -76,6 +116,7 @@ class RungeKuttaMuntheKaas4:
         for number, offset in enumerate(("offset1", "offset2", "offset2", "offset4"), start=1):
             program.call(rates, k=f"k{number - 1}", rates=f"k{number}", offset=offset)
         program.call(total)
+        return rates
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
         pattern = stage_pattern(field)

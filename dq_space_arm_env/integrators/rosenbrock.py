@@ -17,7 +17,6 @@ says that it is not accurate. The total momentum is kept to rounding.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -33,7 +32,7 @@ from dq_space_arm_env.integrators.canonical_coordinates import CanonicalCoordina
 from dq_space_arm_env.integrators.method import graph_inputs
 from dq_space_arm_env.integrators.rosenbrock_system import RosenbrockSystem
 from dq_space_arm_env.integrators.rosenbrock_tableaus import RosenbrockTableau
-from dq_space_arm_env.integrators.substeps import Substeps
+from dq_space_arm_env.integrators.substeps import Substeps, fourth_root, largest_error
 from dq_space_arm_env.integrators.tangent_linearization import append_tangent_linearization
 
 Scalar = Any
@@ -73,10 +72,9 @@ class Rosenbrock:
     def _append(self, program: Program, graphs: _Graphs, momentum: str) -> None:
         """Append the substeps, from x and a buffer of the momentum to x_next and momentum_next."""
         substeps = Substeps(
-            graphs.prefix, _fourth_root, MOST_SUBSTEPS, SMALLEST, SMALLEST_FACTOR, finishes=True
+            graphs.prefix, fourth_root, MOST_SUBSTEPS, SMALLEST, SMALLEST_FACTOR, finishes=True
         )
         substeps.append_begin(program, state="x", momentum_here=momentum)
-        program.call(graphs.limit(self.tolerance))
         first, stage = graphs.first(), graphs.stage()
         with program.repeated_while("unfinished"):
             substeps.append_length(program)
@@ -85,15 +83,10 @@ class Rosenbrock:
                 program.call(graphs.sums(number))
                 names = {name: f"{name}{number}" for name in ("at", "carried", "rate_stage", "stage")}
                 program.call(stage, h="substep_time", **names)
-            program.call(graphs.total(), x="state", momentum="momentum_here")
+            program.call(graphs.total(self.tolerance), x="state", momentum="momentum_here")
             moved = ("state", "momentum_here")
             substeps.append_choice(program, {name: f"{name}_tried" for name in moved})
         substeps.append_end(program, state="x_next", momentum_here="momentum_next")
-
-
-def _fourth_root(error: Scalar) -> Scalar:
-    """The embedded methods are of order 3 and 4; the lower one decides."""
-    return casadi.sqrt(casadi.sqrt(error))
 
 
 class _Graphs:
@@ -133,11 +126,6 @@ class _Graphs:
         linear, angular, _ = self.given.balance.momentum(split_state(self.field, self.x)[1])
         outputs = {"momentum_start": self.given.turned_out(self.x, linear, angular)}
         return self._graph("momentum", {"x": self.x}, outputs)
-
-    def limit(self, tolerance: float) -> Any:
-        """Graph of the tolerance and of what makes an error of a rate comparable with it."""
-        outputs = {"weights": [1.0 / tolerance, casadi.fabs(self.h) / tolerance]}
-        return graph_of(f"{self.prefix}_limit", {"h": [self.h]}, outputs)
 
     def first(self) -> Any:
         """Graph of the start of a substep, the factors, and the first stage."""
@@ -181,28 +169,17 @@ class _Graphs:
         outputs = {f"at{number}": at, f"carried{number}": carried}
         return graph_of(f"{self.prefix}_sums{number}", inputs, outputs)
 
-    def total(self) -> Any:
+    def total(self, tolerance: float) -> Any:
         """Graph of the new state and momentum, and of the error."""
         given, last = self.given, self.tableau.stages - 1
         start, at, stage, error = (symbols(name, self.n) for name in ("start", "at", "U", "W"))
-        center, weights = symbols("center", 3), symbols("weight", 2)
+        center = symbols("center", 3)
         end = given.parts(self.equations.left([a + b for a, b in zip(at, stage, strict=True)]))
         x_next = given.end(self.x, center, end)
         momentum = given.handed_on(self.x, self.momentum_here, given.parts(start), end)
-        off = given.parts(error)
-        turning = given.twist(end.shape, (0.0, 0.0, 0.0), off.angular, off.joint_rates)[:3]
-        moving = [entry / given.balance.mass for entry in off.linear]
-        worst: Scalar = 0.0
-        for weight, entries in (
-            (weights[0], (*off.rotation, *off.shape, *off.displacement)),
-            (weights[1], (*off.joint_rates, *turning, *moving)),
-        ):
-            for entry in entries:
-                worst = casadi.fmax(weight * casadi.fabs(entry), worst)
-        # A maximum passes over NaN; of a comparison with NaN nothing is true.
-        size = casadi.sumsqr(column(*x_next))
-        worst = casadi.if_else(size < math.inf, worst, math.nan)
+        estimate = given.estimate(end, given.parts(error))
+        worst = largest_error(self.field, estimate, x_next, self.h, tolerance)
         inputs = {"x": self.x, "momentum": self.momentum_here, "start": start, "center": center}
-        inputs |= {f"at{last}": at, f"stage{last}": stage, f"rate_stage{last}": error, "weights": weights}
+        inputs |= {f"at{last}": at, f"stage{last}": stage, f"rate_stage{last}": error, "h": [self.h]}
         outputs = {"state_tried": x_next, "momentum_here_tried": momentum, "error": [worst]}
         return self._graph("total", inputs, outputs)

@@ -13,8 +13,10 @@ from typing import Any
 
 import casadi
 
+from dq_space_arm_env.algebra.symbolic import column
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Program
+from dq_space_arm_env.dynamics.vector_field import VectorField
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -140,6 +142,32 @@ class Substeps:
         ends = {**ends, "step_error": "checked_error"}
         graph = trace(f"{self.prefix}_end", {"left": 1, **{name: sizes[name] for name in ends}}, end)
         program.call(graph)
+
+
+def fourth_root(error: Scalar) -> Scalar:
+    """error^1/4, for an error of order h^4 or h^5."""
+    return casadi.sqrt(casadi.sqrt(error))
+
+
+def fifth_root(error: Scalar) -> Scalar:
+    """error^3/16, close to the fifth root, for an error of order h^5 or h^6."""
+    eighth = casadi.sqrt(fourth_root(error))
+    return eighth * casadi.sqrt(eighth)
+
+
+def largest_error(field: VectorField, estimate: Scalars, x_next: Scalars, h: Scalar, limit: float) -> Scalar:
+    """The largest entry of an estimated error in units of a limit [rad, m], rates times a time h; or NaN.
+
+    The estimate is in tangent coordinates: of the pose, if it is apart from y, then of y.
+    """
+    first = len(estimate) - field.n_y
+    rates = {first + i for i in field.rate_indices}
+    scale, rate_scale = 1.0 / limit, casadi.fabs(h) / limit
+    worst: Scalar = 0.0
+    for i, entry in enumerate(estimate):
+        worst = casadi.fmax((rate_scale if i in rates else scale) * casadi.fabs(entry), worst)
+    # A maximum passes over NaN; of a comparison with NaN nothing is true.
+    return casadi.if_else(casadi.sumsqr(column(*x_next)) < math.inf, worst, math.nan)
 
 
 def or_nan(values: Scalars, left: Scalar) -> list[Scalar]:

@@ -6,7 +6,7 @@ equations of motion do not depend on time, so the abscissas c_i, the row sums, a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -16,6 +16,16 @@ class ButcherTableau:
     order: int
     stages: tuple[tuple[float, ...], ...]  # for stage i the a_ij of earlier stages; the first row is empty
     weights: tuple[float, ...]  # b_i
+    # b_i less those of an embedded method of order 3 or more; one longer than `weights` where that takes the
+    # rates at the end of the step too.
+    error: tuple[float, ...] = ()
+
+    @property
+    def with_end(self) -> ButcherTableau:
+        """The same method with the rates at its end as one more stage, if its error takes them."""
+        if len(self.error) <= len(self.stages):
+            return self
+        return replace(self, stages=(*self.stages, self.weights), weights=(*self.weights, 0.0))
 
     @property
     def used(self) -> tuple[tuple[int, ...], ...]:
@@ -29,9 +39,10 @@ RK4_OFFSETS = (0.0, 0.5, 0.5, 1.0)
 RK4_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
 # M. Calvo, J. I. Montijano & L. Randez, A new embedded pair of Runge-Kutta formulas of orders 5 and 6,
-# Computers Math. Applic. 20 (1990): the formula of order 6, without the ninth stage that only its error
-# estimate needs. Of five tableaus of order 6 and 7 it gave the smallest errors for its time on an arm, and
-# its weights are small: Verner's "efficient" ones of up to 200 multiply the rounding errors of the rates.
+# Computers Math. Applic. 20 (1990): the formula of order 6. Of five tableaus of order 6 and 7 it gave the
+# smallest errors for its time on an arm, and its weights are small: Verner's "efficient" ones of up to 200
+# multiply the rounding errors of the rates. With the rates at its end, an error of order h^6 is unique but
+# for a factor: its elementary weights have the norm 1e-3, as those of order h^5 of Dormand and Prince's pair.
 CALVO_6 = ButcherTableau(
     order=6,
     stages=(
@@ -75,10 +86,21 @@ CALVO_6 = ButcherTableau(
         65567621 / 127060952,
         -79074570 / 210557597,
     ),
+    error=(
+        -0.09115832107274877,
+        0.0,
+        0.6701562290306999,
+        -0.8131460825909458,
+        0.31877143010120307,
+        -0.014807621247692575,
+        -0.9639592592336372,
+        0.7467876515948215,
+        0.1473559734183,
+    ),
 )
 
-# The solution of order 8 of DOP853: Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I,
-# section II.5 (2nd ed., 1993), after Dormand and Prince.
+# The solution of order 8 of DOP853, and its difference from the embedded one of order 5: Hairer, Norsett &
+# Wanner, Solving Ordinary Differential Equations I, section II.5 (2nd ed., 1993), after Dormand and Prince.
 DORMAND_PRINCE_8 = ButcherTableau(
     order=8,
     stages=(
@@ -177,6 +199,20 @@ DORMAND_PRINCE_8 = ButcherTableau(
         0.201365400804030348374776537501,
         0.0447106157277725905176885569043,
     ),
+    error=(
+        0.01312004499419488073250102996,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        -1.225156446376204440720569753,
+        -0.4957589496572501915214079952,
+        1.664377182454986536961530415,
+        -0.3503288487499736816886487290,
+        0.3341791187130174790297318841,
+        0.08192320648511571246570742613,
+        -0.02235530786388629525884427845,
+    ),
 )
 
 # Dormand & Prince, A family of embedded Runge-Kutta formulae, J. Comput. Appl. Math. 6 (1980): 5(4). The last
@@ -193,10 +229,8 @@ DORMAND_PRINCE_5 = ButcherTableau(
         (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
     ),
     weights=(35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84, 0.0),
+    error=(71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40),
 )
-
-# Weights of order 5 less those of order 4 with which they are embedded.
-DORMAND_PRINCE_ERROR = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 
 # At y + h sum_i k_i (theta b_i1 + theta^2 b_i2 + theta^3 b_i3 + theta^4 b_i4) the solution passes a share
 # theta of the step, to order 4: Shampine, Some practical Runge-Kutta formulas, Math. Comp. 46 (1986). Row i

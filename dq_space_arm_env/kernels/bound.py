@@ -226,27 +226,26 @@ _ROWS = 256  # steps at a time: their states stay in a near cache
 def walk(
     kernel: BoundKernel,
     start: Array,
-    momentum: Array | None,
+    handed_on: Mapping[str, Array],
     inputs: Mapping[str, Array],
     h: Array,
     every: int,
 ) -> Array:
     """Take many steps in a row; machine code walks down rows that it has just written.
 
-    The inputs are arrays with a row for each step. A kernel that hands on the momentum besides the state
-    takes that of the start, (6,). Returns the start, and the states after every so many steps, shape (steps
-    // every + 1, n_x).
+    The inputs are arrays with a row for each step. What a kernel hands on besides the state is given by its
+    name, as it is at the start. Returns the start, and the states after every so many steps, shape (steps //
+    every + 1, n_x).
     """
     steps, dtype = len(next(iter(inputs.values()))), start.dtype
     rows = min(steps, _ROWS)
-    states, momenta = np.empty((rows + 1, len(start)), dtype), np.empty((rows + 1, 6), dtype)
-    states[0] = start
+    moving = {name: np.empty((rows + 1, len(first)), dtype) for name, first in handed_on.items()}
+    states = moving["x"] = np.empty((rows + 1, len(start)), dtype)
+    for name, first in {**handed_on, "x": start}.items():
+        moving[name][0] = first
     held = {name: np.empty((rows, array.shape[1]), dtype) for name, array in inputs.items()}
     # Each row's successor is the row below it.
-    arrays = {"x": states, "x_next": states[1:], **held, "h": h}
-    if momentum is not None:
-        momenta[0] = momentum
-        arrays |= {"momentum": momenta, "momentum_next": momenta[1:]}
+    arrays = {**moving, **{f"{name}_next": array[1:] for name, array in moving.items()}, **held, "h": h}
     call = KernelCall(kernel, arrays)
     result = np.empty((steps // every + 1, len(start)), dtype)
     result[0] = start
@@ -257,5 +256,6 @@ def walk(
         call(count)
         kept = np.arange(done // every + 1, (done + count) // every + 1)
         result[kept] = states[kept * every - done]
-        states[0], momenta[0] = states[count], momenta[count]
+        for array in moving.values():
+            array[0] = array[count]
     return result

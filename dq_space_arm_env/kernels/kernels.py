@@ -81,29 +81,56 @@ class Kernels(RobotKernels):
         integrator: str | None = None,
         p: ArrayLike | None = None,
     ) -> tuple[Array, Array]:
-        """Advance states by one time step, and tell how accurate it is.
+        """Advance states by one time step as the environment does, and tell how accurate it is.
+
+        The step of a method that takes fixed steps is divided where an embedded method says that it errs by
+        more than `simulation.tolerance`; elsewhere it is that of `step`, to the bit.
 
         Args:
             x: States, shape (n_x,) or (B, n_x), units of `layout.state`.
             u: Inputs, shape (n_u,) or (B, n_u), units of `layout.control`; not clipped to the limits.
             dt: Time step, s; the scene's by default.
-            integrator: Name of an adaptive integrator; the scene's by default.
+            integrator: Name of an integrator with an estimate of its error; the scene's by default.
             p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
-            States as `step` gives them, and the largest estimated error of a substep in units of the
+            States, shape (n_x,) or (B, n_x), and the largest estimated error of a substep in units of the
             tolerance, shape () or (B,): above 1 where `rodas4` and `rodas5p` have tried their most substeps,
-            and NaN with the state where no finite state was found.
+            and NaN with the state where no accurate or finite state was found.
 
         Raises:
-            ValueError: If dt is not a finite number, or the integrator is unknown or takes fixed steps.
+            ValueError: If dt is not a finite number, or the integrator is unknown or estimates no error, as
+                where `simulation.tolerance` is off.
         """
-        name = integrator or self.scene.simulation.integrator
-        if name in INTEGRATORS and not INTEGRATORS[name].is_adaptive:
-            known = ", ".join(key for key, entry in INTEGRATORS.items() if entry.is_adaptive)
+        name, simulation = integrator or self.scene.simulation.integrator, self.scene.simulation
+        if name in INTEGRATORS and not simulation.estimates_error(name):
+            known = ", ".join(filter(simulation.estimates_error, INTEGRATORS))
             raise ValueError(f"integrator: {name!r} estimates no error; choose from {known}")
         x_next, error = self._step_call("checked_step", x, u, dt, integrator, p)
         return x_next, error[..., 0]
+
+    def numerical_error(self, states: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Tell how far the tip of a simulated motion is from where the same inputs truly bring it.
+
+        A companion follows the motion from its first state in double precision: with `rk8`, divided by a
+        tolerance of 1e-8 or less, or with a hundredth of the scene's tolerances if those are adaptive.
+        Where the motion is chaotic the two part, however accurate the single steps are.
+
+        Args:
+            states: States at the ends of time steps, the start first, shape (N + 1, n_x) or (N + 1, B, n_x).
+            u: Inputs held during the steps, shape (N, n_u) or (N, B, n_u), units of `layout.control`.
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Distance [m] or angle [rad] between the tips of both, whichever is larger, shape (N + 1,) or
+            (N + 1, B); NaN where one of the two is not finite.
+
+        Raises:
+            ValueError: If the shapes do not fit.
+        """
+        from dq_space_arm_env.kernels.numerical_error import companion, numerical_error
+
+        return numerical_error(compile_scene(companion(self.scene)), states, u, p)
 
     def simulate(
         self,
@@ -117,9 +144,9 @@ class Kernels(RobotKernels):
     ) -> Array:
         """Take many steps in a row without returning to Python.
 
-        The results are those of repeated calls of `step`, except for integrators that conserve the momentum
-        (`momentum_...`): they hand it on from step to step besides the state, so it does not wander with the
-        rounding errors of the states.
+        The results are those of repeated calls of `step`, except for integrators that conserve the momentum:
+        they hand it on from step to step besides the state, so it does not wander with the rounding errors of
+        the states. `gauss6` also hands on what rounding cuts off the joint angles.
 
         Args:
             x: State at the start, shape (n_x,), units of `layout.state`.
@@ -147,11 +174,13 @@ class Kernels(RobotKernels):
                 f"({self.n_u},) or ({steps}, {self.n_u})"
             )
         kernel = self.kernel("walk", integrator=self._integrator(integrator), lanes=1)
-        carries_momentum = any(spec.name == "momentum" for spec in kernel.inputs)
         given = self.parameter_rows(p, steps)
-        momentum = self.momentum(start, p=given[0]) if carries_momentum else None
+        sizes = {spec.name: spec.stride for spec in kernel.inputs}
+        handed_on = {"momentum": self.momentum(start, p=given[0])} if "momentum" in sizes else {}
+        if "remainder" in sizes:
+            handed_on["remainder"] = np.zeros(sizes["remainder"], self.dtype)
         held = {"u": np.broadcast_to(inputs, (steps, self.n_u)), "parameters": given}
-        return walk(kernel, start, momentum, held, self._time_step(dt), every)
+        return walk(kernel, start, handed_on, held, self._time_step(dt), every)
 
     def linearize(
         self,

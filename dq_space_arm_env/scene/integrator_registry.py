@@ -20,7 +20,7 @@ class IntegratorEntry:
     implementation: tuple[str, ...]
     # Largest dt * frequency of an undamped spring, and dt * decay rate of a damper, at which steps stay
     # bounded: where the stability polynomial leaves the unit circle on the imaginary and on the negative real
-    # axis. Infinite for an L-stable method, and for one that adapts its steps.
+    # axis. Infinite for an A-stable method, and for one that adapts its steps.
     imaginary_interval: float = inf
     real_interval: float = inf
     # The method whose second derivatives the solver takes; None: Gauss-Newton. Newton's method needs a few
@@ -28,12 +28,22 @@ class IntegratorEntry:
     # the solver ends, are always the method's own.
     curvature: str | None = None
     tolerances: tuple[str, ...] = ()  # keys of `simulation`, by which it divides a time step
+    # With an embedded method, by whose estimate the environment divides time steps.
+    is_embedded: bool = False
     keeps_momentum: bool = False  # to rounding, where no external wrench acts
+    # Whether a step is a canonical map where nothing dissipates: the energy does not drift. Such a method is
+    # not L-stable: motion in a very stiff damper alternates, and dies slowly.
+    symplectic: bool = False
 
     @property
     def is_adaptive(self) -> bool:
         """Whether the method divides a time step until its tolerances are met."""
         return bool(self.tolerances)
+
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """Keys of `simulation` that have a use with the method."""
+        return ("tolerance",) if self.is_embedded else self.tolerances
 
     def within(self, tolerance: float) -> dict[str, float]:
         """Keys of `simulation` for a tolerance; an absolute one beside a relative one is its hundredth."""
@@ -68,6 +78,7 @@ INTEGRATORS: Mapping[str, IntegratorEntry] = {
             imaginary_interval=2.828,
             real_interval=2.785,
             curvature="rk4",
+            is_embedded=True,
         ),
         IntegratorEntry(
             "rk6",
@@ -76,6 +87,7 @@ INTEGRATORS: Mapping[str, IntegratorEntry] = {
             imaginary_interval=2.609,
             real_interval=4.463,
             curvature="rk4",
+            is_embedded=True,
         ),
         IntegratorEntry(
             "rk8",
@@ -84,6 +96,7 @@ INTEGRATORS: Mapping[str, IntegratorEntry] = {
             imaginary_interval=5.960,
             real_interval=6.393,
             curvature="rk4",
+            is_embedded=True,
         ),
         IntegratorEntry(
             "dormand_prince",
@@ -106,12 +119,20 @@ INTEGRATORS: Mapping[str, IntegratorEntry] = {
             keeps_momentum=True,
         ),
         IntegratorEntry(
+            "gauss6",
+            order=6,
+            implementation=("gauss.Gauss", "gauss.GAUSS_6"),
+            keeps_momentum=True,
+            symplectic=True,
+        ),
+        IntegratorEntry(
             "momentum_rk4",
             order=4,
             implementation=("momentum.MomentumPreserving", "rk4.RungeKuttaMuntheKaas4"),
             imaginary_interval=2.828,
             real_interval=2.785,
             curvature="rk4",
+            is_embedded=True,
             keeps_momentum=True,
         ),
     )

@@ -7,7 +7,7 @@ from pydantic import Field, StrictStr, field_validator
 
 from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
-from dq_space_arm_env.validation.fields import Positive, Steps, TimeStep
+from dq_space_arm_env.validation.fields import Positive, PositiveOrOff, Steps, TimeStep
 from dq_space_arm_env.validation.problems import Model, Problem, problem
 
 TOLERANCES = {
@@ -15,6 +15,13 @@ TOLERANCES = {
     "float32": {"rtol": 1e-5, "atol": 1e-6, "tolerance": 1e-4},
 }
 """Default tolerances of adaptive integrators, by precision and key."""
+DIVIDED = 1e-3
+"""Default tolerance by which the environment divides steps of Runge-Kutta methods, rad and m.
+
+No planned motion reaches it, not even in steps of 0.1 s, so environment and expert agree to the bit; a
+motion under random or saturated actions keeps its energy. Under held actions a smaller one predicts no more:
+those are chaotic.
+"""
 SMALLEST_SINGLE_RTOL = 1e-6
 """Smallest relative tolerance that single precision can keep."""
 
@@ -46,11 +53,12 @@ class Simulation(Model):
         description="absolute tolerance of `dormand_prince`, rad, m, rad/s, m/s; absent: 1e-10, or "
         "1e-6 in single precision",
     )
-    tolerance: Positive | None = Field(
+    tolerance: PositiveOrOff | None = Field(
         default=None,
         exclude_if=lambda value: value is None,  # the hash of a scene without it is as old as the scene
-        description="largest error of a substep of `rodas4` and `rodas5p`, rad and m; absent: 1e-6, or 1e-4 "
-        "in single precision",
+        description="largest error of a substep, rad and m: by it `rodas4` and `rodas5p` divide time steps, "
+        "absent: 1e-6, or 1e-4 in single precision; and the environment those of Runge-Kutta methods, which "
+        "`off` leaves whole, absent: 1e-3",
     )
 
     @field_validator("integrator")
@@ -66,10 +74,13 @@ class Simulation(Model):
         """Find tolerances without use, or beyond single precision."""
         entry = INTEGRATORS[self.integrator]
         reason = "has other tolerances" if entry.is_adaptive else "takes fixed steps"
+        if entry.is_adaptive and self.tolerance == "off":
+            yield Problem(("tolerance",), "off", f"{self.integrator} cannot do without: remove it")
+            return
         for key in TOLERANCES[self.precision]:
             value = getattr(self, key)
-            if value is not None and key not in entry.tolerances:
-                users = " or ".join(name for name, each in INTEGRATORS.items() if key in each.tolerances)
+            if value is not None and value != "off" and key not in entry.uses:
+                users = " or ".join(name for name, each in INTEGRATORS.items() if key in each.uses)
                 yield Problem(
                     (key,), value, f"{self.integrator} {reason}: remove it, or set integrator to {users}"
                 )
@@ -78,6 +89,16 @@ class Simulation(Model):
             yield Problem(("rtol",), self.rtol, sentence)
 
     def tolerance_of(self, key: str) -> float:
-        """The tolerance under a key, the default of the precision if it is absent."""
-        given: float | None = getattr(self, key)
-        return TOLERANCES[self.precision][key] if given is None else given
+        """The tolerance under a key, the default of the precision if it is absent or off."""
+        given = getattr(self, key)
+        return float(TOLERANCES[self.precision][key] if given in (None, "off") else given)
+
+    @property
+    def division(self) -> float:
+        """The tolerance by which the environment divides steps of Runge-Kutta methods, rad and m."""
+        return DIVIDED if self.tolerance in (None, "off") else float(self.tolerance)
+
+    def estimates_error(self, integrator: str) -> bool:
+        """Whether a step of the environment tells its error with an integrator."""
+        entry = INTEGRATORS[integrator]
+        return entry.is_adaptive or (entry.is_embedded and self.tolerance != "off")

@@ -19,6 +19,7 @@ from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import episode_start, parameter_values
 from dq_space_arm_env.task.equations import SceneEquations, total, weighted_square
 from dq_space_arm_env.task.step_report import MEMORY, REPORT, STATE_LIMIT
+from dq_space_arm_env.task.worst_case import WorstCase
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -47,17 +48,24 @@ def observe(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:
     scene = equations.scene
     seen = equations.observe(x, (scene.simulation.steps - memory[0]) * scene.simulation.dt)
     angle, distance = _shown_errors(seen["errors"])
-    costs = [0.0] * (len(REPORT) - 2)
+    costs = [0.0] * (len(REPORT) - 3)
     return {
         "memory_kept": [memory[0], *equations.state_cost_terms(x)],
         "observation": seen["observation"],
-        "report": [*costs, angle, distance],
+        "report": [*costs, angle, distance, 0.0],
         "flags": [0.0, _is_success(scene, angle, distance), 0.0],
     }
 
 
-def step(equations: SceneEquations, x: Scalars, x_next: Scalars, u: Scalars, memory: Scalars) -> Outputs:
-    """Observation, reward, and end of the episode after a step from x to x_next."""
+def step(
+    equations: SceneEquations,
+    x: Scalars,
+    x_next: Scalars,
+    u: Scalars,
+    memory: Scalars,
+    checked_error: Scalars = (math.nan,),
+) -> Outputs:
+    """Observation, reward, and end of the episode after a step from x to x_next, with its error."""
     scene = equations.scene
     steps, dt = scene.simulation.steps, scene.simulation.dt
     taken, *state_terms = memory
@@ -73,18 +81,17 @@ def step(equations: SceneEquations, x: Scalars, x_next: Scalars, u: Scalars, mem
     angle, distance = _shown_errors(seen["errors"])
 
     # reward = -(stage cost of x and u) - (terminal cost of x_next at the end): the return is -J. After a
-    # divergence every step that is left is charged, so ending early never pays.
+    # divergence the most that this and all further steps could cost is charged, so ending early never pays.
     stage = [*state_terms, equations.effort(u)]
     terminal = [casadi.if_else(terminated, term, 0.0) for term in equations.terminal_cost_terms(x_kept)]
-    charged_steps = casadi.if_else(sound, 1.0, remaining)
-    reward = -(total(stage) * charged_steps) - total(terminal)
+    reward = -casadi.if_else(sound, total(stage) + total(terminal), WorstCase(equations).cost(x, remaining))
 
     success = casadi.logic_and(sound, _is_success(scene, angle, distance))
     return {
         "x_kept": x_kept,
         "memory_kept": [taken + sound, *equations.state_cost_terms(x_kept)],
         "observation": seen["observation"],
-        "report": [reward, *stage, *terminal, angle, distance],
+        "report": [reward, *stage, *terminal, angle, distance, *checked_error],
         "flags": [terminated, success, casadi.logic_not(sound)],
     }
 

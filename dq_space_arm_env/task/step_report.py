@@ -1,7 +1,8 @@
 """Columns of what the environment's step reports; apart from `episode`, as they are read without CasADi."""
 
 # The costs are those of the stage before the step and the terminal ones after it, which are zero before the
-# end of the episode; the tip's errors are those after the step, in deg and m.
+# end of the episode; the tip's errors are those after the step, in deg and m. The step's error is the largest
+# estimate of a substep in units of the scene's tolerance; NaN where nothing estimates it.
 REPORT = (
     "reward",
     "cost_pose",
@@ -11,6 +12,7 @@ REPORT = (
     "terminal_cost_base_velocity",
     "attitude_error",
     "position_error",
+    "step_error",
 )
 FLAGS = ("terminated", "is_success", "diverged")
 

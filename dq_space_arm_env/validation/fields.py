@@ -7,7 +7,7 @@ keeps scenes hashable. Each kind of quantity has a range that the arithmetic car
 import math
 from collections.abc import Callable, Sequence
 from numbers import Integral, Real
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, StrictStr
@@ -45,7 +45,10 @@ STATE_WEIGHTS = Range(0.0, 1e15)
 CONTROL_WEIGHTS = Range(1e-24, 1e24)
 TIME_STEPS = Range(1e-12, 1e6)  # s
 MOST_STEPS = 10_000_000
-"""Largest number of steps of an episode: the plan of such a maneuver fills the memory of a machine."""
+"""Largest number of steps of an episode: the plan of such a maneuver fills the memory of a machine.
+
+Below 2^24, up to which single precision counts the steps of an episode exactly.
+"""
 _MOST_COUNT = 10**12
 _LONGEST_NAME = 200  # characters
 
@@ -99,6 +102,17 @@ def positive(span: Range) -> BeforeValidator:
 def non_negative(span: Range) -> BeforeValidator:
     """Accept zero, or a positive number in a range."""
     return _number(lambda n: 0 <= n < math.inf, "a finite number, 0 or greater", span)
+
+
+def _number_or_off(value: Any) -> float | str:
+    """Accept a positive number, or the word off."""
+    if isinstance(value, str) and value == "off":
+        return value
+    number = _real(value)
+    if not 0 < number < math.inf:
+        raise problem("must be a finite number greater than 0, or off")
+    ANY.check(number)
+    return number
 
 
 def count_up_to(most: int) -> BeforeValidator:
@@ -155,6 +169,7 @@ Eight = tuple[float, float, float, float, float, float, float, float]
 Name = Annotated[StrictStr, Field(min_length=1), AfterValidator(_name)]
 Finite = Annotated[float, _number(math.isfinite, "a finite number", UP_TO)]
 Positive = Annotated[float, positive(ANY)]
+PositiveOrOff = Annotated[float | Literal["off"], BeforeValidator(_number_or_off)]
 NonNegative = Annotated[float, non_negative(UP_TO)]
 Fraction = Annotated[float, _number(lambda n: 0 <= n < 1, "a fraction: 0 or greater, and less than 1", UP_TO)]
 Count = Annotated[int, count_up_to(_MOST_COUNT)]

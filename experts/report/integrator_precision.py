@@ -185,7 +185,7 @@ def observed_order(steps: Sequence[float], errors: Sequence[float], uncertainty:
         for i in range(len(steps) - 1)
         if errors[i] < _ASYMPTOTIC and errors[i + 1] > smallest
     ]
-    return max(float(np.median(slopes[-_SLOPES:])), slopes[-1]) if slopes else None
+    return float(np.median(slopes[-_SLOPES:])) if slopes else None
 
 
 def cheapest(rows: Iterable[Row], accuracy: float, time: str, error: str = "error") -> Row | None:

@@ -92,7 +92,8 @@ def test_each_is_an_episode_with_parameters_of_its_own(drawn: Demonstrations):
 
 @pytest.mark.parametrize("name", ["random-target", "random-masses"])
 def test_shipped_scenes_that_draw_have_the_scene_of_the_episode(name: str, tmp_path: Path):
-    scene = load_scene(name).replace(simulation={"dt": 0.3, "steps": 75})
+    # Steps so coarse err by more than the environment lets pass, and the expert plans with whole ones.
+    scene = load_scene(name).replace(simulation={"dt": 0.3, "steps": 75, "tolerance": "off"})
     made = generate_demonstrations(scene, 2, tmp_path, SEED, executor=SerialExecutor())
     assert isinstance(made, Demonstrations)
     assert len(made) == 2

@@ -17,6 +17,7 @@ import dq_space_arm_env
 from dq_space_arm_env import list_scenes, load_scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Actuators
+from dq_space_arm_env.validation.fields import MOST_STEPS
 
 TARGET = np.array([0.5, 0.5, -0.5, -0.5, 0.25, 2.25, 0.25, 2.25])
 
@@ -185,6 +186,19 @@ def test_bad_actions_are_refused_and_large_ones_clipped():
     assert not np.array_equal(results[3], results[4])  # float64 is used at full precision
 
 
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_the_longest_episode_is_counted_to_its_end(precision):
+    """Single precision counts to 2^24, and no episode is that long."""
+    scene = short(steps=MOST_STEPS).replace(simulation={"precision": precision})
+    env = make(scene).unwrapped
+    env.reset(seed=0)
+    state = env.get_state()
+    state["memory"][0] = MOST_STEPS - 3
+    env.set_state(state)
+    assert [env.step(np.zeros(12))[2] for _ in range(3)] == [False, False, True]
+    assert MOST_STEPS < 2**24
+
+
 def test_order_of_calls_is_enforced():
     env = make(short(steps=1)).unwrapped
     for call in (lambda: env.step(np.zeros(12)), lambda: env.state):
@@ -210,7 +224,7 @@ def test_a_diverged_state_ends_the_episode_and_says_so():
     assert info["diverged"]
     assert not info["is_success"]
     assert steps < 500
-    # Ending early does not pay: the rest is charged at the last sound state's cost.
+    # Ending early does not pay: the rest is charged, and not at the last sound state's cost only.
     assert reward < -(500 - steps) * info["cost_pose"]
 
 

@@ -3,8 +3,9 @@
 A tree is the sorted tuple of the trees that hang on its root.
 """
 
+from collections import Counter
 from functools import cache
-from math import prod
+from math import factorial, prod
 
 import numpy as np
 
@@ -35,6 +36,12 @@ def vertices(tree):
 
 def density(tree):
     return vertices(tree) * prod(density(branch) for branch in tree)
+
+
+def symmetry(tree):
+    """Number of ways to exchange equal branches."""
+    counts = Counter(tree)
+    return prod(symmetry(branch) ** count * factorial(count) for branch, count in counts.items())
 
 
 def elementary_weights(tree, a):

@@ -26,6 +26,7 @@ def test_errors_fall_with_the_order_of_the_method(name, scene):
         ("momentum_rk4", 1, 2e-8),
         ("momentum_rk4", 16, 2e-12),
         ("rodas4", 16, 2e-12),
+        ("gauss6", 1, 2e-12),
     ],
 )
 def test_agrees_with_dop853_on_the_vector_field_of_8_and_22(name, refinement, tolerance):
@@ -47,7 +48,10 @@ def test_the_pose_stays_a_unit_dual_quaternion(name):
 
 
 def test_a_screw_motion_is_exact_whatever_the_step():
-    """A single body spinning about a principal axis moves along a screw: no error (8)."""
+    """A single body spinning about a principal axis moves along a screw: no error (8).
+
+    Collocation of the quaternion is the exception: it turns about the axis by an angle of its order.
+    """
     kernels = free_body()
     x = kernels.layout.initial_state.copy()
     x[kernels.layout.state.base_velocity] = [0.0, 0.0, 2.0, 0.0, 0.0, 0.3]
@@ -56,7 +60,7 @@ def test_a_screw_motion_is_exact_whatever_the_step():
         angle, lift = 2.0 * 1.4, 0.3 * 1.4
         expected = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
         expected += [-0.5 * lift * np.sin(angle / 2), 0, 0, 0.5 * lift * np.cos(angle / 2)]
-        np.testing.assert_allclose(final[:8], expected, atol=1e-15)
+        np.testing.assert_allclose(final[:8], expected, atol=2e-5 if name == "gauss6" else 1e-15)
 
 
 def test_free_motion_of_1500_s_keeps_momentum_and_energy():
@@ -79,7 +83,7 @@ def test_free_motion_of_1500_s_keeps_momentum_and_energy():
         assert np.ptp(states[:, kernels.layout.state.joint_angles], axis=0).min() > 1.0
 
 
-@pytest.mark.parametrize("name", ["momentum_rk4", "rodas4"])
+@pytest.mark.parametrize("name", ["momentum_rk4", "rodas4", "gauss6"])
 def test_an_environment_steps_by_the_method_that_its_scene_names(name):
     scene = load_scene("planar").replace(simulation={"dt": 0.015, "steps": 20, "integrator": name})
     kernels, env = compile_scene(scene), DQSpaceArmEnv(scene)

@@ -12,7 +12,7 @@ from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.integrators.momentum_coordinates import rotation_matrix, rotation_rate
 
-METHODS = ("momentum_rk4", "rodas4")
+METHODS = ("momentum_rk4", "rodas4", "gauss6")
 SLOW = {"joint_rate": 0.2, "base_rate": 0.05}
 
 

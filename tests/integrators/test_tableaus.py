@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rooted_trees import defects, trees
+from rooted_trees import defects, elementary_weights, symmetry, trees
 from scipy.integrate import RK45
 from scipy.integrate._ivp import dop853_coefficients
 
@@ -11,7 +11,6 @@ from dq_space_arm_env.integrators.tableaus import (
     DORMAND_PRINCE_5,
     DORMAND_PRINCE_8,
     DORMAND_PRINCE_DENSE,
-    DORMAND_PRINCE_ERROR,
 )
 
 TABLEAUS = {"calvo 6": CALVO_6, "dormand-prince 5": DORMAND_PRINCE_5, "dormand-prince 8": DORMAND_PRINCE_8}
@@ -38,12 +37,22 @@ def test_a_tableau_meets_all_conditions_up_to_its_order_and_not_those_of_the_nex
     assert np.abs(defects(tableau.order + 1, a, b)).max() > 1e-7
 
 
-def test_the_embedded_solution_of_dormand_and_prince_has_order_4():
-    a, b = square(DORMAND_PRINCE_5), np.array(DORMAND_PRINCE_5.weights)
-    embedded = b - np.array(DORMAND_PRINCE_ERROR)
-    for size in range(1, 5):
-        assert np.abs(defects(size, a, embedded)).max() < 1e-15
-    assert np.abs(defects(5, a, embedded)).max() > 1e-4
+@pytest.mark.parametrize("name", TABLEAUS)
+def test_the_embedded_solution_has_order_4_or_5(name):
+    tableau = TABLEAUS[name].with_end
+    a, embedded = square(tableau), np.array(tableau.weights) - np.array(tableau.error)
+    order = 4 if name == "dormand-prince 5" else 5
+    for size in range(1, order + 1):
+        assert np.abs(defects(size, a, embedded)).max() < 1e-14
+    assert np.abs(defects(order + 1, a, embedded)).max() > 1e-4
+
+
+def test_the_error_of_calvos_method_is_scaled_like_that_of_dormand_and_prince():
+    sizes = []
+    for tableau, order in ((CALVO_6.with_end, 6), (DORMAND_PRINCE_5, 5)):
+        conditions = [elementary_weights(tree, square(tableau)) / symmetry(tree) for tree in trees(order)]
+        sizes.append(float(np.linalg.norm(np.array(conditions) @ tableau.error)))
+    assert sizes == pytest.approx([1e-3, 1.18e-3], rel=1e-2)
 
 
 def test_the_last_stage_of_dormand_and_prince_starts_where_the_step_ends():
@@ -70,6 +79,7 @@ def test_coefficients_are_those_of_scipy():
     a, b = dop853_coefficients.A[:12, :12], dop853_coefficients.B
     np.testing.assert_array_equal(square(DORMAND_PRINCE_8), a)
     np.testing.assert_array_equal(DORMAND_PRINCE_8.weights, b)
+    np.testing.assert_allclose(DORMAND_PRINCE_8.error, dop853_coefficients.E5[:12], atol=1e-16)
     np.testing.assert_array_equal(square(DORMAND_PRINCE_5)[:6, :5], RK45.A)
-    np.testing.assert_allclose(DORMAND_PRINCE_ERROR, -RK45.E, atol=1e-16)
+    np.testing.assert_allclose(DORMAND_PRINCE_5.error, -RK45.E, atol=1e-16)
     np.testing.assert_array_equal(DORMAND_PRINCE_DENSE, RK45.P)

@@ -137,3 +137,16 @@ def test_bad_arguments_are_refused(arm, changes, sentence):
     arguments = {"x": x, "u": np.zeros(kernels.n_u), "duration": 1.0, **changes}
     with pytest.raises(ValueError, match=sentence):
         kernels.integrate(arguments.pop("x"), arguments.pop("u"), arguments.pop("duration"), **arguments)
+
+
+def test_the_global_error_is_estimated(arm):
+    kernels, x = arm
+    u, times = np.zeros(kernels.n_u), np.linspace(0.0, 2.0, 5)
+    reference = followed(kernels, x, u, times)
+    for tolerance in (1e-4, 1e-8):
+        motion = kernels.integrate(x, u, 2.0, rtol=tolerance, atol=tolerance, times=times)
+        true, estimate = kernels.difference(reference, motion.x), motion.global_error()
+        assert estimate.shape == (5, kernels.n_t)
+        assert np.abs(estimate - true).max() < 0.2 * np.abs(true).max()
+    with pytest.raises(ValueError, match="rtol"):
+        kernels.integrate(x, u, 0.1, rtol=1e-15, atol=1e-15).global_error()

@@ -129,6 +129,8 @@ def cases():
     """Every method with each kind of parameters; by default, one method of each kind."""
     scenes = ("random-masses", "random-target", "paper+", "planar+")
     for case in (*product(scenes, INTEGRATORS), *product((0, 1, 2), ("rk4", "symplectic_euler", "rodas4"))):
+        if case[1] == "rodas5p" and case[0] != "planar+":
+            continue  # it shares all but numbers with rodas4
         yield pytest.param(*case, marks=() if case in DEFAULT else pytest.mark.slow)
 
 
@@ -137,7 +139,7 @@ def test_a_step_is_differentiated_by_parameters(name, integrator):
     scene = scene_of(name)
     equations, inputs = SceneEquations.of(scene), point(scene)
     if INTEGRATORS[integrator].is_adaptive:
-        inputs["h"] = [0.15]  # several substeps
+        inputs["h"] = [0.01 if isinstance(name, int) else 0.15]  # several substeps
     expected = step_by_complex_steps(equations, integrator, inputs)
     program = ParameterPrograms(equations).linearize(integrator)
     actual = interpreter.evaluate_program(program, inputs)["P"].reshape(expected.shape)

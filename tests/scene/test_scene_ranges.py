@@ -90,6 +90,8 @@ def test_what_is_accepted_flies() -> None:
         observation, _ = env.reset(seed=seed)
         assert env.observation_space.contains(observation)
         *_, info = env.step(np.zeros(env.action_space.shape or ()))
+        assert info.pop("diverged") or info["step_error"] <= 1.0  # joints may be too fast to follow
+        del info["step_error"]
         assert np.isfinite([float(value) for value in info.values()]).all()
 
 

@@ -16,6 +16,7 @@ from dq_space_arm_env.scene.start import episode_scene, number_of_draws
 from dq_space_arm_env.task import episode
 from dq_space_arm_env.task.equations import SceneEquations
 from dq_space_arm_env.task.step_report import FLAGS, REPORT
+from dq_space_arm_env.task.worst_case import WorstCase
 
 interpreter = pytest.importorskip("graph_interpreter")
 
@@ -99,8 +100,8 @@ def test_an_observation_tells_errors_and_the_time_left(equations: SceneEquations
     after = [x[part] for part in (layout.state.base_velocity, layout.state.joint_angles)]
     after += [x[part] for part in (layout.state.wrist_angles, layout.state.joint_rates)]
     np.testing.assert_array_equal(seen["observation"][count:-1], np.concatenate(after))
-    assert seen["report"][:-2].tolist() == [0.0] * (len(REPORT) - 2)
-    np.testing.assert_allclose(seen["report"][-2:], [angle, distance], rtol=1e-9)
+    assert seen["report"][:-3].tolist() == [0.0] * (len(REPORT) - 3)
+    np.testing.assert_allclose(seen["report"][-3:], [angle, distance, 0.0], rtol=1e-9)
     assert seen["flags"].tolist() == [0.0] * len(FLAGS)
     costs = state_costs(equations, x, terminal=False)
     np.testing.assert_allclose(seen["memory_kept"], [taken, *costs], rtol=1e-12)
@@ -118,8 +119,10 @@ def test_a_step_pays_for_its_stage_and_at_the_end_for_where_it_ends(
     effort = float(layout.control_weight @ u**2)
     terminal = state_costs(equations, x_next, terminal=True) if over else [0.0, 0.0]
     reward = -sum(before) - effort - sum(terminal)
-    expected = [reward, *before, effort, *terminal, *shown_errors(equations, x_next)]
+    expected = [reward, *before, effort, *terminal, *shown_errors(equations, x_next), np.nan]
     np.testing.assert_allclose(done["report"], expected, rtol=1e-9)
+    told = run(partial(episode.step, equations), **given, checked_error=[0.25])
+    assert told["report"][-1] == 0.25
     assert done["flags"].tolist() == [over, False, False]
     assert done["observation"][-1] == pytest.approx((STEPS - taken - 1) * DT)
     np.testing.assert_array_equal(done["x_kept"], x_next)
@@ -138,7 +141,8 @@ def test_a_step_to_what_is_no_state_stays_and_pays_for_all_that_is_left(
     given = {"x": x, "x_next": x_next, "u": u, "memory": [taken, *before]}
     done = run(partial(episode.step, equations), **given)
     terminal = state_costs(equations, x, terminal=True)
-    reward = -(STEPS - taken) * (sum(before) + effort) - sum(terminal)
+    reward = -float(casadi.DM(WorstCase(equations).cost(x.tolist(), STEPS - taken)))
+    assert reward < -(STEPS - taken) * (sum(before) + effort) - sum(terminal)
     np.testing.assert_allclose(done["report"][:6], [reward, *before, effort, *terminal], rtol=1e-12)
     assert done["flags"].tolist() == [True, False, True]
     np.testing.assert_array_equal(done["x_kept"], x)
@@ -170,7 +174,7 @@ def test_a_state_within_the_tolerances_is_a_success(short_scene: Scene) -> None:
             assert compared["is_success"] == [success]
             cost = min(np.array(equations.scene.cost.pose) @ (tip - s * np.array(goal)) ** 2 for s in (1, -1))
             assert compared["cost"][0] == pytest.approx(cost)
-            np.testing.assert_allclose(compared["errors"], seen["report"][-2:], atol=1e-6)
+            np.testing.assert_allclose(compared["errors"], seen["report"][-3:-1], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["random-masses", "random-target"])

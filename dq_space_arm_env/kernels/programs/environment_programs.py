@@ -11,7 +11,7 @@ from functools import partial
 
 from dq_space_arm_env.compiler.graph import Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
-from dq_space_arm_env.integrators import integrator_of
+from dq_space_arm_env.integrators import checked_integrator_of, integrator_of
 from dq_space_arm_env.integrators.method import program_inputs
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import number_of_draws
@@ -74,8 +74,10 @@ class EnvironmentPrograms:
         command = partial(episode.command, equations)
         program.call(trace("inputs_graph", {"action": n_u}, command, parameters=self._parameters))
         program.call(trace("time_step_graph", {}, lambda: {"h": [simulation.dt]}))
-        integrator_of(simulation, integrator).append_step(program, equations.field)
+        method = checked_integrator_of(simulation, integrator)
+        (method or integrator_of(simulation, integrator)).append_step(program, equations.field)
         sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": n_memory}
+        sizes |= {"checked_error": 1} if method else {}
         report = trace("report_graph", sizes, partial(episode.step, equations), parameters=self._parameters)
         program.call(report)
         program.outputs = _outputs(report)

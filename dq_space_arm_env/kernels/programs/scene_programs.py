@@ -16,7 +16,7 @@ from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.vector_field import split_state
-from dq_space_arm_env.integrators import integrator_of
+from dq_space_arm_env.integrators import checked_integrator_of, integrator_of
 from dq_space_arm_env.integrators.dormand_prince import append_measured_step
 from dq_space_arm_env.integrators.method import MomentumIntegrator, program_inputs
 from dq_space_arm_env.kernels.programs.derivative_programs import DerivativePrograms
@@ -255,7 +255,10 @@ class ScenePrograms:
         field = self.field
         x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
         program = Program(name, program_inputs(field, x, u, h), [Buffer("x_next", field.n_x)])
-        integrator_of(self.scene.simulation, integrator).append_step(program, field)
+        choose = checked_integrator_of if name == "checked_step" else integrator_of
+        method = choose(self.scene.simulation, integrator)
+        assert method is not None  # `Kernels.checked_step` refuses it
+        method.append_step(program, field)
         if name == "checked_step":
             program.outputs = [*program.outputs, Buffer("checked_error", 1)]
         if name == "step_with_cost":

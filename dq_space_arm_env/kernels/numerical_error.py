@@ -1,0 +1,48 @@
+"""How far a simulated motion is from the true one, by a companion with a much smaller tolerance."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.kernels.robot_kernels import RobotKernels
+from dq_space_arm_env.scene import INTEGRATORS, Scene
+
+Array = NDArray[Any]
+
+FINER = 1e-2
+"""Tolerances of the companion of an adaptive method, relative to its own."""
+COMPANION, TOLERANCE = "rk8", 1e-8
+"""Integrator and tolerance [rad, m] of the companion of a method that takes fixed steps."""
+
+
+def companion(scene: Scene) -> Scene:
+    """The scene in double precision, with tolerances that make its steps' errors negligible."""
+    simulation, name = scene.simulation, scene.simulation.integrator
+    keys = {**dict.fromkeys(("rtol", "atol", "tolerance")), "precision": "float64"}
+    if INTEGRATORS[name].is_adaptive:
+        finer = {key: FINER * simulation.tolerance_of(key) for key in INTEGRATORS[name].tolerances}
+        return scene.replace(simulation={**keys, **finer})
+    tolerance = min(TOLERANCE, FINER * simulation.division)
+    return scene.replace(simulation={**keys, "integrator": COMPANION, "tolerance": tolerance})
+
+
+def numerical_error(finer: RobotKernels, states: ArrayLike, u: ArrayLike, p: ArrayLike | None) -> Array:
+    """See `Kernels.numerical_error`; `finer` are the functions of the companion."""
+    motion, controls = real_array("states", states), real_array("u", u)
+    expected = len(controls) + 1, *controls.shape[1:-1], finer.n_x
+    if motion.shape != expected or controls.ndim not in (2, 3):
+        raise ValueError(
+            f"states, u: shapes {motion.shape} and {controls.shape}, should be (N + 1, n_x) and (N, n_u), or "
+            "(N + 1, B, n_x) and (N, B, n_u)"
+        )
+    x, errors = motion[0].astype(np.float64), np.zeros(motion.shape[:-1])
+    for step, control in enumerate(controls, start=1):
+        x = finer.call("checked_step", x=x, u=control, p=p)[0]
+        tips = [finer.tip_pose(each, p).T for each in (x, motion[step])]
+        errors[step] = np.maximum(poses.error_distance(*tips), poses.error_angle(*tips))
+    return errors

@@ -1,0 +1,120 @@
+"""The most that the rest of an episode can cost, whatever its actions: what a diverged simulation is charged.
+
+With s = sqrt(2 E), E the kinetic energy and that of the springs, the twist of every body is bounded by s and
+its inertia, so the power of the actuators, and of a wrench at the tip, is at most c s: s' = E' / s <= c.
+Dampers only take energy away. The center of mass gains no more speed than the forces give, and the arm
+reaches no farther from it than when it is stretched out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra.vectors import dot, matrix_vector, norm, subtract
+from dq_space_arm_env.dynamics.chain import RigidBody
+from dq_space_arm_env.task.equations import SceneEquations, total
+
+Scalar = Any
+Scalars = Sequence[Scalar]
+
+_Z = (0.0, 0.0, 1.0)
+
+
+class WorstCase:
+    """Bounds of one scene's motions over the rest of an episode."""
+
+    def __init__(self, equations: SceneEquations) -> None:
+        self.equations, self.chain = equations, equations.chain
+        self.inputs = equations.field.inputs(equations.control_limits)
+        self.bodies = [self.chain.base, *(link.body for link in self.chain.links)]
+        self.mass = total([body.mass for body in self.bodies])
+        # Of any point of the arm from the base's center of mass.
+        places = [*(link.joint for link in self.chain.links), self.chain.wrist, self.chain.tip]
+        lengths = [norm(place.position) for place in places if place is not None]
+        self.reach = total([*lengths, *(norm(body.center_of_mass) for body in self.bodies)])
+
+    def cost(self, x: Scalars, steps: Scalar) -> Scalar:
+        """Bound of the cost of a number of steps from a state, terminal cost included."""
+        equations, base = self.equations, self.chain.base
+        duration = steps * equations.scene.simulation.dt
+        motion = equations.field.motion(equations.y(x))
+        turning = norm(motion.angular) + total([casadi.fabs(rate) for rate in motion.joint_rates])
+        moving = norm(motion.linear) + self.reach * turning
+        speed = self._root_energy(motion.joint_angles, moving, turning) + duration * self._growth()
+        wrench = self.chain.tip_wrench or (0.0,) * 6
+        drift = moving + duration * (norm(self.inputs.force) + norm(wrench[:3])) / self.mass
+        # The dual part of a pose has half the length of its position; unit quaternions are at most 2 apart.
+        start, target = (norm(poses.position(pose)) for pose in (equations.base_pose(x), equations.target))
+        gaps = 2.0, 0.5 * (start + target + duration * drift + 2.0 * self.reach)
+        references = equations.scene.target.base_velocity
+        speeds = (
+            _turned(base, speed) + norm(references[:3]),
+            speed / casadi.sqrt(base.mass) + norm(references[3:]),
+        )
+
+        def state_cost(pose: str, velocity: str) -> Scalar:
+            return self._weighted(pose, 4, gaps) + self._weighted(velocity, 3, speeds)
+
+        stage = state_cost("pose", "base_velocity") + equations.effort(equations.control_limits)
+        return steps * stage + state_cost("terminal_pose", "terminal_base_velocity")
+
+    def _weighted(self, field: str, size: int, lengths: Scalars) -> Scalar:
+        """Cost of two vectors of these lengths; the largest weight counts for all entries of a vector."""
+        weights = self.equations.state_weights(field)
+        costs = []
+        for part, length in zip((weights[:size], weights[size:]), lengths, strict=True):
+            largest: Scalar = 0.0
+            for weight in part:
+                largest = casadi.fmax(largest, weight)
+            costs.append(largest * (length * length))
+        return total(costs)
+
+    def _root_energy(self, joint_angles: Scalars, moving: Scalar, turning: Scalar) -> Scalar:
+        """Bound of s if no body moves or turns faster."""
+        moments = total([body.inertia[i][i] for body in self.bodies for i in range(3)])
+        springs = [
+            casadi.sqrt(link.stiffness) * casadi.fabs(angle - link.rest_angle)
+            for link, angle in zip(self.chain.links, joint_angles, strict=True)
+        ]
+        return casadi.sqrt(self.mass) * moving + casadi.sqrt(moments) * turning + total(springs)
+
+    def _growth(self) -> Scalar:
+        """The bound c: root of the sum of f^2 / m + t' I^-1 t over the bodies' forces f and torques t."""
+        inputs, links, bodies = self.inputs, self.chain.links, self.bodies
+        forces: list[Scalar] = [norm(inputs.force), *[0.0] * len(links)]
+        # Components of the torques as they act in I^-1/2, added as if all pointed the same way.
+        torques = [_turned(self.chain.base, norm(inputs.torque)), *[0.0] * len(links)]
+        for i, (link, limit) in enumerate(zip(links, inputs.joint_torques, strict=True)):
+            axis = matrix_vector(link.joint.rotation, _Z)
+            torque = casadi.fabs(limit)
+            torques[i] = torques[i] + torque * casadi.sqrt(_inverse_moment(bodies[i], axis))
+            torques[i + 1] = torques[i + 1] + torque * casadi.sqrt(_inverse_moment(bodies[i + 1], _Z))
+        if self.chain.tip_wrench is not None:
+            inner = (0.0, 0.0, 0.0) if self.chain.wrist is None else self.chain.wrist.position
+            arm = norm(subtract(inner, bodies[-1].center_of_mass)) + norm(self.chain.tip.position)
+            force, torque = norm(self.chain.tip_wrench[:3]), norm(self.chain.tip_wrench[3:])
+            forces[-1] = forces[-1] + force
+            torques[-1] = torques[-1] + _turned(bodies[-1], torque + force * arm)
+        squares = [force * force / body.mass for force, body in zip(forces, bodies, strict=True)]
+        return casadi.sqrt(total([*squares, *(torque * torque for torque in torques)]))
+
+
+_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), _Z)
+
+
+def _turned(body: RigidBody, size: Scalar) -> Scalar:
+    """Bound of |I^-1/2 v| for a vector of some size along any axis."""
+    return size * casadi.sqrt(total([_inverse_moment(body, axis) for axis in _AXES]))
+
+
+def _inverse_moment(body: RigidBody, axis: Scalars) -> Scalar:
+    """A' I^-1 a about the center of mass."""
+    (a, d, e), (_, b, f), (_, _, c) = body.inertia
+    first, second, third = b * c - f * f, e * f - d * c, d * f - b * e
+    fourth = d * e - a * f
+    adjugate = (first, second, third), (second, a * c - e * e, fourth), (third, fourth, a * b - d * d)
+    return dot(axis, matrix_vector(adjugate, axis)) / (a * first + d * second + e * third)

@@ -1,0 +1,76 @@
+"""The charge of a diverged simulation: no motion that the inputs can cause costs more."""
+
+import casadi
+import numpy as np
+import pytest
+
+from dq_space_arm_env import DQSpaceArmEnv, compile_scene, load_scene
+from dq_space_arm_env.scene import list_scenes
+from dq_space_arm_env.task.equations import SceneEquations
+from dq_space_arm_env.task.worst_case import WorstCase
+
+STEPS = 100
+
+
+def charge(scene, states, steps):
+    """The bound for a batch of states, shape (B,)."""
+    equations = SceneEquations.of(scene, compile_scene(scene).layout.parameters.nominal.tolist())
+    x = casadi.SX.sym("x", equations.field.n_x)
+    bound = casadi.Function("bound", [x], [WorstCase(equations).cost(casadi.vertsplit(x), steps)])
+    return np.array([float(bound(state)) for state in states])
+
+
+def starts(kernels, count):
+    """States of all speeds."""
+    rng, layout = np.random.default_rng(3), kernels.layout
+    x = np.tile(layout.initial_state, (count, 1))
+    scales = 10.0 ** rng.uniform(-2.0, 2.0, (count, 1))
+    for part in (layout.state.base_velocity, layout.state.joint_rates):
+        x[:, part] += scales * rng.uniform(-1.0, 1.0, x[:, part].shape)
+    x[:, layout.state.joint_angles] += rng.uniform(-3.0, 3.0, x[:, layout.state.joint_angles].shape)
+    return x
+
+
+@pytest.mark.parametrize("name", [n for n in list_scenes() if n != "six-joint"])
+def test_no_motion_costs_more(name):
+    """Accurate motions under inputs at their limits: constant, switching, and along the velocities."""
+    scene = load_scene(name)
+    kernels, rng = compile_scene(scene), np.random.default_rng(4)
+    begun = starts(kernels, 48)
+    x, cost = begun.copy(), np.zeros(len(begun))
+    u = rng.choice([-1.0, 1.0], (len(x), kernels.n_u))
+    for step in range(STEPS):
+        if step % 10 == 0:
+            u[::3] = rng.choice([-1.0, 1.0], u[::3].shape)
+        controls = kernels.layout.control_limit * u
+        cost += kernels.cost(x, controls)
+        x, error = kernels.checked_step(x, controls)
+        assert (error <= 1.0).all()
+    cost += kernels.terminal_cost(x)
+    bounds = charge(scene, begun, STEPS)
+    assert (cost < bounds).all()
+    # It is of use only if it is not beyond all measure.
+    assert np.median(bounds / cost) < 1e5
+
+
+def test_a_simulation_that_diverges_pays_more_than_the_true_motion():
+    """Constant full actions, which undivided steps of `planar` at 150 ms do not follow."""
+    scene = load_scene("planar").replace(simulation={"dt": 0.15, "steps": 400})
+    whole, divided = (DQSpaceArmEnv(scene.replace(simulation={"tolerance": t})) for t in ("off", 1e-6))
+    rng, diverged = np.random.default_rng(0), 0
+    for _ in range(6):
+        action = rng.choice([-1.0, 1.0], whole.action_space.shape)
+        returns, ends = [], []
+        for env in (whole, divided):
+            env.reset(options={"nominal": True})
+            total, over = 0.0, False
+            while not over:
+                _, reward, over, _, info = env.step(action)
+                total += reward
+            returns.append(total)
+            ends.append(info["diverged"])
+        assert not ends[1]
+        if ends[0]:
+            diverged += 1
+            assert returns[0] < returns[1]
+    assert diverged >= 3
