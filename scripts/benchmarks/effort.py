@@ -30,6 +30,8 @@ class Effort:
     mass_ratios: tuple[float, ...] = tuple(10.0**k for k in range(-6, 7))  # base to arm
     samples: int = 8  # random states of a case
     steps: int = 10_000_000  # time steps of the cases with many
+    action_episodes: int = 100  # of each kind of actions
+    energy_steps: int = 10_000_000  # of the long motions
     stiffness: tuple[float, ...] = tuple(10.0**k for k in range(2, 9))  # N m/rad
     long_horizon: int = 20_000  # stages
     slow_cases: bool = True
@@ -64,7 +66,7 @@ class Effort:
     pictures: int = 40  # samples of 5 steps with a picture each
 
     # scene-cost; ratios need the best time of each: many short samples find a quiet moment
-    cost_scenes: tuple[str, ...] = ()  # empty: all that are shipped
+    cost_scenes: tuple[str, ...] = ()  # and of stability's actions; empty: all that are shipped
     cost_timing: Sampling = field(default=Sampling(200, 0.0005))
     compilations: int = 2
     processes: int = 6  # new processes with a warm cache
@@ -99,13 +101,22 @@ class Effort:
 
 STANDARD = Effort()
 FULL = Effort(
-    "full", repeats=9, piece_repeats=100, compared_starts=4, starts=200, episodes=5, slow_peers=True
+    "full",
+    energy_steps=100_000_000,
+    repeats=9,
+    piece_repeats=100,
+    compared_starts=4,
+    starts=200,
+    episodes=5,
+    slow_peers=True,
 )
 QUICK = Effort(
     "quick",
     mass_ratios=(1e-6, 1e-3, 1.0, 1e3, 1e6),
     samples=3,
     steps=100_000,
+    action_episodes=4,
+    energy_steps=1_000_000,
     stiffness=(1e2, 1e5, 1e8),
     long_horizon=2_000,
     slow_cases=False,

@@ -39,7 +39,10 @@ def _tables(name: str, title: str) -> tuple[Table, Table]:
         "numbers of states, tangent states, inputs, entries of an observation; memory per state in a step; "
         "machine code; seconds until it is ready for the first time; env.: step of an environment"
     )
-    times = f"ns per state, best, vector kernels on {BATCH:,} states; ratios to the first row"
+    times = (
+        f"ns per state, best, vector kernels on {BATCH:,} states; ratios to the first row; of whole steps: "
+        "time of make_vec beside that with `tolerance: off`"
+    )
     size_columns: list[Column | str] = ["title"]
     for key, heading in (
         ("states", "n_x"),
@@ -67,6 +70,7 @@ def _tables(name: str, title: str) -> tuple[Table, Table]:
         time_column("environment_ns", "ns"),
         Column("environment_ns_ratio", "ratio", ".2f"),
         time_column("make_vec_ns", "make_vec\nns"),
+        Column("of_whole_steps", "of whole\nsteps", ".2f"),
     )
     return (
         Table(name, f"{title}: size of the equations and of the compiled step\n{sizes}", tuple(size_columns)),

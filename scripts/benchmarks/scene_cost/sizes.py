@@ -121,13 +121,15 @@ def scene_rows(table: str, scenes: Mapping[str, Scene], effort: Effort, *, vecto
     cases = [_cases(scene, vector) for scene in scenes.values()]
     timings = iter(time_cases([case for own in cases for case in own], effort.cost_timing))
     for (title, scene), own in zip(scenes.items(), cases, strict=True):
-        names = ("dynamics_ns", "step_ns", "environment_ns", "make_vec_ns")[: len(own)]
+        names = ("dynamics_ns", "step_ns", "environment_ns", "make_vec_ns", "whole_steps_ns")[: len(own)]
         row: Row = {"table": table, "title": title, "integrator": scene.simulation.integrator}
         row |= size_row(scene, effort.compilations)
         row |= {name: next(timings)["best_ns"] for name in names}
         first = rows[0] if rows else row
         for key in ("step_operations", "environment_operations", "step_ns", "environment_ns"):
             row[f"{key}_ratio"] = row[key] / first[key]
+        if "whole_steps_ns" in row:
+            row["of_whole_steps"] = row["make_vec_ns"] / row["whole_steps_ns"]
         rows.append(row)
     return rows
 
@@ -136,9 +138,12 @@ def _cases(scene: Scene, vector: bool) -> list[Case]:
     integrator = scene.simulation.integrator
     programs = ((DYNAMICS, ""), (STEP, integrator), (ENVIRONMENT, integrator))
     cases = [kernel_case(scene, what, name, BATCH) for what, name in programs]
-    if vector:
+    compared = [scene] if vector else []
+    if vector and INTEGRATORS[integrator].is_embedded:
+        compared.append(scene.replace(simulation={"tolerance": "off"}))
+    for each in compared:
         subject = Subject(what=ENVIRONMENT, engine=OURS, way=MAKE_VEC, integrator=integrator, batch=BATCH)
-        cases.append(vector_case(subject, PLAIN.make_vec(scene, BATCH, integrator), scene.simulation.steps))
+        cases.append(vector_case(subject, PLAIN.make_vec(each, BATCH, integrator), scene.simulation.steps))
     return cases
 
 

@@ -12,10 +12,12 @@ from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Benchmark, Picture, Row
 from scripts.benchmarks.stability import (
     bad_numbers,
+    divided_steps,
     expert,
     extreme_motions,
     far_away,
     finite_deflections,
+    long_motions,
     masses,
     motions,
     paper_form,
@@ -34,7 +36,9 @@ _MODULES = (
     extreme_motions,
     stiff_joints,
     finite_deflections,
+    long_motions,
     time_steps,
+    divided_steps,
     paper_form,
     far_away,
     poses,
@@ -56,8 +60,30 @@ def all_cases(groups: Iterable[str] = ()) -> list[Case]:
 
 def measure(effort: Effort) -> Iterator[Row]:
     """Try all cases."""
+    scenes = effort.shipped(effort.cost_scenes)
     for case in all_cases(effort.only):
-        yield from case.rows(effort)
+        if not case.scene or case.scene in scenes:
+            yield from case.rows(effort)
+
+
+def _long_motions(part: str, caption: str, labels: Mapping[str, str]) -> Picture:
+    """A picture of the long motions, a panel for each."""
+    plot = {
+        "x": "x",
+        "y": "y",
+        "color": "subject",
+        "facet": "name",
+        "columns": 3,
+        "log": "xy",
+        "floor": 1e-16,
+    }
+    return Picture(
+        f"stability_long_motions_{part}",
+        f"curves of {long_motions.GROUP}",
+        caption,
+        {**plot, "floor": 1e-16, "labels": labels},
+        lambda row: row["name"].startswith(part),
+    )
 
 
 BENCHMARK = Benchmark(
@@ -113,6 +139,21 @@ BENCHMARK = Benchmark(
                 "labels": {"x": "deflection [rad], rate [rad/s]", "y": "error [rad, m]"},
             },
         ),
+        _long_motions(
+            long_motions.ENERGY,
+            "Largest change of the energy of free motions in steps of 15 ms over the number of steps.",
+            {"x": "steps [$-$]", "y": "change / first energy [$-$]"},
+        ),
+        _long_motions(
+            long_motions.MOMENTUM,
+            "Largest change of the momentum, linear or angular, of the same motions.",
+            {"x": "steps [$-$]", "y": "change / first momentum [$-$]"},
+        ),
+        _long_motions(
+            long_motions.TIP,
+            "Error of the tip's pose after 6 s over run time, in steps of several lengths.",
+            {"x": "run time [ms]", "y": "error [$-$, m]"},
+        ),
     ),
-    packages=("mpmath", "pin"),
+    packages=("mpmath", "pin", "mujoco"),
 )

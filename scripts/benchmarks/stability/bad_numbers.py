@@ -269,6 +269,7 @@ def _overflow(effort: Effort) -> Outcome:
     env.reset(options={"initial_state": x})
     for _ in range(env.scene.simulation.steps):
         observation, reward, terminated, _, info = env.step(np.zeros(env.kernels.n_u))
+        info.pop("step_error")  # of a step that is given up it is NaN
         numbers = np.array([*observation, reward, *(float(value) for value in info.values())])
         if not np.isfinite(numbers).all():
             return Handled(np.inf, "an observation or a reward is not finite")

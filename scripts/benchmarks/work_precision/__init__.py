@@ -104,6 +104,18 @@ BENCHMARK = Benchmark(
             ),
         ),
         Table(
+            "estimates",
+            "{case}: the global error that `integrate(...).global_error()` tells, and the true one\n"
+            "the larger of pose and angles at the end, rad or m",
+            (
+                Column("tolerance", format=_TINY),
+                Column("error", "true", ".1e"),
+                Column("estimate", "estimated", ".1e"),
+                Column("ratio", format=".2f"),
+            ),
+            by=("case",),
+        ),
+        Table(
             "references",
             "Where each motion ends, according to",
             ("case", "reference", Column("second_reference_off_by", "second reference off by", _TINY)),
@@ -139,6 +151,23 @@ BENCHMARK = Benchmark(
                 "labels": {
                     "batch_us_per_s": "time per simulated second, one of 1024 [µs]",
                     "error": "error of the tip [m, rad]",
+                },
+            },
+        ),
+        Picture(
+            "estimates",
+            "estimates",
+            "Estimated global error over the true one, of adaptive integration with smaller and smaller "
+            "tolerances: on the diagonal the estimate is exact.",
+            {
+                "x": "error",
+                "y": "estimate",
+                "color": "case",
+                "log": "xy",
+                "floor": 1e-16,
+                "labels": {
+                    "error": "true error of pose and angles [rad, m]",
+                    "estimate": "estimated error [rad, m]",
                 },
             },
         ),

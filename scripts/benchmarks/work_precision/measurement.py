@@ -17,6 +17,7 @@ import numpy as np
 from dq_space_arm_env import Kernels
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.scene import INTEGRATORS
 from experts.problems.shooting_problem import FloatArray
 from experts.report.integrator_precision import ACCURACIES, BATCH, LOST, cheapest, observed_order
 from scripts.benchmarks.effort import Effort
@@ -38,6 +39,9 @@ ERRORS = {
     "relative_energy_error": "energy",
 }
 """Errors of a state by name of their column; the pose error is the larger one of the tip's."""
+LARGEST_RATIO = 1.2
+"""Largest factor by which an estimated global error may be off, up or down."""
+_ESTIMATED, _UNCERTAINTIES = 1e-11, 30.0  # errors that an estimate can tell
 _FAR_OFF = 1e6  # entries of a lost state
 _ROUNDING = 1e-9  # below, an error that no longer falls with the step is due to rounding
 _LONG_RUN_SECONDS = 0.05
@@ -73,6 +77,7 @@ class Result:
     source: str  # of the reference
     uncertainty: float | None  # difference of two codes' references, m or rad
     curves: list[Curve]
+    estimates: list[Row] = field(default_factory=list)  # of global errors, largest tolerance first
 
     @property
     def integrators(self) -> list[Curve]:
@@ -95,7 +100,7 @@ def measure_case(case: MotionCase, effort: Effort) -> Result:
         else _stepped_curve(method, case, reference, times[method.name, None], effort)
         for method in methods
     ]
-    return Result(case, reference.source, uncertainty, curves)
+    return Result(case, reference.source, uncertainty, curves, [*_estimates(case, reference, effort)])
 
 
 def errors_of(kernels: Kernels, x: FloatArray, reference: FloatArray) -> Row:
@@ -196,6 +201,26 @@ def _point(
     return {**labels, **walked, **errors, "single_ns_per_s": single, "batch_us_per_s": 1e-3 * batch}
 
 
+def _estimates(case: MotionCase, reference: Reference, effort: Effort) -> Iterator[Row]:
+    """True and estimated global errors of `Kernels.integrate`, with smaller and smaller tolerances."""
+    kernels = Method("rk4", 4).kernels(case.scene)
+    of_places = slice(kernels.layout.tangent.base_velocity.start)  # pose and angles
+    for tolerance in effort.tolerances:
+        keys = INTEGRATORS["dormand_prince"].within(tolerance)
+        motion = kernels.integrate(
+            case.start,
+            case.controls,
+            case.duration,
+            rtol=keys["rtol"],
+            atol=keys["atol"],
+            max_steps=effort.most_steps,
+        )
+        errors = kernels.difference(reference.state, motion.x[-1]), motion.global_error()[-1]
+        true, estimated = (float(np.abs(each[of_places]).max()) for each in errors)
+        labels = {"table": "estimates", "case": case.title, "tolerance": tolerance}
+        yield {**labels, "error": true, "estimate": estimated, "ratio": estimated / true}
+
+
 def _step_times(
     methods: Sequence[Method], case: MotionCase, passed: tuple[FloatArray, FloatArray], effort: Effort
 ) -> _Times:
@@ -274,6 +299,7 @@ def rows_of(result: Result, *, all_methods: bool = True) -> Iterator[Row]:
         "reference": result.source,
         "second_reference_off_by": result.uncertainty,
     }
+    yield from result.estimates
     for curve in result.curves:
         yield from curve.points
         yield _method_row(result, curve)
@@ -305,6 +331,16 @@ def rows_of(result: Result, *, all_methods: bool = True) -> Iterator[Row]:
                 "scenes", case.name, own["method"], own["error"], DEFAULT_ACCURACY, unit="m, rad", note=note
             )
         return
+    if ratios := list(_shown_ratios(result)):
+        worst = max(abs(math.log2(ratio)) for ratio in ratios)
+        yield claim(
+            "estimates",
+            case.name,
+            "dormand_prince",
+            2.0**worst,
+            LARGEST_RATIO,
+            note="estimate over true error",
+        )
     errors = [point["error"] for curve in result.integrators for point in curve.points]
     if all_methods:
         least = min(errors, default=math.inf)
@@ -315,6 +351,12 @@ def rows_of(result: Result, *, all_methods: bool = True) -> Iterator[Row]:
             note = f"shows order {order:.2f}, claims {curve.method.order}"
             missing = max(curve.method.order - order, 0.0)
             yield claim("orders", case.name, curve.method.title, missing, ORDER_TOLERANCE, note=note)
+
+
+def _shown_ratios(result: Result) -> Iterator[float]:
+    """Ratios of estimated to true errors where these are neither rounding errors nor the reference's."""
+    floor = max(_ESTIMATED, _UNCERTAINTIES * (result.uncertainty or 0.0))
+    return (row["ratio"] for row in result.estimates if floor < row["error"] < DEFAULT_ACCURACY)
 
 
 def _method_row(result: Result, curve: Curve) -> Row:
