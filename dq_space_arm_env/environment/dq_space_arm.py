@@ -25,7 +25,8 @@ from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.start import episode_scene
-from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT, REPORT
+from dq_space_arm_env.scene.path import given_path
+from dq_space_arm_env.task.step_report import MEMORY, OBSERVATION_LIMIT, REPORT, report_names
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 
 if TYPE_CHECKING:
@@ -199,6 +200,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.scene.simulation.dt))}
         self.action_space = spaces.Box(-1.0, 1.0, (layout.n_u,), np.float32)
         self._bind_kernels()
+        names = report_names(self.scene)[1:]
+        self._more_names = () if names == REPORT[1:] else names
         self.observation_space = self._make_observation_space()
         self._begun, self._over = False, True
         self._trail: list[Array] = []
@@ -232,6 +235,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self._x, self._draws, self._action = arrays["x"], arrays["draws"], arrays["action"]
         self._memory = arrays["memory"]
         self._parameters = arrays.get("parameters", np.zeros(0, dtype=self.kernels.dtype))
+        self._path = given_path(self.scene, self.scene.simulation.steps) if "following" in arrays else None
+        self._following = arrays.get("following")
         self._observation, self._report, self._flags = (
             arrays[name] for name in ("observation", "report", "flags")
         )
@@ -245,7 +250,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     @property
     def parameters(self) -> Array:
-        """What varies between episodes besides the state: target, masses, and whatever the scene names, shape (n_p,); a copy.
+        """What varies between episodes besides the state: target at the start, masses, and whatever the scene names, shape (n_p,); a copy.
 
         `kernels.parameters` has the names and units of the entries. `ResetNeeded` before the first reset.
         """
@@ -254,9 +259,17 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     @property
     def target(self) -> Array:
-        """Pose q_{D/I} of this episode's target, shape (8,), dimensionless and m; a copy. `ResetNeeded` before the first reset."""
+        """Pose q_{D/I} of the target, now if it moves, shape (8,), dimensionless and m; a copy. `ResetNeeded` before the first reset."""
         self._require_reset("reading the target")
-        return self.kernels.layout.target_with(self._parameters)
+        return self.kernels.layout.target_with(self.stage_parameters)
+
+    @property
+    def stage_parameters(self) -> Array:
+        """`parameters`, with pose and velocity of a target that moves as they are now, shape (n_p,); a copy. `ResetNeeded` before the first reset."""
+        self._require_reset("reading the parameters")
+        parameters = self._parameters.copy()
+        parameters[list(self.kernels.parameters.moving)] = self._memory[len(MEMORY) :]
+        return parameters
 
     @property
     def episode_scene(self) -> Scene:
@@ -329,17 +342,22 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         if action.shape != self._action_shape:
             raise ValueError(f"action: shape {action.shape}, should be {self._action_shape}")
         self._action[...] = action
+        if self._path is not None:
+            self._following[...] = self._path[int(self._memory[0]) + 1]
         self._take_step()  # inputs, motion, observation, reward and end of the episode: task/episode.py
         over, success, diverged = self._flags.tolist()
-        reward, pose, velocity, control, end_pose, end_velocity, angle, distance, error = (
-            self._report.tolist()
-        )
+        report = self._report.tolist()
         if over and np.isnan(self._action).any():
             raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
         self._over = over
         if self.render_mode is not None:
             self._show()
+        if self._more_names:
+            flags = {"is_success": success, "diverged": diverged}
+            info = dict(zip(self._more_names, report[1:], strict=True)) | flags
+            return self._observation.copy(), report[0], over, False, info
         # Written out: a call, or a loop over names, would make a step some per cent slower.
+        reward, pose, velocity, control, end_pose, end_velocity, angle, distance, error = report
         info = {
             "cost_pose": pose,
             "cost_base_velocity": velocity,
@@ -384,7 +402,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         if self.render_mode is not None:
             self._show()
         _, success, diverged = self._flags.tolist()
-        info = dict(zip(REPORT[1:], self._report.tolist()[1:], strict=True))
+        info = dict(zip(self._more_names or REPORT[1:], self._report.tolist()[1:], strict=True))
         return self._observation.copy(), {**info, "is_success": success, "diverged": diverged}
 
     def _begin(self, start: GivenStart) -> None:

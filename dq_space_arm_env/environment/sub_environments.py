@@ -14,8 +14,10 @@ from dq_space_arm_env.compiler.random_draws import draws_kernel, generator_state
 from dq_space_arm_env.environment.reset_options import GivenStart
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
+from dq_space_arm_env.scene.motion import Waypoints
+from dq_space_arm_env.scene.path import PATH, given_path
 from dq_space_arm_env.scene.start import number_of_draws
-from dq_space_arm_env.task.step_report import FLAGS, MEMORY, REPORT
+from dq_space_arm_env.task.step_report import FLAGS, MEMORY, memory_names, report_names
 
 Array = NDArray[Any]
 Rows = NDArray[np.int64]
@@ -28,7 +30,7 @@ class StepResult(NamedTuple):
     """Arrays that a step fills."""
 
     observation: Array  # shape (count, n_obs)
-    report: NDArray[np.float64]  # a row for each name in REPORT, shape (len(REPORT), count)
+    report: NDArray[np.float64]  # a row for each of `report_names`, shape (len(report_names(scene)), count)
     flags: NDArray[np.bool_]  # a row for each name in FLAGS, shape (len(FLAGS), count)
 
 
@@ -44,12 +46,18 @@ class SubEnvironments:
         start, observe = kernels.kernel("environment_start"), kernels.kernel("environment_observe")
         sizes = {spec.name: spec.stride for spec in (*start.outputs, *observe.outputs)}
         self.x, self._x_next = (np.zeros((count, kernels.n_x), kernels.dtype) for _ in range(2))
-        self._memory, self._memory_next = (np.zeros((count, len(MEMORY)), kernels.dtype) for _ in range(2))
+        size = len(memory_names(kernels.scene))
+        self._memory, self._memory_next = (np.zeros((count, size), kernels.dtype) for _ in range(2))
         self.parameters = np.zeros((count, sizes.get("parameters", 0)), kernels.dtype)
         self._draws = np.zeros((count, number_of_draws(kernels.scene)))
         self._generators = np.zeros((count, 4), dtype=np.uint64)
-        self._results = _ResultArrays((count, sizes["observation"]), kernels.dtype)
+        rows = len(report_names(kernels.scene))
+        self._results = _ResultArrays((count, sizes["observation"]), rows, kernels.dtype)
         self._action_shape = (count, kernels.n_u)
+        self._path: Array | None = None  # of a target that passes waypoints
+        if isinstance(kernels.scene.target.motion, Waypoints):
+            self._path = given_path(kernels.scene, kernels.scene.simulation.steps).astype(kernels.dtype)
+        self._following = np.zeros((count, PATH), kernels.dtype)
 
         drawing = BoundKernel(draws_kernel(self._draws.shape[1]))
         self._draw = KernelCall(drawing, {"states": self._generators, "draws": self._draws})
@@ -64,7 +72,7 @@ class SubEnvironments:
     def _step_calls(self, kernels: Kernels) -> dict[type, KernelCall]:
         """The step by the type of the actions, from the present arrays of states to the others."""
         arrays = {"x": self.x, "x_kept": self._x_next, "parameters": self.parameters}
-        arrays |= {"memory": self._memory, "memory_kept": self._memory_next}
+        arrays |= {"memory": self._memory, "memory_kept": self._memory_next, "following": self._following}
         arrays |= self._results.fresh()._asdict()
         names = {np.float64: "environment_step", np.float32: "environment_step_float32_actions"}
         return {kind: KernelCall(kernels.kernel(name), arrays) for kind, name in names.items()}
@@ -81,6 +89,12 @@ class SubEnvironments:
             "parameters": self.parameters,
             "generator": self._generators,
         }
+
+    def stage_parameters(self) -> Array:
+        """Parameters with pose and velocity of moving targets as they are now, shape (count, n_p); a copy."""
+        parameters = self.parameters.copy()
+        parameters[:, list(self._kernels.parameters.moving)] = self._memory[:, len(MEMORY) :]
+        return parameters
 
     def seed(self, rows: Rows, seeds: Sequence[int | None]) -> None:
         """Seed random generators, unpredictably for None; a negative seed is a ValueError."""
@@ -135,6 +149,9 @@ class SubEnvironments:
         values = np.ascontiguousarray(values, np.float32 if values.dtype == np.float32 else np.float64)
         result, call = self._results.take(), self._steps[values.dtype.type]
         observation, report, flags = result
+        if self._path is not None:
+            stages = np.minimum(self._memory[:, 0].astype(np.int64) + 1, len(self._path) - 1)
+            np.take(self._path, stages, axis=0, out=self._following)
         call.place(action=values, observation=observation, report=report, flags=flags)
         call(self.count, self._kernels.threads)
         # NaN diverges, and hardly anything else does: looking for it after the step costs nothing.
@@ -161,8 +178,8 @@ class _ResultArrays:
     at every step, which can take as long as the physics.
     """
 
-    def __init__(self, observation_shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
-        self._observation_shape, self._dtype = observation_shape, dtype
+    def __init__(self, observation_shape: tuple[int, int], rows: int, dtype: np.dtype[Any]) -> None:
+        self._observation_shape, self._rows, self._dtype = observation_shape, rows, dtype
         self._spares: list[StepResult] = []
         self._holders_of_a_spare = _holders(self.fresh())
         self._next = 0
@@ -172,7 +189,7 @@ class _ResultArrays:
         count = self._observation_shape[0]
         return StepResult(
             np.empty(self._observation_shape, self._dtype),
-            np.empty((len(REPORT), count)),
+            np.empty((self._rows, count)),
             np.empty((len(FLAGS), count), np.bool_),
         )
 

@@ -23,7 +23,7 @@ from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_s
 from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene
-from dq_space_arm_env.task.step_report import REPORT
+from dq_space_arm_env.task.step_report import report_names
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 from dq_space_arm_env.viewing.trails import Trails
 
@@ -34,8 +34,6 @@ Array = NDArray[Any]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
-# `info` holds the report without the reward, and the flags without the end of the episode.
-_KEYS = (*REPORT[1:], "is_success", "diverged")
 _NONE = np.empty(0, dtype=np.int64)
 
 
@@ -120,7 +118,10 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         self._begun, disabled = False, self.autoreset_mode is AutoresetMode.DISABLED
         self._all = np.ones(num_envs, dtype=np.bool_)
         self._all.setflags(write=False)
-        self._masks = dict.fromkeys((f"_{key}" for key in _KEYS), self._all)
+        # `info` holds the report without the reward, and the flags without the end of the episode.
+        self._names = report_names(self.scene)[1:]
+        keys = (*self._names, "is_success", "diverged")
+        self._masks = dict.fromkeys((f"_{key}" for key in keys), self._all)
         self._over = _NONE  # rows whose episodes are over, to be reset by the next step or the caller
         self._seen = np.zeros(self.observation_space.shape or (), self.kernels.dtype) if disabled else None
         self._trails = None if render_mode is None else Trails(num_envs)
@@ -138,8 +139,13 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
 
     @property
     def targets(self) -> Array:
-        """Poses q_{D/I} of the targets, shape (num_envs, 8), real part dimensionless, dual part m; a copy."""
-        return self.kernels.layout.target_with(self._envs.parameters)
+        """Poses q_{D/I} of the targets now, shape (num_envs, 8), real part dimensionless, dual part m; a copy."""
+        return self.kernels.layout.target_with(self.stage_parameters)
+
+    @property
+    def stage_parameters(self) -> Array:
+        """Parameters of each episode now, shape (num_envs, n_p), see `DQSpaceArmEnv.stage_parameters`."""
+        return self._envs.stage_parameters()
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -452,18 +458,10 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
 
     def _info(self, result: StepResult, mask: Mask) -> dict[str, Any]:
         """Entries of `DQSpaceArmEnv`'s info, as arrays."""
-        _, pose, velocity, control, end_pose, end_velocity, angle, distance, error = result.report
         _, success, diverged = result.flags
         whole = mask is self._all
         return {
-            "cost_pose": pose,
-            "cost_base_velocity": velocity,
-            "cost_control": control,
-            "terminal_cost_pose": end_pose,
-            "terminal_cost_base_velocity": end_velocity,
-            "attitude_error": angle,
-            "position_error": distance,
-            "step_error": error,
+            **dict(zip(self._names, result.report[1:], strict=True)),
             "is_success": success,
             "diverged": diverged,
             **(self._masks if whole else {key: mask.copy() for key in self._masks}),

@@ -228,8 +228,9 @@ def walk(
     start: Array,
     handed_on: Mapping[str, Array],
     inputs: Mapping[str, Array],
-    h: Array,
-    every: int,
+    steps: int,
+    h: Array | None = None,
+    every: int = 1,
 ) -> Array:
     """Take many steps in a row; machine code walks down rows that it has just written.
 
@@ -237,15 +238,16 @@ def walk(
     name, as it is at the start. Returns the start, and the states after every so many steps, shape (steps //
     every + 1, n_x).
     """
-    steps, dtype = len(next(iter(inputs.values()))), start.dtype
-    rows = min(steps, _ROWS)
+    rows, dtype = min(steps, _ROWS), start.dtype
     moving = {name: np.empty((rows + 1, len(first)), dtype) for name, first in handed_on.items()}
     states = moving["x"] = np.empty((rows + 1, len(start)), dtype)
     for name, first in {**handed_on, "x": start}.items():
         moving[name][0] = first
     held = {name: np.empty((rows, array.shape[1]), dtype) for name, array in inputs.items()}
     # Each row's successor is the row below it.
-    arrays = {**moving, **{f"{name}_next": array[1:] for name, array in moving.items()}, **held, "h": h}
+    arrays = {**moving, **{f"{name}_next": array[1:] for name, array in moving.items()}, **held}
+    if h is not None:
+        arrays["h"] = h
     call = KernelCall(kernel, arrays)
     result = np.empty((steps // every + 1, len(start)), dtype)
     result[0] = start

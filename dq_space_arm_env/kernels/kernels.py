@@ -19,6 +19,7 @@ from dq_space_arm_env.kernels.bound import walk
 from dq_space_arm_env.kernels.library import matrices
 from dq_space_arm_env.kernels.robot_kernels import RobotKernels
 from dq_space_arm_env.scene import INTEGRATORS, Scene, load_scene
+from dq_space_arm_env.task.step_report import n_observations
 
 if TYPE_CHECKING:
     from dq_space_arm_env.kernels.adaptive import IntegratedMotion
@@ -180,7 +181,7 @@ class Kernels(RobotKernels):
         if "remainder" in sizes:
             handed_on["remainder"] = np.zeros(sizes["remainder"], self.dtype)
         held = {"u": np.broadcast_to(inputs, (steps, self.n_u)), "parameters": given}
-        return walk(kernel, start, handed_on, held, self._time_step(dt), every)
+        return walk(kernel, start, handed_on, held, steps, self._time_step(dt), every)
 
     def linearize(
         self,
@@ -381,6 +382,43 @@ class Kernels(RobotKernels):
         observation, errors = self.call("observation", x=x, time_left=time_left, p=p)
         return observation, errors
 
+    def relative_twist(self, x: ArrayLike, u: ArrayLike | None = None, p: ArrayLike | None = None) -> Array:
+        """Twist of the tip relative to the target, which may move.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u), whose wrist rates count; the wrist is held by default.
+            p: Parameters of the stage, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by
+                default.
+
+        Returns:
+            Twist w_{G/D} in tip axes, angular then linear, shape (6,) or (B, 6), rad/s and m/s.
+        """
+        inputs = np.zeros(self.n_u, self.dtype) if u is None else u
+        return self.call("relative_twist", x=x, u=inputs, p=p)[0]
+
+    def stage_parameters(self, p: ArrayLike | None = None) -> Array:
+        """Parameters of each stage of an episode: those of a target that moves change from stage to stage.
+
+        Args:
+            p: Parameters at the start, shape (n_p,), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Parameters of the stages and of the end, shape (N + 1, n_p), units of `parameters`.
+
+        Raises:
+            ValueError: If the parameters have another shape.
+        """
+        steps = self.scene.simulation.steps
+        first = self.parameter_rows(p, 1)[0]
+        rows = np.tile(first, (steps + 1, 1))
+        if self.scene.target.motion is not None:
+            from dq_space_arm_env.kernels.target_path import target_path
+
+            moving = list(self.parameters.moving)
+            rows[:, moving] = target_path(self, first[moving])
+        return rows
+
     def observation_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Exact derivative of the observation in tangent coordinates, of observation(retract(x, z)) by z.
 
@@ -389,16 +427,17 @@ class Kernels(RobotKernels):
             p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
-            Derivatives at z = 0, shape (n_x + 1, n_t) or (B, n_x + 1, n_t), units of the observation per unit
-            of `layout.tangent`. The time left has no derivative: its row is zero.
+            Derivatives at z = 0, shape (n_obs, n_t) or (B, n_obs, n_t), units of the observation per unit of
+            `layout.tangent`. The time left has no derivative: its row is zero.
         """
-        return matrices(self.call("observation_jacobian", x=x, p=p)[0], self.n_x + 1, self.n_t)
+        jacobian = self.call("observation_jacobian", x=x, p=p)[0]
+        return matrices(jacobian, n_observations(self.scene), self.n_t)
 
     def state_from_observation(self, observation: ArrayLike, p: ArrayLike | None = None) -> Array:
         """The state behind an observation.
 
         Args:
-            observation: Shape (n_x + 1,) or (B, n_x + 1), entries as documented in `DQSpaceArmEnv`; the error
+            observation: Shape (n_obs,) or (B, n_obs), entries as documented in `DQSpaceArmEnv`; the error
                 pose need not have exactly unit norm.
             p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 

@@ -15,16 +15,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.parameters import (
     CONTROL_UNITS,
+    GRASP,
     TARGET,
+    VELOCITY,
     ControlNumbers,
     control_numbers,
     is_part,
+    moving_numbers,
     parameters,
 )
-from dq_space_arm_env.scene.pose import PLANAR_POSE
+from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import Array, free_axes, initial_state, is_planar
 
@@ -84,9 +89,11 @@ class ParameterEntries(_Entries):
 
     Attributes:
         nominal: The scene's own values, shape (n_p,), units of the parameters.
+        moving: Indices of those that change from stage to stage: pose and velocity of a target that moves.
     """
 
     nominal: Array
+    moving: tuple[int, ...]
 
     def indices(self, path: str) -> list[int]:
         """Find parameters.
@@ -113,7 +120,9 @@ class StateLayout:
         tangent: Entries of the tangent of the state.
         control: Entries of the controls u.
         parameters: Entries of the parameters p.
-        target: The scene's nominal target q_{D/I}, shape (8,), real part dimensionless, dual part m.
+        target: The nominal pose of the target's body at the start, shape (8,), real part dimensionless, dual
+            part m; without a grasp frame the target q_{D/I}.
+        grasp: The nominal grasp frame in the target's body, shape (8,), likewise.
         control_limit: Largest magnitude of each control, shape (n_u,), units of the controls; inf: unlimited.
         control_weight: Weight of each squared control in the cost, shape (n_u,), 1/unit^2.
         initial_state: The scene's nominal start with the sign rule applied, shape (n_x,), units of the state.
@@ -128,6 +137,7 @@ class StateLayout:
     control: ControlEntries
     parameters: ParameterEntries
     target: Array
+    grasp: Array
     control_limit: Array
     control_weight: Array
     initial_state: Array
@@ -156,16 +166,50 @@ class StateLayout:
         """Target where it may be a parameter.
 
         Args:
-            parameters: Shape (..., n_p), units of `parameters`.
+            parameters: Shape (..., n_p), units of `parameters`; those of a stage where the target moves.
 
         Returns:
             q_{D/I}, shape (..., 8), real part dimensionless, dual part m, of the type of the parameters.
         """
-        target = np.tile(self.target.astype(parameters.dtype), (*parameters.shape[:-1], 1))
-        where = self.parameters.indices(TARGET)
+        body = self.target_body_with(parameters)
+        if np.array_equal(self.grasp, dq.IDENTITY) and not self.parameters.indices(GRASP):
+            return body
+        grasp = self._pose_with(GRASP, self.grasp, parameters)
+        return np.stack(dq.multiply(_entries(body), _entries(grasp)), axis=-1)
+
+    def target_body_with(self, parameters: Array) -> Array:
+        """Pose of the target's body where it may be a parameter.
+
+        Args:
+            parameters: Shape (..., n_p), units of `parameters`; those of a stage where the target moves.
+
+        Returns:
+            q_{T/I}, shape (..., 8), real part dimensionless, dual part m, of the type of the parameters.
+        """
+        return self._pose_with(TARGET, self.target, parameters)
+
+    def _pose_with(self, path: str, nominal: Array, parameters: Array) -> Array:
+        pose = np.tile(nominal.astype(parameters.dtype), (*parameters.shape[:-1], 1))
+        where = self.parameters.indices(path)
         if where:
-            target[..., PLANAR_POSE if self.planar else range(8)] = parameters[..., where]
-        return target
+            pose[..., PLANAR_POSE if self.planar else range(8)] = parameters[..., where]
+        return pose
+
+    def target_velocity_with(self, parameters: Array) -> Array:
+        """Velocity of the desired tip pose, which moves with the target's body.
+
+        Args:
+            parameters: Of a stage, shape (..., n_p), units of `parameters`.
+
+        Returns:
+            Twist in the axes of q_{D/I}, angular then linear, shape (..., 6), rad/s and m/s.
+        """
+        velocity = np.zeros((*parameters.shape[:-1], 6), parameters.dtype)
+        where = self.parameters.indices(VELOCITY)
+        if where:
+            velocity[..., PLANAR_TWIST if self.planar else range(6)] = parameters[..., where]
+        grasp = _entries(self._pose_with(GRASP, self.grasp, parameters))
+        return np.stack(dual_vectors.inverse_transform(*poses.to_matrix(grasp), _entries(velocity)), axis=-1)
 
     def limits_with(self, parameters: Array) -> Array:
         """Limits of the controls where some may be parameters.
@@ -219,6 +263,7 @@ class StateLayout:
             control=_lay_out_controls(controls),
             parameters=_lay_out_parameters(scene),
             target=_constant(scene.target.pose.dual_quaternion),
+            grasp=_constant(scene.target.grasp.dual_quaternion),
             control_limit=_constant([control.limit.nominal for control in every_control]),
             control_weight=_constant([control.weight.nominal for control in every_control]),
             initial_state=_constant(initial_state(scene)),
@@ -297,8 +342,9 @@ def _lay_out_controls(controls: Mapping[str, Sequence[ControlNumbers]]) -> Contr
 
 
 def _lay_out_parameters(scene: Scene) -> ParameterEntries:
-    found = parameters(scene)
+    found, moving = parameters(scene), set(moving_numbers(scene))
     return ParameterEntries(
+        moving=tuple(index for index, number in enumerate(found) if number in moving),
         names=tuple(number.name for number in found),
         units=tuple(number.unit for number in found),
         nominal=_constant([number.nominal for number in found]),
@@ -309,6 +355,11 @@ def _actuated_joints(scene: Scene) -> tuple[int, ...]:
     if scene.actuators.joint_torque is None:
         return ()
     return tuple(index for index, link in enumerate(scene.links) if link.actuated)
+
+
+def _entries(vectors: Array) -> tuple[Array, ...]:
+    """Components of vectors, shape (..., n), as the algebra takes them."""
+    return tuple(np.moveaxis(vectors, -1, 0))
 
 
 def _constant(values: Sequence[float] | Array) -> Array:

@@ -2,6 +2,7 @@
 
 from pydantic import Field
 
+from dq_space_arm_env.scene.motion import Motion
 from dq_space_arm_env.scene.pose import Pose
 from dq_space_arm_env.validation.fields import (
     Angles,
@@ -64,9 +65,22 @@ class TipWrench(Model):
 
 
 class Target(Model):
-    """Target pose of the tip, and velocity of the base there."""
+    """Target pose of the tip, fixed or moving with a body, and velocity of the base there."""
 
-    pose: Pose = Field(description="desired pose q_{D/I} of the tip in the inertial frame, m")
+    pose: Pose = Field(
+        description="pose of the target's body in the inertial frame, at the start if it moves, m; without a "
+        "grasp frame this is the desired pose q_{D/I} of the tip"
+    )
+    grasp: Pose = Field(
+        default_factory=Pose,
+        exclude_if=lambda pose: pose == Pose(),
+        description="desired pose of the tip in the frame of the target's body, m",
+    )
+    motion: Motion | None = Field(
+        default=None,
+        exclude_if=lambda motion: motion is None,
+        description="motion of the target's body, of a kind: screw, tumbling, waypoints or file; absent: rest",
+    )
     base_velocity: Twist = Field(
         default=_ZERO_TWIST,
         description="desired velocity of the base in base axes: angular (3) rad/s, linear (3) m/s",
@@ -88,6 +102,18 @@ class Cost(Model):
     )
     terminal_base_velocity: StateWeights6 = Field(
         default=(1.0,) * 6, description="terminal weight on the base velocity error (W_fw): one number or 6"
+    )
+    tip_twist: StateWeights6 = Field(
+        default=(0.0,) * 6,
+        exclude_if=lambda weights: not any(weights),
+        description="running weight on the tip's twist relative to the target, tip axes, angular then linear, "
+        "the wrist's rates included: one number or 6",
+    )
+    terminal_tip_twist: StateWeights6 = Field(
+        default=(0.0,) * 6,
+        exclude_if=lambda weights: not any(weights),
+        description="terminal weight on the tip's twist relative to the target with the wrist held, tip axes, "
+        "angular then linear: one number or 6",
     )
     base_force: ControlWeights3 = Field(
         default=(10.0,) * 3, description="weight on the base force, 1/N^2: one number or 3"
@@ -150,6 +176,26 @@ class Spread(Model):
     target_position: LengthSpread = Field(
         default=0.0, description="position of the target in inertial axes, m"
     )
+    target_angular_velocity: RateSpread = Field(
+        default=0.0,
+        exclude_if=lambda width: not width,
+        description="angular velocity of a target on a screw or tumbling, body axes, rad/s",
+    )
+    target_linear_velocity: RateSpread = Field(
+        default=0.0,
+        exclude_if=lambda width: not width,
+        description="velocity of a target on a screw (body axes) or tumbling (inertial axes), m/s",
+    )
+    grasp_rotation: AngleSpread = Field(
+        default=0.0,
+        exclude_if=lambda width: not width,
+        description="rotation vector of the grasp frame in its own axes, rad",
+    )
+    grasp_position: LengthSpread = Field(
+        default=0.0,
+        exclude_if=lambda width: not width,
+        description="position of the grasp frame in the axes of the target's body, m",
+    )
     base_mass: Fraction = Field(default=0.0, description="mass of the base, as a fraction of it")
     base_inertia: Fraction = Field(
         default=0.0, description="inertia of the base about its center of mass, as a fraction of it"
@@ -169,3 +215,14 @@ class Success(Model):
 
     attitude_error_deg: Positive = Field(default=3.0, description="largest attitude error, degrees")
     position_error: Positive = Field(default=0.1, description="largest position error, m")
+    angular_velocity_error_deg: Positive | None = Field(
+        default=None,
+        exclude_if=lambda largest: largest is None,
+        description="largest angular velocity of the tip relative to the target with the wrist held, deg/s; "
+        "absent: any",
+    )
+    velocity_error: Positive | None = Field(
+        default=None,
+        exclude_if=lambda largest: largest is None,
+        description="largest velocity of the tip relative to the target, m/s; absent: any",
+    )

@@ -8,11 +8,14 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from dq_space_arm_env.scene.bodies import Base, Link, Payload
-from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
+from dq_space_arm_env.scene.path import first_velocity
+from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST, Pose
 
 Scene = Any  # `schema.Scene`, which finds mistakes in its list of parameters by this file
 
 TARGET = "target.pose"
+VELOCITY = "target.velocity"
+GRASP = "target.grasp"
 _AXES = ("x", "y", "z")
 _EULER_ANGLES = ("psi", "theta", "phi")
 _LOWER_TRIANGLE = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
@@ -24,6 +27,8 @@ _STATE_WEIGHTS = {
     "terminal_pose": (_POSE, PLANAR_POSE),
     "base_velocity": (_TWIST, PLANAR_TWIST),
     "terminal_base_velocity": (_TWIST, PLANAR_TWIST),
+    "tip_twist": (_TWIST, PLANAR_TWIST),
+    "terminal_tip_twist": (_TWIST, PLANAR_TWIST),
 }
 
 
@@ -47,11 +52,11 @@ class ControlNumbers(NamedTuple):
 
 def parameters(scene: Scene) -> tuple[Number, ...]:
     """The parameters of a scene: target, bodies from base to payload, weights, limits."""
-    drawn = _drawn(scene)
+    varying = _drawn(scene) | {number.name for number in moving_numbers(scene)}
     return tuple(
         number
         for number in numbers(scene)
-        if number.name in drawn or any(is_part(number.name, path) for path in scene.parameters)
+        if number.name in varying or any(is_part(number.name, path) for path in scene.parameters)
     )
 
 
@@ -70,6 +75,8 @@ def parents(name: str) -> Iterator[str]:
 def numbers(scene: Scene) -> Iterator[Number]:
     """All numbers of a scene that may be parameters; a planar scene has those of its plane only."""
     yield from target_numbers(scene)
+    yield from velocity_numbers(scene)
+    yield from grasp_numbers(scene)
     yield from body_numbers(scene, "base")
     for index, link in enumerate(scene.links):
         place = f"links.{index}"
@@ -80,6 +87,8 @@ def numbers(scene: Scene) -> Iterator[Number]:
         yield from body_numbers(scene, "payload")
     for field, (entries, planar) in _STATE_WEIGHTS.items():
         weights = getattr(scene.cost, field)
+        if field.endswith("tip_twist") and not any(weights):
+            continue  # the term is not in the machine code
         for index in planar if _is_planar(scene) else range(len(entries)):
             yield _number(weight_name(field, index), "1", weights[index], f"cost.{field}.{index}")
     controls = [each for numbers in control_numbers(scene).values() for each in numbers]
@@ -98,14 +107,48 @@ def weight_name(field: str, index: int) -> str:
 
 def target_numbers(scene: Scene) -> Iterator[Number]:
     """The numbers of the target's dual quaternion; in a planar scene four of them are zero."""
-    pose = scene.target.pose.dual_quaternion
+    yield from _pose_numbers(scene, TARGET, scene.target.pose.dual_quaternion)
+
+
+def grasp_numbers(scene: Scene) -> Iterator[Number]:
+    """Likewise of the grasp frame, where there is one."""
+    if has_grasp(scene):
+        yield from _pose_numbers(scene, GRASP, scene.target.grasp.dual_quaternion)
+
+
+def _pose_numbers(scene: Scene, path: str, pose: Sequence[float]) -> Iterator[Number]:
     for index in target_entries(scene):
-        yield Number(f"{TARGET}.{_POSE[index]}", "1" if index < 4 else "m", pose[index], ())
+        yield Number(f"{path}.{_POSE[index]}", "1" if index < 4 else "m", pose[index], ())
+
+
+def velocity_numbers(scene: Scene) -> Iterator[Number]:
+    """The numbers of the velocity of a target that moves, body axes, at the start."""
+    if scene.target.motion is not None:
+        velocity = first_velocity(scene)
+        for index in velocity_entries(scene):
+            yield Number(f"{VELOCITY}.{_TWIST[index]}", "rad/s" if index < 3 else "m/s", velocity[index], ())
+
+
+def moving_numbers(scene: Scene) -> list[Number]:
+    """What changes from stage to stage: pose and velocity of a target that moves."""
+    if scene.target.motion is None:
+        return []
+    return [*target_numbers(scene), *velocity_numbers(scene)]
 
 
 def target_entries(scene: Scene) -> tuple[int, ...]:
     """Indices of the target's eight numbers that are not zero whatever the target."""
     return PLANAR_POSE if _is_planar(scene) else tuple(range(8))
+
+
+def velocity_entries(scene: Scene) -> tuple[int, ...]:
+    """Likewise of the six numbers of its velocity."""
+    return PLANAR_TWIST if _is_planar(scene) else tuple(range(6))
+
+
+def has_grasp(scene: Scene) -> bool:
+    """Tell whether the target has a grasp frame apart from its body's."""
+    return scene.target.grasp != Pose() or has_grasp_spread(scene)
 
 
 def body_numbers(scene: Scene, place: str) -> Iterator[Number]:
@@ -164,11 +207,22 @@ def has_target_spread(scene: Scene) -> bool:
     return bool(scene.spread.target_rotation or scene.spread.target_position)
 
 
+def has_velocity_spread(scene: Scene) -> bool:
+    """Tell whether the velocity of the target is drawn for each episode."""
+    return bool(scene.spread.target_angular_velocity or scene.spread.target_linear_velocity)
+
+
+def has_grasp_spread(scene: Scene) -> bool:
+    """Tell whether the grasp frame is drawn for each episode."""
+    return bool(scene.spread.grasp_rotation or scene.spread.grasp_position)
+
+
 def _drawn(scene: Scene) -> set[str]:
     """Names of what the spread draws; of the target all of it, even if only its position is drawn."""
     target = target_numbers(scene) if has_target_spread(scene) else ()
+    grasp = grasp_numbers(scene) if has_grasp_spread(scene) else ()
     scaled = (number for _, group in drawn_factors(scene) for number in group)
-    return {number.name for number in (*target, *scaled)}
+    return {number.name for number in (*target, *grasp, *scaled)}
 
 
 def control_numbers(scene: Scene) -> dict[str, list[ControlNumbers]]:

@@ -18,6 +18,7 @@ from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
 from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
+from dq_space_arm_env.scene.motion import Motion, ScrewMotion, Tumbling, Waypoints
 from dq_space_arm_env.scene.parameters import is_part, numbers, parents
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.scene.simulation import Simulation
@@ -146,6 +147,11 @@ class Scene(Model):
             half_width = getattr(self.spread, field)
             if half_width and not part:
                 yield Problem(("spread", field), half_width, f"must be 0: the scene has no {part_name}")
+        for field in ("target_angular_velocity", "target_linear_velocity"):
+            half_width = getattr(self.spread, field)
+            if half_width and not isinstance(self.target.motion, ScrewMotion | Tumbling):
+                sentence = "must be 0: the target is on no screw and does not tumble"
+                yield Problem(("spread", field), half_width, sentence)
 
     def _cost_problems(self) -> Iterator[Problem]:
         """Find weights with which the reward of inputs at their limits would not be a number."""
@@ -197,6 +203,8 @@ class Scene(Model):
                 sentence = f"{_PLANAR}: only the torque about z may be nonzero"
                 yield Problem(("tip_wrench", "torque"), self.tip_wrench.torque, sentence)
         yield from _pose_problems(("target", "pose"), self.target.pose)
+        yield from _pose_problems(("target", "grasp"), self.target.grasp)
+        yield from _motion_problems(("target", "motion"), self.target.motion)
         yield from _velocity_problems(("target", "base_velocity"), self.target.base_velocity)
         yield from _pose_problems(("initial_state", "base_pose"), self.initial_state.base_pose)
         yield from _velocity_problems(("initial_state", "base_velocity"), self.initial_state.base_velocity)
@@ -260,6 +268,19 @@ def _pose_problems(location: _Location, pose: Pose) -> Iterator[Problem]:
     if any(pose.rotation[1:3]):
         sentence = f"{_PLANAR}: only rotations about z are possible, so x and y of [w, x, y, z] must be 0"
         yield Problem((*location, "rotation"), pose.rotation, sentence)
+
+
+def _motion_problems(location: _Location, motion: Motion | None) -> Iterator[Problem]:
+    if isinstance(motion, Waypoints):
+        for index, point in enumerate(motion.points):
+            yield from _pose_problems((*location, "points", index, "pose"), point.pose)
+    elif motion is not None:
+        yield from _height_problems((*location, "linear_velocity"), motion.linear_velocity)
+        if any(motion.angular_velocity[:2]):
+            sentence = f"{_PLANAR}: only the angular velocity about z may be nonzero"
+            yield Problem((*location, "angular_velocity"), motion.angular_velocity, sentence)
+    if isinstance(motion, Tumbling):
+        yield from _inertia_problems((*location, "inertia"), motion.inertia)
 
 
 def _height_problems(location: _Location, vector: tuple[float, float, float]) -> Iterator[Problem]:

@@ -10,17 +10,26 @@ from numpy.typing import NDArray
 from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.algebra.quaternion import multiply
 from dq_space_arm_env.algebra.scalars import select
+from dq_space_arm_env.algebra.vectors import matrix_vector, transposed_matrix_vector
 from dq_space_arm_env.scene.maneuver import Spread
+from dq_space_arm_env.scene.motion import ScrewMotion, Tumbling
 from dq_space_arm_env.scene.parameters import (
     Number,
     drawn_factors,
+    grasp_numbers,
+    has_grasp,
+    has_grasp_spread,
     has_target_spread,
+    has_velocity_spread,
     inertia_paths,
     parameters,
     target_entries,
     target_numbers,
+    velocity_entries,
+    velocity_numbers,
 )
-from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
+from dq_space_arm_env.scene.path import first_velocity
+from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST, Pose
 from dq_space_arm_env.scene.schema import Scene
 
 Array = NDArray[np.float64]
@@ -64,7 +73,8 @@ def number_of_draws(scene: Scene) -> int:
     start = scene.initial_state
     base = len(turning) + len(moving)
     states = 2 * base + 2 * len(start.joint_angles) + len(start.wrist_angles)
-    return states + (base if has_target_spread(scene) else 0) + sum(1 for _ in drawn_factors(scene))
+    drawn = [has_target_spread(scene), has_velocity_spread(scene), has_grasp_spread(scene)]
+    return states + base * sum(drawn) + sum(1 for _ in drawn_factors(scene))
 
 
 def start_from_draws(scene: Scene, draws: Array) -> Array:
@@ -82,8 +92,9 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     rotation vector (in base axes: q_{e0/I} = nominal * exp), base position (in inertial axes), joint angles,
     wrist angles, angular and linear velocity of the base, joint rates; then, where there is a spread:
     rotation vector of the target (in its axes) and its position (in inertial axes), mass and inertia of the
-    base, masses of the links, inertias of the links, mass and inertia of the payload. A planar base, and its
-    target, turn about z and move in x and y only.
+    base, masses of the links, inertias of the links, mass and inertia of the payload, angular and linear
+    velocity of the target, rotation vector and position of the grasp frame. A planar base, and its target,
+    turn about z and move in x and y only.
     """
     start, spread = scene.initial_state, scene.spread
     turning, moving = free_axes(scene)
@@ -103,18 +114,37 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     wrist_angles = spread_out(start.wrist_angles, spread.wrist_angles, angles)
     angular = spread_out(start.base_velocity[:3], spread.base_angular_velocity, turning)
     linear = spread_out(start.base_velocity[3:], spread.base_linear_velocity, moving)
-    joint_rates = spread_out(start.joint_rates, spread.joint_rates, joints)
+    joint_rates: Sequence[Scalar] = spread_out(start.joint_rates, spread.joint_rates, joints)
     target = scene.target.pose.dual_quaternion
     drawn: dict[str, Scalar] = {}
+
+    def spread_out_pose(nominal: Pose, half_angle: float, half_width: float) -> tuple[Scalar, ...]:
+        turned = rotations.exponential(spread_out((0.0, 0.0, 0.0), half_angle, turning))
+        moved = spread_out(nominal.position, half_width, moving)
+        return tuple(poses.from_rotation_and_position(multiply(nominal.rotation, turned), moved))
+
     if has_target_spread(scene):
-        turned = rotations.exponential(spread_out((0.0, 0.0, 0.0), spread.target_rotation, turning))
-        moved = spread_out(scene.target.pose.position, spread.target_position, moving)
-        target_rotation = multiply(scene.target.pose.rotation, turned)
-        target = tuple(poses.from_rotation_and_position(target_rotation, moved))
+        target = spread_out_pose(scene.target.pose, spread.target_rotation, spread.target_position)
         drawn |= {number.name: target[index] for number, index in _indexed_target(scene)}
     for half_width, numbers in drawn_factors(scene):
         factor = 1.0 + half_width * next(columns)
         drawn |= {number.name: factor * number.nominal for number in numbers}
+    motion = scene.target.motion
+    if isinstance(motion, ScrewMotion | Tumbling):
+        turning_rate, speed = motion.angular_velocity, motion.linear_velocity
+        if has_velocity_spread(scene):
+            turning_rate = spread_out(turning_rate, spread.target_angular_velocity, turning)
+            speed = spread_out(speed, spread.target_linear_velocity, moving)
+        if isinstance(motion, Tumbling):  # its velocity is given in inertial axes
+            speed = transposed_matrix_vector(rotations.to_matrix(target[:4]), speed)
+        velocity = (*turning_rate, *speed)
+        drawn |= {number.name: velocity[index] for number, index in _indexed_velocity(scene)}
+    grasp = scene.target.grasp.dual_quaternion
+    if has_grasp_spread(scene):
+        grasp = spread_out_pose(scene.target.grasp, spread.grasp_rotation, spread.grasp_position)
+        drawn |= {number.name: grasp[index] for number, index in _indexed_grasp(scene)}
+    if has_grasp(scene):
+        target = multiply(target[:4], grasp[:4])
     # q and -q are one pose, but the cost |q_{G/I} - q_{D/I}|^2 sees two: the base quaternion gets the sign
     # for which the real part of q_{G/I} has a non-negative product with that of q_{D/I}.
     tip = multiply(rotation, _tip_rotation(scene, joint_angles, wrist_angles))
@@ -138,22 +168,50 @@ def episode_scene(scene: Scene, values: Sequence[float]) -> Scene:
     """The scene in which the parameters, (n_p,), are constants; SceneError for what no scene may have."""
     changes: dict[str, Any] = {"spread": Spread(), "parameters": ()}
     target, places = list(scene.target.pose.dual_quaternion), dict(_indexed_target(scene))
+    grasp, grasp_places = list(scene.target.grasp.dual_quaternion), dict(_indexed_grasp(scene))
+    velocity = list(first_velocity(scene))
+    velocity_places = dict(_indexed_velocity(scene))
     for number, value in zip(parameters(scene), values, strict=True):
         if number in places:
             target[places[number]] = float(value)
             changes["target.pose"] = {"dual_quaternion": target}
+        elif number in grasp_places:
+            grasp[grasp_places[number]] = float(value)
+            changes["target.grasp"] = {"dual_quaternion": grasp}
+        elif number in velocity_places:
+            velocity[velocity_places[number]] = float(value)
         changes |= dict.fromkeys(number.paths, float(value))
         if is_planar(scene) and number.name.endswith(".inertia.zz"):  # the rest of the inertia in proportion
             place = number.name.removesuffix(".inertia.zz")
             changes |= {
                 path: float(value) / number.nominal * entry for path, entry in inertia_paths(scene, place)
             }
+    motion = scene.target.motion
+    if isinstance(motion, ScrewMotion | Tumbling):
+        linear: Sequence[float] = velocity[3:]
+        if isinstance(motion, Tumbling):
+            linear = matrix_vector(rotations.to_matrix(target[:4]), linear)
+        changes["target.motion"] = motion.model_dump() | {
+            "angular_velocity": velocity[:3],
+            "linear_velocity": [*linear],
+        }
     return scene.replace(changes)
 
 
 def _indexed_target(scene: Scene) -> Iterator[tuple[Number, int]]:
     """The numbers of the target with their indices in the dual quaternion."""
     return zip(target_numbers(scene), target_entries(scene), strict=True)
+
+
+def _indexed_grasp(scene: Scene) -> Iterator[tuple[Number, int]]:
+    """Likewise of the grasp frame."""
+    return zip(grasp_numbers(scene), target_entries(scene) if has_grasp(scene) else (), strict=True)
+
+
+def _indexed_velocity(scene: Scene) -> Iterator[tuple[Number, int]]:
+    """The numbers of the target's velocity with their indices in the twist."""
+    moves = scene.target.motion is not None
+    return zip(velocity_numbers(scene), velocity_entries(scene) if moves else (), strict=True)
 
 
 def _tip_rotation(scene: Scene, joint_angles: Sequence[Any], wrist_angles: Sequence[Any]) -> Sequence[Any]:

@@ -7,6 +7,12 @@ The stage cost of step k is
 without a factor dt; the terminal cost has the first two terms with weights W_fq, W_fomega. q and -q are the
 same pose but cost differently: the sign of q_{G/I} is fixed at the start, q_r . q_{D,r} >= 0, and carried
 along by continuity.
+
+Where a scene weighs it, the tip's twist relative to the target is a further term,
+
+    w^G_{G/D} = w^G_{G/I} - q_{G/D}* w^D_{D/I} q_{G/D}.
+
+The wrist's Euler rates, which are inputs, are part of it in the stage cost; at the end the wrist is held.
 """
 
 from __future__ import annotations
@@ -17,13 +23,23 @@ from typing import Any
 
 import casadi
 
-from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.equations_of_motion import Motion
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.scene.layout import StateLayout
-from dq_space_arm_env.scene.parameters import target_entries, target_numbers, weight_name
+from dq_space_arm_env.scene.parameters import (
+    grasp_numbers,
+    has_grasp,
+    target_entries,
+    target_numbers,
+    velocity_entries,
+    velocity_numbers,
+    weight_name,
+)
 from dq_space_arm_env.scene.schema import Scene
 
 Scalar = Any
@@ -37,6 +53,7 @@ class SceneEquations:
     scene: Scene
     chain: Chain
     target: Scalars  # q_{D/I}, 8 numbers or symbols
+    target_velocity: Scalars  # twist of D in its axes, 6 numbers or symbols
     layout: StateLayout
     field: SpaceArmField
     given: Mapping[str, Scalar]  # the parameters by name
@@ -49,12 +66,17 @@ class SceneEquations:
         if parameters is None:
             parameters = symbols = [casadi.SX.sym(f"parameter_{i}") for i in range(layout.n_p)]
         given = dict(zip(layout.parameters.names, parameters, strict=True))
-        target = list(scene.target.pose.dual_quaternion)
-        for number, index in zip(target_numbers(scene), target_entries(scene), strict=True):
-            target[index] = given.get(number.name, number.nominal)
+        target: Scalars = body_pose(scene, given)
+        velocity: Scalars = body_velocity(scene, given)
+        if has_grasp(scene):
+            grasp = list(scene.target.grasp.dual_quaternion)
+            for number, index in zip(grasp_numbers(scene), target_entries(scene), strict=True):
+                grasp[index] = given.get(number.name, number.nominal)
+            target = dq.multiply(target, grasp)
+            velocity = dual_vectors.inverse_transform(*poses.to_matrix(grasp), velocity)
         chain = Chain.from_scene(scene, given)
         field = SpaceArmField(chain, layout, symbols, scene.simulation.formulation)
-        return cls(scene, chain, target, layout, field, given)
+        return cls(scene, chain, target, velocity, layout, field, given)
 
     def y(self, x: Scalars) -> Scalars:
         """State without the pose."""
@@ -77,13 +99,42 @@ class SceneEquations:
         """Effort u' R u, the stage cost's term of the input."""
         return weighted_square(u, [0.0] * self.field.n_u, self.control_weights)
 
+    def twist_cost_terms(self, x: Scalars, u: Scalars) -> list[Scalar]:
+        """The stage cost's term of the tip's twist; none where it has no weight."""
+        if not any(self.scene.cost.tip_twist):
+            return []
+        twist = self.relative_twist(x, self.field.inputs(u).wrist_rates)
+        return [weighted_square(twist, [0.0] * 6, self.state_weights("tip_twist"))]
+
     def cost_terms(self, x: Scalars, u: Scalars) -> list[Scalar]:
-        """Pose, base velocity and effort: the terms of the stage cost."""
-        return [*self.state_cost_terms(x), self.effort(u)]
+        """Pose, base velocity, effort, and tip's twist if it has a weight: the terms of the stage cost."""
+        return [*self.state_cost_terms(x), self.effort(u), *self.twist_cost_terms(x, u)]
 
     def terminal_cost_terms(self, x: Scalars) -> list[Scalar]:
-        """Pose and base velocity: the terms of the terminal cost."""
-        return [self._pose_cost(x, "terminal_pose"), self._velocity_cost(x, "terminal_base_velocity")]
+        """Pose, base velocity, and tip's twist if it has a weight: the terms of the terminal cost."""
+        terms = [self._pose_cost(x, "terminal_pose"), self._velocity_cost(x, "terminal_base_velocity")]
+        if any(self.scene.cost.terminal_tip_twist):
+            weights = self.state_weights("terminal_tip_twist")
+            terms.append(weighted_square(self.relative_twist(x), [0.0] * 6, weights))
+        return terms
+
+    def relative_twist(self, x: Scalars, wrist_rates: Scalars | None = None) -> Scalars:
+        """Twist of the tip relative to the target in tip axes, 6; with the wrist held unless it has rates."""
+        tip, moving = self.tip(x), self.field.motion(self.y(x))
+        return dual_vectors.subtract(self.tip_twist(moving, wrist_rates), self.target_twist(tip))
+
+    def tip_twist(self, motion: Motion, wrist_rates: Scalars | None = None) -> Scalars:
+        """Twist of the tip in its axes, 6."""
+        columns = kinematics.tip_jacobian(self.chain, motion.joint_angles, motion.wrist_angles)
+        rates = [*motion.angular, *motion.linear, *motion.joint_rates, *(wrist_rates or ())]
+        # Without wrist rates, the wrist's columns are left over.
+        pairs = list(zip(columns, rates, strict=False))
+        return tuple(total([column[i] * rate for column, rate in pairs]) for i in range(6))
+
+    def target_twist(self, tip: Scalars) -> Scalars:
+        """Twist of the target in the axes of a tip, 6: Ad(q_{G/D}*) w^D."""
+        pose = dq.multiply(dq.conjugate(self.target), tip)
+        return dual_vectors.inverse_transform(*poses.to_matrix(pose), self.target_velocity)
 
     def _pose_cost(self, x: Scalars, field: str) -> Scalar:
         return weighted_square(self.tip(x), self.target, self.state_weights(field))
@@ -115,16 +166,39 @@ class SceneEquations:
         motion = self.field.motion(self.y(x))
         # Error pose q_{D/G} = q_{G/I}* q_{D/I}, eq. (31); in a planar scene four entries vanish identically.
         error = self.field.pose.reduced(poses.error_pose(tip, self.target))
+        twists: list[Scalar] = []
+        if self.scene.target.motion is not None:
+            carried = self.target_twist(tip)
+            relative = dual_vectors.subtract(self.tip_twist(motion), carried)
+            twists = [twist[i] for twist in (relative, carried) for i in self.field.pose.directions]
         observation = [
             *error,
             *x[self.layout.state.base_velocity],
             *motion.joint_angles,
             *motion.wrist_angles,
             *motion.joint_rates,
+            *twists,
             time_left,
         ]
         errors = [poses.error_angle(tip, self.target), poses.error_distance(tip, self.target)]
         return {"observation": observation, "errors": errors}
+
+
+def body_pose(scene: Scene, given: Mapping[str, Scalar]) -> list[Scalar]:
+    """Pose of the target's body q_{T/I}, 8 numbers, where some may be given by name."""
+    pose: list[Scalar] = list(scene.target.pose.dual_quaternion)
+    for number, index in zip(target_numbers(scene), target_entries(scene), strict=True):
+        pose[index] = given.get(number.name, number.nominal)
+    return pose
+
+
+def body_velocity(scene: Scene, given: Mapping[str, Scalar]) -> list[Scalar]:
+    """Twist of the target's body in its axes, 6 numbers, where some may be given by name; zero at rest."""
+    velocity: list[Scalar] = [0.0] * 6
+    if scene.target.motion is not None:
+        for number, index in zip(velocity_numbers(scene), velocity_entries(scene), strict=True):
+            velocity[index] = given.get(number.name, number.nominal)
+    return velocity
 
 
 def weighted_square(

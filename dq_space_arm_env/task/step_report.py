@@ -1,5 +1,9 @@
 """Columns of what the environment's step reports; apart from `episode`, as they are read without CasADi."""
 
+from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.scene.parameters import moving_numbers
+from dq_space_arm_env.scene.schema import Scene
+
 # The costs are those of the stage before the step and the terminal ones after it, which are zero before the
 # end of the episode; the tip's errors are those after the step, in deg and m. The step's error is the largest
 # estimate of a substep in units of the scene's tolerance; NaN where nothing estimates it.
@@ -16,8 +20,45 @@ REPORT = (
 )
 FLAGS = ("terminated", "is_success", "diverged")
 
-# What a step hands to the next besides the state: steps taken, and the stage cost's terms of the state.
+# What a step hands to the next besides the state: steps taken, and the stage cost's terms of the state; then
+# pose and velocity of a target that moves.
 MEMORY = ("steps_taken", "cost_pose", "cost_base_velocity")
+
+
+def has_twist_errors(scene: Scene) -> bool:
+    """Tell whether the tip's velocity relative to the target is reported: it moves, or success asks for it."""
+    success = scene.success
+    asked = (success.angular_velocity_error_deg, success.velocity_error)
+    return scene.target.motion is not None or any(largest is not None for largest in asked)
+
+
+def report_names(scene: Scene) -> tuple[str, ...]:
+    """Names of the report of a scene: `REPORT`, and what only some scenes have.
+
+    The velocities of the tip relative to the target are those after the step with the wrist held, in deg/s
+    and m/s.
+    """
+    names = list(REPORT)
+    if has_twist_errors(scene):
+        names[-1:-1] = ["angular_velocity_error", "velocity_error"]
+    if any(scene.cost.terminal_tip_twist):
+        names.insert(names.index("attitude_error"), "terminal_cost_tip_twist")
+    if any(scene.cost.tip_twist):
+        names.insert(names.index("terminal_cost_pose"), "cost_tip_twist")
+    return tuple(names)
+
+
+def n_observations(scene: Scene) -> int:
+    """Count the entries of an observation: state, time left, and two twists where the target moves."""
+    layout = StateLayout.of(scene)
+    return layout.n_x + 1 + (2 * (3 if layout.planar else 6) if scene.target.motion is not None else 0)
+
+
+def memory_names(scene: Scene) -> tuple[str, ...]:
+    """Names of what a step of a scene hands to the next."""
+    return (*MEMORY, *(number.name for number in moving_numbers(scene)))
+
+
 
 # A state whose norm (m, rad, m/s, rad/s) is larger, or NaN, comes from a simulation that has blown up. It
 # keeps every entry of an observation within twice this number.

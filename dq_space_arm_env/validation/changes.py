@@ -41,8 +41,9 @@ def merged(present: Any, change: Any, location: tuple[str | int, ...] = ()) -> A
     if not isinstance(change, Mapping):
         return change
     if isinstance(present, Model):
-        if not change.keys().isdisjoint(present._other_keys):  # another way to write all of it
-            return change
+        kind = getattr(present, "kind", None)
+        if not change.keys().isdisjoint(present._other_keys) or change.get("kind", kind) != kind:
+            return change  # another way to write all of it, or something else
         fields = {name: getattr(present, name) for name in type(present).model_fields}
         return fields | {
             key: merged(fields.get(key), value, (*location, key)) for key, value in change.items()

@@ -49,6 +49,7 @@ MOST_STEPS = 10_000_000
 
 Below 2^24, up to which single precision counts the steps of an episode exactly.
 """
+MOST_WAYPOINTS = 100_000
 _MOST_COUNT = 10**12
 _LONGEST_NAME = 200  # characters
 
@@ -182,6 +183,7 @@ Load = Annotated[Three, _vector(3, LOADS)]
 Angle = Annotated[float, _number(math.isfinite, "a finite number", ANGLES)]
 Angles = Annotated[tuple[float, ...], _vector(None, ANGLES)]
 Rates = Annotated[tuple[float, ...], _vector(None, RATES)]
+Rates3 = Annotated[Three, _vector(3, RATES)]
 LengthSpread = Annotated[float, non_negative(LENGTHS)]
 AngleSpread = Annotated[float, non_negative(ANGLES)]
 RateSpread = Annotated[float, non_negative(RATES)]

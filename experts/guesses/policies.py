@@ -19,7 +19,7 @@ def policies(solution: Solution, problem: ShootingProblem) -> dict[str, Solution
         return found
     if solution.parameters.shape != problem.parameters.rows.shape:
         return found
-    states = problem.carried(solution.states, solution.parameters[-1])
+    states = problem.carried(solution.states, solution.parameters)
     return found if states is None else {**found, ", moved": replace(solution, states=states)}
 
 

@@ -85,12 +85,20 @@ def tip_path(problem: ArmProblem, start: FloatArray, duration: float, times: Flo
     The pose is q_{G/I}(0) exp(d) exp(s w): w is the screw motion to the target, s rises from 0 to 1, and d
     starts with the tip's velocity, with the wrist at rest, and ends at 0; both with minimum jerk.
     """
-    arm, entries = free_floating_arm(problem), problem.kernels.layout.state
+    arm, layout = free_floating_arm(problem), problem.kernels.layout
+    entries = layout.state
     frames = problem.kernels.frame_poses(start[None])
     jacobian = arm.tip_jacobian(start[None], frames)
     drift = jacobian.base[0] @ start[entries.base_velocity] + jacobian.joints[0] @ start[entries.joint_rates]
-    first = frames[0, -1]
-    way = screw.logarithm(dq.multiply(dq.conjugate(first), tuple(problem.target.tolist())))
+    first, target = frames[0, -1], problem.target
+    path = _target_path(problem, times) if problem.kernels.parameters.moving else None
+    if path is not None:  # the same, relative to a target that moves
+        begin = tuple(path.poses[0].tolist())
+        first = np.array(dq.multiply(dq.conjugate(begin), tuple(first.tolist())))
+        own = poses.to_matrix(tuple(first.tolist()))
+        drift = drift - np.array(dual_vectors.inverse_transform(*own, tuple(path.velocities[0].tolist())))
+        target = np.array(dq.IDENTITY)
+    way = screw.logarithm(dq.multiply(dq.conjugate(first), tuple(target.tolist())))
     t = np.minimum(times / duration, 1.0)
     rise, rise_rate = t**3 * (10.0 - 15.0 * t + 6.0 * t**2), 30.0 * (t * (1.0 - t)) ** 2 / duration
     fade = t * (1.0 - t) ** 3 * (1.0 + 3.0 * t) * duration
@@ -99,7 +107,17 @@ def tip_path(problem: ArmProblem, start: FloatArray, duration: float, times: Flo
     pose = dq.multiply(first, dq.multiply(screw.exponential(dual_vectors.scale(fade, drift)), onward))
     carried = dual_vectors.inverse_transform(*poses.to_matrix(onward), dual_vectors.scale(fade_rate, drift))
     velocity = dual_vectors.add(carried, dual_vectors.scale(rise_rate, way))
+    if path is not None:
+        along = dual_vectors.inverse_transform(*poses.to_matrix(pose), tuple(path.velocities.T))
+        pose, velocity = dq.multiply(tuple(path.poses.T), pose), dual_vectors.add(velocity, along)
     return TipPath(np.stack(pose, axis=-1), np.stack(velocity, axis=-1))
+
+
+def _target_path(problem: ArmProblem, times: FloatArray) -> TipPath:
+    """Poses and velocities of a target that moves, at the stages nearest to some times."""
+    layout, rows = problem.kernels.layout, problem.parameters.rows
+    rows = rows[np.rint(times / problem.time_step).astype(int)]
+    return TipPath(layout.target_with(rows), layout.target_velocity_with(rows))
 
 
 class _ArmMotion:

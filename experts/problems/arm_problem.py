@@ -1,6 +1,7 @@
 """A scene as a shooting problem: its kernels, bounds, horizon and start under the names the solver uses."""
 
 import copy
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -10,9 +11,11 @@ import numpy as np
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
 from dq_space_arm_env.scene import INTEGRATORS
-from dq_space_arm_env.scene.pose import PLANAR_POSE
+from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from experts.problems.shooting_problem import (
     FloatArray,
     Kernel,
@@ -35,7 +38,6 @@ class ArmProblem:
     """
 
     has_retraction = True
-    has_mixed_cost = False
 
     def __init__(self, scene: Scene | str | Path | Mapping[str, Any], integrator: str | None = None) -> None:
         self.scene = in_double_precision(load_scene(scene), integrator)
@@ -43,6 +45,8 @@ class ArmProblem:
         self.integrator: str = self.scene.simulation.integrator
         self.has_second_order = INTEGRATORS[self.integrator].curvature is not None
         layout = self.kernels.layout
+        # The wrist's rates turn the tip.
+        self.has_mixed_cost = any(self.scene.cost.tip_twist) and "wrist psi rate" in layout.control.names
         self.n_states, self.n_tangent, self.n_controls = layout.n_x, layout.n_t, layout.n_u
         self.horizon = self.scene.simulation.steps
         self.time_step = self.scene.simulation.dt
@@ -52,11 +56,16 @@ class ArmProblem:
 
     def _make_inputs(self, usual_emphasis: float) -> None:
         """Allocate what may change between solves: parameters, and the emphasis on the final pose."""
-        self.parameters = StageParameters(self.horizon, self.kernels.layout.parameters.nominal)
+        changing = self._in_stages if self.kernels.parameters.moving else None
+        self.parameters = StageParameters(self.horizon, self.kernels.parameters.nominal, changing)
         self._usual_emphasis = usual_emphasis
         self._emphasis: FloatArray = np.full(1, self._usual_emphasis)
         last = (rows[-1:] for rows in self.parameters.inputs)
         self.terminal_inputs: tuple[FloatArray, ...] = (*last, self._emphasis)
+
+    def _in_stages(self, parameters: FloatArray) -> FloatArray:
+        """Parameters of the stages, (N + 1, n_p), from those at the start: the target moves."""
+        return self.kernels.stage_parameters(parameters)[:: self.scene.simulation.steps // self.horizon]
 
     def coarsened(self, factor: int) -> "ArmProblem":
         """Return the same maneuver in fewer, longer steps; its costs are smaller by the factor.
@@ -99,28 +108,8 @@ class ArmProblem:
         return self.kernels.layout.target_with(self.parameters.rows[-1])
 
     def carried(self, states: FloatArray, parameters: FloatArray) -> FloatArray | None:
-        """Move the states of a maneuver as the target has moved; None if it has not.
-
-        A rigid motion of base and target together leaves a maneuver what it is: nothing else is in space.
-
-        Args:
-            states: Shape (M, n_x).
-            parameters: Of the end of that maneuver, shape (n_p,).
-
-        Returns:
-            States that end at the present target where the others ended at theirs, shape (M, n_x).
-        """
-        layout = self.kernels.layout
-        before = layout.target_with(parameters)
-        if np.array_equal(before, self.target):
-            return None
-        stored, entries = list(PLANAR_POSE if layout.planar else range(8)), layout.state.pose
-        pose, moved = np.zeros((8, len(states))), states.copy()
-        pose[stored] = states[:, entries].T
-        # q_{D'/I} q_{D/I}* q_{e0/I}, with the new target D'
-        motion = dq.multiply(tuple(self.target.tolist()), dq.conjugate(tuple(before.tolist())))
-        moved[:, entries] = np.array(dq.multiply(motion, tuple(pose)))[stored].T
-        return moved
+        """See `carried_along`, with the present parameters."""
+        return carried_along(self.kernels.layout, states, parameters, self.parameters.rows)
 
     @contextmanager
     def emphasized(self, emphasis: float) -> Iterator[None]:
@@ -139,12 +128,16 @@ class ArmProblem:
         return float(cost[0])
 
     def misses(self, state: FloatArray) -> float:
-        """Larger of the tip's attitude and position error at a final state, relative to its tolerance."""
-        angle, distance = self.kernels.observation(state, [0.0], p=self.parameters.rows[-1])[1]
-        success = self.scene.success
-        return max(
-            float(np.degrees(angle)) / success.attitude_error_deg, float(distance) / success.position_error
-        )
+        """Largest of the tip's errors at a final state, each relative to its tolerance."""
+        success, last = self.scene.success, self.parameters.rows[-1]
+        angle, distance = self.kernels.observation(state, [0.0], p=last)[1]
+        relative = [float(np.degrees(angle)) / success.attitude_error_deg, float(distance) / success.position_error]
+        turning, moving = success.angular_velocity_error_deg, success.velocity_error
+        if turning is not None or moving is not None:
+            twist = self.kernels.relative_twist(state, p=last)
+            relative.append(math.degrees(math.hypot(*twist[:3])) / (turning or math.inf))
+            relative.append(math.hypot(*twist[3:]) / (moving or math.inf))
+        return max(relative)
 
     def is_success(self, state: FloatArray) -> bool:
         """Whether an episode that ends in a state is a success."""
@@ -157,6 +150,43 @@ class ArmProblem:
         if name == "lagrangian_hessian":
             integrator = INTEGRATORS[self.integrator].curvature
         return self.kernels.kernel(name, integrator=integrator, lanes=None if batched else 1)
+
+
+def carried_along(
+    layout: StateLayout, states: FloatArray, before: FloatArray, now: FloatArray
+) -> FloatArray | None:
+    """Move the states of a maneuver as the target has moved; None if it has not.
+
+    A rigid motion of base and target together leaves a maneuver what it is: nothing else is in space. Where
+    the target moves differently now, the base moves along with it, stage by stage.
+
+    Args:
+        layout: Of the states.
+        states: Shape (M, n_x).
+        before: Parameters of that maneuver's stages, shape (M, n_p).
+        now: Present parameters of the stages, shape (M, n_p).
+
+    Returns:
+        States that have the same pose relative to the present target, shape (M, n_x).
+    """
+    targets = layout.target_with(before), layout.target_with(now)
+    velocities = layout.target_velocity_with(before), layout.target_velocity_with(now)
+    if np.array_equal(*targets) and np.array_equal(*velocities):
+        return None
+    stored, entries = list(PLANAR_POSE if layout.planar else range(8)), layout.state.pose
+    pose, moved = np.zeros((8, len(states))), states.copy()
+    pose[stored] = states[:, entries].T
+    old, new = (tuple(target.T) for target in targets)
+    # q_{D'/I} q_{D/I}* q_{e0/I}, with the new target D'
+    motion = dq.multiply(new, dq.conjugate(old))
+    moved[:, entries] = np.array(dq.multiply(motion, tuple(pose)))[stored].T
+    faster = velocities[1] - velocities[0]
+    if faster.any():  # of D' than of D, in its axes: the base gains this velocity, carried to its own
+        relative = poses.to_matrix(dq.multiply(dq.conjugate(old), tuple(pose)))
+        gained = np.array(dual_vectors.inverse_transform(*relative, tuple(faster.T)))
+        free = list(PLANAR_TWIST if layout.planar else range(6))
+        moved[:, layout.state.base_velocity] += gained[free].T
+    return moved
 
 
 def as_problem(scene_or_problem: Any) -> ShootingProblem:
@@ -194,7 +224,6 @@ class WindowProblem:
     """
 
     has_retraction = True
-    has_mixed_cost = False
 
     def __init__(self, maneuver: ArmProblem, horizon: int, model: tuple[FloatArray, ...] = ()) -> None:
         self.maneuver, self.horizon, self.ends_early = maneuver, horizon, bool(model)
@@ -202,7 +231,7 @@ class WindowProblem:
         self.terminal_inputs = model or maneuver.terminal_inputs
         self.has_second_order = maneuver.has_second_order and not self.ends_early
         self.n_states, self.n_tangent = maneuver.n_states, maneuver.n_tangent
-        self.n_controls = maneuver.n_controls
+        self.n_controls, self.has_mixed_cost = maneuver.n_controls, maneuver.has_mixed_cost
         self.time_step = maneuver.time_step
         self.initial_state: FloatArray = maneuver.initial_state
 
@@ -226,8 +255,8 @@ class WindowProblem:
         return self.maneuver.kernel(name, batched=batched)
 
     def carried(self, states: FloatArray, parameters: FloatArray) -> FloatArray | None:
-        """See `ArmProblem.carried`."""
-        return self.maneuver.carried(states, parameters)
+        """See `carried_along`, with the present parameters."""
+        return carried_along(self.maneuver.kernels.layout, states, parameters, self.parameters.rows)
 
     def misses(self, state: FloatArray) -> float:
         """See `ArmProblem.misses`; 0 for a window after which the maneuver continues."""

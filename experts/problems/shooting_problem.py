@@ -32,7 +32,7 @@ tangent state z and control u. `retract`, the inverse of `difference`, removes r
 serves guesses of the states, and only problems with `has_retraction` need it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Protocol
 
@@ -67,17 +67,25 @@ class StageParameters:
         inputs: The rows as an array to be read after the state; nothing for a problem without parameters.
     """
 
-    def __init__(self, horizon: int, nominal: ArrayLike = ()) -> None:
+    def __init__(
+        self,
+        horizon: int,
+        nominal: ArrayLike = (),
+        in_stages: Callable[[FloatArray], FloatArray] | None = None,
+    ) -> None:
+        """Begin with nominal values; `in_stages` gives the rows (N + 1, n_p) that follow from the first."""
         self.nominal: FloatArray = np.array(nominal, dtype=np.float64)
         self.rows: FloatArray = np.tile(self.nominal, (horizon + 1, 1))
+        self._in_stages = in_stages
         self.inputs: tuple[FloatArray, ...] = (self.rows,) if self.nominal.size else ()
+        self.set(None)
 
     def checked(self, parameters: ArrayLike | None) -> FloatArray:
         """Return parameters as rows, (N + 1, n_p).
 
         Args:
-            parameters: The same for all stages, shape (n_p,), or one row per stage, (N + 1, n_p); None for
-                the nominal ones.
+            parameters: Those at the start, shape (n_p,), which hold for all stages unless the problem knows
+                how they change; or one row per stage, (N + 1, n_p); None for the nominal ones.
 
         Raises:
             ValueError: If they have another shape or are not finite.
@@ -89,6 +97,8 @@ class StageParameters:
                 "with a row for each stage"
             )
         check_array("parameters", given, given.shape)
+        if self._in_stages is not None and given.ndim == 1:
+            return self._in_stages(given)
         return np.broadcast_to(given, self.rows.shape)
 
     def set(self, parameters: ArrayLike | None) -> None:

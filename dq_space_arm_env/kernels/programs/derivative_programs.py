@@ -76,6 +76,53 @@ class DerivativePrograms:
             hessian[start + index, start + index] += 2.0 * weight
         return gradient, casadi.sparsify(hessian)
 
+    def _twist_residual(self, x: Scalars, u: Scalars) -> tuple[Matrix, Matrix, Matrix]:
+        """Twist of the tip relative to the target, as a function of tangent state z and input; their values.
+
+        The pose moves to second order, by 1 + d / 2 + d^2 / 8 for a twist increment d.
+        """
+        field, n = self.field, len(self.field.pose.directions)
+        z, w = symbols("z", field.n_t), symbols("w", field.n_u)
+        half = dq.from_vector([0.5 * entry for entry in field.pose.full_twist(z[:n])])
+        square = dq.multiply(half, half)
+        turned = [a + 0.5 * b for a, b in zip(half, square, strict=True)]
+        turned[0] = turned[0] + 1.0
+        motion = field.motion([a + b for a, b in zip(self.equations.y(x), z[n:], strict=True)])
+        arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
+        tip = dq.multiply(dq.multiply(self.equations.base_pose(x), turned), arm)
+        rates = field.inputs(w).wrist_rates
+        own, target = self.equations.tip_twist(motion, rates), self.equations.target_twist(tip)
+        residual = column(*(a - b for a, b in zip(own, target, strict=True)))
+        return residual, column(*z, *w), casadi.densify(column(*[0.0] * field.n_t, *u))
+
+    def _twist_cost_derivatives(
+        self, x: Scalars, u: Scalars, field: str, *, exact: bool = False, emphasis: Scalar = 1.0
+    ) -> tuple[Matrix, Matrix]:
+        """Gradient and Hessian, Gauss-Newton's or exact, of a weighted tip twist by tangent state and input."""
+        residual, moved, values = self._twist_residual(x, u)
+        weights = casadi.diag(column(*(2.0 * emphasis * w for w in self.equations.state_weights(field))))
+        jacobian = casadi.jacobian(residual, moved)
+        gradient = casadi.mtimes(jacobian.T, casadi.mtimes(weights, residual))
+        hessian = casadi.mtimes(jacobian.T, casadi.mtimes(weights, jacobian))
+        if exact:
+            factor = casadi.SX.sym("factor", 6)
+            curvature = casadi.hessian(casadi.dot(factor, residual), moved)[0]
+            weighted = casadi.densify(casadi.mtimes(weights, residual))
+            hessian = hessian + casadi.substitute(curvature, factor, weighted)
+        gradient, hessian = casadi.substitute([gradient, hessian], [moved], [values])
+        return gradient, casadi.sparsify(hessian)
+
+    def _held_twist_derivatives(self, x: Scalars, emphasis: Scalar, *, exact: bool) -> tuple[Matrix, Matrix]:
+        """Likewise of the terminal twist, with the wrist held, by the tangent state."""
+        held, n_t = [0.0] * self.field.n_u, self.field.n_t
+        gradient, hessian = self._twist_cost_derivatives(
+            x, held, "terminal_tip_twist", exact=exact, emphasis=emphasis
+        )
+        return gradient[:n_t], hessian[:n_t, :n_t]
+
+    def _has_twist_cost(self, field: str) -> bool:
+        return any(getattr(self.scene.cost, field))
+
     def _stage_weights(self) -> tuple[Scalars, Scalars]:
         weights = self.equations.state_weights
         return weights("pose"), weights("base_velocity")
@@ -92,25 +139,28 @@ class DerivativePrograms:
         field = self.field
         x, u = symbols("x", field.n_x), symbols("u", field.n_u)
         gradient, hessian = self._state_cost_derivatives(x, self._stage_weights())
+        n_t, n_u = field.n_t, field.n_u
         weights = [2.0 * weight for weight in self.equations.control_weights]
+        by_input: Matrix = column(*(weight * value for weight, value in zip(weights, u, strict=True)))
+        squared, mixed = casadi.diag(column(*weights)), zeros(n_u, n_t)
+        if self._has_twist_cost("tip_twist"):
+            slope, curvature = self._twist_cost_derivatives(x, u, "tip_twist")
+            gradient, by_input = gradient + slope[:n_t], by_input + slope[n_t:]
+            hessian = casadi.sparsify(hessian + curvature[:n_t, :n_t])
+            squared = casadi.sparsify(squared + curvature[n_t:, n_t:])
+            mixed = casadi.sparsify(curvature[n_t:, :n_t])
+        matrices = {"lxx": hessian, "luu": squared} | ({"lux": mixed} if mixed.nnz() else {})
         outputs = {
             "lx": casadi.densify(gradient).nonzeros(),
-            "lu": [weight * value for weight, value in zip(weights, u, strict=True)],
-            "lxx": hessian.nonzeros(),
-            "luu": weights,
+            "lu": casadi.densify(by_input).nonzeros(),
+            **{name: entries.nonzeros() for name, entries in matrices.items()},
         }
         graph = graph_of("cost_derivatives_graph", graph_inputs(field, x=x, u=u), outputs)
-        n_t, n_u = field.n_t, field.n_u
-        diagonal = tuple(range(0, n_u * n_u, n_u + 1))
+        buffers = [sparse_buffer(name, entries.sparsity()) for name, entries in matrices.items()]
         program = Program(
             "cost_derivatives",
             program_inputs(field, Buffer("x", field.n_x), Buffer("u", n_u)),
-            [
-                Buffer("lx", n_t),
-                Buffer("lu", n_u),
-                sparse_buffer("lxx", hessian.sparsity()),
-                Buffer("luu", n_u, positions=diagonal, stride=n_u * n_u),
-            ],
+            [Buffer("lx", n_t), Buffer("lu", n_u), *buffers],
         )
         program.call(graph)
         return program
@@ -120,6 +170,9 @@ class DerivativePrograms:
         field = self.field
         x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
         gradient, hessian = self._state_cost_derivatives(x, self._terminal_weights(), emphasis)
+        if self._has_twist_cost("terminal_tip_twist"):
+            slope, curvature = self._held_twist_derivatives(x, emphasis, exact=False)
+            gradient, hessian = gradient + slope, casadi.sparsify(hessian + curvature)
         outputs = {"lx": casadi.densify(gradient).nonzeros(), "lxx": hessian.nonzeros()}
         inputs = graph_inputs(field, x=x, emphasis=[emphasis])
         graph = graph_of("terminal_cost_derivatives_graph", inputs, outputs)
@@ -147,14 +200,18 @@ class DerivativePrograms:
             name = integrator or self.scene.simulation.integrator
             raise ValueError(f"integrator: {name!r} has no second derivatives, which this asks for")
         field = self.field
-        inputs = [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("multiplier", field.n_t)]
-        inputs.append(Buffer("h", 1, shared=True))
-        program = Program("lagrangian_hessian", program_inputs(field, *inputs), [])
+        buffers = [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("multiplier", field.n_t)]
+        buffers.append(Buffer("h", 1, shared=True))
+        program = Program("lagrangian_hessian", program_inputs(field, *buffers), [])
         pattern = method.append_curvature(program, field)
         curvature, x = casadi.SX.sym("curvature", pattern), symbols("x", field.n_x)
         state = self._state_cost_hessian(x, self._stage_weights())
         effort = casadi.diag(column(*(2.0 * weight for weight in self.equations.control_weights)))
-        total = curvature + casadi.triu(casadi.diagcat(state, effort))
+        total, given = curvature + casadi.triu(casadi.diagcat(state, effort)), {"x": x}
+        if self._has_twist_cost("tip_twist"):
+            given["u"] = symbols("u", field.n_u)
+            twist = self._twist_cost_derivatives(x, given["u"], "tip_twist", exact=True)[1]
+            total = total + casadi.triu(twist)
         hessian = casadi.sparsify(casadi.triu2symm(total))
         blocks = {
             "Lxx": hessian[: field.n_t, : field.n_t],
@@ -162,8 +219,8 @@ class DerivativePrograms:
             "Luu": hessian[field.n_t :, field.n_t :],
         }
         outputs = {name: block.nonzeros() for name, block in blocks.items()}
-        given = graph_inputs(field, x=x, curvature=curvature.nonzeros())
-        program.call(graph_of("lagrangian_hessian_graph", given, outputs))
+        inputs = graph_inputs(field, **given, curvature=curvature.nonzeros())
+        program.call(graph_of("lagrangian_hessian_graph", inputs, outputs))
         program.outputs = [sparse_buffer(name, block.sparsity()) for name, block in blocks.items()]
         return program
 
@@ -172,6 +229,8 @@ class DerivativePrograms:
         field = self.field
         x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
         hessian = self._state_cost_hessian(x, self._terminal_weights(), emphasis)
+        if self._has_twist_cost("terminal_tip_twist"):
+            hessian = casadi.sparsify(hessian + self._held_twist_derivatives(x, emphasis, exact=True)[1])
         program = Program(
             "terminal_cost_hessian",
             program_inputs(field, Buffer("x", field.n_x), Buffer("emphasis", 1)),

@@ -13,11 +13,13 @@ from dq_space_arm_env.compiler.graph import Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.integrators import checked_integrator_of, integrator_of
 from dq_space_arm_env.integrators.method import program_inputs
+from dq_space_arm_env.scene.motion import Waypoints
+from dq_space_arm_env.scene.path import PATH
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import number_of_draws
 from dq_space_arm_env.task import episode
 from dq_space_arm_env.task.equations import SceneEquations
-from dq_space_arm_env.task.step_report import MEMORY
+from dq_space_arm_env.task.step_report import memory_names
 
 
 class EnvironmentPrograms:
@@ -45,7 +47,7 @@ class EnvironmentPrograms:
 
     def _observe(self, integrator: str) -> Program:
         """Observations of the present states, without a step, for the listed sub-environments."""
-        sizes = {"x": self.equations.field.n_x, "memory": len(MEMORY)}
+        sizes = {"x": self.equations.field.n_x, "memory": len(memory_names(self.scene))}
         observe = partial(episode.observe, self.equations)
         graph = trace("observe_graph", sizes, observe, parameters=self._parameters)
         inputs = program_inputs(self.equations.field, *(Buffer(name, size) for name, size in sizes.items()))
@@ -68,8 +70,10 @@ class EnvironmentPrograms:
     def _step(self, integrator: str, name: str, actions: str) -> Program:
         """From actions to inputs, motion, observation, reward and end of the episode."""
         equations, simulation = self.equations, self.scene.simulation
-        n_x, n_u, n_memory = equations.field.n_x, equations.field.n_u, len(MEMORY)
-        inputs = Buffer("x", n_x), Buffer("memory", n_memory), Buffer("action", n_u, dtype=actions)
+        n_x, n_u, n_memory = equations.field.n_x, equations.field.n_u, len(memory_names(self.scene))
+        inputs = [Buffer("x", n_x), Buffer("memory", n_memory), Buffer("action", n_u, dtype=actions)]
+        following = {"following": PATH} if isinstance(self.scene.target.motion, Waypoints) else {}
+        inputs += [Buffer(key, size) for key, size in following.items()]
         program = Program(name, program_inputs(equations.field, *inputs), [])
         command = partial(episode.command, equations)
         program.call(trace("inputs_graph", {"action": n_u}, command, parameters=self._parameters))
@@ -77,7 +81,7 @@ class EnvironmentPrograms:
         method = checked_integrator_of(simulation, integrator)
         (method or integrator_of(simulation, integrator)).append_step(program, equations.field)
         sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": n_memory}
-        sizes |= {"checked_error": 1} if method else {}
+        sizes |= ({"checked_error": 1} if method else {}) | following
         report = trace("report_graph", sizes, partial(episode.step, equations), parameters=self._parameters)
         program.call(report)
         program.outputs = _outputs(report)

@@ -12,7 +12,7 @@ from typing import Any
 import casadi
 
 from dq_space_arm_env.algebra import dual_quaternion as dq
-from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.algebra.symbolic import column, zeros
 from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.dynamics import kinematics, minimal
@@ -81,12 +81,8 @@ class RobotPrograms:
         """Twist of the tip."""
 
         def outputs(x: Scalars, u: Scalars) -> Mapping[str, Scalars]:
-            base, arm = self._tip_columns(x)
             motion = self.field.motion(self.equations.y(x))
-            twist = (*motion.angular, *motion.linear)
-            moving = [twist[i] for i in self.field.pose.directions]
-            rates = [*moving, *motion.joint_rates, *self.field.inputs(u).wrist_rates]
-            return {"twist": combined([*base, *arm], rates)}
+            return {"twist": self.equations.tip_twist(motion, self.field.inputs(u).wrist_rates)}
 
         return self._program("tip_twist", outputs, x=self.field.n_x, u=self.field.n_u)
 
@@ -111,10 +107,25 @@ class RobotPrograms:
             rest = self.equations.observe(x, 0.0)["observation"][size:]
             by_y = casadi.jacobian(column(*rest), column(*self.equations.y(x)))
             by_pose = zeros(len(rest), field.n_t - field.n_y)
+            if self.equations.scene.target.motion is not None:
+                by_pose = self._twists_by_pose(x, base, len(rest))
             jacobian = casadi.vertcat(errors, casadi.horzcat(by_pose, by_y))
             return {"jacobian": casadi.densify(jacobian.T).nonzeros()}
 
         return self._program("observation_jacobian", outputs, x=field.n_x)
+
+    def _twists_by_pose(self, x: Scalars, base: Columns, count: int) -> Any:
+        """Derivative of the last entries but one by the base's pose: of relative and target's twist.
+
+        As the tip moves by a twist xi in its axes, the target's twist c in these axes changes by c x xi.
+        """
+        carried = self.equations.target_twist(self.equations.tip(x))
+        directions, columns = self.field.pose.directions, []
+        for twist in base:
+            change = dual_vectors.cross(carried, twist)
+            both = [*(-change[i] for i in directions), *(change[i] for i in directions)]
+            columns.append(column(*[0.0] * (count - len(both) - 1), *both, 0.0))
+        return casadi.horzcat(*columns)
 
     def _tip_columns(self, x: Scalars) -> tuple[Columns, Columns]:
         """The tip's twists per unit of the base's free directions, and of joint rates and Euler rates."""

@@ -23,8 +23,11 @@ from dq_space_arm_env.kernels.programs.derivative_programs import DerivativeProg
 from dq_space_arm_env.kernels.programs.parameter_programs import ParameterPrograms
 from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
 from dq_space_arm_env.kernels.programs.robot_programs import RobotPrograms
+from dq_space_arm_env.scene.parameters import moving_numbers
 from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.task.episode import next_target, with_target
 from dq_space_arm_env.task.equations import SceneEquations, total
+from dq_space_arm_env.task.step_report import n_observations
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -68,6 +71,8 @@ class ScenePrograms:
             "retract": self._retract,
             "measured_step": self._measured_step,
             "observation": self._observation,
+            "relative_twist": self._relative_twist,
+            "next_target": self._next_target,
             "observation_jacobian": robot.observation_jacobian,
             "state_from_observation": self._state_from_observation,
         }
@@ -186,8 +191,8 @@ class ScenePrograms:
 
     def _emphasized_terminal_cost(self) -> Program:
         def outputs(x: Scalars, emphasis: Scalars) -> Mapping[str, Scalars]:
-            pose, velocity = self.equations.terminal_cost_terms(x)
-            return {"cost": [emphasis[0] * pose + velocity]}
+            pose, velocity, *twist = self.equations.terminal_cost_terms(x)
+            return {"cost": [emphasis[0] * total([pose, *twist]) + velocity]}
 
         return self._program("emphasized_terminal_cost", outputs, x=self.field.n_x, emphasis=1)
 
@@ -226,6 +231,23 @@ class ScenePrograms:
             time_left=1,
         )
 
+    def _relative_twist(self) -> Program:
+        """Twist of the tip relative to the target."""
+
+        def outputs(x: Scalars, u: Scalars) -> Mapping[str, Scalars]:
+            return {"twist": self.equations.relative_twist(x, self.field.inputs(u).wrist_rates)}
+
+        return self._program("relative_twist", outputs, x=self.field.n_x, u=self.field.n_u)
+
+    def _next_target(self) -> Program:
+        """From the numbers of a target that moves to those of the next stage."""
+
+        def outputs(x: Scalars) -> Mapping[str, Scalars]:
+            return {"x_next": next_target(with_target(self.equations, x), ())}
+
+        size = len(moving_numbers(self.scene))
+        return self._program("next_target", outputs, varies=False, x=size)
+
     def _state_from_observation(self) -> Program:
         field, state = self.field, self.layout.state
         n_pose = len(field.pose.stored)
@@ -246,7 +268,7 @@ class ScenePrograms:
             x[:n_pose] = field.pose.reduced(dq.multiply(tip, dq.conjugate(arm)))
             return {"x": x}
 
-        return self._program("state_from_observation", outputs, observation=field.n_x + 1)
+        return self._program("state_from_observation", outputs, observation=n_observations(self.scene))
 
     # Steps.
 

@@ -1,0 +1,118 @@
+"""Motions of the target's body: along a screw, tumbling freely, or through given poses."""
+
+import csv
+import math
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from dq_space_arm_env.common.bounded_reading import UnreadableError, read_text
+from dq_space_arm_env.scene.bodies import Inertia
+from dq_space_arm_env.scene.pose import Pose
+from dq_space_arm_env.validation.fields import MOST_WAYPOINTS, Finite, Rates3
+from dq_space_arm_env.validation.problems import Model, Problem, problem
+
+FILE_COLUMNS = ("time", "q_w", "q_x", "q_y", "q_z", "x", "y", "z")
+"""Columns of a file of poses: s, the rotation as unit quaternion, the position in m."""
+
+
+class ScrewMotion(Model):
+    """A constant twist: rotation about a fixed axis, and translation along it."""
+
+    kind: Literal["screw"] = Field(description="'screw'")
+    angular_velocity: Rates3 = Field(
+        default=(0.0, 0.0, 0.0), description="angular velocity of the body, body axes, rad/s"
+    )
+    linear_velocity: Rates3 = Field(
+        default=(0.0, 0.0, 0.0), description="velocity of the body's origin, body axes, m/s"
+    )
+
+
+class Tumbling(Model):
+    """A free rigid body whose frame has its origin at the center of mass."""
+
+    kind: Literal["tumbling"] = Field(description="'tumbling'")
+    inertia: Inertia = Field(
+        description="inertia about the center of mass, body axes, in any unit: its scale does not matter; "
+        "3 numbers (diagonal) or 3x3"
+    )
+    angular_velocity: Rates3 = Field(
+        default=(0.0, 0.0, 0.0), description="angular velocity at the start, body axes, rad/s"
+    )
+    linear_velocity: Rates3 = Field(
+        default=(0.0, 0.0, 0.0), description="velocity of the center of mass, inertial axes, m/s"
+    )
+
+
+class Waypoint(Model):
+    """A pose at a time."""
+
+    time: Finite = Field(description="time from the start of the episode, s")
+    pose: Pose = Field(description="pose of the body in the inertial frame, m")
+
+
+class Waypoints(Model):
+    """Given poses, with a screw motion of constant twist between neighbors, and rest before and after.
+
+    From the target's pose at the start the body moves as the given poses do from theirs: to pass through
+    them, it starts at theirs.
+    """
+
+    kind: Literal["waypoints"] = Field(description="'waypoints'")
+    points: tuple[Waypoint, ...] = Field(
+        description="poses with their times, in order; at least one; a `file` of them is read into this list"
+    )
+
+    def _problems(self) -> Iterator[Problem]:
+        if not 1 <= len(self.points) <= MOST_WAYPOINTS:
+            sentence = f"has {len(self.points)} poses; must have from 1 to {MOST_WAYPOINTS:,}"
+            yield Problem(("points",), len(self.points), sentence)
+        for index, (before, after) in enumerate(zip(self.points, self.points[1:], strict=False)):
+            if after.time <= before.time:
+                sentence = f"must be later than the time before it, {before.time:g} s"
+                yield Problem(("points", index + 1, "time"), after.time, sentence)
+
+
+_KINDS: dict[str, type[Model]] = {"screw": ScrewMotion, "tumbling": Tumbling, "waypoints": Waypoints}
+
+
+def _read_motion(value: Any) -> Any:
+    """Read a motion by its kind; a file of poses becomes waypoints."""
+    if isinstance(value, tuple(_KINDS.values())) or value is None:
+        return value
+    kind = value.get("kind") if isinstance(value, dict) else None
+    if kind == "file":
+        return _read_file(value)
+    if kind not in _KINDS:
+        raise problem(f"must be a mapping whose kind is one of {', '.join(_KINDS)}, file; or absent: at rest")
+    return _KINDS[kind].model_validate(value)
+
+
+def _read_file(value: dict[str, Any]) -> Waypoints:
+    """Read poses from a text file with a header line, columns `FILE_COLUMNS`, separated by commas."""
+    others = sorted(set(value) - {"kind", "path"})
+    path = value.get("path")
+    if others or not isinstance(path, str | Path):
+        raise problem("must have a kind, file, and a path, that of a file of poses; nothing else")
+    try:
+        rows = list(csv.reader(StringIO(read_text(Path(path)))))
+    except (OSError, UnreadableError, csv.Error) as error:
+        raise problem(f"cannot be read: {error}") from error
+    if not rows or tuple(name.strip() for name in rows[0]) != FILE_COLUMNS:
+        raise problem(f"the first line of {path} must be {','.join(FILE_COLUMNS)}")
+    points = []
+    for number, row in enumerate(rows[1:], start=2):
+        try:
+            time, *pose = (float(entry) for entry in row)
+        except ValueError:
+            pose, time = [], math.nan
+        if len(pose) != len(FILE_COLUMNS) - 1:
+            raise problem(f"line {number} of {path} must be {len(FILE_COLUMNS)} numbers")
+        points.append({"time": time, "pose": {"rotation": pose[:4], "position": pose[4:]}})
+    return Waypoints.model_validate({"kind": "waypoints", "points": points})
+
+
+Motion = Annotated[ScrewMotion | Tumbling | Waypoints, BeforeValidator(_read_motion)]

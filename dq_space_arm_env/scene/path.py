@@ -1,0 +1,108 @@
+"""Path of the target's body through an episode: pose q_{T/I} and velocity in body axes, stage by stage.
+
+The target moves without us: its path is data, no state. A target on a screw or tumbling is advanced from
+stage to stage by the same equations everywhere (`advanced`); waypoints are interpolated once (`given_path`).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import dual_vectors, poses, quaternion, rotations, screw
+from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale, transposed_matrix_vector
+from dq_space_arm_env.scene.motion import ScrewMotion, Tumbling, Waypoints
+from dq_space_arm_env.scene.pose import Matrix3
+
+Scene = Any  # `schema.Scene`, whose parameters are found by this file
+Scalar = Any
+Scalars = Sequence[Scalar]
+Array = NDArray[np.float64]
+
+PATH = 14
+"""Numbers of pose and velocity."""
+
+
+def first_velocity(scene: Scene) -> tuple[float, ...]:
+    """Velocity of the body at the start in its own axes, angular then linear, rad/s and m/s."""
+    target, motion = scene.target, scene.target.motion
+    if isinstance(motion, Waypoints):
+        return tuple(given_path(scene, 0)[0, 8:].tolist())
+    if isinstance(motion, Tumbling):
+        linear = transposed_matrix_vector(rotations.to_matrix(target.pose.rotation), motion.linear_velocity)
+        return (*motion.angular_velocity, *linear)
+    if isinstance(motion, ScrewMotion):
+        return (*motion.angular_velocity, *motion.linear_velocity)
+    return (0.0,) * 6
+
+
+def advanced(
+    motion: ScrewMotion | Tumbling, pose: Scalars, velocity: Scalars, h: Scalar
+) -> tuple[Scalars, Scalars]:
+    """Pose and velocity of the body after h seconds, from those before; over plain scalars."""
+    if isinstance(motion, ScrewMotion):
+        return dq.multiply(pose, screw.exponential(dual_vectors.scale(h, velocity))), velocity
+    rotation, position = poses.to_rotation_and_position(pose)
+    linear = matrix_vector(rotations.to_matrix(rotation), velocity[3:])
+    turned, angular = _turned(motion.inertia, velocity[:3], h)
+    attitude = quaternion.multiply(rotation, rotations.exponential(turned))
+    moved = poses.from_rotation_and_position(attitude, add(position, scale(h, linear)))
+    return moved, (*angular, *transposed_matrix_vector(rotations.to_matrix(attitude), linear))
+
+
+def _turned(inertia: Matrix3, angular: Scalars, h: Scalar) -> tuple[Scalars, Scalars]:
+    """Rotation vector and angular velocity of a free rigid body after h seconds, to fourth order.
+
+    Runge and Kutta's method on the rotation vector, phi' = w + phi x w / 2 + phi x (phi x w) / 12 (Munthe-
+    Kaas), and on Euler's equations, J w' = J w x w.
+    """
+    inverse = np.linalg.inv(np.array(inertia)).tolist()
+
+    def rates(vector: Scalars, w: Scalars) -> tuple[Scalars, Scalars]:
+        once = cross(vector, w)
+        turning = add(w, add(scale(0.5, once), scale(1.0 / 12.0, cross(vector, once))))
+        return turning, matrix_vector(inverse, cross(matrix_vector(inertia, w), w))
+
+    start = (0.0, 0.0, 0.0), tuple(angular)
+    slopes: list[tuple[Scalars, Scalars]] = []
+    for share in (0.0, 0.5, 0.5, 1.0):
+        vector, w = start
+        if slopes:
+            vector, w = scale(share * h, slopes[-1][0]), add(w, scale(share * h, slopes[-1][1]))
+        slopes.append(rates(vector, w))
+    sums = []
+    for first, second, third, fourth in zip(*slopes, strict=True):
+        middle = scale(2.0, add(second, third))
+        sums.append(scale(h / 6.0, add(add(first, fourth), middle)))
+    return sums[0], add(angular, sums[1])
+
+
+def given_path(scene: Scene, steps: int) -> Array:
+    """Pose relative to that at the start, and velocity, of a body that passes waypoints.
+
+    Between two waypoints the twist is constant (ScLERP), before the first and after the last it is zero. The
+    sign of the quaternion is carried along by continuity.
+
+    Returns numbers at the stages 0 to `steps`, shape (steps + 1, 14).
+    """
+    points = scene.target.motion.points
+    known = np.array([point.time for point in points])
+    pose = np.array([point.pose.dual_quaternion for point in points]).T
+    if len(points) > 1:
+        overlaps = np.sum(pose[:4, 1:] * pose[:4, :-1], axis=0)
+        pose[:, 1:] *= np.cumprod(np.where(overlaps < 0.0, -1.0, 1.0))
+    durations = np.diff(known, append=known[-1] + 1.0)
+    following = np.concatenate([pose[:, 1:], pose[:, -1:]], axis=1)
+    ways = np.array(screw.logarithm(dq.multiply(dq.conjugate(tuple(pose)), tuple(following)))) / durations
+    times = scene.simulation.dt * np.arange(steps + 1)
+    near = 1e-9 * scene.simulation.dt  # the last pose is passed, not rested at
+    index = np.clip(np.searchsorted(known, times + near, side="right") - 1, 0, max(len(points) - 2, 0))
+    inside = (times > known[0] - near) & (times < known[-1] + near)
+    velocity = np.where(inside, ways[:, index], 0.0)
+    elapsed = np.clip(times, known[0], known[-1]) - known[index]
+    moved = screw.exponential(dual_vectors.scale(elapsed, tuple(ways[:, index])))
+    path = dq.multiply(tuple(pose[:, index]), tuple(np.broadcast_to(each, times.shape) for each in moved))
+    path = dq.multiply(dq.conjugate([each[0] for each in path]), path)
+    return np.concatenate([np.stack(path), velocity]).T
