@@ -32,6 +32,7 @@ from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.common.worker_process import WorkerLostError, WorkerProcess
 from dq_space_arm_env.kernels import Kernels
+from dq_space_arm_env.task.step_report import n_observations
 from experts.ddp.solution import StopReason
 from experts.demonstrations import Demonstrations, DemonstrationsError, load_demonstrations
 from experts.demonstrations.folder import MANIFEST, SETTINGS, SHARDS
@@ -62,12 +63,13 @@ def read_from_minari(dataset_id: str, folder: Path) -> Demonstrations:
         return load_demonstrations(folder, verify=True)
     shutil.rmtree(folder / SHARDS, ignore_errors=True)  # of an interrupted run
     (folder / SHARDS).mkdir(parents=True)
-    shapes = _shapes(Demonstrations(folder, settings, {"shards": [], "demonstrations": 0}).kernels)
+    kernels = Demonstrations(folder, settings, {"shards": [], "demonstrations": 0}).kernels
+    shapes = _shapes(kernels), kernels.parameters.moving
     shards = []
     with closing(WorkerProcess(quiet=True)) as worker:
         for number, first in enumerate(range(0, count, SHARD_SIZE)):
             episodes = range(first, min(first + SHARD_SIZE, count))
-            worker.assign(packed_episodes, place / "main_data.hdf5", episodes, shapes)
+            worker.assign(packed_episodes, place / "main_data.hdf5", episodes, *shapes)
             with _damage_named(dataset_id):
                 content = worker.answer()
             digest = hashlib.sha256(content).hexdigest()
@@ -146,7 +148,7 @@ def _shapes(kernels: Kernels) -> Shapes:
     varied = {f"infos/{PARAMETERS}": (n + 1, kernels.n_p)} if kernels.n_p else {}
     return {
         **varied,
-        "observations": (n + 1, kernels.n_x + 1),
+        "observations": (n + 1, n_observations(kernels.scene)),
         "actions": (n, n_u),
         "rewards": (n,),
         "infos/state": (n + 1, kernels.n_x),
@@ -154,8 +156,13 @@ def _shapes(kernels: Kernels) -> Shapes:
     }
 
 
-def packed_episodes(path: Path, episodes: Sequence[int], shapes: Shapes) -> bytes:
-    """Read episodes of an HDF5 file, and pack them as a shard, see `experts.demonstrations.shard`."""
+def packed_episodes(
+    path: Path, episodes: Sequence[int], shapes: Shapes, moving: tuple[int, ...] = ()
+) -> bytes:
+    """Read episodes of an HDF5 file, and pack them as a shard, see `experts.demonstrations.shard`.
+
+    The parameters `moving` change from row to row; those of the first row are kept.
+    """
     import h5py
 
     open_regular(path, ANY_SIZE).close()
@@ -177,7 +184,7 @@ def packed_episodes(path: Path, episodes: Sequence[int], shapes: Shapes) -> byte
     }
     content = {
         "states": arrays.pop("infos/state"),
-        **_varied(arrays.pop(f"infos/{PARAMETERS}", None)),
+        **_varied(arrays.pop(f"infos/{PARAMETERS}", None), moving),
         **arrays,
         GAINS: gains[:, :-1].astype(np.float32),
         "index": np.array([_number(each, "problem") for each in facts], dtype=np.int64),
@@ -229,11 +236,12 @@ def _number(facts: dict[str, Any], name: str) -> np.number[Any]:
     return value
 
 
-def _varied(parameters: NDArray[np.float64] | None) -> dict[str, NDArray[Any]]:
-    """Parameters of episodes, (M, N + 1, n_p), as a column, and none of failures; nothing without any."""
+def _varied(parameters: NDArray[np.float64] | None, moving: tuple[int, ...]) -> dict[str, NDArray[Any]]:
+    """Parameters of episodes at their start, (M, n_p), from (M, N + 1, n_p), and none of failures."""
     if parameters is None:
         return {}
-    if not (parameters == parameters[:, :1]).all():
+    constant = np.delete(parameters, moving, axis=2)
+    if not (constant == constant[:, :1]).all():
         raise UnreadableError("infos/parameters: should be the same in every row of an episode")
     return {PARAMETERS: parameters[:, 0], f"failures.{PARAMETERS}": np.zeros((0, parameters.shape[-1]))}
 

@@ -8,6 +8,7 @@ import numpy as np
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.path import target_path, target_pose
 from dq_space_arm_env.viewing.replay.flights import frame_poses
 from experts.problems.shooting_problem import FloatArray
 
@@ -60,10 +61,17 @@ class Maneuver:
         return frame_poses(self.scene, StateLayout.of(self.scene), self.states)
 
     @cached_property
+    def target(self) -> tuple[FloatArray, ...] | tuple[float, ...]:
+        """Pose q_{D/I} of the target at the states, 8 numbers, or 8 of shape (N + 1,) where it moves."""
+        if self.scene.target.motion is None:
+            return target_pose(self.scene)
+        return tuple(target_path(self.scene)[: len(self.states)].T)
+
+    @cached_property
     def error_pose(self) -> FloatArray:
         """Error dual quaternion q_{D/G} (31), shape (N + 1, 8), dimensionless and m."""
         tip = tuple(self.frames[:, -1].T)
-        return np.stack(poses.error_pose(tip, self.scene.target.pose.dual_quaternion), axis=1)
+        return np.stack(poses.error_pose(tip, self.target), axis=1)
 
     @cached_property
     def position_error(self) -> FloatArray:
@@ -79,7 +87,7 @@ class Maneuver:
     def angle(self) -> FloatArray:
         """Euler angle of the attitude error, shape (N + 1,), rad."""
         tip = tuple(self.frames[:, -1].T)
-        return np.asarray(poses.error_angle(tip, self.scene.target.pose.dual_quaternion))
+        return np.asarray(poses.error_angle(tip, self.target))
 
     @cached_property
     def actuators(self) -> tuple[ActuatorHistory, ...]:

@@ -23,6 +23,7 @@ from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.pose import PLANAR_POSE
+from dq_space_arm_env.task.step_report import n_observations
 from experts.ddp.shooting import ShootingWorkspace, line_search
 from experts.ddp.solution import Policy, Solution, StopReason
 from experts.guesses.guided import GuidedDDP
@@ -104,7 +105,8 @@ class RecedingHorizonExpert:
 
     Observations of `DQSpaceArm-v0` reveal the stage by the time left; the first one, and any with no less
     time left than the last, begins a new episode. States do not reveal it: calls are counted, and `reset`
-    begins an episode. A state has n_x entries, an observation one more. Poses are normalized.
+    begins an episode. A state has n_x entries, an observation n_obs, one more, or 13 more where the target
+    moves. Poses are normalized.
 
     A measurement that is no state, with numbers that are not finite or a zero quaternion, is an error where
     an episode begins. Within an episode the expert flies on: the state that its last solution predicts for
@@ -163,7 +165,7 @@ class RecedingHorizonExpert:
         """Begin an episode.
 
         Args:
-            observation_or_state: Its start, shape (n_x + 1,) or (n_x,), to plan now; None plans in the next
+            observation_or_state: Its start, shape (n_obs,) or (n_x,), to plan now; None plans in the next
                 call.
             parameters: What varies in the scene, shape (n_p,), or a row for each stage and the end, (N + 1,
                 n_p), entries as in `kernels.parameters`; None for nominal ones.
@@ -189,7 +191,8 @@ class RecedingHorizonExpert:
         """Take other parameters in mid-flight, a new target or mass; the next call plans the rest anew.
 
         Args:
-            parameters: See `reset`.
+            parameters: See `reset`; with a row for each stage, the motion of a target as it is measured and
+                predicted now.
 
         Raises:
             ValueError: If they have another shape or are not finite.
@@ -201,7 +204,7 @@ class RecedingHorizonExpert:
         """Choose an action.
 
         Args:
-            observation_or_state: Observation, shape (n_x + 1,), or state, shape (n_x,).
+            observation_or_state: Observation, shape (n_obs,), or state, shape (n_x,).
 
         Returns:
             Inputs as fractions of their limits, in [-1, 1], shape (n_u,).
@@ -242,12 +245,12 @@ class RecedingHorizonExpert:
 
     def _checked(self, observation_or_state: ArrayLike) -> FloatArray:
         """Return an observation or a state, or raise for another shape; its numbers may be wrong."""
-        n_states = self.maneuver.n_states
+        n_states, size = self.maneuver.n_states, n_observations(self.maneuver.scene)
         given = real_array("observation_or_state", observation_or_state, np.float64)
-        if given.shape not in ((n_states,), (n_states + 1,)):
+        if given.shape not in ((n_states,), (size,)):
             raise ValueError(
                 f"observation_or_state has shape {given.shape}; expected a state, ({n_states},), or "
-                f"an observation, ({n_states + 1},)"
+                f"an observation, ({size},)"
             )
         return given
 
@@ -264,7 +267,7 @@ class RecedingHorizonExpert:
         if not 0 <= stage < maneuver.horizon:
             duration = maneuver.horizon * maneuver.time_step
             raise ValueError(
-                f"observation[{maneuver.n_states}], the time left, is {time_left} s; an episode of scene "
+                f"observation[{len(given) - 1}], the time left, is {time_left} s; an episode of scene "
                 f"{maneuver.scene.name!r} lasts {duration:g} s"
             )
         return stage

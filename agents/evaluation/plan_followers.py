@@ -78,7 +78,13 @@ def onboard_follower(scene: Scene, *, feedback: bool) -> Callable[[NDArray[Any]]
     solution = expert_of(problem.scene).solver.solve()
     policy, actions, stages = solution.policy(problem), to_action(solution.controls), count()
     if feedback:
-        return lambda seen: to_action(policy(kernels.state_from_observation(seen), next(stages)))
+        rows = problem.parameters.rows
+
+        def act(seen: NDArray[Any]) -> FloatArray:
+            stage = next(stages)
+            return np.asarray(to_action(policy(kernels.state_from_observation(seen, p=rows[stage]), stage)))
+
+        return act
     return lambda seen: np.asarray(actions[next(stages)])
 
 

@@ -37,7 +37,7 @@ def label_by_gains(demonstrations: Demonstrations, visits: Rollout) -> Correctio
                 visits.observations[i, steps],
                 np.clip(wanted, -1.0, 1.0),
                 np.where(free[:, :, None], gains, np.float32(0.0)),
-                np.tile(demonstration.parameters, (len(states), 1)),
+                demonstrations.kernels.stage_parameters(demonstration.parameters)[steps],
             )
         )
     return Corrections.joined(parts)
@@ -94,11 +94,12 @@ class Solver:
         maneuver, parameters = self._maneuver, demonstration.parameters
         limits = self._kernels.layout.limits_with(parameters)
         maneuver.parameters.set(parameters)  # its end is that of the window
+        rows = maneuver.parameters.rows[stage:]
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         guess = self._followed(demonstration, state, stage, limits) * limits
         # The demonstration's own weight on the final pose: without it some plans miss the target.
         with maneuver.emphasized(float(demonstration.facts["emphasis"])):
-            solution = BoxDDP(problem).solve(x0=state, u_init=guess, parameters=parameters)
+            solution = BoxDDP(problem).solve(x0=state, u_init=guess, parameters=rows)
         if not solution.converged:
             return None
         steps = slice(0, end - stage)
@@ -107,10 +108,10 @@ class Solver:
         gains = solution.feedback_gains[steps] / limits[:, None]
         return Corrections(
             states,
-            self._kernels.observation(states, left[:, None], p=parameters)[0],
+            self._kernels.observation(states, left[:, None], p=rows[steps])[0],
             solution.controls[steps] / limits,
             gains.astype(np.float32),
-            np.tile(parameters, (len(states), 1)),
+            rows[steps].copy(),
         )
 
     def _followed(

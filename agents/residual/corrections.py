@@ -12,6 +12,7 @@ from agents.evaluation.plans import FloatArray, Followed, Plans
 from agents.policies import ExportedPolicy
 from dq_space_arm_env import Kernels, Scene, compile_scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
+from dq_space_arm_env.task.step_report import n_observations
 
 SMALL = 0.02
 """Deviations below this size are observed nearly linearly, rad, m, rad/s, m/s."""
@@ -34,15 +35,20 @@ class CorrectionObserver:
         self._share = min(1.0, self._dt / memory)
         self.average: FloatArray | None = None
         self._parameters: FloatArray | None = None
+        self._stages: FloatArray | None = None
 
     @staticmethod
     def size(kernels: Kernels) -> int:
         """Entries of an observation."""
-        return kernels.n_x + 1 + 2 * kernels.n_t + kernels.n_u
+        return n_observations(kernels.scene) + 2 * kernels.n_t + kernels.n_u
 
     def reset(self, parameters: FloatArray | None = None) -> None:
         """Clear the average; what varies in the plans' scene, shape (B, n_p), is nominal unless given."""
         self.average, self._parameters = None, parameters
+        self._stages = None  # parameters by stage, shape (B, N + 1, n_p), of targets that move
+        if self._kernels.parameters.moving:
+            known = [None] if parameters is None else list(parameters)
+            self._stages = np.stack([self._kernels.stage_parameters(each) for each in known])
 
     def authority(self) -> FloatArray:
         """Share of corrections that counts, in [0, 1], shape (B, 1): it grows with the averaged deviation."""
@@ -56,7 +62,8 @@ class CorrectionObserver:
             self.average = np.zeros_like(followed.deviation)
         self.average += self._share * (followed.deviation - self.average)
         time_left = np.full((len(measured), 1), (self._steps - stage) * self._dt)
-        seen = self._kernels.observation(measured, time_left, p=self._parameters)[0]
+        parameters = self._parameters if self._stages is None else self._stages[:, stage]
+        seen = self._kernels.observation(measured, time_left, p=parameters)[0]
         deviations = (np.arcsinh(each / SMALL) for each in (followed.deviation, self.average))
         parts = (seen, *deviations, followed.action)
         return np.concatenate(parts, axis=1).astype(np.float32)

@@ -24,8 +24,8 @@ from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_s
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene, load_scene
-from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.scene.path import given_path
+from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.task.step_report import MEMORY, OBSERVATION_LIMIT, REPORT, report_names
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 
@@ -236,7 +236,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self._memory = arrays["memory"]
         self._parameters = arrays.get("parameters", np.zeros(0, dtype=self.kernels.dtype))
         self._path = given_path(self.scene, self.scene.simulation.steps) if "following" in arrays else None
-        self._following = arrays.get("following")
+        self._following = arrays.get("following", np.zeros(0))
         self._observation, self._report, self._flags = (
             arrays[name] for name in ("observation", "report", "flags")
         )

@@ -69,6 +69,9 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
     | 17-19 | velocity of the base's center of mass, base axes                      | -1e6 | 1e6 | m/s   |
     | 20-22 | rates of joints 1 to 3                                                | -1e6 | 1e6 | rad/s |
 
+    Where the target moves, its twist in its own axes follows, 6 entries in rad/s and m/s, and `desired_goal` is its pose now. A relabeled goal stands for a target
+    that passes there; velocities count in no reward of this environment, nor in its `is_success`.
+
     q and -q are the same pose. At reset the sign of `achieved_goal`, and with it that of the base's pose, is chosen such that its real part has a non-negative product
     with that of `desired_goal`; it is then carried along by continuity. Rewards do not depend on the sign of either goal.
 
@@ -167,10 +170,13 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
         self.scene, self.kernels = self._env.scene, self._env.kernels
         self.reward_type, self.render_mode = reward_type, render_mode
         self.metadata = self._env.metadata
+        self._twist_size = 6 if self.scene.target.motion is not None else 0
         self.action_space = self._env.action_space
         self.observation_space: spaces.Space[Any] = spaces.Dict(
             {
-                "observation": self._box(self.kernels.n_x, 2 if self.kernels.layout.planar else 4),
+                "observation": self._box(
+                    self.kernels.n_x + self._twist_size, 2 if self.kernels.layout.planar else 4
+                ),
                 "achieved_goal": self._box(8, 4),
                 "desired_goal": self._box(8, 4),
             }
@@ -272,8 +278,11 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
         return observation, reward, False, self._truncated, self._judged(info, comparison)
 
     def _observe(self) -> Observation:
-        x = self._env.state
-        return {"observation": x, "achieved_goal": self.kernels.tip_pose(x), "desired_goal": self._env.target}
+        x, parameters = self._env.state, self._env.stage_parameters
+        layout = self.kernels.layout
+        seen = np.append(x, layout.target_velocity_with(parameters)) if self._twist_size else x
+        goals = {"achieved_goal": self.kernels.tip_pose(x), "desired_goal": layout.target_with(parameters)}
+        return {"observation": seen, **goals}
 
     def _judged(self, info: dict[str, Any], comparison: _Comparison) -> dict[str, Any]:
         """Make `info` agree with the reward about the goal, to the last bit."""

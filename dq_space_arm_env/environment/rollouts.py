@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances
 from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
+from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.task.trajectory import Trajectory
 
@@ -60,7 +61,7 @@ class Rollout:
         scene: The scene.
         seeds: Of the episodes; None if they began at given states.
         parameters: What varies, as drawn or given, shape (B, n_p), units of the parameters.
-        targets: Poses q_{D/I}, shape (B, 8), dimensionless and m.
+        targets: Poses q_{D/I}, at the start where they move, shape (B, 8), dimensionless and m.
         rewards: Shape (B, N), dimensionless; zero after the end of an episode.
         cost_terms: Sums of the terms of the cost by their names in `info`, shape (B,) each, dimensionless.
         length: Steps flown, shape (B,); all of the scene's unless the simulation diverged.
@@ -111,14 +112,18 @@ class Rollout:
         """The record of one episode, whose states must have been recorded."""
         if self.states is None or self.controls is None:
             raise ValueError("the rollout has no states: call rollout(..., record=True)")
-        steps = int(self.length[episode])
+        steps, target = int(self.length[episode]), self.targets[episode]
+        if self.scene.target.motion is not None:
+            kernels = compile_scene(self.scene)
+            stages = kernels.stage_parameters(self.parameters[episode])[: steps + 1]
+            target = kernels.layout.target_with(stages)
         return Trajectory(
             label=label,
             states=self.states[episode, : steps + 1],
             controls=self.controls[episode, :steps],
             noise=None if self.noise is None else self.noise[episode, :steps],
             rewards=self.rewards[episode, :steps],
-            target=self.targets[episode],
+            target=target,
             scene=self.scene,
             start=start,
             seed=None if self.seeds is None else self.seeds[episode],

@@ -139,7 +139,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
 
     @property
     def targets(self) -> Array:
-        """Poses q_{D/I} of the targets now, shape (num_envs, 8), real part dimensionless, dual part m; a copy."""
+        """Poses q_{D/I} of the targets now, shape (num_envs, 8), dimensionless and m; a copy."""
         return self.kernels.layout.target_with(self.stage_parameters)
 
     @property

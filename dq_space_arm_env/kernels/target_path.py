@@ -14,11 +14,11 @@ from dq_space_arm_env.scene.parameters import target_entries, velocity_entries
 from dq_space_arm_env.scene.path import given_path
 
 if TYPE_CHECKING:
-    from dq_space_arm_env.kernels.kernels import Kernels
+    from dq_space_arm_env.kernels.library import KernelLibrary
 
 
-def target_path(kernels: Kernels, start: NDArray[Any]) -> NDArray[Any]:
-    """Pose and velocity of the target's body from those at the start, the numbers that vary, a row a stage."""
+def target_path(kernels: KernelLibrary, start: NDArray[Any]) -> NDArray[Any]:
+    """Pose and velocity of the target's body from those at the start: what varies of them, a row a stage."""
     scene, steps = kernels.scene, kernels.scene.simulation.steps
     if not isinstance(scene.target.motion, Waypoints):
         return walk(kernels.kernel("next_target", lanes=1), start, {}, {}, steps)

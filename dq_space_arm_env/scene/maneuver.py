@@ -79,7 +79,7 @@ class Target(Model):
     motion: Motion | None = Field(
         default=None,
         exclude_if=lambda motion: motion is None,
-        description="motion of the target's body, of a kind: screw, tumbling, waypoints or file; absent: rest",
+        description="motion of the target's body, by its kind: screw, tumbling, waypoints, file; absent: rest",
     )
     base_velocity: Twist = Field(
         default=_ZERO_TWIST,
@@ -106,14 +106,14 @@ class Cost(Model):
     tip_twist: StateWeights6 = Field(
         default=(0.0,) * 6,
         exclude_if=lambda weights: not any(weights),
-        description="running weight on the tip's twist relative to the target, tip axes, angular then linear, "
-        "the wrist's rates included: one number or 6",
+        description="running weight on the tip's twist relative to the target (tip axes, angular then linear), "
+        "with the wrist's rates: one number or 6",
     )
     terminal_tip_twist: StateWeights6 = Field(
         default=(0.0,) * 6,
         exclude_if=lambda weights: not any(weights),
-        description="terminal weight on the tip's twist relative to the target with the wrist held, tip axes, "
-        "angular then linear: one number or 6",
+        description="terminal weight on the tip's twist relative to the target (tip axes, angular then linear), "
+        "with the wrist held: one number or 6",
     )
     base_force: ControlWeights3 = Field(
         default=(10.0,) * 3, description="weight on the base force, 1/N^2: one number or 3"

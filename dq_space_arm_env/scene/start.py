@@ -115,7 +115,7 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     angular = spread_out(start.base_velocity[:3], spread.base_angular_velocity, turning)
     linear = spread_out(start.base_velocity[3:], spread.base_linear_velocity, moving)
     joint_rates: Sequence[Scalar] = spread_out(start.joint_rates, spread.joint_rates, joints)
-    target = scene.target.pose.dual_quaternion
+    target: Sequence[Scalar] = scene.target.pose.dual_quaternion
     drawn: dict[str, Scalar] = {}
 
     def spread_out_pose(nominal: Pose, half_angle: float, half_width: float) -> tuple[Scalar, ...]:
@@ -131,7 +131,8 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
         drawn |= {number.name: factor * number.nominal for number in numbers}
     motion = scene.target.motion
     if isinstance(motion, ScrewMotion | Tumbling):
-        turning_rate, speed = motion.angular_velocity, motion.linear_velocity
+        turning_rate: Sequence[Scalar] = motion.angular_velocity
+        speed: Sequence[Scalar] = motion.linear_velocity
         if has_velocity_spread(scene):
             turning_rate = spread_out(turning_rate, spread.target_angular_velocity, turning)
             speed = spread_out(speed, spread.target_linear_velocity, moving)
@@ -139,7 +140,7 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
             speed = transposed_matrix_vector(rotations.to_matrix(target[:4]), speed)
         velocity = (*turning_rate, *speed)
         drawn |= {number.name: velocity[index] for number, index in _indexed_velocity(scene)}
-    grasp = scene.target.grasp.dual_quaternion
+    grasp: Sequence[Scalar] = scene.target.grasp.dual_quaternion
     if has_grasp_spread(scene):
         grasp = spread_out_pose(scene.target.grasp, spread.grasp_rotation, spread.grasp_position)
         drawn |= {number.name: grasp[index] for number, index in _indexed_grasp(scene)}
@@ -188,12 +189,12 @@ def episode_scene(scene: Scene, values: Sequence[float]) -> Scene:
             }
     motion = scene.target.motion
     if isinstance(motion, ScrewMotion | Tumbling):
-        linear: Sequence[float] = velocity[3:]
+        linear = velocity[3:]
         if isinstance(motion, Tumbling):
-            linear = matrix_vector(rotations.to_matrix(target[:4]), linear)
+            linear = list(matrix_vector(rotations.to_matrix(target[:4]), linear))
         changes["target.motion"] = motion.model_dump() | {
             "angular_velocity": velocity[:3],
-            "linear_velocity": [*linear],
+            "linear_velocity": linear,
         }
     return scene.replace(changes)
 

@@ -138,12 +138,13 @@ def with_target(equations: SceneEquations, target: Scalars) -> SceneEquations:
 
 
 def next_target(equations: SceneEquations, start: Scalars, following: Scalars = ()) -> list[Scalar]:
-    """Pose and velocity of the target's body a step later, the numbers that vary; `start` is its first pose."""
+    """Pose and velocity of the target's body a step later, from its first pose; the numbers that vary."""
     scene, motion = equations.scene, equations.scene.target.motion
     if motion is None:
         return []
     if isinstance(motion, Waypoints):
-        pose, velocity = dq.multiply(start, following[:8]), following[8:]
+        pose: Scalars = dq.multiply(start, following[:8])
+        velocity = following[8:]
     else:
         now = body_pose(scene, equations.given), body_velocity(scene, equations.given)
         pose, velocity = advanced(motion, *now, scene.simulation.dt)
@@ -162,8 +163,8 @@ def tip_errors(equations: SceneEquations, x: Scalars, errors: Scalars) -> list[S
 def is_success(scene: Scene, errors: Scalars) -> Scalar:
     """Whether the tip is within the scene's tolerances, as far as errors are given."""
     success = scene.success
-    largest = (success.attitude_error_deg, success.position_error)
-    largest += (success.angular_velocity_error_deg, success.velocity_error)
+    largest = [success.attitude_error_deg, success.position_error]
+    largest += [success.angular_velocity_error_deg, success.velocity_error]
     met: Scalar = None
     for error, most in zip(errors, largest, strict=False):
         if most is not None:

@@ -26,7 +26,7 @@ MEMORY = ("steps_taken", "cost_pose", "cost_base_velocity")
 
 
 def has_twist_errors(scene: Scene) -> bool:
-    """Tell whether the tip's velocity relative to the target is reported: it moves, or success asks for it."""
+    """Tell whether the tip's velocity relative to the target counts: it moves, or success asks for it."""
     success = scene.success
     asked = (success.angular_velocity_error_deg, success.velocity_error)
     return scene.target.motion is not None or any(largest is not None for largest in asked)
@@ -57,7 +57,6 @@ def n_observations(scene: Scene) -> int:
 def memory_names(scene: Scene) -> tuple[str, ...]:
     """Names of what a step of a scene hands to the next."""
     return (*MEMORY, *(number.name for number in moving_numbers(scene)))
-
 
 
 # A state whose norm (m, rad, m/s, rad/s) is larger, or NaN, comes from a simulation that has blown up. It

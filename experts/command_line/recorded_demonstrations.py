@@ -26,6 +26,8 @@ def read_demonstration(source: str, label: str | None) -> Trajectory | None:
         raise ValueError(str(error)) from error
     layout, parameters = StateLayout.of(scene), demonstration.parameters
     controls = demonstration.actions * layout.limits_with(parameters)
+    if layout.parameters.moving:
+        parameters = demonstrations.kernels.stage_parameters(parameters)
     target = layout.target_with(parameters) if layout.n_p else None
     name = label or f"demonstration {number}"
     return Trajectory(name, np.array(demonstration.states), controls, target=target, scene=scene)

@@ -20,6 +20,7 @@ from dq_space_arm_env.command_line.simulated_episode import (
 from dq_space_arm_env.common.files import json_value, to_json, write_atomically
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.tables import plain_table
+from dq_space_arm_env.scene import StateLayout
 from experts import BoxDDP, GuidedDDP, Solution, StopReason
 from experts.report import Maneuver, SolveProgress
 from experts.report.reproduction import results_folder
@@ -93,8 +94,8 @@ def solve(
         progress.start()
         solution = solver.solve(begun.state, callback=progress.update, parameters=begun.parameters)
     solved = perf_counter()
-    # The files are of the episode's scene, where what was drawn is constant.
-    solution.parameters = solution.parameters[:, :0]
+    # The files are of the episode's scene, where what was drawn is constant; a target that moves is not.
+    solution.parameters = solution.parameters[:, StateLayout.of(scene).parameters.moving]
     solution.metadata |= {"scene": begun.episode_scene.model_dump(mode="json"), "start": begun.title}
     name = type(solver).__name__
     return SolveRun(scene, begun, name, solution, prepared - began, before, solved - prepared)

@@ -11,6 +11,7 @@ from string import Template
 
 from dq_space_arm_env.common.shown_text import markdown_text
 from dq_space_arm_env.common.tables import TextTable
+from dq_space_arm_env.task.step_report import n_observations
 from dq_space_arm_env.validation import dump_yaml
 from experts.demonstrations import facts as tables
 from experts.demonstrations.facts import Facts
@@ -203,7 +204,7 @@ def _arrays(facts: Facts) -> list[TextTable]:
     n, n_x = simulation.steps, layout.n_x
     shapes = {
         "states": (n + 1, n_x),
-        "observations": (n + 1, n_x + 1),
+        "observations": (n + 1, n_observations(facts.demonstrations.scene)),
         "actions": (n, layout.n_u),
         "rewards": (n,),
         "feedback_gains": (n, layout.n_u, layout.n_t),

@@ -30,7 +30,7 @@ from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.worker_process import WorkerLostError, WorkerProcess
 from dq_space_arm_env.scene.layout import ParameterEntries
 from experts.demonstrations.reading import Demonstration, Demonstrations
-from experts.demonstrations.shard import PARAMETERS, tip_errors
+from experts.demonstrations.shard import PARAMETERS, are_successes, tip_errors
 from experts.demonstrations.tensors import DemonstrationsError
 
 ALGORITHM = "Control-limited differential dynamic programming (box-DDP)"
@@ -269,17 +269,17 @@ def _infos(
     demonstrations: Demonstrations, demonstration: Demonstration, feedback_gains: bool
 ) -> dict[str, Any]:
     """Return arrays with N + 1 rows."""
-    states, success = demonstration.states, demonstrations.scene.success
-    parameters = demonstration.parameters
-    attitude, position = tip_errors(demonstrations.kernels, states, parameters).T
+    states, kernels = demonstration.states, demonstrations.kernels
+    parameters = kernels.stage_parameters(demonstration.parameters)
+    attitude, position = tip_errors(kernels, states, parameters).T
     infos = {
         "state": states,
         "attitude_error": attitude,
         "position_error": position,
-        "is_success": (attitude <= success.attitude_error_deg) & (position <= success.position_error),
+        "is_success": are_successes(kernels, states, parameters),
     }
     if parameters.size:
-        infos[PARAMETERS] = np.tile(parameters, (len(states), 1))
+        infos[PARAMETERS] = parameters
     if feedback_gains:
         gains = demonstration.feedback_gains
         infos["feedback_gains"] = np.concatenate([gains, np.zeros_like(gains[:1])])

@@ -105,7 +105,7 @@ class _Files:
     """The shards of a folder, some of them mapped."""
 
     def __init__(self, folder: Path, shards: Sequence[Mapping[str, Any]], scene: Scene) -> None:
-        self.layout, self._horizon = StateLayout.of(scene), scene.simulation.steps
+        self.scene, self.layout = scene, StateLayout.of(scene)
         self._sizes = [int(shard["demonstrations"]) for shard in shards]
         self.paths = [folder / SHARDS / shard["file"] for shard in shards]
         self.ends = list(accumulate(self._sizes))
@@ -113,7 +113,7 @@ class _Files:
 
     def _map(self, shard: int) -> Tensors:
         tensors, path = map_tensors(self.paths[shard]), self.paths[shard]
-        check_arrays(path, tensors.arrays, self.layout, self._horizon)
+        check_arrays(path, tensors.arrays, self.scene, self.layout)
         if len(tensors.arrays["index"]) != self._sizes[shard]:
             raise DemonstrationsError(
                 f"{path} holds {len(tensors.arrays['index'])} demonstrations, its manifest says "
@@ -269,7 +269,7 @@ class Demonstrations(Sequence[Demonstration]):
         Args:
             size: Time steps of a batch.
             names: Arrays to read, of `shard.TRAJECTORIES`; states and observations without the last, at which
-                no action is taken. Also "parameters" if the scene has any, those of the demonstration.
+                no action is taken. Also "parameters" if the scene has any, those of the stage.
             seed: Seed of the order; None for the order of problems and stages.
             drop_last: Whether to omit a smaller last batch.
 
@@ -310,7 +310,12 @@ class Demonstrations(Sequence[Demonstration]):
             mine = positions == position
             for name in names:
                 source = tensors.arrays[name][row]
-                rows = source[None] if name == PARAMETERS else source[stages[mine]]
+                if name != PARAMETERS:
+                    rows = source[stages[mine]]
+                elif self.kernels.parameters.moving:
+                    rows = self.kernels.stage_parameters(source)[stages[mine]]
+                else:
+                    rows = source[None]
                 if name not in arrays:
                     arrays[name] = np.empty((len(steps), *rows.shape[1:]), rows.dtype)
                 arrays[name][mine] = rows

@@ -41,6 +41,7 @@ from dq_space_arm_env.environment import DQSpaceArmVectorEnv
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.task.step_report import n_observations
 from experts.demonstrations.outcomes import (
     GUESSES,
     REASONS,
@@ -158,9 +159,10 @@ def with_parameters(names: tuple[str, ...], layout: StateLayout) -> tuple[str, .
     return (*names, PARAMETERS) if layout.n_p else names
 
 
-def check_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], layout: StateLayout, horizon: int) -> None:
+def check_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], scene: Scene, layout: StateLayout) -> None:
     """Raise DemonstrationsError where a shard has other arrays than those of its scene."""
-    sizes = {"n_x": layout.n_x, "n_u": layout.n_u, "n_t": layout.n_t, "n_obs": layout.n_x + 1}
+    horizon, n_obs = scene.simulation.steps, n_observations(scene)
+    sizes = {"n_x": layout.n_x, "n_u": layout.n_u, "n_t": layout.n_t, "n_obs": n_obs}
     sizes |= {"n_p": layout.n_p, "N": horizon, "N + 1": horizon + 1, "2": 2}
     varying = _VARYING if layout.n_p else {}
     for name, (dtype, *axes) in {**_ARRAYS, **varying}.items():
@@ -284,7 +286,8 @@ def _demonstration_arrays(
 def _failure_arrays(problem: ArmProblem, outcomes: Sequence[Outcome]) -> Arrays:
     ends = np.array([outcome.solution.states[-1] for outcome in outcomes]).reshape(-1, problem.n_states)
     starts = np.array([outcome.start for outcome in outcomes]).reshape(-1, problem.n_states)
-    errors = tip_errors(problem.kernels, ends, _parameters(problem, outcomes))
+    last = np.array([outcome.solution.parameters[-1] for outcome in outcomes])
+    errors = tip_errors(problem.kernels, ends, last.reshape(len(outcomes), problem.kernels.n_p))
     arrays = {**_common(problem, outcomes), "start": starts, "final_errors": errors}
     return {f"failures.{name}": array for name, array in arrays.items()}
 
@@ -295,6 +298,18 @@ def tip_errors(kernels: Kernels, states: FloatArray, parameters: FloatArray) -> 
         return np.zeros((0, 2))
     _, errors = kernels.observation(states, np.zeros((len(states), 1)), p=parameters)
     return np.stack([np.degrees(errors[:, 0]), errors[:, 1]], axis=1)
+
+
+def are_successes(kernels: Kernels, states: FloatArray, parameters: FloatArray) -> NDArray[np.bool_]:
+    """Whether an episode that ended in a state would be a success, shape (n,); parameters (n, n_p)."""
+    success, (attitude, position) = kernels.scene.success, tip_errors(kernels, states, parameters).T
+    found = (attitude <= success.attitude_error_deg) & (position <= success.position_error)
+    if success.angular_velocity_error_deg is not None or success.velocity_error is not None:
+        twist = kernels.relative_twist(states, np.zeros((len(states), kernels.n_u)), p=parameters)
+        turning, moving = (np.linalg.norm(part, axis=1) for part in (twist[:, :3], twist[:, 3:]))
+        found &= np.degrees(turning) <= (success.angular_velocity_error_deg or np.inf)
+        found &= moving <= (success.velocity_error or np.inf)
+    return np.asarray(found)
 
 
 def _parameters(problem: ArmProblem, outcomes: Sequence[Outcome]) -> FloatArray:

@@ -131,7 +131,10 @@ class ArmProblem:
         """Largest of the tip's errors at a final state, each relative to its tolerance."""
         success, last = self.scene.success, self.parameters.rows[-1]
         angle, distance = self.kernels.observation(state, [0.0], p=last)[1]
-        relative = [float(np.degrees(angle)) / success.attitude_error_deg, float(distance) / success.position_error]
+        relative = [
+            float(np.degrees(angle)) / success.attitude_error_deg,
+            float(distance) / success.position_error,
+        ]
         turning, moving = success.angular_velocity_error_deg, success.velocity_error
         if turning is not None or moving is not None:
             twist = self.kernels.relative_twist(state, p=last)

@@ -127,5 +127,6 @@ def errors_with_finer_steps(scene: Scene, controls: FloatArray, substeps: int = 
     with np.errstate(all="ignore"):
         start = kernels.layout.initial_state
         end = kernels.simulate(start, finer, len(finer), dt, "rk4", every=len(finer))[-1]
-    tip, target = tuple(kernels.tip_pose(end).tolist()), scene.target.pose.dual_quaternion
+    tip = tuple(kernels.tip_pose(end).tolist())
+    target = tuple(kernels.layout.target_with(kernels.stage_parameters()[-1]).tolist())
     return math.degrees(poses.error_angle(tip, target)), poses.error_distance(tip, target)
