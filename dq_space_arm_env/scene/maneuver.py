@@ -3,6 +3,7 @@
 from pydantic import Field
 
 from dq_space_arm_env.scene.pose import Pose
+from dq_space_arm_env.scene.shapes import Shape, geometry_field
 from dq_space_arm_env.validation.fields import (
     Angles,
     AngleSpread,
@@ -71,6 +72,7 @@ class Target(Model):
         default=_ZERO_TWIST,
         description="desired velocity of the base in base axes: angular (3) rad/s, linear (3) m/s",
     )
+    geometry: tuple[Shape, ...] = geometry_field("only axes and the ghost of a hand")
 
 
 class Cost(Model):
