@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene.shapes import COLORS, Shape, color_of
 from dq_space_arm_env.viewing.rendering.solids import SHINE, Color, Mesh, box, crumpled_box, cylinder
 
 Array = NDArray[np.float64]
 
 _SIDES = 36  # of a cylinder, which may be as large as a spacecraft
+_MARGIN = 0.05  # of the size of shapes, between them and the border of the picture
+_SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 _SHINE = {COLORS["cells"]: 0.7}
 
 
@@ -39,33 +44,44 @@ def shape_meshes(frame: int, shapes: Sequence[Shape], color: Color) -> Iterator[
             yield box(frame, center, shape.box, own, axes, _SHINE.get(own, SHINE))
 
 
-def extent_of(shapes: Sequence[Shape]) -> tuple[Array, Array]:
-    """Find the box around shapes along the axes of their body.
+def corners_of(shapes: Sequence[Shape]) -> Array:
+    """Find the corners of shapes, of cylinders those of the boxes around them.
 
     Args:
-        shapes: One or more.
+        shapes: The shapes.
 
     Returns:
-        Its smallest and its largest coordinates in the frame of the body, shape (3,) each, m.
+        Corners in the frame of the body, shape (8 * shapes, 3), m.
     """
-    lows, highs = [], []
+    corners = [np.empty((0, 3))]
     for shape in shapes:
-        axes, center = np.array(shape.pose.rotation_matrix), np.array(shape.pose.position)
+        size = shape.box
         if shape.cylinder is not None:
-            along = axes[:, 2]
-            # A disk across a unit vector a reaches sqrt(1 - a_i^2) of its radius along axis i.
-            disk = shape.cylinder.radius * np.sqrt(np.maximum(1.0 - along**2, 0.0))
-            reach = disk + 0.5 * shape.cylinder.length * np.abs(along)
-        else:
-            reach = 0.5 * np.abs(axes) @ np.array(shape.box)
-        lows.append(center - reach)
-        highs.append(center + reach)
-    return np.min(lows, axis=0), np.max(highs, axis=0)
+            size = (2.0 * shape.cylinder.radius, 2.0 * shape.cylinder.radius, shape.cylinder.length)
+        inner = 0.5 * _SIGNS * np.array(size)
+        corners.append(inner @ np.array(shape.pose.rotation_matrix).T + np.array(shape.pose.position))
+    return np.concatenate(corners)
 
 
-def reach_of(shapes: Sequence[Shape]) -> float:
-    """Bound the distance of shapes from the origin of their body's frame, m; 0 without shapes."""
-    if not shapes:
-        return 0.0
-    low, high = extent_of(shapes)
-    return float(np.linalg.norm(np.maximum(-low, high)))
+def balls_around(
+    shapes: Sequence[Shape], pose: Sequence[float], turn: float = 0.0, shift: float = 0.0
+) -> Iterator[tuple[Array, float]]:
+    """Find balls around the corners of shapes, which keep the shapes in view.
+
+    Args:
+        shapes: The shapes.
+        pose: Pose of their body in the inertial frame, shape (8,), real part dimensionless, dual part m.
+        turn: Largest angle by which the body may be turned from there, rad.
+        shift: Largest distance by which it may be moved, m.
+
+    Yields:
+        Center, shape (3,), m, and radius, m, of each ball.
+    """
+    matrix, origin = poses.to_matrix(tuple(pose))
+    corners = corners_of(shapes)
+    chord = 2.0 * math.sin(0.5 * min(turn, math.pi))
+    for corner in corners:
+        radius = (
+            shift + chord * float(np.linalg.norm(corner)) + _MARGIN * float(np.ptp(corners, axis=0).max())
+        )
+        yield np.array(origin) + np.array(matrix) @ corner, radius

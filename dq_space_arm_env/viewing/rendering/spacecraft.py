@@ -19,7 +19,7 @@ from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.kinematics import frame_poses
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.shapes import COLORS, Shape
-from dq_space_arm_env.viewing.rendering.body_shapes import extent_of, reach_of, shape_meshes
+from dq_space_arm_env.viewing.rendering.body_shapes import balls_around, corners_of, shape_meshes
 from dq_space_arm_env.viewing.rendering.solids import Mesh, ball, box, crumpled_box, cylinder, lathe
 
 Array = NDArray[np.float64]
@@ -65,8 +65,7 @@ class SpacecraftModel:
         self.frame_count = len(self._offsets) + 1
         self._body_size, self._body_axes = equivalent_box(scene.base.mass, scene.base.inertia)
         if scene.base.geometry:
-            low, high = extent_of(scene.base.geometry)
-            self._body_size, self._body_axes = high - low, np.eye(3)
+            self._body_size, self._body_axes = np.ptp(corners_of(scene.base.geometry), axis=0), np.eye(3)
         lengths = np.linalg.norm(self._offsets, axis=1)
         # Without links or wrist the tip is part of the base.
         self._arm_length = float(lengths[1:].sum())
@@ -122,16 +121,12 @@ class SpacecraftModel:
         return np.array(centers), np.array(radii)
 
     def _shape_balls(self, starts: Sequence[Sequence[float]]) -> Iterator[tuple[Array, float]]:
-        """Balls around the given shapes of base and links, at the poses of their frames, and the target's."""
+        """Balls around given shapes, given the poses of the robot's frames at the start."""
         for shapes, pose in zip(self._geometry, starts, strict=False):
-            if shapes:
-                low, high = extent_of(shapes)
-                matrix, origin = poses.to_matrix(tuple(pose))
-                center = np.array(origin) + np.array(matrix) @ (0.5 * (low + high))
-                yield center, 0.5 * float(np.linalg.norm(high - low))
-        target, spread = self.scene.target, self.scene.spread.target_position
-        if target.geometry:
-            yield np.array(target.pose.position), reach_of(target.geometry) + math.sqrt(3.0) * spread
+            yield from balls_around(shapes, pose)
+        target, spread = self.scene.target, self.scene.spread
+        turn, shift = (math.sqrt(3.0) * width for width in (spread.target_rotation, spread.target_position))
+        yield from balls_around(target.geometry, target.pose.dual_quaternion, turn, shift)
 
     @cached_property
     def _wing_axes(self) -> tuple[int, int, int]:
@@ -287,7 +282,7 @@ class SpacecraftModel:
         overhang = max(0.0, self._hand_length - float(np.linalg.norm(self._offsets[-1])))
         payload = self.scene.payload
         if payload is not None and payload.geometry:
-            overhang = max(overhang, reach_of(payload.geometry))
+            overhang = max(overhang, float(np.linalg.norm(corners_of(payload.geometry), axis=1).max()))
         elif payload is not None:
             size, _ = equivalent_box(payload.mass, payload.inertia)
             overhang = max(overhang, float(np.linalg.norm(payload.center_of_mass) + 0.5 * size.max()))
