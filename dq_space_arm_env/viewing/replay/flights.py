@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.scene import Scene, StateLayout
@@ -132,13 +131,11 @@ def _finite_steps(states: FloatArray, controls: FloatArray, noise: FloatArray | 
 def _target(what: str, value: ArrayLike, steps: int, shown: int) -> FloatArray:
     """Check a target, and keep what is shown of it: (8,) if it is at rest there, else (shown + 1, 8)."""
     target = _numbers(what, value)
+    said = f"{what}: {target if target.ndim == 1 else f'array of shape {target.shape}'}, should be a pose"
     if target.shape not in ((8,), (steps + 1, 8)) or not np.isfinite(target).all():
-        raise ValueError(
-            f"{what}: {shortened(target)}, should be a pose, 8 finite numbers, or one for each of "
-            f"{steps + 1} states"
-        )
+        raise ValueError(f"{said}, 8 finite numbers, or one for each of {steps + 1} states")
     if (np.abs(np.linalg.norm(target[..., :4], axis=-1) - 1.0) > _UNIT).any():
-        raise ValueError(f"{what}: {shortened(target)}, should be a pose: its real part should have length 1")
+        raise ValueError(f"{said}: its real part should have length 1")
     if target.ndim == 1:
         return target
     moving = _continuous(target[: shown + 1, None])[:, 0]
