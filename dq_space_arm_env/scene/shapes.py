@@ -69,6 +69,13 @@ class Shape(Model):
         "links, teal for the payload, metal for the target",
     )
 
+    @property
+    def edges(self) -> Three:
+        """Edge lengths of the box, or of that around the cylinder, along the axes of `pose`, m."""
+        if self.cylinder is not None:
+            return (2.0 * self.cylinder.radius, 2.0 * self.cylinder.radius, self.cylinder.length)
+        return self.box or (0.0, 0.0, 0.0)  # which a valid shape has
+
     def _problems(self) -> Iterator[Problem]:
         """Find a shape that is not one of the two."""
         if self.box is None and self.cylinder is None:

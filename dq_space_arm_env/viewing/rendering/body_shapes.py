@@ -38,10 +38,10 @@ def shape_meshes(frame: int, shapes: Sequence[Shape], color: Color) -> Iterator[
         if shape.cylinder is not None:
             half = 0.5 * shape.cylinder.length * axes[:, 2]
             yield cylinder(frame, center - half, center + half, shape.cylinder.radius, own, _SIDES)
-        elif shape.box is not None and own == COLORS["foil"]:
-            yield crumpled_box(frame, center, shape.box, own, axes)
-        elif shape.box is not None:
-            yield box(frame, center, shape.box, own, axes, _SHINE.get(own, SHINE))
+        elif own == COLORS["foil"]:
+            yield crumpled_box(frame, center, shape.edges, own, axes)
+        else:
+            yield box(frame, center, shape.edges, own, axes, _SHINE.get(own, SHINE))
 
 
 def corners_of(shapes: Sequence[Shape]) -> Array:
@@ -55,10 +55,7 @@ def corners_of(shapes: Sequence[Shape]) -> Array:
     """
     corners = [np.empty((0, 3))]
     for shape in shapes:
-        size = shape.box
-        if shape.cylinder is not None:
-            size = (2.0 * shape.cylinder.radius, 2.0 * shape.cylinder.radius, shape.cylinder.length)
-        inner = 0.5 * _SIGNS * np.array(size)
+        inner = 0.5 * _SIGNS * np.array(shape.edges)
         corners.append(inner @ np.array(shape.pose.rotation_matrix).T + np.array(shape.pose.position))
     return np.concatenate(corners)
 
