@@ -18,8 +18,8 @@ export function readRecording(text) {
   const frameCount = solids.counts.length - 2; // the last two are those of the target and of its body
   const target = (place) => (place && !Array.isArray(place) ? array(place) : place);
   const flights = data.flights.map((flight) => {
-    const [aim, body] = [target(flight.target), target(flight.targetBody)];
-    return new Flight({ ...flight, target: aim, targetBody: body, frames: array(flight.frames) }, frameCount, data.scene.dt);
+    const arrays = { frames: array(flight.frames), target: target(flight.target), targetBody: target(flight.targetBody) };
+    return new Flight({ ...flight, ...arrays }, frameCount, data.scene.dt);
   });
   const panels = data.panels.map((panel) => ({
     ...panel,
