@@ -23,6 +23,7 @@ from extensions.policies import policy_table  # noqa: E402
 from agents import configuration  # noqa: E402
 from agents.configuration.residual import ResidualConfiguration  # noqa: E402
 from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmGoalEnv, Scene  # noqa: E402
+from dq_space_arm_env.scene import Cylinder, Pose, Shape  # noqa: E402
 
 BLOCK = re.compile(
     r"(?<=^<!-- generated: )([\w-]+)( -->\n).*?(?=^<!-- end of generated text -->$)", re.M | re.S
@@ -35,8 +36,14 @@ def docstring_page(environment: type) -> str:
     return text.replace("\n\n```\n", "\n```\n")  # doctests need the empty line, the page does not
 
 
+_PLACES = {  # of parts that stand in several places of a scene
+    Pose: "Poses",
+    Shape: "`geometry[]` of `base`, `links[]`, `payload` and `target`",
+    Cylinder: "`geometry[].cylinder`",
+}
+
 TEXTS: Mapping[str, Callable[[], str]] = {
-    "scene-keys": partial(key_tables, Scene),
+    "scene-keys": partial(key_tables, Scene, _PLACES),
     "reinforcement-keys": partial(key_tables, configuration.Configuration),
     "imitation-keys": partial(key_tables, configuration.ImitationConfiguration),
     "residual-keys": partial(key_tables, ResidualConfiguration),

@@ -12,7 +12,9 @@ import numpy as np
 
 from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.interoperability.exporting import free_name, refuse, tip_from_last_link, words
-from dq_space_arm_env.scene import Base, Link, Payload, Scene, StateLayout
+from dq_space_arm_env.scene import Base, Link, Payload, Scene, Shape, StateLayout
+from dq_space_arm_env.scene.shapes import COLORS, color_of
+from dq_space_arm_env.validation.fields import Three
 
 _FORCE_GEARS = ("1 0 0 0 0 0", "0 1 0 0 0 0", "0 0 1 0 0 0")
 _TORQUE_GEARS = ("0 0 0 1 0 0", "0 0 0 0 1 0", "0 0 0 0 0 1")
@@ -21,7 +23,7 @@ _TORQUE_GEARS = ("0 0 0 1 0 0", "0 0 0 0 1 0", "0 0 0 0 0 1")
 def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
     """Write a scene's robot as MJCF.
 
-    There is no gravity, and there are no shapes: nothing collides, and only frames and inertias are visible.
+    There is no gravity, and nothing collides: the scene's shapes, if it gives any, are there to be seen.
     Body `base` has the frame e0 and a free joint, called `base joint`; in a planar scene it slides along x
     and y and turns about z. Each link is a body with the frame of its joint, a hinge about z called by the
     link's name and " joint", with the scene's damping and spring and no armature. Site `tip` has the frame G,
@@ -56,17 +58,20 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     base = SubElement(SubElement(root, "worldbody"), "body", name=free_name("base", names))
     _add_base_joint(base, scene)
     _add_inertial(base, scene.base, (0.0, 0.0, 0.0))
+    _add_shapes(base, scene.base.geometry, COLORS["foil"])
     SubElement(base, "site", name="e0")
     body = base
     for link in scene.links:
         body = _add_body(body, link.name, link.joint.dual_quaternion)
         _add_hinge(body, link)
         _add_inertial(body, link, link.center_of_mass)
+        _add_shapes(body, link.geometry, COLORS["white"])
     tip = tip_from_last_link(scene)
     SubElement(body, "site", {"name": "tip", **_placed(tip)})
     if scene.payload is not None:
         payload = _add_body(body, free_name("payload", names), tip)
         _add_inertial(payload, scene.payload, scene.payload.center_of_mass)
+        _add_shapes(payload, scene.payload.geometry, COLORS["teal"])
     _add_actuators(root, scene)
     _add_start(root, scene)
     ElementTree.indent(root)
@@ -111,6 +116,16 @@ def _add_inertial(parent: Element, body: Base | Link | Payload, center_of_mass: 
         mass=words([body.mass]),
         diaginertia=words(moments),
     )
+
+
+def _add_shapes(body: Element, shapes: Sequence[Shape], color: Three) -> None:
+    """Add shapes that collide with nothing and have no mass."""
+    for shape in shapes:
+        x, y, z = (0.5 * edge for edge in shape.edges)
+        size, kind = ((x, y, z), "box") if shape.cylinder is None else ((x, z), "cylinder")
+        look = {"type": kind, "size": words(size), "rgba": words([*color_of(shape, color), 1.0])}
+        place = _placed(shape.pose.dual_quaternion)
+        SubElement(body, "geom", {**look, **place, "contype": "0", "conaffinity": "0"})
 
 
 def _add_hinge(body: Element, link: Link) -> None:

@@ -10,7 +10,9 @@ from xml.etree.ElementTree import Element, SubElement
 
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.interoperability.exporting import free_name, refuse, tip_from_last_link, words
-from dq_space_arm_env.scene import Base, Link, Payload, Scene
+from dq_space_arm_env.scene import Base, Link, Payload, Scene, Shape
+from dq_space_arm_env.scene.shapes import COLORS, color_of
+from dq_space_arm_env.validation.fields import Three
 
 # URDF asks for a limit of the rate wherever there is one of the torque; this one limits nothing.
 _ANY_RATE = "1e+06"
@@ -23,7 +25,7 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     (Pinocchio: `JointModelFreeFlyer`). Each further link has the frame of its joint and carries the scene's
     name; its joint is continuous, turns about z, and is called by the link's name and " joint". A link `tip`
     without mass, or with that of the payload, has the frame G. Torque limits become efforts, 0 for a joint
-    without motor; URDF has no thrusters, wheels, start or task.
+    without motor; URDF has no thrusters, wheels, start or task. Shapes become visuals.
 
     Features that URDF lacks and that change the motion are refused: joint springs, a wrench at the tip, a
     planar base. The massless wrist as three joints would have infinite accelerations; fixed at its initial
@@ -79,6 +81,22 @@ def _add_link(
     SubElement(inertial, "mass", value=words([body.mass]))
     entries = {f"i{'xyz'[i]}{'xyz'[j]}": words([body.inertia[i][j]]) for i in range(3) for j in range(i, 3)}
     SubElement(inertial, "inertia", entries)
+    color = COLORS["foil" if isinstance(body, Base) else "white" if isinstance(body, Link) else "teal"]
+    for index, shape in enumerate(body.geometry):
+        _add_visual(link, shape, color, f"{name} {index}")
+
+
+def _add_visual(link: Element, shape: Shape, default: Three, material: str) -> None:
+    visual = SubElement(link, "visual")
+    _add_origin(visual, shape.pose.dual_quaternion)
+    geometry = SubElement(visual, "geometry")
+    if shape.cylinder is None:
+        SubElement(geometry, "box", size=words(shape.edges))
+    else:
+        radius, length = words([shape.cylinder.radius]), words([shape.cylinder.length])
+        SubElement(geometry, "cylinder", radius=radius, length=length)
+    color = words([*color_of(shape, default), 1.0])
+    SubElement(SubElement(visual, "material", name=material), "color", rgba=color)
 
 
 def _add_joint(root: Element, link: Link, parent: str, effort: float) -> None:
@@ -92,7 +110,11 @@ def _add_joint(root: Element, link: Link, parent: str, effort: float) -> None:
 
 
 def _connect(joint: Element, parent: str, child: str, pose: Sequence[float]) -> None:
-    yaw, pitch, roll, position = poses.to_euler_321(dual_quaternion.normalize(tuple(pose)))
-    SubElement(joint, "origin", xyz=words(position), rpy=words([roll, pitch, yaw]))
+    _add_origin(joint, pose)
     SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=child)
+
+
+def _add_origin(element: Element, pose: Sequence[float]) -> None:
+    yaw, pitch, roll, position = poses.to_euler_321(dual_quaternion.normalize(tuple(pose)))
+    SubElement(element, "origin", xyz=words(position), rpy=words([roll, pitch, yaw]))

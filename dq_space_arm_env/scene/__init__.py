@@ -17,6 +17,7 @@ from dq_space_arm_env.scene.maneuver import (
 )
 from dq_space_arm_env.scene.pose import AxisAngle, Pose
 from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.scene.shapes import Cylinder, Shape
 from dq_space_arm_env.scene.simulation import Simulation
 from dq_space_arm_env.scene.start import draw_initial_state, initial_state
 from dq_space_arm_env.validation.problems import SceneError
@@ -29,6 +30,7 @@ __all__ = [
     "Base",
     "ControlEntries",
     "Cost",
+    "Cylinder",
     "InitialState",
     "JointLimit",
     "Link",
@@ -36,6 +38,7 @@ __all__ = [
     "Pose",
     "Scene",
     "SceneError",
+    "Shape",
     "Simulation",
     "Spread",
     "StateEntries",

@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, StrictBool
 
 from dq_space_arm_env.scene.pose import Matrix3, Pose
+from dq_space_arm_env.scene.shapes import Shape, geometry_field
 from dq_space_arm_env.validation.fields import (
     INERTIAS,
     Angle,
@@ -80,6 +81,7 @@ class Base(Model):
         default="spatial",
         description="'spatial': six degrees of freedom; 'planar': motion in the x-y plane, rotation about z",
     )
+    geometry: tuple[Shape, ...] = geometry_field("the box of its inertia, with wings")
 
 
 class Link(Model):
@@ -105,6 +107,7 @@ class Link(Model):
     stiffness: NonNegative = Field(default=0.0, description="stiffness of the joint spring, N m/rad")
     rest_angle: Angle = Field(default=0.0, description="joint angle at which the spring is at rest, rad")
     damping: NonNegative = Field(default=0.0, description="viscous damping of the joint, N m s/rad")
+    geometry: tuple[Shape, ...] = geometry_field("a joint, and a rod to the next one")
 
 
 class Wrist(Model):
@@ -126,3 +129,4 @@ class Payload(Model):
     center_of_mass: Position = Field(
         default=(0.0, 0.0, 0.0), description="center of mass of the payload in the tip frame, m"
     )
+    geometry: tuple[Shape, ...] = geometry_field("the box of its inertia")

@@ -4,6 +4,7 @@ from pydantic import Field
 
 from dq_space_arm_env.scene.motion import Motion
 from dq_space_arm_env.scene.pose import Pose
+from dq_space_arm_env.scene.shapes import Shape, geometry_field
 from dq_space_arm_env.validation.fields import (
     Angles,
     AngleSpread,
@@ -79,12 +80,13 @@ class Target(Model):
     motion: Motion | None = Field(
         default=None,
         exclude_if=lambda motion: motion is None,
-        description="motion of the target's body, by its kind: screw, tumbling, waypoints, file; absent: rest",
+        description="motion of the target's body, of kind screw, tumbling, waypoints or file; absent: rest",
     )
     base_velocity: Twist = Field(
         default=_ZERO_TWIST,
         description="desired velocity of the base in base axes: angular (3) rad/s, linear (3) m/s",
     )
+    geometry: tuple[Shape, ...] = geometry_field("only axes and the ghost of a hand")
 
 
 class Cost(Model):
@@ -106,13 +108,13 @@ class Cost(Model):
     tip_twist: StateWeights6 = Field(
         default=(0.0,) * 6,
         exclude_if=lambda weights: not any(weights),
-        description="running weight on the tip's twist relative to the target (tip axes, angular then linear), "
+        description="running weight on the tip's twist relative to the target, angular then linear, tip axes, "
         "with the wrist's rates: one number or 6",
     )
     terminal_tip_twist: StateWeights6 = Field(
         default=(0.0,) * 6,
         exclude_if=lambda weights: not any(weights),
-        description="terminal weight on the tip's twist relative to the target (tip axes, angular then linear), "
+        description="terminal weight on the tip's twist relative to the target, angular then linear, tip axes, "
         "with the wrist held: one number or 6",
     )
     base_force: ControlWeights3 = Field(

@@ -30,6 +30,13 @@ from dq_space_arm_env.validation.yaml_text import dump_yaml
 _LARGEST_COST = 1e30  # of one actuator: sums and second derivatives stay finite in single precision too
 _PLANAR = 'base.motion is "planar"'
 _Location = tuple[str | int, ...]
+_GEOMETRY: Mapping[str, Any] = {"geometry": True}
+_NOT_CONTENT: Any = {  # words and pictures, which change neither motion nor task
+    "name": True,
+    "description": True,
+    **dict.fromkeys(("base", "payload", "target"), _GEOMETRY),
+    "links": {"__all__": _GEOMETRY},
+}
 
 
 class Scene(Model):
@@ -253,12 +260,12 @@ class Scene(Model):
         return text
 
     def content_hash(self) -> str:
-        """Identify the scene by its content: everything but name and description.
+        """Identify the scene by its content: everything but name, description and geometry.
 
         Returns:
             SHA-256 of the canonical JSON of all other fields, 64 hexadecimal digits.
         """
-        content = self.model_dump(exclude={"name", "description"})
+        content = self.model_dump(exclude=_NOT_CONTENT)
         canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()
 

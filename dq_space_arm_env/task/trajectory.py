@@ -24,7 +24,7 @@ from dq_space_arm_env.validation.problems import SceneError
 
 FloatArray = NDArray[np.float64]
 
-_REQUIRED, _OPTIONAL = ("states", "controls"), ("noise", "rewards", "target")
+_REQUIRED, _OPTIONAL = ("states", "controls"), ("noise", "rewards", "target", "target_body")
 _LONGEST = 200  # characters of a sentence about an array
 
 
@@ -38,7 +38,10 @@ class Trajectory:
         controls: Commanded inputs, constant over a step, shape (M, n_u), N, N m or rad/s.
         noise: Disturbance added to them at the actuators, shape (M, n_u), same units; None for none.
         rewards: Shape (M,), dimensionless; None if unknown.
-        target: Pose q_{D/I}, shape (8,), dimensionless and m; None for the scene's.
+        target: Desired pose of the tip q_{D/I}, shape (8,), or (M + 1, 8) if it moves, one for each state,
+            dimensionless and m; None for the scene's.
+        target_body: Pose of the target's body in the inertial frame, shape (8,) or (M + 1, 8), dimensionless
+            and m; None if it is the desired pose of the tip.
         scene: The scene; None if unknown.
         start: The initial state in words.
         seed: Seed of the episode; None without one.
@@ -55,6 +58,7 @@ class Trajectory:
     noise: FloatArray | None = None
     rewards: FloatArray | None = None
     target: FloatArray | None = None
+    target_body: FloatArray | None = None
     scene: Scene | None = None
     start: str = ""
     seed: int | None = None
@@ -91,8 +95,8 @@ class Trajectory:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trajectory to a file in NumPy's npz format, in one go or not at all.
 
-        The file holds `states`, `controls`, and where they are known `rewards`, `target` and `noise`; and
-        `facts`, JSON text with the scene and the entries of `facts()`.
+        The file holds `states`, `controls`, and where they are known `rewards`, `target`, `target_body`
+        and `noise`; and `facts`, JSON text with the scene and the entries of `facts()`.
 
         Args:
             path: The file, `.npz` by convention; its folder must exist.
@@ -157,18 +161,20 @@ _KINDS: Mapping[str, tuple[str, Any]] = {  # fields, their keys in the facts, an
 def _check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
     """Raise UnreadableError for arrays that are no numbers, or not of one maneuver."""
     steps, inputs = (*arrays["controls"].shape, 0, 0)[:2]
-    shapes = {
-        "states": (steps + 1, *(arrays["states"].shape[1:2] or (1,))),
-        "controls": (steps, inputs),
-        "noise": (steps, inputs),
-        "rewards": (steps,),
-        "target": (8,),
+    shapes: dict[str, tuple[tuple[int, ...], ...]] = {
+        "states": ((steps + 1, *(arrays["states"].shape[1:2] or (1,))),),
+        "controls": ((steps, inputs),),
+        "noise": ((steps, inputs),),
+        "rewards": ((steps,),),
+        "target": ((8,), (steps + 1, 8)),
+        "target_body": ((8,), (steps + 1, 8)),
     }
     for name, array in arrays.items():
         if array.dtype.kind not in "biuf":
             raise UnreadableError(f"{name} holds {array.dtype}, it should hold numbers"[:_LONGEST])
-        if array.shape != shapes[name]:
-            raise UnreadableError(f"{name} has shape {shortened(array.shape)}, it should have {shapes[name]}")
+        if array.shape not in shapes[name]:
+            wanted = " or ".join(map(str, shapes[name]))
+            raise UnreadableError(f"{name} has shape {shortened(array.shape)}, it should have {wanted}")
 
 
 def _known(facts: Mapping[str, Any]) -> dict[str, Any]:

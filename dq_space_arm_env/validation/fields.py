@@ -35,6 +35,7 @@ class Range(NamedTuple):
 ANY = Range(1e-18, 1e18)
 UP_TO = Range(0.0, ANY.most)
 LENGTHS = Range(0.0, 1e9)  # m: rounded to 1e-7 m there
+SIZES = Range(1e-6, 1e6)  # m, of shapes in pictures
 ANGLES = Range(0.0, 1e6)  # rad: up to where the code reduces angles with full precision
 RATES = Range(0.0, 1e9)  # rad/s, m/s
 MASSES = Range(1e-12, 1e12)  # kg: from a speck of dust to a mountain
@@ -184,6 +185,7 @@ Angle = Annotated[float, _number(math.isfinite, "a finite number", ANGLES)]
 Angles = Annotated[tuple[float, ...], _vector(None, ANGLES)]
 Rates = Annotated[tuple[float, ...], _vector(None, RATES)]
 Rates3 = Annotated[Three, _vector(3, RATES)]
+Size = Annotated[float, positive(SIZES)]
 LengthSpread = Annotated[float, non_negative(LENGTHS)]
 AngleSpread = Annotated[float, non_negative(ANGLES)]
 RateSpread = Annotated[float, non_negative(RATES)]

@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.viewing.rendering.body_shapes import shape_meshes
 from dq_space_arm_env.viewing.rendering.solids import Color, Mesh, ball, box, lathe
 from dq_space_arm_env.viewing.rendering.spacecraft import equivalent_box
 from experts.figures.style import BLUE, GREEN, PURPLE, VERMILION
 from experts.problems.shooting_problem import FloatArray
 
 AXIS_COLORS = (to_rgb(VERMILION), to_rgb(GREEN), to_rgb(BLUE))
-BASE_COLOR, LINK_COLOR, JOINT_COLOR, PAYLOAD_COLOR = (
+BASE_COLOR, LINK_COLOR, JOINT_COLOR, PAYLOAD_COLOR, TARGET_COLOR = (
     (0.88, 0.78, 0.56),
     (0.72, 0.76, 0.82),
     (0.34, 0.38, 0.46),
     (0.62, 0.74, 0.72),
+    (0.80, 0.80, 0.80),
 )
 PATH_COLOR = to_rgb(PURPLE)
 
@@ -55,6 +57,10 @@ class _Solids(NamedTuple):
     def of(cls, mesh: Mesh) -> _Solids:
         return cls(mesh.corners, mesh.normals, mesh.colors, mesh.frames)
 
+    @classmethod
+    def joined(cls, parts: Iterable[_Solids]) -> _Solids:
+        return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
 
 class Schematic:
     """The solids of a scene in their frames, lit from a direction, shape (3,)."""
@@ -71,7 +77,10 @@ class Schematic:
         self._radius = 0.02 * self.reach
         self._spacecraft = _divided(Mesh.joined([*self._bodies(), *self._arm(offsets)]), 0.06 * self.reach)
         self._tip_axes = _axes(_TIP_AXES * self.reach, 0.006 * self.reach)
-        self._target_axes = _axes(_TARGET_AXES * self.reach, 0.004 * self.reach)
+        self._target = _axes(_TARGET_AXES * self.reach, 0.004 * self.reach)
+        if scene.target.geometry:
+            body = Mesh.joined(shape_meshes(0, scene.target.geometry, TARGET_COLOR))
+            self._target = _Solids.joined([self._target, _divided(body, 0.06 * self.reach)])
 
     def spacecraft(self, frames: FloatArray) -> Faces:
         """Place base, arm and the axes of the tip, given the poses of all frames, shape (frames, 8), m."""
@@ -86,9 +95,9 @@ class Schematic:
         )
 
     def target(self) -> Faces:
-        """Place the axes of the target, longer and thinner than the tip's."""
+        """Place the axes of the target, longer and thinner than the tip's, and the shapes of its body."""
         pose = self._scene.target.pose
-        return self._lit(self._target_axes, np.array([pose.rotation_matrix]), np.array([pose.position]))
+        return self._lit(self._target, np.array([pose.rotation_matrix]), np.array([pose.position]))
 
     def path(self, points: FloatArray, radius: float) -> Faces:
         """A path through points, shape (n, 3), m, as a thin tube; no faces if it has no length."""
@@ -118,20 +127,31 @@ class Schematic:
     def _bodies(self) -> Iterable[Mesh]:
         base, payload = self._scene.base, self._scene.payload
         size, axes = equivalent_box(base.mass, base.inertia)
-        yield box(0, np.zeros(3), size, BASE_COLOR, axes)
+        if base.geometry:
+            yield from shape_meshes(0, base.geometry, BASE_COLOR)
+        else:
+            yield box(0, np.zeros(3), size, BASE_COLOR, axes)
         if payload is not None:
             size, axes = equivalent_box(payload.mass, payload.inertia)
             tip = 1 + len(self._scene.links)  # a payload excludes a wrist
+            if payload.geometry:
+                yield from shape_meshes(tip, payload.geometry, PAYLOAD_COLOR)
+                return
             yield box(tip, payload.center_of_mass, size, PAYLOAD_COLOR, axes)
 
     def _arm(self, offsets: list[tuple[float, float, float]]) -> Iterable[Mesh]:
         """Links from each frame to the next, joints along their axes, a ball for the wrist."""
         joints, radius = len(self._scene.links), self._radius
+        shapes = {0: self._scene.base.geometry}
+        shapes |= {frame: link.geometry for frame, link in enumerate(self._scene.links, 1)}
         for frame, offset in enumerate(offsets):
             length = float(np.linalg.norm(offset))
-            if length > 0.0:
+            if length > 0.0 and not shapes.get(frame):
                 yield _rod(frame, offset, length, radius if frame else 1.5 * radius, LINK_COLOR)
         for frame in range(1, joints + 1):
+            if shapes[frame]:
+                yield from shape_meshes(frame, shapes[frame], LINK_COLOR)
+                continue
             profile = [(-1.7, 0.0), (-1.7, 1.6), (1.7, 1.6), (1.7, 0.0)]
             scaled = [(radius * height, radius * ring) for height, ring in profile]
             yield lathe(frame, np.zeros(3), (0.0, 0.0, 1.0), scaled, JOINT_COLOR, _SIDES)
@@ -191,7 +211,7 @@ def _divided(mesh: Mesh, longest: float) -> _Solids:
                 np.repeat(mesh.frames[chosen], count, axis=0),
             )
         )
-    return _Solids(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    return _Solids.joined(parts)
 
 
 def _cut(corners: FloatArray, columns: int, rows: int) -> FloatArray:

@@ -37,7 +37,7 @@ def preparation_key(problem: ArmProblem, settings: Mapping[str, Any]) -> str:
     """Hash all that a preparation follows from."""
     numbers = (problem.initial_state, problem.parameters.nominal, problem.control_upper)
     facts = [
-        problem.scene.model_dump(mode="json"),
+        problem.scene.content_hash(),
         problem.integrator,
         problem.horizon,
         problem.time_step,

@@ -115,6 +115,25 @@ def test_motors_have_the_names_and_limits_of_the_inputs():
     assert not model.opt.gravity.any()
 
 
+def test_shapes_are_seen_and_weigh_nothing():
+    shapes = [
+        {"box": [1, 2, 3], "pose": {"position": [0.1, 0.2, 0.3]}, "color": "#336699"},
+        {"cylinder": {"radius": 0.2, "length": 3}, "pose": {"rotation": {"axis": [1, 0, 0], "angle": 30}}},
+    ]
+    scene = load_scene("payload")
+    scene = scene.replace({f"{body}.geometry": shapes for body in ("base", "links.1", "payload")})
+    check_accelerations(scene, samples=1)
+    model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene))
+    assert [model.body(number).name for number in model.geom_bodyid[::2]] == ["base", "link 2", "payload"]
+    np.testing.assert_allclose(model.geom_size[0], [0.5, 1.0, 1.5])
+    np.testing.assert_allclose(model.geom_size[3, :2], [0.2, 1.5])
+    np.testing.assert_allclose(model.geom_pos[2], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(np.abs(model.geom_quat[5]), [np.cos(np.pi / 12), np.sin(np.pi / 12), 0, 0])
+    np.testing.assert_allclose(model.geom_rgba[4], [0.2, 0.4, 0.6, 1.0], rtol=1e-6)
+    assert not model.geom_contype.any()
+    assert "<geom" not in scene_to_mjcf(load_scene("payload"))
+
+
 def test_a_lamina_is_a_body_to_mujoco_too():
     """Its largest moment of inertia is the sum of the others, to the last digit; its axes lie askew."""
     scene = load_scene("no-wrist")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from foreign_robots import ROBOTS, accelerations, drawn, foreign_scene, relative_error, robot_file, tip_pose
 
-from dq_space_arm_env import DQSpaceArmEnv, compile_scene, scene_from_urdf, scene_to_urdf
+from dq_space_arm_env import DQSpaceArmEnv, compile_scene, load_scene, scene_from_urdf, scene_to_urdf
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import StateLayout
 
@@ -159,6 +159,28 @@ def test_robots_of_others_survive_the_way_out_and_in_again(name):
     assert relative_error(accelerations(again, x, u), accelerations(scene, x, u)) < 1e-12
     layouts = [StateLayout.of(one) for one in (scene, again)]
     np.testing.assert_array_equal(layouts[0].control_limit, layouts[1].control_limit)
+
+
+def test_shapes_become_visuals():
+    shapes = [
+        {"box": [1, 2, 3], "pose": {"position": [0.1, 0.2, 0.3]}, "color": "#336699"},
+        {"cylinder": {"radius": 0.2, "length": 3}, "pose": {"rotation": {"axis": [1, 0, 0], "angle": 30}}},
+    ]
+    scene = load_scene("payload")
+    plain = scene_to_urdf(scene)
+    bodies = ("base", "links.1", "payload")
+    text = scene_to_urdf(scene.replace({f"{body}.geometry": shapes for body in bodies}))
+    model = pin.buildModelFromXML(text)
+    objects = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL).geometryObjects
+    assert len(objects) == 6
+    box, cylinder = objects[0], objects[1]
+    np.testing.assert_allclose(2.0 * box.geometry.halfSide, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(box.placement.translation, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(box.meshColor, [0.2, 0.4, 0.6, 1.0])
+    assert (cylinder.geometry.radius, 2.0 * cylinder.geometry.halfLength) == (0.2, 3.0)
+    np.testing.assert_allclose(cylinder.placement.rotation[1:, 2], [-0.5, np.sqrt(0.75)])
+    assert "visual" not in plain
+    assert scene_from_urdf(text, "tip").content_hash() == scene_from_urdf(plain, "tip").content_hash()
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,11 @@ matplotlib = pytest.importorskip("matplotlib")
 from matplotlib.image import imread  # noqa: E402
 
 from dq_space_arm_env import Scene, load_scene  # noqa: E402
-from dq_space_arm_env.algebra.poses import position  # noqa: E402
+from dq_space_arm_env.algebra.poses import position, to_matrix  # noqa: E402
 from dq_space_arm_env.scene import StateLayout  # noqa: E402
 from experts.figures import write_figures, write_readme_picture  # noqa: E402
 from experts.figures.maneuver_curves import convergence_figure, figure_3, figure_4, figure_5, figure_6  # noqa: E402
+from experts.figures.schematic import Schematic  # noqa: E402
 from experts.figures.snapshots import best_view, figure_2, snapshot_stages  # noqa: E402
 from experts.figures.space import Grid  # noqa: E402
 from experts.report import Maneuver, ManeuverRun  # noqa: E402
@@ -115,6 +116,27 @@ def test_planar_scene_is_seen_from_above(short_run: ManeuverRun) -> None:
     view = best_view(short_run.maneuver)
     assert view.project(np.array([[2.0, 3.0, 7.0]])) == pytest.approx(np.array([[2.0, 3.0]]))
     assert len(figure_2(still(short_run.scene)).axes) >= 2  # though nothing moves
+
+
+def test_shapes_of_bodies_are_placed_and_replace_what_is_derived(paper_maneuver: Maneuver) -> None:
+    scene, frames = paper_maneuver.scene, paper_maneuver.frames[0]
+    cube = {"box": [0.1, 0.1, 0.1], "pose": {"position": [0, 0, 3]}, "color": "#ff00ff"}
+    shaped = scene.replace({f"{body}.geometry": [cube] for body in ("base", "links.0", "target")})
+    light = np.array([0.0, 0.0, 1.0])
+    plain, found = Schematic(scene, light), Schematic(shaped, light)
+    for faces, pose in (
+        (found.spacecraft(frames), frames[0]),
+        (found.spacecraft(frames), frames[1]),
+        (found.target(), np.array(scene.target.pose.dual_quaternion)),
+    ):
+        rotation, origin = to_matrix(tuple(pose.tolist()))
+        expected = np.array(origin) + np.array(rotation) @ [0.0, 0.0, 3.0]
+        magenta = (faces.colors[:, 1] == 0.0) & (faces.colors[:, 0] > 0.0)
+        centers = faces.corners[magenta].mean(axis=1)
+        near = np.linalg.norm(centers - expected, axis=1) < 0.1
+        assert centers[near].mean(axis=0) == pytest.approx(expected, abs=1e-9)
+    assert len(found.target().corners) > len(plain.target().corners)
+    assert len(found.spacecraft(frames).corners) < len(plain.spacecraft(frames).corners)
 
 
 def test_grid_lies_below_everything_at_round_numbers() -> None:

@@ -47,7 +47,16 @@ poses: st.SearchStrategy[dict[str, Any]] = st.one_of(
     st.fixed_dictionaries({"position": vector(numbers, 3), "rotation": quaternions()}),
     st.fixed_dictionaries({"rotation": turns}),
 )
-bodies = {"mass": positive, "inertia": inertias(), "center_of_mass": vector(numbers, 3)}
+sizes = st.floats(1e-6, 1e6)
+colors = st.sampled_from([None, "foil", "teal", "#0a1B2c"])
+solids = st.fixed_dictionaries({"box": vector(sizes, 3)}) | st.fixed_dictionaries(
+    {"cylinder": st.fixed_dictionaries({"radius": sizes, "length": sizes})}
+)
+shapes = st.lists(
+    st.builds(lambda solid, pose, color: {**solid, "pose": pose, "color": color}, solids, poses, colors),
+    max_size=2,
+)
+bodies = {"mass": positive, "inertia": inertias(), "center_of_mass": vector(numbers, 3), "geometry": shapes}
 
 
 @st.composite
@@ -73,11 +82,13 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
     scene: dict[str, st.SearchStrategy[Any]] = {
         "name": st.text(st.characters(exclude_categories=("C", "Zl", "Zp")), min_size=1, max_size=8),
         "description": st.text(max_size=20),
-        "base": st.fixed_dictionaries({"mass": positive, "inertia": inertias()}),
+        "base": st.fixed_dictionaries({"mass": positive, "inertia": inertias(), "geometry": shapes}),
         "links": st.tuples(*[st.fixed_dictionaries(link | {"name": st.just(f"link {i}")}) for i in range(n)]),
         "tip": poses,
         "actuators": st.fixed_dictionaries(actuators),
-        "target": st.fixed_dictionaries({"pose": poses, "base_velocity": vector(numbers, 6)}),
+        "target": st.fixed_dictionaries(
+            {"pose": poses, "base_velocity": vector(numbers, 6), "geometry": shapes}
+        ),
         "cost": st.fixed_dictionaries({"pose": one_or(non_negative, 8), "base_torque": one_or(positive, 3)}),
         "initial_state": st.fixed_dictionaries(
             {

@@ -34,6 +34,20 @@ def test_what_is_known_comes_back(tmp_path: Path) -> None:
     assert (found.cost, found.seed) == (3.5, 3)
 
 
+@pytest.mark.parametrize("shape", [(8,), (4, 8)])
+@pytest.mark.parametrize("name", ["target", "target_body"])
+def test_a_target_rests_or_has_a_pose_for_each_state(
+    name: str, shape: tuple[int, ...], tmp_path: Path
+) -> None:
+    path, poses = tmp_path / "flight.npz", np.arange(float(np.prod(shape))).reshape(shape)
+    Trajectory("moving", STATES, CONTROLS, **{name: poses}).save(path)
+    found = Trajectory.load(path)
+    np.testing.assert_array_equal(getattr(found, name), poses)
+    assert (found.target is None) is (name == "target_body")
+    with np.load(path) as content:
+        assert sorted(content.files) == sorted(["controls", "facts", "states", name])
+
+
 @pytest.mark.parametrize("missing", ["states", "controls"])
 def test_a_file_without_states_or_controls_is_no_flight(missing: str, tmp_path: Path) -> None:
     arrays = {"states": STATES, "controls": CONTROLS, "rewards": np.ones(3)}
@@ -51,7 +65,9 @@ def test_a_file_without_states_or_controls_is_no_flight(missing: str, tmp_path: 
         ("controls", CONTROLS[:, 0], "(3, 0)"),
         ("noise", np.ones((3, 3)), "(3, 2)"),
         ("rewards", np.ones((3, 1)), "(3,)"),
-        ("target", np.ones(7), "(8,)"),
+        ("target", np.ones(7), "(8,) or (4, 8)"),
+        ("target", np.ones((3, 8)), "(8,) or (4, 8)"),
+        ("target_body", np.ones((4, 7)), "(8,) or (4, 8)"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import load_scene
+from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.viewing.replay import write_replay
 
 SIZE = {"width": 1000, "height": 640}
@@ -242,6 +243,28 @@ def test_planar_and_diverged_flights(open_flights, make_flight):
     first = opened.picture()
     opened.seek(0.9)
     assert opened.picture() != first
+
+
+@pytest.mark.slow
+def test_a_moving_target_is_seen_to_move(open_flights, make_flight, paper):
+    """Its shapes and its name; the robot is hidden, so nothing else changes the picture."""
+    scene = paper.replace({"target.geometry": [{"box": [0.8, 0.6, 0.4], "color": "#ff00ff"}]})
+    start = scene.target.pose.dual_quaternion
+    shifts = [poses.from_axis_angle((1.0, 0.0, 0.0), 0.01 * n, (0.0, 0.0, 0.02 * n)) for n in range(61)]
+    target = np.array([dual_quaternion.multiply(start, shift) for shift in shifts])
+    still = np.tile(make_flight(scene).states[0], (61, 1))
+    flights = [replace(make_flight(scene), states=still, target=target), make_flight(scene, "other")]
+    opened = open_flights(flights, scene)
+    for number in (0, 1):
+        opened.page.locator(".flight input[type=checkbox]").nth(number).uncheck()
+    name = opened.page.locator("#labels span").first
+    first, place = opened.picture(), name.bounding_box()
+    opened.seek(0.9)
+    assert opened.picture() != first
+    later = name.bounding_box()
+    assert np.hypot(later["x"] - place["x"], later["y"] - place["y"]) > 20
+    opened.seek(0.0)
+    assert opened.picture() == first
 
 
 @pytest.mark.slow

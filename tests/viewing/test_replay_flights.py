@@ -74,6 +74,45 @@ def test_own_target_is_what_errors_refer_to(paper, make_flight):
     assert verdict(missed, paper).endswith("outside the tolerances")
 
 
+def drifting(start, steps):
+    """Poses that move along x and turn about their own z axis by more than a turn, shape (steps + 1, 8)."""
+    shares = np.linspace(0.0, 1.0, steps + 1)
+    turns = [poses.from_axis_angle((0.0, 0.0, 1.0), 7.0 * share, (0.0, 0.0, 0.0)) for share in shares]
+    shifts = [poses.from_axis_angle((0.0, 0.0, 1.0), 0.0, (0.5 * share, 0.0, 0.0)) for share in shares]
+    multiply = dual_quaternion.multiply
+    return np.array(
+        [multiply(multiply(shift, start), turn) for shift, turn in zip(shifts, turns, strict=True)]
+    )
+
+
+def test_errors_refer_to_the_target_of_the_moment(paper, make_flight):
+    """State by state, whatever the signs of the poses."""
+    flight = make_flight(paper)
+    target = drifting(paper.target.pose.dual_quaternion, 60)
+    signs = np.where(np.arange(61) % 7 == 3, -1.0, 1.0)[:, None]
+    shown = prepare([replace(flight, target=signs * target)], paper)[0]
+    np.testing.assert_allclose(shown.target, target, atol=1e-15)
+    assert (np.sum(shown.target[1:, :4] * shown.target[:-1, :4], axis=1) > 0.0).all()
+    for instant in (0, 3, 31, 60):
+        alone = prepare([replace(flight, target=target[instant])], paper)[0]
+        assert shown.angle[instant] == pytest.approx(alone.angle[instant], abs=1e-6)
+        assert shown.distance[instant] == pytest.approx(alone.distance[instant], abs=1e-12)
+    assert verdict(shown, paper) == verdict(prepare([replace(flight, target=target[-1])], paper)[0], paper)
+
+
+def test_a_target_at_rest_is_one_pose_and_a_moving_one_is_cut_off_with_the_flight(paper, make_flight):
+    flight = make_flight(paper)
+    target = drifting(paper.target.pose.dual_quaternion, 60)
+    resting = prepare([replace(flight, target=np.tile(target[0], (61, 1)), target_body=target)], paper)[0]
+    assert resting.target.shape == (8,)
+    np.testing.assert_allclose(resting.target_body, target, atol=1e-15)
+    states = flight.states.copy()
+    states[31:] = np.nan
+    cut = prepare([replace(flight, states=states, target=target, target_body=target[0])], paper)[0]
+    assert (cut.target.shape, cut.target_body.shape) == ((31, 8), (8,))
+    assert prepare([flight], paper)[0].target_body is None
+
+
 @pytest.mark.parametrize(
     ("angle", "distance", "expected"),
     [
@@ -101,6 +140,9 @@ def test_unusable_flights_are_refused_in_a_sentence(paper, make_flight):
         ([replace(good, states=nan)], "its first step is not finite"),
         ([replace(good, target=np.zeros(3))], "should be a pose, 8 finite numbers"),
         ([replace(good, target=np.zeros(8))], "its real part should have length 1"),
+        ([replace(good, target=np.ones((60, 8)))], "should be a pose, .* or one for each of 61 states"),
+        ([replace(good, target_body=np.full((61, 8), np.nan))], "target_body: .* 8 finite numbers"),
+        ([replace(good, target_body=np.ones((61, 8)))], "target_body: .*real part should have length 1"),
         ([replace(good, controls=np.full((60, 12), "x"))], "'expert': controls: should be numbers"),
     ):
         with pytest.raises(ValueError, match=sentence):

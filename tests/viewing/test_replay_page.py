@@ -15,6 +15,7 @@ from dq_space_arm_env import list_scenes, load_scene
 from dq_space_arm_env.algebra import dual_quaternion, poses, screw
 from dq_space_arm_env.viewing.replay import replay_page, write_replay
 from dq_space_arm_env.viewing.replay.flights import prepare
+from dq_space_arm_env.viewing.replay.geometry import view_of
 from dq_space_arm_env.viewing.replay.page import SCRIPTS, bundle
 
 BROWSER = files("dq_space_arm_env.viewing.replay").joinpath("browser")
@@ -76,6 +77,70 @@ def test_numbers_of_the_page_are_those_of_the_flight(make_flight, paper):
     expected = flight.controls[:, 9:].T.ravel()
     np.testing.assert_array_equal(array(rates["curves"][0]), expected.astype(np.float32))
     np.testing.assert_allclose(array(rates["disturbed"][0]), expected + 1.0, rtol=1e-6)
+
+
+def drifting(paper, steps):
+    """Poses of a target that turns and moves, shape (steps + 1, 8)."""
+    start, axis = paper.target.pose.dual_quaternion, (0.0, 0.0, 1.0)
+    moves = [poses.from_axis_angle(axis, 0.01 * step, (0.02 * step, 0.0, 0.0)) for step in range(steps + 1)]
+    return np.array([dual_quaternion.multiply(start, move) for move in moves])
+
+
+def test_a_moving_target_and_its_body_are_in_the_data(make_flight, paper):
+    scene = paper.replace({"target.geometry": [{"box": [1, 1, 1]}]})
+    target = drifting(paper, 60)
+    moving = replace(make_flight(scene), target=target, target_body=target[5])
+    data = data_of(replay_page([moving, make_flight(scene, "still")], scene))
+    blob, (first, second) = b64decode(data["blob"]), data["flights"]
+    place = first["target"]
+    found = np.frombuffer(blob, place["type"], place["length"], place["start"]).reshape(61, 8)
+    np.testing.assert_array_equal(found, target.astype(np.float32))
+    assert first["targetBody"] == target[5].tolist()
+    assert (second["target"], second["targetBody"]) == (list(paper.target.pose.dual_quaternion), None)
+    assert data["solids"]["counts"][-1] == 12  # triangles of a box
+
+
+def test_a_target_at_rest_and_no_shapes_cost_nothing(make_flight, paper):
+    flight = make_flight(paper)
+    pose = np.array(paper.target.pose.dual_quaternion)
+    page = replay_page([flight], paper)
+    assert replay_page([replace(flight, target=np.tile(pose, (61, 1)))], paper) == page
+    data = data_of(page)
+    assert (data["solids"]["counts"][-1], data["flights"][0]["targetBody"]) == (0, None)
+
+
+def test_a_target_that_moves_away_stays_in_the_picture(make_flight, paper):
+    flight = make_flight(paper)
+    target = drifting(paper, 60)
+    near, far = (view_of(prepare([replace(flight, target=q)], paper), paper) for q in (target[0], target))
+    position = np.array(poses.position(tuple(target[-1])))
+    assert any((near.points @ axis).max() < position @ axis for axis in (*np.eye(3), *-np.eye(3)))
+    assert all(position @ axis <= (far.points @ axis).max() for axis in (*np.eye(3), *-np.eye(3)))
+
+
+@pytest.mark.skipif(which("node") is None, reason="node is not installed")
+def test_the_page_moves_target_and_body_with_time(make_flight, paper, tmp_path):
+    """Poses at an instant between two, by the page's own script, against the screw motion between them."""
+    target = drifting(paper, 60)
+    body = np.array([dual_quaternion.multiply(tuple(pose), tuple(target[30])) for pose in target])
+    flight = replace(make_flight(paper), target=target, target_body=body)
+    text = DATA.search(replay_page([flight, make_flight(paper, "still")], paper))[1]
+    (tmp_path / "data.json").write_text(text, encoding="utf-8")
+    script = tmp_path / "read.mjs"
+    script.write_text(
+        'import { readFileSync } from "node:fs";\n'
+        f'import {{ readRecording }} from "{BROWSER / "recording.mjs"}";\n'
+        f'const {{ flights }} = readRecording(readFileSync("{tmp_path / "data.json"}", "utf-8"));\n'
+        "for (const flight of flights) flight.moveTo(20.25 * 0.015);\n"
+        "console.log(JSON.stringify(flights.map((flight) => [[...flight.poses.slice(-16)], flight.aim])));"
+    )
+    printed = subprocess.run(["node", str(script)], check=True, capture_output=True, text=True).stdout
+    (moved, aim), (rest, _) = json.loads(printed)
+    expected = [screw.interpolate(tuple(each[20]), tuple(each[21]), 0.25) for each in (target, body)]
+    np.testing.assert_allclose(np.reshape(moved, (2, 8)), expected, atol=1e-5)
+    np.testing.assert_allclose(aim, poses.position(expected[0]), atol=1e-5)
+    nominal = paper.target.pose.dual_quaternion
+    np.testing.assert_allclose(np.reshape(rest, (2, 8)), [nominal, nominal], atol=1e-6)
 
 
 def test_unlimited_inputs_have_a_page(make_flight, paper):

@@ -25,8 +25,8 @@ class Renderer:
     """Draws a scene from a fixed camera.
 
     The tip has solid axes, red, green and blue for x, y and z; the target has paler ones and a ghost of the
-    hand. The target is the scene's until another is given; if the scene draws it for each episode, the whole
-    spread of its position is in view.
+    hand, and the shapes of its body, if the scene gives any. The target is the scene's until another is
+    given; if the scene draws it for each episode, the whole spread of its position is in view.
 
     Attributes:
         camera: The camera.
@@ -40,13 +40,20 @@ class Renderer:
         self.camera = camera_around(*self._model.region, default._replace(**given), width, height)
         self._rasterizer = Rasterizer(width, height)
         self._sky = paint_sky(width, height)
-        self._target = np.array(scene.target.pose.dual_quaternion)
+        self.aim_at(scene.target.pose.dual_quaternion)
         self._title = f"DQ Space Arm: {scene.name}"
         self._window: Window | None = None
 
-    def aim_at(self, target: ArrayLike) -> None:
-        """Move the target to a pose q_{D/I}, shape (8,)."""
+    def aim_at(self, target: ArrayLike, body: ArrayLike | None = None) -> None:
+        """Move the target, for the pictures that follow.
+
+        Args:
+            target: Desired pose of the tip q_{D/I}, shape (8,), real part dimensionless, dual part m.
+            body: Pose of the target's body in the inertial frame, where its shapes are drawn, shape (8,),
+                same units; None: that of the target.
+        """
         self._target = np.array(target, dtype=np.float64)
+        self._target_body = self._target if body is None else np.array(body, dtype=np.float64)
 
     # Diverged simulations (infinite, NaN) are not drawn; a warning for each number would not help.
     @np.errstate(over="ignore", invalid="ignore")
@@ -82,8 +89,9 @@ class Renderer:
 
     def _faces(self, dual_quaternions: Array, trail: Array) -> Faces:
         """Faces of the solids and the trail."""
-        # The frame after the robot's is the target's.
-        matrices, origins = poses.to_matrix(np.vstack([dual_quaternions, self._target]).T)
+        # The frames after the robot's are those of the target and of its body.
+        frames = np.vstack([dual_quaternions, self._target, self._target_body])
+        matrices, origins = poses.to_matrix(frames.T)
         rotations: Array = np.moveaxis(np.array(matrices), 2, 0)
         solids = mesh_faces(self._model.mesh, rotations, np.array(origins).T, self.camera)
         ribbon = trail_faces(trail, self.camera)

@@ -1,13 +1,14 @@
 """A scene as solids: spacecraft, arm, payload and target, and the region that they reach.
 
-A scene gives masses and frames, not shapes. Base and payload are drawn as the homogeneous boxes of their
-inertia; links join the origins of neighboring frames, in proportions taken from the length of the arm.
+A body with shapes of its own is drawn by these alone. For others a scene gives masses and frames: base and
+payload are drawn as the homogeneous boxes of their inertia; links join the origins of neighboring frames, in
+proportions taken from the length of the arm.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -17,18 +18,15 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.kinematics import frame_poses
 from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.scene.shapes import COLORS, Shape
+from dq_space_arm_env.viewing.rendering.body_shapes import balls_around, corners_of, shape_meshes
 from dq_space_arm_env.viewing.rendering.solids import Mesh, ball, box, crumpled_box, cylinder, lathe
 
 Array = NDArray[np.float64]
 
-FOIL = (1.0, 0.74, 0.34)
-METAL = (0.62, 0.65, 0.70)
-RADIATOR = (0.80, 0.82, 0.85)
-DARK_METAL = (0.24, 0.26, 0.31)
-CELLS = (0.16, 0.27, 0.58)
-LINK = (0.95, 0.95, 0.96)
-JOINT = (0.36, 0.42, 0.52)
-GRASPED = (0.42, 0.60, 0.58)
+FOIL, METAL, DARK_METAL, RADIATOR, CELLS, LINK, JOINT, GRASPED = (
+    COLORS[name] for name in ("foil", "metal", "dark_metal", "radiator", "cells", "white", "slate", "teal")
+)
 LIKENESS = (0.80, 0.88, 1.0)
 AXIS_COLORS = ((1.0, 0.24, 0.22), (0.26, 0.88, 0.34), (0.26, 0.52, 1.0))
 
@@ -49,8 +47,8 @@ def equivalent_box(mass: float, inertia: ArrayLike) -> tuple[Array, Array]:
 class SpacecraftModel:
     """The solids of a scene.
 
-    Frames are numbered as in `Kernels.frame_poses`: base, joints, wrist (if any), tip. The number after those
-    stands for the target.
+    Frames are numbered as in `Kernels.frame_poses`: base, joints, wrist (if any), tip. The two numbers after
+    those stand for the target, which is where the tip should be, and for the target's body.
 
     Attributes:
         scene: The scene.
@@ -66,6 +64,8 @@ class SpacecraftModel:
         self._offsets = np.array([*offsets, scene.tip.position])
         self.frame_count = len(self._offsets) + 1
         self._body_size, self._body_axes = equivalent_box(scene.base.mass, scene.base.inertia)
+        if scene.base.geometry:
+            self._body_size, self._body_axes = np.ptp(corners_of(scene.base.geometry), axis=0), np.eye(3)
         lengths = np.linalg.norm(self._offsets, axis=1)
         # Without links or wrist the tip is part of the base.
         self._arm_length = float(lengths[1:].sum())
@@ -73,15 +73,17 @@ class SpacecraftModel:
 
     @cached_property
     def mesh(self) -> Mesh:
-        """All solids; the frame after the robot's is the target's."""
-        hand = list(self._hand())
+        """All solids; the frames after the robot's are those of the target and of its body."""
+        hand = list(self._hand()) if self._has_hand else []
         # The ghost of the hand stands to the target as the hand to the tip.
         from_tip = np.array(self.scene.tip.rotation_matrix)
         likeness = [
             part.moved(self.frame_count, from_tip.T, -from_tip.T @ self._offsets[-1]).likeness(LIKENESS)
             for part in hand
         ]
-        return Mesh.joined([*self._base(), *self._arm(), *hand, *self._payload(), *self._axes(), *likeness])
+        body = shape_meshes(self.frame_count + 1, self.scene.target.geometry, METAL)
+        parts = [*self._base(), *self._arm(), *hand, *self._payload(), *self._axes(), *likeness, *body]
+        return Mesh.joined(parts)
 
     @cached_property
     def axis_length(self) -> float:
@@ -103,16 +105,28 @@ class SpacecraftModel:
         # Less than the arm's reach: it works between start and target, and is seen better from near.
         reach = self._arm_length + self._overhang()
         target = 1.2 * self.axis_length + math.sqrt(3.0) * spread.target_position
-        balls = [
+        body = [
             (frames[0], 0.75 * float(np.linalg.norm(self._body_size))),
             (frames[0] + wing, 0.3 * float(self._body_size.max())),
             (frames[0] - wing, 0.3 * float(self._body_size.max())),
+        ]
+        balls = [
+            *(() if self.scene.base.geometry else body),
             (shoulder, 0.6 * reach),
             (frames[-1], 0.15 * reach + self._overhang()),
             (np.array(self.scene.target.pose.position), target),
+            *self._shape_balls(poses_at_start),
         ]
         centers, radii = zip(*balls, strict=True)
         return np.array(centers), np.array(radii)
+
+    def _shape_balls(self, starts: Sequence[Sequence[float]]) -> Iterator[tuple[Array, float]]:
+        """Balls around given shapes, given the poses of the robot's frames at the start."""
+        for shapes, pose in zip(self._geometry, starts, strict=False):
+            yield from balls_around(shapes, pose)
+        target, spread = self.scene.target, self.scene.spread
+        turn, shift = (math.sqrt(3.0) * width for width in (spread.target_rotation, spread.target_position))
+        yield from balls_around(target.geometry, target.pose.dual_quaternion, turn, shift)
 
     @cached_property
     def _wing_axes(self) -> tuple[int, int, int]:
@@ -134,6 +148,9 @@ class SpacecraftModel:
         return tip
 
     def _base(self) -> Iterator[Mesh]:
+        if self.scene.base.geometry:
+            yield from shape_meshes(0, self.scene.base.geometry, FOIL)
+            return
         size, axes = self._body_size, self._body_axes
         yield crumpled_box(0, (0.0, 0.0, 0.0), size, FOIL, axes)
         yield from self._rims()
@@ -205,16 +222,33 @@ class SpacecraftModel:
 
     def _arm(self) -> Iterator[Mesh]:
         last = len(self._offsets) - 1
+        shapes = self._geometry
         for frame, offset in enumerate(self._offsets):
+            if shapes[frame]:
+                continue
             radius, color = (self._radius(frame), LINK) if frame else (1.2 * self._radius(frame), METAL)
             end = offset if frame < last else self._hand_start
             if np.linalg.norm(end) > 0.1 * radius:
                 yield cylinder(frame, (0.0, 0.0, 0.0), end, radius, color)
         for joint in range(1, len(self.scene.links) + 1):
-            yield from self._joint(joint)
+            if shapes[joint]:
+                yield from shape_meshes(joint, shapes[joint], LINK)
+            else:
+                yield from self._joint(joint)
         if self.scene.wrist is not None:
             frame = len(self.scene.links) + 1
             yield ball(frame, (0.0, 0.0, 0.0), 1.5 * self._radius(frame), JOINT)
+
+    @property
+    def _geometry(self) -> list[tuple[Shape, ...]]:
+        """Given shapes of what is fixed in each frame but the tip's; a wrist has none."""
+        own = [self.scene.base.geometry, *(link.geometry for link in self.scene.links)]
+        return own if self.scene.wrist is None else [*own, ()]
+
+    @property
+    def _has_hand(self) -> bool:
+        """Whether a hand is drawn: as part of the body before the tip, if that has no shapes of its own."""
+        return not self._geometry[-1]
 
     def _joint(self, frame: int) -> Iterator[Mesh]:
         """A beveled housing along the joint's z axis."""
@@ -247,7 +281,9 @@ class SpacecraftModel:
         """Reach of hand and payload beyond the tip, m."""
         overhang = max(0.0, self._hand_length - float(np.linalg.norm(self._offsets[-1])))
         payload = self.scene.payload
-        if payload is not None:
+        if payload is not None and payload.geometry:
+            overhang = max(overhang, float(np.linalg.norm(corners_of(payload.geometry), axis=1).max()))
+        elif payload is not None:
             size, _ = equivalent_box(payload.mass, payload.inertia)
             overhang = max(overhang, float(np.linalg.norm(payload.center_of_mass) + 0.5 * size.max()))
         return overhang
@@ -268,7 +304,9 @@ class SpacecraftModel:
 
     def _payload(self) -> Iterator[Mesh]:
         payload = self.scene.payload
-        if payload is not None:
+        if payload is not None and payload.geometry:
+            yield from shape_meshes(self.frame_count - 1, payload.geometry, GRASPED)
+        elif payload is not None:
             size, axes = equivalent_box(payload.mass, payload.inertia)
             yield box(self.frame_count - 1, payload.center_of_mass, size, GRASPED, axes)
 

@@ -31,7 +31,10 @@ class ShownFlight:
     label: str
     controls: FloatArray  # commanded, shape (M, n_u), N, N m or rad/s
     noise: FloatArray | None  # added to it at the actuators, same shape and units; None for none
-    target: FloatArray  # q_{D/I}, shape (8,)
+    # Desired pose of the tip q_{D/I}, and pose of the target's body, None if that is the same; one that moves
+    # has a pose for each state, with signs that make them continuous in time.
+    target: FloatArray  # shape (8,) or (M + 1, 8)
+    target_body: FloatArray | None  # shape (8,) or (M + 1, 8)
     # Poses of base, joint frames, wrist frame (if any) and tip, with signs that make them continuous in time.
     frames: FloatArray  # shape (M + 1, frames, 8), dimensionless and m
     angle: FloatArray  # Euler angle of the tip's attitude error, shape (M + 1,), deg
@@ -70,15 +73,18 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
     shown = _finite_steps(states, controls, noise)
     if shown < 1:
         raise ValueError(f"{what}: its first step is not finite or has blown up: there is nothing to show")
-    target = _pose(what, scene.target.pose.dual_quaternion if flight.target is None else flight.target)
+    given = scene.target.pose.dual_quaternion if flight.target is None else flight.target
+    target = _target(f"{what}: target", given, steps, shown)
+    body = flight.target_body
     frames = _continuous(frame_poses(scene, layout, states[: shown + 1]))
-    tip, aim = tuple(frames[:, -1].T), tuple(target.tolist())
+    tip, aim = tuple(frames[:, -1].T), tuple(target.T) if target.ndim == 2 else tuple(target.tolist())
     seconds = shown * scene.simulation.dt
     return ShownFlight(
         label=flight.label,
         controls=controls[:shown],
         noise=None if noise is None else noise[:shown],
         target=target,
+        target_body=None if body is None else _target(f"{what}: target_body", body, steps, shown),
         frames=frames,
         angle=np.degrees(poses.error_angle(tip, aim)),
         distance=np.asarray(poses.error_distance(tip, aim)),
@@ -95,6 +101,11 @@ def frame_poses(scene: Scene, layout: StateLayout, states: FloatArray) -> FloatA
     joints, wrist = tuple(states[:, entries.joint_angles].T), tuple(states[:, entries.wrist_angles].T)
     frames = kinematics.frame_poses(Chain.from_scene(scene), tuple(base), joints, wrist)
     return np.stack([np.stack(frame, axis=1) for frame in frames], axis=1)
+
+
+def poses_at(target: FloatArray, instants: NDArray[np.intp]) -> FloatArray:
+    """Poses of a target, (8,) or (M + 1, 8), at some instants, shape (instants, 8)."""
+    return target[instants] if target.ndim == 2 else np.tile(target, (len(instants), 1))
 
 
 def _continuous(frames: FloatArray) -> FloatArray:
@@ -117,13 +128,18 @@ def _finite_steps(states: FloatArray, controls: FloatArray, noise: FloatArray | 
     return len(good) if good.all() else int(np.argmin(good))
 
 
-def _pose(what: str, value: ArrayLike) -> FloatArray:
-    target = _numbers(f"{what}: target", value)
-    if target.shape != (8,) or not np.isfinite(target).all():
-        raise ValueError(f"{what}: target: {target}, should be a pose, 8 finite numbers")
-    if abs(np.linalg.norm(target[:4]) - 1.0) > _UNIT:
-        raise ValueError(f"{what}: target: {target}, should be a pose: its real part should have length 1")
-    return target
+def _target(what: str, value: ArrayLike, steps: int, shown: int) -> FloatArray:
+    """Check a target, and keep what is shown of it: (8,) if it is at rest there, else (shown + 1, 8)."""
+    target = _numbers(what, value)
+    said = f"{what}: {target if target.ndim == 1 else f'array of shape {target.shape}'}, should be a pose"
+    if target.shape not in ((8,), (steps + 1, 8)) or not np.isfinite(target).all():
+        raise ValueError(f"{said}, 8 finite numbers, or one for each of {steps + 1} states")
+    if (np.abs(np.linalg.norm(target[..., :4], axis=-1) - 1.0) > _UNIT).any():
+        raise ValueError(f"{said}: its real part should have length 1")
+    if target.ndim == 1:
+        return target
+    moving = _continuous(target[: shown + 1, None])[:, 0]
+    return moving[0] if (moving == moving[0]).all() else moving
 
 
 def _numbers(name: str, value: ArrayLike) -> FloatArray:

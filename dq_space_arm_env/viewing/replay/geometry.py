@@ -14,7 +14,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.viewing.rendering.solids import Mesh
 from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
-from dq_space_arm_env.viewing.replay.flights import FloatArray, ShownFlight
+from dq_space_arm_env.viewing.replay.flights import FloatArray, ShownFlight, poses_at
 
 _CREASE = math.cos(math.radians(40.0))
 _STEPS_PER_METER = 1e5  # resolution of corners; equal ones share a vertex
@@ -32,7 +32,8 @@ class Solids(NamedTuple):
     normals: NDArray[np.int8]  # in that frame, units of 1/127, shape (V, 4); the last is 0
     colors: NDArray[np.uint8]  # red, green, blue in units of 1/255, shape (V, 4); the last is 255
     triangles: NDArray[np.uint16]  # vertices, counterclockwise seen from outside, shape (T, 3)
-    counts: tuple[int, ...]  # of triangles in each frame, frame by frame, the target's last
+    # Of triangles in each frame, frame by frame, in the end those of the target and of its body.
+    counts: tuple[int, ...]
     axis_length: float  # m
 
 
@@ -76,7 +77,7 @@ def solids_of(scene: Scene) -> Solids:
         np.column_stack([distinct[:, 4:7], np.zeros(count)]).astype(np.int8),
         np.column_stack([distinct[:, 1:4], np.full(count, 255)]).astype(np.uint8),
         triangles.reshape(-1, 3).astype(np.uint16),
-        tuple(np.bincount(looks[kept, 0].astype(int), minlength=model.frame_count + 1).tolist()),
+        tuple(np.bincount(looks[kept, 0].astype(int), minlength=model.frame_count + 2).tolist()),
         model.axis_length,
     )
 
@@ -99,17 +100,24 @@ def smooth_normals(mesh: Mesh) -> FloatArray:
 def view_of(flights: Sequence[ShownFlight], scene: Scene) -> View:
     """Choose the side from which arm and target are seen best."""
     model = SpacecraftModel(scene)
-    instants = [flight.frames[np.linspace(0, flight.steps, _INSTANTS).astype(int)] for flight in flights]
-    targets = np.stack([flight.target for flight in flights])
-    origins = [np.moveaxis(np.array(poses.position(tuple(np.moveaxis(f, 2, 0)))), 0, 2) for f in instants]
-    goals = np.stack([np.array(poses.position(tuple(target))) for target in targets])
+    frames = [_frames_at(flight) for flight in flights]
+    origins = [np.moveaxis(np.array(poses.position(tuple(np.moveaxis(f, 2, 0)))), 0, 2) for f in frames]
+    robots, goals = [origin[:, :-2] for origin in origins], np.stack([origin[:, -2] for origin in origins])
     if scene.base.motion == "planar":
         azimuth, elevation = _PLANAR_VIEW
     else:
-        azimuth, elevation = _best_direction(origins, goals, float(model.axis_length))
-    cloud = [_corners(model, frames, target) for frames, target in zip(instants, targets, strict=True)]
-    arm = np.concatenate([*(origin[:, 1:].reshape(-1, 3) for origin in origins), goals])
+        azimuth, elevation = _best_direction(robots, goals[:, 0], float(model.axis_length))
+    cloud = [_corners(model, each) for each in frames]
+    arm = np.concatenate([*(robot[:, 1:].reshape(-1, 3) for robot in robots), goals.reshape(-1, 3)])
     return View(azimuth, elevation, _outermost(np.concatenate(cloud)), 0.5 * (arm.min(0) + arm.max(0)))
+
+
+def _frames_at(flight: ShownFlight) -> FloatArray:
+    """Frames of robot, target and target's body at some instants, shape (instants, frames + 2, 8)."""
+    instants = np.linspace(0, flight.steps, _INSTANTS).astype(int)
+    body = flight.target if flight.target_body is None else flight.target_body
+    targets = [poses_at(target, instants)[:, None] for target in (flight.target, body)]
+    return np.concatenate([flight.frames[instants], *targets], axis=1)
 
 
 def direction(azimuth: float, elevation: float) -> FloatArray:
@@ -139,14 +147,14 @@ def _best_direction(origins: Sequence[FloatArray], goals: FloatArray, size: floa
     return max(itertools.product(_AZIMUTHS, _ELEVATIONS), key=score)
 
 
-def _corners(model: SpacecraftModel, frames: FloatArray, target: FloatArray) -> FloatArray:
+def _corners(model: SpacecraftModel, frames: FloatArray) -> FloatArray:
     """Corners of all solids at some instants, shape (n, 3), except of a robot that has flown away."""
     corners = np.column_stack([np.repeat(model.mesh.frames, 4), model.mesh.corners.reshape(-1, 3)])
     corners = np.unique(np.round(corners, 3), axis=0)
     numbers, places = corners[:, 0].astype(int), corners[:, 1:, None]
     points = []
     for instant in frames:
-        matrices, positions = poses.to_matrix(np.vstack([instant, target]).T)
+        matrices, positions = poses.to_matrix(instant.T)
         rotations = np.moveaxis(np.array(matrices), 2, 0)[numbers]
         points.append((rotations @ places)[..., 0] + np.array(positions).T[numbers])
     cloud = np.concatenate(points)

@@ -129,6 +129,11 @@ def _as_script(data: dict[str, Any]) -> str:
     return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
+def _target(target: NDArray[np.float64], blob: _Blob) -> list[float] | dict[str, Any]:
+    """The numbers of a pose, or the place of those of a target that moves."""
+    return target.tolist() if target.ndim == 1 else blob.add(target.astype(np.float32))
+
+
 def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
     """Content of the page as JSON values."""
     shown = prepare(flights, scene)
@@ -161,7 +166,8 @@ def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
                 "steps": flight.steps,
                 "note": flight.note,
                 "verdict": verdict(flight, scene),
-                "target": flight.target.tolist(),
+                "target": _target(flight.target, blob),
+                "targetBody": None if flight.target_body is None else _target(flight.target_body, blob),
                 "frames": blob.add(flight.frames.astype(np.float32)),
             }
             for flight in shown

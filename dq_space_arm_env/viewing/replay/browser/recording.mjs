@@ -15,10 +15,12 @@ export function readRecording(text) {
   const { solids, view } = data;
   for (const name of ["positions", "normals", "colors", "triangles"]) solids[name] = array(solids[name]);
   view.points = array(view.points);
-  const frameCount = solids.counts.length - 1; // the last one is the target's
-  const flights = data.flights.map(
-    (flight) => new Flight({ ...flight, frames: array(flight.frames) }, frameCount, data.scene.dt),
-  );
+  const frameCount = solids.counts.length - 2; // the last two are those of the target and of its body
+  const target = (place) => (place && !Array.isArray(place) ? array(place) : place);
+  const flights = data.flights.map((flight) => {
+    const arrays = { frames: array(flight.frames), target: target(flight.target), targetBody: target(flight.targetBody) };
+    return new Flight({ ...flight, ...arrays }, frameCount, data.scene.dt);
+  });
   const panels = data.panels.map((panel) => ({
     ...panel,
     curves: panel.curves.map(array),
@@ -30,12 +32,16 @@ export function readRecording(text) {
 /** A flight: its poses at any time; before its beginning the first, after its end the last. */
 export class Flight {
   constructor(description, frameCount, dt) {
-    Object.assign(this, description); // label, steps, note, verdict, target, frames
+    Object.assign(this, description); // label, steps, note, verdict, target, targetBody, frames
     this.frameCount = frameCount;
     this.dt = dt;
-    // The target's pose comes after the robot's.
-    this.poses = new Float32Array(8 * (frameCount + 1));
-    this.poses.set(this.target, 8 * frameCount);
+    // The poses of the target and of its body come after the robot's.
+    this.poses = new Float32Array(8 * (frameCount + 2));
+    this.targets = [this.target, this.targetBody ?? this.target].map((source, index) => ({
+      source, // a pose, or one for each instant
+      poses: this.poses.subarray(8 * (frameCount + index), 8 * (frameCount + index + 1)),
+    }));
+    for (const { source, poses } of this.targets) poses.set(source.slice(0, 8));
   }
 
   get duration() {
@@ -48,6 +54,9 @@ export class Flight {
     const before = Math.min(Math.floor(place), this.steps - 1);
     const size = 8 * this.frameCount;
     blendPoses(this.frames, before * size, (before + 1) * size, place - before, this.frameCount, this.poses);
+    for (const { source, poses } of this.targets) {
+      if (source.length > 8) blendPoses(source, 8 * before, 8 * (before + 1), place - before, 1, poses);
+    }
   }
 
   /** Position of the tip at an instant. */

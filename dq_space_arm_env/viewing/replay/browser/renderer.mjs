@@ -36,13 +36,14 @@ export class Renderer {
       grid: this.program(GRID_SHADERS),
       sky: this.program(SKY_SHADERS),
     };
-    // Frame by frame: where its triangles begin, and how many there are; the last frame is the target's.
+    // Frame by frame: where its triangles begin, and how many there are; the last two frames are those of the
+    // target and of its body.
     const starts = solids.counts.map((_, frame) => solids.counts.slice(0, frame).reduce((a, b) => a + b, 0));
     this.parts = solids.counts.map((count, frame) => ({ frame, start: starts[frame], count }));
     this.robot = this.solid(solids);
     const bubble = ball(scene.tolerance);
     this.bubble = this.solid(bubble);
-    this.bubbleParts = [{ frame: this.parts.length - 1, start: 0, count: bubble.triangles.length / 3 }];
+    this.bubbleParts = [{ frame: this.parts.length - 2, start: 0, count: bubble.triangles.length / 3 }];
     this.ribbons = flights.map((flight) => {
       const { positions, directions, places, vertexCount } = ribbon(flight);
       return {
@@ -148,7 +149,7 @@ export class Renderer {
     const ghosts = flights.map((_, index) => index).filter((i) => moment.visible[i] && i !== moment.solid);
     const front = flights[moment.solid];
     gl.disable(gl.BLEND);
-    const parts = moment.visible[moment.solid] ? this.parts : this.parts.slice(-1);
+    const parts = moment.visible[moment.solid] ? this.parts : this.parts.slice(-2);
     this.drawSolid(front, { shape: this.robot, parts, tint: [0, 0, 0, 0], opacity: 1 });
     gl.enable(gl.BLEND);
     gl.depthMask(false);
@@ -201,6 +202,7 @@ export class Renderer {
     gl.uniform1f(uniforms.u_rim, rim);
     gl.uniform1f(uniforms.u_ambient, this.look.ambient + glow);
     for (const { frame, start, count } of parts) {
+      if (count === 0) continue;
       const matrix = multiply(this.matrices.view, poseMatrix(flight.poses, 8 * frame));
       gl.uniformMatrix4fv(uniforms.u_frame, false, matrix);
       gl.drawElements(gl.TRIANGLES, 3 * count, gl.UNSIGNED_SHORT, 6 * start);
@@ -215,7 +217,7 @@ export class Renderer {
     const { gl } = this;
     const ghost = {
       shape: this.robot,
-      parts: this.parts.slice(0, -1),
+      parts: this.parts.slice(0, -2),
       tint: [...color, GHOST_TINT],
       opacity: GHOST_OPACITY,
       glow: GHOST_GLOW,
