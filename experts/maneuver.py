@@ -8,7 +8,7 @@ import numpy as np
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import StateLayout
-from dq_space_arm_env.scene.path import target_path, target_pose
+from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.viewing.replay.flights import frame_poses
 from experts.problems.shooting_problem import FloatArray
 
@@ -63,9 +63,8 @@ class Maneuver:
     @cached_property
     def target(self) -> tuple[FloatArray, ...] | tuple[float, ...]:
         """Pose q_{D/I} of the target at the states, 8 numbers, or 8 of shape (N + 1,) where it moves."""
-        if self.scene.target.motion is None:
-            return target_pose(self.scene)
-        return tuple(target_path(self.scene)[: len(self.states)].T)
+        target = shown_target(self.scene)[0]
+        return tuple(target.tolist()) if target.ndim == 1 else tuple(target[: len(self.states)].T)
 
     @cached_property
     def error_pose(self) -> FloatArray:

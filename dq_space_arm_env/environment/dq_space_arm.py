@@ -441,7 +441,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             from dq_space_arm_env.viewing.rendering import Renderer
 
             self._renderer = Renderer(self.scene, self._picture)
-        self._renderer.aim_at(self.target)
+        parameters, layout = self.stage_parameters, self.kernels.layout
+        self._renderer.aim_at(layout.target_with(parameters), layout.target_body_with(parameters))
         frames, trail = self.kernels.frame_poses(self._x), np.array(self._trail)
         if self.render_mode == "rgb_array":
             return self._renderer.draw(frames, trail)

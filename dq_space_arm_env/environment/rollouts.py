@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances
 from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
 from dq_space_arm_env.kernels import compile_scene
-from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.parameters import has_grasp
 from dq_space_arm_env.task.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
@@ -112,18 +113,18 @@ class Rollout:
         """The record of one episode, whose states must have been recorded."""
         if self.states is None or self.controls is None:
             raise ValueError("the rollout has no states: call rollout(..., record=True)")
-        steps, target = int(self.length[episode]), self.targets[episode]
-        if self.scene.target.motion is not None:
-            kernels = compile_scene(self.scene)
-            stages = kernels.stage_parameters(self.parameters[episode])[: steps + 1]
-            target = kernels.layout.target_with(stages)
+        steps, layout = int(self.length[episode]), StateLayout.of(self.scene)
+        parameters = self.parameters[episode]
+        if layout.parameters.moving:
+            parameters = compile_scene(self.scene).stage_parameters(parameters)[: steps + 1]
         return Trajectory(
             label=label,
             states=self.states[episode, : steps + 1],
             controls=self.controls[episode, :steps],
             noise=None if self.noise is None else self.noise[episode, :steps],
             rewards=self.rewards[episode, :steps],
-            target=target,
+            target=layout.target_with(parameters),
+            target_body=layout.target_body_with(parameters) if has_grasp(self.scene) else None,
             scene=self.scene,
             start=start,
             seed=None if self.seeds is None else self.seeds[episode],

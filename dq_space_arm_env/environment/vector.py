@@ -436,9 +436,11 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             from dq_space_arm_env.viewing.rendering import Renderer
 
             self._renderer = Renderer(self.scene, self._picture)
-        frames, targets, pictures = self.kernels.frame_poses(self._envs.x), self.targets, []
+        frames, parameters, pictures = self.kernels.frame_poses(self._envs.x), self.stage_parameters, []
+        layout = self.kernels.layout
+        targets, bodies = layout.target_with(parameters), layout.target_body_with(parameters)
         for row in range(self.num_envs):
-            self._renderer.aim_at(targets[row])
+            self._renderer.aim_at(targets[row], bodies[row])
             pictures.append(self._renderer.draw(frames[row], self._trails.of(row)))
         return tuple(pictures)
 

@@ -79,36 +79,33 @@ def _turned(inertia: Matrix3, angular: Scalars, h: Scalar) -> tuple[Scalars, Sca
     return sums[0], add(angular, sums[1])
 
 
-def target_pose(scene: Scene) -> tuple[float, ...]:
-    """Pose q_{D/I} of a scene's target, at the start if it moves."""
-    target = scene.target
-    if target.grasp.dual_quaternion == dq.IDENTITY:  # the same bits
-        return tuple(target.pose.dual_quaternion)
-    return tuple(dq.multiply(target.pose.dual_quaternion, target.grasp.dual_quaternion))
+def shown_target(scene: Scene) -> tuple[Array, Array | None]:
+    """Poses of a scene's target for pictures, without compiled code, equal to the machine code's to rounding.
 
-
-def target_path(scene: Scene) -> Array:
-    """Poses q_{D/I} of a scene's target at all stages, shape (steps + 1, 8), without compiled code.
-
-    They agree with those of the machine code to rounding errors.
+    Returns q_{D/I}, and the pose of the target's body where that differs: shape (8,), or (steps + 1, 8) where
+    it moves.
     """
-    steps, motion, target = scene.simulation.steps, scene.target.motion, scene.target
-    pose: Scalars = target.pose.dual_quaternion
-    if motion is None:
-        path = np.tile(np.array(pose), (steps + 1, 1))
-    elif isinstance(motion, Waypoints):
-        path = np.stack(dq.multiply(pose, tuple(given_path(scene, steps)[:, :8].T)), axis=1)
-    elif isinstance(motion, ScrewMotion):
-        times = scene.simulation.dt * np.arange(steps + 1)
-        path = np.stack(advanced(motion, pose, first_velocity(scene), times)[0], axis=1)
-    else:
-        velocity: Scalars = first_velocity(scene)
-        path = np.empty((steps + 1, 8))
-        path[0] = pose
-        for stage in range(1, steps + 1):
-            pose, velocity = advanced(motion, pose, velocity, scene.simulation.dt)
-            path[stage] = pose
-    return np.stack(dq.multiply(tuple(path.T), target.grasp.dual_quaternion), axis=1)
+    target, motion = scene.target, scene.target.motion
+    body = np.array(target.pose.dual_quaternion) if motion is None else _body_path(scene)
+    if target.grasp.dual_quaternion == dq.IDENTITY:
+        return body, None
+    return np.stack(dq.multiply(tuple(body.T), target.grasp.dual_quaternion), axis=-1), body
+
+
+def _body_path(scene: Scene) -> Array:
+    """Poses of the body at all stages, shape (steps + 1, 8)."""
+    steps, dt, motion = scene.simulation.steps, scene.simulation.dt, scene.target.motion
+    pose: Scalars = scene.target.pose.dual_quaternion
+    if isinstance(motion, Waypoints):
+        return np.stack(dq.multiply(pose, tuple(given_path(scene, steps)[:, :8].T)), axis=1)
+    velocity: Scalars = first_velocity(scene)
+    if isinstance(motion, ScrewMotion):
+        return np.stack(advanced(motion, pose, velocity, dt * np.arange(steps + 1))[0], axis=1)
+    path = [pose]
+    for _ in range(steps):
+        pose, velocity = advanced(motion, pose, velocity, dt)
+        path.append(pose)
+    return np.array(path)
 
 
 def given_path(scene: Scene, steps: int) -> Array:

@@ -138,8 +138,8 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
             speed = spread_out(speed, spread.target_linear_velocity, moving)
         if isinstance(motion, Tumbling):  # its velocity is given in inertial axes
             speed = transposed_matrix_vector(rotations.to_matrix(target[:4]), speed)
-        velocity = (*turning_rate, *speed)
-        drawn |= {number.name: velocity[index] for number, index in _indexed_velocity(scene)}
+        twist = (*turning_rate, *speed)
+        drawn |= {number.name: twist[index] for number, index in _indexed_velocity(scene)}
     grasp: Sequence[Scalar] = scene.target.grasp.dual_quaternion
     if has_grasp_spread(scene):
         grasp = spread_out_pose(scene.target.grasp, spread.grasp_rotation, spread.grasp_position)
@@ -170,7 +170,7 @@ def episode_scene(scene: Scene, values: Sequence[float]) -> Scene:
     changes: dict[str, Any] = {"spread": Spread(), "parameters": ()}
     target, places = list(scene.target.pose.dual_quaternion), dict(_indexed_target(scene))
     grasp, grasp_places = list(scene.target.grasp.dual_quaternion), dict(_indexed_grasp(scene))
-    velocity = list(first_velocity(scene))
+    twist = list(first_velocity(scene))
     velocity_places = dict(_indexed_velocity(scene))
     for number, value in zip(parameters(scene), values, strict=True):
         if number in places:
@@ -180,7 +180,7 @@ def episode_scene(scene: Scene, values: Sequence[float]) -> Scene:
             grasp[grasp_places[number]] = float(value)
             changes["target.grasp"] = {"dual_quaternion": grasp}
         elif number in velocity_places:
-            velocity[velocity_places[number]] = float(value)
+            twist[velocity_places[number]] = float(value)
         changes |= dict.fromkeys(number.paths, float(value))
         if is_planar(scene) and number.name.endswith(".inertia.zz"):  # the rest of the inertia in proportion
             place = number.name.removesuffix(".inertia.zz")
@@ -189,11 +189,11 @@ def episode_scene(scene: Scene, values: Sequence[float]) -> Scene:
             }
     motion = scene.target.motion
     if isinstance(motion, ScrewMotion | Tumbling):
-        linear = velocity[3:]
+        linear = twist[3:]
         if isinstance(motion, Tumbling):
             linear = list(matrix_vector(rotations.to_matrix(target[:4]), linear))
         changes["target.motion"] = motion.model_dump() | {
-            "angular_velocity": velocity[:3],
+            "angular_velocity": twist[:3],
             "linear_velocity": linear,
         }
     return scene.replace(changes)

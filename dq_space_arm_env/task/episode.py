@@ -163,8 +163,8 @@ def tip_errors(equations: SceneEquations, x: Scalars, errors: Scalars) -> list[S
 def is_success(scene: Scene, errors: Scalars) -> Scalar:
     """Whether the tip is within the scene's tolerances, as far as errors are given."""
     success = scene.success
-    largest = [success.attitude_error_deg, success.position_error]
-    largest += [success.angular_velocity_error_deg, success.velocity_error]
+    pose = success.attitude_error_deg, success.position_error
+    largest = (*pose, success.angular_velocity_error_deg, success.velocity_error)
     met: Scalar = None
     for error, most in zip(errors, largest, strict=False):
         if most is not None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.viewing.rendering.body_shapes import shape_meshes
 from dq_space_arm_env.viewing.rendering.solids import Color, Mesh, ball, box, lathe
 from dq_space_arm_env.viewing.rendering.spacecraft import equivalent_box
@@ -76,10 +77,13 @@ class Schematic:
         self._light = light / np.linalg.norm(light)
         self._radius = 0.02 * self.reach
         self._spacecraft = _divided(Mesh.joined([*self._bodies(), *self._arm(offsets)]), 0.06 * self.reach)
+        target, target_body = shown_target(scene)
+        ends = [each if each.ndim == 1 else each[-1] for each in (target, target_body) if each is not None]
+        self._target_frames: FloatArray = np.array([ends[0], ends[-1]])
         self._tip_axes = _axes(_TIP_AXES * self.reach, 0.006 * self.reach)
         self._target = _axes(_TARGET_AXES * self.reach, 0.004 * self.reach)
         if scene.target.geometry:
-            body = Mesh.joined(shape_meshes(0, scene.target.geometry, TARGET_COLOR))
+            body = Mesh.joined(shape_meshes(1, scene.target.geometry, TARGET_COLOR))
             self._target = _Solids.joined([self._target, _divided(body, 0.06 * self.reach)])
 
     def spacecraft(self, frames: FloatArray) -> Faces:
@@ -95,9 +99,10 @@ class Schematic:
         )
 
     def target(self) -> Faces:
-        """Place the axes of the target, longer and thinner than the tip's, and the shapes of its body."""
-        pose = self._scene.target.pose
-        return self._lit(self._target, np.array([pose.rotation_matrix]), np.array([pose.position]))
+        """Place the target's axes at the end, longer and thinner than the tip's, and its body's shapes."""
+        matrices, origins = poses.to_matrix(tuple(self._target_frames.T))
+        rotations: FloatArray = np.moveaxis(np.array(matrices), 2, 0)
+        return self._lit(self._target, rotations, np.array(origins).T)
 
     def path(self, points: FloatArray, radius: float) -> Faces:
         """A path through points, shape (n, 3), m, as a thin tube; no faces if it has no length."""
@@ -115,9 +120,9 @@ class Schematic:
 
     def target_points(self) -> FloatArray:
         """Origin of the target's axes and the ends of x, y and z, shape (4, 3), m."""
-        pose = self._scene.target.pose
-        origin = np.array(pose.position)
-        return np.vstack([origin, origin + _TARGET_AXES * self.reach * np.array(pose.rotation_matrix).T])
+        rotation, position = poses.to_matrix(tuple(self._target_frames[0].tolist()))
+        origin = np.array(position)
+        return np.vstack([origin, origin + _TARGET_AXES * self.reach * np.array(rotation).T])
 
     def tip_points(self, frames: FloatArray) -> FloatArray:
         """Origin of the tip's axes and the ends of x, y and z, shape (4, 3), m."""

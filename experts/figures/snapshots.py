@@ -38,7 +38,8 @@ def best_view(maneuver: Maneuver) -> View:
     origins = _origins(maneuver)[::10]
     spread = np.cov(origins.reshape(-1, 3).T)
     arm = (origins[:, -1] - origins[:, 0]).mean(axis=0)
-    axes = np.array(maneuver.scene.target.pose.rotation_matrix).T
+    end = tuple(np.atleast_2d(np.transpose(maneuver.target))[-1].tolist())
+    axes: FloatArray = np.array(poses.to_matrix(end)[0]).T
 
     def rank(view: View) -> tuple[bool, bool, float]:
         x, y, z = view.project(axes)

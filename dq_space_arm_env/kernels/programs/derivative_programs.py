@@ -98,7 +98,7 @@ class DerivativePrograms:
     def _twist_cost_derivatives(
         self, x: Scalars, u: Scalars, field: str, *, exact: bool = False, emphasis: Scalar = 1.0
     ) -> tuple[Matrix, Matrix]:
-        """Gradient and Hessian, exact or Gauss-Newton's, of the tip twist's cost by tangent state and input."""
+        """Gradient and Hessian (exact or Gauss-Newton's) of the tip twist's cost by tangent state, input."""
         residual, moved, values = self._twist_residual(x, u)
         weights = casadi.diag(column(*(2.0 * emphasis * w for w in self.equations.state_weights(field))))
         jacobian = casadi.jacobian(residual, moved)

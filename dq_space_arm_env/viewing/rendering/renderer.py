@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.viewing.picture_format import PictureFormat, View
 from dq_space_arm_env.viewing.rendering.camera import camera_around
 from dq_space_arm_env.viewing.rendering.drawing import Image, mesh_faces, paint_sky, trail_faces
@@ -26,7 +27,8 @@ class Renderer:
 
     The tip has solid axes, red, green and blue for x, y and z; the target has paler ones and a ghost of the
     hand, and the shapes of its body, if the scene gives any. The target is the scene's until another is
-    given; if the scene draws it for each episode, the whole spread of its position is in view.
+    given; if the scene draws it for each episode, the whole spread of its position is in view, and if it
+    moves, its path.
 
     Attributes:
         camera: The camera.
@@ -40,7 +42,9 @@ class Renderer:
         self.camera = camera_around(*self._model.region, default._replace(**given), width, height)
         self._rasterizer = Rasterizer(width, height)
         self._sky = paint_sky(width, height)
-        self.aim_at(scene.target.pose.dual_quaternion)
+        target, body = (each if each is None or each.ndim == 1 else each[0] for each in shown_target(scene))
+        assert target is not None
+        self.aim_at(target, body)
         self._title = f"DQ Space Arm: {scene.name}"
         self._window: Window | None = None
 

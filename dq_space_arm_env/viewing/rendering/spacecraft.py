@@ -18,6 +18,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.kinematics import frame_poses
 from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.scene.shapes import COLORS, Shape
 from dq_space_arm_env.viewing.rendering.body_shapes import balls_around, corners_of, shape_meshes
 from dq_space_arm_env.viewing.rendering.solids import Mesh, ball, box, crumpled_box, cylinder, lathe
@@ -30,6 +31,7 @@ FOIL, METAL, DARK_METAL, RADIATOR, CELLS, LINK, JOINT, GRASPED = (
 LIKENESS = (0.80, 0.88, 1.0)
 AXIS_COLORS = ((1.0, 0.24, 0.22), (0.26, 0.88, 0.34), (0.26, 0.52, 1.0))
 
+_TARGET_POSES = 16  # of a target that moves, kept in view
 _THINNEST = 0.05  # of the longest edge: even a flat body is drawn with some thickness
 
 
@@ -114,7 +116,7 @@ class SpacecraftModel:
             *(() if self.scene.base.geometry else body),
             (shoulder, 0.6 * reach),
             (frames[-1], 0.15 * reach + self._overhang()),
-            (np.array(self.scene.target.pose.position), target),
+            *((np.array(poses.position(tuple(pose))), target) for pose in self._target_poses[0]),
             *self._shape_balls(poses_at_start),
         ]
         centers, radii = zip(*balls, strict=True)
@@ -126,7 +128,16 @@ class SpacecraftModel:
             yield from balls_around(shapes, pose)
         target, spread = self.scene.target, self.scene.spread
         turn, shift = (math.sqrt(3.0) * width for width in (spread.target_rotation, spread.target_position))
-        yield from balls_around(target.geometry, target.pose.dual_quaternion, turn, shift)
+        for pose in self._target_poses[1]:
+            yield from balls_around(target.geometry, tuple(pose), turn, shift)
+
+    @cached_property
+    def _target_poses(self) -> tuple[Array, Array]:
+        """Poses of the target and of its body, shape (n, 8) each, some of those on their way."""
+        target, body = shown_target(self.scene)
+        paths = (np.atleast_2d(target), np.atleast_2d(target if body is None else body))
+        stages = np.unique(np.linspace(0, len(paths[0]) - 1, _TARGET_POSES).astype(int))
+        return paths[0][stages], paths[1][stages]
 
     @cached_property
     def _wing_axes(self) -> tuple[int, int, int]:

@@ -12,6 +12,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.task.step_report import STATE_LIMIT
 from dq_space_arm_env.task.trajectory import Trajectory
@@ -73,9 +74,13 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
     shown = _finite_steps(states, controls, noise)
     if shown < 1:
         raise ValueError(f"{what}: its first step is not finite or has blown up: there is nothing to show")
-    given = scene.target.pose.dual_quaternion if flight.target is None else flight.target
+    given, body = flight.target, flight.target_body
+    if given is None:
+        given, body = (
+            each[: steps + 1] if each is not None and each.ndim == 2 else each for each in shown_target(scene)
+        )
+    assert given is not None
     target = _target(f"{what}: target", given, steps, shown)
-    body = flight.target_body
     frames = _continuous(frame_poses(scene, layout, states[: shown + 1]))
     tip, aim = tuple(frames[:, -1].T), tuple(target.T) if target.ndim == 2 else tuple(target.tolist())
     seconds = shown * scene.simulation.dt
