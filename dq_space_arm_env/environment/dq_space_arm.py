@@ -228,6 +228,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             for kernel in (start, observe, step)
             for spec in (*kernel.inputs, *kernel.outputs)
         }
+        if "episode_parameters" in arrays:
+            arrays["episode_parameters"] = arrays["parameters"]
         # A step reads state and memory before it writes them: they stay where they are.
         arrays["x_kept"], arrays["memory_kept"] = arrays["x"], arrays["memory"]
         self._start, self._observe = KernelCall(start, arrays), KernelCall(observe, arrays)
@@ -268,7 +270,10 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         """`parameters`, with pose and velocity of a target that moves as they are now, shape (n_p,); a copy. `ResetNeeded` before the first reset."""
         self._require_reset("reading the parameters")
         parameters = self._parameters.copy()
-        parameters[list(self.kernels.parameters.moving)] = self._memory[len(MEMORY) :]
+        entries = self.kernels.parameters
+        if entries.staged:
+            parameters = self.kernels.stage_parameters(parameters)[int(self._memory[0])]
+        parameters[list(entries.moving)] = self._memory[len(MEMORY) :][: len(entries.moving)]
         return parameters
 
     @property

@@ -72,6 +72,7 @@ class SubEnvironments:
     def _step_calls(self, kernels: Kernels) -> dict[type, KernelCall]:
         """The step by the type of the actions, from the present arrays of states to the others."""
         arrays = {"x": self.x, "x_kept": self._x_next, "parameters": self.parameters}
+        arrays["episode_parameters"] = self.parameters
         arrays |= {"memory": self._memory, "memory_kept": self._memory_next, "following": self._following}
         arrays |= self._results.fresh()._asdict()
         names = {np.float64: "environment_step", np.float32: "environment_step_float32_actions"}
@@ -93,7 +94,13 @@ class SubEnvironments:
     def stage_parameters(self) -> Array:
         """Parameters with pose and velocity of moving targets as they are now, shape (count, n_p); a copy."""
         parameters = self.parameters.copy()
-        parameters[:, list(self._kernels.parameters.moving)] = self._memory[:, len(MEMORY) :]
+        entries = self._kernels.parameters
+        if entries.staged:
+            stages = self._memory[:, 0].astype(np.int64)
+            for row, (first, stage) in enumerate(zip(self.parameters, stages, strict=True)):
+                parameters[row] = self._kernels.stage_parameters(first)[stage]
+        size = len(entries.moving)
+        parameters[:, list(entries.moving)] = self._memory[:, len(MEMORY) : len(MEMORY) + size]
         return parameters
 
     def seed(self, rows: Rows, seeds: Sequence[int | None]) -> None:

@@ -1,80 +1,23 @@
-"""Capture of a payload: the jump in velocities when the mass of the robot changes.
+"""Capture of a payload by a single call, see `dynamics.plastic_impact`.
 
-At the capture the payload and the tip, meeting at different velocities, move on as one body. The impulse
-between them is internal, so linear and angular momentum are conserved; with open brakes it also does no work
-at any joint: the new velocities v+ of base and joints obey M+ v+ = M v + J' p, where p is the momentum of the
-payload and J the Jacobian of the tip (a plastic impact; Featherstone, Rigid Body Dynamics Algorithms, section
-11.7). At a release velocities stay, and the payload leaves with the tip's.
+At a release velocities stay, and the payload leaves with the tip's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.dynamics.chain import Chain, RigidBody
-from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
-from dq_space_arm_env.dynamics.minimal import (
-    ZERO,
-    Accelerations,
-    inverse_dynamics,
-    joint_rotations,
-    tip_wrench_forces,
-)
+from dq_space_arm_env.dynamics.plastic_impact import Velocities, capture
 from dq_space_arm_env.dynamics.vector_field import spread
 from dq_space_arm_env.kernels.kernels import Kernels
 from dq_space_arm_env.scene.pose import PLANAR_TWIST
 
-Scalar = Any
-Vector3 = Sequence[Scalar]
 Array = NDArray[Any]
-
-
-class Velocities(NamedTuple):
-    """Velocities of base and joints."""
-
-    angular: Vector3  # of the base, base axes, rad/s
-    linear: Vector3  # of the base's center of mass, base axes, m/s
-    joint_rates: Sequence[Scalar]  # n, rad/s
-
-
-def capture(
-    free: Chain,
-    loaded: Chain,
-    payload: RigidBody,
-    joint_angles: Sequence[Scalar],
-    velocities: Velocities,
-    payload_twist: Sequence[Scalar],
-) -> Velocities:
-    """Velocities right after a capture, from the chain without and with the payload.
-
-    The payload's mass properties are in tip axes, its twist (angular [rad/s], linear [m/s]) at the tip's
-    origin in tip axes; the robot has no wrist.
-    """
-    rotations = joint_rotations(free, joint_angles)
-    still = [0.0] * len(free.links)
-    # Without velocities, what accelerations need is M a: here the momentum M v.
-    own = inverse_dynamics(
-        free,
-        rotations,
-        ZERO,
-        still,
-        Accelerations(velocities.angular, velocities.linear, velocities.joint_rates),
-    )
-    omega, center = payload_twist[:3], payload.center_of_mass
-    linear = scale(payload.mass, add(payload_twist[3:], cross(omega, center)))
-    angular = add(matrix_vector(payload.inertia, omega), cross(center, linear))
-    brought = tip_wrench_forces(free, rotations, free.tip.rotation, free.tip.position, (*linear, *angular))
-    joints = [a + b for a, b in zip(own.joints, brought.joints, strict=True)]
-    after = MassMatrix(loaded, rotations).solve(
-        add(own.force, brought.force), add(own.torque, brought.torque), joints
-    )
-    return Velocities(after.angular, after.linear, after.joints)
 
 
 def catch_payload(free: Kernels, loaded: Kernels, x: ArrayLike, payload_twist: ArrayLike) -> Array:

@@ -398,7 +398,7 @@ class Kernels(RobotKernels):
         return self.call("relative_twist", x=x, u=inputs, p=p)[0]
 
     def stage_parameters(self, p: ArrayLike | None = None) -> Array:
-        """Parameters of each stage of an episode: those of a target that moves change from stage to stage.
+        """Parameters of each stage of an episode: those of a target that moves, and what phases change.
 
         Args:
             p: Parameters at the start, shape (n_p,), units of `parameters`; nominal ones by default.
@@ -412,11 +412,10 @@ class Kernels(RobotKernels):
         steps = self.scene.simulation.steps
         first = self.parameter_rows(p, 1)[0]
         rows = np.tile(first, (steps + 1, 1))
-        if self.scene.target.motion is not None:
-            from dq_space_arm_env.kernels.target_path import target_path
+        if self.parameters.moving or self.parameters.staged:
+            from dq_space_arm_env.kernels.stages import fill_stages
 
-            moving = list(self.parameters.moving)
-            rows[:, moving] = target_path(self, first[moving])
+            fill_stages(self, rows)
         return rows
 
     def observation_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:

@@ -25,6 +25,7 @@ from dq_space_arm_env.scene.parameters import (
     VELOCITY,
     ControlNumbers,
     control_numbers,
+    catch_numbers,
     is_part,
     moving_numbers,
     parameters,
@@ -90,10 +91,12 @@ class ParameterEntries(_Entries):
     Attributes:
         nominal: The scene's own values, shape (n_p,), units of the parameters.
         moving: Indices of those that change from stage to stage: pose and velocity of a target that moves.
+        staged: Indices of those that change from phase to phase, and of what is caught between them.
     """
 
     nominal: Array
     moving: tuple[int, ...]
+    staged: tuple[int, ...]
 
     def indices(self, path: str) -> list[int]:
         """Find parameters.
@@ -342,9 +345,11 @@ def _lay_out_controls(controls: Mapping[str, Sequence[ControlNumbers]]) -> Contr
 
 
 def _lay_out_parameters(scene: Scene) -> ParameterEntries:
-    found, moving = parameters(scene), set(moving_numbers(scene))
+    found, moving = parameters(scene), {number.name for number in moving_numbers(scene)}
+    staged = {*scene.staged.values, *(number.name for number in catch_numbers(scene))} if scene.phases else {}
     return ParameterEntries(
-        moving=tuple(index for index, number in enumerate(found) if number in moving),
+        moving=tuple(index for index, number in enumerate(found) if number.name in moving),
+        staged=tuple(index for index, number in enumerate(found) if number.name in staged),
         names=tuple(number.name for number in found),
         units=tuple(number.unit for number in found),
         nominal=_constant([number.nominal for number in found]),

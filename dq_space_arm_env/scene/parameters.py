@@ -16,6 +16,8 @@ Scene = Any  # `schema.Scene`, which finds mistakes in its list of parameters by
 TARGET = "target.pose"
 VELOCITY = "target.velocity"
 GRASP = "target.grasp"
+PHASE = "phase"
+CATCH = "catch"
 _AXES = ("x", "y", "z")
 _EULER_ANGLES = ("psi", "theta", "phi")
 _LOWER_TRIANGLE = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
@@ -52,11 +54,14 @@ class ControlNumbers(NamedTuple):
 
 def parameters(scene: Scene) -> tuple[Number, ...]:
     """The parameters of a scene: target, bodies from base to payload, weights, limits."""
-    varying = _drawn(scene) | {number.name for number in moving_numbers(scene)}
+    staged = scene.staged.values if scene.phases else {}
+    varying = _drawn(scene) | {number.name for number in moving_numbers(scene)} | staged.keys()
     return tuple(
-        number
+        number._replace(nominal=staged.get(number.name, (number.nominal,))[0])
         for number in numbers(scene)
-        if number.name in varying or any(is_part(number.name, path) for path in scene.parameters)
+        if number.name in varying
+        or is_part(number.name, CATCH)
+        or any(is_part(number.name, path) for path in scene.parameters)
     )
 
 
@@ -91,9 +96,20 @@ def numbers(scene: Scene) -> Iterator[Number]:
             continue  # the term is not in the machine code
         for index in planar if _is_planar(scene) else range(len(entries)):
             yield _number(weight_name(field, index), "1", weights[index], f"cost.{field}.{index}")
+    if scene.phases:
+        yield _number(PHASE, "1", 0.0)
+        yield from catch_numbers(scene)
     controls = [each for numbers in control_numbers(scene).values() for each in numbers]
     yield from dict.fromkeys(control.weight for control in controls)
     yield from dict.fromkeys(control.limit for control in controls)
+
+
+def catch_numbers(scene: Scene) -> Iterator[Number]:
+    """Whether the payload is caught at the end of a stage, 1 or 0, and its twist then, tip axes; if any is."""
+    if any(phase.catch is not None for phase in scene.phases):
+        yield _number(f"{CATCH}.now", "1", 0.0)
+        for index in velocity_entries(scene):
+            yield _number(f"{CATCH}.{_TWIST[index]}", "rad/s" if index < 3 else "m/s", 0.0)
 
 
 def _number(name: str, unit: str, nominal: float, *paths: str) -> Number:

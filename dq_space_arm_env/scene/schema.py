@@ -20,6 +20,7 @@ from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
 from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
 from dq_space_arm_env.scene.motion import Motion, ScrewMotion, Tumbling, Waypoints
 from dq_space_arm_env.scene.parameters import is_part, numbers, parents
+from dq_space_arm_env.scene.phases import Phase, StagedNumbers, phase_problems, staged_numbers
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.scene.simulation import Simulation
 from dq_space_arm_env.validation.changes import ChangeError, merged, nested
@@ -76,9 +77,19 @@ class Scene(Model):
     success: Success = Field(
         default_factory=Success, description="tolerances that count as reaching the target"
     )
+    phases: tuple[Phase, ...] = Field(
+        default=(),
+        exclude_if=lambda phases: not phases,
+        description="phases of the episode, one after another; absent: one, without changes",
+    )
     simulation: Simulation = Field(
         default_factory=Simulation, description="time step, number of steps, integrator"
     )
+
+    @property
+    def staged(self) -> StagedNumbers:
+        """What the phases change."""
+        return staged_numbers(self)
 
     @field_validator("initial_state")
     @classmethod
@@ -108,6 +119,8 @@ class Scene(Model):
         yield from self._part_problems()
         yield from self._cost_problems()
         yield from self._parameter_problems()
+        if self.phases:
+            yield from phase_problems(self)
         if self.base.motion == "planar":
             yield from self._planar_problems()
 

@@ -14,6 +14,7 @@ from dq_space_arm_env.algebra.vectors import matrix_vector, transposed_matrix_ve
 from dq_space_arm_env.scene.maneuver import Spread
 from dq_space_arm_env.scene.motion import ScrewMotion, Tumbling
 from dq_space_arm_env.scene.parameters import (
+    CATCH,
     Number,
     drawn_factors,
     grasp_numbers,
@@ -22,6 +23,7 @@ from dq_space_arm_env.scene.parameters import (
     has_target_spread,
     has_velocity_spread,
     inertia_paths,
+    is_part,
     parameters,
     target_entries,
     target_numbers,
@@ -172,7 +174,10 @@ def episode_scene(scene: Scene, values: Sequence[float]) -> Scene:
     grasp, grasp_places = list(scene.target.grasp.dual_quaternion), dict(_indexed_grasp(scene))
     twist = list(first_velocity(scene))
     velocity_places = dict(_indexed_velocity(scene))
+    staged = scene.staged.values if scene.phases else {}
     for number, value in zip(parameters(scene), values, strict=True):
+        if number.name in staged or is_part(number.name, CATCH):
+            continue  # the phases stay
         if number in places:
             target[places[number]] = float(value)
             changes["target.pose"] = {"dual_quaternion": target}

@@ -18,11 +18,20 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import norm
 from dq_space_arm_env.scene.motion import Waypoints
-from dq_space_arm_env.scene.parameters import moving_numbers, target_entries, velocity_entries
+from dq_space_arm_env.scene.maneuver import Success
+from dq_space_arm_env.scene.parameters import (
+    PHASE,
+    catch_numbers,
+    is_part,
+    moving_numbers,
+    target_entries,
+    velocity_entries,
+)
 from dq_space_arm_env.scene.parameters import parameters as all_parameters
 from dq_space_arm_env.scene.path import advanced
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import episode_start, parameter_values
+from dq_space_arm_env.task.catching import Catching, has_catch
 from dq_space_arm_env.task.equations import (
     SceneEquations,
     body_pose,
@@ -46,7 +55,8 @@ def start(scene: Scene, draws: Scalars) -> Outputs:
     parameters = parameter_values(scene, begun)
     given = dict(zip((number.name for number in all_parameters(scene)), parameters, strict=True))
     target = [given[number.name] for number in moving_numbers(scene)]
-    outputs = {"x": begun.state, "memory": [0.0] * len(MEMORY) + target}
+    held = [1.0] if has_catch(scene) else []
+    outputs = {"x": begun.state, "memory": [0.0] * len(MEMORY) + target + held}
     return {**outputs, "parameters": parameters} if parameters else outputs
 
 
@@ -59,15 +69,16 @@ def command(equations: SceneEquations, action: Scalars) -> Outputs:
 
 def observe(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:
     """Observation and report of a state, without a step."""
-    scene, target = equations.scene, memory[len(MEMORY) :]
-    equations = with_target(equations, target)
+    scene, rest = equations.scene, memory[len(MEMORY) :]
+    equations = at_stage(equations, memory[0], rest)
     seen = equations.observe(x, (scene.simulation.steps - memory[0]) * scene.simulation.dt)
     errors = tip_errors(equations, x, seen["errors"])
-    costs = [0.0] * (len(report_names(scene)) - len(errors) - 1)
+    errors += [equations.given[PHASE]] if scene.phases else []
+    costs = [0.0] * (len(report_names(scene)) - len(errors) - 1 - 3 * has_catch(scene))
     return {
-        "memory_kept": [memory[0], *equations.state_cost_terms(x), *target],
+        "memory_kept": [memory[0], *equations.state_cost_terms(x), *rest],
         "observation": seen["observation"],
-        "report": [*costs, *errors, 0.0],
+        "report": [*costs, *errors, *(rest[-1:] + [0.0, 0.0] if has_catch(scene) else []), 0.0],
         "flags": [0.0, is_success(scene, errors), 0.0],
     }
 
@@ -89,9 +100,14 @@ def step(
     steps, dt = scene.simulation.steps, scene.simulation.dt
     taken, *state_terms = memory[: len(MEMORY)]
     remaining = steps - taken
-    before = with_target(equations, memory[len(MEMORY) :])
+    before = at_stage(equations, taken, memory[len(MEMORY) :])
     target = next_target(before, body_pose(scene, equations.given), following)
-    after = with_target(equations, target)
+    rest, caught = target, []
+    if has_catch(scene):
+        x_next, *caught = _catch(with_target(before, target), x_next, taken + 1.0, memory[-1])
+        rest = [*target, caught[0]]
+    rest = _resting(scene, taken + 1.0, rest)
+    after = at_stage(equations, taken + 1.0, rest)
 
     # The episode ends at the scene's number of steps, or when the simulation diverges, which leaves it at the
     # last sound state. NaN is not below any limit.
@@ -101,19 +117,23 @@ def step(
 
     seen = after.observe(x_kept, (remaining - 1.0) * dt)
     errors = tip_errors(after, x_kept, seen["errors"])
+    errors += [after.given[PHASE]] if scene.phases else []
 
     # reward = -(stage cost of x and u) - (terminal cost of x_next at the end): the return is -J. After a
     # divergence the most that this and all further steps could cost is charged, so ending early never pays.
     stage = [*state_terms, equations.effort(u), *before.twist_cost_terms(x, u)]
     terminal = [casadi.if_else(terminated, term, 0.0) for term in after.terminal_cost_terms(x_kept)]
-    reward = -casadi.if_else(sound, total(stage) + total(terminal), WorstCase(before).cost(x, remaining))
+    worst = total([WorstCase(each).cost(x, remaining) for each in _every_phase(before)])
+    reward = -casadi.if_else(sound, total(stage) + total(terminal), worst)
 
     success = casadi.logic_and(sound, is_success(scene, errors))
+    if caught:
+        success = casadi.logic_and(success, caught[0])
     return {
         "x_kept": x_kept,
-        "memory_kept": [taken + sound, *after.state_cost_terms(x_kept), *target],
+        "memory_kept": [taken + sound, *after.state_cost_terms(x_kept), *rest],
         "observation": seen["observation"],
-        "report": [reward, *stage, *terminal, *errors, *checked_error],
+        "report": [reward, *stage, *terminal, *errors, *caught, *checked_error],
         "flags": [terminated, success, casadi.logic_not(sound)],
     }
 
@@ -135,6 +155,77 @@ def with_target(equations: SceneEquations, target: Scalars) -> SceneEquations:
         return equations
     given = {**equations.given, **dict(zip(names, target, strict=True))}
     return SceneEquations.of(scene, [given[number.name] for number in all_parameters(scene)])
+
+
+def at_stage(equations: SceneEquations, stage: Scalar, rest: Scalars) -> SceneEquations:
+    """The equations at a stage: `rest` of the memory is the target now, and whether the payload is held."""
+    scene = equations.scene
+    if not scene.phases:
+        return with_target(equations, rest)
+    size, starts = len(moving_numbers(scene)), scene.staged.starts
+    given = {**equations.given, **{number.name: 0.0 for number in catch_numbers(scene)}}
+    given |= {name: by_phase(stage, starts, values) for name, values in scene.staged.values.items()}
+    if has_catch(scene):
+        given |= {name: rest[size] * value for name, value in given.items() if is_part(name, "payload")}
+    moving = zip(moving_numbers(scene), rest[:size], strict=True)
+    given |= {number.name: value for number, value in moving}
+    return SceneEquations.of(scene, [given[number.name] for number in all_parameters(scene)])
+
+
+def by_phase(stage: Scalar, starts: Sequence[int], values: Sequence[float]) -> Scalar:
+    """The value of the phase that a stage is in."""
+    found: Scalar = values[0]
+    for start, before, value in zip(starts[1:], values, values[1:], strict=False):
+        if value != before:
+            found = casadi.if_else(stage >= start, value, found)
+    return found
+
+
+def _catch(equations: SceneEquations, x: Scalars, stage: Scalar, held: Scalar) -> list[Any]:
+    """State after the catch that a stage may begin with; whether the payload is held, and both impulses.
+
+    The payload moves with the target until then. It is missed beyond the phase's tolerances.
+    """
+    scene, twist = equations.scene, equations.target_velocity
+    catching, caught_state = Catching(equations), list(x)
+    caught = catching(x, twist)
+    shock: list[Scalar] = [0.0, 0.0]
+    tip = equations.tip(x)
+    errors = [poses.error_angle(tip, equations.target) * DEGREES, poses.error_distance(tip, equations.target)]
+    relative = equations.relative_twist(x)
+    errors += [norm(relative[:3]) * DEGREES, norm(relative[3:])]
+    for start, phase in zip(scene.staged.starts, scene.phases, strict=True):
+        if phase.catch is not None:
+            due = stage == start
+            met = casadi.logic_and(due, within(phase.catch, errors))
+            held = casadi.if_else(due, met, held)
+            caught_state = [casadi.if_else(met, a, b) for a, b in zip(caught, caught_state, strict=True)]
+            impulses = catching.shock(caught, twist)
+            shock = [casadi.if_else(met, a, b) for a, b in zip(impulses, shock, strict=True)]
+    return [caught_state, held, *shock]
+
+
+def _resting(scene: Scene, stage: Scalar, rest: Scalars) -> list[Scalar]:
+    """The rest of the memory where a phase has the target at rest."""
+    resting = scene.staged.resting if scene.phases and moving_numbers(scene) else ()
+    found = list(rest)
+    for start, pose in zip(scene.staged.starts if resting else (), resting, strict=True):
+        if pose is not None:
+            still = [*(pose[i] for i in target_entries(scene)), *[0.0] * len(velocity_entries(scene))]
+            found[: len(still)] = [casadi.if_else(stage >= start, a, b) for a, b in zip(still, found, strict=False)]
+    return found
+
+
+def _every_phase(equations: SceneEquations) -> list[SceneEquations]:
+    """The equations with the numbers of each phase."""
+    scene = equations.scene
+    if not scene.phases:
+        return [equations]
+    found = []
+    for index in range(len(scene.phases)):
+        given = equations.given | {name: values[index] for name, values in scene.staged.values.items()}
+        found.append(SceneEquations.of(scene, [given[number.name] for number in all_parameters(scene)]))
+    return found
 
 
 def next_target(equations: SceneEquations, start: Scalars, following: Scalars = ()) -> list[Scalar]:
@@ -162,11 +253,15 @@ def tip_errors(equations: SceneEquations, x: Scalars, errors: Scalars) -> list[S
 
 def is_success(scene: Scene, errors: Scalars) -> Scalar:
     """Whether the tip is within the scene's tolerances, as far as errors are given."""
-    success = scene.success
+    return within(scene.success, errors)
+
+
+def within(success: Success, errors: Scalars) -> Scalar:
+    """Whether the tip is within tolerances, as far as errors are given."""
     pose = success.attitude_error_deg, success.position_error
     largest = (*pose, success.angular_velocity_error_deg, success.velocity_error)
     met: Scalar = None
-    for error, most in zip(errors, largest, strict=False):
+    for error, most in zip(errors[:4], largest, strict=False):
         if most is not None:
             met = error <= most if met is None else casadi.logic_and(met, error <= most)
     return met

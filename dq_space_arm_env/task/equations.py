@@ -32,6 +32,7 @@ from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.parameters import (
+    PHASE,
     grasp_numbers,
     has_grasp,
     target_entries,
@@ -177,6 +178,7 @@ class SceneEquations:
             *motion.joint_angles,
             *motion.wrist_angles,
             *motion.joint_rates,
+            *([self.given[PHASE]] if self.scene.phases else []),
             *twists,
             time_left,
         ]

@@ -36,11 +36,16 @@ def report_names(scene: Scene) -> tuple[str, ...]:
     """Names of the report of a scene: `REPORT`, and what only some scenes have.
 
     The velocities of the tip relative to the target are those after the step with the wrist held, in deg/s
-    and m/s.
+    and m/s. The phase is that of the next step; `caught` is 1 unless a catch has failed; the shocks are the
+    impulse [N s] on a payload that the step has caught, and the angular impulse about the tip [N m s].
     """
     names = list(REPORT)
     if has_twist_errors(scene):
         names[-1:-1] = ["angular_velocity_error", "velocity_error"]
+    if scene.phases:
+        names.insert(-1, "phase")
+    if any(phase.catch is not None for phase in scene.phases):
+        names[-1:-1] = ["caught", "shock", "angular_shock"]
     if any(scene.cost.terminal_tip_twist):
         names.insert(names.index("attitude_error"), "terminal_cost_tip_twist")
     if any(scene.cost.tip_twist):
@@ -51,12 +56,14 @@ def report_names(scene: Scene) -> tuple[str, ...]:
 def n_observations(scene: Scene) -> int:
     """Count the entries of an observation: state, time left, and two twists where the target moves."""
     layout = StateLayout.of(scene)
-    return layout.n_x + 1 + (2 * (3 if layout.planar else 6) if scene.target.motion is not None else 0)
+    phase = 1 if scene.phases else 0
+    return layout.n_x + 1 + phase + (2 * (3 if layout.planar else 6) if scene.target.motion is not None else 0)
 
 
 def memory_names(scene: Scene) -> tuple[str, ...]:
     """Names of what a step of a scene hands to the next."""
-    return (*MEMORY, *(number.name for number in moving_numbers(scene)))
+    held = ("held",) if any(phase.catch is not None for phase in scene.phases) else ()
+    return (*MEMORY, *(number.name for number in moving_numbers(scene)), *held)
 
 
 # A state whose norm (m, rad, m/s, rad/s) is larger, or NaN, comes from a simulation that has blown up. It

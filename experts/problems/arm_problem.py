@@ -15,6 +15,7 @@ from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
 from dq_space_arm_env.scene import INTEGRATORS
 from dq_space_arm_env.scene.layout import StateLayout
+from dq_space_arm_env.scene.parameters import CATCH, PHASE
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from experts.problems.shooting_problem import (
     FloatArray,
@@ -43,7 +44,8 @@ class ArmProblem:
         self.scene = in_double_precision(load_scene(scene), integrator)
         self.kernels = compile_scene(self.scene)
         self.integrator: str = self.scene.simulation.integrator
-        self.has_second_order = INTEGRATORS[self.integrator].curvature is not None
+        catches = bool(self.kernels.parameters.indices(CATCH))  # a catch has no second derivatives
+        self.has_second_order = INTEGRATORS[self.integrator].curvature is not None and not catches
         layout = self.kernels.layout
         # The wrist's rates turn the tip.
         self.has_mixed_cost = any(self.scene.cost.tip_twist) and "wrist psi rate" in layout.control.names
@@ -56,7 +58,8 @@ class ArmProblem:
 
     def _make_inputs(self, usual_emphasis: float) -> None:
         """Allocate what may change between solves: parameters, and the emphasis on the final pose."""
-        changing = self._in_stages if self.kernels.parameters.moving else None
+        entries = self.kernels.parameters
+        changing = self._in_stages if entries.moving or entries.staged else None
         self.parameters = StageParameters(self.horizon, self.kernels.parameters.nominal, changing)
         self._usual_emphasis = usual_emphasis
         self._emphasis: FloatArray = np.full(1, self._usual_emphasis)
@@ -65,7 +68,29 @@ class ArmProblem:
 
     def _in_stages(self, parameters: FloatArray) -> FloatArray:
         """Parameters of the stages, (N + 1, n_p), from those at the start: the target moves."""
-        return self.kernels.stage_parameters(parameters)[:: self.scene.simulation.steps // self.horizon]
+        factor = self.scene.simulation.steps // self.horizon
+        rows = self.kernels.stage_parameters(parameters)
+        found = rows[::factor].copy()
+        if factor > 1 and self.kernels.parameters.staged:
+            # A long step has the mean weights of its stages, and the catch at its end.
+            blocks = rows[:-1].reshape(self.horizon, factor, -1)
+            weights, caught = (self.kernels.parameters.indices(path) for path in ("cost", CATCH))
+            found[:-1, weights] = blocks[:, :, weights].mean(axis=1)
+            found[:-1, caught] = blocks[:, -1, caught]
+        return found
+
+    def can_coarsen(self, factor: int) -> bool:
+        """Tell whether long steps of so many stages end where the robot changes.
+
+        Args:
+            factor: Steps in one of the longer steps; it divides the number of stages.
+        """
+        entries = self.kernels.parameters
+        others = {index for path in ("cost", "actuators", PHASE, CATCH) for index in entries.indices(path)}
+        robot = [index for index in entries.staged if index not in others]
+        rows = self.kernels.stage_parameters()[:-1, robot]
+        changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1
+        return not (changes % factor).any()
 
     def coarsened(self, factor: int) -> "ArmProblem":
         """Return the same maneuver in fewer, longer steps; its costs are smaller by the factor.
@@ -81,6 +106,8 @@ class ArmProblem:
         """
         if not isinstance(factor, int | np.integer) or factor < 1 or self.horizon % factor:
             raise ValueError(f"factor is {factor!r}; it must divide the {self.horizon} stages")
+        if not self.can_coarsen(factor):
+            raise ValueError(f"factor is {factor}; it must divide the stages of the phases that change the robot")
         coarse = copy.copy(self)
         coarse.horizon, coarse.time_step = self.horizon // factor, self.time_step * factor
         coarse.integrator = INTEGRATORS[self.integrator].curvature or self.integrator

@@ -6,20 +6,23 @@ input, `parameters`; a scene in which nothing does has no such input.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from dq_space_arm_env.compiler.graph import Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.integrators import checked_integrator_of, integrator_of
 from dq_space_arm_env.integrators.method import program_inputs
 from dq_space_arm_env.scene.motion import Waypoints
+from dq_space_arm_env.scene.parameters import parameters
 from dq_space_arm_env.scene.path import PATH
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import number_of_draws
 from dq_space_arm_env.task import episode
 from dq_space_arm_env.task.equations import SceneEquations
-from dq_space_arm_env.task.step_report import memory_names
+from dq_space_arm_env.task.step_report import MEMORY, memory_names
 
 
 class EnvironmentPrograms:
@@ -67,6 +70,21 @@ class EnvironmentPrograms:
         program.call(graph)
         return program
 
+    def _append_stage(self, program: Program, n_memory: int) -> None:
+        """From the parameters of the episode to those of the present stage."""
+        names = [number.name for number in parameters(self.scene)]
+        program.inputs = [
+            replace(buffer, name=EPISODE) if buffer.name == "parameters" else buffer
+            for buffer in program.inputs
+        ]
+
+        def stage(memory: Sequence[Any]) -> Mapping[str, Sequence[Any]]:
+            given = episode.at_stage(self.equations, memory[0], memory[len(MEMORY) :]).given
+            return {"parameters": [given[each] for each in names]}
+
+        graph = trace("stage_graph", {"memory": n_memory}, stage, episode=self._parameters)
+        program.call(graph, episode=EPISODE)
+
     def _step(self, integrator: str, name: str, actions: str) -> Program:
         """From actions to inputs, motion, observation, reward and end of the episode."""
         equations, simulation = self.equations, self.scene.simulation
@@ -75,6 +93,8 @@ class EnvironmentPrograms:
         following = {"following": PATH} if isinstance(self.scene.target.motion, Waypoints) else {}
         inputs += [Buffer(key, size) for key, size in following.items()]
         program = Program(name, program_inputs(equations.field, *inputs), [])
+        if self.scene.phases:
+            self._append_stage(program, n_memory)
         command = partial(episode.command, equations)
         program.call(trace("inputs_graph", {"action": n_u}, command, parameters=self._parameters))
         program.call(trace("time_step_graph", {}, lambda: {"h": [simulation.dt]}))
@@ -83,9 +103,13 @@ class EnvironmentPrograms:
         sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": n_memory}
         sizes |= ({"checked_error": 1} if method else {}) | following
         report = trace("report_graph", sizes, partial(episode.step, equations), parameters=self._parameters)
-        program.call(report)
+        program.call(report, **({"parameters": EPISODE} if self.scene.phases else {}))
         program.outputs = _outputs(report)
         return program
+
+
+EPISODE = "episode_parameters"
+"""Name of the parameters of the start of an episode, where its stages have their own."""
 
 
 def _outputs(graph: Graph) -> list[Buffer]:

@@ -11,9 +11,9 @@ from dq_space_arm_env.algebra.symbolic import column, dense_entries, symbols
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.compiler.tangent import append_for_each, append_matrix, append_tangents
-from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.integrators.method import graph_inputs, program_inputs
 from dq_space_arm_env.integrators.tangent_linearization import tangent_graph
+from dq_space_arm_env.kernels.programs.stage_programs import stage_method
 from dq_space_arm_env.task.equations import SceneEquations, total
 
 Scalar = Any
@@ -37,7 +37,7 @@ class ParameterPrograms:
         field, n_p = self.field, len(self.parameters)
         inputs = [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)]
         program = Program("linearize_parameters", program_inputs(field, *inputs), [])
-        integrator_of(self.equations.scene.simulation, integrator).append_step(program, field)
+        stage_method(self.equations, integrator).append_step(program, field)
         changes = append_tangents(program, ["parameters"], ["x_next"])["x_next"]
         if changes is not None:
             graph = tangent_graph(field)

@@ -16,13 +16,14 @@ from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.vector_field import split_state
-from dq_space_arm_env.integrators import checked_integrator_of, integrator_of
+from dq_space_arm_env.integrators import checked_integrator_of
 from dq_space_arm_env.integrators.dormand_prince import append_measured_step
 from dq_space_arm_env.integrators.method import MomentumIntegrator, program_inputs
 from dq_space_arm_env.kernels.programs.derivative_programs import DerivativePrograms
 from dq_space_arm_env.kernels.programs.parameter_programs import ParameterPrograms
 from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
 from dq_space_arm_env.kernels.programs.robot_programs import RobotPrograms
+from dq_space_arm_env.kernels.programs.stage_programs import stage_method
 from dq_space_arm_env.scene.parameters import moving_numbers
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.task.episode import next_target, with_target
@@ -277,8 +278,9 @@ class ScenePrograms:
         field = self.field
         x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
         program = Program(name, program_inputs(field, x, u, h), [Buffer("x_next", field.n_x)])
-        choose = checked_integrator_of if name == "checked_step" else integrator_of
-        method = choose(self.scene.simulation, integrator)
+        method: Any = stage_method(self.equations, integrator)
+        if name == "checked_step":
+            method = checked_integrator_of(self.scene.simulation, integrator)
         assert method is not None  # `Kernels.checked_step` refuses it
         method.append_step(program, field)
         if name == "checked_step":
@@ -308,7 +310,7 @@ class ScenePrograms:
 
     def _walk(self, integrator: str) -> Program:
         """A step of many in a row; a momentum-preserving method hands on the momentum besides the state."""
-        field, method = self.field, integrator_of(self.scene.simulation, integrator)
+        field, method = self.field, stage_method(self.equations, integrator)
         x, u, h = Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("h", 1, shared=True)
         if not isinstance(method, MomentumIntegrator):
             program = Program("walk", program_inputs(field, x, u, h), [Buffer("x_next", field.n_x)])

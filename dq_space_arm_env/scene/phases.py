@@ -1,0 +1,163 @@
+"""Phases of an episode: what is held at the tip, masses, actuators, cost and target change from one to the next.
+
+A phase changes numbers of the scene, which thereby become parameters of the stages: inputs of the one machine
+code. At its start the payload may be caught.
+"""
+
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import BeforeValidator, Field, PlainSerializer
+
+from dq_space_arm_env.scene.maneuver import Success
+from dq_space_arm_env.scene.parameters import numbers
+from dq_space_arm_env.validation.fields import Name, Steps
+from dq_space_arm_env.validation.problems import Model, Problem, SceneError, problem
+
+Scene = Any  # `schema.Scene`, which has phases
+
+_REMOVABLE = ("payload", "target.motion")
+_ACTUATORS = "actuators."
+
+
+def _read_changes(value: Any) -> tuple[tuple[str, Any], ...]:
+    """Flatten mappings within mappings into paths with their values, sorted."""
+    if isinstance(value, tuple):  # read before
+        value = dict(value)
+    if not isinstance(value, Mapping):
+        raise problem("must be a mapping from paths, such as base.mass, to new values")
+    return tuple(sorted(_flat(value.items()), key=lambda change: change[0]))
+
+
+def _flat(items: Iterable[tuple[Any, Any]], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    for key, value in items:
+        if isinstance(value, Mapping):
+            yield from _flat(value.items(), f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", _hashable(value)
+
+
+def _hashable(value: Any) -> Any:
+    return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value
+
+
+Changes = Annotated[
+    tuple[tuple[str, Any], ...], BeforeValidator(_read_changes), PlainSerializer(lambda changes: dict(changes))
+]
+
+
+class Phase(Model):
+    """A part of the episode with numbers of its own."""
+
+    name: Name = Field(description="name of the phase")
+    steps: Steps = Field(description="number of time steps; those of all phases add up to simulation.steps")
+    catch: Success | None = Field(
+        default=None,
+        exclude_if=lambda tolerances: tolerances is None,
+        description="tolerances of the tip within which the payload, which moves with the target until then, is "
+        "caught as the phase begins; absent: nothing is caught",
+    )
+    changes: Changes = Field(
+        default=(),
+        description="numbers of the scene that differ in this phase, by their paths; payload, actuators such as "
+        "actuators.base_force, or target.motion may be null: nothing held, out of work, at rest",
+    )
+
+
+class StagedNumbers(NamedTuple):
+    """What the phases of a scene change."""
+
+    starts: tuple[int, ...]  # first stage of each phase
+    values: dict[str, tuple[float, ...]]  # by name, a value for each phase, of those that differ
+    resting: tuple[tuple[float, ...] | None, ...]  # pose of a target at rest in a phase; None where it moves
+    catches: tuple[bool, ...]  # whether a phase begins with a catch
+
+
+@lru_cache(maxsize=64)
+def staged_numbers(scene: Scene) -> StagedNumbers:
+    """Find what the phases of a scene change; SceneError for what none may."""
+    starts, every, resting = [0], [], []
+    for phase in scene.phases:
+        starts.append(starts[-1] + phase.steps)
+        own, removed = phase_scene(scene, phase)
+        moves = scene.target.motion is not None and own.target.motion is not None
+        resting.append(None if moves else own.target.pose.dual_quaternion)
+        every.append({number.name: 0.0 if _is_in(number.name, removed) else number.nominal for number in numbers(own)})
+    moving = ("target.pose", "target.velocity") if scene.target.motion is not None else ()
+    values = {
+        name: tuple(each[name] for each in every)
+        for name in (every[0] if every else {})
+        if not _is_in(name, moving) and len({each[name] for each in every}) > 1
+    }
+    if every:
+        values = {"phase": tuple(float(index) for index in range(len(every))), **values}
+    catches = tuple(phase.catch is not None for phase in scene.phases)
+    return StagedNumbers(tuple(starts[:-1]), values, tuple(resting), catches)
+
+
+def phase_scene(scene: Scene, phase: Phase) -> tuple[Scene, tuple[str, ...]]:
+    """The scene with the numbers of a phase, and the paths of what is missing in it."""
+    changes, removed = {}, []
+    for path, value in phase.changes:
+        if value is None and (path == "payload" or path.startswith(_ACTUATORS)):
+            removed.append(path if path == "payload" else f"{path}.limit")
+        else:
+            changes[path] = value
+            if path == "target.motion":  # at rest, nothing of it is drawn
+                changes |= dict.fromkeys(("spread.target_angular_velocity", "spread.target_linear_velocity"), 0.0)
+    return scene.replace({**changes, "phases": ()}), tuple(removed)
+
+
+def _is_in(name: str, paths: Iterable[str]) -> bool:
+    return any(name == path or name.startswith(path + ".") for path in paths)
+
+
+def phase_problems(scene: Scene) -> Iterable[Problem]:
+    """Find mistakes in the phases of a scene."""
+    total = sum(phase.steps for phase in scene.phases)
+    if total != scene.simulation.steps:
+        sentence = f"have {total} steps together, the simulation has {scene.simulation.steps}: make them equal"
+        yield Problem(("phases",), total, sentence)
+    names = {number.name for number in numbers(scene.replace(phases=()))}
+    held = True
+    for index, phase in enumerate(scene.phases):
+        here = ("phases", index, "changes")
+        for path, value in phase.changes:
+            if value is None and path not in _REMOVABLE and path.removeprefix(_ACTUATORS) not in _FIELDS:
+                yield Problem((*here, path), value, "only payload, actuators or target.motion may be null")
+            elif value is not None and not _may_change(path, names):
+                sentence = "leads to no number that phases may change; such are base.mass, cost.pose, target.pose"
+                yield Problem((*here, path), value, sentence)
+        try:
+            own, removed = phase_scene(scene, phase)
+        except SceneError as error:
+            yield Problem(here, dict(phase.changes), f"makes no valid scene: {error}")
+            continue
+        if {number.name for number in numbers(own)} != names - _velocities(names, own):
+            sentence = "changes what the scene has, not its numbers: a weight of 0 for all phases leaves a term out"
+            yield Problem(here, dict(phase.changes), sentence)
+        held_before, held = held, "payload" not in removed
+        if phase.catch is not None and (index == 0 or held_before or not held or scene.payload is None):
+            sentence = (
+                "needs a payload that the phase before does not hold (changes: {payload: null}) and this one does"
+            )
+            yield Problem(("phases", index, "catch"), phase.catch, sentence)
+
+
+_FIELDS = ("base_force", "base_torque", "joint_torque", "wrist_rate")
+
+
+def _velocities(names: set[str], own: Scene) -> set[str]:
+    """Names of a target's velocity where it is at rest in a phase."""
+    return {name for name in names if _is_in(name, ("target.velocity",))} if own.target.motion is None else set()
+
+
+def _may_change(path: str, names: set[str]) -> bool:
+    """Whether a path leads to numbers that may be parameters of a stage."""
+    if _is_in(path, ("target.pose",)):
+        return True
+    if _is_in(path, ("actuators", "target", "phases", "parameters", "spread")):
+        return False
+    inner = path.rstrip("0123456789").rstrip(".")  # an entry of a list has a name
+    return any(_is_in(name, (inner,)) or _is_in(inner, (name,)) for name in names)
