@@ -43,7 +43,9 @@ def _hashable(value: Any) -> Any:
 
 
 Changes = Annotated[
-    tuple[tuple[str, Any], ...], BeforeValidator(_read_changes), PlainSerializer(lambda changes: dict(changes))
+    tuple[tuple[str, Any], ...],
+    BeforeValidator(_read_changes),
+    PlainSerializer(lambda changes: dict(changes)),
 ]
 
 
@@ -83,13 +85,19 @@ def staged_numbers(scene: Scene) -> StagedNumbers:
         own, removed = phase_scene(scene, phase)
         moves = scene.target.motion is not None and own.target.motion is not None
         resting.append(None if moves else own.target.pose.dual_quaternion)
-        every.append({number.name: 0.0 if _is_in(number.name, removed) else number.nominal for number in numbers(own)})
+        every.append(
+            {number.name: 0.0 if _is_in(number.name, removed) else number.nominal for number in numbers(own)}
+        )
     moving = ("target.pose", "target.velocity") if scene.target.motion is not None else ()
     values = {
         name: tuple(each[name] for each in every)
         for name in (every[0] if every else {})
         if not _is_in(name, moving) and len({each[name] for each in every}) > 1
     }
+    if any(_is_in(name, ("target.pose",)) for name in values):  # a pose changes as a whole
+        values |= {
+            name: tuple(each[name] for each in every) for name in every[0] if _is_in(name, ("target.pose",))
+        }
     if every:
         values = {"phase": tuple(float(index) for index in range(len(every))), **values}
     catches = tuple(phase.catch is not None for phase in scene.phases)
@@ -105,7 +113,9 @@ def phase_scene(scene: Scene, phase: Phase) -> tuple[Scene, tuple[str, ...]]:
         else:
             changes[path] = value
             if path == "target.motion":  # at rest, nothing of it is drawn
-                changes |= dict.fromkeys(("spread.target_angular_velocity", "spread.target_linear_velocity"), 0.0)
+                changes |= dict.fromkeys(
+                    ("spread.target_angular_velocity", "spread.target_linear_velocity"), 0.0
+                )
     return scene.replace({**changes, "phases": ()}), tuple(removed)
 
 
@@ -117,7 +127,9 @@ def phase_problems(scene: Scene) -> Iterable[Problem]:
     """Find mistakes in the phases of a scene."""
     total = sum(phase.steps for phase in scene.phases)
     if total != scene.simulation.steps:
-        sentence = f"have {total} steps together, the simulation has {scene.simulation.steps}: make them equal"
+        sentence = (
+            f"have {total} steps together, the simulation has {scene.simulation.steps}: make them equal"
+        )
         yield Problem(("phases",), total, sentence)
     names = {number.name for number in numbers(scene.replace(phases=()))}
     held = True
@@ -127,7 +139,9 @@ def phase_problems(scene: Scene) -> Iterable[Problem]:
             if value is None and path not in _REMOVABLE and path.removeprefix(_ACTUATORS) not in _FIELDS:
                 yield Problem((*here, path), value, "only payload, actuators or target.motion may be null")
             elif value is not None and not _may_change(path, names):
-                sentence = "leads to no number that phases may change; such are base.mass, cost.pose, target.pose"
+                sentence = (
+                    "leads to no number that phases may change; such are base.mass, cost.pose, target.pose"
+                )
                 yield Problem((*here, path), value, sentence)
         try:
             own, removed = phase_scene(scene, phase)
@@ -135,13 +149,13 @@ def phase_problems(scene: Scene) -> Iterable[Problem]:
             yield Problem(here, dict(phase.changes), f"makes no valid scene: {error}")
             continue
         if {number.name for number in numbers(own)} != names - _velocities(names, own):
-            sentence = "changes what the scene has, not its numbers: a weight of 0 for all phases leaves a term out"
+            sentence = (
+                "changes what the scene has, not its numbers: a weight of 0 for all phases leaves a term out"
+            )
             yield Problem(here, dict(phase.changes), sentence)
         held_before, held = held, "payload" not in removed
         if phase.catch is not None and (index == 0 or held_before or not held or scene.payload is None):
-            sentence = (
-                "needs a payload that the phase before does not hold (changes: {payload: null}) and this one does"
-            )
+            sentence = "needs a payload that the phase before does not hold (changes: {payload: null}) and this one does"
             yield Problem(("phases", index, "catch"), phase.catch, sentence)
 
 
@@ -150,7 +164,9 @@ _FIELDS = ("base_force", "base_torque", "joint_torque", "wrist_rate")
 
 def _velocities(names: set[str], own: Scene) -> set[str]:
     """Names of a target's velocity where it is at rest in a phase."""
-    return {name for name in names if _is_in(name, ("target.velocity",))} if own.target.motion is None else set()
+    return (
+        {name for name in names if _is_in(name, ("target.velocity",))} if own.target.motion is None else set()
+    )
 
 
 def _may_change(path: str, names: set[str]) -> bool:

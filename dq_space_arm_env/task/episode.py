@@ -17,8 +17,8 @@ import casadi
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import norm
-from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.maneuver import Success
+from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.parameters import (
     PHASE,
     catch_numbers,
@@ -212,7 +212,9 @@ def _resting(scene: Scene, stage: Scalar, rest: Scalars) -> list[Scalar]:
     for start, pose in zip(scene.staged.starts if resting else (), resting, strict=True):
         if pose is not None:
             still = [*(pose[i] for i in target_entries(scene)), *[0.0] * len(velocity_entries(scene))]
-            found[: len(still)] = [casadi.if_else(stage >= start, a, b) for a, b in zip(still, found, strict=False)]
+            found[: len(still)] = [
+                casadi.if_else(stage >= start, a, b) for a, b in zip(still, found, strict=False)
+            ]
     return found
 
 

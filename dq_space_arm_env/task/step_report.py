@@ -57,7 +57,9 @@ def n_observations(scene: Scene) -> int:
     """Count the entries of an observation: state, time left, and two twists where the target moves."""
     layout = StateLayout.of(scene)
     phase = 1 if scene.phases else 0
-    return layout.n_x + 1 + phase + (2 * (3 if layout.planar else 6) if scene.target.motion is not None else 0)
+    return (
+        layout.n_x + 1 + phase + (2 * (3 if layout.planar else 6) if scene.target.motion is not None else 0)
+    )
 
 
 def memory_names(scene: Scene) -> tuple[str, ...]:

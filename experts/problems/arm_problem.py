@@ -107,7 +107,9 @@ class ArmProblem:
         if not isinstance(factor, int | np.integer) or factor < 1 or self.horizon % factor:
             raise ValueError(f"factor is {factor!r}; it must divide the {self.horizon} stages")
         if not self.can_coarsen(factor):
-            raise ValueError(f"factor is {factor}; it must divide the stages of the phases that change the robot")
+            raise ValueError(
+                f"factor is {factor}; it must divide the stages of the phases that change the robot"
+            )
         coarse = copy.copy(self)
         coarse.horizon, coarse.time_step = self.horizon // factor, self.time_step * factor
         coarse.integrator = INTEGRATORS[self.integrator].curvature or self.integrator
