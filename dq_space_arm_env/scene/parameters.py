@@ -105,7 +105,7 @@ def numbers(scene: Scene) -> Iterator[Number]:
 
 
 def catch_numbers(scene: Scene) -> Iterator[Number]:
-    """Whether the payload is caught at the end of a stage, 1 or 0, and its twist then, tip axes; if any is."""
+    """Whether the payload is caught at the end of a stage, 1 or 0, and its twist then, tip axes."""
     if any(phase.catch is not None for phase in scene.phases):
         yield _number(f"{CATCH}.now", "1", 0.0)
         for index in velocity_entries(scene):

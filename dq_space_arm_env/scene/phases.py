@@ -1,17 +1,17 @@
-"""Phases of an episode: what is held at the tip, masses, actuators, cost and target change from one to the next.
+"""Phases of an episode: what the tip holds, masses, actuators, cost and target change from one to the next.
 
 A phase changes numbers of the scene, which thereby become parameters of the stages: inputs of the one machine
 code. At its start the payload may be caught.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import Annotated, Any, NamedTuple
 
 from pydantic import BeforeValidator, Field, PlainSerializer
 
 from dq_space_arm_env.scene.maneuver import Success
-from dq_space_arm_env.scene.parameters import numbers
+from dq_space_arm_env.scene.parameters import drawn_factors, has_target_spread, numbers, target_numbers
 from dq_space_arm_env.validation.fields import Name, Steps
 from dq_space_arm_env.validation.problems import Model, Problem, SceneError, problem
 
@@ -57,13 +57,13 @@ class Phase(Model):
     catch: Success | None = Field(
         default=None,
         exclude_if=lambda tolerances: tolerances is None,
-        description="tolerances of the tip within which the payload, which moves with the target until then, is "
-        "caught as the phase begins; absent: nothing is caught",
+        description="tolerances of the tip within which the payload, which moves with the target until then, "
+        "is caught as the phase begins; absent: nothing is caught",
     )
     changes: Changes = Field(
         default=(),
-        description="numbers of the scene that differ in this phase, by their paths; payload, actuators such as "
-        "actuators.base_force, or target.motion may be null: nothing held, out of work, at rest",
+        description="numbers of the scene that differ in this phase, by their paths; payload, an actuator such "
+        "as actuators.base_force, or target.motion may be null: nothing held, out of work, at rest",
     )
 
 
@@ -123,7 +123,7 @@ def _is_in(name: str, paths: Iterable[str]) -> bool:
     return any(name == path or name.startswith(path + ".") for path in paths)
 
 
-def phase_problems(scene: Scene) -> Iterable[Problem]:
+def phase_problems(scene: Scene) -> Iterator[Problem]:
     """Find mistakes in the phases of a scene."""
     total = sum(phase.steps for phase in scene.phases)
     if total != scene.simulation.steps:
@@ -132,41 +132,73 @@ def phase_problems(scene: Scene) -> Iterable[Problem]:
         )
         yield Problem(("phases",), total, sentence)
     names = {number.name for number in numbers(scene.replace(phases=()))}
-    held = True
+    held = moves = True
+    valid = True
     for index, phase in enumerate(scene.phases):
-        here = ("phases", index, "changes")
-        for path, value in phase.changes:
-            if value is None and path not in _REMOVABLE and path.removeprefix(_ACTUATORS) not in _FIELDS:
-                yield Problem((*here, path), value, "only payload, actuators or target.motion may be null")
-            elif value is not None and not _may_change(path, names):
-                sentence = (
-                    "leads to no number that phases may change; such are base.mass, cost.pose, target.pose"
-                )
-                yield Problem((*here, path), value, sentence)
+        here: tuple[str | int, ...] = ("phases", index, "changes")
+        wrong = [*_change_problems(scene, phase, here, names)]
+        yield from wrong
+        if wrong:
+            valid = False
+            continue
         try:
             own, removed = phase_scene(scene, phase)
         except SceneError as error:
+            valid = False
             yield Problem(here, dict(phase.changes), f"makes no valid scene: {error}")
             continue
-        if {number.name for number in numbers(own)} != names - _velocities(names, own):
+        own_names = {number.name for number in numbers(own)}
+        rests = scene.target.motion is not None and own.target.motion is None
+        if (
+            own_names | ({name for name in names if _is_in(name, ("target.velocity",))} if rests else set())
+            != names
+        ):
+            valid = False
             sentence = (
-                "changes what the scene has, not its numbers: a weight of 0 for all phases leaves a term out"
+                "adds or removes a term of the cost: give its weight a number other than 0 in the scene"
             )
             yield Problem(here, dict(phase.changes), sentence)
-        held_before, held = held, "payload" not in removed
-        if phase.catch is not None and (index == 0 or held_before or not held or scene.payload is None):
-            sentence = "needs a payload that the phase before does not hold (changes: {payload: null}) and this one does"
+        if not rests and not moves:
+            yield Problem(
+                here, dict(phase.changes), "moves a target that came to rest: keep target.motion null"
+            )
+        held_before, held, moves = held, "payload" not in removed, not rests
+        gains = scene.payload is not None and held and index > 0 and not held_before
+        if gains != (phase.catch is not None):
+            sentence = (
+                "must be given where the phase before holds no payload and this one does, and only there"
+            )
             yield Problem(("phases", index, "catch"), phase.catch, sentence)
+    if valid:
+        yield from _drawn_problems(scene)
+
+
+def _change_problems(
+    scene: Scene, phase: Phase, here: tuple[str | int, ...], names: set[str]
+) -> Iterator[Problem]:
+    """Find changes that phases cannot make."""
+    for path, value in phase.changes:
+        if value is None and path not in _REMOVABLE and path.removeprefix(_ACTUATORS) not in _FIELDS:
+            yield Problem((*here, path), value, "only payload, actuators or target.motion may be null")
+        elif path == "payload" and scene.payload is None:
+            yield Problem((*here, path), value, "the scene has no payload")
+        elif value is not None and _is_in(path, ("payload",)):
+            yield Problem((*here, path), value, "the payload is held as it is, or not at all: payload: null")
+        elif value is not None and not _may_change(path, names):
+            sentence = "leads to no number that phases change; such are base.mass, links.0.inertia, target.pose"
+            yield Problem((*here, path), value, sentence)
+
+
+def _drawn_problems(scene: Scene) -> Iterator[Problem]:
+    """Find numbers that phases change and a spread draws."""
+    drawn = {number.name for _, group in drawn_factors(scene) for number in group}
+    drawn |= {number.name for number in target_numbers(scene)} if has_target_spread(scene) else set()
+    both = sorted(drawn & staged_numbers(scene).values.keys())
+    if both:
+        yield Problem(("phases",), both[0], "phases change it, so it can have no spread")
 
 
 _FIELDS = ("base_force", "base_torque", "joint_torque", "wrist_rate")
-
-
-def _velocities(names: set[str], own: Scene) -> set[str]:
-    """Names of a target's velocity where it is at rest in a phase."""
-    return (
-        {name for name in names if _is_in(name, ("target.velocity",))} if own.target.motion is None else set()
-    )
 
 
 def _may_change(path: str, names: set[str]) -> bool:

@@ -47,7 +47,7 @@ class Catching:
         return caught
 
     def shock(self, x: Scalars, twist: Scalars) -> list[Scalar]:
-        """Impulse [N s] and angular impulse about the tip [N m s] on a payload whose tip moves on as x says."""
+        """Impulse [N s] and angular impulse about the tip [N m s] on a payload that moves on as x says."""
         motion = self.equations.field.motion(self.equations.y(x))
         after = momentum_at_tip(self._payload, self.equations.tip_twist(motion))
         before = momentum_at_tip(self._payload, twist)

@@ -78,7 +78,7 @@ def observe(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:
     return {
         "memory_kept": [memory[0], *equations.state_cost_terms(x), *rest],
         "observation": seen["observation"],
-        "report": [*costs, *errors, *(rest[-1:] + [0.0, 0.0] if has_catch(scene) else []), 0.0],
+        "report": [*costs, *errors, *([rest[-1], 0.0, 0.0] if has_catch(scene) else []), 0.0],
         "flags": [0.0, is_success(scene, errors), 0.0],
     }
 
@@ -225,7 +225,8 @@ def _every_phase(equations: SceneEquations) -> list[SceneEquations]:
         return [equations]
     found = []
     for index in range(len(scene.phases)):
-        given = equations.given | {name: values[index] for name, values in scene.staged.values.items()}
+        own = {name: values[index] for name, values in scene.staged.values.items()}
+        given = {**equations.given, **own}
         found.append(SceneEquations.of(scene, [given[number.name] for number in all_parameters(scene)]))
     return found
 

@@ -410,7 +410,7 @@ class GuidedDDP:
         """Find the longest steps whose policy leads to the minimum in the problem's own."""
         horizon = self.problem.horizon
         for factor in range(LARGEST_COARSENING, 1, -1):
-            if horizon % factor == 0 and self.problem.can_coarsen(factor):
+            if horizon % factor == 0 and cast(ArmProblem, self.problem).can_coarsen(factor):
                 coarse = self._with_best_model(factor)
                 if self._leads_to_minimum(coarse):
                     self._coarse = coarse
