@@ -62,8 +62,8 @@ class Phase(Model):
     )
     changes: Changes = Field(
         default=(),
-        description="numbers of the scene that differ in this phase, by their paths; payload, an actuator such "
-        "as actuators.base_force, or target.motion may be null: nothing held, out of work, at rest",
+        description="numbers of the scene that differ in this phase, by their paths; payload, an actuator "
+        "such as actuators.base_force, or target.motion may be null: nothing held, out of work, at rest",
     )
 
 
@@ -185,7 +185,7 @@ def _change_problems(
         elif value is not None and _is_in(path, ("payload",)):
             yield Problem((*here, path), value, "the payload is held as it is, or not at all: payload: null")
         elif value is not None and not _may_change(path, names):
-            sentence = "leads to no number that phases change; such are base.mass, links.0.inertia, target.pose"
+            sentence = "leads to no number that phases change; such are base.mass, links.0, target.pose"
             yield Problem((*here, path), value, sentence)
 
 

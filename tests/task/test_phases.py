@@ -1,0 +1,268 @@
+"""Phases: the environment, the kernels and the solver's rows agree; a catch is a plastic impact."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import dq_space_arm_env
+from dq_space_arm_env import Scene, SceneError, compile_scene, load_scene
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.interoperability.pinocchio_twin import pinocchio_model, to_pinocchio
+from dq_space_arm_env.kernels.capture import catch_payload
+from experts.problems.arm_problem import ArmProblem
+
+ANYWAY = {
+    "attitude_error_deg": 180.0,
+    "position_error": 100.0,
+    "angular_velocity_error_deg": None,
+    "velocity_error": None,
+}
+
+
+def shortened(name: str) -> Scene:
+    """A scene with phases, in a tenth of its steps and with a catch that succeeds anywhere."""
+    scene = load_scene(name)
+    lengths = [max(1, phase.steps // 10) for phase in scene.phases]
+    changes: dict[str, Any] = {f"phases.{i}.steps": steps for i, steps in enumerate(lengths)}
+    for index, phase in enumerate(scene.phases):
+        if phase.catch is not None:
+            changes |= {f"phases.{index}.catch": ANYWAY}
+    return scene.replace({**changes, "simulation.steps": sum(lengths)})
+
+
+SCENES = {name: shortened(name) for name in ("capture-and-detumble", "release", "refuelling")}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_an_episode_costs_what_the_kernels_say_stage_by_stage(name: str) -> None:
+    scene = SCENES[name]
+    env = gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped
+    venv = gymnasium.make_vec("DQSpaceArm-v0", num_envs=3, scene=scene)
+    assert isinstance(env, dq_space_arm_env.DQSpaceArmEnv)
+    kernels, rng = env.kernels, np.random.default_rng(0)
+    first, _ = env.reset(seed=7)
+    assert np.array_equal(venv.reset(seed=7)[0][0], first)
+    rows, x, cost, returned = kernels.stage_parameters(env.parameters), env.state, 0.0, 0.0
+    for stage in range(scene.simulation.steps):
+        action = rng.uniform(-0.3, 0.3, kernels.n_u).astype(np.float32)
+        u = kernels.layout.limits_with(rows[stage]) * action.astype(np.float64)
+        cost += kernels.cost(x, u, p=rows[stage])
+        x = kernels.step(x, u, p=rows[stage])
+        observation, reward, over, _, info = env.step(action)
+        returned += float(reward)
+        seen, rewards, *_ = venv.step(np.tile(action, (3, 1)))
+        assert np.array_equal(seen[0], observation)
+        assert rewards[0] == reward
+        assert np.abs(env.state - x).max() < 1e-13
+        assert info["phase"] == rows[stage + 1][kernels.parameters.names.index("phase")]
+        assert np.abs(env.stage_parameters - rows[stage + 1]).max() < 1e-13
+    cost += kernels.terminal_cost(x, p=rows[-1])
+    assert over
+    assert returned == pytest.approx(-cost, rel=1e-13)
+
+
+@pytest.mark.parametrize("name", ["capture-and-detumble"])
+def test_state_is_kept_and_restored_across_a_catch(name: str) -> None:
+    scene = SCENES[name]
+    one, other = (gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped for _ in range(2))
+    one.reset(seed=3)
+    rng, start = np.random.default_rng(1), scene.staged.starts[2] - 3
+    actions = rng.uniform(-0.3, 0.3, (scene.simulation.steps, one.action_space.shape[0]))
+    for action in actions[:start]:
+        one.step(action)
+    other.reset(seed=9)
+    other.set_state(one.get_state())
+    for action in actions[start:]:
+        results = [each.step(action) for each in (one, other)]
+        assert np.array_equal(results[0][0], results[1][0])
+        assert results[0][1:] == results[1][1:]
+
+
+def caught(kernels: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """State before and after a catch, from rows without and with it."""
+    rows, rng = kernels.stage_parameters(), np.random.default_rng(2)
+    stage = kernels.scene.staged.starts[2] - 1
+    x = kernels.retract(kernels.layout.initial_state, 0.2 * rng.standard_normal(kernels.n_t))
+    u = rng.standard_normal(kernels.n_u)
+    free = rows[stage].copy()
+    free[kernels.parameters.indices("catch")] = 0.0
+    return kernels.step(x, u, p=free), kernels.step(x, u, p=rows[stage]), rows[stage], rows[stage + 1], u
+
+
+def center_of_mass(scene: Scene, x: np.ndarray, given: dict[str, float]) -> np.ndarray:
+    chain, total, moment = Chain.from_scene(scene, given), 0.0, np.zeros(3)
+    for body, pose in zip(
+        [chain.base, *(link.body for link in chain.links)], compile_scene(scene).frame_poses(x), strict=False
+    ):
+        rotation, position = poses.to_matrix(tuple(pose.tolist()))
+        moment += body.mass * (np.array(position) + np.array(rotation) @ np.array(body.center_of_mass))
+        total += body.mass
+    return np.asarray(moment / total)
+
+
+def test_a_catch_conserves_the_momentum_of_robot_and_payload() -> None:
+    """Linear, and angular about the origin, with the payload where the latch holds it."""
+    scene = SCENES["capture-and-detumble"]
+    kernels = compile_scene(scene)
+    before, after, row, next_row, _ = caught(kernels)
+    twist = row[kernels.parameters.indices("catch")][1:]
+    payload, (rotation, tip) = scene.payload, poses.to_matrix(tuple(kernels.tip_pose(before).tolist()))
+    assert payload is not None
+    turn, center = np.array(rotation), np.array(payload.center_of_mass)
+    brought = payload.mass * (turn @ (twist[3:] + np.cross(twist[:3], center)))
+    spin = turn @ (np.array(payload.inertia) @ twist[:3])
+    spin += np.cross(np.array(tip) + turn @ center, brought)
+    momenta = kernels.momentum(before, p=row), kernels.momentum(after, p=next_row)
+    missing = {name: 0.0 for name in kernels.parameters.names if name.startswith("payload")}
+    centers = center_of_mass(scene, before, missing), center_of_mass(scene, after, {})
+    linear, angular = (momenta[0][:3] + brought, momenta[0][3:] + np.cross(centers[0], momenta[0][:3]) + spin)
+    assert np.abs(momenta[1][:3] - linear).max() < 1e-13 * np.abs(linear).max()
+    found = momenta[1][3:] + np.cross(centers[1], momenta[1][:3])
+    assert np.abs(found - angular).max() < 1e-13 * np.abs(angular).max()
+    assert np.array_equal(before[:11], after[:11])  # pose and angles stay
+
+
+def test_the_merged_body_has_the_momentum_that_pinocchio_finds() -> None:
+    pinocchio = pytest.importorskip("pinocchio")
+    scene = SCENES["capture-and-detumble"]
+    kernels = compile_scene(scene)
+    _, after, _, next_row, _ = caught(kernels)
+    loaded = scene.replace({"phases": ()})
+    model = pinocchio_model(loaded)
+    q, v = to_pinocchio(loaded, after)
+    momentum = pinocchio.computeCentroidalMomentum(model, model.createData(), q, v)
+    found = kernels.momentum(after, p=next_row)
+    expected = np.concatenate([momentum.linear, momentum.angular])
+    assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+def test_a_catch_in_an_episode_is_that_of_a_single_call() -> None:
+    scene = SCENES["capture-and-detumble"]
+    kernels = compile_scene(scene)
+    before, after, row, *_ = caught(kernels)
+    loaded = scene.replace({"phases": ()})
+    free = compile_scene(loaded.replace({"payload": None}))
+    expected = catch_payload(
+        free, compile_scene(loaded), before, row[kernels.parameters.indices("catch")][1:]
+    )
+    assert np.abs(after - expected).max() < 1e-14
+
+
+def test_derivatives_across_a_catch() -> None:
+    """Against central differences, extrapolated to order 4."""
+    kernels = compile_scene(SCENES["capture-and-detumble"])
+    rows, rng = kernels.stage_parameters(), np.random.default_rng(3)
+    p = rows[kernels.scene.staged.starts[2] - 1]
+    x = kernels.retract(kernels.layout.initial_state, 0.2 * rng.standard_normal(kernels.n_t))
+    u, n_t = rng.standard_normal(kernels.n_u), kernels.n_t
+    landed = kernels.step(x, u, p=p)
+
+    def moved(direction: np.ndarray, h: float) -> np.ndarray:
+        state = kernels.retract(x, h * direction[:n_t])
+        return np.asarray(kernels.difference(landed, kernels.step(state, u + h * direction[n_t:], p=p)))
+
+    def slope(direction: np.ndarray, h: float) -> np.ndarray:
+        return (moved(direction, h) - moved(direction, -h)) / (2.0 * h)
+
+    found = np.hstack(kernels.linearize(x, u, p=p))
+    for column, direction in enumerate(np.eye(n_t + kernels.n_u)):
+        expected = (4.0 * slope(direction, 2.5e-4) - slope(direction, 5e-4)) / 3.0
+        assert np.abs(found[:, column] - expected).max() < 5e-12
+
+
+def test_a_catch_outside_the_tolerances_fails() -> None:
+    scene = shortened("capture-and-detumble").replace({"phases.2.catch.position_error": 0.01})
+    env = gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped
+    env.reset(options={"nominal": True})
+    still, start = np.zeros(env.action_space.shape), scene.staged.starts[2]
+    for stage in range(scene.simulation.steps):
+        before = env.state
+        *_, info = env.step(still)
+        assert info["caught"] == (stage + 1 < start)
+        assert info["shock"] == 0.0
+    assert not info["is_success"]
+    # Nothing is held: the free robot moves on.
+    assert (
+        np.abs(
+            env.kernels.step(before, np.zeros(env.kernels.n_u), p=env.kernels.parameters.nominal) - env.state
+        ).max()
+        < 1e-14
+    )
+
+
+def test_the_shock_is_the_change_of_the_payloads_momentum() -> None:
+    scene = SCENES["capture-and-detumble"]
+    env = gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped
+    env.reset(seed=5)
+    start, kernels = scene.staged.starts[2], env.kernels
+    rows, rng = kernels.stage_parameters(env.parameters), np.random.default_rng(4)
+    for _ in range(start):
+        *_, info = env.step(rng.uniform(-0.3, 0.3, kernels.n_u))
+    payload, twist = scene.payload, rows[start - 1][kernels.parameters.indices("catch")][1:]
+    gained = kernels.tip_twist(env.state, np.zeros(kernels.n_u)) - twist
+    center = np.array(payload.center_of_mass)
+    linear = payload.mass * (gained[3:] + np.cross(gained[:3], center))
+    angular = np.array(payload.inertia) @ gained[:3] + np.cross(center, linear)
+    assert info["caught"] == 1.0
+    assert info["shock"] == pytest.approx(float(np.linalg.norm(linear)), rel=1e-12)
+    assert info["angular_shock"] == pytest.approx(float(np.linalg.norm(angular)), rel=1e-12)
+
+
+def test_a_released_payload_leaves_the_robot_as_it_moves() -> None:
+    """Velocities stay, and the robot goes on without the payload's mass."""
+    scene = SCENES["release"]
+    kernels = compile_scene(scene)
+    rows, rng = kernels.stage_parameters(), np.random.default_rng(5)
+    x = kernels.retract(kernels.layout.initial_state, 0.2 * rng.standard_normal(kernels.n_t))
+    u, alone = rng.standard_normal(kernels.n_u), compile_scene(scene.replace({"phases": (), "payload": None}))
+    whole = compile_scene(scene.replace({"phases": ()}))
+    assert np.abs(kernels.step(x, u, p=rows[0]) - whole.step(x, u)).max() < 1e-14
+    assert np.abs(kernels.step(x, u, p=rows[-1]) - alone.step(x, u)).max() < 1e-14
+
+
+def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
+    problem = ArmProblem("capture-and-detumble")
+    coarse, entries = problem.coarsened(5), problem.kernels.parameters
+    rows, long_rows = problem.parameters.rows, coarse.parameters.rows
+    weights, catch = entries.indices("cost"), entries.indices("catch")
+    start = problem.scene.staged.starts[2] // 5
+    assert np.array_equal(long_rows[start - 1, weights], rows[795:800, weights].mean(axis=0))
+    assert np.array_equal(long_rows[start - 1, catch], rows[799, catch])
+    assert long_rows[:, catch[0]].sum() == 1.0
+    assert not problem.can_coarsen(3)
+    with pytest.raises(ValueError, match="phases that change the robot"):
+        problem.coarsened(3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"phases.0.steps": 7}, "make them equal"),
+        ({"phases.1.changes": {"payload.mass": 3}}, "held as it is, or not at all"),
+        ({"phases.1.changes": {"payload": None, "base.mas": 3}}, "leads to no number that phases change"),
+        ({"phases.1.changes": {"payload": None, "base.mass": -3}}, "must be a finite number greater than 0"),
+        ({"phases.1.changes": {"payload": None, "base.mass": float("nan")}}, "must be a finite number"),
+        ({"phases.1.changes": {"payload": None, "base": None}}, "may be null"),
+        ({"phases.1.changes": [1]}, "must be a mapping from paths"),
+        ({"phases.2.catch": None}, "must be given where the phase before holds no payload"),
+        ({"phases.0.catch": {}}, "and only there"),
+        ({"phases.2.changes": {"target.motion": None, "cost.tip_twist": 0}}, "adds or removes a term"),
+        ({"spread.payload_mass": 0.1}, "it can have no spread"),
+        ({"payload": None}, "the scene has no payload"),
+        ({"phases.0.changes": {"payload": None, "target.motion": None}}, "keep target.motion null"),
+    ],
+)
+def test_mistakes_are_named(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(SceneError, match="phases") as error:
+        SCENES["capture-and-detumble"].replace(changes)
+    assert words in str(error.value)
+
+
+def test_scenes_with_phases_survive_their_yaml() -> None:
+    for scene in SCENES.values():
+        again = load_scene(scene.model_dump())
+        assert again == scene
+        assert again.content_hash() == scene.content_hash()
