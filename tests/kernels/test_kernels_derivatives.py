@@ -43,8 +43,8 @@ def moved(layout, x, direction):
     return result
 
 
-def complex_step_jacobians(kernels, x, u, integrator):
-    program = ScenePrograms(kernels.scene).build("step", integrator)
+def complex_step_jacobians(kernels, program, x, u):
+    """Derivatives of a traced step."""
     layout, h = kernels.layout, [kernels.scene.simulation.dt]
 
     # One lane for each direction.
@@ -79,8 +79,9 @@ def scenes_and_integrators():
 def test_linearization_agrees_with_complex_steps(scene, integrator, draw):
     kernels, states, inputs = draw(scene, 3)
     a, b = kernels.linearize(states, inputs, integrator=integrator)
+    program = ScenePrograms(kernels.scene).build("step", integrator)
     for k in range(3):
-        expected_a, expected_b = complex_step_jacobians(kernels, states[k], inputs[k], integrator)
+        expected_a, expected_b = complex_step_jacobians(kernels, program, states[k], inputs[k])
         np.testing.assert_allclose(a[k], expected_a, atol=2e-13 * max(1.0, np.abs(expected_a).max()))
         np.testing.assert_allclose(b[k], expected_b, atol=2e-13)
 

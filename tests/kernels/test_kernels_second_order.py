@@ -13,7 +13,8 @@ STEP = 5e-4
 # Each of the others takes seconds to compile.
 QUICK = ("paper", "planar")
 CURVED = [name for name, entry in INTEGRATORS.items() if entry.has_curvature]
-SCENES = [s if s in QUICK else pytest.param(s, marks=pytest.mark.slow) for s in robots()]
+WITH_COST = (*robots(), "random-target")  # whose target is a parameter of the cost
+SCENES = [s if s in QUICK else pytest.param(s, marks=pytest.mark.slow) for s in WITH_COST]
 ODD_SCENES = [s if s in ("base", "wrist") else pytest.param(s, marks=pytest.mark.slow) for s in ODD]
 
 
