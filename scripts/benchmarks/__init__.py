@@ -3,6 +3,7 @@
 harness          rows, claims, tables, figures, files and exit status of every benchmark
 effort           the workload: quick, standard, full
 subjects         kernels and environments to be timed
+robots           one scene of each distinct robot
 peers            Pinocchio, MuJoCo, Crocoddyl and IPOPT with a scene's robot or maneuver; all optional
 work_precision   error against run time of integrators and formulations
 stability        stiff and extreme cases

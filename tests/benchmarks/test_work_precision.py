@@ -6,13 +6,14 @@ import mpmath
 import numpy as np
 import pytest
 
-from dq_space_arm_env import compile_scene, list_scenes, load_scene
+from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.kernels.programs.paper_programs import PaperPrograms
 from dq_space_arm_env.scene import INTEGRATORS
 from experts.report.integrator_precision import observed_order
 from scripts.benchmarks import work_precision
 from scripts.benchmarks.effort import QUICK, Sampling
 from scripts.benchmarks.harness import Row, select, shortcomings
+from scripts.benchmarks.robots import OTHER_MOTIONS, robots
 from scripts.benchmarks.work_precision.formulations import LIMITS, PINOCCHIO, measure_formulations
 from scripts.benchmarks.work_precision.many_digits import evaluate, torque_free_motion
 from scripts.benchmarks.work_precision.measurement import (
@@ -317,8 +318,8 @@ def test_the_maneuver_of_a_scene_is_followed() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", list_scenes())
-def test_the_integrator_of_each_scene_follows_from_the_errors(name: str) -> None:
+@pytest.mark.parametrize("name", [*robots(), *OTHER_MOTIONS])
+def test_the_integrator_of_each_robot_follows_from_the_errors(name: str) -> None:
     case = scene_case(name)
     own = Method(case.scene.simulation.integrator, 4)
     walk = Walk(own, own.kernels(case.scene), case)

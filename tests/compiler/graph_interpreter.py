@@ -1,5 +1,7 @@
 """A second implementation of graphs: NumPy evaluates them node by node, in any number type it has."""
 
+import operator
+
 import numpy as np
 
 from dq_space_arm_env.compiler.graph import LIBRARY_FUNCTIONS, Graph
@@ -20,11 +22,11 @@ _OPERATIONS = {
     "arctan": np.arctan,
     "sign": lambda a: np.sign(np.real(a)),
     "floor": lambda a: np.floor(np.real(a)),
-    "add": lambda a, b: a + b,
-    "subtract": lambda a, b: a - b,
-    "multiply": lambda a, b: a * b,
-    "divide": lambda a, b: a / b,
-    "negate": lambda a: -a,
+    "add": operator.add,
+    "subtract": operator.sub,
+    "multiply": operator.mul,
+    "divide": operator.truediv,
+    "negate": operator.neg,
     "square": lambda a: a * a,
     "twice": lambda a: a + a,
     "invert": lambda a: 1 / a,
@@ -46,22 +48,48 @@ _OPERATIONS = {
 }
 
 
+_TRUTHS = ("less", "less_equal", "equal", "not_equal", "not", "and", "or")
+
+
+class _Evaluation:
+    """A graph prepared to be evaluated many times, as loops do."""
+
+    def __init__(self, graph: Graph, dtype) -> None:
+        self.dtype, self.results = dtype, graph.results
+        self.constants = [dtype(n.constant) if n.operation == "constant" else None for n in graph.nodes]
+        self.inputs = [(i, *node.slot) for i, node in enumerate(graph.nodes) if node.operation == "input"]
+        self.operations = [
+            (i, self._function(node.operation), *node.arguments, *[None] * (2 - len(node.arguments)))
+            for i, node in enumerate(graph.nodes)
+            if node.operation not in ("constant", "input")
+        ]
+
+    def _function(self, operation: str):
+        function, dtype = _OPERATIONS[operation], self.dtype
+        return (lambda *a: function(*a).astype(dtype)) if operation in _TRUTHS else function  # 0 or 1
+
+    def __call__(self, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        """Outputs for inputs of shape (n,), or (n, lanes) for many evaluations at once."""
+        values = [*self.constants]
+        for index, buffer, entry in self.inputs:
+            values[index] = inputs[buffer][entry]
+        for index, function, first, second in self.operations:
+            one = values[first]
+            values[index] = function(one) if second is None else function(one, values[second])
+        lanes = next((value.shape[1:] for value in inputs if value.ndim == 2), ())
+        return [
+            np.array([np.broadcast_to(values[i], lanes) for i in indices], dtype=self.dtype).reshape(
+                -1, *lanes
+            )
+            if lanes
+            else np.array([values[i] for i in indices], dtype=self.dtype)
+            for indices in self.results
+        ]
+
+
 def evaluate_graph(graph: Graph, inputs: list[np.ndarray], dtype) -> list[np.ndarray]:
     """Outputs of a graph for inputs of shape (n,), or (n, lanes) for many evaluations at once."""
-    values = []
-    for node in graph.nodes:
-        if node.operation == "constant":
-            values.append(dtype(node.constant))
-        elif node.operation == "input":
-            values.append(inputs[node.slot[0]][node.slot[1]])
-        else:
-            value = np.asarray(_OPERATIONS[node.operation](*(values[i] for i in node.arguments)))
-            values.append(value.astype(dtype) if value.dtype == bool else value)  # truth is 0 or 1
-    lanes = next((value.shape[1:] for value in inputs if value.ndim == 2), ())
-    return [
-        np.array([np.broadcast_to(values[i], lanes) for i in indices], dtype=dtype).reshape(-1, *lanes)
-        for indices in graph.results
-    ]
+    return _Evaluation(graph, dtype)(inputs)
 
 
 def evaluate_program(
@@ -77,11 +105,13 @@ def evaluate_program(
     for name, value in arrays.items():
         buffers[name] = value if value.shape[1:] == lanes else np.repeat(value[:, None], lanes[0], axis=1)
     loops = {loop.end: loop for loop in program.loops}
+    graphs = {id(call.graph): call.graph for call in program.calls}
+    evaluations = {key: _Evaluation(graph, dtype) for key, graph in graphs.items()}
     position = 0
     while position < len(program.calls):
         call = program.calls[position]
         names = [call.bindings.get(name, name) for name, _ in call.graph.inputs]
-        results = evaluate_graph(call.graph, [buffers[name] for name in names], dtype)
+        results = evaluations[id(call.graph)]([buffers[name] for name in names])
         for (name, _), result in zip(call.graph.outputs, results, strict=True):
             buffer = call.bindings.get(name, name)
             buffers[buffer] = result.real.astype(dtype) if buffer in frozen else result

@@ -59,13 +59,34 @@ def test_internal_torques_keep_the_momentum_to_rounding(name, scene):
     assert by_rk4 < 1e-5 or scene == "six-joint"  # its joints reach 20 rad/s
 
 
-@pytest.mark.parametrize("steps", [100_000, pytest.param(10_000_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", METHODS)
+def durations():
+    """Each method for many steps, the cheapest for ten million too; the others when minutes do not count."""
+    for name in METHODS:
+        yield name, 100_000
+        quick = name == "momentum_rk4"
+        yield pytest.param(name, 10_000_000, marks=pytest.mark.slow if quick else pytest.mark.endurance)
+
+
+@pytest.mark.parametrize(("name", "steps"), list(durations()))
 def test_momentum_over_many_steps(name, steps):
     kernels = compile_scene("paper")
     states = slow_walk(kernels, np.zeros(kernels.n_u), steps, name, steps // 1000)
     assert drift(kernels, states) < 2e-14
     assert np.ptp(states[:, kernels.layout.state.joint_angles], axis=0).min() > 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
+def test_a_million_steps_foretell_ten_million(name):
+    """A bias of the steps moves the mean momentum from one half of them to the other, above all rounding.
+
+    Ten times as many steps, and from end to end, it would move twenty times as far.
+    """
+    kernels = compile_scene("paper")
+    states = slow_walk(kernels, np.zeros(kernels.n_u), 1_000_000, name, 1000)
+    assert drift(kernels, states) < 2e-14
+    first, second = (half.mean(axis=0) for half in np.split(kernels.momentum(states[1:]), 2))
+    assert 20.0 * np.abs(second - first).max() < 2e-14
 
 
 def test_single_steps_let_the_momentum_wander_by_rounding_only():

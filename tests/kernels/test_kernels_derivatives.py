@@ -1,4 +1,4 @@
-"""Exact derivatives: complex steps through the traced graphs, for every scene and integrator."""
+"""Exact derivatives: complex steps through the traced graphs, for every robot and integrator."""
 
 import numpy as np
 import pytest
@@ -7,6 +7,7 @@ from dq_space_arm_env import compile_scene, list_scenes, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
 from dq_space_arm_env.scene import INTEGRATORS
+from scripts.benchmarks.robots import robots
 
 interpreter = pytest.importorskip("graph_interpreter")
 
@@ -42,8 +43,8 @@ def moved(layout, x, direction):
     return result
 
 
-def complex_step_jacobians(kernels, x, u, integrator):
-    program = ScenePrograms(kernels.scene).build("step", integrator)
+def complex_step_jacobians(kernels, program, x, u):
+    """Derivatives of a traced step."""
     layout, h = kernels.layout, [kernels.scene.simulation.dt]
 
     # One lane for each direction.
@@ -63,9 +64,9 @@ SLOW_SCENES = ("no-wrist", "paper", "random-masses", "six-joint", "tip-load")
 
 
 def scenes_and_integrators():
-    """Every scene with rk4; the other methods on scenes of each structure; by default what compiles fast."""
+    """Every robot with rk4; the other methods on scenes of each structure; by default what compiles fast."""
     for integrator in INTEGRATORS:
-        for scene in list_scenes():
+        for scene in robots():
             if scene in FAST_SCENES or (scene, integrator) == ("paper", "rk4"):
                 yield scene, integrator
             elif integrator == "rodas5p":
@@ -78,13 +79,14 @@ def scenes_and_integrators():
 def test_linearization_agrees_with_complex_steps(scene, integrator, draw):
     kernels, states, inputs = draw(scene, 3)
     a, b = kernels.linearize(states, inputs, integrator=integrator)
+    program = ScenePrograms(kernels.scene).build("step", integrator)
     for k in range(3):
-        expected_a, expected_b = complex_step_jacobians(kernels, states[k], inputs[k], integrator)
+        expected_a, expected_b = complex_step_jacobians(kernels, program, states[k], inputs[k])
         np.testing.assert_allclose(a[k], expected_a, atol=2e-13 * max(1.0, np.abs(expected_a).max()))
         np.testing.assert_allclose(b[k], expected_b, atol=2e-13)
 
 
-@pytest.mark.parametrize("scene", list_scenes())
+@pytest.mark.parametrize("scene", robots())
 def test_machine_code_agrees_with_the_interpreted_graph(scene, draw):
     kernels, states, inputs = draw(scene, 2)
     program = ScenePrograms(kernels.scene).build("step", "rk4")

@@ -1,14 +1,15 @@
-"""The compiled dynamics of every shipped scene against the paper's Newton-Euler system (13)-(22)."""
+"""The compiled dynamics of every shipped robot against the paper's Newton-Euler system (13)-(22)."""
 
 import numpy as np
 import pytest
 
-from dq_space_arm_env import list_scenes, load_scene
+from dq_space_arm_env import load_scene
 from dq_space_arm_env.algebra import vectors
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
+from scripts.benchmarks.robots import robots
 
 
 def relative_error(actual, expected):
@@ -40,7 +41,7 @@ def paper_solution(kernels, x, u):
     return np.array([*base[list(field.pose.directions)], *joints]), np.array(reactions)
 
 
-@pytest.mark.parametrize("scene", list_scenes())
+@pytest.mark.parametrize("scene", robots())
 def test_minimal_coordinates_and_the_papers_system_agree_to_1e_12(scene, draw):
     kernels, states, inputs = draw(scene, 30)
     accelerations = kernels.forward_dynamics(states, inputs)
@@ -82,7 +83,7 @@ def test_base_pose_and_velocity_do_not_change_the_motion(draw):
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("scene", list_scenes())
+@pytest.mark.parametrize("scene", robots())
 def test_frame_poses_end_at_the_tip_27(scene, draw):
     kernels, states, _ = draw(scene, 10)
     frames, tips = kernels.frame_poses(states), kernels.tip_pose(states)

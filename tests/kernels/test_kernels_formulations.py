@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 from test_kernels_odd_scenes import ODD
 
-from dq_space_arm_env import compile_scene, list_scenes, load_scene
+from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
+from scripts.benchmarks.robots import robots
 
 BOTH = ("articulated_body", "minimal_coordinates")
 DEFAULT = None  # the articulated body, unless the integrator keeps the momentum
 DIFFERENTIATED = ("paper", "planar")
-SCENES = {name: load_scene(name) for name in list_scenes()} | ODD
+SCENES = {name: load_scene(name) for name in robots()} | ODD
 
 
 def by(scene, formulation):
@@ -38,7 +39,7 @@ def test_accelerations_and_reactions_agree_to_1e_12(name, draw):
 
 
 @pytest.mark.parametrize(
-    "name", [s if s in DIFFERENTIATED else pytest.param(s, marks=pytest.mark.slow) for s in list_scenes()]
+    "name", [s if s in DIFFERENTIATED else pytest.param(s, marks=pytest.mark.slow) for s in robots()]
 )
 def test_derivatives_of_a_step_agree_to_1e_12(name, draw):
     kernels, states, inputs = both(draw, load_scene(name), 3)

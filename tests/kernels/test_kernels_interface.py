@@ -8,9 +8,10 @@ import pytest
 
 from dq_space_arm_env import compile_scene, list_scenes, load_scene
 from dq_space_arm_env.kernels.bound import KernelCall
+from scripts.benchmarks.robots import robots
 
 
-@pytest.mark.parametrize("scene", list_scenes())
+@pytest.mark.parametrize("scene", robots())
 def test_batches_give_the_bits_of_single_states(scene, draw):
     kernels, states, inputs = draw(scene, 11)
     functions = {

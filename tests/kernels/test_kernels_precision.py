@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from dq_space_arm_env import compile_scene, list_scenes, load_scene
+from dq_space_arm_env import compile_scene, load_scene
+from scripts.benchmarks.robots import robots
 
 
 def in_single_precision(scene):
@@ -11,7 +12,7 @@ def in_single_precision(scene):
     return scene.replace(simulation={"precision": "float32"})
 
 
-@pytest.mark.parametrize("scene", list_scenes())
+@pytest.mark.parametrize("scene", robots())
 def test_results_are_single_and_near_those_in_double_precision(scene, draw):
     kernels, states, inputs = draw(scene, 40)
     single = compile_scene(in_single_precision(scene))

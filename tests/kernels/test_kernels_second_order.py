@@ -1,19 +1,20 @@
-"""Exact second derivatives: differences of the exact first derivatives along retractions, for every scene."""
+"""Exact second derivatives: differences of the exact first derivatives along retractions, for every robot."""
 
 import numpy as np
 import pytest
 from test_kernels_odd_scenes import ODD
 
-from dq_space_arm_env import list_scenes
 from dq_space_arm_env.algebra import screw
 from dq_space_arm_env.scene import INTEGRATORS
+from scripts.benchmarks.robots import robots
 
 STEP = 5e-4
 
 # Each of the others takes seconds to compile.
 QUICK = ("paper", "planar")
 CURVED = [name for name, entry in INTEGRATORS.items() if entry.has_curvature]
-SCENES = [s if s in QUICK else pytest.param(s, marks=pytest.mark.slow) for s in list_scenes()]
+WITH_COST = (*robots(), "random-target")  # whose target is a parameter of the cost
+SCENES = [s if s in QUICK else pytest.param(s, marks=pytest.mark.slow) for s in WITH_COST]
 ODD_SCENES = [s if s in ("base", "wrist") else pytest.param(s, marks=pytest.mark.slow) for s in ODD]
 
 

@@ -6,12 +6,13 @@ The equations run over plain numbers here; benchmark `stability` holds the machi
 import numpy as np
 import pytest
 
-from dq_space_arm_env import list_scenes, load_scene
+from dq_space_arm_env import load_scene
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.vector_field import split_state
 
 pytest.importorskip("mpmath")
 
+from scripts.benchmarks.robots import robots
 from scripts.benchmarks.stability.free_bodies import free_bodies
 from scripts.benchmarks.stability.masses import samples
 from scripts.benchmarks.stability.reactions import LIGHTEST, acceleration_error, wrench_error
@@ -31,8 +32,8 @@ def errors(scene, seed=0):
     return wrench_error(found[0], exact), acceleration_error(found[1], exact)
 
 
-@pytest.mark.parametrize("name", list_scenes())
-def test_free_bodies_agree_with_every_shipped_scene(name):
+@pytest.mark.parametrize("name", robots())
+def test_free_bodies_agree_with_every_shipped_robot(name):
     """Wrists, payloads, wrenches at the tip and a planar base are in both."""
     (sample,) = samples(load_scene(name), 1)
     exact = free_bodies(sample)

@@ -1,4 +1,4 @@
-"""Time steps of the environment where the motion is fast: actions of all kinds in shipped scenes, and spins.
+"""Time steps of the environment where the motion is fast: actions of all kinds on shipped robots, and spins.
 
 An episode must end with its tip right, or `Kernels.numerical_error` must tell that it does not: motions under
 actions that are held are chaotic, and no accuracy of single steps saves them. The reference is the method of
@@ -14,9 +14,10 @@ import numpy as np
 
 from dq_space_arm_env import Kernels, Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.scene import INTEGRATORS, list_scenes
+from dq_space_arm_env.scene import INTEGRATORS
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
+from scripts.benchmarks.robots import OTHER_MOTIONS, robots
 from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome
 from scripts.benchmarks.stability.scenes import with_simulation
 from scripts.benchmarks.stability.time_steps import moving_start
@@ -49,7 +50,7 @@ ACTIONS: dict[str, Actions] = {
 
 def cases() -> Iterator[Case]:
     criterion = f"episodes whose tip ends more than {RIGHT:g} rad or m off without being told: none"
-    for name in list_scenes():
+    for name in (*robots(), *OTHER_MOTIONS):
         for kind in ACTIONS:
             run = partial(_episodes, name, kind)
             title, subject = f"{kind} actions", f"scene {name}"

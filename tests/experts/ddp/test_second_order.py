@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dq_space_arm_env import list_scenes, load_scene
+from dq_space_arm_env import load_scene
 from experts import BoxDDP, GuidedDDP, StopReason
 from experts.ddp.backward_pass import PASS_COMPLETED
 from experts.ddp.derivatives import mirrored
@@ -27,6 +27,7 @@ from experts.ddp.solution import IterationRecord
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.paper_problem import PaperProblem
 from experts.receding_horizon import ManeuverPlan
+from scripts.benchmarks.robots import OTHER_MOTIONS, robots
 
 ONE_OF_EACH_KIND = ("free-floating", "no-wrist", "paper", "planar", "reaction-wheels", "tip-load")
 
@@ -126,7 +127,7 @@ def test_saddle_is_not_a_minimum(pendulum):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", list_scenes())
+@pytest.mark.parametrize("scene", [*robots(), *OTHER_MOTIONS])
 def test_hybrid_ends_no_higher_than_gauss_newton(scene):
     hybrid = BoxDDP(scene).solve()
     gauss_newton = BoxDDP(scene, second_order="gauss_newton").solve()

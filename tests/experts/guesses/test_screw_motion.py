@@ -6,13 +6,12 @@ import pytest
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses, screw
-from dq_space_arm_env.scene import list_scenes
 from dq_space_arm_env.scene.start import draw_initial_state
 from experts.guesses.free_floating import FreeFloatingArm
 from experts.guesses.screw_motion import screw_motion, tip_path
 from experts.problems.arm_problem import ArmProblem
+from scripts.benchmarks.robots import robots
 
-SCENES = list_scenes()
 TILTED = ["paper", "planar", "no-wrist", "six-joint", "tip-load"]  # one of each kind of robot
 
 
@@ -163,9 +162,9 @@ def test_the_path_begins_with_the_velocity_of_the_tip(scene):
 # The arm ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", robots())
 @pytest.mark.parametrize("seed", [None, 0])
-def test_every_scene_gets_a_finite_guess_within_its_limits(scene, seed):
+def test_every_robot_gets_a_finite_guess_within_its_limits(scene, seed):
     problem = ArmProblem(scene)
     start = problem.initial_state if seed is None else random_start(problem, seed)
     guess = screw_motion(problem, start)
