@@ -12,6 +12,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.interoperability.pinocchio_twin import pinocchio_model, to_pinocchio
 from dq_space_arm_env.kernels.capture import catch_payload
+from dq_space_arm_env.scene.phases import phase_scene
 from experts.problems.arm_problem import ArmProblem
 
 ANYWAY = {
@@ -211,16 +212,20 @@ def test_the_shock_is_the_change_of_the_payloads_momentum() -> None:
     assert info["angular_shock"] == pytest.approx(float(np.linalg.norm(angular)), rel=1e-12)
 
 
-def test_a_released_payload_leaves_the_robot_as_it_moves() -> None:
-    """Velocities stay, and the robot goes on without the payload's mass."""
-    scene = SCENES["release"]
+@pytest.mark.parametrize("name", SCENES)
+def test_the_robot_of_each_phase_is_that_of_a_scene_with_its_numbers(name: str) -> None:
+    """Without its payload where nothing is held; velocities stay when it is let go."""
+    scene = SCENES[name]
     kernels = compile_scene(scene)
     rows, rng = kernels.stage_parameters(), np.random.default_rng(5)
     x = kernels.retract(kernels.layout.initial_state, 0.2 * rng.standard_normal(kernels.n_t))
-    u, alone = rng.standard_normal(kernels.n_u), compile_scene(scene.replace({"phases": (), "payload": None}))
-    whole = compile_scene(scene.replace({"phases": ()}))
-    assert np.abs(kernels.step(x, u, p=rows[0]) - whole.step(x, u)).max() < 1e-14
-    assert np.abs(kernels.step(x, u, p=rows[-1]) - alone.step(x, u)).max() < 1e-14
+    for phase, stage in zip(scene.phases, scene.staged.starts, strict=True):
+        own, removed = phase_scene(scene, phase)
+        alone = compile_scene(own.replace({"payload": None}) if "payload" in removed else own)
+        p = rows[stage].copy()
+        p[kernels.parameters.indices("catch")] = 0.0
+        u = rng.standard_normal(kernels.n_u)
+        assert np.abs(kernels.step(x, u, p=p) - alone.step(x, u)).max() < 1e-14
 
 
 def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
