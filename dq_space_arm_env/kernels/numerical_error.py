@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.robot_kernels import RobotKernels
+from dq_space_arm_env.kernels.stages import fill_stages
 from dq_space_arm_env.scene import INTEGRATORS, Scene
 
 Array = NDArray[Any]
@@ -41,8 +42,21 @@ def numerical_error(finer: RobotKernels, states: ArrayLike, u: ArrayLike, p: Arr
             "(N + 1, B, n_x) and (N, B, n_u)"
         )
     x, errors = motion[0].astype(np.float64), np.zeros(motion.shape[:-1])
+    stages = _stages(finer, p)
     for step, control in enumerate(controls, start=1):
-        x = finer.call("checked_step", x=x, u=control, p=p)[0]
+        own = p if stages is None else stages[step - 1]
+        x = finer.call("checked_step", x=x, u=control, p=own)[0]
         tips = [finer.tip_pose(each, p).T for each in (x, motion[step])]
         errors[step] = np.maximum(poses.error_distance(*tips), poses.error_angle(*tips))
     return errors
+
+
+def _stages(kernels: RobotKernels, p: ArrayLike | None) -> Array | None:
+    """Parameters by stage, (N + 1, n_p) or (N + 1, B, n_p), where phases change some; else None."""
+    if not kernels.parameters.staged:
+        return None
+    given = kernels.parameters.nominal if p is None else np.asarray(p)
+    rows = [np.tile(each, (kernels.scene.simulation.steps + 1, 1)) for each in np.atleast_2d(given)]
+    for each in rows:
+        fill_stages(kernels, each)
+    return rows[0] if given.ndim == 1 else np.stack(rows, axis=1)

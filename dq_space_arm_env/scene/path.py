@@ -87,6 +87,13 @@ def shown_target(scene: Scene) -> tuple[Array, Array | None]:
     """
     target, motion = scene.target, scene.target.motion
     body = np.array(target.pose.dual_quaternion) if motion is None else _body_path(scene)
+    poses_at_rest = scene.staged.resting if scene.phases else ()
+    if len(set(poses_at_rest)) > 1:
+        body = np.broadcast_to(body, (scene.simulation.steps + 1, 8)).copy()
+        starts = scene.staged.starts
+        for begin, end, pose in zip(starts, (*starts[1:], len(body)), poses_at_rest, strict=True):
+            if pose is not None:
+                body[begin:end] = pose
     if target.grasp.dual_quaternion == dq.IDENTITY:
         return body, None
     return np.stack(dq.multiply(tuple(body.T), target.grasp.dual_quaternion), axis=-1), body

@@ -21,6 +21,7 @@ from dq_space_arm_env.common.files import json_value, to_json, write_atomically
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.tables import plain_table
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.task.step_report import has_twist_errors
 from experts import BoxDDP, GuidedDDP, Solution, StopReason
 from experts.report import Maneuver, SolveProgress
 from experts.report.reproduction import results_folder
@@ -34,6 +35,9 @@ class SolveRun:
     start: Start
     solver: str
     solution: Solution
+    # Angular velocity [deg/s] and velocity [m/s] of the tip relative to the target at the end, with the wrist
+    # held; None where neither moves the target nor does success ask for them.
+    final_velocities: tuple[float, float] | None
     preparation_seconds: float  # compile or load, and solve the guesses' source, s
     preparation_iterations: int | None  # of the solve from the scene's own start; None without
     solve_seconds: float  # s
@@ -48,7 +52,7 @@ class SolveRun:
         """Attitude error [deg] and position error [m] at the end; inf where the motion has diverged."""
         if not math.isfinite(self.solution.cost):
             return math.inf, math.inf
-        maneuver = Maneuver(self.start.episode_scene, self.solution.states[-1:], self.solution.controls[-1:])
+        maneuver = Maneuver(self.start.episode_scene, self.solution.states, self.solution.controls)
         return math.degrees(maneuver.angle[-1]), float(maneuver.distance[-1])
 
     @property
@@ -56,7 +60,13 @@ class SolveRun:
         """Whether the tip ends within the scene's tolerances."""
         attitude, position = self.final_errors
         success = self.scene.success
-        return attitude <= success.attitude_error_deg and position <= success.position_error
+        turning, moving = self.final_velocities or (0.0, 0.0)
+        return (
+            attitude <= success.attitude_error_deg
+            and position <= success.position_error
+            and turning <= (success.angular_velocity_error_deg or math.inf)
+            and moving <= (success.velocity_error or math.inf)
+        )
 
 
 def check_figures() -> None:
@@ -94,11 +104,21 @@ def solve(
         progress.start()
         solution = solver.solve(begun.state, callback=progress.update, parameters=begun.parameters)
     solved = perf_counter()
-    # The files are of the episode's scene, where what was drawn is constant; a target that moves is not.
-    solution.parameters = solution.parameters[:, StateLayout.of(scene).parameters.moving]
+    velocities = _final_velocities(scene, solution) if has_twist_errors(scene) else None
+    # The files are of the episode's scene, where what was drawn is constant; what changes on the way is not.
+    every, kept = (StateLayout.of(each).parameters.names for each in (scene, begun.episode_scene))
+    solution.parameters = solution.parameters[:, [every.index(name) for name in kept]]
     solution.metadata |= {"scene": begun.episode_scene.model_dump(mode="json"), "start": begun.title}
     name = type(solver).__name__
-    return SolveRun(scene, begun, name, solution, prepared - began, before, solved - prepared)
+    return SolveRun(scene, begun, name, solution, velocities, prepared - began, before, solved - prepared)
+
+
+def _final_velocities(scene: Scene, solution: Solution) -> tuple[float, float]:
+    """See `SolveRun.final_velocities`; inf where the motion has diverged."""
+    if not math.isfinite(solution.cost):
+        return math.inf, math.inf
+    twist = ArmProblem(scene).kernels.relative_twist(solution.states[-1], p=solution.parameters[-1])
+    return math.degrees(math.hypot(*twist[:3])), math.hypot(*twist[3:])
 
 
 def save(run: SolveRun, folder: Path, *, figures: bool) -> list[Path]:
@@ -139,6 +159,9 @@ def record(run: SolveRun) -> dict[str, Any]:
         "final_position_error_m": position,
         "is_success": run.is_success,
     }
+    if run.final_velocities is not None:
+        turning, moving = run.final_velocities
+        found |= {"final_angular_velocity_error_deg_s": turning, "final_velocity_error_m_s": moving}
     return {name: json_value(value) for name, value in found.items()}
 
 
@@ -161,7 +184,7 @@ def table(run: SolveRun) -> Table:
         seconds += f", after {sum(attempt['iterations'] for attempt in long_steps)} in long steps"
     if solution.converged and solution.iterations == 0:
         seconds += ": the initial guess is already optimal"
-    rows = (
+    rows = [
         ("start", run.start.title, ""),
         ("preparation", f"{run.preparation_seconds:.1f} s", prepared),
         ("solver", run.solver, f"initial guess: {guess}"),
@@ -170,5 +193,13 @@ def table(run: SolveRun) -> Table:
         ("iterations", str(solution.iterations), seconds),
         ("attitude error", f"{attitude:.3g} deg", f"tolerance {success.attitude_error_deg:g} deg; {reached}"),
         ("position error", f"{position:.3g} m", f"tolerance {success.position_error:g} m"),
-    )
+    ]
+    if run.final_velocities is not None:
+        turning, moving = run.final_velocities
+        asked = success.angular_velocity_error_deg, success.velocity_error
+        limits = ("relative to the target" + (f"; tolerance {most:g}" if most else "") for most in asked)
+        found = zip(
+            ("angular velocity", "velocity"), (turning, moving), ("deg/s", "m/s"), limits, strict=True
+        )
+        rows += [(name, f"{value:.3g} {unit}", limit) for name, value, unit, limit in found]
     return plain_table(f"Scene {run.scene.name}", ("", "", ""), rows)

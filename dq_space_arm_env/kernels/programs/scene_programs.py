@@ -23,7 +23,7 @@ from dq_space_arm_env.kernels.programs.derivative_programs import DerivativeProg
 from dq_space_arm_env.kernels.programs.parameter_programs import ParameterPrograms
 from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
 from dq_space_arm_env.kernels.programs.robot_programs import RobotPrograms
-from dq_space_arm_env.kernels.programs.stage_programs import stage_method
+from dq_space_arm_env.kernels.programs.stage_programs import stage_method, with_catch
 from dq_space_arm_env.scene.parameters import moving_numbers
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.task.episode import next_target, with_target
@@ -280,8 +280,9 @@ class ScenePrograms:
         program = Program(name, program_inputs(field, x, u, h), [Buffer("x_next", field.n_x)])
         method: Any = stage_method(self.equations, integrator)
         if name == "checked_step":
-            method = checked_integrator_of(self.scene.simulation, integrator)
-        assert method is not None  # `Kernels.checked_step` refuses it
+            checked = checked_integrator_of(self.scene.simulation, integrator)
+            assert checked is not None  # `Kernels.checked_step` refuses it
+            method = with_catch(self.equations, checked)
         method.append_step(program, field)
         if name == "checked_step":
             program.outputs = [*program.outputs, Buffer("checked_error", 1)]
