@@ -23,6 +23,7 @@ from dq_space_arm_env.common.tables import plain_table
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.task.step_report import has_twist_errors
 from experts import BoxDDP, GuidedDDP, Solution, StopReason
+from experts.problems.arm_problem import ArmProblem
 from experts.report import Maneuver, SolveProgress
 from experts.report.reproduction import results_folder
 
@@ -198,8 +199,6 @@ def table(run: SolveRun) -> Table:
         turning, moving = run.final_velocities
         asked = success.angular_velocity_error_deg, success.velocity_error
         limits = ("relative to the target" + (f"; tolerance {most:g}" if most else "") for most in asked)
-        found = zip(
-            ("angular velocity", "velocity"), (turning, moving), ("deg/s", "m/s"), limits, strict=True
-        )
-        rows += [(name, f"{value:.3g} {unit}", limit) for name, value, unit, limit in found]
+        shown = f"{turning:.3g} deg/s", f"{moving:.3g} m/s"
+        rows += list(zip(("angular velocity", "velocity"), shown, limits, strict=True))
     return plain_table(f"Scene {run.scene.name}", ("", "", ""), rows)

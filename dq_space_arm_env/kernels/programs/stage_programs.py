@@ -13,7 +13,8 @@ from dq_space_arm_env.task.equations import SceneEquations
 
 def stage_method(equations: SceneEquations, integrator: str) -> Integrator:
     """Build the scene's integrator, or the named one, with the catch at the end of a stage, if any."""
-    return with_catch(equations, integrator_of(equations.scene.simulation, integrator))
+    method: Integrator = with_catch(equations, integrator_of(equations.scene.simulation, integrator))
+    return method
 
 
 def with_catch(equations: SceneEquations, method: Any) -> Any:
