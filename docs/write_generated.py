@@ -24,6 +24,7 @@ from agents import configuration  # noqa: E402
 from agents.configuration.residual import ResidualConfiguration  # noqa: E402
 from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmGoalEnv, Scene  # noqa: E402
 from dq_space_arm_env.scene import Cylinder, Pose, Shape  # noqa: E402
+from dq_space_arm_env.scene.maneuver import Success  # noqa: E402
 
 BLOCK = re.compile(
     r"(?<=^<!-- generated: )([\w-]+)( -->\n).*?(?=^<!-- end of generated text -->$)", re.M | re.S
@@ -40,6 +41,7 @@ _PLACES = {  # of parts that stand in several places of a scene
     Pose: "Poses",
     Shape: "`geometry[]` of `base`, `links[]`, `payload` and `target`",
     Cylinder: "`geometry[].cylinder`",
+    Success: "`success`, and `phases[].catch`",
 }
 
 TEXTS: Mapping[str, Callable[[], str]] = {
