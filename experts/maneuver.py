@@ -9,6 +9,7 @@ from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.path import shown_target
+from dq_space_arm_env.viewing.payload_places import payload_path
 from dq_space_arm_env.viewing.replay.flights import frame_poses
 from experts.problems.shooting_problem import FloatArray
 
@@ -65,6 +66,12 @@ class Maneuver:
         """Pose q_{D/I} of the target at the states, 8 numbers, or 8 of shape (N + 1,) where it moves."""
         target = shown_target(self.scene)[0]
         return tuple(target.tolist()) if target.ndim == 1 else tuple(target[: len(self.states)].T)
+
+    @cached_property
+    def payload(self) -> FloatArray | None:
+        """Poses of the payload where phases have it, shape (N + 1, 8), m; None if it is at the tip."""
+        target = np.atleast_2d(np.transpose(self.target))
+        return payload_path(self.scene, self.frames[:, -1], target)
 
     @cached_property
     def error_pose(self) -> FloatArray:

@@ -27,6 +27,7 @@ from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.task.step_report import MEMORY, OBSERVATION_LIMIT, REPORT, report_names
+from dq_space_arm_env.viewing.payload_places import Payloads, leaves_tip
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 
 if TYPE_CHECKING:
@@ -205,6 +206,9 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self.observation_space = self._make_observation_space()
         self._begun, self._over = False, True
         self._trail: list[Array] = []
+        self._payloads: Payloads | None = None
+        if render_mode is not None and leaves_tip(self.scene):
+            self._payloads = Payloads(self.kernels, 1)
         self._renderer: Renderer | None = None
 
     def _make_observation_space(self) -> spaces.Space[Array]:
@@ -315,7 +319,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             array[...] = found[name]
         self._begun, self._over = True, bool(found["over"])
         self.np_random = generator_of(found["generator"])
-        self._trail = []
+        self._begin_trail()
 
     def _kept(self) -> dict[str, Array]:
         return {"x": self._x, "memory": self._memory, "parameters": self._parameters}
@@ -417,11 +421,19 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self._start.on_rows(_ROW)
         start.apply(self.kernels, self._x, self._parameters)
         self._begun, self._over = True, False
+        self._begin_trail()
+
+    def _begin_trail(self) -> None:
+        """Forget what pictures show of the past."""
         self._trail = []
+        if self._payloads is not None:
+            self._payloads.forget(_ROW)
 
     def _show(self) -> None:
         """Extend the tip's trail, and update the window."""
         self._trail.append(np.array(poses.position(self.kernels.tip_pose(self._x).tolist())))
+        if self._payloads is not None:
+            self._payloads.follow(self._x[None], self._memory[None])
         if self.render_mode == "human":
             self.render()
 
@@ -447,8 +459,11 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
             self._renderer = Renderer(self.scene, self._picture)
         parameters, layout = self.stage_parameters, self.kernels.layout
-        self._renderer.aim_at(layout.target_with(parameters), layout.target_body_with(parameters))
-        frames, trail = self.kernels.frame_poses(self._x), np.array(self._trail)
+        target, payload = layout.target_with(parameters), None
+        if self._payloads is not None:
+            payload = self._payloads.poses(self._memory[None], self._parameters[None], target[None])[0]
+        self._renderer.aim_at(target, layout.target_body_with(parameters), payload)
+        frames, trail = self.kernels.frame_poses(self._x), np.array(self._trail).reshape(-1, 3)
         if self.render_mode == "rgb_array":
             return self._renderer.draw(frames, trail)
         self._renderer.show(frames, trail, self.metadata["render_fps"])

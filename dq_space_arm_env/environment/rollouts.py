@@ -19,6 +19,7 @@ from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.parameters import has_grasp
 from dq_space_arm_env.task.trajectory import Trajectory
+from dq_space_arm_env.viewing.payload_places import leaves_tip, payload_path
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -31,7 +32,7 @@ COST_TERMS = (
     "terminal_cost_base_velocity",
 )
 
-_AT_THE_END = ("attitude_error", "position_error", "is_success", "diverged")
+_AT_THE_END = ("attitude_error", "position_error", "is_success", "diverged", "caught")
 
 Policy = Callable[[NDArray[Any]], ArrayLike]
 """From observations, shape (B, n_obs), to actions, fractions of the limits, shape (B, n_u).
@@ -79,6 +80,7 @@ class Rollout:
         observations: Shape (B, N + 1, n_obs), as the policy saw them.
         controls: Commanded inputs, shape (B, N, n_u), N, N m or rad/s.
         noise: Disturbance added to them, same shape and units; None without.
+        caught: Whether the last catch has not failed, shape (B,); None in a scene without.
     """
 
     scene: Scene
@@ -100,6 +102,7 @@ class Rollout:
     observations: FloatArray | None = None
     controls: FloatArray | None = None
     noise: FloatArray | None = None
+    caught: Mask | None = None
 
     @cached_property
     def cost(self) -> FloatArray:
@@ -115,15 +118,21 @@ class Rollout:
             raise ValueError("the rollout has no states: call rollout(..., record=True)")
         steps, layout = int(self.length[episode]), StateLayout.of(self.scene)
         parameters = self.parameters[episode]
-        if layout.parameters.moving:
-            parameters = compile_scene(self.scene).stage_parameters(parameters)[: steps + 1]
+        states, kernels = self.states[episode, : steps + 1], compile_scene(self.scene)
+        if layout.parameters.move_target:
+            parameters = kernels.stage_parameters(parameters)[: steps + 1]
+        target, payload = layout.target_with(parameters), None
+        if leaves_tip(self.scene):
+            caught = self.caught is None or bool(self.caught[episode])
+            payload = payload_path(self.scene, kernels.tip_pose(states), target, caught)
         return Trajectory(
             label=label,
-            states=self.states[episode, : steps + 1],
+            states=states,
             controls=self.controls[episode, :steps],
             noise=None if self.noise is None else self.noise[episode, :steps],
             rewards=self.rewards[episode, :steps],
-            target=layout.target_with(parameters),
+            target=target,
+            payload=payload,
             target_body=layout.target_body_with(parameters) if has_grasp(self.scene) else None,
             scene=self.scene,
             start=start,
@@ -234,7 +243,7 @@ class _Log:
         self.cost_terms = {name: np.zeros(count) for name in COST_TERMS}
         self.length = np.zeros(count, dtype=np.int64)
         self.flying, self.failed = np.ones(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
-        self.last = {name: info[name].copy() for name in _AT_THE_END}
+        self.last = {name: info[name].copy() for name in _AT_THE_END if name in info}
         # Real part of the base's pose, 4 numbers (planar: 2), and its smallest overlap with the first one.
         self._real = slice(layout.state.pose.start, (layout.state.pose.start + layout.state.pose.stop) // 2)
         self._attitude, self._overlap = self.state[:, self._real].copy(), np.ones(count)
@@ -321,4 +330,5 @@ class _Log:
             observations=self.observations,
             controls=self.controls,
             noise=self.noise,
+            caught=self.last["caught"] != 0.0 if "caught" in self.last else None,
         )

@@ -24,6 +24,7 @@ from dq_space_arm_env.environment.sub_environments import StepResult, SubEnviron
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.task.step_report import report_names
+from dq_space_arm_env.viewing.payload_places import Payloads, leaves_tip
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 from dq_space_arm_env.viewing.trails import Trails
 
@@ -125,6 +126,9 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         self._over = _NONE  # rows whose episodes are over, to be reset by the next step or the caller
         self._seen = np.zeros(self.observation_space.shape or (), self.kernels.dtype) if disabled else None
         self._trails = None if render_mode is None else Trails(num_envs)
+        self._payloads: Payloads | None = None
+        if render_mode is not None and leaves_tip(self.scene):
+            self._payloads = Payloads(self.kernels, num_envs)
         self._renderer: Renderer | None = None
 
     @property
@@ -182,9 +186,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             result.observation[others] = self._seen[others]
         result.report[:, others], result.flags[:, others] = 0.0, False
         self._remember(result.observation)
-        if self._trails is not None:
-            self._trails.begin(rows)
-            self._trails.append(self._tip_positions())
+        self._begin_trails(rows)
+        self._extend_trails()
         return result.observation, self._info(result, mask)
 
     def _remember(self, observations: Array) -> None:
@@ -278,8 +281,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             else:
                 self._over = rows
         self._remember(result.observation)
-        if self._trails is not None:
-            self._trails.append(self._tip_positions())
+        self._extend_trails()
         info = self._info(result, self._all)
         if final is not None:
             info |= final
@@ -368,9 +370,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         for name, array in kept.items():
             array[chosen] = found[name]
         self._begun, self._over = True, np.flatnonzero(kept["over"])
-        if self._trails is not None:
-            self._trails.begin(chosen)
-            self._trails.append(self._tip_positions())
+        self._begin_trails(chosen)
+        self._extend_trails()
 
     def _kept(self) -> dict[str, Array]:
         """Arrays that all later steps depend on; "over" is made anew."""
@@ -408,12 +409,23 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
     def _begin_anew(self, rows: Rows, result: StepResult) -> None:
         """Begin new episodes, and overwrite the old observations."""
         self._envs.begin(rows)
-        if self._trails is not None:
-            self._trails.begin(rows)
+        self._begin_trails(rows)
         self._envs.observe(rows, result)
 
-    def _tip_positions(self) -> Array:
-        return np.array(poses.position(self.kernels.tip_pose(self._envs.x).T)).T
+    def _begin_trails(self, rows: Rows) -> None:
+        """Forget what pictures show of the past of some episodes."""
+        if self._trails is not None:
+            self._trails.begin(rows)
+        if self._payloads is not None:
+            self._payloads.forget(rows)
+
+    def _extend_trails(self) -> None:
+        """Keep what later pictures show of the present."""
+        if self._trails is not None:
+            tips = self.kernels.tip_pose(self._envs.x)
+            self._trails.append(np.array(poses.position(tips.T)).T)
+        if self._payloads is not None:
+            self._payloads.follow(self._envs.x, self._envs.kept()["memory"])
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Draw the present state of every sub-environment.
@@ -439,8 +451,11 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         frames, parameters, pictures = self.kernels.frame_poses(self._envs.x), self.stage_parameters, []
         layout = self.kernels.layout
         targets, bodies = layout.target_with(parameters), layout.target_body_with(parameters)
+        payloads: list[Array | None] = [None] * self.num_envs
+        if self._payloads is not None:
+            payloads = self._payloads.poses(self._envs.kept()["memory"], self._envs.parameters, targets)
         for row in range(self.num_envs):
-            self._renderer.aim_at(targets[row], bodies[row])
+            self._renderer.aim_at(targets[row], bodies[row], payloads[row])
             pictures.append(self._renderer.draw(frames[row], self._trails.of(row)))
         return tuple(pictures)
 

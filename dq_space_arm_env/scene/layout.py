@@ -98,6 +98,11 @@ class ParameterEntries(_Entries):
     moving: tuple[int, ...]
     staged: tuple[int, ...]
 
+    @property
+    def move_target(self) -> bool:
+        """Whether the target has another pose at some stages: it moves, or phases move it."""
+        return bool(self.moving or {*self.staged}.intersection(self.indices(TARGET)))
+
     def indices(self, path: str) -> list[int]:
         """Find parameters.
 

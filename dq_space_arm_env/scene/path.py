@@ -83,15 +83,14 @@ def shown_target(scene: Scene) -> tuple[Array, Array | None]:
     """Poses of a scene's target for pictures, without compiled code, equal to the machine code's to rounding.
 
     Returns q_{D/I}, and the pose of the target's body where that differs: shape (8,), or (steps + 1, 8) where
-    it moves.
+    it moves or phases move it.
     """
     target, motion = scene.target, scene.target.motion
     body = np.array(target.pose.dual_quaternion) if motion is None else _body_path(scene)
-    poses_at_rest = scene.staged.resting if scene.phases else ()
-    if len(set(poses_at_rest)) > 1:
-        body = np.broadcast_to(body, (scene.simulation.steps + 1, 8)).copy()
-        starts = scene.staged.starts
-        for begin, end, pose in zip(starts, (*starts[1:], len(body)), poses_at_rest, strict=True):
+    if scene.phases and (motion is not None or len(set(scene.staged.resting)) > 1):
+        body = np.array(np.broadcast_to(body, (scene.simulation.steps + 1, 8)))
+        starts, resting = scene.staged.starts, scene.staged.resting
+        for begin, end, pose in zip(starts, (*starts[1:], None), resting, strict=True):
             if pose is not None:
                 body[begin:end] = pose
     if target.grasp.dual_quaternion == dq.IDENTITY:

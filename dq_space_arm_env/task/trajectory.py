@@ -24,7 +24,7 @@ from dq_space_arm_env.validation.problems import SceneError
 
 FloatArray = NDArray[np.float64]
 
-_REQUIRED, _OPTIONAL = ("states", "controls"), ("noise", "rewards", "target", "target_body")
+_REQUIRED, _OPTIONAL = ("states", "controls"), ("noise", "rewards", "target", "target_body", "payload")
 _LONGEST = 200  # characters of a sentence about an array
 
 
@@ -42,6 +42,8 @@ class Trajectory:
             dimensionless and m; None for the scene's.
         target_body: Pose of the target's body in the inertial frame, shape (8,) or (M + 1, 8), dimensionless
             and m; None if it is the desired pose of the tip.
+        payload: Pose of the payload's frame, which is that of the tip that holds it, in the inertial frame,
+            shape (M + 1, 8), dimensionless and m; None if it is where the scene's phases have it.
         scene: The scene; None if unknown.
         start: The initial state in words.
         seed: Seed of the episode; None without one.
@@ -59,6 +61,7 @@ class Trajectory:
     rewards: FloatArray | None = None
     target: FloatArray | None = None
     target_body: FloatArray | None = None
+    payload: FloatArray | None = None
     scene: Scene | None = None
     start: str = ""
     seed: int | None = None
@@ -95,8 +98,8 @@ class Trajectory:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trajectory to a file in NumPy's npz format, in one go or not at all.
 
-        The file holds `states`, `controls`, and where they are known `rewards`, `target`, `target_body`
-        and `noise`; and `facts`, JSON text with the scene and the entries of `facts()`.
+        The file holds `states`, `controls`, and where they are known `rewards`, `target`, `target_body`,
+        `payload` and `noise`; and `facts`, JSON text with the scene and the entries of `facts()`.
 
         Args:
             path: The file, `.npz` by convention; its folder must exist.
@@ -168,6 +171,7 @@ def _check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
         "rewards": ((steps,),),
         "target": ((8,), (steps + 1, 8)),
         "target_body": ((8,), (steps + 1, 8)),
+        "payload": ((steps + 1, 8),),
     }
     for name, array in arrays.items():
         if array.dtype.kind not in "biuf":

@@ -26,7 +26,7 @@ def read_demonstration(source: str, label: str | None) -> Trajectory | None:
         raise ValueError(str(error)) from error
     layout, parameters = StateLayout.of(scene), demonstration.parameters
     controls = demonstration.actions * layout.limits_with(parameters)
-    if layout.parameters.moving:
+    if layout.parameters.move_target:
         parameters = demonstrations.kernels.stage_parameters(parameters)
     target = layout.target_with(parameters) if layout.n_p else None
     name = label or f"demonstration {number}"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 from dq_space_arm_env.viewing.rendering import Renderer
+from dq_space_arm_env.viewing.replay.flights import target_during
 from experts.maneuver import Maneuver
 
 if TYPE_CHECKING:
@@ -41,7 +42,17 @@ def draw_maneuver(maneuver: Maneuver, picture: PictureFormat, fps: float, second
     tips = np.array(poses.position(maneuver.frames[:, -1].T)).T
     times = np.arange(0.0, min(seconds, maneuver.time[-1]) + 1e-9, 1.0 / fps)
     stages = np.searchsorted(maneuver.time, times - 0.5 * maneuver.scene.simulation.dt)
-    return [renderer.draw(maneuver.frames[stage], tips[: stage + 1]) for stage in stages]
+    targets, bodies = target_during(maneuver.scene, len(tips) - 1)
+    pictures = []
+    for stage in stages:
+        target, body, payload = (
+            each if each is None or each.ndim == 1 else each[stage]
+            for each in (targets, bodies, maneuver.payload)
+        )
+        assert target is not None
+        renderer.aim_at(target, body, payload)
+        pictures.append(renderer.draw(maneuver.frames[stage], tips[: stage + 1]))
+    return pictures
 
 
 def check_gif(fps: float, hold: float, colors: int) -> None:

@@ -86,15 +86,19 @@ class Schematic:
             body = Mesh.joined(shape_meshes(1, scene.target.geometry, TARGET_COLOR))
             self._target = _Solids.joined([self._target, _divided(body, 0.06 * self.reach)])
 
-    def spacecraft(self, frames: FloatArray) -> Faces:
-        """Place base, arm and the axes of the tip, given the poses of all frames, shape (frames, 8), m."""
-        matrices, origins = poses.to_matrix(tuple(frames.T))
+    def spacecraft(self, frames: FloatArray, payload: FloatArray | None = None) -> Faces:
+        """Place base, arm, payload and the axes of the tip.
+
+        Given are the poses of all frames, shape (frames, 8), m, and the payload's, (8,); None: at the tip.
+        """
+        all_frames = np.vstack([frames, frames[-1] if payload is None else payload])
+        matrices, origins = poses.to_matrix(tuple(all_frames.T))
         rotations: FloatArray = np.moveaxis(np.array(matrices), 2, 0)
         positions: FloatArray = np.array(origins).T
         return Faces.joined(
             [
                 self._lit(self._spacecraft, rotations, positions),
-                self._lit(self._tip_axes, rotations[-1:], positions[-1:]),
+                self._lit(self._tip_axes, rotations[-2:-1], positions[-2:-1]),
             ]
         )
 
@@ -138,11 +142,11 @@ class Schematic:
             yield box(0, np.zeros(3), size, BASE_COLOR, axes)
         if payload is not None:
             size, axes = equivalent_box(payload.mass, payload.inertia)
-            tip = 1 + len(self._scene.links)  # a payload excludes a wrist
+            own = 2 + len(self._scene.links)  # after the tip's; a payload excludes a wrist
             if payload.geometry:
-                yield from shape_meshes(tip, payload.geometry, PAYLOAD_COLOR)
+                yield from shape_meshes(own, payload.geometry, PAYLOAD_COLOR)
                 return
-            yield box(tip, payload.center_of_mass, size, PAYLOAD_COLOR, axes)
+            yield box(own, payload.center_of_mass, size, PAYLOAD_COLOR, axes)
 
     def _arm(self, offsets: list[tuple[float, float, float]]) -> Iterable[Mesh]:
         """Links from each frame to the next, joints along their axes, a ball for the wrist."""

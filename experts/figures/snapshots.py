@@ -67,7 +67,13 @@ class SnapshotPainter:
         self._schematic = Schematic(maneuver.scene, light)
         self._target = self._schematic.target()
         self._tip_path = _origins(maneuver)[:, -1]
-        self._spacecraft = {stage: self._schematic.spacecraft(maneuver.frames[stage]) for stage in stages}
+        payload = maneuver.payload
+        self._spacecraft = {
+            stage: self._schematic.spacecraft(
+                maneuver.frames[stage], None if payload is None else payload[stage]
+            )
+            for stage in stages
+        }
         corners = [self._target.corners, *(faces.corners for faces in self._spacecraft.values())]
         points = np.concatenate(corners).reshape(-1, 3)
         self._grid = Grid.below(points)

@@ -8,6 +8,7 @@ import pytest
 
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 from dq_space_arm_env.viewing.rendering import Renderer
 from experts.figures.animation import check_gif, draw_maneuver, encode_gif
@@ -84,3 +85,16 @@ def test_gif_plays_what_was_drawn(maneuver):
         shown = np.asarray(file.convert("RGB")).astype(int)
         assert np.abs(shown - picture).mean() < 4.0
         assert (np.abs(shown - picture).max(axis=2) > 60).mean() < 0.02
+
+
+def test_a_payload_stays_where_it_was_let_go_and_the_target_is_that_of_the_phase():
+    scene = load_scene("release")
+    layout, start = StateLayout.of(scene), scene.staged.starts[-1]
+    states = np.tile(layout.initial_state, (scene.simulation.steps + 1, 1))
+    states[start + 1 :, layout.state.joint_angles] += 0.5
+    turned = Maneuver(scene, states, np.zeros((len(states) - 1, layout.n_u)))
+    last = draw_maneuver(turned, SMALL, fps=1.0 / 18.0, seconds=18.0)[-1]
+    renderer = Renderer(scene, SMALL)
+    renderer.aim_at(scene.staged.resting[-1], payload=turned.frames[0, -1])
+    trail = np.transpose(poses.position(turned.frames[:, -1].T))
+    np.testing.assert_array_equal(last, renderer.draw(turned.frames[-1], trail))

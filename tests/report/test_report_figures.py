@@ -139,6 +139,24 @@ def test_shapes_of_bodies_are_placed_and_replace_what_is_derived(paper_maneuver:
     assert len(found.spacecraft(frames).corners) < len(plain.spacecraft(frames).corners)
 
 
+def test_a_payload_that_was_let_go_stays_behind_in_snapshots(paper_maneuver: Maneuver) -> None:
+    scene = load_scene("release")
+    layout, start = StateLayout.of(scene), scene.staged.starts[-1]
+    states = np.tile(layout.initial_state, (scene.simulation.steps + 1, 1))
+    states[start + 1 :, layout.state.joint_angles] += 0.5
+    maneuver = Maneuver(scene, states, np.zeros((len(states) - 1, layout.n_u)))
+    assert maneuver.payload == pytest.approx(np.tile(maneuver.frames[0, -1], (len(states), 1)), abs=1e-12)
+    assert paper_maneuver.payload is None
+    schematic, frames = Schematic(scene, np.array([0.0, 0.0, 1.0])), maneuver.frames[-1]
+    carried, left = schematic.spacecraft(frames), schematic.spacecraft(frames, maneuver.payload[-1])
+    moved = np.abs(carried.corners - left.corners).max(axis=(1, 2)) > 1e-6
+    center = np.array(position(tuple(maneuver.payload[-1]))) + to_matrix(tuple(maneuver.payload[-1]))[
+        0
+    ] @ np.array([0.35, 0.0, 0.0])
+    assert left.corners[moved].reshape(-1, 3).mean(axis=0) == pytest.approx(center, abs=1e-9)
+    assert 0 < moved.sum() < len(moved)
+
+
 def test_grid_lies_below_everything_at_round_numbers() -> None:
     points = np.random.default_rng(1).normal(size=(50, 3))
     grid = Grid.below(points)

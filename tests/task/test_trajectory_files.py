@@ -68,6 +68,7 @@ def test_a_file_without_states_or_controls_is_no_flight(missing: str, tmp_path: 
         ("target", np.ones(7), "(8,) or (4, 8)"),
         ("target", np.ones((3, 8)), "(8,) or (4, 8)"),
         ("target_body", np.ones((4, 7)), "(8,) or (4, 8)"),
+        ("payload", np.ones(8), "(4, 8)"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(

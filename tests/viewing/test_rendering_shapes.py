@@ -44,6 +44,8 @@ def bounds(camera, corners):
 def test_scenes_without_shapes_look_as_before(name):
     """No shapes, or an empty list of them, leave base, arm, payload and target as they are, to the pixel."""
     scene = load_scene(name)
+    if scene.target.geometry or (scene.payload is not None and scene.payload.geometry):
+        pytest.skip("the scene gives shapes")
     bodies = ["base", "target", *(f"links.{index}" for index in range(len(scene.links)))]
     bodies += ["payload"] if scene.payload else []
     empty = scene.replace({f"{body}.geometry": [] for body in bodies})
@@ -51,7 +53,7 @@ def test_scenes_without_shapes_look_as_before(name):
     picture = Renderer(scene).draw(frames, NO_TRAIL)
     np.testing.assert_array_equal(Renderer(empty).draw(frames, NO_TRAIL), picture)
     model = SpacecraftModel(scene)
-    assert model.mesh.frames.max() == model.frame_count  # the target; its body has no faces
+    assert model.frame_count + 1 not in model.mesh.frames  # the target's body has no faces
     # An invisibly far body leaves the picture as it is, so the target's body is drawn from its own pose.
     renderer = Renderer(scene)
     renderer.aim_at(scene.target.pose.dual_quaternion, np.full(8, np.nan))
@@ -115,8 +117,8 @@ def test_shapes_replace_what_is_derived_from_masses():
         for other in set(plain.frames) - {frame}:  # sizes of the rest follow the base
             assert (mesh.frames == other).sum() == (plain.frames == other).sum()
     held = SpacecraftModel(scene.replace({"payload.geometry": [BOX, CYLINDER]})).mesh
-    tip = SpacecraftModel(scene).frame_count - 1
-    assert (held.frames == tip).sum() == (plain.frames == tip).sum() + 3 * 36
+    own = SpacecraftModel(scene).frame_count + 2
+    assert ((held.frames == own).sum(), (plain.frames == own).sum()) == (6 + 3 * 36, 6)
 
 
 def test_a_last_link_with_shapes_has_no_hand_and_no_ghost_of_one():

@@ -11,8 +11,9 @@ from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.pose import PLANAR_POSE
+from dq_space_arm_env.viewing.replay import common_scene
 from dq_space_arm_env.viewing.replay.curves import panels
-from dq_space_arm_env.viewing.replay.flights import MOST_FLIGHTS, prepare, verdict
+from dq_space_arm_env.viewing.replay.flights import MOST_FLIGHTS, prepare, target_during, verdict
 
 
 @pytest.mark.parametrize("name", list_scenes())
@@ -21,13 +22,15 @@ def test_frames_are_those_of_the_chain_one_state_at_a_time(name, make_flight):
     scene = load_scene(name)
     flight = make_flight(scene, steps=5)
     shown = prepare([flight], scene)[0]
-    layout, chain, target = StateLayout.of(scene), Chain.from_scene(scene), scene.target.pose.dual_quaternion
+    layout, chain = StateLayout.of(scene), Chain.from_scene(scene)
+    targets = np.broadcast_to(target_during(scene, 5)[0], (6, 8))
     for instant, state in enumerate(flight.states.tolist()):
         base = np.zeros(8)
         base[list(PLANAR_POSE) if layout.planar else list(range(8))] = state[layout.state.pose]
         joints, wrist = state[layout.state.joint_angles], state[layout.state.wrist_angles]
         expected = kinematics.frame_poses(chain, tuple(base.tolist()), joints, wrist)
         np.testing.assert_allclose(shown.frames[instant], expected, atol=1e-14)
+        target = tuple(targets[instant])
         error = poses.error_angle(tuple(expected[-1]), target)
         assert shown.angle[instant] == pytest.approx(np.degrees(error), abs=1e-6)
         distance = poses.error_distance(tuple(expected[-1]), target)
@@ -143,6 +146,7 @@ def test_unusable_flights_are_refused_in_a_sentence(paper, make_flight):
         ([replace(good, target=np.ones((60, 8)))], "should be a pose, .* or one for each of 61 states"),
         ([replace(good, target_body=np.full((61, 8), np.nan))], "target_body: .* 8 finite numbers"),
         ([replace(good, target_body=np.ones((61, 8)))], "target_body: .*real part should have length 1"),
+        ([replace(good, payload=np.ones((61, 8)))], "payload: .*real part should have length 1"),
         ([replace(good, controls=np.full((60, 12), "x"))], "'expert': controls: should be numbers"),
     ):
         with pytest.raises(ValueError, match=sentence):
@@ -174,3 +178,15 @@ def test_absent_actuators_have_no_panel(make_flight):
     scene = load_scene("planar")
     shown = panels(prepare([make_flight(scene)], scene), scene)
     assert [panel.names for panel in shown[2:]] == [("x", "y"), ("z",), ("1", "2", "3")]
+
+
+def test_a_solution_of_a_scene_with_phases_is_shown_with_the_target_of_each_phase(make_flight):
+    """The file of a solution has a scene and no target."""
+    scene = load_scene("release")
+    steps, start = scene.simulation.steps, scene.staged.starts[-1]
+    flight = replace(make_flight(scene, steps=steps), scene=scene)
+    shown = prepare(common_scene([flight])[0], scene)[0]
+    for stage, phase in ((0, 0), (start - 1, 0), (start, -1), (steps, -1)):
+        np.testing.assert_allclose(shown.target[stage], scene.staged.resting[phase], atol=1e-15)
+    resting = prepare([make_flight(load_scene("refuelling"))], load_scene("refuelling"))[0]
+    assert resting.target.shape == (8,)

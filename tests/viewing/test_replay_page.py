@@ -97,7 +97,7 @@ def test_a_moving_target_and_its_body_are_in_the_data(make_flight, paper):
     np.testing.assert_array_equal(found, target.astype(np.float32))
     assert first["targetBody"] == target[5].tolist()
     assert (second["target"], second["targetBody"]) == (list(paper.target.pose.dual_quaternion), None)
-    assert data["solids"]["counts"][-1] == 12  # triangles of a box
+    assert data["solids"]["counts"][-2:] == [12, 0]  # triangles of a box
 
 
 def test_a_target_at_rest_and_no_shapes_cost_nothing(make_flight, paper):
@@ -106,7 +106,8 @@ def test_a_target_at_rest_and_no_shapes_cost_nothing(make_flight, paper):
     page = replay_page([flight], paper)
     assert replay_page([replace(flight, target=np.tile(pose, (61, 1)))], paper) == page
     data = data_of(page)
-    assert (data["solids"]["counts"][-1], data["flights"][0]["targetBody"]) == (0, None)
+    flight = data["flights"][0]
+    assert (data["solids"]["counts"][-2:], flight["targetBody"], flight["payload"]) == ([0, 0], None, None)
 
 
 def test_a_target_that_moves_away_stays_in_the_picture(make_flight, paper):
@@ -119,11 +120,12 @@ def test_a_target_that_moves_away_stays_in_the_picture(make_flight, paper):
 
 
 @pytest.mark.skipif(which("node") is None, reason="node is not installed")
-def test_the_page_moves_target_and_body_with_time(make_flight, paper, tmp_path):
+def test_the_page_moves_target_body_and_payload_with_time(make_flight, paper, tmp_path):
     """Poses at an instant between two, by the page's own script, against the screw motion between them."""
     target = drifting(paper, 60)
     body = np.array([dual_quaternion.multiply(tuple(pose), tuple(target[30])) for pose in target])
-    flight = replace(make_flight(paper), target=target, target_body=body)
+    payload = body[::-1]
+    flight = replace(make_flight(paper), target=target, target_body=body, payload=payload)
     text = DATA.search(replay_page([flight, make_flight(paper, "still")], paper))[1]
     (tmp_path / "data.json").write_text(text, encoding="utf-8")
     script = tmp_path / "read.mjs"
@@ -132,15 +134,17 @@ def test_the_page_moves_target_and_body_with_time(make_flight, paper, tmp_path):
         f'import {{ readRecording }} from "{BROWSER / "recording.mjs"}";\n'
         f'const {{ flights }} = readRecording(readFileSync("{tmp_path / "data.json"}", "utf-8"));\n'
         "for (const flight of flights) flight.moveTo(20.25 * 0.015);\n"
-        "console.log(JSON.stringify(flights.map((flight) => [[...flight.poses.slice(-16)], flight.aim])));"
+        "console.log(JSON.stringify(flights.map((flight) => [[...flight.poses.slice(-32)], flight.aim])));"
     )
     printed = subprocess.run(["node", str(script)], check=True, capture_output=True, text=True).stdout
     (moved, aim), (rest, _) = json.loads(printed)
-    expected = [screw.interpolate(tuple(each[20]), tuple(each[21]), 0.25) for each in (target, body)]
-    np.testing.assert_allclose(np.reshape(moved, (2, 8)), expected, atol=1e-5)
+    expected = [screw.interpolate(tuple(each[20]), tuple(each[21]), 0.25) for each in (target, body, payload)]
+    np.testing.assert_allclose(np.reshape(moved, (4, 8))[1:], expected, atol=1e-5)
     np.testing.assert_allclose(aim, poses.position(expected[0]), atol=1e-5)
     nominal = paper.target.pose.dual_quaternion
-    np.testing.assert_allclose(np.reshape(rest, (2, 8)), [nominal, nominal], atol=1e-6)
+    tip, *others, held = np.reshape(rest, (4, 8))
+    np.testing.assert_allclose(others, [nominal, nominal], atol=1e-6)
+    np.testing.assert_array_equal(held, tip)
 
 
 def test_unlimited_inputs_have_a_page(make_flight, paper):

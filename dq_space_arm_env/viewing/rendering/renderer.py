@@ -28,7 +28,7 @@ class Renderer:
     The tip has solid axes, red, green and blue for x, y and z; the target has paler ones and a ghost of the
     hand, and the shapes of its body, if the scene gives any. The target is the scene's until another is
     given; if the scene draws it for each episode, the whole spread of its position is in view, and if it
-    moves, its path.
+    moves, its path. The payload is at the tip unless another place is given.
 
     Attributes:
         camera: The camera.
@@ -48,16 +48,21 @@ class Renderer:
         self._title = f"DQ Space Arm: {scene.name}"
         self._window: Window | None = None
 
-    def aim_at(self, target: ArrayLike, body: ArrayLike | None = None) -> None:
-        """Move the target, for the pictures that follow.
+    def aim_at(
+        self, target: ArrayLike, body: ArrayLike | None = None, payload: ArrayLike | None = None
+    ) -> None:
+        """Move the target and what the tip does not hold, for the pictures that follow.
 
         Args:
             target: Desired pose of the tip q_{D/I}, shape (8,), real part dimensionless, dual part m.
             body: Pose of the target's body in the inertial frame, where its shapes are drawn, shape (8,),
                 same units; None: that of the target.
+            payload: Pose of the payload's frame in the inertial frame, shape (8,), same units; None: that of
+                the tip, which holds it.
         """
         self._target = np.array(target, dtype=np.float64)
         self._target_body = self._target if body is None else np.array(body, dtype=np.float64)
+        self._payload = None if payload is None else np.array(payload, dtype=np.float64)
 
     # Diverged simulations (infinite, NaN) are not drawn; a warning for each number would not help.
     @np.errstate(over="ignore", invalid="ignore")
@@ -93,8 +98,9 @@ class Renderer:
 
     def _faces(self, dual_quaternions: Array, trail: Array) -> Faces:
         """Faces of the solids and the trail."""
-        # The frames after the robot's are those of the target and of its body.
-        frames = np.vstack([dual_quaternions, self._target, self._target_body])
+        # The frames after the robot's are those of the target, of its body and of the payload.
+        payload = dual_quaternions[-1] if self._payload is None else self._payload
+        frames = np.vstack([dual_quaternions, self._target, self._target_body, payload])
         matrices, origins = poses.to_matrix(frames.T)
         rotations: Array = np.moveaxis(np.array(matrices), 2, 0)
         solids = mesh_faces(self._model.mesh, rotations, np.array(origins).T, self.camera)

@@ -20,6 +20,7 @@ from dq_space_arm_env.dynamics.kinematics import frame_poses
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.scene.shapes import COLORS, Shape
+from dq_space_arm_env.viewing.payload_places import leaves_tip
 from dq_space_arm_env.viewing.rendering.body_shapes import balls_around, corners_of, shape_meshes
 from dq_space_arm_env.viewing.rendering.solids import Mesh, ball, box, crumpled_box, cylinder, lathe
 
@@ -49,8 +50,9 @@ def equivalent_box(mass: float, inertia: ArrayLike) -> tuple[Array, Array]:
 class SpacecraftModel:
     """The solids of a scene.
 
-    Frames are numbered as in `Kernels.frame_poses`: base, joints, wrist (if any), tip. The two numbers after
-    those stand for the target, which is where the tip should be, and for the target's body.
+    Frames are numbered as in `Kernels.frame_poses`: base, joints, wrist (if any), tip. The three numbers
+    after those stand for the target, which is where the tip should be, for the target's body, and for the
+    payload, whose frame is that of the tip that holds it.
 
     Attributes:
         scene: The scene.
@@ -75,7 +77,7 @@ class SpacecraftModel:
 
     @cached_property
     def mesh(self) -> Mesh:
-        """All solids; the frames after the robot's are those of the target and of its body."""
+        """All solids; the frames after the robot's are those of target, target's body and payload."""
         hand = list(self._hand()) if self._has_hand else []
         # The ghost of the hand stands to the target as the hand to the tip.
         from_tip = np.array(self.scene.tip.rotation_matrix)
@@ -130,6 +132,13 @@ class SpacecraftModel:
         turn, shift = (math.sqrt(3.0) * width for width in (spread.target_rotation, spread.target_position))
         for pose in self._target_poses[1]:
             yield from balls_around(target.geometry, tuple(pose), turn, shift)
+        payload = self.scene.payload
+        if payload is not None and leaves_tip(self.scene):
+            for pose in self._target_poses[0]:
+                if payload.geometry:
+                    yield from balls_around(payload.geometry, tuple(pose), turn, shift)
+                else:
+                    yield np.array(poses.position(tuple(pose))), self._overhang() + shift
 
     @cached_property
     def _target_poses(self) -> tuple[Array, Array]:
@@ -316,10 +325,10 @@ class SpacecraftModel:
     def _payload(self) -> Iterator[Mesh]:
         payload = self.scene.payload
         if payload is not None and payload.geometry:
-            yield from shape_meshes(self.frame_count - 1, payload.geometry, GRASPED)
+            yield from shape_meshes(self.frame_count + 2, payload.geometry, GRASPED)
         elif payload is not None:
             size, axes = equivalent_box(payload.mass, payload.inertia)
-            yield box(self.frame_count - 1, payload.center_of_mass, size, GRASPED, axes)
+            yield box(self.frame_count + 2, payload.center_of_mass, size, GRASPED, axes)
 
     def _axes(self) -> Iterator[Mesh]:
         """Axes of the tip, and thicker and lighter ones at the target."""

@@ -6,11 +6,10 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from dq_space_arm_env.common.entry_points import entry_points, load
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.task.trajectory import Trajectory
+from dq_space_arm_env.viewing.replay.flights import target_during
 
 GROUP = "dq_space_arm.flights"
 """Entry-point group: functions (source, label) -> `Trajectory`, or None for what they do not read."""
@@ -61,7 +60,8 @@ def common_scene(flights: Sequence[Trajectory], scene: Scene | None = None) -> t
         if flight.scene is not None:
             _check_same_robot(flight.label, flight.scene, scene)
             if flight.target is None:
-                flight = replace(flight, target=np.array(flight.scene.target.pose.dual_quaternion))
+                target, body = target_during(flight.scene, len(flight.states) - 1)
+                flight = replace(flight, target=target, target_body=body)
         aimed.append(flight)
     return aimed, scene
 

@@ -16,6 +16,7 @@ from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.task.step_report import STATE_LIMIT
 from dq_space_arm_env.task.trajectory import Trajectory
+from dq_space_arm_env.viewing.payload_places import payload_path
 
 FloatArray = NDArray[np.float64]
 MOST_FLIGHTS = 6
@@ -36,6 +37,7 @@ class ShownFlight:
     # has a pose for each state, with signs that make them continuous in time.
     target: FloatArray  # shape (8,) or (M + 1, 8)
     target_body: FloatArray | None  # shape (8,) or (M + 1, 8)
+    payload: FloatArray | None  # pose of its frame, None at the tip; shape (8,) or (M + 1, 8), signs likewise
     # Poses of base, joint frames, wrist frame (if any) and tip, with signs that make them continuous in time.
     frames: FloatArray  # shape (M + 1, frames, 8), dimensionless and m
     angle: FloatArray  # Euler angle of the tip's attitude error, shape (M + 1,), deg
@@ -76,12 +78,15 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
         raise ValueError(f"{what}: its first step is not finite or has blown up: there is nothing to show")
     given, body = flight.target, flight.target_body
     if given is None:
-        given, body = (
-            each[: steps + 1] if each is not None and each.ndim == 2 else each for each in shown_target(scene)
-        )
-    assert given is not None
+        given, own_body = target_during(scene, steps)
+        body = own_body if body is None else body
     target = _target(f"{what}: target", given, steps, shown)
     frames = _continuous(frame_poses(scene, layout, states[: shown + 1]))
+    payload = flight.payload
+    if payload is not None:
+        payload = _target(f"{what}: payload", payload, steps, shown)
+    elif (path := payload_path(flight.scene or scene, frames[:, -1], target)) is not None:
+        payload = _target(f"{what}: payload", path, shown, shown)
     tip, aim = tuple(frames[:, -1].T), tuple(target.T) if target.ndim == 2 else tuple(target.tolist())
     seconds = shown * scene.simulation.dt
     return ShownFlight(
@@ -90,6 +95,7 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
         noise=None if noise is None else noise[:shown],
         target=target,
         target_body=None if body is None else _target(f"{what}: target_body", body, steps, shown),
+        payload=payload,
         frames=frames,
         angle=np.degrees(poses.error_angle(tip, aim)),
         distance=np.asarray(poses.error_distance(tip, aim)),
@@ -106,6 +112,18 @@ def frame_poses(scene: Scene, layout: StateLayout, states: FloatArray) -> FloatA
     joints, wrist = tuple(states[:, entries.joint_angles].T), tuple(states[:, entries.wrist_angles].T)
     frames = kinematics.frame_poses(Chain.from_scene(scene), tuple(base), joints, wrist)
     return np.stack([np.stack(frame, axis=1) for frame in frames], axis=1)
+
+
+def target_during(scene: Scene, steps: int) -> tuple[FloatArray, FloatArray | None]:
+    """A scene's target and the target's body, None if that is the same, during a number of steps.
+
+    Each of shape (8,), or (steps + 1, 8) where it moves.
+    """
+    target, body = (
+        each[: steps + 1] if each is not None and each.ndim == 2 else each for each in shown_target(scene)
+    )
+    assert target is not None
+    return target, body
 
 
 def poses_at(target: FloatArray, instants: NDArray[np.intp]) -> FloatArray:

@@ -32,7 +32,7 @@ class Solids(NamedTuple):
     normals: NDArray[np.int8]  # in that frame, units of 1/127, shape (V, 4); the last is 0
     colors: NDArray[np.uint8]  # red, green, blue in units of 1/255, shape (V, 4); the last is 255
     triangles: NDArray[np.uint16]  # vertices, counterclockwise seen from outside, shape (T, 3)
-    # Of triangles in each frame, frame by frame, in the end those of the target and of its body.
+    # Of triangles in each frame, frame by frame, in the end those of target, target's body and payload.
     counts: tuple[int, ...]
     axis_length: float  # m
 
@@ -77,7 +77,7 @@ def solids_of(scene: Scene) -> Solids:
         np.column_stack([distinct[:, 4:7], np.zeros(count)]).astype(np.int8),
         np.column_stack([distinct[:, 1:4], np.full(count, 255)]).astype(np.uint8),
         triangles.reshape(-1, 3).astype(np.uint16),
-        tuple(np.bincount(looks[kept, 0].astype(int), minlength=model.frame_count + 2).tolist()),
+        tuple(np.bincount(looks[kept, 0].astype(int), minlength=model.frame_count + 3).tolist()),
         model.axis_length,
     )
 
@@ -102,7 +102,7 @@ def view_of(flights: Sequence[ShownFlight], scene: Scene) -> View:
     model = SpacecraftModel(scene)
     frames = [_frames_at(flight) for flight in flights]
     origins = [np.moveaxis(np.array(poses.position(tuple(np.moveaxis(f, 2, 0)))), 0, 2) for f in frames]
-    robots, goals = [origin[:, :-2] for origin in origins], np.stack([origin[:, -2] for origin in origins])
+    robots, goals = [origin[:, :-3] for origin in origins], np.stack([origin[:, -3] for origin in origins])
     if scene.base.motion == "planar":
         azimuth, elevation = _PLANAR_VIEW
     else:
@@ -113,11 +113,12 @@ def view_of(flights: Sequence[ShownFlight], scene: Scene) -> View:
 
 
 def _frames_at(flight: ShownFlight) -> FloatArray:
-    """Frames of robot, target and target's body at some instants, shape (instants, frames + 2, 8)."""
+    """Frames of robot, target, its body and payload at some instants, shape (instants, frames + 3, 8)."""
     instants = np.linspace(0, flight.steps, _INSTANTS).astype(int)
     body = flight.target if flight.target_body is None else flight.target_body
-    targets = [poses_at(target, instants)[:, None] for target in (flight.target, body)]
-    return np.concatenate([flight.frames[instants], *targets], axis=1)
+    payload = flight.frames[:, -1] if flight.payload is None else flight.payload
+    others = [poses_at(each, instants)[:, None] for each in (flight.target, body, payload)]
+    return np.concatenate([flight.frames[instants], *others], axis=1)
 
 
 def direction(azimuth: float, elevation: float) -> FloatArray:

@@ -129,9 +129,11 @@ def _as_script(data: dict[str, Any]) -> str:
     return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
-def _target(target: NDArray[np.float64], blob: _Blob) -> list[float] | dict[str, Any]:
-    """The numbers of a pose, or the place of those of a target that moves."""
-    return target.tolist() if target.ndim == 1 else blob.add(target.astype(np.float32))
+def _poses(poses: NDArray[np.float64] | None, blob: _Blob) -> list[float] | dict[str, Any] | None:
+    """The numbers of a pose, or the place of those of what moves; None for none."""
+    if poses is None:
+        return None
+    return poses.tolist() if poses.ndim == 1 else blob.add(poses.astype(np.float32))
 
 
 def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
@@ -166,8 +168,9 @@ def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
                 "steps": flight.steps,
                 "note": flight.note,
                 "verdict": verdict(flight, scene),
-                "target": _target(flight.target, blob),
-                "targetBody": None if flight.target_body is None else _target(flight.target_body, blob),
+                "target": _poses(flight.target, blob),
+                "targetBody": _poses(flight.target_body, blob),
+                "payload": _poses(flight.payload, blob),
                 "frames": blob.add(flight.frames.astype(np.float32)),
             }
             for flight in shown

@@ -15,10 +15,11 @@ export function readRecording(text) {
   const { solids, view } = data;
   for (const name of ["positions", "normals", "colors", "triangles"]) solids[name] = array(solids[name]);
   view.points = array(view.points);
-  const frameCount = solids.counts.length - 2; // the last two are those of the target and of its body
-  const target = (place) => (place && !Array.isArray(place) ? array(place) : place);
+  const frameCount = solids.counts.length - 3; // the last three are those of the target, of its body, of the payload
+  const poses = (place) => (place && !Array.isArray(place) ? array(place) : place);
   const flights = data.flights.map((flight) => {
-    const arrays = { frames: array(flight.frames), target: target(flight.target), targetBody: target(flight.targetBody) };
+    const [target, targetBody, payload] = [flight.target, flight.targetBody, flight.payload].map(poses);
+    const arrays = { frames: array(flight.frames), target, targetBody, payload };
     return new Flight({ ...flight, ...arrays }, frameCount, data.scene.dt);
   });
   const panels = data.panels.map((panel) => ({
@@ -32,16 +33,17 @@ export function readRecording(text) {
 /** A flight: its poses at any time; before its beginning the first, after its end the last. */
 export class Flight {
   constructor(description, frameCount, dt) {
-    Object.assign(this, description); // label, steps, note, verdict, target, targetBody, frames
+    Object.assign(this, description); // label, steps, note, verdict, target, targetBody, payload, frames
     this.frameCount = frameCount;
     this.dt = dt;
-    // The poses of the target and of its body come after the robot's.
-    this.poses = new Float32Array(8 * (frameCount + 2));
-    this.targets = [this.target, this.targetBody ?? this.target].map((source, index) => ({
+    // The poses of the target, of its body and of the payload come after the robot's.
+    this.poses = new Float32Array(8 * (frameCount + 3));
+    const others = [this.target, this.targetBody ?? this.target, this.payload ?? this.frames.slice(-8)];
+    this.others = others.map((source, index) => ({
       source, // a pose, or one for each instant
       poses: this.poses.subarray(8 * (frameCount + index), 8 * (frameCount + index + 1)),
     }));
-    for (const { source, poses } of this.targets) poses.set(source.slice(0, 8));
+    for (const { source, poses } of this.others) poses.set(source.slice(0, 8));
   }
 
   get duration() {
@@ -54,9 +56,10 @@ export class Flight {
     const before = Math.min(Math.floor(place), this.steps - 1);
     const size = 8 * this.frameCount;
     blendPoses(this.frames, before * size, (before + 1) * size, place - before, this.frameCount, this.poses);
-    for (const { source, poses } of this.targets) {
+    for (const { source, poses } of this.others) {
       if (source.length > 8) blendPoses(source, 8 * before, 8 * (before + 1), place - before, 1, poses);
     }
+    if (!this.payload) this.poses.copyWithin(8 * (this.frameCount + 2), size - 8, size); // the tip holds it
   }
 
   /** Position of the tip at an instant. */

@@ -36,14 +36,16 @@ export class Renderer {
       grid: this.program(GRID_SHADERS),
       sky: this.program(SKY_SHADERS),
     };
-    // Frame by frame: where its triangles begin, and how many there are; the last two frames are those of the
-    // target and of its body.
+    // Frame by frame: where its triangles begin, and how many there are; the last three frames are those of the
+    // target, of its body and of the payload.
     const starts = solids.counts.map((_, frame) => solids.counts.slice(0, frame).reduce((a, b) => a + b, 0));
     this.parts = solids.counts.map((count, frame) => ({ frame, start: starts[frame], count }));
+    this.targetParts = this.parts.slice(-3, -1);
+    this.robotParts = [...this.parts.slice(0, -3), ...this.parts.slice(-1)];
     this.robot = this.solid(solids);
     const bubble = ball(scene.tolerance);
     this.bubble = this.solid(bubble);
-    this.bubbleParts = [{ frame: this.parts.length - 2, start: 0, count: bubble.triangles.length / 3 }];
+    this.bubbleParts = [{ frame: this.parts.length - 3, start: 0, count: bubble.triangles.length / 3 }];
     this.ribbons = flights.map((flight) => {
       const { positions, directions, places, vertexCount } = ribbon(flight);
       return {
@@ -149,7 +151,7 @@ export class Renderer {
     const ghosts = flights.map((_, index) => index).filter((i) => moment.visible[i] && i !== moment.solid);
     const front = flights[moment.solid];
     gl.disable(gl.BLEND);
-    const parts = moment.visible[moment.solid] ? this.parts : this.parts.slice(-2);
+    const parts = moment.visible[moment.solid] ? this.parts : this.targetParts;
     this.drawSolid(front, { shape: this.robot, parts, tint: [0, 0, 0, 0], opacity: 1 });
     gl.enable(gl.BLEND);
     gl.depthMask(false);
@@ -217,7 +219,7 @@ export class Renderer {
     const { gl } = this;
     const ghost = {
       shape: this.robot,
-      parts: this.parts.slice(0, -2),
+      parts: [...this.robotParts],
       tint: [...color, GHOST_TINT],
       opacity: GHOST_OPACITY,
       glow: GHOST_GLOW,
