@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -61,6 +61,17 @@ def prepare(flights: Sequence[Trajectory], scene: Scene) -> list[ShownFlight]:
     return [_prepare(flight, scene, layout) for flight in flights]
 
 
+def aimed(flight: Trajectory, scene: Scene) -> Trajectory:
+    """Give a flight that names no target the nominal one of a scene."""
+    if flight.target is not None:
+        return flight
+    count = len(np.asarray(flight.states))
+    target, body = (
+        each[:count] if each is not None and each.ndim == 2 else each for each in shown_target(scene)
+    )
+    return replace(flight, target=target, target_body=body)
+
+
 def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlight:
     what = f"flight {flight.label!r}"
     if not flight.label.strip():
@@ -74,11 +85,8 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
     shown = _finite_steps(states, controls, noise)
     if shown < 1:
         raise ValueError(f"{what}: its first step is not finite or has blown up: there is nothing to show")
+    flight = aimed(flight, scene)
     given, body = flight.target, flight.target_body
-    if given is None:
-        given, body = (
-            each[: steps + 1] if each is not None and each.ndim == 2 else each for each in shown_target(scene)
-        )
     assert given is not None
     target = _target(f"{what}: target", given, steps, shown)
     frames = _continuous(frame_poses(scene, layout, states[: shown + 1]))
