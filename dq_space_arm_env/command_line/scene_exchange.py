@@ -12,12 +12,15 @@ from pathlib import Path
 from shlex import quote
 from typing import Any, Literal
 
+import numpy as np
+
 from dq_space_arm_env import Scene, SceneError, load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.interoperability.urdf_elements import read_robot
 from dq_space_arm_env.scene import Simulation
+from dq_space_arm_env.scene.path import shown_target
 
 _OPTIONS = {
     r"spacecraft=\{'mass': \.\.\., 'inertia': \.\.\.\}": "--spacecraft-mass and --spacecraft-inertia",
@@ -128,7 +131,8 @@ def _way(scene: Scene) -> tuple[float, float]:
     start = scene.initial_state
     base = start.base_pose.dual_quaternion
     tip = kinematics.tip_pose(Chain.from_scene(scene), base, start.joint_angles, start.wrist_angles)
-    way = dual_quaternion.multiply(dual_quaternion.conjugate(tip), scene.target.pose.dual_quaternion)
+    target = np.atleast_2d(shown_target(scene)[0])[0]
+    way = dual_quaternion.multiply(dual_quaternion.conjugate(tip), tuple(target.tolist()))
     rotation, position = poses.to_rotation_and_position(way)
     return math.degrees(2.0 * math.atan2(math.hypot(*rotation[1:]), abs(rotation[0]))), math.hypot(*position)
 

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.text import Text
 
 from dq_space_arm_env.common.tables import TextTable
-from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene import Pose, Scene, StateLayout
+from dq_space_arm_env.scene.path import first_velocity
 
 _ACTUATORS = {
     "base_force": "thrusters: no force on the base",
@@ -173,10 +174,19 @@ def _task(scene: Scene) -> Iterator[tuple[str, str]]:
     yield "integrator", f"{simulation.integrator}, {simulation.precision}"
     position, rotation = scene.target.pose.position, scene.target.pose.rotation
     yield "target", f"{_vector(position)} m, rotation {_vector(rotation)}"
-    yield (
-        "success",
-        f"within {success.attitude_error_deg:g} degrees and {success.position_error:g} m at the end",
-    )
+    if scene.target.grasp != Pose():
+        position, rotation = scene.target.grasp.position, scene.target.grasp.rotation
+        yield "grasp frame", f"{_vector(position)} m, rotation {_vector(rotation)}"
+    if scene.target.motion is not None:
+        twist = first_velocity(scene)
+        at_start = f"{_vector(twist[:3])} rad/s, {_vector(twist[3:])} m/s at the start, body axes"
+        yield "target's motion", f"{scene.target.motion.kind}, {at_start}"
+    largest = [f"{success.attitude_error_deg:g} degrees", f"{success.position_error:g} m"]
+    if success.angular_velocity_error_deg is not None:
+        largest.append(f"{success.angular_velocity_error_deg:g} deg/s")
+    if success.velocity_error is not None:
+        largest.append(f"{success.velocity_error:g} m/s")
+    yield "success", f"within {', '.join(largest[:-1])} and {largest[-1]} at the end"
 
 
 def _range(part: slice) -> str:

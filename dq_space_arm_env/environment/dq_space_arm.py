@@ -80,6 +80,16 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     q_{D/G} and -q_{D/G} are the same pose: the sign is chosen at reset such that the scalar part is not negative, and carried along by continuity, as in
     the cost. The observation determines the state; in a planar scene the error has only the four entries that are not identically zero.
 
+    Where the target moves, two twists stand before the time left, in tip axes, with the wrist held (in a planar scene three entries each; bounds are 1e12):
+
+    | Num   | Observation, scene `tumbling-target`                                  | Min  | Max | Unit  |
+    |-------|-----------------------------------------------------------------------|------|-----|-------|
+    | 23-25 | angular velocity of the tip relative to the target                    | -1e12 | 1e12 | rad/s |
+    | 26-28 | velocity of the tip relative to the target                            | -1e12 | 1e12 | m/s  |
+    | 29-31 | angular velocity of the target                                        | -1e12 | 1e12 | rad/s |
+    | 32-34 | velocity of the target, as if it reached to the tip                   | -1e12 | 1e12 | m/s  |
+    | 35    | time left in the episode                                              | 0    | T   | s     |
+
     ## Rewards
 
     The reward of a step is minus the paper's stage cost, of the state before the step and of the action; the last step adds minus the terminal cost of
@@ -93,15 +103,23 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | `terminal_cost_pose`          | as `cost_pose`, at the end; 0 before                   | 150                                  |
     | `terminal_cost_base_velocity` | as `cost_base_velocity`, at the end; 0 before          | 1                                    |
 
+    Scenes may weigh the tip's twist relative to the target; `info` then has these terms too:
+
+    | Term (key in `info`)          | Formula                                                | Weight                               |
+    |-------------------------------|--------------------------------------------------------|--------------------------------------|
+    | `cost_tip_twist`              | w' W w, w the relative twist with the wrist's rates    | the scene's `cost.tip_twist`         |
+    | `terminal_cost_tip_twist`     | the same at the end, with the wrist held; 0 before     | `cost.terminal_tip_twist`: 1e5 in `tracking` |
+
     `info` also holds the tip's `attitude_error` [deg] and `position_error` [m], `is_success` (both within the scene's tolerances, 3 deg and 0.1 m) and
-    `diverged`. `reset` returns the same keys, with costs of zero.
+    `diverged`; where the target moves, or success asks for it, the tip's `angular_velocity_error` [deg/s] and `velocity_error` [m/s] relative to the target with the
+    wrist held. `reset` returns the same keys, with costs of zero.
 
     ## Starting State
 
     `reset(seed=...)` draws the initial state from the scene's spread, uniformly per component, and the target, masses and inertias where they have a spread
     (scenes `random-target` and `random-masses`). `options={"nominal": True}` starts at the scene's initial state, `options={"initial_state": x}` at a state x
     (`env.unwrapped.kernels.layout.state` names its entries); both keep target and masses nominal. `options={"target": q}`, alone or with either,
-    sets the target of a scene in which it varies, `options={"parameters": p}` all that varies (`kernels.parameters` names its entries). `options={"state": s}` goes on in the middle of an episode, where `s = env.unwrapped.get_state()` was called, to the
+    sets the target of a scene in which it varies (at the start if it moves; its velocity in its own axes stays), `options={"parameters": p}` all that varies (`kernels.parameters` names its entries). `options={"state": s}` goes on in the middle of an episode, where `s = env.unwrapped.get_state()` was called, to the
     same bits; `copy.deepcopy` and `pickle` keep a running episode likewise. `env.unwrapped.episode_scene` is the scene of the running episode with everything drawn or given as plain numbers:
     what an optimal controller may know.
 
@@ -217,6 +235,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         real_part = 2 if self.kernels.layout.planar else 4
         # A unit quaternion and the time left may exceed their bounds by a rounding error.
         high[:real_part] = 1.0 + 1e-5
+        if self.scene.target.motion is not None:  # seen from the tip, which turns, far from the target
+            high[self.kernels.n_x : -1] = OBSERVATION_LIMIT**2
         high[-1] = simulation.steps * simulation.dt * (1.0 + 1e-6)
         low = -high
         low[-1] = 0.0
@@ -407,7 +427,10 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         else:
             super().reset(seed=seed)
             self._begin(given_start(self.kernels, options or {}))
+        memory = self._memory.copy()
         self._observe.on_rows(_ROW)
+        if saved is not None:  # its costs are those of the step before, which may be rounded otherwise
+            self._memory[...] = memory
         if self.render_mode is not None:
             self._show()
         _, success, diverged = self._flags.tolist()
@@ -420,6 +443,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self._draws[:] = self.np_random.uniform(-1.0, 1.0, self._draws.shape) if drawn else 0.0
         self._start.on_rows(_ROW)
         start.apply(self.kernels, self._x, self._parameters)
+        self._memory[len(MEMORY) :] = self._parameters[list(self.kernels.parameters.moving)]
         self._begun, self._over = True, False
         self._begin_trail()
 

@@ -9,12 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dq_space_arm_env.algebra import dual_quaternion
+from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.parameters import TARGET, target_entries
-from dq_space_arm_env.scene.pose import PLANAR_POSE
+from dq_space_arm_env.scene.path import given_path
+from dq_space_arm_env.scene.pose import PLANAR_POSE, Pose
 from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.task.step_report import STATE_LIMIT
 
@@ -41,7 +43,8 @@ class GivenStart(NamedTuple):
             parameters[...] = self.parameters
         if self.target is not None:
             where = kernels.parameters.indices(TARGET)
-            parameters[..., where] = self.target[..., target_entries(kernels.scene)]
+            body = kernels.layout.target_body_below(self.target, parameters)
+            parameters[..., where] = body[..., target_entries(kernels.scene)]
         if any(given is not None for given in self):
             _give_sign_of_target(kernels, x, kernels.layout.target_with(parameters))
 
@@ -132,12 +135,30 @@ def check_scene(scene: Scene) -> None:
     lengths |= {"tip.position": scene.tip.position, "target.pose.position": scene.target.pose.position}
     sizes = {name: math.hypot(*position) for name, position in lengths.items()}
     sizes["spread.target_position"] = math.sqrt(3.0) * spread.target_position
+    if scene.target.grasp != Pose() or spread.grasp_position:
+        grasp = math.hypot(*scene.target.grasp.position) + math.sqrt(3.0) * spread.grasp_position
+        sizes["target.grasp.position"] = 2.0 * grasp  # it turns with the body
+    if scene.target.motion is not None:
+        sizes["target.motion"] = _target_way(scene)
     if sum(sizes.values()) > STATE_LIMIT:
         name, size = max(sizes.items(), key=lambda each: each[1])
         raise ValueError(
             f"scene {scene.name!r}: {name}: {size:.3g} m; lengths of the arm and distance of the target "
             f"should add up to at most {STATE_LIMIT:g} m, for observations to hold them"
         )
+
+
+def _target_way(scene: Scene) -> float:
+    """Largest distance of the target's body from its start in an episode, m; or its rate, if that is more."""
+    motion, spread, duration = scene.target.motion, scene.spread, scene.simulation.steps * scene.simulation.dt
+    if isinstance(motion, Waypoints):
+        path = given_path(scene, scene.simulation.steps)
+        places = np.stack(poses.position(tuple(path[:, :8].T)), axis=1)
+        return float(max(np.linalg.norm(places, axis=1).max(), np.linalg.norm(path[:, 8:], axis=1).max()))
+    assert motion is not None
+    speed = math.hypot(*motion.linear_velocity) + math.sqrt(3.0) * spread.target_linear_velocity
+    rate = math.hypot(*motion.angular_velocity) + math.sqrt(3.0) * spread.target_angular_velocity
+    return max(rate, speed, duration * speed)
 
 
 def _checked_target(kernels: Kernels, target: Any) -> Array:

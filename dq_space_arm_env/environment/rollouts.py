@@ -18,19 +18,12 @@ from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.parameters import has_grasp
+from dq_space_arm_env.task.step_report import cost_names
 from dq_space_arm_env.task.trajectory import Trajectory
 from dq_space_arm_env.viewing.payload_places import leaves_tip, payload_path
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-COST_TERMS = (
-    "cost_pose",
-    "cost_base_velocity",
-    "cost_control",
-    "terminal_cost_pose",
-    "terminal_cost_base_velocity",
-)
 
 _AT_THE_END = ("attitude_error", "position_error", "is_success", "diverged", "caught")
 
@@ -240,7 +233,7 @@ class _Log:
         self.parameters = environment.parameters
         self.initial_errors = np.stack([info["attitude_error"], info["position_error"]], axis=1)
         self.rewards, self.action_seconds = np.zeros((count, steps)), np.zeros(steps)
-        self.cost_terms = {name: np.zeros(count) for name in COST_TERMS}
+        self.cost_terms = {name: np.zeros(count) for name in cost_names(environment.scene)}
         self.length = np.zeros(count, dtype=np.int64)
         self.flying, self.failed = np.ones(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         self.last = {name: info[name].copy() for name in _AT_THE_END if name in info}

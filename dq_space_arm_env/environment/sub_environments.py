@@ -119,6 +119,8 @@ class SubEnvironments:
             x, parameters = self.x[rows], self.parameters[rows]
             given.apply(self._kernels, x, parameters)
             self.x[rows], self.parameters[rows] = x, parameters
+            moving = list(self._kernels.parameters.moving)
+            self._memory[rows, len(MEMORY) :] = parameters[:, moving]
 
     def observe(self, rows: Rows, result: StepResult | None = None) -> StepResult:
         """Observe without a step: no costs, no end of an episode.

@@ -180,7 +180,7 @@ class StateLayout:
             q_{D/I}, shape (..., 8), real part dimensionless, dual part m, of the type of the parameters.
         """
         body = self.target_body_with(parameters)
-        if np.array_equal(self.grasp, dq.IDENTITY) and not self.parameters.indices(GRASP):
+        if not self._has_grasp:
             return body
         grasp = self._pose_with(GRASP, self.grasp, parameters)
         return np.stack(dq.multiply(_entries(body), _entries(grasp)), axis=-1)
@@ -195,6 +195,26 @@ class StateLayout:
             q_{T/I}, shape (..., 8), real part dimensionless, dual part m, of the type of the parameters.
         """
         return self._pose_with(TARGET, self.target, parameters)
+
+    def target_body_below(self, target: Array, parameters: Array) -> Array:
+        """Pose of the target's body from the desired pose of the tip, the other way round.
+
+        Args:
+            target: q_{D/I}, shape (8,) or (..., 8), real part dimensionless, dual part m.
+            parameters: Shape (..., n_p), units of `parameters`, of which those of the grasp frame count.
+
+        Returns:
+            q_{T/I}, shape (8,) or (..., 8), real part dimensionless, dual part m.
+        """
+        if not self._has_grasp:
+            return target
+        grasp = self._pose_with(GRASP, self.grasp, parameters)
+        body = dq.multiply(_entries(target), dq.conjugate(_entries(grasp)))
+        return np.stack(body, axis=-1)
+
+    @property
+    def _has_grasp(self) -> bool:
+        return bool(self.parameters.indices(GRASP)) or not np.array_equal(self.grasp, dq.IDENTITY)
 
     def _pose_with(self, path: str, nominal: Array, parameters: Array) -> Array:
         pose = np.tile(nominal.astype(parameters.dtype), (*parameters.shape[:-1], 1))

@@ -7,6 +7,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BeforeValidator, Field
 
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_text
@@ -45,6 +46,12 @@ class Tumbling(Model):
     linear_velocity: Rates3 = Field(
         default=(0.0, 0.0, 0.0), description="velocity of the center of mass, inertial axes, m/s"
     )
+
+    @property
+    def rate_growth(self) -> float:
+        """Bound of the angular velocity later, relative to that now: energy is kept."""
+        moments = np.linalg.eigvalsh(np.array(self.inertia))
+        return math.sqrt(moments[-1] / moments[0])
 
 
 class Waypoint(Model):

@@ -29,6 +29,7 @@ from dq_space_arm_env.validation.problems import Model, Problem, SceneError, pro
 from dq_space_arm_env.validation.yaml_text import dump_yaml
 
 _LARGEST_COST = 1e30  # of one actuator: sums and second derivatives stay finite in single precision too
+_LARGEST_TURN = 0.2  # rad, of a tumbling target in a time step: its attitude then errs by 1e-6 rad a step
 _PLANAR = 'base.motion is "planar"'
 _Location = tuple[str | int, ...]
 _GEOMETRY: Mapping[str, Any] = {"geometry": True}
@@ -117,6 +118,7 @@ class Scene(Model):
     def _problems(self) -> Iterator[Problem]:
         yield from self._actuator_problems()
         yield from self._part_problems()
+        yield from self._tumbling_problems()
         yield from self._cost_problems()
         yield from self._parameter_problems()
         if self.phases:
@@ -172,6 +174,20 @@ class Scene(Model):
             if half_width and not isinstance(self.target.motion, ScrewMotion | Tumbling):
                 sentence = "must be 0: the target is on no screw and does not tumble"
                 yield Problem(("spread", field), half_width, sentence)
+
+    def _tumbling_problems(self) -> Iterator[Problem]:
+        """Find a tumble too fast for the time step, of which the target takes one step each."""
+        motion = self.target.motion
+        if isinstance(motion, Tumbling):
+            drawn = math.sqrt(3.0) * self.spread.target_angular_velocity
+            fastest = motion.rate_growth * (math.hypot(*motion.angular_velocity) + drawn)
+            turn = fastest * self.simulation.dt
+            if turn > _LARGEST_TURN:
+                sentence = (
+                    f"the target may turn at {fastest:.3g} rad/s, {turn:.3g} rad in a time step; it must be "
+                    f"at most {_LARGEST_TURN:g} rad: lower it or simulation.dt"
+                )
+                yield Problem(("target", "motion", "angular_velocity"), motion.angular_velocity, sentence)
 
     def _cost_problems(self) -> Iterator[Problem]:
         """Find weights with which the reward of inputs at their limits would not be a number."""

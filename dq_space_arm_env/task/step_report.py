@@ -53,6 +53,11 @@ def report_names(scene: Scene) -> tuple[str, ...]:
     return tuple(names)
 
 
+def cost_names(scene: Scene) -> tuple[str, ...]:
+    """Names of the terms of a scene's cost: those of the stage, then the terminal ones."""
+    return tuple(name for name in report_names(scene) if "cost" in name)
+
+
 def n_observations(scene: Scene) -> int:
     """Count the entries of an observation: state, time left, and two twists where the target moves."""
     layout = StateLayout.of(scene)

@@ -3,7 +3,8 @@
 With s = sqrt(2 E), E the kinetic energy and that of the springs, the twist of every body is bounded by s and
 its inertia, so the power of the actuators, and of a wrench at the tip, is at most c s: s' = E' / s <= c.
 Dampers only take energy away. The center of mass gains no more speed than the forces give, and the arm
-reaches no farther from it than when it is stretched out.
+reaches no farther from it than when it is stretched out. A target on a screw keeps its speed; one
+that tumbles keeps its energy, so its rate grows at most by the root of the ratio of its moments of inertia.
 """
 
 from __future__ import annotations
@@ -12,11 +13,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import casadi
+import numpy as np
+from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import dot, matrix_vector, norm, subtract
 from dq_space_arm_env.dynamics.chain import RigidBody
-from dq_space_arm_env.task.equations import SceneEquations, total
+from dq_space_arm_env.scene.motion import Tumbling, Waypoints
+from dq_space_arm_env.scene.path import given_path
+from dq_space_arm_env.task.equations import SceneEquations, body_pose, body_velocity, total
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -49,6 +54,8 @@ class WorstCase:
         drift = moving + duration * (norm(self.inputs.force) + norm(wrench[:3])) / self.mass
         # The dual part of a pose has half the length of its position; unit quaternions are at most 2 apart.
         start, target = (norm(poses.position(pose)) for pose in (equations.base_pose(x), equations.target))
+        if equations.scene.target.motion is not None:
+            target = target + self._target_way(duration)
         gaps = 2.0, 0.5 * (start + target + duration * drift + 2.0 * self.reach)
         references = equations.scene.target.base_velocity
         speeds = (
@@ -56,11 +63,58 @@ class WorstCase:
             speed / casadi.sqrt(base.mass) + norm(references[3:]),
         )
 
-        def state_cost(pose: str, velocity: str) -> Scalar:
-            return self._weighted(pose, 4, gaps) + self._weighted(velocity, 3, speeds)
+        def state_cost(pose: str, velocity: str, twist: str) -> Scalar:
+            cost = self._weighted(pose, 4, gaps) + self._weighted(velocity, 3, speeds)
+            if any(getattr(equations.scene.cost, twist)):
+                cost = cost + self._weighted(twist, 3, self._relative_speeds(speed, 2.0 * gaps[1]))
+            return cost
 
-        stage = state_cost("pose", "base_velocity") + equations.effort(equations.control_limits)
-        return steps * stage + state_cost("terminal_pose", "terminal_base_velocity")
+        effort = equations.effort(equations.control_limits)
+        stage = state_cost("pose", "base_velocity", "tip_twist") + effort
+        return steps * stage + state_cost("terminal_pose", "terminal_base_velocity", "terminal_tip_twist")
+
+    def _target_way(self, duration: Scalar) -> Scalar:
+        """Bound of the way from where the target is now."""
+        motion, grasp = self.equations.scene.target.motion, self._grasp_length()
+        if isinstance(motion, Waypoints):  # all of them lie within this distance of the first
+            return 2.0 * (np.linalg.norm(self._given_places(), axis=1).max() + grasp)
+        return duration * norm(self._target_velocity()[3:]) + 2.0 * grasp
+
+    def _target_speeds(self) -> tuple[Scalar, Scalar]:
+        """Bounds of angular velocity and velocity of the target."""
+        scene = self.equations.scene
+        if scene.target.motion is None:
+            return 0.0, 0.0
+        if isinstance(scene.target.motion, Waypoints):
+            velocities = given_path(scene, scene.simulation.steps)[:, 8:].reshape(-1, 2, 3)
+            turning, moving = np.linalg.norm(velocities, axis=2).max(axis=0).tolist()
+        else:
+            velocity = self._target_velocity()
+            turning, moving = norm(velocity[:3]), norm(velocity[3:])
+        if isinstance(scene.target.motion, Tumbling):
+            turning = turning * scene.target.motion.rate_growth
+        return turning, moving + turning * self._grasp_length()
+
+    def _relative_speeds(self, speed: Scalar, distance: Scalar) -> tuple[Scalar, Scalar]:
+        """Bounds of angular velocity and velocity of the tip relative to a target at most so far away."""
+        hand, (target_turning, target_moving) = self.bodies[-1], self._target_speeds()
+        wrist = total([0.0, *(casadi.fabs(rate) for rate in self.inputs.wrist_rates)])
+        turning = _turned(hand, speed) + wrist
+        moving = speed / casadi.sqrt(hand.mass) + self.reach * turning
+        return turning + target_turning, moving + target_moving + distance * target_turning
+
+    def _target_velocity(self) -> list[Scalar]:
+        return body_velocity(self.equations.scene, self.equations.given)
+
+    def _grasp_length(self) -> Scalar:
+        body = body_pose(self.equations.scene, self.equations.given)
+        return norm(subtract(poses.position(self.equations.target), poses.position(body)))
+
+    def _given_places(self) -> NDArray[np.float64]:
+        """Places of a target that passes waypoints, relative to its start, shape (steps + 1, 3)."""
+        scene = self.equations.scene
+        path = given_path(scene, scene.simulation.steps)[:, :8]
+        return np.stack(poses.position(tuple(path.T)), axis=1)
 
     def _weighted(self, field: str, size: int, lengths: Scalars) -> Scalar:
         """Cost of two vectors of these lengths; the largest weight counts for all entries of a vector."""

@@ -1,10 +1,12 @@
 """Demonstrations as flights to replay: entry point of the group `dq_space_arm.flights`."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.parameters import has_grasp
 from dq_space_arm_env.task.trajectory import Trajectory
 from experts.demonstrations import DemonstrationsError, load_demonstrations
 
@@ -28,6 +30,9 @@ def read_demonstration(source: str, label: str | None) -> Trajectory | None:
     controls = demonstration.actions * layout.limits_with(parameters)
     if layout.parameters.move_target:
         parameters = demonstrations.kernels.stage_parameters(parameters)
-    target = layout.target_with(parameters) if layout.n_p else None
-    name = label or f"demonstration {number}"
-    return Trajectory(name, np.array(demonstration.states), controls, target=target, scene=scene)
+    flight = Trajectory(label or f"demonstration {number}", np.array(demonstration.states), controls)
+    if layout.n_p:
+        flight = replace(flight, target=layout.target_with(parameters))
+    if layout.n_p and has_grasp(scene):
+        flight = replace(flight, target_body=layout.target_body_with(parameters))
+    return replace(flight, scene=scene)

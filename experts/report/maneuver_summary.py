@@ -56,6 +56,9 @@ def _result_rows(run: ManeuverRun) -> Iterable[tuple[str, str, str]]:
     yield "  tip pose", f"{terms['cost_pose']:.6f}", f"at T {terms['terminal_cost_pose']:.2e}"
     velocity = terms["terminal_cost_base_velocity"]
     yield "  base velocity", f"{terms['cost_base_velocity']:.6f}", f"at T {velocity:.2e}"
+    if any(name.endswith("tip_twist") for name in terms):
+        running, final = (terms.get(f"{stage}cost_tip_twist", 0.0) for stage in ("", "terminal_"))
+        yield "  tip twist", f"{running:.6f}", f"at T {final:.2e}"
     yield "  inputs", f"{terms['cost_control']:.6f}", ""
     verdict = "converged" if solution.converged else f"NOT converged ({solution.stop_reason.value})"
     yield "solver", verdict, solution.message

@@ -109,13 +109,21 @@ def test_observation_is_what_the_documentation_says(scene):
     env.reset(seed=2)
     observation, *_, info = env.step(env.action_space.sample())
     kernels, x = env.unwrapped.kernels, env.unwrapped.state
-    layout, target = kernels.layout.state, env.unwrapped.episode_scene.target.pose.dual_quaternion
+    layout, target = kernels.layout.state, tuple(env.unwrapped.target)
+    if env.unwrapped.scene.target.motion is None:
+        assert target == pytest.approx(env.unwrapped.episode_scene.target.pose.dual_quaternion, abs=1e-15)
     error = np.array(poses.error_pose(tuple(kernels.tip_pose(x)), target))  # (31)
     if kernels.layout.planar:
         np.testing.assert_allclose(error[[1, 2, 4, 7]], 0.0, atol=1e-15)
         error = error[[0, 3, 5, 6]]
     parts = (layout.base_velocity, layout.joint_angles, layout.wrist_angles, layout.joint_rates)
-    expected = np.concatenate([error, *(x[part] for part in parts), [19 * 0.015]])
+    twists = []
+    if env.unwrapped.scene.target.motion is not None:
+        relative = kernels.relative_twist(x, p=env.unwrapped.stage_parameters)
+        twists = [relative, kernels.tip_twist(x) - relative]
+        assert info["angular_velocity_error"] == pytest.approx(np.degrees(np.linalg.norm(relative[:3])))
+        assert info["velocity_error"] == pytest.approx(np.linalg.norm(relative[3:]))
+    expected = np.concatenate([error, *(x[part] for part in parts), *twists, [19 * 0.015]])
     np.testing.assert_allclose(observation, expected, atol=1e-14)
     tip = tuple(kernels.tip_pose(x))
     assert info["attitude_error"] == pytest.approx(np.degrees(poses.error_angle(tip, target)))

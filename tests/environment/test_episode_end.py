@@ -5,7 +5,8 @@ import pytest
 from short_scenes import short
 
 from dq_space_arm_env import DQSpaceArmEnv, Scene, compile_scene
-from dq_space_arm_env.environment.rollouts import COST_TERMS, rollout
+from dq_space_arm_env.environment.rollouts import rollout
+from dq_space_arm_env.task.step_report import cost_names
 
 STEPS = 25
 
@@ -70,8 +71,8 @@ def test_more_than_every_step_that_is_left_is_charged_after_a_divergence(scene: 
         step += 1
     assert info["diverged"]
     assert observation[-1] == pytest.approx((STEPS - step - 1) * scene.simulation.dt)
-    stage = sum(info[name] for name in COST_TERMS[:3])
-    terminal = sum(info[name] for name in COST_TERMS[3:])
+    stage = sum(info[name] for name in cost_names(scene)[:3])
+    terminal = sum(info[name] for name in cost_names(scene)[3:])
     assert reward < -(STEPS - step) * stage - terminal
 
 
@@ -82,7 +83,7 @@ def test_nothing_is_counted_after_the_end_of_an_episode(scene: Scene) -> None:
     alone = rollout(lambda seen: np.full((len(seen), 6), 0.5), scene, starts=starts[:1])
     assert both.length.tolist() == [alone.length[0], STEPS]
     assert alone.length[0] < STEPS
-    for name in COST_TERMS:
+    for name in cost_names(scene):
         assert both.cost_terms[name][0] == alone.cost_terms[name][0]
     assert both.base_turn[0] == alone.base_turn[0]
     np.testing.assert_array_equal(both.rewards[0], alone.rewards[0])

@@ -34,7 +34,9 @@ SIZES = {  # n_x, n_t, n_u
     "reaction-wheels": (23, 21, 9),
     "six-joint": (26, 24, 12),
     "tip-load": (23, 21, 12),
+    "tracking": (23, 21, 12),
     "tumbling": (23, 21, 12),
+    "tumbling-target": (23, 21, 12),
 }
 
 

@@ -36,6 +36,7 @@ def test_no_motion_costs_more(name):
     """Accurate motions under inputs at their limits: constant, switching, and along the velocities."""
     scene = load_scene(name)
     kernels, rng = compile_scene(scene), np.random.default_rng(4)
+    rows = kernels.stage_parameters()  # of a target that moves
     begun = starts(kernels, 48)
     x, cost = begun.copy(), np.zeros(len(begun))
     u = rng.choice([-1.0, 1.0], (len(x), kernels.n_u))
@@ -43,14 +44,15 @@ def test_no_motion_costs_more(name):
         if step % 10 == 0:
             u[::3] = rng.choice([-1.0, 1.0], u[::3].shape)
         controls = kernels.layout.control_limit * u
-        cost += kernels.cost(x, controls)
+        cost += kernels.cost(x, controls, p=rows[step])
         x, error = kernels.checked_step(x, controls)
         assert (error <= 1.0).all()
-    cost += kernels.terminal_cost(x)
+    cost += kernels.terminal_cost(x, p=rows[STEPS])
     bounds = charge(scene, begun, STEPS)
     assert (cost < bounds).all()
     # It is of use only if it is not beyond all measure.
-    assert np.median(bounds / cost) < 1e5
+    limit = 1e6 if any(scene.cost.terminal_tip_twist) else 1e5  # the lightest body may take all the energy
+    assert np.median(bounds / cost) < limit
 
 
 def test_a_simulation_that_diverges_pays_more_than_the_true_motion():

@@ -110,7 +110,8 @@ class DerivativePrograms:
             curvature = casadi.hessian(casadi.dot(factor, residual), moved)[0]
             weighted = casadi.densify(casadi.mtimes(weights, residual))
             hessian = hessian + casadi.substitute(curvature, factor, weighted)
-        gradient, hessian = casadi.substitute([gradient, hessian], [moved], [values])
+        symmetric = casadi.triu2symm(casadi.triu(hessian))  # to the last bit
+        gradient, hessian = casadi.substitute([gradient, symmetric], [moved], [values])
         return gradient, casadi.sparsify(hessian)
 
     def _held_twist_derivatives(self, x: Scalars, emphasis: Scalar, *, exact: bool) -> tuple[Matrix, Matrix]:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 
 from dq_space_arm_env.common.entry_points import entry_points, load
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.task.trajectory import Trajectory
-from dq_space_arm_env.viewing.replay.flights import target_during
+from dq_space_arm_env.viewing.replay.flights import aimed
 
 GROUP = "dq_space_arm.flights"
 """Entry-point group: functions (source, label) -> `Trajectory`, or None for what they do not read."""
@@ -55,15 +54,13 @@ def common_scene(flights: Sequence[Trajectory], scene: Scene | None = None) -> t
     scene = scene or next((flight.scene for flight in flights if flight.scene is not None), None)
     if scene is None:
         raise ValueError("no file says which scene it belongs to: name the scene")
-    aimed = []
+    shown = []
     for flight in flights:
         if flight.scene is not None:
             _check_same_robot(flight.label, flight.scene, scene)
-            if flight.target is None:
-                target, body = target_during(flight.scene, len(flight.states) - 1)
-                flight = replace(flight, target=target, target_body=body)
-        aimed.append(flight)
-    return aimed, scene
+            flight = aimed(flight, flight.scene)
+        shown.append(flight)
+    return shown, scene
 
 
 def _check_same_robot(label: str, own: Scene, scene: Scene) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,6 +63,14 @@ def prepare(flights: Sequence[Trajectory], scene: Scene) -> list[ShownFlight]:
     return [_prepare(flight, scene, layout) for flight in flights]
 
 
+def aimed(flight: Trajectory, scene: Scene) -> Trajectory:
+    """Give a flight that names no target the nominal one of a scene."""
+    if flight.target is not None:
+        return flight
+    target, body = target_during(scene, len(np.asarray(flight.states)) - 1)
+    return replace(flight, target=target, target_body=body)
+
+
 def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlight:
     what = f"flight {flight.label!r}"
     if not flight.label.strip():
@@ -76,10 +84,9 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
     shown = _finite_steps(states, controls, noise)
     if shown < 1:
         raise ValueError(f"{what}: its first step is not finite or has blown up: there is nothing to show")
+    flight = aimed(flight, scene)
     given, body = flight.target, flight.target_body
-    if given is None:
-        given, own_body = target_during(scene, steps)
-        body = own_body if body is None else body
+    assert given is not None
     target = _target(f"{what}: target", given, steps, shown)
     frames = _continuous(frame_poses(scene, layout, states[: shown + 1]))
     payload = flight.payload
