@@ -108,13 +108,13 @@ class Cost(Model):
     tip_twist: StateWeights6 = Field(
         default=(0.0,) * 6,
         exclude_if=lambda weights: not any(weights),
-        description="running weight on the tip's twist relative to the target, angular and linear, tip axes, "
-        "with the wrist's rates: one number or 6",
+        description="running weight on the twist of the tip relative to the target, angular and linear, "
+        "tip axes, with the rates of the wrist: one number or 6",
     )
     terminal_tip_twist: StateWeights6 = Field(
         default=(0.0,) * 6,
         exclude_if=lambda weights: not any(weights),
-        description="terminal weight on the tip's twist relative to the target, angular and linear, "
+        description="terminal weight on the twist of the tip relative to the target, angular and linear, "
         "tip axes, with the wrist held: one number or 6",
     )
     base_force: ControlWeights3 = Field(
