@@ -443,7 +443,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self._draws[:] = self.np_random.uniform(-1.0, 1.0, self._draws.shape) if drawn else 0.0
         self._start.on_rows(_ROW)
         start.apply(self.kernels, self._x, self._parameters)
-        self._memory[len(MEMORY) :] = self._parameters[list(self.kernels.parameters.moving)]
+        moving = list(self.kernels.parameters.moving)
+        self._memory[len(MEMORY) : len(MEMORY) + len(moving)] = self._parameters[moving]
         self._begun, self._over = True, False
         self._begin_trail()
 

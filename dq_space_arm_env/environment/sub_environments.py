@@ -120,7 +120,7 @@ class SubEnvironments:
             given.apply(self._kernels, x, parameters)
             self.x[rows], self.parameters[rows] = x, parameters
             moving = list(self._kernels.parameters.moving)
-            self._memory[rows, len(MEMORY) :] = parameters[:, moving]
+            self._memory[rows, len(MEMORY) : len(MEMORY) + len(moving)] = parameters[:, moving]
 
     def observe(self, rows: Rows, result: StepResult | None = None) -> StepResult:
         """Observe without a step: no costs, no end of an episode.

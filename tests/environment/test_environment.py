@@ -123,7 +123,8 @@ def test_observation_is_what_the_documentation_says(scene):
         twists = [relative, kernels.tip_twist(x) - relative]
         assert info["angular_velocity_error"] == pytest.approx(np.degrees(np.linalg.norm(relative[:3])))
         assert info["velocity_error"] == pytest.approx(np.linalg.norm(relative[3:]))
-    expected = np.concatenate([error, *(x[part] for part in parts), *twists, [19 * 0.015]])
+    phase = [info["phase"]] if env.unwrapped.scene.phases else []
+    expected = np.concatenate([error, *(x[part] for part in parts), phase, *twists, [19 * 0.015]])
     np.testing.assert_allclose(observation, expected, atol=1e-14)
     tip = tuple(kernels.tip_pose(x))
     assert info["attitude_error"] == pytest.approx(np.degrees(poses.error_angle(tip, target)))

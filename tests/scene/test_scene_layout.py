@@ -23,6 +23,7 @@ from dq_space_arm_env.scene import (
 Change = Callable[..., dict[str, Any]]
 
 SIZES = {  # n_x, n_t, n_u
+    "capture-and-detumble": (20, 18, 9),
     "far": (23, 21, 12),
     "free-floating": (23, 21, 6),
     "no-wrist": (20, 18, 9),
@@ -32,6 +33,8 @@ SIZES = {  # n_x, n_t, n_u
     "random-masses": (20, 18, 9),
     "random-target": (23, 21, 12),
     "reaction-wheels": (23, 21, 9),
+    "refuelling": (23, 21, 12),
+    "release": (20, 18, 9),
     "six-joint": (26, 24, 12),
     "tip-load": (23, 21, 12),
     "tracking": (23, 21, 12),

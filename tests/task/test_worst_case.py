@@ -52,7 +52,7 @@ def test_no_motion_costs_more(name):
     assert (cost < bounds).all()
     # It is of use only if it is not beyond all measure.
     limit = 1e6 if any(scene.cost.terminal_tip_twist) else 1e5  # the lightest body may take all the energy
-    assert np.median(bounds / cost) < limit
+    assert np.median(bounds / cost) < limit * max(1, len(scene.phases))  # each phase is charged for all steps
 
 
 def test_a_simulation_that_diverges_pays_more_than_the_true_motion():

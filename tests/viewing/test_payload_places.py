@@ -96,7 +96,11 @@ def test_only_some_scenes_have_a_payload_that_leaves_the_tip(name, leaves):
             [AT_TIP, AT_TARGET, AT_TARGET, 3],
             [AT_TIP, AT_TARGET, AT_TARGET, AT_TIP],
         ),
-        (staged("release", [(3, ABSENT, None), (3, {}, None)]), [AT_TARGET, AT_TIP], [AT_TARGET, AT_TIP]),
+        (
+            staged("release", [(3, ABSENT, None), (3, {}, ALWAYS)]),
+            [AT_TARGET, 1],
+            [AT_TARGET, AT_TIP],
+        ),
     ],
 )
 def test_places_phase_by_phase(scene, missed, caught):
