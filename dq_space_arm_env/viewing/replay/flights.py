@@ -69,6 +69,7 @@ def aimed(flight: Trajectory, scene: Scene) -> Trajectory:
     target, body = (
         each[:count] if each is not None and each.ndim == 2 else each for each in shown_target(scene)
     )
+    body = body if flight.target_body is None else flight.target_body
     return replace(flight, target=target, target_body=body)
 
 
