@@ -45,8 +45,6 @@ DIMENSIONLESS = {
     "Cost.terminal_pose",
     "Cost.base_velocity",
     "Cost.terminal_base_velocity",
-    "Cost.tip_twist",
-    "Cost.terminal_tip_twist",
     "Tumbling.inertia",
     "Spread.base_mass",
     "Spread.base_inertia",

@@ -108,14 +108,14 @@ class Cost(Model):
     tip_twist: StateWeights6 = Field(
         default=(0.0,) * 6,
         exclude_if=lambda weights: not any(weights),
-        description="running weight on the twist of the tip relative to the target, angular and linear, "
-        "tip axes, with the rates of the wrist: one number or 6",
+        description="running weight on the tip's twist relative to the target, angular and linear, tip axes, "
+        "with the wrist's rates, (s/rad)^2 and (s/m)^2: one number or 6",
     )
     terminal_tip_twist: StateWeights6 = Field(
         default=(0.0,) * 6,
         exclude_if=lambda weights: not any(weights),
-        description="terminal weight on the twist of the tip relative to the target, angular and linear, "
-        "tip axes, with the wrist held: one number or 6",
+        description="terminal weight on the tip's twist relative to the target, angular and linear, "
+        "tip axes, with the wrist held, (s/rad)^2 and (s/m)^2: one number or 6",
     )
     base_force: ControlWeights3 = Field(
         default=(10.0,) * 3, description="weight on the base force, 1/N^2: one number or 3"

@@ -72,7 +72,7 @@ def neighbors(count, seed=0):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("scene", ["random-target", "paper", "planar", "payload"])
+@pytest.mark.parametrize("scene", ["random-target", "paper", "planar", "payload", "tumbling-target"])
 def test_check_env_has_no_complaint(scene, kind):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dq_space_arm_env import list_scenes, load_scene
+from dq_space_arm_env import compile_scene, list_scenes, load_scene
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
@@ -13,7 +13,7 @@ from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.viewing.replay import common_scene
 from dq_space_arm_env.viewing.replay.curves import panels
-from dq_space_arm_env.viewing.replay.flights import MOST_FLIGHTS, prepare, target_during, verdict
+from dq_space_arm_env.viewing.replay.flights import MOST_FLIGHTS, prepare, verdict
 
 
 @pytest.mark.parametrize("name", list_scenes())
@@ -23,14 +23,14 @@ def test_frames_are_those_of_the_chain_one_state_at_a_time(name, make_flight):
     flight = make_flight(scene, steps=5)
     shown = prepare([flight], scene)[0]
     layout, chain = StateLayout.of(scene), Chain.from_scene(scene)
-    targets = np.broadcast_to(target_during(scene, 5)[0], (6, 8))
+    targets = compile_scene(scene).layout.target_with(compile_scene(scene).stage_parameters())
     for instant, state in enumerate(flight.states.tolist()):
         base = np.zeros(8)
         base[list(PLANAR_POSE) if layout.planar else list(range(8))] = state[layout.state.pose]
         joints, wrist = state[layout.state.joint_angles], state[layout.state.wrist_angles]
         expected = kinematics.frame_poses(chain, tuple(base.tolist()), joints, wrist)
         np.testing.assert_allclose(shown.frames[instant], expected, atol=1e-14)
-        target = tuple(targets[instant])
+        target = tuple(targets[instant].tolist())
         error = poses.error_angle(tuple(expected[-1]), target)
         assert shown.angle[instant] == pytest.approx(np.degrees(error), abs=1e-6)
         distance = poses.error_distance(tuple(expected[-1]), target)

@@ -68,9 +68,8 @@ def aimed(flight: Trajectory, scene: Scene) -> Trajectory:
     if flight.target is not None:
         return flight
     target, body = target_during(scene, len(np.asarray(flight.states)) - 1)
-    return replace(
-        flight, target=target, target_body=body if flight.target_body is None else flight.target_body
-    )
+    body = body if flight.target_body is None else flight.target_body
+    return replace(flight, target=target, target_body=body)
 
 
 def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlight:
