@@ -90,6 +90,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | 32-34 | velocity of the target, as if it reached to the tip                   | -1e12 | 1e12 | m/s  |
     | 35    | time left in the episode                                              | 0    | T   | s     |
 
+    In a scene with phases the number of the phase, from 0, is one more entry: before the twists, or the time left.
+
     ## Rewards
 
     The reward of a step is minus the paper's stage cost, of the state before the step and of the action; the last step adds minus the terminal cost of
