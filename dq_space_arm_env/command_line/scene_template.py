@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.scene import Pose
+from dq_space_arm_env.scene.phases import Phase
 
 WIDTH = 110
 _HEADER = """\
@@ -35,6 +36,10 @@ def _mapping(model: BaseModel, indent: str, *, apart: bool = False, explained: b
         if value is None or value == ():
             if explained:
                 yield from _comment(f"{name}: absent. {comment}", indent)
+            continue
+        if isinstance(model, Phase) and name == "changes":
+            yield from _with_comment(f"{indent}{name}:", comment, indent)
+            yield from (f"{indent}  {path}: {_inline(number)}" for path, number in value)
             continue
         models = isinstance(value, tuple) and isinstance(value[0], BaseModel)
         line = f"{indent}{name}: {_inline(value)}" if isinstance(value, Pose) else ""
@@ -85,6 +90,8 @@ def _inline(value: Any) -> str:
         if _is_diagonal(value):
             value = tuple(value[i][i] for i in range(3))
         return f"[{', '.join(map(_inline, value))}]"
+    if value is None:
+        return "null"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
