@@ -71,7 +71,7 @@ class StagedNumbers(NamedTuple):
     """What the phases of a scene change."""
 
     starts: tuple[int, ...]  # first stage of each phase
-    values: dict[str, tuple[float, ...]]  # by name, a value for each phase, of those that differ
+    values: dict[str, tuple[float, ...]]  # by name, a value for each phase, of those that any changes
     resting: tuple[tuple[float, ...] | None, ...]  # pose of a target at rest in a phase; None where it moves
     catches: tuple[bool, ...]  # whether a phase begins with a catch
 
@@ -88,11 +88,12 @@ def staged_numbers(scene: Scene) -> StagedNumbers:
         every.append(
             {number.name: 0.0 if _is_in(number.name, removed) else number.nominal for number in numbers(own)}
         )
+    own_values = {number.name: number.nominal for number in numbers(scene.replace(phases=()))}
     moving = ("target.pose", "target.velocity") if scene.target.motion is not None else ()
     values = {
         name: tuple(each[name] for each in every)
         for name in (every[0] if every else {})
-        if not _is_in(name, moving) and len({each[name] for each in every}) > 1
+        if not _is_in(name, moving) and len({own_values[name], *(each[name] for each in every)}) > 1
     }
     if any(_is_in(name, ("target.pose",)) for name in values):  # a pose changes as a whole
         values |= {

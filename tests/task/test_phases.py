@@ -231,6 +231,19 @@ def test_the_robot_of_each_phase_is_that_of_a_scene_with_its_numbers(name: str) 
         assert np.abs(kernels.step(x, u, p=p) - alone.step(x, u)).max() < 1e-14
 
 
+def test_what_every_phase_changes_is_changed() -> None:
+    """One phase without its payload, and with another base, is the scene without it, and with that base."""
+    scene = load_scene("payload")
+    changes = {"payload": None, "base.mass": 90.0, "actuators": {"base_force": None}}
+    steps = scene.simulation.steps
+    kernels = compile_scene(scene.replace(phases=[{"name": "only", "steps": steps, "changes": changes}]))
+    alone = compile_scene(scene.replace({"payload": None, "base.mass": 90.0}))
+    rows, rng = kernels.stage_parameters(), np.random.default_rng(6)
+    x, u = kernels.layout.initial_state, rng.standard_normal(kernels.n_u)
+    assert np.abs(kernels.step(x, u, p=rows[3]) - alone.step(x, u)).max() < 1e-14
+    assert not kernels.layout.limits_with(rows[3])[kernels.layout.control.base_force].any()
+
+
 def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
     problem = ArmProblem("capture-and-detumble")
     coarse, entries = problem.coarsened(5), problem.kernels.parameters
