@@ -6,6 +6,7 @@ from test_kernels_derivatives import complex_step_jacobians
 from test_kernels_dynamics import paper_solution, relative_error
 
 from dq_space_arm_env import load_scene
+from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
 from dq_space_arm_env.scene import INTEGRATORS, Actuators, InitialState, Spread, Target
 
 PAPER = load_scene("paper")
@@ -59,8 +60,9 @@ def odd_scenes_and_integrators():
 def test_linearization_agrees_with_complex_steps(name, integrator, draw):
     kernels, states, inputs = draw(ODD[name], 2)
     a, b = kernels.linearize(states, inputs, integrator=integrator)
+    program = ScenePrograms(kernels.scene).build("step", integrator)
     for k in range(2):
-        expected_a, expected_b = complex_step_jacobians(kernels, states[k], inputs[k], integrator)
+        expected_a, expected_b = complex_step_jacobians(kernels, program, states[k], inputs[k])
         np.testing.assert_allclose(a[k], expected_a, atol=2e-13 * max(1.0, np.abs(expected_a).max()))
         np.testing.assert_allclose(b[k], expected_b.reshape(b[k].shape), atol=2e-13)
 
