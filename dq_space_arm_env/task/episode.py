@@ -121,7 +121,7 @@ def step(
 
     # reward = -(stage cost of x and u) - (terminal cost of x_next at the end): the return is -J. After a
     # divergence the most that this and all further steps could cost is charged, so ending early never pays.
-    stage = [*state_terms, equations.effort(u), *before.twist_cost_terms(x, u)]
+    stage = [*state_terms, before.effort(u), *before.twist_cost_terms(x, u)]
     terminal = [casadi.if_else(terminated, term, 0.0) for term in after.terminal_cost_terms(x_kept)]
     worst = total([WorstCase(each).cost(x, remaining) for each in _every_phase(before)])
     reward = -casadi.if_else(sound, total(stage) + total(terminal), worst)
