@@ -103,7 +103,8 @@ def check_fit(policy: ActingPolicy, scene: Scene) -> None:
     environment = DQSpaceArmVectorEnv(1, scene)
     space, layout = environment.single_observation_space, environment.kernels.layout
     assert space.shape is not None
-    seen = layout.n_x + 16 if kind == "goal" else space.shape[0]
+    moving = 6 if layout.parameters.moving else 0
+    seen = layout.n_x + moving + 16 if kind == "goal" else space.shape[0]
     if policy.sizes != (seen, layout.n_u):
         origin = policy.metadata.get("scene")
         made = f" (it was trained for scene {origin!r})" if origin else ""
@@ -153,11 +154,15 @@ class _OnGoals:
     def __call__(self, observations: NDArray[Any]) -> NDArray[Any]:
         environment = self._environment
         assert environment is not None
-        states = environment.states
+        states, layout = environment.states, environment.kernels.layout
+        seen = states
+        if layout.parameters.moving:  # as in the goal environment
+            velocity = layout.target_velocity_with(environment.stage_parameters)
+            seen = np.concatenate([states, velocity], axis=1)
         parts = {
             "achieved_goal": np.reshape(environment.kernels.tip_pose(states), (len(states), 8)),
             "desired_goal": environment.targets,
-            "observation": states,
+            "observation": seen,
         }
         single = {name: np.asarray(part, dtype=np.float32) for name, part in parts.items()}
         return self._act(np.concatenate(list(single.values()), axis=1) if self._joined else single)
