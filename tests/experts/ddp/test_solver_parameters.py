@@ -138,10 +138,10 @@ def test_a_maneuver_moves_with_its_target(scene):
     problem = ArmProblem(scene)
     solver = BoxDDP(problem)
     solution = solver.solve()
-    assert problem.carried(solution.states, solution.parameters[-1]) is None
+    assert problem.carried(solution.states, solution.parameters) is None
     p = values(solver)
     problem.parameters.set(p)
-    moved = problem.carried(solution.states, solution.parameters[-1])
+    moved = problem.carried(solution.states, solution.parameters)
     # The tip sees its target as before, and the motion is one of the robot.
     errors = [
         problem.kernels.observation(x, [0.0], p=q)[1]
