@@ -133,8 +133,8 @@ def phase_problems(scene: Scene) -> Iterator[Problem]:
         )
         yield Problem(("phases",), total, sentence)
     names = {number.name for number in numbers(scene.replace(phases=()))}
-    held = moves = True
-    valid = True
+    moves = valid = True
+    held: list[bool] = []  # whether the tip holds the payload, phase by phase
     for index, phase in enumerate(scene.phases):
         here: tuple[str | int, ...] = ("phases", index, "changes")
         wrong = [*_change_problems(scene, phase, here, names)]
@@ -163,13 +163,22 @@ def phase_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem(
                 here, dict(phase.changes), "moves a target that came to rest: keep target.motion null"
             )
-        held_before, held, moves = held, "payload" not in removed, not rests
-        gains = scene.payload is not None and held and index > 0 and not held_before
+        moves = not rests
+        held.append(scene.payload is not None and "payload" not in removed)
+        gains = held[-2:] == [False, True]
         if gains != (phase.catch is not None):
             sentence = (
                 "must be given where the phase before holds no payload and this one does, and only there"
             )
             yield Problem(("phases", index, "catch"), phase.catch, sentence)
+        elif gains and any(held[:-1]):
+            sentence = (
+                "must be in no phase after one that holds the payload: once let go, it drifts and does not "
+                "move with the target"
+            )
+            yield Problem(("phases", index, "catch"), phase.catch, sentence)
+    if scene.payload is not None and held and not any(held):
+        yield Problem(("phases",), len(held), "never hold the payload: leave it out of the scene")
     if valid:
         yield from _drawn_problems(scene)
 

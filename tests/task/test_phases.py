@@ -233,12 +233,12 @@ def test_the_robot_of_each_phase_is_that_of_a_scene_with_its_numbers(name: str) 
 
 
 def test_what_every_phase_changes_is_changed() -> None:
-    """One phase without its payload, and with another base, is the scene without it, and with that base."""
+    """One phase with another base is the scene with that base."""
     scene = load_scene("payload")
-    changes = {"payload": None, "base.mass": 90.0, "actuators": {"base_force": None}}
+    changes = {"base.mass": 90.0, "actuators": {"base_force": None}}
     steps = scene.simulation.steps
     kernels = compile_scene(scene.replace(phases=[{"name": "only", "steps": steps, "changes": changes}]))
-    alone = compile_scene(scene.replace({"payload": None, "base.mass": 90.0}))
+    alone = compile_scene(scene.replace({"base.mass": 90.0}))
     rows, rng = kernels.stage_parameters(), np.random.default_rng(6)
     x, u = kernels.layout.initial_state, rng.standard_normal(kernels.n_u)
     assert np.abs(kernels.step(x, u, p=rows[3]) - alone.step(x, u)).max() < 1e-14
@@ -271,6 +271,8 @@ def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
         ({"phases.1.changes": [1]}, "must be a mapping from paths"),
         ({"phases.2.catch": None}, "must be given where the phase before holds no payload"),
         ({"phases.0.catch": {}}, "and only there"),
+        ({"phases.0.changes": {"base.mass": 100.0}}, "no phase after one that holds the payload"),
+        ({"phases.2.catch": None, "phases.2.changes": {"payload": None}}, "never hold the payload"),
         ({"phases.2.changes": {"target.motion": None, "cost.tip_twist": 0}}, "adds or removes a term"),
         ({"spread.payload_mass": 0.1}, "it can have no spread"),
         ({"payload": None}, "the scene has no payload"),

@@ -89,14 +89,6 @@ def test_only_some_scenes_have_a_payload_that_leaves_the_tip(name, leaves):
             [AT_TARGET, AT_TIP, 2],
         ),
         (
-            staged(
-                "capture-and-detumble",
-                [(3, {}, None), (3, ABSENT, None), (3, ABSENT, None), (3, REST, ALWAYS)],
-            ),
-            [AT_TIP, AT_TARGET, AT_TARGET, 3],
-            [AT_TIP, AT_TARGET, AT_TARGET, AT_TIP],
-        ),
-        (
             staged("release", [(3, ABSENT, None), (3, {}, ALWAYS)]),
             [AT_TARGET, 1],
             [AT_TARGET, AT_TIP],
