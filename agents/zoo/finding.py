@@ -155,14 +155,10 @@ class _OnGoals:
         environment = self._environment
         assert environment is not None
         states, layout = environment.states, environment.kernels.layout
-        seen = states
-        if layout.parameters.moving:  # as in the goal environment
-            velocity = layout.target_velocity_with(environment.stage_parameters)
-            seen = np.concatenate([states, velocity], axis=1)
         parts = {
             "achieved_goal": np.reshape(environment.kernels.tip_pose(states), (len(states), 8)),
             "desired_goal": environment.targets,
-            "observation": seen,
+            "observation": layout.goal_observation(states, environment.stage_parameters),
         }
         single = {name: np.asarray(part, dtype=np.float32) for name, part in parts.items()}
         return self._act(np.concatenate(list(single.values()), axis=1) if self._joined else single)

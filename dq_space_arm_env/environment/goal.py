@@ -69,8 +69,8 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
     | 17-19 | velocity of the base's center of mass, base axes                      | -1e6 | 1e6 | m/s   |
     | 20-22 | rates of joints 1 to 3                                                | -1e6 | 1e6 | rad/s |
 
-    Where the target moves, its twist in its own axes follows, 6 entries in rad/s and m/s, and `desired_goal` is its pose now. A relabeled goal stands for a target
-    that passes there; velocities count in no reward of this environment, nor in its `is_success`.
+    In a scene with phases the number of the phase, from 0, follows. Where the target moves, its twist in its own axes comes last, 6 entries in rad/s and m/s, and
+    `desired_goal` is its pose now. A relabeled goal stands for a target that passes there; velocities count in no reward of this environment, nor in its `is_success`.
 
     q and -q are the same pose. At reset the sign of `achieved_goal`, and with it that of the base's pose, is chosen such that its real part has a non-negative product
     with that of `desired_goal`; it is then carried along by continuity. Rewards do not depend on the sign of either goal.
@@ -170,13 +170,12 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
         self.scene, self.kernels = self._env.scene, self._env.kernels
         self.reward_type, self.render_mode = reward_type, render_mode
         self.metadata = self._env.metadata
-        self._twist_size = 6 if self.scene.target.motion is not None else 0
+        layout = self.kernels.layout
+        seen = layout.goal_observation(layout.initial_state, layout.parameters.nominal)
         self.action_space = self._env.action_space
         self.observation_space: spaces.Space[Any] = spaces.Dict(
             {
-                "observation": self._box(
-                    self.kernels.n_x + self._twist_size, 2 if self.kernels.layout.planar else 4
-                ),
+                "observation": self._box(seen.size, 2 if layout.planar else 4),
                 "achieved_goal": self._box(8, 4),
                 "desired_goal": self._box(8, 4),
             }
@@ -280,7 +279,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
     def _observe(self) -> Observation:
         x, parameters = self._env.state, self._env.stage_parameters
         layout = self.kernels.layout
-        seen = np.append(x, layout.target_velocity_with(parameters)) if self._twist_size else x
+        seen = layout.goal_observation(x, parameters)
         goals = {"achieved_goal": self.kernels.tip_pose(x), "desired_goal": layout.target_with(parameters)}
         return {"observation": seen, **goals}
 

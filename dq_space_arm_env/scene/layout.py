@@ -21,6 +21,7 @@ from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.parameters import (
     CONTROL_UNITS,
     GRASP,
+    PHASE,
     TARGET,
     VELOCITY,
     ControlNumbers,
@@ -238,6 +239,22 @@ class StateLayout:
             velocity[..., PLANAR_TWIST if self.planar else range(6)] = parameters[..., where]
         grasp = _entries(self._pose_with(GRASP, self.grasp, parameters))
         return np.stack(dual_vectors.inverse_transform(*poses.to_matrix(grasp), _entries(velocity)), axis=-1)
+
+    def goal_observation(self, x: Array, parameters: Array) -> Array:
+        """Entry `observation` of the goal environment: the state, then what scenes with phases or motion add.
+
+        Args:
+            x: States, shape (..., n_x), units of `state`.
+            parameters: Of the present stages, shape (..., n_p), units of `parameters`.
+
+        Returns:
+            State, number of the phase, and velocity of a target that moves, in its axes, rad/s and m/s, shape
+            (..., n).
+        """
+        parts = [x, parameters[..., self.parameters.indices(PHASE)]]
+        if self.parameters.moving:
+            parts.append(self.target_velocity_with(parameters))
+        return np.concatenate(parts, axis=-1)
 
     def limits_with(self, parameters: Array) -> Array:
         """Limits of the controls where some may be parameters.

@@ -153,6 +153,20 @@ def test_dynamics_costs_and_draws_are_those_of_the_environment_without_goals():
         assert info == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize(("name", "more"), [("release", 1), ("capture-and-detumble", 7), ("tracking", 6)])
+def test_the_observation_has_the_phase_and_the_velocity_of_the_target(name, more):
+    env = make(short(name))
+    observation, info = env.reset(seed=3)
+    over = False
+    while not over:
+        seen, n_x = observation["observation"], env.kernels.n_x
+        assert len(seen) == n_x + more
+        np.testing.assert_array_equal(seen[n_x : n_x + more % 6], [info["phase"]] if more % 6 else [])
+        velocity = env.kernels.layout.target_velocity_with(env._env.stage_parameters)
+        np.testing.assert_array_equal(seen[len(seen) - more // 6 * 6 :], velocity[: more // 6 * 6])
+        observation, _, _, over, info = env.step(np.zeros(env.action_space.shape))
+
+
 def test_the_goal_is_the_target_of_the_episode():
     env = make(DRAWN)
     goals = []
