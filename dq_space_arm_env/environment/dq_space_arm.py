@@ -226,9 +226,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self.observation_space = self._make_observation_space()
         self._begun, self._over = False, True
         self._trail: list[Array] = []
-        self._payloads: Payloads | None = None
-        if render_mode is not None and leaves_tip(self.scene):
-            self._payloads = Payloads(self.kernels, 1)
+        self._payloads = Payloads(self.kernels, 1) if leaves_tip(self.scene) else None
         self._renderer: Renderer | None = None
 
     def _make_observation_space(self) -> spaces.Space[Array]:
@@ -313,8 +311,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
         Returns:
             Arrays by name, for `set_state`, of this environment or another of the same scene: the state "x", shape (n_x,); "memory" of the
-            step (number, sign of the error, stage cost), and "parameters";
-            whether the episode is "over"; and the state of the random "generator". `ResetNeeded` before the first reset.
+            step (number, sign of the error, stage cost), and "parameters"; in scenes that let a payload go "adrift", shape (15,), its pose and
+            twist then, see `Payloads`; whether the episode is "over"; and the state of the random "generator". `ResetNeeded` before the first reset.
         """
         self._require_reset("get_state()")
         state = {**self._kept(), "over": np.array(self._over)}
@@ -337,14 +335,15 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             "generator": np.empty(4, np.uint64),
         }
         found = checked_state(state, expected)
+        self._begin_trail()
         for name, array in self._kept().items():
             array[...] = found[name]
         self._begun, self._over = True, bool(found["over"])
         self.np_random = generator_of(found["generator"])
-        self._begin_trail()
 
     def _kept(self) -> dict[str, Array]:
-        return {"x": self._x, "memory": self._memory, "parameters": self._parameters}
+        kept = {"x": self._x, "memory": self._memory, "parameters": self._parameters}
+        return kept if self._payloads is None else {**kept, "adrift": self._payloads.adrift[0]}
 
     def _require_reset(self, what: str) -> None:
         if not self._begun:
@@ -381,6 +380,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         if over and np.isnan(self._action).any():
             raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
         self._over = over
+        if self._payloads is not None and self._memory[0] in self._payloads.releases:
+            self._payloads.follow(self._x[None], self._memory[None])
         if self.render_mode is not None:
             self._show()
         if self._more_names:
@@ -451,16 +452,14 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         self._begin_trail()
 
     def _begin_trail(self) -> None:
-        """Forget what pictures show of the past."""
+        """Forget what was before, which pictures show."""
         self._trail = []
         if self._payloads is not None:
-            self._payloads.forget(_ROW)
+            self._payloads.adrift[:] = np.nan
 
     def _show(self) -> None:
         """Extend the tip's trail, and update the window."""
         self._trail.append(np.array(poses.position(self.kernels.tip_pose(self._x).tolist())))
-        if self._payloads is not None:
-            self._payloads.follow(self._x[None], self._memory[None])
         if self.render_mode == "human":
             self.render()
 

@@ -126,9 +126,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         self._over = _NONE  # rows whose episodes are over, to be reset by the next step or the caller
         self._seen = np.zeros(self.observation_space.shape or (), self.kernels.dtype) if disabled else None
         self._trails = None if render_mode is None else Trails(num_envs)
-        self._payloads: Payloads | None = None
-        if render_mode is not None and leaves_tip(self.scene):
-            self._payloads = Payloads(self.kernels, num_envs)
+        self._payloads = Payloads(self.kernels, num_envs) if leaves_tip(self.scene) else None
         self._renderer: Renderer | None = None
 
     @property
@@ -176,6 +174,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             self._seed(seed, rows)
             self._envs.begin(rows, starts)
             self._over = np.setdiff1d(self._over, rows)
+            self._begin_trails(rows)
+            self._extend_trails()
         else:
             self.set_state(self._given_state(saved, rows), rows)
             self._seed(seed, rows)
@@ -186,8 +186,6 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             result.observation[others] = self._seen[others]
         result.report[:, others], result.flags[:, others] = 0.0, False
         self._remember(result.observation)
-        self._begin_trails(rows)
-        self._extend_trails()
         return result.observation, self._info(result, mask)
 
     def _remember(self, observations: Array) -> None:
@@ -367,16 +365,18 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             raise ResetNeeded("the other episodes have not begun: call reset() before set_state() of some")
         kept = self._kept()
         found = checked_state(state, {name: array[chosen] for name, array in kept.items()})
+        self._begin_trails(chosen)
         for name, array in kept.items():
             array[chosen] = found[name]
         self._begun, self._over = True, np.flatnonzero(kept["over"])
-        self._begin_trails(chosen)
         self._extend_trails()
 
     def _kept(self) -> dict[str, Array]:
         """Arrays that all later steps depend on; "over" is made anew."""
-        over = np.isin(np.arange(self.num_envs), self._over)
-        return {**self._envs.kept(), "over": over, **({} if self._seen is None else {"seen": self._seen})}
+        kept = {**self._envs.kept(), "over": np.isin(np.arange(self.num_envs), self._over)}
+        if self._payloads is not None:
+            kept["adrift"] = self._payloads.adrift
+        return kept if self._seen is None else {**kept, "seen": self._seen}
 
     def _given_state(self, state: Any, rows: Rows) -> Any:
         """The option "state" for some sub-environments; that of a single environment is the same for all."""
@@ -413,14 +413,14 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         self._envs.observe(rows, result)
 
     def _begin_trails(self, rows: Rows) -> None:
-        """Forget what pictures show of the past of some episodes."""
+        """Forget what was before in some episodes, which pictures show."""
         if self._trails is not None:
             self._trails.begin(rows)
         if self._payloads is not None:
-            self._payloads.forget(rows)
+            self._payloads.adrift[rows] = np.nan
 
     def _extend_trails(self) -> None:
-        """Keep what later pictures show of the present."""
+        """Keep what later pictures show of the present, and where payloads are let go."""
         if self._trails is not None:
             tips = self.kernels.tip_pose(self._envs.x)
             self._trails.append(np.array(poses.position(tips.T)).T)

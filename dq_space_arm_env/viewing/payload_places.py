@@ -6,8 +6,7 @@ let go keeps the twist that it had: it moves by q exp(t xi).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -111,32 +110,25 @@ def _drifted(pose: Any, twist: Any, times: Array) -> FloatArray:
     return np.stack(np.broadcast_arrays(*dual_quaternion.multiply(pose, moved)), axis=-1)
 
 
-class _LetGo(NamedTuple):
-    """What a drifting payload has begun with."""
-
-    stage: int
-    pose: Array  # shape (8,), dimensionless and m
-    twist: Array  # in its own axes, angular then linear, shape (6,), rad/s and m/s
-
-
 class Payloads:
-    """Places of the payloads of `count` running episodes."""
+    """Places of the payloads of `count` running episodes.
+
+    Attributes:
+        releases: First stages of the phases in which the tip lets it go.
+        adrift: What each payload that the tip has let go began with, shape (count, 15): stage; pose,
+            dimensionless and m; twist in its own axes, rad/s and m/s. NaN where there is none.
+    """
 
     def __init__(self, kernels: Kernels, count: int) -> None:
         scene = kernels.scene
         self._kernels, self._starts, self._may_miss = kernels, scene.staged.starts, any(scene.staged.catches)
         self._places_by_phase = payload_places(scene)
-        self._releases = {start for start, mass in zip(self._starts, _masses(scene), strict=True) if not mass}
-        self._let_go: list[_LetGo | None] = [None] * count
-
-    def forget(self, rows: Iterable[int]) -> None:
-        """Forget where payloads were let go: other episodes have begun.
-
-        Args:
-            rows: Numbers of these episodes.
-        """
-        for row in rows:
-            self._let_go[row] = None
+        self.releases = tuple(
+            start
+            for phase, (start, mass) in enumerate(zip(self._starts, _masses(scene), strict=True))
+            if not mass and phase in self._places_by_phase[:, phase]
+        )
+        self.adrift: FloatArray = np.full((count, 15), np.nan)
 
     def follow(self, x: Array, memory: Array) -> None:
         """Keep where payloads are let go.
@@ -145,12 +137,12 @@ class Payloads:
             x: States after a step, shape (count, n_x), units of the state.
             memory: What the step hands to the next, shape (count, n).
         """
-        for row, stage in enumerate(memory[:, 0].astype(int).tolist()):
-            if stage in self._releases:
-                place = self._places(memory[row : row + 1])[0]
-                if place >= 0 and self._starts[place] == stage:
-                    pose, twist = self._kernels.tip_pose(x[row]), self._kernels.tip_twist(x[row])
-                    self._let_go[row] = _LetGo(stage, pose, twist)
+        rows = np.flatnonzero((memory[:, :1] == self.releases).any(axis=1))
+        if len(rows):  # of which some may have missed it before
+            places = self._places(memory[rows])
+            rows = rows[(places >= 0) & (np.take(self._starts, places) == memory[rows, 0])]
+            poses, twists = self._kernels.tip_pose(x[rows]), self._kernels.tip_twist(x[rows])
+            self.adrift[rows] = np.column_stack([memory[rows, 0], poses, twists])
 
     def poses(self, memory: Array, parameters: Array, targets: Array) -> list[Array | None]:
         """Poses of the payloads' frames now; None at the tip.
@@ -170,11 +162,11 @@ class Payloads:
             elif place == AT_TARGET:
                 found.append(targets[row])
             else:
-                begun = self._let_go[row] or self._expected(int(place), parameters[row])
-                self._let_go[row] = begun
-                seconds = (memory[row, 0] - begun.stage) * self._kernels.scene.simulation.dt
-                pose, twist = tuple(begun.pose.tolist()), tuple(begun.twist.tolist())
-                found.append(_drifted(pose, twist, np.array([seconds]))[0])
+                begun = self.adrift[row]
+                if np.isnan(begun[0]):
+                    begun = self._missed(int(place), parameters[row])
+                seconds = (memory[row, :1] - begun[0]) * self._kernels.scene.simulation.dt
+                found.append(_drifted(tuple(begun[1:9].tolist()), tuple(begun[9:].tolist()), seconds)[0])
         return found
 
     def _places(self, memory: Array) -> NDArray[np.intp]:
@@ -182,9 +174,9 @@ class Payloads:
         phases = _phases_at(self._starts, memory[:, 0])
         return np.asarray(self._places_by_phase[caught.astype(int), phases])
 
-    def _expected(self, phase: int, parameters: Array) -> _LetGo:
-        """A payload that was missed, or let go unseen: it was where the target was a step before."""
-        kernels = self._kernels
-        stage = self._starts[phase] - 1
+    def _missed(self, phase: int, parameters: Array) -> FloatArray:
+        """A payload that was missed as a phase began: it was where the target was a step before."""
+        kernels, stage = self._kernels, self._starts[phase] - 1
         row = kernels.stage_parameters(parameters)[stage]
-        return _LetGo(stage, kernels.layout.target_with(row), kernels.layout.target_velocity_with(row))
+        layout = kernels.layout
+        return np.array([stage, *layout.target_with(row), *layout.target_velocity_with(row)])

@@ -181,16 +181,39 @@ def test_pictures_show_the_payload_where_it_is(scene):
         assert np.abs(np.diff(path, axis=0)).max() < 0.05
 
 
-def test_a_saved_state_is_drawn_where_the_payload_should_have_been_let_go():
-    env = flown(RELEASE)[0]
-    picture, rows = env.render(), env.kernels.stage_parameters(env.parameters)
-    env.set_state(env.get_state())
-    again = DQSpaceArmEnv(RELEASE, render_mode="rgb_array", **SIZE)
-    again.set_state(env.get_state())
-    np.testing.assert_array_equal(env.render(), again.render())
-    assert (env.render() != picture).any()
-    payload = env._payloads.poses(env._memory[None], env.parameters[None], env.target[None])[0]
-    np.testing.assert_allclose(payload, env.kernels.layout.target_with(rows[1]), atol=1e-12)
+@pytest.mark.parametrize("scene", [MISSED, RELEASE], ids=["missed", "released"])
+def test_a_saved_state_has_the_payload_where_it_was(scene):
+    """Whether or not pictures are drawn, alone or in a batch, now and later."""
+    env, venv = DQSpaceArmEnv(scene), DQSpaceArmVectorEnv(2, scene)
+    others = DQSpaceArmEnv(scene, render_mode="rgb_array", **SIZE), DQSpaceArmVectorEnv(2, scene)
+    env.reset(seed=3)
+    venv.reset(seed=[3, 4])
+    actions = np.random.default_rng(0).uniform(
+        -1.0, 1.0, (scene.simulation.steps - 1, *env.action_space.shape)
+    )
+    for action in actions[:5]:
+        env.step(action)
+        venv.step(np.tile(action, (2, 1)))
+    others[0].reset(options={"state": env.get_state()})
+    others[1].reset(options={"state": venv.get_state()})
+    for action in actions[5:]:
+        for each in (env, others[0]):
+            each.step(action)
+        for each in (venv, others[1]):
+            each.step(np.tile(action, (2, 1)))
+        at, beside = (
+            np.array(each._payloads.poses(memory, np.atleast_2d(each.parameters), targets))
+            for each, memory, targets in (
+                (env, env._memory[None], env.target[None]),
+                (venv, venv._envs.kept()["memory"], venv.targets),
+            )
+        )
+        np.testing.assert_array_equal(at[0], beside[0])
+        for each, other in zip((env, venv), others, strict=True):
+            state, restored = each.get_state(), other.get_state()
+            for name, array in state.items():
+                np.testing.assert_array_equal(array, restored[name])
+        assert np.isnan(env.get_state()["adrift"]).all() == (scene is MISSED)
 
 
 @pytest.mark.parametrize("scene", [MISSED, RELEASE], ids=["missed", "released"])
