@@ -81,7 +81,10 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     last = builder.sub(end, INDEX(1))
     rows = [arrays.row_number(_clamped(builder, row, lane, last)) for lane in range(target.lanes)]
     access = {dtype: ArrayAccess(vectors, dtype) for dtype in ELEMENTS}
+    read = program.read_buffers()
     for buffer in program.inputs:
+        if buffer.name not in read:
+            continue
         lanes = arrays.rows_of(buffer, rows, target)
         element = access[buffer.dtype or target.precision]
         element.gather(lanes, blocks[buffer.name], buffer.size, shared=buffer.shared)

@@ -132,6 +132,15 @@ class Program:
             known.update(call.bindings.get(name, name) for name, _ in call.graph.outputs)
         return early
 
+    def read_buffers(self) -> set[str]:
+        """Buffers of which some call reads an entry, or that are outputs as they are."""
+        found = {buffer.name for buffer in self.outputs}
+        for call in self.calls:
+            slots = {node.slot[0] for node in call.graph.nodes if node.operation == "input"}
+            names = (call.graph.inputs[slot][0] for slot in slots)
+            found.update(call.bindings.get(name, name) for name in names)
+        return found
+
     def lifetimes(self) -> dict[str, Lifetime]:
         """Lifetimes of the buffers: inputs from the start, outputs to the end, initial zeros always."""
         end = len(self.calls)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import dual_quaternion as dq
-from dq_space_arm_env.algebra import dual_vectors, poses, quaternion, rotations, screw
+from dq_space_arm_env.algebra import dual_vectors, rotations, screw
 from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale, transposed_matrix_vector
 from dq_space_arm_env.scene.motion import ScrewMotion, Tumbling, Waypoints
 from dq_space_arm_env.scene.pose import Matrix3
@@ -44,12 +44,12 @@ def advanced(
     """Pose and velocity of the body after h seconds, from those before; over plain scalars."""
     if isinstance(motion, ScrewMotion):
         return dq.multiply(pose, screw.exponential(dual_vectors.scale(h, velocity))), velocity
-    rotation, position = poses.to_rotation_and_position(pose)
-    linear = matrix_vector(rotations.to_matrix(rotation), velocity[3:])
-    turned, angular = _turned(motion.inertia, velocity[:3], h)
-    attitude = quaternion.multiply(rotation, rotations.exponential(turned))
-    moved = poses.from_rotation_and_position(attitude, add(position, scale(h, linear)))
-    return moved, (*angular, *transposed_matrix_vector(rotations.to_matrix(attitude), linear))
+    vector, angular = _turned(motion.inertia, velocity[:3], h)
+    turn = rotations.exponential(vector)
+    # First it moves, in its present axes, then it turns.
+    moved = dq.multiply(pose, (1.0, 0.0, 0.0, 0.0, 0.0, *scale(0.5 * h, velocity[3:])))
+    linear = transposed_matrix_vector(rotations.to_matrix(turn), velocity[3:])
+    return dq.multiply(moved, (*turn, 0.0, 0.0, 0.0, 0.0)), (*angular, *linear)
 
 
 def _turned(inertia: Matrix3, angular: Scalars, h: Scalar) -> tuple[Scalars, Scalars]:

@@ -25,6 +25,7 @@ import casadi
 
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
+from dq_space_arm_env.algebra.vectors import norm
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.equations_of_motion import Motion
@@ -70,9 +71,7 @@ class SceneEquations:
         target: Scalars = body_pose(scene, given)
         velocity: Scalars = body_velocity(scene, given)
         if has_grasp(scene):
-            grasp = list(scene.target.grasp.dual_quaternion)
-            for number, index in zip(grasp_numbers(scene), target_entries(scene), strict=True):
-                grasp[index] = given.get(number.name, number.nominal)
+            grasp = grasp_pose(scene, given)
             target = dq.multiply(target, grasp)
             velocity = dual_vectors.inverse_transform(*poses.to_matrix(grasp), velocity)
         chain = Chain.from_scene(scene, given)
@@ -126,16 +125,15 @@ class SceneEquations:
 
     def tip_twist(self, motion: Motion, wrist_rates: Scalars | None = None) -> Scalars:
         """Twist of the tip in its axes, 6."""
-        columns = kinematics.tip_jacobian(self.chain, motion.joint_angles, motion.wrist_angles)
-        rates = [*motion.angular, *motion.linear, *motion.joint_rates, *(wrist_rates or ())]
-        # Without wrist rates, the wrist's columns are left over.
-        pairs = list(zip(columns, rates, strict=False))
-        return tuple(total([column[i] * rate for column, rate in pairs]) for i in range(6))
+        base = (*motion.angular, *motion.linear)
+        angles = motion.joint_angles, motion.wrist_angles
+        return kinematics.tip_twist(self.chain, *angles, base, motion.joint_rates, wrist_rates)
 
     def target_twist(self, tip: Scalars) -> Scalars:
-        """Twist of the target in the axes of a tip, 6: Ad(q_{G/D}*) w^D."""
-        pose = dq.multiply(dq.conjugate(self.target), tip)
-        return dual_vectors.inverse_transform(*poses.to_matrix(pose), self.target_velocity)
+        """Twist of the target in the axes of a tip, 6: Ad(q_{D/G}) w^D, with the error pose observed."""
+        return dual_vectors.transform(
+            *poses.to_matrix(poses.error_pose(tip, self.target)), self.target_velocity
+        )
 
     def _pose_cost(self, x: Scalars, field: str) -> Scalar:
         return weighted_square(self.tip(x), self.target, self.state_weights(field))
@@ -183,6 +181,8 @@ class SceneEquations:
             time_left,
         ]
         errors = [poses.error_angle(tip, self.target), poses.error_distance(tip, self.target)]
+        if self.scene.target.motion is not None:  # the target's twist has the error's position computed
+            errors[1] = norm(poses.position(poses.error_pose(tip, self.target)))
         return {"observation": observation, "errors": errors}
 
 
@@ -190,6 +190,14 @@ def body_pose(scene: Scene, given: Mapping[str, Scalar]) -> list[Scalar]:
     """Pose of the target's body q_{T/I}, 8 numbers, where some may be given by name."""
     pose: list[Scalar] = list(scene.target.pose.dual_quaternion)
     for number, index in zip(target_numbers(scene), target_entries(scene), strict=True):
+        pose[index] = given.get(number.name, number.nominal)
+    return pose
+
+
+def grasp_pose(scene: Scene, given: Mapping[str, Scalar]) -> list[Scalar]:
+    """Grasp frame in the target's body q_{D/T}, likewise."""
+    pose: list[Scalar] = list(scene.target.grasp.dual_quaternion)
+    for number, index in zip(grasp_numbers(scene), target_entries(scene), strict=False):
         pose[index] = given.get(number.name, number.nominal)
     return pose
 

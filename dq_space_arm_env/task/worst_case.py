@@ -16,12 +16,12 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra import poses, quaternion
 from dq_space_arm_env.algebra.vectors import dot, matrix_vector, norm, subtract
 from dq_space_arm_env.dynamics.chain import RigidBody
 from dq_space_arm_env.scene.motion import Tumbling, Waypoints
 from dq_space_arm_env.scene.path import given_path
-from dq_space_arm_env.task.equations import SceneEquations, body_pose, body_velocity, total
+from dq_space_arm_env.task.equations import SceneEquations, body_pose, body_velocity, grasp_pose, total
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -54,8 +54,9 @@ class WorstCase:
         drift = moving + duration * (norm(self.inputs.force) + norm(wrench[:3])) / self.mass
         # The dual part of a pose has half the length of its position; unit quaternions are at most 2 apart.
         start, target = (norm(poses.position(pose)) for pose in (equations.base_pose(x), equations.target))
-        if equations.scene.target.motion is not None:
-            target = target + self._target_way(duration)
+        if equations.scene.target.motion is not None:  # its body is at |r| = 2 |q_d|
+            body = body_pose(equations.scene, equations.given)
+            target = 2.0 * quaternion.norm(body[4:]) + self._target_way(duration)
         gaps = 2.0, 0.5 * (start + target + duration * drift + 2.0 * self.reach)
         references = equations.scene.target.base_velocity
         speeds = (
@@ -74,11 +75,11 @@ class WorstCase:
         return steps * stage + state_cost("terminal_pose", "terminal_base_velocity", "terminal_tip_twist")
 
     def _target_way(self, duration: Scalar) -> Scalar:
-        """Bound of the way from where the target is now."""
+        """Bound of the way of the target from where its body is now."""
         motion, grasp = self.equations.scene.target.motion, self._grasp_length()
         if isinstance(motion, Waypoints):  # all of them lie within this distance of the first
             return 2.0 * (np.linalg.norm(self._given_places(), axis=1).max() + grasp)
-        return duration * norm(self._target_velocity()[3:]) + 2.0 * grasp
+        return duration * norm(self._target_velocity()[3:]) + grasp
 
     def _target_speeds(self) -> tuple[Scalar, Scalar]:
         """Bounds of angular velocity and velocity of the target."""
@@ -107,8 +108,7 @@ class WorstCase:
         return body_velocity(self.equations.scene, self.equations.given)
 
     def _grasp_length(self) -> Scalar:
-        body = body_pose(self.equations.scene, self.equations.given)
-        return norm(subtract(poses.position(self.equations.target), poses.position(body)))
+        return norm(poses.position(grasp_pose(self.equations.scene, self.equations.given)))
 
     def _given_places(self) -> NDArray[np.float64]:
         """Places of a target that passes waypoints, relative to its start, shape (steps + 1, 3)."""

@@ -39,6 +39,16 @@ def evaluate(function, size_out, lanes, x, precision="float64"):
     return y
 
 
+def test_an_input_that_no_call_reads_is_not_loaded():
+    def loads(inputs):
+        program = Program("program", inputs, [Buffer("y", 1)])
+        program.call(trace("graph", {"x": 2}, lambda x: {"y": [x[0] + x[1]]}))
+        return assembly(program, 1).count(" load ")
+
+    x, unread = Buffer("x", 2), Buffer("unread", 3)
+    assert loads([x, unread]) == loads([x]) + 1, "its address"
+
+
 def everything(x):
     a, b, c = x
     smaller, both, either = a < b, casadi.logic_and(a < b, b <= c), casadi.logic_or(a == b, a != c)

@@ -430,3 +430,17 @@ def test_a_target_too_fast_for_observations_is_refused() -> None:
     scene = scene_of("screw", **{"target.motion.linear_velocity": [1e8, 0, 0]})
     with pytest.raises(ValueError, match=r"target\.motion: 1e\+08 m"):
         DQSpaceArmEnv(scene)
+
+
+@pytest.mark.parametrize(("name", "most"), [("tracking", 1.06), ("tumbling-target", 1.1)])
+def test_a_target_that_moves_adds_few_operations(name: str, most: float) -> None:
+    scene = load_scene(name)
+    rest = {
+        "target.motion": None,
+        "spread.target_angular_velocity": 0.0,
+        "spread.target_linear_velocity": 0.0,
+    }
+    moving, fixed = (
+        compile_scene(each).operation_count("environment_step") for each in (scene, scene.replace(rest))
+    )
+    assert moving < most * fixed
