@@ -14,6 +14,17 @@ from experts.problems.arm_problem import in_double_precision
 from experts.problems.shooting_problem import FloatArray, Kernel, StageParameters
 
 
+def beyond_the_paper(scene: Scene) -> list[str]:
+    """What a scene asks for beyond the paper's cost of one target pose at rest, in words for a sentence."""
+    cost = scene.cost
+    asked = {
+        "a target that moves (target.motion)": scene.target.motion is not None,
+        "phases": bool(scene.phases),
+        "weights of the tip's twist": any(cost.tip_twist) or any(cost.terminal_tip_twist),
+    }
+    return [words for words, applies in asked.items() if applies]
+
+
 class PaperProblem:
     """A scene in the paper's formulation, stepped by classical Runge-Kutta; a `ShootingProblem`."""
 
@@ -30,8 +41,14 @@ class PaperProblem:
 
         Raises:
             SceneError: If the scene cannot be loaded.
+            ValueError: If it asks for what the paper's cost does not have.
         """
         self.scene = in_double_precision(load_scene(scene))
+        if more := beyond_the_paper(self.scene):
+            raise ValueError(
+                f"scene {self.scene.name!r} has {' and '.join(more)}: the paper's formulation knows only a "
+                "target at rest"
+            )
         self.kernels = compile_scene(self.scene)
         layout = self.kernels.layout
         self.initial_state = self.from_minimal(layout.initial_state)

@@ -13,6 +13,7 @@ from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
 from experts import BoxDDP
 from experts.problems.arm_problem import ArmProblem
+from experts.problems.paper_problem import PaperProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.peers import crocoddyl_maneuver, crocoddyl_peer
 from scripts.benchmarks.peers.crocoddyl_maneuver import CrocoddylManeuver
@@ -246,10 +247,35 @@ def test_crocoddyl_refuses_weights_that_its_residual_has_not(crocoddyl: Any) -> 
 
 @pytest.mark.parametrize(
     ("name", "reason"),
-    [("planar", "a planar base"), ("free-floating", "parts without an actuator"), ("tip-load", "a wrench")],
+    [
+        ("planar", "a planar base"),
+        ("free-floating", "parts without an actuator"),
+        ("tip-load", "a wrench"),
+        ("tracking", "a target that moves"),
+        ("refuelling", "phases"),
+    ],
 )
 def test_crocoddyl_is_left_out_with_a_sentence(name: str, reason: str) -> None:
     sentence = crocoddyl_maneuver.obstacle(ArmProblem(name))
     assert sentence is not None
     assert reason in sentence
     assert crocoddyl_maneuver.obstacle(ArmProblem("paper")) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "more"), [("tracking", "a target that moves"), ("release", "phases or weights of the tip's")]
+)
+def test_what_knows_a_target_at_rest_only_refuses_more(name: str, more: str) -> None:
+    scene = load_scene(name)
+    with pytest.raises(ValueError, match=f"IPOPT is left out: it is not given {more}"):
+        transcribe(scene)
+    with pytest.raises(ValueError, match="formulation knows only a target at rest"):
+        PaperProblem(scene)
+
+
+def test_the_papers_formulation_brings_the_tip_to_a_grasp_frame() -> None:
+    grasp = {"position": [-0.3, 0.0, 0.1], "rotation": {"axis": [0, 0, 1], "angle": 20}}
+    scene = load_scene("paper").replace({"target.grasp": grasp, "simulation.steps": 5})
+    problems = PaperProblem(scene), ArmProblem(scene)
+    costs = [BoxDDP(problem, max_iterations=1).solve().cost for problem in problems]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-6)

@@ -30,7 +30,7 @@ class PaperPrograms:
         self.scene = scene
         self.layout = StateLayout.of(scene)
         nominal = SceneEquations.of(scene, self.layout.parameters.nominal.tolist())
-        self.field = PaperField(nominal.field)
+        self.field, self.target = PaperField(nominal.field), nominal.target
 
     def build(self, name: str) -> Program:
         """Trace a program by name.
@@ -128,12 +128,11 @@ class PaperPrograms:
     def _state_weights(self, pose: Scalars, velocity: Scalars) -> tuple[list[float], list[float]]:
         """References and weights of every entry of the state."""
         references, weights = [0.0] * self.field.n_x, [0.0] * self.field.n_x
-        target = self.scene.target
         tip = range(self.field.tip.start, self.field.tip.stop)
-        for index, reference, weight in zip(tip, target.pose.dual_quaternion, pose, strict=True):
+        for index, reference, weight in zip(tip, self.target, pose, strict=True):
             references[index], weights[index] = reference, weight
         for index, reference, weight in zip(
-            self.field.base_twist, target.base_velocity, velocity, strict=True
+            self.field.base_twist, self.scene.target.base_velocity, velocity, strict=True
         ):
             references[index], weights[index] = reference, weight
         return references, weights

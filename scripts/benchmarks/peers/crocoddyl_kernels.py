@@ -21,8 +21,10 @@ import numpy as np
 
 from experts.problems.casadi_problem import CasadiProblem
 from experts.problems.shooting_problem import FloatArray
-from scripts.benchmarks.peers.crocoddyl_peer import INITIAL_REGULARIZATION, TOLERANCE
 
+TOLERANCE = 1e-7
+"""Converged when a step promises less than this decrease, relative to the cost; that of `BoxDDP`."""
+INITIAL_REGULARIZATION = 1e2
 METHODS = ("SolverBoxDDP", "SolverBoxFDDP")
 _KERNELS = (
     "step_with_cost",

@@ -32,6 +32,7 @@ import numpy as np
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics.chain import Chain
 from experts.problems.arm_problem import ArmProblem
+from experts.problems.paper_problem import beyond_the_paper
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.peers.pinocchio_peer import PinocchioPeer
 from scripts.benchmarks.peers.robot import Robot
@@ -54,7 +55,7 @@ def obstacle(problem: ArmProblem) -> str | None:
         "springs or dampers": any(link.stiffness or link.damping for link in chain.links),
         "a wrench at the tip": chain.tip_wrench is not None,
     }
-    found = [reason for reason, applies in reasons.items() if applies]
+    found = [reason for reason, applies in reasons.items() if applies] + beyond_the_paper(problem.scene)
     return f"Crocoddyl is left out: it is not given {' or '.join(found)}." if found else None
 
 
@@ -211,7 +212,7 @@ class CrocoddylManeuver:
         return self._crocoddyl.CostModelResidual(self._state, activation, residual)
 
     def _pose_cost(self, weights: FloatArray) -> Any:
-        target = self._problem.scene.target.pose.dual_quaternion
+        target = tuple(self._problem.target.tolist())
         if self._exact_pose_cost:
             residual = _exact_residual(self._state, self._tip, np.array(target))
             return self._quadratic(residual, weights)

@@ -21,13 +21,11 @@ import numpy as np
 
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
+from scripts.benchmarks.peers.crocoddyl_kernels import INITIAL_REGULARIZATION, TOLERANCE
 from scripts.benchmarks.peers.crocoddyl_maneuver import CrocoddylManeuver
 from scripts.benchmarks.solvers.runs import SolverRun, costs_of
 
 METHODS = {"box_ddp": "SolverBoxDDP", "box_fddp": "SolverBoxFDDP"}
-TOLERANCE = 1e-7
-"""Converged when a step promises less than this decrease, relative to the cost; that of `BoxDDP`."""
-INITIAL_REGULARIZATION = 1e2
 _REPETITIONS = 7
 
 

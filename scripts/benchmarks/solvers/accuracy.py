@@ -14,6 +14,7 @@ import numpy as np
 from experts.ddp.second_order import SecondOrder
 from experts.guesses.guided import GuidedDDP
 from experts.problems.arm_problem import ArmProblem
+from experts.problems.paper_problem import beyond_the_paper
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim, note
@@ -148,6 +149,8 @@ def contenders(
         notes.append("The paper's formulation is left out.")
     elif problem.scene.simulation.integrator != "rk4":
         notes.append("The paper's formulation is compared with RK4 only, which steps it.")
+    elif more := beyond_the_paper(problem.scene):
+        notes.append(f"The paper's formulation is left out: it has no {' or '.join(more)}.")
     else:
         found.append(Contender(PAPERS_STATES, papers_states(problem, limit)))
     if not effort.peers:
@@ -196,4 +199,6 @@ def _ipopt(problem: ArmProblem, effort: Effort) -> tuple[list[Contender], list[s
         return [], ["IPOPT is left out: it is not installed."]
     if not effort.slow_peers:
         return [], ["IPOPT is left out: it takes minutes; --set slow_peers=true or --full have it."]
+    if more := beyond_the_paper(problem.scene):
+        return [], [f"IPOPT is left out: it is not given {' or '.join(more)}."]
     return [Contender("IPOPT", partial(ipopt_peer.solve_with_ipopt, problem), is_slow=True)], []
