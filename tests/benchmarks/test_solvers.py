@@ -36,6 +36,7 @@ from scripts.benchmarks.solvers.runs import (
     time_to_gap,
     uninterrupted,
 )
+from scripts.benchmarks.solvers.tracking import measure_tracking
 
 SHORT = replace(QUICK, piece_repeats=1, horizons=(10,))
 
@@ -282,3 +283,11 @@ def test_flights_have_every_horizon_and_disturbance(problem: ArmProblem) -> None
     assert flights[0]["cost"] == pytest.approx(flights[0]["open_loop_cost"], rel=1e-5)
     assert len(select(rows, table="claims")) == 2
     assert shortcomings(rows) == []
+
+
+def test_the_tip_follows_a_target_that_the_papers_formulation_cannot() -> None:
+    rows = list(measure_tracking())
+    assert [row["status"] for row in rows if row["table"] == "claims"] == ["handled", "handled"]
+    late = next(row for row in rows if row["time"] == "14")
+    assert late["distance_mm"] < 1.0 < 100.0 < late["fixed_distance_mm"]
+    assert late["angle_deg"] < 0.05 < 10.0 < late["fixed_angle_deg"]

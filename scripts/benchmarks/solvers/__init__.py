@@ -5,6 +5,7 @@ iterations      what an iteration costs, whole and in pieces
 accuracy        how soon solvers come close to the best known cost, from the same start
 random_starts   how often the expert converges, succeeds, and finds the best known minimum
 receding        the receding-horizon expert under disturbances
+tracking        the tip's error behind a target that moves, beside the paper's formulation
 own_problems    problems of one's own: cart-pole and planar quadrotor, beside Crocoddyl
 """
 
@@ -28,9 +29,17 @@ from scripts.benchmarks.solvers.own_problems import measure_own_problems
 from scripts.benchmarks.solvers.random_starts import draw_starts, measure_starts
 from scripts.benchmarks.solvers.receding import measure_flights
 from scripts.benchmarks.solvers.runs import GAPS, Search, uninterrupted
+from scripts.benchmarks.solvers.tracking import measure_tracking
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
 
-ITERATIONS, ACCURACY, STARTS, HORIZON, OWN = PARTS = ("iterations", "accuracy", "starts", "horizon", "own")
+ITERATIONS, ACCURACY, STARTS, HORIZON, TRACKING, OWN = PARTS = (
+    "iterations",
+    "accuracy",
+    "starts",
+    "horizon",
+    "tracking",
+    "own",
+)
 
 
 def measure(effort: Effort) -> Iterator[Row]:
@@ -67,6 +76,8 @@ def measure(effort: Effort) -> Iterator[Row]:
                 yield from measure_starts(problem, guided, seconds, effort)
         if HORIZON in parts:
             yield from measure_flights(ArmProblem(scene), effort)
+    if TRACKING in parts:
+        yield from measure_tracking()
     if OWN in parts:
         yield from measure_own_problems(effort)
 
@@ -185,6 +196,19 @@ BENCHMARK = Benchmark(
                 Column("open_loop_cost", "plan's\ncontrols", ".6g"),
                 Column("attitude_error_deg", "error\ndeg"),
                 Column("position_error_m", "error\nm"),
+            ),
+            by=("scene",),
+        ),
+        Table(
+            "tracking",
+            "Scene {scene}: error of the tip over time\nfixed: the paper's formulation, its target at rest "
+            "where it is halfway",
+            (
+                Column("time", "time, s"),
+                Column("angle_deg", "angle,\ndeg", ".2g"),
+                Column("distance_mm", "distance,\nmm", ".2g"),
+                Column("fixed_angle_deg", "fixed:\nangle", ".2g"),
+                Column("fixed_distance_mm", "fixed:\ndistance", ".2g"),
             ),
             by=("scene",),
         ),
