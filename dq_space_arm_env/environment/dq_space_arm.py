@@ -105,6 +105,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | `terminal_cost_pose`          | as `cost_pose`, at the end; 0 before                   | 150                                  |
     | `terminal_cost_base_velocity` | as `cost_base_velocity`, at the end; 0 before          | 1                                    |
 
+    omega_D is the scene's `target.base_velocity`, which may be relative to a target that moves (`target.base_velocity_relative`).
+
     Scenes may weigh the tip's twist relative to the target; `info` then has these terms too:
 
     | Term (key in `info`)          | Formula                                                | Weight                               |

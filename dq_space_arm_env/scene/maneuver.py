@@ -86,6 +86,12 @@ class Target(Model):
         default=_ZERO_TWIST,
         description="desired velocity of the base in base axes: angular (3) rad/s, linear (3) m/s",
     )
+    base_velocity_relative: bool = Field(
+        default=False,
+        exclude_if=lambda relative: not relative,
+        description="whether base_velocity is relative to a target that moves: at 0 the base moves along as "
+        "if fixed to it",
+    )
     geometry: tuple[Shape, ...] = geometry_field("only axes and the ghost of a hand")
 
 

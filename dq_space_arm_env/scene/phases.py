@@ -117,6 +117,7 @@ def phase_scene(scene: Scene, phase: Phase) -> tuple[Scene, tuple[str, ...]]:
                 changes |= dict.fromkeys(
                     ("spread.target_angular_velocity", "spread.target_linear_velocity"), 0.0
                 )
+                changes["target.base_velocity_relative"] = False
     return scene.replace({**changes, "phases": ()}), tuple(removed)
 
 

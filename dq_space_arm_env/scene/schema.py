@@ -169,6 +169,9 @@ class Scene(Model):
             half_width = getattr(self.spread, field)
             if half_width and not part:
                 yield Problem(("spread", field), half_width, f"must be 0: the scene has no {part_name}")
+        if self.target.base_velocity_relative and self.target.motion is None:
+            sentence = "must be false: the target has no motion to be relative to"
+            yield Problem(("target", "base_velocity_relative"), True, sentence)
         for field in ("target_angular_velocity", "target_linear_velocity"):
             half_width = getattr(self.spread, field)
             if half_width and not isinstance(self.target.motion, ScrewMotion | Tumbling):

@@ -130,7 +130,7 @@ class SceneEquations:
         return kinematics.tip_twist(self.chain, *angles, base, motion.joint_rates, wrist_rates)
 
     def target_twist(self, tip: Scalars) -> Scalars:
-        """Twist of the target in the axes of a tip, 6: Ad(q_{D/G}) w^D, with the error pose observed."""
+        """Twist of the target in the axes of a tip or another frame, 6: Ad(q_{D/G}) w^D."""
         return dual_vectors.transform(
             *poses.to_matrix(poses.error_pose(tip, self.target)), self.target_velocity
         )
@@ -139,7 +139,10 @@ class SceneEquations:
         return weighted_square(self.tip(x), self.target, self.state_weights(field))
 
     def _velocity_cost(self, x: Scalars, field: str) -> Scalar:
-        motion, references = self.field.motion(self.y(x)), self.scene.target.base_velocity
+        motion = self.field.motion(self.y(x))
+        references: Scalars = self.scene.target.base_velocity
+        if self.scene.target.base_velocity_relative:
+            references = dual_vectors.add(references, self.target_twist(self.base_pose(x)))
         return weighted_square((*motion.angular, *motion.linear), references, self.state_weights(field))
 
     def state_weights(self, field: str) -> list[Scalar]:

@@ -59,9 +59,12 @@ class WorstCase:
             target = 2.0 * quaternion.norm(body[4:]) + self._target_way(duration)
         gaps = 2.0, 0.5 * (start + target + duration * drift + 2.0 * self.reach)
         references = equations.scene.target.base_velocity
+        carried = (0.0, 0.0)
+        if equations.scene.target.base_velocity_relative:
+            carried = self._carried_speeds(2.0 * gaps[1])
         speeds = (
-            _turned(base, speed) + norm(references[:3]),
-            speed / casadi.sqrt(base.mass) + norm(references[3:]),
+            _turned(base, speed) + norm(references[:3]) + carried[0],
+            speed / casadi.sqrt(base.mass) + norm(references[3:]) + carried[1],
         )
 
         def state_cost(pose: str, velocity: str, twist: str) -> Scalar:
@@ -98,11 +101,16 @@ class WorstCase:
 
     def _relative_speeds(self, speed: Scalar, distance: Scalar) -> tuple[Scalar, Scalar]:
         """Bounds of angular velocity and velocity of the tip relative to a target at most so far away."""
-        hand, (target_turning, target_moving) = self.bodies[-1], self._target_speeds()
+        hand, carried = self.bodies[-1], self._carried_speeds(distance)
         wrist = total([0.0, *(casadi.fabs(rate) for rate in self.inputs.wrist_rates)])
         turning = _turned(hand, speed) + wrist
         moving = speed / casadi.sqrt(hand.mass) + self.reach * turning
-        return turning + target_turning, moving + target_moving + distance * target_turning
+        return turning + carried[0], moving + carried[1]
+
+    def _carried_speeds(self, distance: Scalar) -> tuple[Scalar, Scalar]:
+        """Likewise of the target, as if it reached so far."""
+        turning, moving = self._target_speeds()
+        return turning, moving + distance * turning
 
     def _target_velocity(self) -> list[Scalar]:
         return body_velocity(self.equations.scene, self.equations.given)

@@ -10,6 +10,8 @@ from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.kernels import Kernels
 
 COST = {
+    "base_velocity": [3.0, 2.0, 5.0, 1.0, 4.0, 6.0],
+    "terminal_base_velocity": [30.0, 20.0, 50.0, 10.0, 40.0, 60.0],
     "tip_twist": [10.0, 20.0, 30.0, 40.0, 50.0, 60.0],
     "terminal_tip_twist": [600.0, 500.0, 400.0, 300.0, 200.0, 100.0],
 }
@@ -27,7 +29,10 @@ def moving(name: str) -> Scene:
     if not planar:
         motion["inertia"] = [4.9, 7.1, 8.7]
         grasp = {"position": [-0.4, 0.1, 0.2], "rotation": {"axis": [0.2, 0.1, 1.0], "angle": 40}}
-    return load_scene(name).replace(target={"motion": motion, "grasp": grasp}, cost=COST)
+    target: dict[str, Any] = {"motion": motion, "grasp": grasp}
+    if name != "no-wrist":
+        target |= {"base_velocity_relative": True, "base_velocity": [0.0, 0.0, 0.2, 0.1, -0.3, 0.0]}
+    return load_scene(name).replace(target=target, cost=COST)
 
 
 @pytest.fixture(params=["paper", "planar", pytest.param("no-wrist", marks=pytest.mark.slow)])

@@ -10,7 +10,14 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, Scene, compile_scene, load_scene
+from dq_space_arm_env import (
+    DQSpaceArmEnv,
+    DQSpaceArmVectorEnv,
+    Scene,
+    SceneError,
+    compile_scene,
+    load_scene,
+)
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses, rotations, screw
 from dq_space_arm_env.algebra.dual_vectors import inverse_transform
@@ -424,6 +431,43 @@ def test_a_planar_target_moves_in_its_plane() -> None:
     np.testing.assert_allclose(observation[13:16], twist[2:5], atol=1e-14)
     np.testing.assert_allclose(twist[[0, 1, 5]], 0.0, atol=1e-15)
     np.testing.assert_allclose(kernels.state_from_observation(observation, p=rows[-1]), env.state, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", MOTIONS)
+def test_the_velocity_of_the_base_may_be_relative_to_the_target(kind: str) -> None:
+    """The reference is the twist that a base fixed to the target would have, plus the scene's own."""
+    weights, own = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0.1, 0.2, -0.1, 0.3, 0.1, -0.2]
+    target = {"target.base_velocity_relative": True, "target.base_velocity": own}
+    cost = {"cost.base_velocity": weights, "cost.terminal_base_velocity": 2.0}
+    env = DQSpaceArmEnv(scene_of(kind, **target, **cost))
+    env.reset(seed=3)
+    layout, deviation = env.kernels.layout, np.zeros(6)
+    for _ in range(STEPS):
+        info = env.step(np.full(12, 0.3))[4]
+        if deviation.any():
+            assert info["cost_base_velocity"] == pytest.approx(weights @ deviation**2, rel=1e-11)
+        x, row = env.state, env.stage_parameters
+        relative = np.linalg.inv(homogeneous(x[:8])) @ homogeneous(layout.target_with(row))
+        rotation, position = relative[:3, :3], relative[:3, 3]
+        angular, linear = layout.target_velocity_with(row).reshape(2, 3) @ rotation.T
+        carried = np.concatenate([angular, linear + np.cross(position, angular)])
+        deviation = x[layout.state.base_velocity] - own - carried
+    assert info["terminal_cost_base_velocity"] == pytest.approx(2.0 * deviation @ deviation, rel=1e-11)
+
+
+def test_a_relative_velocity_without_weights_is_not_computed() -> None:
+    free = scene_of("screw", **{"cost.base_velocity": 0.0, "cost.terminal_base_velocity": 0.0})
+    follows = free.replace({"target.base_velocity_relative": True})
+    for program in (
+        "environment_step",
+        "cost_derivatives",
+        "terminal_cost_derivatives",
+        "lagrangian_hessian",
+    ):
+        assert compile_scene(follows).operation_count(program) == compile_scene(free).operation_count(program)
+    assert "base_velocity_relative" not in free.to_yaml()
+    with pytest.raises(SceneError, match="base_velocity_relative = True: must be false: the target has no"):
+        load_scene("paper").replace({"target.base_velocity_relative": True})
 
 
 def test_a_target_too_fast_for_observations_is_refused() -> None:

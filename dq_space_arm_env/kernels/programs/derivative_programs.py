@@ -13,7 +13,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from dq_space_arm_env.algebra import dual_matrices
+from dq_space_arm_env.algebra import dual_matrices, dual_vectors
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra.symbolic import column, matrix, symbols, zeros
 from dq_space_arm_env.compiler.graph import graph_of
@@ -77,8 +77,8 @@ class DerivativePrograms:
             hessian[start + index, start + index] += 2.0 * weight
         return gradient, casadi.sparsify(hessian)
 
-    def _twist_residual(self, x: Scalars, u: Scalars) -> tuple[Matrix, Matrix, Matrix]:
-        """Twist of the tip relative to the target, as a function of tangent state z and input; their values.
+    def _twist_residual(self, x: Scalars, u: Scalars, cost: str) -> tuple[Matrix, Matrix, Matrix]:
+        """Twist relative to the target, of the tip or the base, by tangent state z and input; their values.
 
         The pose moves to second order, by 1 + d / 2 + d^2 / 8 for a twist increment d.
         """
@@ -89,18 +89,22 @@ class DerivativePrograms:
         turned = [a + 0.5 * b for a, b in zip(half, square, strict=True)]
         turned[0] = turned[0] + 1.0
         motion = field.motion([a + b for a, b in zip(self.equations.y(x), z[n:], strict=True)])
-        arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
-        tip = dq.multiply(dq.multiply(self.equations.base_pose(x), turned), arm)
-        rates = field.inputs(w).wrist_rates
-        own, target = self.equations.tip_twist(motion, rates), self.equations.target_twist(tip)
+        frame = dq.multiply(self.equations.base_pose(x), turned)
+        if cost.endswith("tip_twist"):
+            arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
+            frame = dq.multiply(frame, arm)
+            own = self.equations.tip_twist(motion, field.inputs(w).wrist_rates)
+        else:
+            own = dual_vectors.subtract((*motion.angular, *motion.linear), self.scene.target.base_velocity)
+        target = self.equations.target_twist(frame)
         residual = column(*(a - b for a, b in zip(own, target, strict=True)))
         return residual, column(*z, *w), casadi.densify(column(*[0.0] * field.n_t, *u))
 
     def _twist_cost_derivatives(
         self, x: Scalars, u: Scalars, field: str, *, exact: bool = False, emphasis: Scalar = 1.0
     ) -> tuple[Matrix, Matrix]:
-        """Gradient and Hessian (exact or Gauss-Newton's) of the tip twist's cost by tangent state, input."""
-        residual, moved, values = self._twist_residual(x, u)
+        """Gradient and Hessian (exact or Gauss-Newton's) of a relative twist's cost by tangent state, u."""
+        residual, moved, values = self._twist_residual(x, u, field)
         weights = casadi.diag(column(*(2.0 * emphasis * w for w in self.equations.state_weights(field))))
         jacobian = casadi.jacobian(residual, moved)
         gradient = casadi.mtimes(jacobian.T, casadi.mtimes(weights, residual))
@@ -115,23 +119,29 @@ class DerivativePrograms:
         return gradient, casadi.sparsify(hessian)
 
     def _held_twist_derivatives(self, x: Scalars, emphasis: Scalar, *, exact: bool) -> tuple[Matrix, Matrix]:
-        """Likewise of the terminal twist, with the wrist held, by the tangent state."""
+        """Likewise of the terminal twists, with the wrist held, by the tangent state."""
         held, n_t = [0.0] * self.field.n_u, self.field.n_t
-        gradient, hessian = self._twist_cost_derivatives(
-            x, held, "terminal_tip_twist", exact=exact, emphasis=emphasis
-        )
-        return gradient[:n_t], hessian[:n_t, :n_t]
+        gradient, hessian = casadi.SX(n_t, 1), casadi.SX(n_t, n_t)
+        for cost in self._twist_costs("terminal_"):
+            stressed = emphasis if cost == "terminal_tip_twist" else 1.0
+            slope, curvature = self._twist_cost_derivatives(x, held, cost, exact=exact, emphasis=stressed)
+            gradient, hessian = gradient + slope[:n_t], hessian + curvature[:n_t, :n_t]
+        return gradient, hessian
 
-    def _has_twist_cost(self, field: str) -> bool:
-        return any(getattr(self.scene.cost, field))
+    def _twist_costs(self, prefix: str = "") -> list[str]:
+        """Those terms of twists relative to the target that have weights."""
+        fields = ["tip_twist", *(["base_velocity"] if self.scene.target.base_velocity_relative else [])]
+        return [prefix + field for field in fields if any(getattr(self.scene.cost, prefix + field))]
 
-    def _stage_weights(self) -> tuple[Scalars, Scalars]:
-        weights = self.equations.state_weights
-        return weights("pose"), weights("base_velocity")
+    def _stage_weights(self, prefix: str = "") -> tuple[Scalars, Scalars]:
+        """Weights of pose and base velocity, none of the latter where it is a relative twist."""
+        velocity = self.equations.state_weights(prefix + "base_velocity")
+        if self.scene.target.base_velocity_relative:
+            velocity = [0.0] * 6
+        return self.equations.state_weights(prefix + "pose"), velocity
 
     def _terminal_weights(self) -> tuple[Scalars, Scalars]:
-        weights = self.equations.state_weights
-        return weights("terminal_pose"), weights("terminal_base_velocity")
+        return self._stage_weights("terminal_")
 
     def _angle_count(self) -> int:
         return self.layout.n_joints + (3 if self.layout.has_wrist else 0)
@@ -145,12 +155,12 @@ class DerivativePrograms:
         weights = [2.0 * weight for weight in self.equations.control_weights]
         by_input: Matrix = column(*(weight * value for weight, value in zip(weights, u, strict=True)))
         squared, mixed = casadi.diag(column(*weights)), zeros(n_u, n_t)
-        if self._has_twist_cost("tip_twist"):
-            slope, curvature = self._twist_cost_derivatives(x, u, "tip_twist")
+        for cost in self._twist_costs():
+            slope, curvature = self._twist_cost_derivatives(x, u, cost)
             gradient, by_input = gradient + slope[:n_t], by_input + slope[n_t:]
             hessian = casadi.sparsify(hessian + curvature[:n_t, :n_t])
             squared = casadi.sparsify(squared + curvature[n_t:, n_t:])
-            mixed = casadi.sparsify(curvature[n_t:, :n_t])
+            mixed = casadi.sparsify(mixed + curvature[n_t:, :n_t])
         matrices = {"lxx": hessian, "luu": squared} | ({"lux": mixed} if mixed.nnz() else {})
         outputs = {
             "lx": casadi.densify(gradient).nonzeros(),
@@ -172,7 +182,7 @@ class DerivativePrograms:
         field = self.field
         x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
         gradient, hessian = self._state_cost_derivatives(x, self._terminal_weights(), emphasis)
-        if self._has_twist_cost("terminal_tip_twist"):
+        if self._twist_costs("terminal_"):
             slope, curvature = self._held_twist_derivatives(x, emphasis, exact=False)
             gradient, hessian = gradient + slope, casadi.sparsify(hessian + curvature)
         outputs = {"lx": casadi.densify(gradient).nonzeros(), "lxx": hessian.nonzeros()}
@@ -211,9 +221,9 @@ class DerivativePrograms:
         state = self._state_cost_hessian(x, self._stage_weights())
         effort = casadi.diag(column(*(2.0 * weight for weight in self.equations.control_weights)))
         total, given = curvature + casadi.triu(casadi.diagcat(state, effort)), {"x": x}
-        if self._has_twist_cost("tip_twist"):
-            given["u"] = symbols("u", field.n_u)
-            twist = self._twist_cost_derivatives(x, given["u"], "tip_twist", exact=True)[1]
+        for cost in self._twist_costs():
+            given.setdefault("u", symbols("u", field.n_u))
+            twist = self._twist_cost_derivatives(x, given["u"], cost, exact=True)[1]
             total = total + casadi.triu(twist)
         hessian = casadi.sparsify(casadi.triu2symm(total))
         blocks = {
@@ -232,7 +242,7 @@ class DerivativePrograms:
         field = self.field
         x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
         hessian = self._state_cost_hessian(x, self._terminal_weights(), emphasis)
-        if self._has_twist_cost("terminal_tip_twist"):
+        if self._twist_costs("terminal_"):
             hessian = casadi.sparsify(hessian + self._held_twist_derivatives(x, emphasis, exact=True)[1])
         program = Program(
             "terminal_cost_hessian",
