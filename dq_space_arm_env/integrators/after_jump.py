@@ -1,4 +1,4 @@
-"""A step after which the velocities may jump, with exact derivatives of both."""
+"""A step after which the velocities may jump, with exact derivatives of both, second ones included."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import casadi
 from dq_space_arm_env.algebra.symbolic import column, symbols
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Call, Program
-from dq_space_arm_env.dynamics.vector_field import VectorField, split_state
-from dq_space_arm_env.integrators.method import Integrator, graph_inputs
+from dq_space_arm_env.dynamics.vector_field import TwiceDifferentiableField, VectorField, split_state
+from dq_space_arm_env.integrators.method import Integrator, TwiceDifferentiableIntegrator, graph_inputs
 
 Scalar = Any
 
@@ -35,12 +35,7 @@ class StepAndJump:
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
         """See `Integrator.append_linearization`."""
-        begin = len(program.calls)
-        self.method.append_step(program, field)
-        _rename(program, begin, {"x_next": _BEFORE})
-        begin = len(program.calls)
-        patterns = dict(zip("AB", self.method.append_linearization(program, field), strict=True))
-        _rename(program, begin, {"A": "A_before", "B": "B_before"})
+        patterns = self._append_linearization_before(program, field)
         x = symbols("x", field.n_x)
         y, after = split_state(field, x)[1], split_state(field, self.jump(x))[1]
         by_y = casadi.jacobian(column(*after), column(*y))
@@ -55,6 +50,50 @@ class StepAndJump:
             sparsity.append(product.sparsity())
         program.call(graph_of(f"{field.name}_jump_derivatives", graph_inputs(field, **given), outputs))
         return sparsity[0], sparsity[1]
+
+    def append_curvature(self, program: Program, field: TwiceDifferentiableField) -> Any:
+        """See `TwiceDifferentiableIntegrator.append_curvature`; the method must have second derivatives.
+
+        With multipliers m of the jump j(f(z)): m . (j o f)'' = (j' m) . f'' + f'' (m . j'') f'.
+        """
+        assert isinstance(self.method, TwiceDifferentiableIntegrator)
+        patterns = self._append_linearization_before(program, field)
+        n_t = patterns["A"].size1()
+        x, multiplier, pose = symbols("x", field.n_x), symbols("multiplier", n_t), n_t - field.n_y
+        y, after = split_state(field, x)[1], split_state(field, self.jump(x))[1]
+        weighted = casadi.dot(column(*multiplier[pose:]), column(*after))
+        twice, slope = casadi.hessian(weighted, column(*y))
+        outputs = {
+            "multiplier_before": [*multiplier[:pose], *casadi.densify(slope).nonzeros()],
+            "bend": casadi.triu(twice).nonzeros(),
+        }
+        given = graph_inputs(field, **{_BEFORE: x}, multiplier=multiplier)
+        program.call(graph_of(f"{field.name}_jump_curvature", given, outputs))
+        begin = len(program.calls)
+        before = self.method.append_curvature(program, field)
+        _rename(program, begin, {"multiplier": "multiplier_before", "curvature": "curvature_before"})
+        bend = casadi.SX.sym("bend", casadi.triu(twice).sparsity())
+        curvature, a, b = (
+            casadi.SX.sym(name, pattern)
+            for name, pattern in (("C", before), ("A", patterns["A"]), ("B", patterns["B"]))
+        )
+        change = casadi.horzcat(a, b)[pose:, :]
+        moved = casadi.mtimes(change.T, casadi.mtimes(casadi.triu2symm(bend), change))
+        total = casadi.sparsify(curvature + casadi.triu(moved))
+        matrices = {"curvature_before": curvature, "bend": bend, "A_before": a, "B_before": b}
+        inputs = {name: matrix.nonzeros() for name, matrix in matrices.items()}
+        program.call(graph_of(f"{field.name}_jump_sum", inputs, {"curvature": total.nonzeros()}))
+        return total.sparsity()
+
+    def _append_linearization_before(self, program: Program, field: VectorField) -> dict[str, Any]:
+        """Append the method's step and linearization, with results of other names; their patterns."""
+        begin = len(program.calls)
+        self.method.append_step(program, field)
+        _rename(program, begin, {"x_next": _BEFORE})
+        begin = len(program.calls)
+        patterns = dict(zip("AB", self.method.append_linearization(program, field), strict=True))
+        _rename(program, begin, {"A": "A_before", "B": "B_before"})
+        return patterns
 
 
 _BEFORE = "x_before"

@@ -44,8 +44,7 @@ class ArmProblem:
         self.scene = in_double_precision(load_scene(scene), integrator)
         self.kernels = compile_scene(self.scene)
         self.integrator: str = self.scene.simulation.integrator
-        catches = bool(self.kernels.parameters.indices(CATCH))  # a catch has no second derivatives
-        self.has_second_order = INTEGRATORS[self.integrator].curvature is not None and not catches
+        self.has_second_order = INTEGRATORS[self.integrator].curvature is not None
         layout = self.kernels.layout
         # The wrist's rates turn the tip.
         self.has_mixed_cost = any(self.scene.cost.tip_twist) and "wrist psi rate" in layout.control.names

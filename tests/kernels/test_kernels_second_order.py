@@ -29,14 +29,14 @@ def right_jacobian(kernels, twist):
     return jacobian
 
 
-def lagrangian_gradient(kernels, integrator, x, u, multiplier, successor):
+def lagrangian_gradient(kernels, integrator, x, u, multiplier, successor, p=None):
     """Gradient of cost(x (+) z, u) + multiplier . (step(x (+) z, u) (-) successor), by (z, u)."""
 
     def gradient(z, v):
         moved = kernels.retract(x, z)
-        a, b = kernels.linearize(moved, v, integrator=integrator)
-        lx, lu, *_ = kernels.call("cost_derivatives", x=moved, u=v)
-        image = kernels.difference(successor, kernels.step(moved, v, integrator=integrator))
+        a, b = kernels.linearize(moved, v, integrator=integrator, p=p)
+        lx, lu, *_ = kernels.call("cost_derivatives", x=moved, u=v, p=p)
+        image = kernels.difference(successor, kernels.step(moved, v, integrator=integrator, p=p))
         weights = np.linalg.solve(right_jacobian(kernels, image).T, multiplier)
         return np.concatenate([right_jacobian(kernels, z).T @ (lx + a.T @ weights), lu + b.T @ weights])
 
@@ -52,20 +52,20 @@ def differences(gradient, size):
     return np.array([(4.0 * slope(e, STEP / 2) - slope(e, STEP)) / 3.0 for e in np.eye(size)])
 
 
-def lagrangian_hessian(kernels, integrator, x, u, multiplier):
+def lagrangian_hessian(kernels, integrator, x, u, multiplier, p=None):
     h = np.array([kernels.scene.simulation.dt])
-    blocks = kernels.call("lagrangian_hessian", integrator, x=x, u=u, multiplier=multiplier, h=h)
+    blocks = kernels.call("lagrangian_hessian", integrator, x=x, u=u, multiplier=multiplier, h=h, p=p)
     n_t, n_u = kernels.n_t, kernels.n_u
     lux = blocks[1].reshape(n_u, n_t)
     return np.block([[blocks[0].reshape(n_t, n_t), lux.T], [lux, blocks[2].reshape(n_u, n_u)]])
 
 
-def check_lagrangian(kernels, integrator, x, u, seed):
+def check_lagrangian(kernels, integrator, x, u, seed, p=None):
     multiplier = 300.0 * np.random.default_rng(seed).normal(size=kernels.n_t)
-    successor = kernels.step(x, u, integrator=integrator)
-    gradient = lagrangian_gradient(kernels, integrator, x, u, multiplier, successor)
+    successor = kernels.step(x, u, integrator=integrator, p=p)
+    gradient = lagrangian_gradient(kernels, integrator, x, u, multiplier, successor, p)
     expected = differences(gradient, kernels.n_t + kernels.n_u)
-    hessian = lagrangian_hessian(kernels, integrator, x, u, multiplier)
+    hessian = lagrangian_hessian(kernels, integrator, x, u, multiplier, p)
     np.testing.assert_array_equal(hessian, hessian.T)
     np.testing.assert_allclose(hessian, expected, atol=1e-8 * np.abs(expected).max())
 
@@ -83,6 +83,21 @@ def test_lagrangian_hessian_agrees_with_differences_of_the_gradient(scene, integ
 def test_lagrangian_hessian_of_odd_scenes(scene, integrator, draw):
     kernels, states, inputs = draw(ODD[scene], 1)
     check_lagrangian(kernels, integrator, states[0], inputs[0], 0)
+
+
+def test_lagrangian_hessian_across_a_catch(draw):
+    kernels, states, inputs = draw("capture-and-detumble", 2)
+    rows, (start,) = kernels.stage_parameters(), np.flatnonzero(kernels.scene.staged.catches)
+    stage = kernels.scene.staged.starts[start] - 1
+    rows[:, kernels.parameters.indices("cost")] *= 1e-6  # what counts is the impact
+    for seed, (p, x, u) in enumerate(zip(rows[stage - 1 : stage + 1], states, inputs, strict=True)):
+        check_lagrangian(kernels, "rk4", x, u, seed, p)
+    free = rows[stage].copy()
+    free[kernels.parameters.indices("catch")] = 0.0
+    with_catch, without = (
+        lagrangian_hessian(kernels, "rk4", x, u, np.full(kernels.n_t, 300.0), p) for p in (rows[stage], free)
+    )
+    assert np.abs(with_catch - without).max() > 1e-3 * np.abs(with_catch).max()
 
 
 @pytest.mark.parametrize("scene", ["paper", "planar", "six-joint", "no-wrist"])

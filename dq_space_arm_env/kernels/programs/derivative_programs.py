@@ -19,13 +19,13 @@ from dq_space_arm_env.algebra.symbolic import column, matrix, symbols, zeros
 from dq_space_arm_env.compiler.graph import graph_of
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics import kinematics
+from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.integrators.method import (
     TwiceDifferentiableIntegrator,
     graph_inputs,
     program_inputs,
 )
-from dq_space_arm_env.kernels.programs.stage_programs import stage_method
-from dq_space_arm_env.task.catching import has_catch
+from dq_space_arm_env.kernels.programs.stage_programs import stage_method, with_catch
 from dq_space_arm_env.task.equations import SceneEquations
 
 Scalar = Any
@@ -207,11 +207,11 @@ class DerivativePrograms:
 
     def lagrangian_hessian(self, integrator: str) -> Program:
         """Hessian of stage cost + multiplier . step, in tangent coordinates around x and its successor."""
-        method = stage_method(self.equations, integrator)
+        method = integrator_of(self.scene.simulation, integrator)
         if not isinstance(method, TwiceDifferentiableIntegrator):
             name = integrator or self.scene.simulation.integrator
-            reason = "a catch" if has_catch(self.scene) else f"integrator: {name!r}"
-            raise ValueError(f"{reason} has no second derivatives, which this asks for")
+            raise ValueError(f"integrator: {name!r} has no second derivatives, which this asks for")
+        method = with_catch(self.equations, method)
         field = self.field
         buffers = [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("multiplier", field.n_t)]
         buffers.append(Buffer("h", 1, shared=True))
