@@ -96,7 +96,7 @@ class Solver:
         maneuver.parameters.set(parameters)  # its end is that of the window
         rows = maneuver.parameters.rows[stage:]
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
-        guess = self._followed(demonstration, state, stage, limits) * limits
+        guess = self._followed(demonstration, state, stage, limits, rows) * limits
         # The demonstration's own weight on the final pose: without it some plans miss the target.
         with maneuver.emphasized(float(demonstration.facts["emphasis"])):
             solution = BoxDDP(problem).solve(x0=state, u_init=guess, parameters=rows)
@@ -115,12 +115,17 @@ class Solver:
         )
 
     def _followed(
-        self, demonstration: Demonstration, state: FloatArray, stage: int, limits: FloatArray
+        self,
+        demonstration: Demonstration,
+        state: FloatArray,
+        stage: int,
+        limits: FloatArray,
+        rows: FloatArray,
     ) -> FloatArray:
         """Actions of the demonstration's feedback policy, rolled out from a state."""
         actions = demonstration.actions[stage:].copy()
         for k in range(len(actions)):
             deviation = self._kernels.difference(demonstration.states[stage + k], state)
             actions[k] = np.clip(actions[k] + demonstration.feedback_gains[stage + k] @ deviation, -1.0, 1.0)
-            state = self._kernels.step(state, actions[k] * limits, p=demonstration.parameters)
+            state = self._kernels.step(state, actions[k] * limits, p=rows[k])
         return actions

@@ -133,11 +133,12 @@ def _flights(
     plain.set_options(options)
     observation = environment.reset()
     unit = action_limits(environment)
+    rows = np.array([data.kernels.stage_parameters(each.parameters) for each in chosen])
     columns: list[tuple[NDArray[Any], ...]] = []
     infos: list[dict[str, Any]] = []
     for stage in range(0, data.scene.simulation.steps, settings.repeat):
         states = plain.vector_env.states
-        actions = np.clip(_mean_action(data, chosen, states, stage, settings.repeat), -unit, unit)
+        actions = np.clip(_mean_action(data, chosen, rows, states, stage, settings.repeat), -unit, unit)
         following, reward, done, infos = environment.step(actions)
         after = np.array(
             [info.get("terminal_observation", row) for info, row in zip(infos, following, strict=True)]
@@ -153,19 +154,26 @@ def _flights(
 
 
 def _mean_action(
-    data: Demonstrations, chosen: list[Demonstration], states: NDArray[np.float64], stage: int, hold: int
+    data: Demonstrations,
+    chosen: list[Demonstration],
+    rows: NDArray[np.float64],
+    states: NDArray[np.float64],
+    stage: int,
+    hold: int,
 ) -> SingleArray:
-    """Mean feedback action clip(a_k + G_k (x (-) x_k)) over a hold from given states, shape (B, n_u)."""
+    """Mean feedback action clip(a_k + G_k (x (-) x_k)) over a hold from given states, shape (B, n_u).
+
+    `rows` are the parameters of the flights' stages, shape (B, N + 1, n_p).
+    """
     kernels = data.kernels
-    total, parameters = np.zeros((len(chosen), kernels.n_u)), np.array([each.parameters for each in chosen])
-    limits = kernels.layout.limits_with(parameters)
+    total, limits = np.zeros((len(chosen), kernels.n_u)), kernels.layout.limits_with(rows[:, 0])
     stages = range(stage, min(stage + hold, data.scene.simulation.steps))
     for at in stages:
         deviation = data.tangent(np.array([each.states[at] for each in chosen]), states)
         gains = np.array([each.feedback_gains[at] for each in chosen])
         nominal = np.array([each.actions[at] for each in chosen])
         actions = np.clip(nominal + np.einsum("bij,bj->bi", gains, deviation), -1.0, 1.0)
-        states = kernels.step(states, actions * limits, p=parameters)
+        states = kernels.step(states, actions * limits, p=rows[:, at])
         total += actions
     mean: SingleArray = (total / len(stages)).astype(np.float32)
     return mean

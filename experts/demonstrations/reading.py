@@ -7,7 +7,7 @@ import os
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, Self, overload
@@ -110,6 +110,11 @@ class _Files:
         self.paths = [folder / SHARDS / shard["file"] for shard in shards]
         self.ends = list(accumulate(self._sizes))
         self.mapped = lru_cache(maxsize=OPEN_SHARDS)(self._map)
+        self.stages = lru_cache(maxsize=2 * MIXED)(self._stages)  # of one group and the rest of the last
+
+    @cached_property
+    def kernels(self) -> Kernels:
+        return compile_scene(self.scene)
 
     def _map(self, shard: int) -> Tensors:
         tensors, path = map_tensors(self.paths[shard]), self.paths[shard]
@@ -125,6 +130,10 @@ class _Files:
         """Return the shard of a demonstration, and its row there."""
         shard = bisect_right(self.ends, place)
         return self.mapped(shard), place - (self.ends[shard - 1] if shard else 0)
+
+    def _stages(self, place: int) -> FloatArray:
+        tensors, row = self.locate(place)
+        return self.kernels.stage_parameters(tensors.arrays[PARAMETERS][row])
 
     def column(self, name: str) -> NDArray[Any]:
         """Return an array of all shards, concatenated in memory."""
@@ -168,7 +177,7 @@ class Demonstrations(Sequence[Demonstration]):
     @property
     def kernels(self) -> Kernels:
         """Compiled functions of the scene: layout of states, difference, retraction, observation."""
-        return compile_scene(self.scene)
+        return self._files.kernels
 
     def __len__(self) -> int:
         return len(self._places)
@@ -305,15 +314,17 @@ class Demonstrations(Sequence[Demonstration]):
         """Copy time steps, pairs of demonstration and stage, out of the files."""
         positions, stages = steps[:, 0].copy(), steps[:, 1].copy()
         arrays: dict[str, NDArray[Any]] = {}
+        entries = self._files.layout.parameters
         for position in np.unique(positions):
-            tensors, row = self._files.locate(int(self._places[position]))
+            place = int(self._places[position])
+            tensors, row = self._files.locate(place)
             mine = positions == position
             for name in names:
                 source = tensors.arrays[name][row]
                 if name != PARAMETERS:
                     rows = source[stages[mine]]
-                elif self.kernels.parameters.moving:
-                    rows = self.kernels.stage_parameters(source)[stages[mine]]
+                elif entries.moving or entries.staged:
+                    rows = self._files.stages(place)[stages[mine]]
                 else:
                     rows = source[None]
                 if name not in arrays:

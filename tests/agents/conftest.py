@@ -70,6 +70,31 @@ def drawn(small_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Demon
     return made
 
 
+@pytest.fixture(scope="session", params=["target", "masses"])
+def staged(
+    request: pytest.FixtureRequest, small_scene: Scene, tmp_path_factory: pytest.TempPathFactory
+) -> Demonstrations:
+    """Demonstrations in which a target moves, or the base becomes lighter, from stage to stage."""
+    changes = {
+        "target": {
+            "target.motion": {"kind": "screw", "angular_velocity": [0, 0, 0.02]},
+            "spread": {"target_angular_velocity": 0.02, "target_linear_velocity": 0.02},
+        },
+        "masses": {
+            "spread": {"base_position": 0.1},
+            "phases": [
+                {"name": "full", "steps": 70},
+                {"name": "light", "steps": 80, "changes": {"base.mass": 60}},
+            ],
+        },
+    }[request.param]
+    folder = tmp_path_factory.mktemp("demonstrations") / "staged"
+    scene = small_scene.replace({"name": "staged", **changes})
+    made = generate_demonstrations(scene, 3, folder, SEED, executor=SerialExecutor())
+    assert made is not None
+    return made
+
+
 @pytest.fixture(scope="module", autouse=True)
 def results_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A cache of evaluations for each file of tests; compiled kernels stay in theirs."""

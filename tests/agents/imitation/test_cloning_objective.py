@@ -92,6 +92,19 @@ def test_observations_around_a_demonstration_are_relative_to_its_own_target(draw
     assert torch.isfinite(objective(network, batch, np.random.default_rng(0)).total)
 
 
+def test_time_steps_have_the_target_and_the_masses_of_their_stage(staged):
+    batch, kernels = next(staged.batches(200, COLUMNS, seed=0)), staged.kernels
+    states, observations, parameters = (
+        batch.arrays[name] for name in ("states", "observations", "parameters")
+    )
+    seen = kernels.observation(states, observations[:, -1:], p=parameters)[0]
+    np.testing.assert_allclose(seen, observations, atol=1e-12)
+    directions = np.random.default_rng(0).normal(size=(200, kernels.n_t))
+    exact = kernels.observation_jacobian(states, p=parameters) @ directions[:, :, None]
+    found = observation_change(kernels, states, observations, directions, parameters)
+    np.testing.assert_allclose(found, exact[:, :, 0], atol=1e-8)
+
+
 def test_a_policy_with_the_right_gains_has_no_gain_loss(demonstrations, statistics, batch):
     network, exact = linear_network(demonstrations, statistics, batch)
 
