@@ -49,7 +49,7 @@ class Practice(Model):
     end_error_cost: NonNegative = Field(
         default=0.0,
         description="cost of ending far off the target, not scaled by reward_scale; half of it where one "
-        "error equals its tolerance and the other is zero",
+        "error equals its tolerance and the others are zero",
     )
     normalize_observations: StrictBool = Field(
         default=True, description="whether networks see observations in units of their spread"

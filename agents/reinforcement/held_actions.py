@@ -1,7 +1,6 @@
 """The training environment: small actions, held for several time steps, and scaled rewards."""
 
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -9,6 +8,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+ERRORS = ("attitude_error", "position_error", "angular_velocity_error", "velocity_error")
+"""Of the tip at the end, in the order of the tolerances; velocities where success asks for them."""
 
 
 class HeldActions(VecEnvWrapper):
@@ -36,7 +38,7 @@ class HeldActions(VecEnvWrapper):
         cost_power: float = 1.0,
         success_reward: float = 0.0,
         end_error_cost: float = 0.0,
-        tolerances: tuple[float, float] = (math.inf, math.inf),
+        tolerances: Sequence[float | None] = (),
         add_rewards: bool = True,
     ) -> None:
         space = spaces.Box(-action_scale, action_scale, dtype=np.float32)
@@ -87,8 +89,8 @@ class HeldActions(VecEnvWrapper):
         return observations, scaled, done, infos
 
     def _final_reward(self, info: Mapping[str, Any]) -> float:
-        angle, distance = self.tolerances
-        errors = (info["attitude_error"] / angle) ** 2 + (info["position_error"] / distance) ** 2
+        limits = zip(ERRORS, self.tolerances, strict=False)
+        errors = sum((info[name] / limit) ** 2 for name, limit in limits if limit is not None)
         # Bounded, or a few stray flights would dominate the critic.
         charged = self.end_error_cost * float(errors / (1.0 + errors))
         return self.success_reward * float(info["is_success"]) - charged

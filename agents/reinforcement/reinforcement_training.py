@@ -113,7 +113,7 @@ def train_learner(
 def make_environment(configuration: c.Configuration, scene: Scene) -> HeldActions:
     """Make the training environment: native copies, or goal environments for hindsight, with held actions."""
     _check_lengths(configuration, scene)
-    practice, hindsight = configuration.environment, configuration.hindsight
+    practice, hindsight, success = configuration.environment, configuration.hindsight, scene.success
     environment: VecEnv
     if hindsight is None:
         environment = DQSpaceArmVecEnv(practice.copies, scene)
@@ -134,7 +134,12 @@ def make_environment(configuration: c.Configuration, scene: Scene) -> HeldAction
         cost_power=practice.cost_power,
         success_reward=practice.success_reward,
         end_error_cost=practice.end_error_cost,
-        tolerances=(scene.success.attitude_error_deg, scene.success.position_error),
+        tolerances=(
+            success.attitude_error_deg,
+            success.position_error,
+            success.angular_velocity_error_deg,
+            success.velocity_error,
+        ),
         add_rewards=hindsight is None,
     )
 

@@ -74,3 +74,9 @@ def test_errors_at_the_end_cost_the_more_the_larger_they_are_but_not_without_bou
     charged = [2.0 * error / (1.0 + error) for error in errors]
     assert all(1.0 < cost < 2.0 for cost in charged)
     np.testing.assert_allclose(np.subtract(*rewards), [[0.0, 0.0], charged], rtol=1e-4)
+
+
+def test_the_tips_velocity_at_the_end_costs_where_success_asks_for_it():
+    env = hold(tolerances=(0.5, 0.01, None, 0.02), end_error_cost=1.0)
+    info = {"attitude_error": 0.0, "position_error": 0.01, "velocity_error": 0.04, "is_success": False}
+    assert env._final_reward(info) == pytest.approx(-5.0 / 6.0)
