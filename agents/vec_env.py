@@ -287,5 +287,8 @@ def _in_single_precision(space: spaces.Box) -> spaces.Box:
 def _single_infos(info: Info, copies: NDArray[np.intp]) -> list[Info]:
     """Infos of some copies as Python numbers, from the vector environment's arrays."""
     names = [name for name in info if not name.startswith(("_", "final_"))]
-    rows = zip(*(info[name][copies].tolist() for name in names), strict=True)
-    return [dict(zip(names, row, strict=True)) for row in rows]
+    columns = (
+        _single_infos(each, copies) if isinstance(each := info[name], dict) else each[copies].tolist()
+        for name in names
+    )
+    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]

@@ -24,6 +24,7 @@ from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.task.step_report import n_observations
+from experts.ddp.augmented_lagrangian import AugmentedLagrangian
 from experts.ddp.shooting import ShootingWorkspace, line_search
 from experts.ddp.solution import Policy, Solution, StopReason
 from experts.guesses.guided import GuidedDDP
@@ -44,6 +45,7 @@ class ManeuverPlan:
     # factor of the final pose's weights at which the solution is a minimum: 1, or as much as reaching the
     # target requires (`reaching`)
     emphasis: float
+    multipliers: FloatArray  # and penalties of constraints at every stage and the end, shape (M + 1, 2 m)
     Vx: FloatArray  # at every stage, with this emphasis, shape (M, n_t)
     # at every stage, shape (M, n_t, n_t), without negative curvature: off the plan it would predict costs
     # without a lower bound
@@ -63,6 +65,8 @@ class ManeuverPlan:
         solver = GuidedDDP(problem, library=library) if stage > 0 else planner
         solution = solver.solve(state, parameters=problem.parameters.rows)
         emphasis = float(solution.metadata["emphasis"])
+        if problem.constraints is not None:
+            AugmentedLagrangian(problem.constraints).hold(solution.multipliers)
         exact = problem.has_second_order
         work = ShootingWorkspace(problem, second_order=exact, keep_values=True)
         with maneuver.emphasized(emphasis):
@@ -76,7 +80,8 @@ class ManeuverPlan:
         if solution.stop_reason is StopReason.DIVERGED or not found:
             raise RuntimeError(f"there is no plan from the state at stage {stage}: {solution.message}")
         hessians = _convex_part(work.update.Vxx_all)
-        return cls(stage, solution, solution.policy(), emphasis, work.update.Vx_all, hessians)
+        held = problem.parameters.more.copy()
+        return cls(stage, solution, solution.policy(), emphasis, held, work.update.Vx_all, hessians)
 
 
 def _last_stages(solution: Solution, count: int) -> Solution:
@@ -87,6 +92,7 @@ def _last_stages(solution: Solution, count: int) -> Solution:
         controls=solution.controls[-count:],
         feedback_gains=solution.feedback_gains[-count:],
         parameters=solution.parameters[-count - 1 :],
+        multipliers=solution.multipliers[-count - 1 :],
     )
 
 
@@ -338,6 +344,8 @@ class RecedingHorizonExpert:
         work = self._workspace(horizon, ends_early=end < self.maneuver.horizon)
         assert isinstance(work.problem, WindowProblem)
         work.problem.begin_at(stage)
+        first = stage - plan.first_stage
+        work.problem.parameters.more[:] = plan.multipliers[first : first + horizon + 1]
         kept = 0
         if last is not None:
             kept = last.problem.horizon - 1

@@ -21,6 +21,7 @@ from agents.configuration.residual import ResidualConfiguration
 from agents.zoo import list_policies
 from agents.zoo.shelf import policy_file
 from dq_space_arm_env.command_line.verb import DefaultGroup
+from dq_space_arm_env.scene.constraints import Constraint
 from dq_space_arm_env.validation import parse_yaml
 
 ROOT = Path(__file__).parent.parent
@@ -52,9 +53,17 @@ DIMENSIONLESS = {
     "Spread.link_inertias",
     "Spread.payload_mass",
     "Spread.payload_inertia",
+    "Axis.direction",
+    "LineOfSight.boresight",
+    "ApproachCorridor.direction",
     "AxisLimits.limit",
+} | {
+    f"{model.__name__}.{name}"
+    for model in keys.models_of(dq_space_arm_env.Scene)
+    for name in ("margin", "tolerance", "observed")
+    if issubclass(model, Constraint)
 }
-"""Keys of a scene without a unit, or, the last one, with that of the actuator that it limits."""
+"""Keys of a scene without a unit, or, the last ones, with that of an actuator's limit or a residual."""
 
 
 def code_of(text: str, language: str) -> list[str]:

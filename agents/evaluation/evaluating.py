@@ -124,6 +124,7 @@ class Evaluation:
             "position_error": float(np.median(flights.position_error)),
             "effort": float(np.median(flights.effort)),
             "base_turn": float(np.median(flights.base_turn)),
+            "constraint_violations": _known_mean(flights.constraint_violations),
             "action_seconds": self.action_seconds,
             "wall_seconds": self.wall_seconds,
             "training_steps": training.get("environment_steps"),
@@ -163,6 +164,11 @@ class Evaluation:
             metadata=dict(record["metadata"]),
             same_scene=summary["same_scene"],
         )
+
+
+def _known_mean(values: NDArray[np.float64]) -> float | None:
+    """Mean of values; None if there are none, or one is not known."""
+    return float(np.mean(values)) if values.size and np.isfinite(values).all() else None
 
 
 def evaluate(

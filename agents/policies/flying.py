@@ -35,6 +35,8 @@ class Flights(NamedTuple):
         position_error: Of the tip at the end, shape (B,), m.
         effort: Sum of the control cost, shape (B,), dimensionless.
         base_turn: Largest rotation of the base from its first attitude, shape (B,), deg.
+        constraint_violations: Share of the steps that violate constraints, see `Rollout`, shape (B,); NaN in
+            a scene without.
     """
 
     cost: FloatArray
@@ -46,11 +48,14 @@ class Flights(NamedTuple):
     position_error: FloatArray
     effort: FloatArray
     base_turn: FloatArray
+    constraint_violations: FloatArray
 
     @classmethod
     def of(cls, flown: Rollout) -> Self:
         """Outcomes of a rollout."""
         found = {name: getattr(flown, name) for name in cls._fields if name != "effort"}
+        if flown.constraint_violations is None:
+            found["constraint_violations"] = np.full(len(flown), np.nan)
         return cls(**found, effort=flown.cost_terms["cost_control"])
 
     def columns(self) -> dict[str, list[Any]]:
@@ -61,7 +66,9 @@ class Flights(NamedTuple):
     def from_columns(cls, columns: Mapping[str, Sequence[Any]]) -> Self:
         """Outcomes that `columns` has written; other columns may stand beside them."""
         kinds = {"is_success": np.bool_, "diverged": np.bool_, "policy_failed": np.bool_, "length": np.int64}
-        return cls(**{name: from_json_list(columns[name], kinds.get(name)) for name in cls._fields})
+        unknown = {"constraint_violations": [None] * len(columns["cost"])}  # in records of earlier versions
+        found = {**unknown, **columns}
+        return cls(**{name: from_json_list(found[name], kinds.get(name)) for name in cls._fields})
 
 
 def fly(

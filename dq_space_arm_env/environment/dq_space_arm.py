@@ -26,7 +26,7 @@ from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.scene.start import episode_scene
-from dq_space_arm_env.task.step_report import MEMORY, OBSERVATION_LIMIT, REPORT, report_names
+from dq_space_arm_env.task.step_report import MEMORY, OBSERVATION_LIMIT, REPORT, grouped, report_names
 from dq_space_arm_env.viewing.payload_places import Payloads, leaves_tip
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 
@@ -118,6 +118,10 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     `diverged`; where the target moves, or success asks for it, the tip's `angular_velocity_error` [deg/s] and `velocity_error` [m/s] relative to the target with the
     wrist held. `reset` returns the same keys, with costs of zero.
 
+    Where a scene has constraints, `info["constraints"]` has every residual by its name, which is at most 0 where the constraint holds, of the state after
+    the step and of the input, and `info["cost"]` the sum of their violations, each over its tolerance (the convention of safe reinforcement learning; the
+    reward is without). What is exact at the end is charged there. The margins that a scene asks for stand in the observation after the phase, as tanh(-c / scale).
+
     ## Starting State
 
     `reset(seed=...)` draws the initial state from the scene's spread, uniformly per component, and the target, masses and inertias where they have a spread
@@ -133,6 +137,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
        the task, not a truncation.
     2. Termination: the simulation diverged (the state is not finite, or its norm exceeds 5e5). `info["diverged"]` is true, and this and the remaining steps are
        charged with a bound of what any motion from there could cost, so ending early never pays.
+
+    3. Termination: a constraint with `terminates: true` is violated by more than its tolerance. The episode is no success, and is charged as after a divergence.
 
     A step is divided where it would err by more than the scene's `simulation.tolerance` (1e-3 rad or m by default): motions too fast for the time step stay
     sound, and slow ones cost an estimate. `info["step_error"]` is that estimate in units of the tolerance, 0 after a reset, NaN where nothing estimates it (`tolerance: off`, or a method
@@ -388,7 +394,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             self._show()
         if self._more_names:
             flags = {"is_success": success, "diverged": diverged}
-            info = dict(zip(self._more_names, report[1:], strict=True)) | flags
+            info = grouped(dict(zip(self._more_names, report[1:], strict=True))) | flags
             return self._observation.copy(), report[0], over, False, info
         # Written out: a call, or a loop over names, would make a step some per cent slower.
         reward, pose, velocity, control, end_pose, end_velocity, angle, distance, error = report
@@ -439,7 +445,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         if self.render_mode is not None:
             self._show()
         _, success, diverged = self._flags.tolist()
-        info = dict(zip(self._more_names or REPORT[1:], self._report.tolist()[1:], strict=True))
+        info = grouped(dict(zip(self._more_names or REPORT[1:], self._report.tolist()[1:], strict=True)))
         return self._observation.copy(), {**info, "is_success": success, "diverged": diverged}
 
     def _begin(self, start: GivenStart) -> None:

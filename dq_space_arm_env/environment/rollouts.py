@@ -74,6 +74,8 @@ class Rollout:
         controls: Commanded inputs, shape (B, N, n_u), N, N m or rad/s.
         noise: Disturbance added to them, same shape and units; None without.
         caught: Whether the last catch has not failed, shape (B,); None in a scene without.
+        constraint_violations: Share of the steps whose violations exceed the constraints' tolerances, shape
+            (B,): `info["cost"]` is above 1; None in a scene without constraints.
     """
 
     scene: Scene
@@ -96,6 +98,7 @@ class Rollout:
     controls: FloatArray | None = None
     noise: FloatArray | None = None
     caught: Mask | None = None
+    constraint_violations: FloatArray | None = None
 
     @cached_property
     def cost(self) -> FloatArray:
@@ -235,6 +238,7 @@ class _Log:
         self.rewards, self.action_seconds = np.zeros((count, steps)), np.zeros(steps)
         self.cost_terms = {name: np.zeros(count) for name in cost_names(environment.scene)}
         self.length = np.zeros(count, dtype=np.int64)
+        self.violations = np.zeros(count) if environment.scene.constraints else None
         self.flying, self.failed = np.ones(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         self.last = {name: info[name].copy() for name in _AT_THE_END if name in info}
         # Real part of the base's pose, 4 numbers (planar: 2), and its smallest overlap with the first one.
@@ -283,6 +287,8 @@ class _Log:
         for name, sums in self.cost_terms.items():
             np.add(sums, info[name], out=sums, where=flying)
         self.length += flying
+        if self.violations is not None:
+            self.violations += flying & (info["cost"] > 1.0)
         ending = flying & terminated
         if ending.any():
             self._keep_last(info, ending)
@@ -324,4 +330,5 @@ class _Log:
             controls=self.controls,
             noise=self.noise,
             caught=self.last["caught"] != 0.0 if "caught" in self.last else None,
+            constraint_violations=None if self.violations is None else self.violations / self.length,
         )

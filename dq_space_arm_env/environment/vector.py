@@ -23,7 +23,7 @@ from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_s
 from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene
-from dq_space_arm_env.task.step_report import report_names
+from dq_space_arm_env.task.step_report import grouped, report_names
 from dq_space_arm_env.viewing.payload_places import Payloads, leaves_tip
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 from dq_space_arm_env.viewing.trails import Trails
@@ -121,7 +121,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         self._all.setflags(write=False)
         # `info` holds the report without the reward, and the flags without the end of the episode.
         self._names = report_names(self.scene)[1:]
-        keys = (*self._names, "is_success", "diverged")
+        keys = (*grouped(dict.fromkeys(self._names)), "is_success", "diverged")
         self._masks = dict.fromkeys((f"_{key}" for key in keys), self._all)
         self._over = _NONE  # rows whose episodes are over, to be reset by the next step or the caller
         self._seen = np.zeros(self.observation_space.shape or (), self.kernels.dtype) if disabled else None
@@ -477,8 +477,12 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         """Entries of `DQSpaceArmEnv`'s info, as arrays."""
         _, success, diverged = result.flags
         whole = mask is self._all
+        values = grouped(dict(zip(self._names, result.report[1:], strict=True)))
+        if "constraints" in values:  # as Gymnasium nests dictionaries
+            inner = values["constraints"]
+            values["constraints"] = inner | {f"_{name}": mask.copy() for name in inner}
         return {
-            **dict(zip(self._names, result.report[1:], strict=True)),
+            **values,
             "is_success": success,
             "diverged": diverged,
             **(self._masks if whole else {key: mask.copy() for key in self._masks}),

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import walk
+from dq_space_arm_env.kernels.constraint_kernels import ConstraintKernels
 from dq_space_arm_env.kernels.library import matrices
-from dq_space_arm_env.kernels.robot_kernels import RobotKernels
 from dq_space_arm_env.scene import INTEGRATORS, Scene, load_scene
 from dq_space_arm_env.task.step_report import n_observations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 
-class Kernels(RobotKernels):
+class Kernels(ConstraintKernels):
     """The compiled functions of a scene.
 
     What varies in the scene, by its spread or its list of `parameters`, is an argument p of every function

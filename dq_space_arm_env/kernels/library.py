@@ -9,6 +9,7 @@ import hashlib
 import logging
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -55,6 +56,12 @@ class KernelLibrary:
         return ScenePrograms(self.scene)
 
     @cached_property
+    def _penalized_programs(self) -> ScenePrograms:
+        from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
+
+        return ScenePrograms(self.scene, penalized=True)
+
+    @cached_property
     def _environment_programs(self) -> EnvironmentPrograms:
         from dq_space_arm_env.kernels.programs.environment_programs import EnvironmentPrograms
 
@@ -68,17 +75,21 @@ class KernelLibrary:
     def kernel(self, name: str, *, integrator: str | None = None, lanes: int | None = None) -> BoundKernel:
         """Compile a program of `ScenePrograms` or `EnvironmentPrograms`, or load it from the cache.
 
+        With the prefix `PENALIZED` a program of `ScenePrograms` has the cost of `task.augmented_lagrangian`.
         `integrator` is that of programs that take a step, the scene's by default; `lanes` the rows the code
         works on at a time: 1, or the processor's vector width (default).
         """
-        method = (integrator or self.scene.simulation.integrator) if name in _STEPS else ""
+        plain = name.removeprefix(PENALIZED)
+        method = (integrator or self.scene.simulation.integrator) if plain in _STEPS else ""
         key = (name, method, self.lanes if lanes is None else lanes)
         if key not in self._kernels:
 
             def trace() -> Program:
-                of_environment = name.startswith("environment_")
-                programs = self._environment_programs if of_environment else self._programs
-                return programs.build(name, method)
+                if name.startswith("environment_"):
+                    return self._environment_programs.build(name, method)
+                if name == plain:
+                    return self._programs.build(name, method)
+                return replace(self._penalized_programs.build(plain, method), name=name)
 
             self._kernels[key] = self._load(*key, trace)
         return self._kernels[key]
@@ -239,6 +250,9 @@ def source_hash() -> str:
             digest.update(path.read_bytes())
     return digest.hexdigest()
 
+
+PENALIZED = "penalized_"
+"""Prefix of programs whose cost has a penalty for each constraint."""
 
 _MODEL_SOURCES = ("algebra", "compiler", "dynamics", "integrators", "kernels", "scene", "task", "validation")
 

@@ -17,6 +17,7 @@ from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
+from dq_space_arm_env.scene.constraints import AnyConstraint, constraint_problems
 from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
 from dq_space_arm_env.scene.motion import Motion, ScrewMotion, Tumbling, Waypoints
 from dq_space_arm_env.scene.parameters import is_part, numbers, parents
@@ -83,6 +84,11 @@ class Scene(Model):
         exclude_if=lambda phases: not phases,
         description="phases of the episode, one after another; absent: one, without changes",
     )
+    constraints: tuple[AnyConstraint, ...] = Field(
+        default=(),
+        exclude_if=lambda constraints: not constraints,
+        description="what a maneuver must keep to besides the limits of its actuators; absent: nothing",
+    )
     simulation: Simulation = Field(
         default_factory=Simulation, description="time step, number of steps, integrator"
     )
@@ -123,6 +129,7 @@ class Scene(Model):
         yield from self._parameter_problems()
         if self.phases:
             yield from phase_problems(self)
+        yield from constraint_problems(self)
         if self.base.motion == "planar":
             yield from self._planar_problems()
 

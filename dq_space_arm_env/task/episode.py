@@ -32,6 +32,7 @@ from dq_space_arm_env.scene.path import advanced
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import episode_start, parameter_values
 from dq_space_arm_env.task.catching import Catching, has_catch
+from dq_space_arm_env.task.constraint_residuals import charged, observed_margins, reported
 from dq_space_arm_env.task.equations import (
     SceneEquations,
     body_pose,
@@ -71,14 +72,18 @@ def observe(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:
     """Observation and report of a state, without a step."""
     scene, rest = equations.scene, memory[len(MEMORY) :]
     equations = at_stage(equations, memory[0], rest)
-    seen = equations.observe(x, (scene.simulation.steps - memory[0]) * scene.simulation.dt)
-    errors = tip_errors(equations, x, seen["errors"])
+    view = seen(equations, x, (scene.simulation.steps - memory[0]) * scene.simulation.dt)
+    errors = tip_errors(equations, x, view["errors"])
     errors += [equations.given[PHASE]] if scene.phases else []
-    costs = [0.0] * (len(report_names(scene)) - len(errors) - 1 - 3 * has_catch(scene))
+    catching = [rest[-1], 0.0, 0.0] if has_catch(scene) else []
+    residuals = reported(equations, equations, x, [0.0] * equations.field.n_u, x) if scene.constraints else []
+    charge = [charged(scene, residuals, at_end=0.0)[0]] if scene.constraints else []
+    last = [*errors, *catching, 0.0, *charge, *residuals]
+    costs = [0.0] * (len(report_names(scene)) - len(last))
     return {
         "memory_kept": [memory[0], *equations.state_cost_terms(x), *rest],
-        "observation": seen["observation"],
-        "report": [*costs, *errors, *([rest[-1], 0.0, 0.0] if has_catch(scene) else []), 0.0],
+        "observation": view["observation"],
+        "report": [*costs, *last],
         "flags": [0.0, is_success(scene, errors), 0.0],
     }
 
@@ -113,29 +118,43 @@ def step(
     # last sound state. NaN is not below any limit.
     sound = total([entry * entry for entry in x_next]) <= STATE_LIMIT**2
     x_kept = [casadi.if_else(sound, new, old) for new, old in zip(x_next, x, strict=True)]
-    terminated = casadi.logic_or(taken == steps - 1, casadi.logic_not(sound))
+    at_end = casadi.logic_or(taken == steps - 1, casadi.logic_not(sound))
+    terminated, finished, charges = at_end, sound, []
+    if scene.constraints:
+        residuals = reported(before, after, x, u, x_kept)
+        charge, ends = charged(scene, residuals, at_end)
+        charges = [charge, *residuals]
+        terminated, finished = casadi.logic_or(at_end, ends), casadi.logic_and(sound, casadi.logic_not(ends))
 
-    seen = after.observe(x_kept, (remaining - 1.0) * dt)
-    errors = tip_errors(after, x_kept, seen["errors"])
+    view = seen(after, x_kept, (remaining - 1.0) * dt)
+    errors = tip_errors(after, x_kept, view["errors"])
     errors += [after.given[PHASE]] if scene.phases else []
 
     # reward = -(stage cost of x and u) - (terminal cost of x_next at the end): the return is -J. After a
-    # divergence the most that this and all further steps could cost is charged, so ending early never pays.
+    # divergence, or a violation that ends the episode, the most that this and all further steps could cost is
+    # charged, so ending early never pays.
     stage = [*state_terms, before.effort(u), *before.twist_cost_terms(x, u)]
     terminal = [casadi.if_else(terminated, term, 0.0) for term in after.terminal_cost_terms(x_kept)]
     worst = total([WorstCase(each).cost(x, remaining) for each in _every_phase(before)])
-    reward = -casadi.if_else(sound, total(stage) + total(terminal), worst)
+    reward = -casadi.if_else(finished, total(stage) + total(terminal), worst)
 
-    success = casadi.logic_and(sound, is_success(scene, errors))
+    success = casadi.logic_and(finished, is_success(scene, errors))
     if caught:
         success = casadi.logic_and(success, caught[0])
     return {
         "x_kept": x_kept,
         "memory_kept": [taken + sound, *after.state_cost_terms(x_kept), *rest],
-        "observation": seen["observation"],
-        "report": [reward, *stage, *terminal, *errors, *caught, *checked_error],
+        "observation": view["observation"],
+        "report": [reward, *stage, *terminal, *errors, *caught, *checked_error, *charges],
         "flags": [terminated, success, casadi.logic_not(sound)],
     }
+
+
+def seen(equations: SceneEquations, x: Scalars, time_left: Scalar) -> dict[str, list[Scalar]]:
+    """Observation, with the margins of constraints, and the tip's errors: angle in rad, distance in m."""
+    return equations.observe(
+        x, time_left, observed_margins(equations, equations.base_pose(x), equations.y(x))
+    )
 
 
 def compare_goals(scene: Scene, achieved: Scalars, desired: Scalars) -> Outputs:

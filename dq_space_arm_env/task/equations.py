@@ -86,6 +86,18 @@ class SceneEquations:
         """Pose of the base q_{e0/I}, 8 numbers."""
         return self.field.pose.full(split_state(self.field, x)[0])
 
+    def moved(self, x: Scalars, z: Scalars) -> tuple[Scalars, Scalars]:
+        """Pose of the base and y of a state moved by z in tangent coordinates, to second order in z.
+
+        A twist increment d moves the pose by 1 + d / 2 + d^2 / 8, with dual quaternion products.
+        """
+        n = len(self.field.pose.directions)
+        half = dq.from_vector([0.5 * entry for entry in self.field.pose.full_twist(z[:n])])
+        turned = [a + 0.5 * b for a, b in zip(half, dq.multiply(half, half), strict=True)]
+        turned[0] = turned[0] + 1.0
+        y = [a + b for a, b in zip(self.y(x), z[n:], strict=True)]
+        return dq.multiply(self.base_pose(x), turned), y
+
     def tip(self, x: Scalars) -> Scalars:
         """Pose of the tip q_{G/I}, 8 numbers, eq. (27)."""
         motion = self.field.motion(self.y(x))
@@ -162,8 +174,8 @@ class SceneEquations:
         names, nominal = self.layout.control.limits, self.layout.control_limit.tolist()
         return [self.given.get(name, limit) for name, limit in zip(names, nominal, strict=True)]
 
-    def observe(self, x: Scalars, time_left: Scalar) -> dict[str, list[Scalar]]:
-        """Observation, and the tip's errors: angle in rad, distance in m."""
+    def observe(self, x: Scalars, time_left: Scalar, margins: Scalars = ()) -> dict[str, list[Scalar]]:
+        """Observation, with the margins of constraints, and the tip's errors: angle in rad, distance in m."""
         tip = self.tip(x)
         motion = self.field.motion(self.y(x))
         # Error pose q_{D/G} = q_{G/I}* q_{D/I}, eq. (31); in a planar scene four entries vanish identically.
@@ -180,6 +192,7 @@ class SceneEquations:
             *motion.wrist_angles,
             *motion.joint_rates,
             *([self.given[PHASE]] if self.scene.phases else []),
+            *margins,
             *twists,
             time_left,
         ]

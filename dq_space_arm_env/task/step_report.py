@@ -1,5 +1,8 @@
 """Columns of what the environment's step reports; apart from `episode`, as they are read without CasADi."""
 
+from typing import Any
+
+from dq_space_arm_env.scene.constraint_rows import exact_rows, path_rows
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.parameters import moving_numbers
 from dq_space_arm_env.scene.schema import Scene
@@ -25,6 +28,10 @@ FLAGS = ("terminated", "is_success", "diverged")
 MEMORY = ("steps_taken", "cost_pose", "cost_base_velocity")
 
 
+CONSTRAINT = "constraints."
+"""Prefix of the columns of residuals."""
+
+
 def has_twist_errors(scene: Scene) -> bool:
     """Tell whether the tip's velocity relative to the target counts: it moves, or success asks for it."""
     success = scene.success
@@ -38,6 +45,7 @@ def report_names(scene: Scene) -> tuple[str, ...]:
     The velocities of the tip relative to the target are those after the step with the wrist held, in deg/s
     and m/s. The phase is that of the next step; `caught` is 1 unless a catch has failed; the shocks are the
     impulse [N s] on a payload that the step has caught, and the angular impulse about the tip [N m s].
+    Of constraints the sum of violations over tolerances and every residual come last.
     """
     names = list(REPORT)
     if has_twist_errors(scene):
@@ -46,6 +54,8 @@ def report_names(scene: Scene) -> tuple[str, ...]:
         names.insert(-1, "phase")
     if any(phase.catch is not None for phase in scene.phases):
         names[-1:-1] = ["caught", "shock", "angular_shock"]
+    if scene.constraints:
+        names += ["cost", *(CONSTRAINT + name for name in constraint_names(scene))]
     if any(scene.cost.terminal_tip_twist):
         names.insert(names.index("attitude_error"), "terminal_cost_tip_twist")
     if any(scene.cost.tip_twist):
@@ -53,18 +63,32 @@ def report_names(scene: Scene) -> tuple[str, ...]:
     return tuple(names)
 
 
+def constraint_names(scene: Scene) -> tuple[str, ...]:
+    """Names of the residuals that a step reports last: those of the path, and of what is exact at the end."""
+    return tuple(row.name for row in (*path_rows(scene), *exact_rows(scene)))
+
+
+def grouped(info: dict[str, Any]) -> dict[str, Any]:
+    """Gather the columns of residuals in a dictionary of their own, `constraints`; there is none without."""
+    residuals = {name: value for name, value in info.items() if name.startswith(CONSTRAINT)}
+    if not residuals:
+        return info
+    rest = {name: value for name, value in info.items() if name not in residuals}
+    return rest | {"constraints": {name.removeprefix(CONSTRAINT): each for name, each in residuals.items()}}
+
+
 def cost_names(scene: Scene) -> tuple[str, ...]:
     """Names of the terms of a scene's cost: those of the stage, then the terminal ones."""
-    return tuple(name for name in report_names(scene) if "cost" in name)
+    return tuple(name for name in report_names(scene) if name.startswith(("cost_", "terminal_cost_")))
 
 
 def n_observations(scene: Scene) -> int:
-    """Count the entries of an observation: state, time left, and two twists where the target moves."""
+    """Count the entries of an observation: state, phase, margins, two twists where the target moves, time."""
     layout = StateLayout.of(scene)
     phase = 1 if scene.phases else 0
-    return (
-        layout.n_x + 1 + phase + (2 * (3 if layout.planar else 6) if scene.target.motion is not None else 0)
-    )
+    twists = 2 * (3 if layout.planar else 6) if scene.target.motion is not None else 0
+    margins = sum(row.observed is not None for row in path_rows(scene))
+    return layout.n_x + phase + margins + twists + 1
 
 
 def memory_names(scene: Scene) -> tuple[str, ...]:

@@ -17,12 +17,21 @@ overestimates counts as converged.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from experts.ddp import augmented_lagrangian
+from experts.ddp.augmented_lagrangian import (
+    LONG_ENOUGH,
+    SERIOUS,
+    STATIONARITY,
+    AugmentedLagrangian,
+    ConstraintReport,
+)
 from experts.ddp.backward_pass import PASS_NOT_FINITE, PASS_NOT_POSITIVE_DEFINITE, PassResult
 from experts.ddp.multiple_shooting import MultipleShooting
 from experts.ddp.rollout import FINISHED
@@ -38,6 +47,7 @@ from experts.problems.shooting_problem import (
     check_control_weights,
     stage_bounds,
 )
+from experts.problems.stage_constraints import StageConstraints
 
 CONVERGED = "no step is predicted to reduce the cost"
 
@@ -94,6 +104,8 @@ class BoxDDP:
         # Exact second derivatives, where there are any, have the last word on convergence.
         self._has_exact = self.second_order is not SecondOrder.GAUSS_NEWTON
         self._work = ShootingWorkspace(self.problem, self._has_exact, threads=threads)
+        constraints: StageConstraints | None = getattr(self.problem, "constraints", None)
+        self._lagrangian = None if constraints is None else AugmentedLagrangian(constraints)
         self._shooting: MultipleShooting | None = None
 
     def solve(
@@ -104,6 +116,7 @@ class BoxDDP:
         *,
         x_init: FloatArray | None = None,
         parameters: ArrayLike | None = None,
+        multipliers: FloatArray | None = None,
     ) -> Solution:
         """Minimize the cost, starting from a guess of the controls, or of controls and states.
 
@@ -119,17 +132,22 @@ class BoxDDP:
             parameters: What varies in the problem, the same for all stages, shape (n_p,), or a row for each
                 stage and the end, (N + 1, n_p), entries as in `kernels.parameters`; None for nominal ones.
                 Nothing is compiled when they change.
+            multipliers: Those of a similar maneuver with the same constraints, shape (N + 1, m), as in
+                `Solution.multipliers`; the constraints then count from the first step on. None begins without
+                them.
 
         Returns:
             The best trajectory found, whatever the reason to stop; always a rollout of its controls from x0.
+            Its cost is without penalties.
 
         Raises:
-            ValueError: If x0, u_init, x_init or parameters have the wrong shape, are not finite or out of
-                bounds, an input has no cost of its own, or states are given and the problem has no
+            ValueError: If x0, u_init, x_init, parameters or multipliers have the wrong shape, are not finite
+                or out of bounds, an input has no cost of its own, or states are given and the problem has no
                 retraction.
         """
         self.problem.parameters.set(parameters)
         initial_state, controls = self._check_start(x0, u_init)
+        self._begin_multipliers(multipliers)
         work, stop = self._work, None
         state = SolverState(Regularization(self.initial_regularization))
         if x_init is None:
@@ -143,12 +161,25 @@ class BoxDDP:
             message = f"the first rollout is not finite from stage {work.current.failing_stage} on"
             return self._solution(state, Stop(StopReason.DIVERGED, message), np.zeros_like(work.update.K))
         state.moved = True
+        if multipliers is not None:
+            state.switch.request_exact()
         try:
             while stop is None:
                 stop = self._iterate(state, callback)
         except KeyboardInterrupt:
             stop = Stop(StopReason.INTERRUPTED, "interrupted by the user")
         return self._finish(state, stop)
+
+    def _begin_multipliers(self, multipliers: FloatArray | None) -> None:
+        """Begin with the multipliers of a similar maneuver, or without the constraints."""
+        if self._lagrangian is not None:
+            self._lagrangian.leave_out()
+        if multipliers is None:
+            return
+        if self._lagrangian is None:
+            raise ValueError("multipliers are given, but the problem has no constraints; leave them out")
+        check_array("multipliers", multipliers, self._lagrangian.constraints.multipliers.shape)
+        self._lagrangian.begin(multipliers)
 
     def _iterate(self, state: SolverState, callback: Callback | None) -> Stop | None:
         """Run one iteration; return why the solve ends, or None to continue."""
@@ -161,10 +192,10 @@ class BoxDDP:
         cost, alpha = work.current.cost, 0.0
         for direction in self._backward_passes(state):
             stop = self._stopping_criteria(state, direction)
-            if stop is not None:
+            if stop is not None and not self._is_unfinished(state, stop):
                 return stop
             alpha = line_search(work, direction)
-            if alpha > 0.0:
+            if alpha > 0.0 or stop is not None:
                 break
         # Beside another model the exact one has a regularization of its own.
         if direction.exact == (self.second_order is SecondOrder.EXACT):
@@ -175,7 +206,52 @@ class BoxDDP:
         record = self._record(state, direction, cost, alpha, started)
         if callback is not None:
             callback(record)
+        if self._lagrangian is not None:
+            if stop is not None and self._meets_constraints():
+                return None if state.moved else stop
+            is_near = alpha >= LONG_ENOUGH and record.optimality <= self._lagrangian.near
+            if stop is not None or is_near:
+                return self._follow_constraints(state)
         return self._no_progress(state, record)
+
+    def _is_unfinished(self, state: SolverState, stop: Stop) -> bool:
+        """Whether only the constraints ask for more: a step too small to count still serves their rows."""
+        if self._lagrangian is None or stop.reason is not StopReason.CONVERGED:
+            return False
+        return state.optimality > STATIONARITY or not self._meets_constraints()
+
+    def _meets_constraints(self) -> bool:
+        """Whether the current trajectory keeps to all rows that count."""
+        current, lagrangian = self._work.current, self._lagrangian
+        assert lagrangian is not None  # or it is not called
+        return lagrangian.counts and lagrangian.is_met(current.states, current.controls, current.cost)
+
+    def _follow_constraints(self, state: SolverState) -> Stop | None:
+        """Let constraints begin to count, or multipliers follow the trajectory."""
+        work, lagrangian = self._work, self._lagrangian
+        assert lagrangian is not None  # or it is not called
+        if lagrangian.counts:
+            lagrangian.update(work.current.states, work.current.controls)
+        else:
+            lagrangian.begin()
+            state.switch.request_exact()
+        work.evaluate_anew()
+        state.moved, state.idle_iterations, state.optimality = True, 0, np.inf
+        if not lagrangian.is_infeasible:
+            return None
+        report = self._constraint_report()
+        return Stop(
+            StopReason.INFEASIBLE,
+            f"{report.worst_row} is violated by {report.violation:.1e} at {report.worst_time:.3g} s, and "
+            "larger penalties do not help",
+        )
+
+    def _constraint_report(self) -> ConstraintReport:
+        """Judge the current trajectory by its constraints."""
+        current, lagrangian = self._work.current, self._lagrangian
+        assert lagrangian is not None  # or it is not called
+        given = current.states, current.controls, current.cost, self.problem.time_step
+        return lagrangian.report(*given)
 
     def _backward_passes(self, state: SolverState) -> Iterator[PassResult]:
         """Yield control updates to search along; the next one is asked for if no step was accepted."""
@@ -199,7 +275,8 @@ class BoxDDP:
             while direction.status == PASS_NOT_POSITIVE_DEFINITE and remembered.increase():
                 direction = self._work.backward_pass(remembered.mu, exact=True)
             return direction
-        for mu in EXACT_MU:
+        rows_count = self._lagrangian is not None and self._lagrangian.counts
+        for mu in augmented_lagrangian.EXACT_MU if rows_count else EXACT_MU:
             direction = self._work.backward_pass(mu, exact=True)
             if direction.status != PASS_NOT_POSITIVE_DEFINITE:
                 break
@@ -298,6 +375,8 @@ class BoxDDP:
     def _finish(self, state: SolverState, stop: Stop) -> Solution:
         """Compute the gains around the final trajectory, and judge it without regularization."""
         work, (reason, message) = self._work, stop
+        if self._lagrangian is not None:
+            return self._finish_constrained(state, stop)
         if reason is not StopReason.CONVERGED:
             state.optimality = np.inf
             work.differentiate()
@@ -312,6 +391,28 @@ class BoxDDP:
         if np.isfinite(state.optimality):
             message += f"; an unregularized step predicts a relative reduction of {state.optimality:.1e}"
         return self._solution(state, Stop(reason, message), work.update.K.copy())
+
+    def _finish_constrained(self, state: SolverState, stop: Stop) -> Solution:
+        """Compute the gains with moderate penalties, and the cost without any."""
+        work, lagrangian = self._work, self._lagrangian
+        assert lagrangian is not None  # or it is not called
+        lagrangian.settle(work.current.states, work.current.controls)
+        lagrangian.soften()
+        work.differentiate()
+        gains, message = np.zeros_like(work.update.K), stop.message
+        if self._final_backward_pass().completed:
+            gains = work.update.K.copy()
+        else:
+            message += "; there are no feedback gains, they are zero"
+        multipliers, report = lagrangian.constraints.multipliers.copy(), self._constraint_report()
+        lagrangian.leave_out()
+        work.evaluate_anew()
+        message += f"; the largest violation is {max(report.violation, 0.0):.1e}, of {report.worst_row}"
+        reason = stop.reason
+        if reason is StopReason.REGULARIZATION_LIMIT and report.violation > SERIOUS:
+            reason = StopReason.INFEASIBLE
+        found = self._solution(state, Stop(reason, message), gains)
+        return replace(found, multipliers=multipliers, constraints=report)
 
     def _final_backward_pass(self) -> PassResult:
         """Run a backward pass without regularization, with exact second derivatives if that succeeds."""

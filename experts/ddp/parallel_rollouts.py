@@ -31,7 +31,7 @@ class _Work(NamedTuple):
     control_columns: FloatArray  # controls of a stage, shape (n_u, LANES)
     end_state: FloatArray  # last state of a lane, shape (1, n_x)
     end_cost: FloatArray  # its terminal cost, shape (1,)
-    parameters: FloatArray  # of the stages, the same in every lane, shape (N, LANES, n_p)
+    parameters: FloatArray  # inputs of the stages, the same in every lane, shape (N, LANES, n_p and more)
 
 
 class _Kernels(NamedTuple):
@@ -50,7 +50,7 @@ class ParallelRollouts:
 
     def __init__(self, problem: ShootingProblem, time_step: FloatArray) -> None:
         self._problem = problem
-        horizon, n_x = problem.horizon, problem.n_states
+        horizon, n_x, inputs = problem.horizon, problem.n_states, problem.parameters.inputs
         n_t, n_u = problem.n_tangent, problem.n_controls
         self._work = work = _Work(
             states=np.zeros((horizon + 1, LANES, n_x)),
@@ -63,9 +63,9 @@ class ParallelRollouts:
             control_columns=np.zeros((n_u, LANES)),
             end_state=np.zeros((1, n_x)),
             end_cost=np.zeros(1),
-            parameters=np.zeros((horizon, LANES, problem.parameters.rows.shape[1])),
+            parameters=np.zeros((horizon, LANES, inputs[0].shape[1] if inputs else 0)),
         )
-        parameters = (work.parameters,) if problem.parameters.inputs else ()
+        parameters = (work.parameters,) if inputs else ()
         # Keeps the kernels' code and the arrays behind the tables alive.
         self._arrays = (time_step, *problem.terminal_inputs)
         self._code = difference, step, terminal = (
@@ -96,7 +96,8 @@ class ParallelRollouts:
         alphas = np.zeros(LANES)
         alphas[: len(step_lengths)] = step_lengths
         states, controls = reference
-        self._work.parameters[:] = self._problem.parameters.rows[:-1, None]
+        for rows in self._problem.parameters.inputs:
+            self._work.parameters[:] = rows[:-1, None]
         with native_calls(self._problem):
             _roll_out(
                 self._kernels,

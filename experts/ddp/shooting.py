@@ -127,6 +127,11 @@ class ShootingWorkspace:
         trajectory.controls[:] = controls
         trajectory.roll_out(self._kernels)
 
+    @timed("rollout")
+    def evaluate_anew(self) -> None:
+        """Compute the cost of the current trajectory with what the problem has changed."""
+        self.current.roll_out(self._kernels)
+
     @timed("derivatives")
     def differentiate(self) -> None:
         """Compute the derivatives along the current trajectory that Gauss-Newton needs."""

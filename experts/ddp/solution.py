@@ -19,6 +19,7 @@ from dq_space_arm_env.common.bounded_reading import parse_json
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.kernels.bound import address_of, buffer_table, one_row_call
+from experts.ddp.augmented_lagrangian import ConstraintReport
 from experts.problems.arm_problem import as_problem
 from experts.problems.shooting_problem import FloatArray, ShootingProblem, stage_bounds
 
@@ -38,6 +39,8 @@ class StopReason(StrEnum):
     """No step reduces the cost, however short."""
     DIVERGED = "diverged"
     """The first rollout, or a derivative along the trajectory, is not finite."""
+    INFEASIBLE = "infeasible"
+    """A constraint stays violated however large its penalty."""
     INTERRUPTED = "interrupted"
     """The user interrupted the solve."""
 
@@ -109,6 +112,9 @@ class Solution:
         iterations: Number of iterations.
         history: One row per iteration, fields as in `IterationRecord`.
         parameters: What varies, at every stage and the end, shape (N + 1, n_p).
+        multipliers: Those of the constraints along the path, the last row of those at the end, shape
+            (N + 1, m), see `StageConstraints`; empty without constraints.
+        constraints: How the trajectory keeps to its constraints; None without.
         metadata: JSON values to be saved along, for example the resolved scene.
         problem: The problem solved; None after `load`.
     """
@@ -123,6 +129,8 @@ class Solution:
     iterations: int
     history: NDArray[np.void]
     parameters: FloatArray
+    multipliers: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    constraints: ConstraintReport | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
     problem: ShootingProblem | None = field(default=None, repr=False)
 
@@ -169,11 +177,13 @@ class Solution:
             "optimality": self.optimality,
             "iterations": self.iterations,
             "metadata": self.metadata,
+            **({} if self.constraints is None else {"constraints": self.constraints._asdict()}),
             "versions": {
                 "python": platform.python_version(),
                 **{package: version(package) for package in ("numpy", "numba", "llvmlite")},
             },
         }
+        multipliers = {} if self.constraints is None else {"multipliers": self.multipliers}
         content = BytesIO()
         np.savez(
             content,
@@ -183,6 +193,7 @@ class Solution:
             history=self.history,
             parameters=self.parameters,
             facts=np.array(json.dumps(facts)),
+            **multipliers,  # type: ignore[arg-type]  # numpy types them as its options
         )
         return content.getvalue()
 
@@ -199,7 +210,7 @@ class Solution:
         Raises:
             ValueError: If the file does not hold a solution.
         """
-        return cls.from_arrays(read_arrays(path, _ARRAYS), os.fspath(path))
+        return cls.from_arrays(read_arrays(path, (*_ARRAYS, *_OPTIONAL_ARRAYS)), os.fspath(path))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], where: str) -> Self:
@@ -231,10 +242,12 @@ class Solution:
             optimality=facts["optimality"],
             iterations=facts["iterations"],
             metadata=facts["metadata"],
+            constraints=ConstraintReport(**facts["constraints"]) if "constraints" in facts else None,
         )
 
 
 _ARRAYS = ("states", "controls", "feedback_gains", "history", "parameters", "facts")
+_OPTIONAL_ARRAYS = ("multipliers",)
 _FACTS: Mapping[str, tuple[Any, str]] = {
     "cost": (float | int, "a number"),
     "stop_reason": (str, "text"),

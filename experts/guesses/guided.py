@@ -50,6 +50,8 @@ LARGEST_COARSENING = 8
 """Most steps in a long one."""
 NEAR_ITERATIONS = 10
 """Long steps are short enough if their policy is within so many iterations of the problem's own minimum."""
+NEAR_ITERATIONS_CONSTRAINED = 40
+"""The same where there are constraints, whose multipliers follow."""
 CREEPING = 30
 """Iterations in long steps beyond which Gauss-Newton's model creeps, and the mirrored one is tried."""
 CHEAPER = 0.999
@@ -66,6 +68,7 @@ class _Guess(NamedTuple):
     emphasis: float = 1.0  # factor of the final pose's weights
     interrupted: bool = False  # whether the user stopped the solve that led to it
     long_steps: tuple[dict[str, Any], ...] = ()  # the attempts in long steps that led to it
+    multipliers: FloatArray | None = None  # of the maneuver that it comes from; None without constraints
 
 
 class _Attempt(NamedTuple):
@@ -253,6 +256,8 @@ class GuidedDDP:
         solution, target = found.solution, self._target
         if not solution.converged or self._is_good(solution) or not self.reach_target or target is None:
             return attempts
+        if solution.constraints is not None:  # the tolerances are among them
+            return attempts
 
         def solve(controls: FloatArray) -> Solution:
             return self._solve_from(_Guess("", controls, np.inf, NEAR_REGULARIZATION), start, callback)
@@ -283,9 +288,8 @@ class GuidedDDP:
         for i, solution in enumerate(library):
             for name, policy in policies(solution, self.problem).items():
                 trial = follow(policy, self.problem, start)
-                rollouts.append(
-                    _Guess(f"policy {i}{name}", trial.controls, trial.cost, POLICY_REGULARIZATION)
-                )
+                guess = _Guess(f"policy {i}{name}", trial.controls, trial.cost, POLICY_REGULARIZATION)
+                rollouts.append(guess._replace(multipliers=_multipliers(solution)))
                 strayed = strayed and trial.cost > STRAYED * solution.cost
         if strayed and self._kinematic_guess is not None:
             motion = self._kinematic_guess(start)
@@ -310,7 +314,8 @@ class GuidedDDP:
                 callback(record._replace(**costs))
 
         found = coarse.solve(start, report, parameters=self.problem.parameters.rows[::factor])
-        trial = follow(refined(found, self.problem), self.problem, start)
+        policy = refined(found, self.problem)
+        trial = follow(policy, self.problem, start)
         if not np.isfinite(trial.cost):
             return None
         facts = found.metadata
@@ -323,6 +328,7 @@ class GuidedDDP:
             facts["emphasis"],
             interrupted=found.stop_reason is StopReason.INTERRUPTED,
             long_steps=tuple({**attempt, "cost": factor * attempt["cost"]} for attempt in attempts),
+            multipliers=_multipliers(policy),
         )
 
     def _solve_from(self, guess: _Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
@@ -330,7 +336,11 @@ class GuidedDDP:
 
         def solve() -> Solution:
             return self._solver.solve(
-                start, guess.controls, callback, parameters=self.problem.parameters.rows
+                start,
+                guess.controls,
+                callback,
+                parameters=self.problem.parameters.rows,
+                multipliers=guess.multipliers,
             )
 
         callback = _interrupt if guess.interrupted else callback
@@ -458,7 +468,8 @@ class GuidedDDP:
         guess = self._coarse_guess(coarse, start, None)
         if guess is None:
             return False
-        self._solver.max_iterations = NEAR_ITERATIONS
+        constrained = guess.multipliers is not None
+        self._solver.max_iterations = NEAR_ITERATIONS_CONSTRAINED if constrained else NEAR_ITERATIONS
         try:
             solution = self._solve_from(guess, start)
         finally:
@@ -479,6 +490,11 @@ class GuidedDDP:
             solutions.append(solution)
         best = min(solutions, key=lambda solution: solution.cost)
         return [best] if np.isfinite(best.cost) else []
+
+
+def _multipliers(solution: Solution) -> FloatArray | None:
+    """Multipliers of a solution to start another solve with."""
+    return None if solution.constraints is None else solution.multipliers
 
 
 def _interrupt(record: IterationRecord) -> None:

@@ -32,6 +32,7 @@ def coarsened(solution: Solution, factor: int) -> Solution:
         controls=stages.mean(axis=1),
         feedback_gains=solution.feedback_gains[::factor],
         parameters=solution.parameters[::factor],
+        multipliers=solution.multipliers[::factor],
         cost=solution.cost / factor,
     )
 
@@ -48,13 +49,17 @@ def refined(solution: Solution, problem: ShootingProblem) -> Solution:
     steps *= np.tile(np.arange(factor) / factor, stages)[:, None]
     buffers = buffer_table(references, steps, between)
     run_kernel(problem.kernel("retract").address, 0, problem.horizon, buffers)
-    parameters = np.repeat(solution.parameters[:-1], factor, axis=0)
+    parameters, multipliers = (
+        np.concatenate([np.repeat(rows[:-1], factor, axis=0), rows[-1:]])
+        for rows in (solution.parameters, solution.multipliers)
+    )
     return replace(
         solution,
         states=np.concatenate([between, solution.states[-1:]]),
         controls=np.repeat(solution.controls, factor, axis=0),
         feedback_gains=np.repeat(solution.feedback_gains, factor, axis=0),
-        parameters=np.concatenate([parameters, solution.parameters[-1:]]),
+        parameters=parameters,
+        multipliers=multipliers,
         cost=solution.cost * factor,
     )
 

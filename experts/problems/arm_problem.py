@@ -13,7 +13,9 @@ from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
+from dq_space_arm_env.kernels.library import PENALIZED
 from dq_space_arm_env.scene import INTEGRATORS
+from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, terminal_rows
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.parameters import CATCH, PHASE
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
@@ -25,6 +27,7 @@ from experts.problems.shooting_problem import (
     check_interface,
     check_problem,
 )
+from experts.problems.stage_constraints import StageConstraints
 
 
 class ArmProblem:
@@ -34,20 +37,30 @@ class ArmProblem:
         parameters: What varies in the scene, as in `kernels.parameters`.
         terminal_inputs: The last stage's parameters, if there are any, and the emphasis on the pose in the
             terminal cost, shape (1,); see `emphasized`.
+        constraints: Those of the scene and of success at its end; None without.
         has_second_order: Whether the registry of integrators names second derivatives for the scene's; the
             solver uses Gauss-Newton's model where there are none.
     """
 
     has_retraction = True
 
-    def __init__(self, scene: Scene | str | Path | Mapping[str, Any], integrator: str | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene | str | Path | Mapping[str, Any],
+        integrator: str | None = None,
+        *,
+        constrained: bool | None = None,
+    ) -> None:
         self.scene = in_double_precision(load_scene(scene), integrator)
         self.kernels = compile_scene(self.scene)
         self.integrator: str = self.scene.simulation.integrator
         self.has_second_order = INTEGRATORS[self.integrator].curvature is not None
         layout = self.kernels.layout
+        self.is_constrained = bool(self.scene.constraints) if constrained is None else constrained
+        mixed_rows = self.is_constrained and any(row.has_input for row in path_rows(self.scene))
         # The wrist's rates turn the tip.
-        self.has_mixed_cost = any(self.scene.cost.tip_twist) and "wrist psi rate" in layout.control.names
+        twists = any(self.scene.cost.tip_twist) and "wrist psi rate" in layout.control.names
+        self.has_mixed_cost = twists or mixed_rows
         self.n_states, self.n_tangent, self.n_controls = layout.n_x, layout.n_t, layout.n_u
         self.horizon = self.scene.simulation.steps
         self.time_step = self.scene.simulation.dt
@@ -59,11 +72,30 @@ class ArmProblem:
         """Allocate what may change between solves: parameters, and the emphasis on the final pose."""
         entries = self.kernels.parameters
         changing = self._in_stages if entries.moving or entries.staged else None
-        self.parameters = StageParameters(self.horizon, self.kernels.parameters.nominal, changing)
+        n_rows = n_multipliers(self.scene) if self.is_constrained else 0
+        nominal = self.kernels.parameters.nominal
+        self.parameters = StageParameters(self.horizon, nominal, changing, 2 * n_rows)
+        self.constraints = self.constraints_of(self.parameters)
         self._usual_emphasis = usual_emphasis
         self._emphasis: FloatArray = np.full(1, self._usual_emphasis)
         last = (rows[-1:] for rows in self.parameters.inputs)
         self.terminal_inputs: tuple[FloatArray, ...] = (*last, self._emphasis)
+
+    def constraints_of(self, parameters: StageParameters) -> StageConstraints | None:
+        """Constraints of stages with given parameters, whose further numbers are their multipliers."""
+        if not self.is_constrained:
+            return None
+        path, terminal, kernels = path_rows(self.scene), terminal_rows(self.scene), self.kernels
+
+        def residuals(states: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
+            rows, along = parameters.rows, np.zeros((len(controls), 0))
+            if path:
+                along = kernels.constraints(states[:-1], controls, p=rows[:-1])
+            at_end = kernels.terminal_constraints(states[-1], p=rows[-1])
+            return along + [row.margin for row in path], at_end + [row.margin for row in terminal]
+
+        multipliers, penalties = np.split(parameters.more, 2, axis=1)
+        return StageConstraints(path, terminal, multipliers, penalties, residuals)
 
     def _in_stages(self, parameters: FloatArray) -> FloatArray:
         """Parameters of the stages, (N + 1, n_p), from those at the start: the target moves."""
@@ -180,6 +212,8 @@ class ArmProblem:
         integrator: str | None = self.integrator
         if name == "lagrangian_hessian":
             integrator = INTEGRATORS[self.integrator].curvature
+        if self.is_constrained and name not in ("difference", "retract"):
+            name = PENALIZED + name
         return self.kernels.kernel(name, integrator=integrator, lanes=None if batched else 1)
 
 
@@ -250,6 +284,7 @@ class WindowProblem:
 
     Attributes:
         ends_early: Whether the maneuver continues after the last stage.
+        constraints: Those of the maneuver; None if it does: its multipliers are given then.
         terminal_inputs: If it does, the quadratic model: its reference state, shape (1, n_x), gradient (1,
             n_t) and symmetric Hessian (1, n_t, n_t).
     """
@@ -258,8 +293,11 @@ class WindowProblem:
 
     def __init__(self, maneuver: ArmProblem, horizon: int, model: tuple[FloatArray, ...] = ()) -> None:
         self.maneuver, self.horizon, self.ends_early = maneuver, horizon, bool(model)
-        self.parameters = StageParameters(horizon, maneuver.parameters.nominal)
-        self.terminal_inputs = model or maneuver.terminal_inputs
+        n_more = maneuver.parameters.more.shape[1]
+        self.parameters = StageParameters(horizon, maneuver.parameters.nominal, n_more=n_more)
+        self.constraints = None if self.ends_early else maneuver.constraints_of(self.parameters)
+        last = (rows[-1:] for rows in self.parameters.inputs)
+        self.terminal_inputs = model or (*last, *maneuver.terminal_inputs[-1:])
         self.has_second_order = maneuver.has_second_order and not self.ends_early
         self.n_states, self.n_tangent = maneuver.n_states, maneuver.n_tangent
         self.n_controls, self.has_mixed_cost = maneuver.n_controls, maneuver.has_mixed_cost

@@ -64,7 +64,9 @@ class StageParameters:
     Attributes:
         nominal: Values of a solve that is given none, shape (n_p,).
         rows: Present values, shape (N + 1, n_p); the last row is that of the terminal cost.
-        inputs: The rows as an array to be read after the state; nothing for a problem without parameters.
+        more: Further numbers of each stage that only the solver changes, multipliers for example.
+        inputs: Rows and further numbers side by side, an array to be read after the state; nothing for a
+            problem without either.
     """
 
     def __init__(
@@ -72,12 +74,14 @@ class StageParameters:
         horizon: int,
         nominal: ArrayLike = (),
         in_stages: Callable[[FloatArray], FloatArray] | None = None,
+        n_more: int = 0,
     ) -> None:
         """Begin with nominal values; `in_stages` gives the rows (N + 1, n_p) that follow from the first."""
         self.nominal: FloatArray = np.array(nominal, dtype=np.float64)
-        self.rows: FloatArray = np.tile(self.nominal, (horizon + 1, 1))
+        self._whole: FloatArray = np.zeros((horizon + 1, self.nominal.size + n_more))
+        self.rows, self.more = np.split(self._whole, [self.nominal.size], axis=1)
         self._in_stages = in_stages
-        self.inputs: tuple[FloatArray, ...] = (self.rows,) if self.nominal.size else ()
+        self.inputs: tuple[FloatArray, ...] = (self._whole,) if self._whole.size else ()
         self.set(None)
 
     def checked(self, parameters: ArrayLike | None) -> FloatArray:

@@ -7,7 +7,7 @@ method.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import casadi
@@ -25,7 +25,10 @@ from dq_space_arm_env.integrators.method import (
     graph_inputs,
     program_inputs,
 )
+from dq_space_arm_env.kernels.programs.constraint_programs import constraint_residuals
 from dq_space_arm_env.kernels.programs.stage_programs import stage_method, with_catch
+from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
+from dq_space_arm_env.task.augmented_lagrangian import PenalizedEquations
 from dq_space_arm_env.task.equations import SceneEquations
 
 Scalar = Any
@@ -78,18 +81,11 @@ class DerivativePrograms:
         return gradient, casadi.sparsify(hessian)
 
     def _twist_residual(self, x: Scalars, u: Scalars, cost: str) -> tuple[Matrix, Matrix, Matrix]:
-        """Twist relative to the target, of the tip or the base, by tangent state z and input; their values.
-
-        The pose moves to second order, by 1 + d / 2 + d^2 / 8 for a twist increment d.
-        """
-        field, n = self.field, len(self.field.pose.directions)
+        """Twist relative to the target, of tip or base, by tangent state z and input; their values."""
+        field = self.field
         z, w = symbols("z", field.n_t), symbols("w", field.n_u)
-        half = dq.from_vector([0.5 * entry for entry in field.pose.full_twist(z[:n])])
-        square = dq.multiply(half, half)
-        turned = [a + 0.5 * b for a, b in zip(half, square, strict=True)]
-        turned[0] = turned[0] + 1.0
-        motion = field.motion([a + b for a, b in zip(self.equations.y(x), z[n:], strict=True)])
-        frame = dq.multiply(self.equations.base_pose(x), turned)
+        frame, y = self.equations.moved(x, z)
+        motion = field.motion(y)
         if cost.endswith("tip_twist"):
             arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
             frame = dq.multiply(frame, arm)
@@ -101,7 +97,7 @@ class DerivativePrograms:
         return residual, column(*z, *w), casadi.densify(column(*[0.0] * field.n_t, *u))
 
     def _twist_cost_derivatives(
-        self, x: Scalars, u: Scalars, field: str, *, exact: bool = False, emphasis: Scalar = 1.0
+        self, x: Scalars, u: Scalars, field: str, *, exact: bool, emphasis: Scalar = 1.0
     ) -> tuple[Matrix, Matrix]:
         """Gradient and Hessian (exact or Gauss-Newton's) of a relative twist's cost by tangent state, u."""
         residual, moved, values = self._twist_residual(x, u, field)
@@ -118,15 +114,46 @@ class DerivativePrograms:
         gradient, hessian = casadi.substitute([gradient, symmetric], [moved], [values])
         return gradient, casadi.sparsify(hessian)
 
-    def _held_twist_derivatives(self, x: Scalars, emphasis: Scalar, *, exact: bool) -> tuple[Matrix, Matrix]:
-        """Likewise of the terminal twists, with the wrist held, by the tangent state."""
+    def _penalty_derivatives(
+        self, equations: PenalizedEquations, x: Scalars, u: Scalars | None, *, exact: bool
+    ) -> tuple[Matrix, Matrix]:
+        """Gradient and Hessian (exact or Gauss-Newton's) of the penalties by tangent state and input.
+
+        Those of the path's rows; without input those of the rows at the end, by the tangent state.
+        """
+        residuals, moved, values = constraint_residuals(equations, x, u)
+        rows = terminal_rows(self.scene) if u is None else path_rows(self.scene)
+        penalties = equations.penalized(rows, residuals)
+        slopes = casadi.densify(column(*(each.slope for each in penalties)))
+        jacobian, factor = casadi.jacobian(column(*residuals), moved), symbols("factor", len(rows))
+        stiffness = casadi.diag(casadi.densify(column(*(each.curvature for each in penalties))))
+        hessian = casadi.mtimes(jacobian.T, casadi.mtimes(stiffness, jacobian))
+        if exact:
+            curvature = casadi.hessian(casadi.dot(column(*factor), column(*residuals)), moved)[0]
+            hessian = hessian + casadi.substitute(curvature, casadi.densify(column(*factor)), slopes)
+        gradient, symmetric = casadi.mtimes(jacobian.T, slopes), casadi.triu2symm(casadi.triu(hessian))
+        gradient, hessian = casadi.substitute([gradient, symmetric], [moved], [values])
+        return gradient, casadi.sparsify(hessian)
+
+    def _further_terms(self, x: Scalars, u: Scalars, *, exact: bool) -> Iterator[tuple[Matrix, Matrix]]:
+        """Gradients and Hessians by tangent state and input of what only some stage costs have."""
+        for cost in self._twist_costs():
+            yield self._twist_cost_derivatives(x, u, cost, exact=exact)
+        if isinstance(self.equations, PenalizedEquations) and path_rows(self.scene):
+            yield self._penalty_derivatives(self.equations, x, u, exact=exact)
+
+    def _further_terminal_terms(
+        self, x: Scalars, emphasis: Scalar, *, exact: bool
+    ) -> Iterator[tuple[Matrix, Matrix]]:
+        """Likewise of terminal costs by the tangent state; for their twists the wrist is held."""
         held, n_t = [0.0] * self.field.n_u, self.field.n_t
-        gradient, hessian = casadi.SX(n_t, 1), casadi.SX(n_t, n_t)
         for cost in self._twist_costs("terminal_"):
             stressed = emphasis if cost == "terminal_tip_twist" else 1.0
             slope, curvature = self._twist_cost_derivatives(x, held, cost, exact=exact, emphasis=stressed)
-            gradient, hessian = gradient + slope[:n_t], hessian + curvature[:n_t, :n_t]
-        return gradient, hessian
+            yield slope[:n_t], curvature[:n_t, :n_t]
+        if isinstance(self.equations, PenalizedEquations):
+            slope, curvature = self._penalty_derivatives(self.equations, x, None, exact=exact)
+            yield emphasis * slope, emphasis * curvature
 
     def _twist_costs(self, prefix: str = "") -> list[str]:
         """Those terms of twists relative to the target that have weights."""
@@ -155,8 +182,7 @@ class DerivativePrograms:
         weights = [2.0 * weight for weight in self.equations.control_weights]
         by_input: Matrix = column(*(weight * value for weight, value in zip(weights, u, strict=True)))
         squared, mixed = casadi.diag(column(*weights)), zeros(n_u, n_t)
-        for cost in self._twist_costs():
-            slope, curvature = self._twist_cost_derivatives(x, u, cost)
+        for slope, curvature in self._further_terms(x, u, exact=False):
             gradient, by_input = gradient + slope[:n_t], by_input + slope[n_t:]
             hessian = casadi.sparsify(hessian + curvature[:n_t, :n_t])
             squared = casadi.sparsify(squared + curvature[n_t:, n_t:])
@@ -182,8 +208,7 @@ class DerivativePrograms:
         field = self.field
         x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
         gradient, hessian = self._state_cost_derivatives(x, self._terminal_weights(), emphasis)
-        if self._twist_costs("terminal_"):
-            slope, curvature = self._held_twist_derivatives(x, emphasis, exact=False)
+        for slope, curvature in self._further_terminal_terms(x, emphasis, exact=False):
             gradient, hessian = gradient + slope, casadi.sparsify(hessian + curvature)
         outputs = {"lx": casadi.densify(gradient).nonzeros(), "lxx": hessian.nonzeros()}
         inputs = graph_inputs(field, x=x, emphasis=[emphasis])
@@ -221,10 +246,10 @@ class DerivativePrograms:
         state = self._state_cost_hessian(x, self._stage_weights())
         effort = casadi.diag(column(*(2.0 * weight for weight in self.equations.control_weights)))
         total, given = curvature + casadi.triu(casadi.diagcat(state, effort)), {"x": x}
-        for cost in self._twist_costs():
-            given.setdefault("u", symbols("u", field.n_u))
-            twist = self._twist_cost_derivatives(x, given["u"], cost, exact=True)[1]
-            total = total + casadi.triu(twist)
+        u = symbols("u", field.n_u)
+        for _, bend in self._further_terms(x, u, exact=True):
+            given["u"] = u
+            total = total + casadi.triu(bend)
         hessian = casadi.sparsify(casadi.triu2symm(total))
         blocks = {
             "Lxx": hessian[: field.n_t, : field.n_t],
@@ -242,8 +267,8 @@ class DerivativePrograms:
         field = self.field
         x, emphasis = symbols("x", field.n_x), casadi.SX.sym("emphasis")
         hessian = self._state_cost_hessian(x, self._terminal_weights(), emphasis)
-        if self._twist_costs("terminal_"):
-            hessian = casadi.sparsify(hessian + self._held_twist_derivatives(x, emphasis, exact=True)[1])
+        for _, bend in self._further_terminal_terms(x, emphasis, exact=True):
+            hessian = casadi.sparsify(hessian + bend)
         program = Program(
             "terminal_cost_hessian",
             program_inputs(field, Buffer("x", field.n_x), Buffer("emphasis", 1)),

@@ -13,11 +13,13 @@ import casadi
 
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
-from dq_space_arm_env.algebra.symbolic import column, zeros
+from dq_space_arm_env.algebra.symbolic import column, symbols, zeros
 from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 from dq_space_arm_env.dynamics.minimal import ZERO
+from dq_space_arm_env.task.constraint_residuals import observed_margins
+from dq_space_arm_env.task.episode import seen
 from dq_space_arm_env.task.equations import SceneEquations, total
 
 Scalar = Any
@@ -104,15 +106,29 @@ class RobotPrograms:
             size = len(field.pose.stored)
             errors = casadi.horzcat(*columns, zeros(size, field.n_t - len(columns)))
             # The rest of the observation holds entries of y, which tangent coordinates shift.
-            rest = self.equations.observe(x, 0.0)["observation"][size:]
+            rest = seen(self.equations, x, 0.0)["observation"][size:]
             by_y = casadi.jacobian(column(*rest), column(*self.equations.y(x)))
             by_pose = zeros(len(rest), field.n_t - field.n_y)
             if self.equations.scene.target.motion is not None:
                 by_pose = self._twists_by_pose(x, base, len(rest))
+            by_pose = by_pose + self._margins_by_pose(x, len(rest))
             jacobian = casadi.vertcat(errors, casadi.horzcat(by_pose, by_y))
             return {"jacobian": casadi.densify(jacobian.T).nonzeros()}
 
         return self._program("observation_jacobian", outputs, x=field.n_x)
+
+    def _margins_by_pose(self, x: Scalars, count: int) -> Any:
+        """Derivative of the last entries by the base's pose: of the margins, before twists and time left."""
+        n = len(self.field.pose.directions)
+        z = symbols("z", n)
+        margins = observed_margins(
+            self.equations, *self.equations.moved(x, [*z, *[0.0] * (self.field.n_t - n)])
+        )
+        if not margins:
+            return zeros(count, n)
+        after = 1 + (2 * n if self.equations.scene.target.motion is not None else 0)
+        by_pose = casadi.substitute(casadi.jacobian(column(*margins), column(*z)), column(*z), [0.0] * n)
+        return casadi.vertcat(zeros(count - after - len(margins), n), by_pose, zeros(after, n))
 
     def _twists_by_pose(self, x: Scalars, base: Columns, count: int) -> Any:
         """Derivative of the last entries but one by the base's pose: of relative and target's twist.

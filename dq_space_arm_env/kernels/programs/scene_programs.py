@@ -19,6 +19,7 @@ from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators import checked_integrator_of
 from dq_space_arm_env.integrators.dormand_prince import append_measured_step
 from dq_space_arm_env.integrators.method import MomentumIntegrator, program_inputs
+from dq_space_arm_env.kernels.programs.constraint_programs import ConstraintPrograms
 from dq_space_arm_env.kernels.programs.derivative_programs import DerivativePrograms
 from dq_space_arm_env.kernels.programs.parameter_programs import ParameterPrograms
 from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
@@ -26,7 +27,8 @@ from dq_space_arm_env.kernels.programs.robot_programs import RobotPrograms
 from dq_space_arm_env.kernels.programs.stage_programs import stage_method, with_catch
 from dq_space_arm_env.scene.parameters import moving_numbers
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.task.episode import next_target, with_target
+from dq_space_arm_env.task.augmented_lagrangian import PenalizedEquations
+from dq_space_arm_env.task.episode import next_target, seen, with_target
 from dq_space_arm_env.task.equations import SceneEquations, total
 from dq_space_arm_env.task.step_report import n_observations
 
@@ -37,9 +39,9 @@ Scalars = Sequence[Scalar]
 class ScenePrograms:
     """Builds the programs of one scene by name."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, *, penalized: bool = False) -> None:
         self.scene = scene
-        self.equations = SceneEquations.of(scene)
+        self.equations = (PenalizedEquations if penalized else SceneEquations).of(scene)
         self.chain, self.layout = self.equations.chain, self.equations.layout
         self.field = self.equations.field
         derivatives = self._derivatives = DerivativePrograms(self.equations)
@@ -61,6 +63,7 @@ class ScenePrograms:
             "cost": self._cost,
             "terminal_cost": self._terminal_cost,
             "emphasized_terminal_cost": self._emphasized_terminal_cost,
+            **ConstraintPrograms(self.equations).builders,
             "cost_derivatives": derivatives.cost,
             "terminal_cost_derivatives": derivatives.terminal_cost,
             "terminal_cost_hessian": derivatives.terminal_cost_hessian,
@@ -192,8 +195,8 @@ class ScenePrograms:
 
     def _emphasized_terminal_cost(self) -> Program:
         def outputs(x: Scalars, emphasis: Scalars) -> Mapping[str, Scalars]:
-            pose, velocity, *twist = self.equations.terminal_cost_terms(x)
-            return {"cost": [emphasis[0] * total([pose, *twist]) + velocity]}
+            pose, velocity, *others = self.equations.terminal_cost_terms(x)
+            return {"cost": [emphasis[0] * total([pose, *others]) + velocity]}
 
         return self._program("emphasized_terminal_cost", outputs, x=self.field.n_x, emphasis=1)
 
@@ -227,7 +230,7 @@ class ScenePrograms:
     def _observation(self) -> Program:
         return self._program(
             "observation",
-            lambda x, time_left: self.equations.observe(x, time_left[0]),
+            lambda x, time_left: seen(self.equations, x, time_left[0]),
             x=self.field.n_x,
             time_left=1,
         )

@@ -1,0 +1,245 @@
+"""Names of the rows c(x, u, p) <= 0 or = 0 of a scene's constraints; environments read them without CasADi.
+
+The residuals are in `task.constraint_residuals`, in the same order. Path rows hold at every stage, those
+without the input at the end too. Terminal rows hold at the end: those, success, and what is exact.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from dq_space_arm_env.scene.constraints import (
+    Distance,
+    JointLimits,
+    Momentum,
+    Plume,
+    Terminal,
+    Volume,
+    WheelMomentum,
+    per_link,
+)
+from dq_space_arm_env.scene.pose import PLANAR_TWIST
+
+Scene = Any  # `schema.Scene`
+AXES = ("x", "y", "z")
+
+
+class Row(NamedTuple):
+    """A row of a constraint."""
+
+    name: str  # of the constraint, and what it is about
+    unit: str  # of the residual, "1" for dimensionless
+    tolerance: float  # violation that costs 1
+    margin: float = 0.0  # that the expert adds to the residual
+    terminates: bool = False  # whether a violation beyond the tolerance ends an episode
+    observed: float | None = None  # scale of its entry in the observation, in its unit
+    is_equality: bool = False
+    has_input: bool = False
+
+
+class Side(NamedTuple):
+    """A bound of a joint's angle or rate: sign * value - bound <= 0."""
+
+    link: int
+    is_rate: bool
+    sign: float
+    bound: float
+
+
+def path_rows(scene: Scene) -> tuple[Row, ...]:
+    """The rows that hold along the path.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        One row per residual of `task.constraint_residuals.path_residuals`.
+    """
+    rows: list[Row] = []
+    for each in scene.constraints:
+        common = each.tolerance, each.margin, each.terminates, each.observed
+        if isinstance(each, JointLimits):
+            for side in sides(scene, each):
+                words = ("rate " if side.is_rate else "") + ("upper" if side.sign > 0 else "lower")
+                unit = "rad/s" if side.is_rate else "rad"
+                rows.append(Row(f"{each.name}: {scene.links[side.link].name} {words}", unit, *common))
+        elif isinstance(each, Distance):
+            pairs = pairs_that_may_touch(scene, each)
+            found = [f"{each.name}: {a.frame} {i} to {b.frame} {j}" for i, a, j, b in pairs]
+            rows += [Row(name, "m", *common) for name in found]
+        elif isinstance(each, Momentum):
+            bounded = {"linear": "N s", "angular": "N m s", "energy": "J"}
+            found = [name for name in bounded if getattr(each, name) is not None]
+            rows += [Row(f"{each.name}: {name}", bounded[name], *common) for name in found]
+        elif isinstance(each, WheelMomentum):
+            axes = AXES[2:] if scene.base.motion == "planar" else AXES
+            names = [f"{each.name}: {sign}{axis}" for axis in axes for sign in "+-"]
+            rows += [Row(name, "N m s", *common) for name in names]
+        elif isinstance(each, Plume):
+            rows.append(Row(each.name, "N m", *common, has_input=True))
+        elif not isinstance(each, Terminal):
+            is_length = hasattr(each, "point")  # line of sight and corridor; the others compare cosines
+            rows.append(Row(each.name, "m" if is_length else "1", *common))
+    return tuple(rows)
+
+
+def success_tolerances(scene: Scene) -> list[tuple[str, str, float]]:
+    """What success asks of the tip at the end.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        Names of the errors, their units, and their tolerances, rad, m, rad/s, m/s.
+    """
+    success = scene.success
+    turning = success.angular_velocity_error_deg
+    tolerances = (
+        ("attitude error", "rad", math.radians(success.attitude_error_deg)),
+        ("position error", "m", success.position_error),
+        ("angular velocity error", "rad/s", None if turning is None else math.radians(turning)),
+        ("velocity error", "m/s", success.velocity_error),
+    )
+    return [(name, unit, tolerance) for name, unit, tolerance in tolerances if tolerance is not None]
+
+
+EXACT = {
+    "pose": (("rad", "m"), "tip"),
+    "twist": (("rad/s", "m/s"), "tip twist"),
+    "base_velocity": (("rad/s", "m/s"), "base velocity"),
+    "linear_momentum": (("N s",), "linear momentum"),
+    "angular_momentum": (("N m s",), "angular momentum"),
+}
+"""Units and names of what may be exact at the end; by field of `Terminal.exact`."""
+
+
+def directions(scene: Scene, quantity: str) -> tuple[int, ...]:
+    """Entries of a quantity of `Terminal.exact` that a scene does not keep at zero anyway."""
+    whole = range(3 * len(EXACT[quantity][0]))
+    if scene.base.motion != "planar":
+        return tuple(whole)
+    if len(whole) == 6:
+        return PLANAR_TWIST
+    return (2,) if quantity == "angular_momentum" else (0, 1)
+
+
+def exact_rows(scene: Scene) -> tuple[Row, ...]:
+    """The rows of what is exact at the end.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        The last rows of `terminal_rows`.
+    """
+    return tuple(row for row in terminal_rows(scene) if row.is_equality)
+
+
+def _final_rows(scene: Scene) -> tuple[Row, ...]:
+    """The rows that hold at the end besides those of the path."""
+    rows = [
+        Row(f"success: {name}", unit, tolerance, margin=1e-3 * tolerance)
+        for name, unit, tolerance in success_tolerances(scene)
+    ]
+    for each in scene.constraints:
+        for quantity in each.exact if isinstance(each, Terminal) else ():
+            units, words = EXACT[quantity]
+            for index in directions(scene, quantity):
+                name = f"{each.name}: {words} {AXES[index % 3]}"
+                unit = units[index // 3]
+                if len(units) > 1:
+                    name = f"{each.name}: {words} {'angular' if index < 3 else 'linear'} {AXES[index % 3]}"
+                rows.append(Row(name, unit, each.tolerance, is_equality=True))
+    return tuple(rows)
+
+
+def terminal_rows(scene: Scene) -> tuple[Row, ...]:
+    """The rows that hold at the end: those of the path without the input, success, what is exact.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        One row per residual of `task.constraint_residuals.terminal_residuals`.
+    """
+    return (*(row for row in path_rows(scene) if not row.has_input), *_final_rows(scene))
+
+
+def n_multipliers(scene: Scene) -> int:
+    """Multipliers of a stage: as many as the path, or the end, has rows.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        The number.
+    """
+    return max(len(path_rows(scene)), len(terminal_rows(scene)))
+
+
+def sides(scene: Scene, limits: JointLimits) -> Iterator[Side]:
+    """The finite bounds of joints."""
+    count = len(scene.links)
+    lower, upper, rate = (per_link(each, count) for each in (limits.lower, limits.upper, limits.rate))
+    for link in range(count):
+        for is_rate, sign, bound in (
+            (False, -1.0, -lower[link]),
+            (False, 1.0, upper[link]),
+            (True, -1.0, rate[link]),
+            (True, 1.0, rate[link]),
+        ):
+            if math.isfinite(bound):
+                yield Side(link, is_rate, sign, bound)
+
+
+def pairs_that_may_touch(scene: Scene, constraint: Distance) -> list[tuple[int, Volume, int, Volume]]:
+    """Bodies and obstacles, with their numbers, that the joints may bring together.
+
+    Others need no row: volumes fixed to each other, and volumes of the robot out of each other's reach.
+    """
+    return [
+        (i, body, j, obstacle)
+        for i, body in enumerate(constraint.bodies)
+        for j, obstacle in enumerate(constraint.obstacles)
+        if _may_touch(scene, body, obstacle)
+    ]
+
+
+_MOVES_WITH_TARGET = ("target", "grasp")
+
+
+def _may_touch(scene: Scene, a: Volume, b: Volume) -> bool:
+    if a.frame == b.frame or (a.frame in _MOVES_WITH_TARGET and b.frame in _MOVES_WITH_TARGET):
+        return False
+    chain = ["base", *(link.name for link in scene.links), "tip"]
+    if a.frame not in chain or b.frame not in chain:
+        return True
+    if scene.wrist is None and {a.frame, b.frame} == set(chain[-2:]):
+        return False
+    near, far = sorted((a, b), key=lambda volume: chain.index(volume.frame))
+    # In the frame of the near volume, the far one is within its reach of the origin of the next frame.
+    first = chain.index(near.frame)
+    steps = [_offset(scene, index) for index in range(first, chain.index(far.frame))]
+    reach = sum(math.hypot(*step) for step in steps[1:])
+    if scene.wrist is not None and far.frame == "tip":
+        reach += math.hypot(*scene.tip.position)
+    reach += max(math.hypot(*end) for end in far.ends) + near.radius + far.radius
+    return _distance_to_segment(steps[0], *near.ends) <= reach
+
+
+def _offset(scene: Scene, index: int) -> tuple[float, ...]:
+    """Origin of the frame after that of a body, base or link, in its frame; of the tip after the last."""
+    if index < len(scene.links):
+        return tuple(scene.links[index].joint.position)
+    if scene.wrist is None:
+        return tuple(scene.tip.position)
+    return tuple(scene.wrist.frame.position)
+
+
+def _distance_to_segment(point: tuple[float, ...], start: tuple[float, ...], end: tuple[float, ...]) -> float:
+    along = [b - a for a, b in zip(start, end, strict=True)]
+    offset = [p - a for p, a in zip(point, start, strict=True)]
+    length = sum(entry * entry for entry in along)
+    share = sum(a * b for a, b in zip(along, offset, strict=True)) / length if length else 0.0
+    share = min(max(share, 0.0), 1.0)
+    return math.hypot(*(o - share * a for o, a in zip(offset, along, strict=True)))

@@ -1,0 +1,400 @@
+"""Residuals of a scene's constraints over plain scalars, in the order of `scene.constraint_rows`.
+
+All geometry is seen from the base: rows between the robot's own bodies then have no derivative by its pose.
+A residual holds where it is at most zero; it is smooth but for distances between segments, whose closest
+points may jump where the segments are parallel. |v| is sqrt(v . v + e^2) - e, with e = `SMALLEST_LENGTH`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import casadi
+
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import dual_vectors, poses
+from dq_space_arm_env.algebra.scalars import select, sqrt
+from dq_space_arm_env.algebra.vectors import (
+    add,
+    dot,
+    matrix_vector,
+    scale,
+    subtract,
+)
+from dq_space_arm_env.dynamics import kinematics, minimal
+from dq_space_arm_env.scene.constraint_rows import (
+    directions,
+    exact_rows,
+    pairs_that_may_touch,
+    path_rows,
+    sides,
+    success_tolerances,
+)
+from dq_space_arm_env.scene.constraints import (
+    ApproachCorridor,
+    Constraint,
+    Distance,
+    JointLimits,
+    KeepInDirection,
+    KeepOutDirection,
+    LineOfSight,
+    Momentum,
+    Plume,
+    Point,
+    Terminal,
+    Volume,
+    WheelMomentum,
+)
+from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.task.equations import SceneEquations, body_pose
+
+Scalar = Any
+Scalars = Sequence[Scalar]
+
+SMALLEST_LENGTH = 1e-3
+"""Length, m, below which a distance from a point or an axis is rounded off."""
+
+
+class _Situation:
+    """A state with its input, seen from the base."""
+
+    def __init__(self, equations: SceneEquations, base: Scalars, y: Scalars, u: Scalars) -> None:
+        self.equations, self.base, self.scene = equations, base, equations.scene
+        self.motion = equations.field.motion(y)
+        self.inputs = equations.field.inputs(u)
+        chain, motion = equations.chain, self.motion
+        frames = kinematics.frame_poses(chain, dq.IDENTITY, motion.joint_angles, motion.wrist_angles)
+        names = ["base", *(link.name for link in self.scene.links)]
+        self._poses: dict[str, Scalars] = dict(zip(names, frames, strict=False))
+        self._poses["tip"] = frames[-1]
+        self._placements: dict[str, tuple[Any, Any]] = {}
+
+    def pose(self, frame: str) -> Scalars:
+        """Pose of a frame seen from the base."""
+        if frame not in self._poses:
+            outside: Scalars = dq.IDENTITY
+            if frame != "inertial":
+                grasp = self.equations.target
+                outside = grasp if frame == "grasp" else body_pose(self.scene, self.equations.given)
+            self._poses[frame] = dq.multiply(dq.conjugate(self.base), outside)
+        return self._poses[frame]
+
+    def placement(self, frame: str) -> tuple[Any, Any]:
+        """Rotation matrix and position of a frame seen from the base."""
+        if frame not in self._placements:
+            self._placements[frame] = poses.to_matrix(self.pose(frame))
+        return self._placements[frame]
+
+    def point(self, frame: str, position: Scalars) -> Scalars:
+        """A point of a frame, base axes, m."""
+        rotation, origin = self.placement(frame)
+        return add(origin, matrix_vector(rotation, position))
+
+    def place_of(self, point: Point) -> Scalars:
+        """A point of a constraint, base axes, m."""
+        return self.point(point.frame, point.position)
+
+    def direction(self, frame: str, vector: Scalars) -> Scalars:
+        """Unit vector along a direction of a frame, base axes."""
+        return matrix_vector(self.placement(frame)[0], scale(1.0 / math.hypot(*vector), vector))
+
+    def momentum(self) -> tuple[Scalars, Scalars, Scalar]:
+        """Linear momentum, angular momentum about the center of mass, base axes; energy."""
+        chain, motion = self.equations.chain, self.motion
+        rotations = minimal.joint_rotations(chain, motion.joint_angles)
+        twist = (*motion.angular, *motion.linear)
+        velocities = kinematics.body_velocities(chain, rotations, twist, motion.joint_rates)
+        linear, angular, _ = kinematics.momentum(chain, rotations, velocities)
+        kinetic, potential = kinematics.energy(chain, motion.joint_angles, velocities)
+        return linear, angular, kinetic + potential
+
+
+def path_residuals(equations: SceneEquations, base: Scalars, y: Scalars, u: Scalars) -> list[Scalar]:
+    """Residuals of the path's rows.
+
+    Args:
+        equations: The scene's, with the parameters of the stage.
+        base: Pose of the base q_{e0/I}, 8 scalars.
+        y: The state without the pose.
+        u: Input, n_u scalars.
+
+    Returns:
+        One scalar per row of `path_rows`.
+    """
+    situation = _Situation(equations, base, y, u)
+    return [
+        residual
+        for constraint in equations.scene.constraints
+        if type(constraint) in _RESIDUALS
+        for residual in _RESIDUALS[type(constraint)](situation, constraint)
+    ]
+
+
+def state_residuals(equations: SceneEquations, base: Scalars, y: Scalars) -> list[Scalar]:
+    """Those of `path_residuals` that have no input."""
+    residuals = path_residuals(equations, base, y, [0.0] * equations.field.n_u)
+    rows = path_rows(equations.scene)
+    return [residual for residual, row in zip(residuals, rows, strict=True) if not row.has_input]
+
+
+def observed_margins(equations: SceneEquations, base: Scalars, y: Scalars) -> list[Scalar]:
+    """Entries tanh(-c / scale) of the observation.
+
+    Args:
+        equations: The scene's, with the parameters of the stage.
+        base: Pose of the base q_{e0/I}, 8 scalars.
+        y: The state without the pose.
+
+    Returns:
+        One scalar per row of `path_rows` that is observed.
+    """
+    rows = [row for row in path_rows(equations.scene) if not row.has_input]
+    if all(row.observed is None for row in rows):
+        return []
+    residuals = zip(state_residuals(equations, base, y), rows, strict=True)
+    return [casadi.tanh(-c / row.observed) for c, row in residuals if row.observed is not None]
+
+
+def reported(
+    before: SceneEquations, after: SceneEquations, x: Scalars, u: Scalars, x_next: Scalars
+) -> list[Scalar]:
+    """Residuals that a step from x to x_next reports: of its end, of x and u where the input counts.
+
+    Args:
+        before: The equations before the step.
+        after: Those after it.
+        x: State before the step, n_x scalars.
+        u: Input, n_u scalars.
+        x_next: State after the step, n_x scalars.
+
+    Returns:
+        One scalar per name of `step_report.constraint_names`.
+    """
+    scene, there = after.scene, (after.base_pose(x_next), after.y(x_next))
+    first = path_residuals(before, before.base_pose(x), before.y(x), u)
+    second = iter(terminal_residuals(after, *there))
+    along = [c if row.has_input else next(second) for row, c in zip(path_rows(scene), first, strict=True)]
+    exact = exact_rows(scene)
+    return along + (list(second)[-len(exact) :] if exact else [])
+
+
+def charged(scene: Scene, residuals: Scalars, at_end: Scalar) -> tuple[Scalar, Scalar]:
+    """Sum of violations, each over its tolerance, and whether one of them ends the episode.
+
+    Args:
+        scene: The scene.
+        residuals: Those of `reported`.
+        at_end: Whether the episode ends: what is exact at the end is charged then.
+
+    Returns:
+        The sum, dimensionless, and a truth value.
+    """
+    cost, ends = 0.0, False
+    rows = (*path_rows(scene), *exact_rows(scene))
+    for row, c in zip(rows, residuals, strict=True):
+        violation = casadi.if_else(at_end, casadi.fabs(c), 0.0) if row.is_equality else casadi.fmax(c, 0.0)
+        cost = cost + violation / row.tolerance
+        if row.terminates:
+            ends = casadi.logic_or(ends, c > row.tolerance)
+    return cost, ends
+
+
+def _joint_limits(situation: _Situation, limits: JointLimits) -> Iterator[Scalar]:
+    for side in sides(situation.scene, limits):
+        values = situation.motion.joint_rates if side.is_rate else situation.motion.joint_angles
+        yield side.sign * values[side.link] - side.bound
+
+
+def _distance(situation: _Situation, constraint: Distance) -> Iterator[Scalar]:
+    for _, body, _, obstacle in pairs_that_may_touch(situation.scene, constraint):
+        apart = _segment_distance(_segment(situation, body), _segment(situation, obstacle))
+        yield body.radius + obstacle.radius - apart
+
+
+class _Segment(NamedTuple):
+    start: Scalars
+    along: Scalars | None  # from start to end; None for a point
+
+
+def _segment(situation: _Situation, volume: Volume) -> _Segment:
+    start, end = volume.ends
+    place = situation.point(volume.frame, start)
+    if start == end:
+        return _Segment(place, None)
+    return _Segment(
+        place,
+        matrix_vector(situation.placement(volume.frame)[0], [b - a for a, b in zip(start, end, strict=True)]),
+    )
+
+
+def _clamped(share: Scalar) -> Scalar:
+    share = select(share > 0.0, share, 0.0)
+    return select(share < 1.0, share, 1.0)
+
+
+def _segment_distance(first: _Segment, second: _Segment) -> Scalar:
+    """Distance of two segments (Ericson, Real-Time Collision Detection, 2005, 5.1.9)."""
+    between = subtract(first.start, second.start)
+    if first.along is None and second.along is None:
+        return _length(between)
+    if first.along is None:
+        first, second, between = second, first, scale(-1.0, between)
+    assert first.along is not None
+    a, c = dot(first.along, first.along), dot(first.along, between)
+    if second.along is None:
+        return _length(add(between, scale(_clamped(-c / a), first.along)))
+    e, f, b = dot(second.along, second.along), dot(second.along, between), dot(first.along, second.along)
+    denominator = a * e - b * b
+    parallel = denominator <= 1e-12 * a * e
+    share = _clamped((b * f - c * e) / select(parallel, 1.0, denominator))
+    share = select(parallel, 0.0, share)
+    other = (b * share + f) / e
+    share = select(other < 0.0, _clamped(-c / a), select(other > 1.0, _clamped((b - c) / a), share))
+    nearest = subtract(scale(share, first.along), scale(_clamped(other), second.along))
+    return _length(add(between, nearest))
+
+
+def _length(vector: Scalars) -> Scalar:
+    """Length of a vector, rounded off at zero."""
+    return sqrt(dot(vector, vector) + SMALLEST_LENGTH**2) - SMALLEST_LENGTH
+
+
+def _cosine(situation: _Situation, constraint: KeepInDirection | KeepOutDirection) -> Scalar:
+    axis, direction = constraint.axis, constraint.direction
+    return dot(
+        situation.direction(axis.frame, axis.direction),
+        situation.direction(direction.frame, direction.direction),
+    ) - math.cos(math.radians(constraint.angle_deg))
+
+
+def _keep_out_direction(situation: _Situation, constraint: KeepOutDirection) -> Iterator[Scalar]:
+    yield _cosine(situation, constraint)
+
+
+def _keep_in_direction(situation: _Situation, constraint: KeepInDirection) -> Iterator[Scalar]:
+    yield -_cosine(situation, constraint)
+
+
+def _line_of_sight(situation: _Situation, constraint: LineOfSight) -> Iterator[Scalar]:
+    """cos(angle) |d| - boresight . d, with d from camera to point (Lee & Mesbahi, JGCD 2017)."""
+    camera = constraint.camera
+    d = subtract(situation.place_of(constraint.point), situation.place_of(camera))
+    boresight = situation.direction(camera.frame, constraint.boresight)
+    yield math.cos(math.radians(constraint.angle_deg)) * _length(d) - dot(boresight, d)
+
+
+def _approach_corridor(situation: _Situation, constraint: ApproachCorridor) -> Iterator[Scalar]:
+    """Distance from the axis less the corridor's radius there."""
+    apex = constraint.apex
+    r = subtract(situation.place_of(constraint.point), situation.place_of(apex))
+    axis = situation.direction(apex.frame, constraint.direction)
+    height = dot(axis, r)
+    aside = subtract(r, scale(height, axis))
+    yield _length(aside) - constraint.width - height * math.tan(math.radians(constraint.angle_deg))
+
+
+def _plume(situation: _Situation, constraint: Plume) -> Iterator[Scalar]:
+    """-f . d - cos(plume + asin(R / |d|)) |f| |d|: the gas leaves along -f, the sphere is seen along d."""
+    force, sphere = situation.inputs.force, constraint.keeps_clear
+    d = subtract(situation.point(sphere.frame, sphere.position), constraint.thruster)
+    # Within the sphere its half angle stays that at the surface, 90 deg.
+    square = dot(d, d) + SMALLEST_LENGTH**2
+    nearest = select(square > sphere.radius**2, square, sphere.radius**2)
+    sine, half = sphere.radius / sqrt(nearest), math.radians(constraint.angle_deg)
+    square_of_cosine = 1.0 - sine * sine
+    cosine = sqrt(square_of_cosine + 1e-12)
+    cosine_of_both = math.cos(half) * cosine - math.sin(half) * sine
+    thrusters = situation.scene.actuators.base_force
+    assert thrusters is not None  # or the scene is refused
+    strongest = max(thrusters.limit)
+    rounded_off = 1e-3 * (strongest if math.isfinite(strongest) else 1.0)
+    strength = sqrt(dot(force, force) + rounded_off**2)
+    yield -dot(force, d) - cosine_of_both * strength * sqrt(square)
+
+
+def _momentum(situation: _Situation, constraint: Momentum) -> Iterator[Scalar]:
+    """(|h|^2 - bound^2) / (2 bound), smooth at zero; likewise of the energy, which is quadratic itself."""
+    linear, angular, energy = situation.momentum()
+    for vector, bound in ((linear, constraint.linear), (angular, constraint.angular)):
+        if bound is not None:
+            yield (dot(vector, vector) - bound * bound) / (2.0 * bound)
+    if constraint.energy is not None:
+        yield energy - constraint.energy
+
+
+def _wheel_momentum(situation: _Situation, constraint: WheelMomentum) -> Iterator[Scalar]:
+    _, angular, _ = situation.momentum()
+    for axis in directions(situation.scene, "angular_momentum"):
+        yield -angular[axis] - constraint.capacity
+        yield angular[axis] - constraint.capacity
+
+
+_RESIDUALS: dict[type[Constraint], Callable[..., Iterator[Scalar]]] = {
+    JointLimits: _joint_limits,
+    Distance: _distance,
+    KeepOutDirection: _keep_out_direction,
+    KeepInDirection: _keep_in_direction,
+    LineOfSight: _line_of_sight,
+    ApproachCorridor: _approach_corridor,
+    Plume: _plume,
+    Momentum: _momentum,
+    WheelMomentum: _wheel_momentum,
+}
+
+
+def terminal_residuals(equations: SceneEquations, base: Scalars, y: Scalars) -> list[Scalar]:
+    """Residuals of the rows at the end.
+
+    Args:
+        equations: The scene's, with the parameters of the end.
+        base: Pose of the base q_{e0/I}, 8 scalars.
+        y: The state without the pose.
+
+    Returns:
+        One scalar per row of `terminal_rows`.
+    """
+    return [*state_residuals(equations, base, y), *_final_residuals(equations, base, y)]
+
+
+def _final_residuals(equations: SceneEquations, base: Scalars, y: Scalars) -> list[Scalar]:
+    """Residuals of success and of what is exact.
+
+    A tolerance t of success is (e^2 / t - t) / 2 of an error e: smooth where e is zero, e - t near t.
+    """
+    situation = _Situation(equations, base, y, [0.0] * equations.field.n_u)
+    error = dq.multiply(dq.conjugate(situation.pose("grasp")), situation.pose("tip"))  # q_{G/D}
+    twist = dual_vectors.subtract(equations.tip_twist(situation.motion), _target_twist(equations, error))
+    # |2 vec q_r| is 2 sin(angle / 2), the angle up to third order.
+    halves = (scale(2.0, error[1:4]), poses.position(error))
+    squares = [dot(vector, vector) for vector in (*halves, twist[:3], twist[3:])]
+    names = ("attitude error", "position error", "angular velocity error", "velocity error")
+    by_name = dict(zip(names, squares, strict=True))
+    found = []
+    for name, _, tolerance in success_tolerances(equations.scene):
+        bound = 2.0 * math.sin(0.5 * tolerance) if name == names[0] else tolerance
+        found.append(0.5 * (by_name[name] / bound - bound))
+    for constraint in equations.scene.constraints:
+        for quantity in constraint.exact if isinstance(constraint, Terminal) else ():
+            values = _exact(situation, quantity, [*halves[0], *halves[1]], twist)
+            found += [values[i] for i in directions(equations.scene, quantity)]
+    return found
+
+
+def _target_twist(equations: SceneEquations, error: Scalars) -> Scalars:
+    """Twist of the target in the tip's axes, by the pose q_{G/D}."""
+    return dual_vectors.inverse_transform(*poses.to_matrix(error), equations.target_velocity)
+
+
+def _exact(situation: _Situation, quantity: str, pose: Scalars, twist: Scalars) -> Scalars:
+    """What is zero where a quantity is exact at the end."""
+    if quantity == "pose":
+        return pose
+    if quantity == "twist":
+        return twist
+    if quantity == "base_velocity":
+        moving = (*situation.motion.angular, *situation.motion.linear)
+        return [a - b for a, b in zip(moving, situation.scene.target.base_velocity, strict=True)]
+    linear, angular, _ = situation.momentum()
+    return linear if quantity == "linear_momentum" else angular

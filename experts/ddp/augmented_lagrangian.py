@@ -1,0 +1,178 @@
+"""The method of multipliers around box-DDP: constraints become penalties, which multipliers make exact.
+
+The solver minimizes an augmented Lagrangian (`dq_space_arm_env.task.augmented_lagrangian`) with multipliers l
+and penalties r that are those of the present iteration. After a step that goes well and promises little more,
+the multipliers follow, l <- l f'(r c) for rows c <= 0 and l <- l + r c for rows c = 0, and the penalties
+grow. The stiffness of a row is l r: where a joint meets its limit the multiplier is an impulse, and the row
+becomes stiff there only. The inputs' bounds stay with the box QP. A solve ends where an unregularized step is
+predicted not to reduce the Lagrangian, no row is violated, and the sum of |l c|, by which the cost may exceed
+that of the optimum, is small.
+
+The first steps, far from a minimum, leave the rows out.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experts.problems.shooting_problem import FloatArray
+from experts.problems.stage_constraints import StageConstraints
+
+FEASIBILITY = 1e-6
+"""Largest violation of a feasible trajectory, in the units of the rows."""
+SERIOUS = 1e-3
+"""Violation with which a problem counts as infeasible where no step is left."""
+COMPLEMENTARITY = 1e-7
+"""Largest sum of |l c| at the end of a solve, relative to the cost."""
+STATIONARITY = 1e-12
+"""Predicted reduction, relative to the cost, below which multipliers are slopes of the penalties."""
+FIRST_MULTIPLIER = 1.0
+"""First multiplier of a row c <= 0."""
+LEAST_MULTIPLIER = 1e-9
+"""Least multiplier of such a row: zero would stay zero."""
+LEAST_WARM_MULTIPLIER = 1e-2
+"""The same where the multipliers of a similar maneuver are the first."""
+CHANGE = (1e-3, 1e2)
+"""Least and greatest factor of such a multiplier in an update."""
+FIRST_PENALTY, FIRST_EQUALITY_PENALTY = 1e2, 1e4
+"""First penalties of rows c <= 0 and c = 0."""
+GROWTH = 2.0
+"""Factor of the penalties in an update."""
+LARGEST_PENALTY = 3e6
+"""Beyond it rounding hides what a step gains."""
+GAIN_STIFFNESS = 1e3
+"""Largest stiffness of a row in feedback gains: with more they would follow noise."""
+BEGIN = 1e-2
+"""Predicted reduction, relative to the cost, at which the rows begin to count."""
+NEAR = 1e-3
+"""Predicted reduction, relative to the cost, of a step after which the multipliers follow."""
+NEARER, NEAREST = 0.5, 1e-5
+"""Factor of that from one update to the next, and its least value."""
+LONG_ENOUGH = 0.5
+"""Length of such a step."""
+EXACT_MU = (1e-3, 1e-1, 1e1)
+"""Regularizations with which the hybrid tries the exact model where rows count."""
+PATIENCE = 8
+"""Updates without progress at the largest penalty after which a problem counts as infeasible."""
+PROGRESS = 0.9
+"""Largest share of the smallest violation so far that counts as progress."""
+
+
+class ConstraintReport(NamedTuple):
+    """How a trajectory keeps to its constraints.
+
+    Attributes:
+        violation: Largest violation of a row with its margin, in the row's unit; negative where all are met.
+        worst_row: Name of the row that has it.
+        worst_time: Time at which it has it, s.
+        complementarity: Sum of |l c| over all rows, relative to the cost.
+        active_share: Share of the rows c <= 0, over all stages, that are active: l > -c.
+    """
+
+    violation: float
+    worst_row: str
+    worst_time: float
+    complementarity: float
+    active_share: float
+
+
+class AugmentedLagrangian:
+    """Multipliers and penalties of a solve; they are zero outside of one.
+
+    Attributes:
+        counts: Whether the rows count.
+        near: Predicted reduction, relative to the cost, of a step after which an update follows.
+    """
+
+    def __init__(self, constraints: StageConstraints) -> None:
+        self.constraints = constraints
+        self._holds, self._equalities = constraints.holds, constraints.equalities
+        self._inequalities = self._holds & ~self._equalities
+        self.counts, self.near = False, BEGIN
+        self._least_violation, self._idle_updates = np.inf, 0
+
+    def leave_out(self) -> None:
+        """Let the rows not count."""
+        self.constraints.multipliers[:], self.constraints.penalties[:] = 0.0, 0.0
+        self.counts, self.near = False, BEGIN
+
+    def begin(self, multipliers: FloatArray | None = None) -> None:
+        """Let the rows count, with those multipliers of a similar maneuver, shape (N + 1, m), if any."""
+        present, penalties = self.constraints.multipliers, self.constraints.penalties
+        present[:] = 0.0 if multipliers is None else np.where(self._holds, multipliers, 0.0)
+        least = FIRST_MULTIPLIER if multipliers is None else LEAST_WARM_MULTIPLIER
+        present[self._inequalities] = np.maximum(present[self._inequalities], least)
+        penalties[:] = np.where(self._equalities, FIRST_EQUALITY_PENALTY, FIRST_PENALTY)
+        penalties[~self._holds] = 0.0
+        self.counts, self.near = True, NEAR
+        self._least_violation, self._idle_updates = np.inf, 0
+
+    def hold(self, multipliers: FloatArray) -> None:
+        """Let the rows count with a solution's multipliers, shape (N + 1, m), as stiff as in its gains."""
+        self.begin(multipliers)
+        self.constraints.penalties[:] = np.where(self._holds, LARGEST_PENALTY, 0.0)
+        self.soften()
+
+    def update(self, states: FloatArray, controls: FloatArray) -> None:
+        """Let the multipliers follow a trajectory, states (N + 1, n_x) and controls (N, n_u)."""
+        penalties, residuals = self.constraints.penalties, self.constraints.find(states, controls)
+        self._move(residuals, CHANGE)
+        self.near = max(NEARER * self.near, NEAREST)
+        exhausted = penalties.max(initial=0.0) >= LARGEST_PENALTY
+        np.minimum(GROWTH * penalties, LARGEST_PENALTY, out=penalties)
+        violation = float(self._violations(residuals).max(initial=0.0))
+        stands = exhausted and violation > max(PROGRESS * self._least_violation, FEASIBILITY)
+        self._idle_updates = self._idle_updates + 1 if stands else 0
+        self._least_violation = min(self._least_violation, violation)
+
+    def settle(self, states: FloatArray, controls: FloatArray) -> None:
+        """Take the slopes of the penalties along the last trajectory as multipliers: the best estimate."""
+        self._move(self.constraints.find(states, controls), (0.0, np.inf))
+
+    def _move(self, residuals: FloatArray, change: tuple[float, float]) -> None:
+        """Let the multipliers follow, those of rows c <= 0 by factors within limits."""
+        multipliers, t = self.constraints.multipliers, self.constraints.penalties * residuals
+        slopes = np.where(t < -0.5, -0.25 / np.minimum(t, -0.5), 1.0 + t)  # f'
+        grown = np.maximum(multipliers * np.clip(slopes, *change), LEAST_MULTIPLIER)
+        multipliers[:] = np.where(self._inequalities, grown, multipliers + t)
+
+    @property
+    def is_infeasible(self) -> bool:
+        """Whether large penalties have not reduced a violation for long."""
+        return self._idle_updates >= PATIENCE
+
+    def is_met(self, states: FloatArray, controls: FloatArray, cost: float) -> bool:
+        """Whether a trajectory keeps to all rows, with multipliers only where it must."""
+        residuals = self.constraints.find(states, controls)
+        gap = np.abs(self.constraints.multipliers * residuals).sum()
+        feasible = self._violations(residuals).max(initial=0.0) <= FEASIBILITY
+        return bool(feasible and gap <= COMPLEMENTARITY * abs(cost))
+
+    def soften(self) -> None:
+        """Limit the stiffness of rows to what feedback gains may have."""
+        multipliers, penalties = self.constraints.multipliers, self.constraints.penalties
+        most = GAIN_STIFFNESS / np.where(self._inequalities, np.maximum(multipliers, LEAST_MULTIPLIER), 1.0)
+        np.minimum(penalties, most, out=penalties)
+
+    def _violations(self, residuals: FloatArray) -> FloatArray:
+        """Violations of the rows, negative where they are met, shape (N + 1, m); -inf where there is none."""
+        return np.where(self._equalities, np.abs(residuals), np.where(self._inequalities, residuals, -np.inf))
+
+    def report(
+        self, states: FloatArray, controls: FloatArray, cost: float, time_step: float
+    ) -> ConstraintReport:
+        """Judge a trajectory by the present multipliers."""
+        constraints = self.constraints
+        residuals = constraints.find(states, controls)
+        violations = self._violations(residuals)
+        stage, column = np.unravel_index(violations.argmax(), violations.shape)
+        gap = float(np.abs(constraints.multipliers * residuals).sum())
+        active: NDArray[np.bool_] = (constraints.multipliers > -residuals)[self._inequalities]
+        return ConstraintReport(
+            violation=float(violations[stage, column]),
+            worst_row=constraints.name(int(stage), int(column)),
+            worst_time=float(stage * time_step),
+            complementarity=gap / max(abs(cost), float(np.finfo(np.float64).tiny)),
+            active_share=float(active.mean()) if active.size else 0.0,
+        )

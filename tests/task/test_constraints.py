@@ -1,0 +1,292 @@
+"""Constraints: refused mistakes, residuals against independent formulas, and their exact derivatives."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from dq_space_arm_env import SceneError, compile_scene, load_scene
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.kernels.library import PENALIZED
+from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
+from dq_space_arm_env.scene.constraints import Volume
+from dq_space_arm_env.task.constraint_residuals import _Segment, _segment_distance
+
+FRAME = {"frame": "link 2", "to": [0.75, 0.1, -0.2], "radius": 0.05}
+KINDS = {
+    "joint_limits": {"lower": [-2.0, -0.6, -1.7], "upper": [1.5, 1.0, math.inf], "rate": 0.2},
+    "distance": {
+        "bodies": [FRAME, {"frame": "tip", "radius": 0.1}],
+        "obstacles": [
+            {"frame": "inertial", "position": [0.5, -3.2, 5.4], "radius": 0.1},
+            {"frame": "base", "position": [-0.3, -0.3, 0.2], "to": [0.3, 0.3, 0.2], "radius": 0.2},
+            {"frame": "target", "position": [0.1, 0.2, 0.3], "to": [0.4, 0.1, -0.2], "radius": 0.2},
+        ],
+    },
+    "keep_out_direction": {
+        "axis": {"frame": "link 3", "direction": [1, 0.2, 0]},
+        "direction": {"frame": "inertial", "direction": [0, 1, 2]},
+        "angle_deg": 20,
+    },
+    "keep_in_direction": {
+        "axis": {"frame": "base", "direction": [1, 0, 0]},
+        "direction": {"frame": "grasp", "direction": [0, 1, 1]},
+        "angle_deg": 60,
+    },
+    "line_of_sight": {
+        "camera": {"frame": "base", "position": [0.1, 0, 0.3]},
+        "boresight": [0, 0.2, 2],
+        "angle_deg": 40,
+        "point": {"frame": "grasp", "position": [0, 0.1, 0]},
+    },
+    "approach_corridor": {
+        "apex": {"frame": "target", "position": [0, 0, 0.1]},
+        "direction": [0.3, 0, -1],
+        "angle_deg": 30,
+        "width": 0.05,
+    },
+    "plume": {
+        "thruster": [0, 0.1, -0.2],
+        "angle_deg": 20,
+        "keeps_clear": {"frame": "target", "radius": 0.3},
+    },
+    "momentum": {"linear": 3.0, "angular": 2.0, "energy": 1.5},
+    "terminal": {
+        "exact": ["pose", "twist", "base_velocity", "linear_momentum", "angular_momentum"],
+    },
+}
+
+
+def every_kind():
+    """A scene with a target that moves, and constraints of all kinds but one."""
+    entries = [{"kind": kind, "name": kind, **fields} for kind, fields in KINDS.items()]
+    return load_scene("tumbling-target").replace(constraints=entries)
+
+
+def with_wheels():
+    """A scene without thrusters, whose wheels store momentum."""
+    rest = {"base_angular_velocity": 0.0, "base_linear_velocity": 0.0, "joint_rates": 0.0}
+    entry = {"kind": "wheel_momentum", "name": "wheels", "capacity": 0.5}
+    return load_scene("reaction-wheels").replace(spread=rest, constraints=[entry])
+
+
+def random_point(kernels, seed):
+    """A state some way from the scene's start, an input and parameters."""
+    rng = np.random.default_rng(seed)
+    x = kernels.retract(kernels.layout.initial_state, 0.3 * rng.standard_normal(kernels.n_t))
+    limits = np.minimum(kernels.layout.control_limit, 1e3)
+    return x, limits * rng.uniform(-1.0, 1.0, kernels.n_u), kernels.parameters.nominal
+
+
+def differences(function, size):
+    """Derivatives of a function of `size` coordinates at zero, extrapolated to order 6."""
+    columns = []
+    for direction in np.eye(size):
+        slopes = []
+        for h in (4e-2, 2e-2, 1e-2):
+            slopes.append((function(h * direction) - function(-h * direction)) / (2.0 * h))
+        first = [(4.0 * b - a) / 3.0 for a, b in itertools.pairwise(slopes)]
+        columns.append((16.0 * first[1] - first[0]) / 15.0)
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("scene", [every_kind, with_wheels])
+def test_derivatives(scene):
+    kernels = compile_scene(scene())
+    n_t = kernels.n_t
+    for seed in range(2):
+        x, u, p = random_point(kernels, seed)
+
+        def path(z, x=x, u=u, p=p):
+            return kernels.constraints(kernels.retract(x, z[:n_t]), u + z[n_t:], p=p)
+
+        def end(z, x=x, p=p):
+            return kernels.terminal_constraints(kernels.retract(x, z), p=p)
+
+        exact = kernels.constraint_jacobian(x, u, p=p)
+        assert exact.shape == (len(path_rows(kernels.scene)), n_t + kernels.n_u)
+        found = differences(path, n_t + kernels.n_u)
+        np.testing.assert_allclose(exact, found, atol=1e-7 * max(1.0, abs(exact).max(initial=0.0)))
+        exact = kernels.terminal_constraint_jacobian(x, p=p)
+        np.testing.assert_allclose(exact, differences(end, n_t), atol=1e-7 * max(1.0, abs(exact).max()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", [every_kind, with_wheels])
+def test_derivatives_of_the_augmented_lagrangian(scene):
+    """Gradients against differences of its cost, exact Hessians against differences of its gradients."""
+    kernels = compile_scene(scene())
+    n_t, n_u, rng = kernels.n_t, kernels.n_u, np.random.default_rng(3)
+    x, u, p = random_point(kernels, 3)
+    count = max(len(path_rows(kernels.scene)), len(terminal_rows(kernels.scene)))
+    parameters = np.concatenate([p, rng.uniform(0.1, 1.0, count), rng.uniform(1.0, 5.0, count)])
+
+    def call(name, **inputs):
+        """Run a program on one row, with multipliers and penalties."""
+        kernel = kernels.kernel(PENALIZED + name, lanes=1)
+        inputs |= {"parameters": parameters, "h": [0.015]}
+        given = [np.atleast_2d(np.ascontiguousarray(inputs[spec.name])) for spec in kernel.inputs]
+        outputs = [np.zeros((1, spec.stride)) for spec in kernel.outputs]
+        kernel([*given, *outputs], 1, 1)
+        return [output[0] for output in outputs]
+
+    def cost(z):
+        return call("step_with_cost", x=kernels.retract(x, z[:n_t]), u=u + z[n_t:])[1]
+
+    def gradient(z):
+        slopes = call("cost_derivatives", x=kernels.retract(x, z[:n_t]), u=u + z[n_t:])
+        return np.concatenate(slopes[:2])
+
+    zero = np.zeros(n_t + n_u)
+    scale = abs(gradient(zero)).max()
+    np.testing.assert_allclose(gradient(zero), differences(cost, n_t + n_u)[0], atol=1e-6 * scale)
+    # Gradients elsewhere are in coordinates of another tangent space, which matters to the pose alone.
+    rest = np.arange(6 if not kernels.layout.planar else 3, n_t + n_u)
+    multiplier = np.zeros(n_t)
+    found = call("lagrangian_hessian", x=x, u=u, multiplier=multiplier)
+    xx, ux, uu = (entries.reshape(rows, -1) for entries, rows in zip(found, (n_t, n_u, n_u), strict=True))
+    exact = np.block([[xx, ux.T], [ux, uu]])
+    np.testing.assert_array_equal(exact, exact.T)
+    numeric = differences(gradient, n_t + n_u)
+    np.testing.assert_allclose(
+        exact[np.ix_(rest, rest)], numeric[np.ix_(rest, rest)], atol=1e-5 * abs(exact).max()
+    )
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_distances_against_a_search(seed):
+    rng = np.random.default_rng(seed)
+    (a, b), (c, d) = rng.standard_normal((2, 2, 3))
+    if seed % 5 == 0:
+        d = c + (b - a) * rng.uniform(0.3, 2.0)  # parallel
+    points = [tuple(a), tuple(c)]
+    along = [tuple(b - a), tuple(d - c) if seed % 3 else None]
+
+    def apart(shares):
+        ends = (a + shares[0] * (b - a), c + shares[1] * (d - c if seed % 3 else 0.0 * c))
+        return np.linalg.norm(ends[0] - ends[1])
+
+    search = min(
+        minimize(apart, start, bounds=[(0.0, 1.0)] * 2, tol=1e-12).fun
+        for start in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5))
+    )
+    found = _segment_distance(_Segment(points[0], along[0]), _Segment(points[1], along[1]))
+    assert found == pytest.approx(search, abs=1.1e-3)  # rounded off by a millimeter near zero
+    turned = _segment_distance(_Segment(points[1], along[1]), _Segment(points[0], along[0]))
+    assert turned == pytest.approx(found, abs=1e-9)
+
+
+def placed(pose):
+    """Rotation and position of a pose."""
+    real, position = poses.to_rotation_and_position(pose)
+    return Rotation.from_quat(real, scalar_first=True), np.array(position)
+
+
+def test_cones_and_plume_against_vectors():
+    """Formulas in inertial axes, by another library's rotations."""
+    scene = load_scene("paper").replace(
+        constraints=[
+            {"kind": kind, "name": kind, **KINDS[kind]}
+            for kind in (
+                "keep_out_direction",
+                "keep_in_direction",
+                "line_of_sight",
+                "approach_corridor",
+                "plume",
+            )
+        ]
+    )
+    kernels = compile_scene(scene)
+    for seed in range(5):
+        x, u, _ = random_point(kernels, seed)
+        frames = kernels.frame_poses(x)
+        (base, at), (link, _), (_, tip) = placed(frames[0]), placed(frames[3]), placed(frames[-1])
+        target, there = placed(scene.target.pose.dual_quaternion)
+
+        def unit(vector):
+            return np.array(vector) / np.linalg.norm(vector)
+
+        cosine = link.apply(unit([1, 0.2, 0])) @ unit([0, 1, 2])
+        expected = [cosine - math.cos(math.radians(20))]
+        cosine = base.apply([1, 0, 0]) @ target.apply(unit([0, 1, 1]))
+        expected.append(math.cos(math.radians(60)) - cosine)
+        sight = there + target.apply([0, 0.1, 0]) - at - base.apply([0.1, 0, 0.3])
+        boresight = base.apply(unit([0, 0.2, 2]))
+        expected.append(math.cos(math.radians(40)) * np.linalg.norm(sight) - boresight @ sight)
+        r = tip - there - target.apply([0, 0, 0.1])
+        axis = target.apply(unit([0.3, 0, -1]))
+        height = axis @ r
+        aside = np.linalg.norm(r - height * axis)
+        expected.append(aside - 0.05 - height * math.tan(math.radians(30)))
+        force = base.apply(u[:3])
+        d = there - at - base.apply([0, 0.1, -0.2])
+        opening = math.radians(20) + math.asin(0.3 / np.linalg.norm(d))
+        limit = math.cos(opening) * np.linalg.norm(force) * np.linalg.norm(d)
+        expected.append(-force @ d - limit)
+        np.testing.assert_allclose(kernels.constraints(x, u), expected, atol=2e-3)
+
+
+def test_wheels_store_the_negative_of_what_bodies_have():
+    kernels = compile_scene(with_wheels())
+    x, u, p = random_point(kernels, 1)
+    turned, _ = placed(kernels.frame_poses(x)[0])
+    stored = -turned.inv().apply(kernels.momentum(x)[3:])
+    expected = [sign * each - 0.5 for each in stored for sign in (1.0, -1.0)]
+    np.testing.assert_allclose(kernels.constraints(x, u, p=p), expected, atol=1e-12)
+
+
+def test_pairs_that_cannot_touch_have_no_row():
+    near = {"frame": "base", "position": [0, 0, 0.6], "radius": 0.1}
+    far = {"frame": "base", "position": [0, 0, 9.0], "radius": 0.1}
+    own = {"frame": "link 2", "position": [0, 0, 1.0], "radius": 0.1}
+    entry = {"kind": "distance", "name": "it", "bodies": [FRAME], "obstacles": [near, far, own]}
+    scene = load_scene("paper").replace(constraints=[entry])
+    assert [row.name for row in path_rows(scene)] == ["it: link 2 0 to base 0"]
+    # Within the bound nothing is missed: no joint angles bring the far volume near.
+    kernels = compile_scene(scene.replace({"constraints": [{**entry, "obstacles": [near]}]}))
+    angles = kernels.layout.state.joint_angles
+    nearest = math.inf
+    for seed in range(200):
+        x = kernels.layout.initial_state.copy()
+        x[angles] = np.random.default_rng(seed).uniform(-math.pi, math.pi, 3)
+        base, link = (placed(kernels.frame_poses(x)[i]) for i in (0, 2))
+        ends = [link[1] + link[0].apply(end) for end in Volume.model_validate(FRAME).ends]
+        center = base[1] + base[0].apply(far["position"])
+        nearest = min(nearest, *(np.linalg.norm(end - center) for end in ends))
+    assert nearest > 0.15
+
+
+MISTAKES = [
+    ({"kind": "wall"}, "must be a mapping whose kind is one of joint_limits, distance"),
+    ({"kind": "joint_limits", "lower": [0.0, 0.0]}, "one per link: the scene has 3 links"),
+    ({"kind": "joint_limits", "lower": 1.0, "upper": 0.5}, "must be above the lower limit of link 0"),
+    ({"kind": "joint_limits"}, "must bound something"),
+    ({"kind": "joint_limits", "upper": math.nan}, "must be numbers, .inf for none"),
+    ({"kind": "distance", "bodies": [], "obstacles": [FRAME]}, "must list at least one volume"),
+    ({"kind": "distance", "bodies": [{**FRAME, "frame": "hand"}]}, "must be one of inertial, base, link 1"),
+    ({"kind": "keep_out_direction", "angle_deg": 180}, "must be below 180 degrees"),
+    ({"kind": "line_of_sight", "boresight": [0, 0, 0]}, "must not have zero length"),
+    ({"kind": "momentum"}, "must bound at least one of linear, angular, energy"),
+    ({"kind": "wheel_momentum", "capacity": 1.0}, "thrusters change the total momentum"),
+    ({"kind": "terminal", "exact": []}, "must list at least one quantity"),
+    ({"kind": "plume", "observed": 1.0}, "is not observed"),
+    ({"kind": "approach_corridor", "tolerance": 0.0}, "must be a finite number greater than 0"),
+    ({"kind": "approach_corridor", "marign": 0.1}, "unknown key; did you mean"),
+]
+WITHOUT_DEFAULTS = ("joint_limits", "momentum")
+
+
+@pytest.mark.parametrize(("changes", "message"), MISTAKES)
+def test_mistakes_are_named(changes, message):
+    rest = {} if changes["kind"] in WITHOUT_DEFAULTS else KINDS.get(changes["kind"], {})
+    with pytest.raises(SceneError, match=message):
+        load_scene("paper").replace(constraints=[{"name": "it", **rest, **changes}])
+
+
+def test_two_constraints_of_a_name_are_refused():
+    entry = {"kind": "momentum", "name": "it", "linear": 1.0}
+    with pytest.raises(SceneError, match="another constraint has this name"):
+        load_scene("paper").replace(constraints=[entry, entry])
