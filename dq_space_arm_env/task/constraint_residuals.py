@@ -2,7 +2,8 @@
 
 All geometry is seen from the base: rows between the robot's own bodies then have no derivative by its pose.
 A residual holds where it is at most zero; it is smooth but for distances between segments, whose closest
-points may jump where the segments are parallel. |v| is sqrt(v . v + e^2) - e, with e = `SMALLEST_LENGTH`.
+points may jump where the segments are parallel. In cones |v| is sqrt(v . v + e^2) - e, with
+e = `SMALLEST_LENGTH`.
 """
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ Scalar = Any
 Scalars = Sequence[Scalar]
 
 SMALLEST_LENGTH = 1e-3
-"""Length, m, below which a distance from a point or an axis is rounded off."""
+"""Length, m, by which a cone is wider at its apex, where its residual is rounded off."""
+MEETING = 1e-4
+"""Distance, m, that stands for none between centers or axes of volumes."""
 
 
 class _Situation:
@@ -238,13 +241,13 @@ def _segment_distance(first: _Segment, second: _Segment) -> Scalar:
     """Distance of two segments (Ericson, Real-Time Collision Detection, 2005, 5.1.9)."""
     between = subtract(first.start, second.start)
     if first.along is None and second.along is None:
-        return _length(between)
+        return _distance_of(between)
     if first.along is None:
         first, second, between = second, first, scale(-1.0, between)
     assert first.along is not None
     a, c = dot(first.along, first.along), dot(first.along, between)
     if second.along is None:
-        return _length(add(between, scale(_clamped(-c / a), first.along)))
+        return _distance_of(add(between, scale(_clamped(-c / a), first.along)))
     e, f, b = dot(second.along, second.along), dot(second.along, between), dot(first.along, second.along)
     denominator = a * e - b * b
     parallel = denominator <= 1e-12 * a * e
@@ -253,7 +256,12 @@ def _segment_distance(first: _Segment, second: _Segment) -> Scalar:
     other = (b * share + f) / e
     share = select(other < 0.0, _clamped(-c / a), select(other > 1.0, _clamped((b - c) / a), share))
     nearest = subtract(scale(share, first.along), scale(_clamped(other), second.along))
-    return _length(add(between, nearest))
+    return _distance_of(add(between, nearest))
+
+
+def _distance_of(vector: Scalars) -> Scalar:
+    """Length of a vector between centers or axes; its derivative is finite where they meet."""
+    return sqrt(dot(vector, vector) + MEETING**2)
 
 
 def _length(vector: Scalars) -> Scalar:

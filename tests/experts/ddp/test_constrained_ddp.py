@@ -31,9 +31,9 @@ POSE = {"kind": "terminal", "name": "exact", "exact": ["pose"]}
 # Costs of minima, each found from two guesses and with other penalties.
 CASES = {
     "limits": ([LIMITS], 1436.0406),
-    "ball": ([BALL], 1432.8625),
+    "ball": ([BALL], 1432.7256),
     "pose": ([POSE], 1422.2509),
-    "all": ([LIMITS, BALL, POSE], 1447.9774),
+    "all": ([LIMITS, BALL, POSE], 1447.8408),
 }
 FREE = 1422.18983
 
