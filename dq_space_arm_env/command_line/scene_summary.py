@@ -11,6 +11,7 @@ from rich.text import Text
 
 from dq_space_arm_env.common.tables import TextTable
 from dq_space_arm_env.scene import Pose, Scene, StateLayout
+from dq_space_arm_env.scene.constraint_rows import path_rows
 from dq_space_arm_env.scene.path import first_velocity
 
 _ACTUATORS = {
@@ -187,6 +188,10 @@ def _task(scene: Scene) -> Iterator[tuple[str, str]]:
     if success.velocity_error is not None:
         largest.append(f"{success.velocity_error:g} m/s")
     yield "success", f"within {', '.join(largest[:-1])} and {largest[-1]} at the end"
+    for constraint in scene.constraints:
+        rows = len(path_rows(scene.model_copy(update={"constraints": (constraint,)})))
+        what = f", {rows} row{'s' * (rows > 1)} along the path" if rows else ", at the end"
+        yield "constraint", f"{constraint.name}: {constraint.kind.replace('_', ' ')}{what}"
 
 
 def _range(part: slice) -> str:
