@@ -65,7 +65,7 @@ def solve_with_ipopt(
         "tol": tolerance,
     }
     options = {"ipopt": settings, "print_time": False, "iteration_callback": watch, **program.derivatives}
-    nlp = {"x": program.variables, "f": program.cost, "g": program.gaps}
+    nlp = {"x": program.variables, "f": program.cost, "g": casadi.vertcat(program.gaps, program.rows)}
     solver = casadi.nlpsol("ipopt", "ipopt", nlp, options)
     lower, upper = (
         np.concatenate([np.full(states.size, sign * np.inf), np.tile(bound, problem.horizon)])
@@ -73,8 +73,11 @@ def solve_with_ipopt(
     )
     lower[: start.size] = upper[: start.size] = start
     guess = np.concatenate([states.ravel(), controls.ravel()])
+    row_lower, row_upper = (
+        np.concatenate([np.zeros(program.gaps.numel()), bound]) for bound in program.row_bounds
+    )
     watch.begin()
-    result = solver(x0=guess, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+    result = solver(x0=guess, lbx=lower, ubx=upper, lbg=row_lower, ubg=row_upper)
     watch.controls[-1] = np.array(result["x"])[states.size :].reshape(controls.shape)
     plans = [np.clip(plan, problem.control_lower, problem.control_upper) for plan in watch.controls]
     costs = costs_of(problem, start, plans)
@@ -97,7 +100,11 @@ class _Watch(casadi.Callback):
 
     def __init__(self, program: Transcription, n_states: int, shape: tuple[int, ...]) -> None:
         casadi.Callback.__init__(self)
-        self._sizes = {"x": program.variables.numel(), "f": 1, "g": program.gaps.numel()}
+        self._sizes = {
+            "x": program.variables.numel(),
+            "f": 1,
+            "g": program.gaps.numel() + program.rows.numel(),
+        }
         self._sizes |= {"lam_x": self._sizes["x"], "lam_g": self._sizes["g"], "lam_p": 0}
         self._n_states, self._shape = n_states, shape
         self.seconds: list[float] = []

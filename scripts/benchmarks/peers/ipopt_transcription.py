@@ -14,10 +14,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi
+import numpy as np
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
+from dq_space_arm_env.task.constraint_residuals import path_residuals, terminal_residuals
 from dq_space_arm_env.task.equations import SceneEquations
 from experts.problems.paper_problem import beyond_the_paper
 
@@ -32,12 +35,14 @@ class Transcription:
     variables: Any
     cost: Any
     gaps: Any  # steps less the states that they should lead to, shape (N n_x,)
+    rows: Any  # of the constraints at all stages, then at the end
+    row_bounds: tuple[Any, Any]  # least and greatest value of each row
     derivatives: dict[str, Any]
 
 
 def transcribe(scene: Scene) -> Transcription:
     """Write a maneuver as a program over all its states and controls; ValueError if its target moves."""
-    if more := beyond_the_paper(scene):
+    if more := beyond_the_paper(scene.replace(constraints=())):
         raise ValueError(f"IPOPT is left out: it is not given {' or '.join(more)}.")
     equations = SceneEquations.of(scene, StateLayout.of(scene).parameters.nominal.tolist())
     n_x, n_u, n = equations.layout.n_x, equations.layout.n_u, scene.simulation.steps
@@ -48,6 +53,8 @@ def transcribe(scene: Scene) -> Transcription:
     start = states[:, :-1]
     cost = casadi.sum2(stage.map(n)(start, controls)) + terminal(states[:, -1])
     gaps = casadi.vec(step.map(n)(start, controls) - states[:, 1:])
+    path, at_end = _constraints(equations)
+    rows = casadi.vertcat(casadi.vec(path.map(n)(start, controls)), at_end(states[:, -1]))
 
     by_state, by_control = (
         casadi.diagcat(*casadi.horzsplit(part, width))
@@ -56,21 +63,82 @@ def transcribe(scene: Scene) -> Transcription:
     last = casadi.MX(n * n_x, n_x)
     shift = casadi.horzcat(casadi.DM(n * n_x, n_x), casadi.DM.eye(n * n_x))
     jacobian = casadi.horzcat(casadi.horzcat(by_state, last) - shift, by_control)
+    if scene.constraints:
+        jacobian = casadi.vertcat(jacobian, _row_jacobian(path, at_end, states, controls))
 
-    parameters, lam_f, lam_g = casadi.MX.sym("p", 0), casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", n * n_x)
-    multipliers = casadi.reshape(lam_g, n_x, n)
+    parameters, lam_f = casadi.MX.sym("p", 0), casadi.MX.sym("lam_f")
+    lam_g = casadi.MX.sym("lam_g", n * n_x + rows.numel())
+    multipliers = casadi.reshape(lam_g[: n * n_x], n_x, n)
     stage_hessian, terminal_hessian = (_hessian(function) for function in (stage, terminal))
     total = step_hessian.map(n)(start, controls, multipliers) + lam_f * stage_hessian.map(n)(start, controls)
+    end = lam_f * terminal_hessian(states[:, -1])
+    if scene.constraints:
+        n_path = path.numel_out(0)
+        pushed = casadi.reshape(lam_g[n * n_x :][: n * n_path], n_path, n)
+        total += _weighted_hessian(path).map(n)(start, controls, pushed)
+        end += _weighted_hessian(at_end)(states[:, -1], lam_g[n * (n_x + n_path) :])
     blocks = casadi.horzsplit(total, n_x + n_u)
-    xx = casadi.diagcat(*(block[:n_x, :n_x] for block in blocks), lam_f * terminal_hessian(states[:, -1]))
+    xx = casadi.diagcat(*(block[:n_x, :n_x] for block in blocks), end)
     xu = casadi.diagcat(*(block[:n_x, n_x:] for block in blocks), casadi.MX(n_x, 0))
     uu = casadi.diagcat(*(block[n_x:, n_x:] for block in blocks))
     hessian = casadi.triu(casadi.vertcat(casadi.horzcat(xx, xu), casadi.horzcat(casadi.MX(*xu.T.shape), uu)))
     derivatives = {
-        "jac_g": casadi.Function("jac_g", [variables, parameters], [gaps, jacobian]),
+        "jac_g": casadi.Function("jac_g", [variables, parameters], [casadi.vertcat(gaps, rows), jacobian]),
         "hess_lag": casadi.Function("hess_lag", [variables, parameters, lam_f, lam_g], [hessian]),
     }
-    return Transcription(variables, cost, gaps, derivatives)
+    return Transcription(variables, cost, gaps, rows, _row_bounds(scene), derivatives)
+
+
+def _constraints(equations: SceneEquations) -> tuple[Any, Any]:
+    """Residuals of the path's rows and of those at the end, with the margins that the expert keeps."""
+    scene, layout = equations.scene, equations.layout
+    x, u = casadi.SX.sym("x", layout.n_x), casadi.SX.sym("u", layout.n_u)
+    entries = casadi.vertsplit(x)
+    place = equations.base_pose(entries), equations.y(entries)
+    if not scene.constraints:
+        none = casadi.SX(0, 1)
+        return casadi.Function("path", [x, u], [none]), casadi.Function("at_end", [x], [none])
+    along = casadi.vertcat(*path_residuals(equations, *place, casadi.vertsplit(u)))
+    at_end = casadi.vertcat(*terminal_residuals(equations, *place))
+    along += casadi.DM([row.margin for row in path_rows(scene)])
+    at_end += casadi.DM([row.margin for row in terminal_rows(scene)])
+    return casadi.Function("path", [x, u], [along]), casadi.Function("at_end", [x], [at_end])
+
+
+def _row_bounds(scene: Scene) -> tuple[Any, Any]:
+    """Bounds of the rows; at stage 0, whose state is given, only rows with the input have any."""
+    if not scene.constraints:
+        return np.zeros(0), np.zeros(0)
+    path, at_end = path_rows(scene), terminal_rows(scene)
+    rows = [*path * scene.simulation.steps, *at_end]
+    lower = np.array([0.0 if row.is_equality else -np.inf for row in rows])
+    upper = np.zeros(len(rows))
+    upper[: len(path)] = [0.0 if row.has_input else np.inf for row in path]
+    return lower, upper
+
+
+def _row_jacobian(path: Any, at_end: Any, states: Any, controls: Any) -> Any:
+    """Jacobian of all rows by all states and controls."""
+    n, n_x, n_u = controls.shape[1], states.shape[0], controls.shape[0]
+    arguments = path.sx_in()
+    jacobian = casadi.jacobian(path(*arguments), casadi.veccat(*arguments))
+    parts = casadi.Function("jacobian", arguments, [jacobian[:, :n_x], jacobian[:, n_x:]], {"cse": True})
+    by_state, by_control = (
+        casadi.diagcat(*casadi.horzsplit(part, width))
+        for part, width in zip(parts.map(n)(states[:, :-1], controls), (n_x, n_u), strict=True)
+    )
+    (x,) = at_end.sx_in()
+    last = casadi.Function("last", [x], [casadi.jacobian(at_end(x), x)], {"cse": True})(states[:, -1])
+    return casadi.horzcat(
+        casadi.diagcat(by_state, last), casadi.vertcat(by_control, casadi.MX(last.shape[0], n * n_u))
+    )
+
+
+def _weighted_hessian(function: Any) -> Any:
+    """Hessian of weights . rows by all their arguments together; the weights are a further argument."""
+    arguments, weights = function.sx_in(), casadi.SX.sym("w", function.numel_out(0))
+    hessian = casadi.hessian(casadi.dot(weights, function(*arguments)), casadi.veccat(*arguments))[0]
+    return casadi.Function("hessian", [*arguments, weights], [hessian], {"cse": True})
 
 
 def _hessian(function: Any) -> Any:

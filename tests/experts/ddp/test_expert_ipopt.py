@@ -4,7 +4,7 @@ import casadi
 import numpy as np
 import pytest
 
-from experts import BoxDDP
+from experts import BoxDDP, GuidedDDP
 from experts.problems.arm_problem import ArmProblem
 from scripts.benchmarks.peers.ipopt_peer import solve_with_ipopt
 from scripts.benchmarks.peers.ipopt_transcription import transcribe
@@ -33,3 +33,20 @@ def test_ipopt_finds_the_experts_plan_from_zero_controls():
     run = solve_with_ipopt(problem)
     assert run.converged, run.stop_reason
     assert run.replayed_cost == pytest.approx(BoxDDP(problem).solve().cost, rel=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["joint-limits", "keep-out", "pointing"])
+def test_ipopt_finds_the_experts_plan_under_constraints(name):
+    """From the plan's neighborhood an interior-point method arrives at the same cost."""
+    solution = GuidedDDP(name).solve()
+    assert solution.converged
+    run = solve_with_ipopt(
+        ArmProblem(name),
+        u_init=solution.controls,
+        x_init=solution.states,
+        first_barrier=1e-3,
+        tolerance=1e-8,
+    )
+    assert run.converged, run.stop_reason
+    assert solution.cost == pytest.approx(run.replayed_cost, rel=1e-6)
