@@ -4,7 +4,8 @@ Control-limited differential dynamic programming of Tassa, Mansard & Todorov (IC
 model of the dynamics (iLQR), exact second derivatives (Newton's method), or a hybrid of the two
 (`second_order`). An iteration differentiates along the trajectory, runs a backward pass for a control update
 and its gains, and a forward pass that searches along the update for a step that reduces the cost as
-predicted. Given a guess of the states, a solve begins by multiple shooting (`multiple_shooting`).
+predicted. Given a guess of the states, a solve begins by multiple shooting (`multiple_shooting`). Constraints
+become penalties, whose multipliers follow the steps (`augmented_lagrangian`).
 
 **Convergence** is measured by the reduction of the cost that the model predicts for a full, unregularized
 step, relative to the cost. It does not depend on the units of states, controls or cost, it accounts for the
