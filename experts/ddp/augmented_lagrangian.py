@@ -4,9 +4,10 @@ The solver minimizes an augmented Lagrangian (`dq_space_arm_env.task.augmented_l
 and penalties r that are those of the present iteration. After a step that goes well and promises little more,
 the multipliers follow, l <- l f'(r c) for rows c <= 0 and l <- l + r c for rows c = 0, and the penalties
 grow. The stiffness of a row is l r: where a joint meets its limit the multiplier is an impulse, and the row
-becomes stiff there only. The inputs' bounds stay with the box QP. A solve ends where an unregularized step is
-predicted not to reduce the Lagrangian, no row is violated, and the sum of |l c|, by which the cost may exceed
-that of the optimum, is small.
+becomes stiff there only. It grows slowly: a leap would narrow the valley faster than steps can follow. The
+inputs' bounds stay with the box QP. A solve ends where an unregularized step is predicted not to reduce the
+Lagrangian, no row is violated, and the sum of |l c|, by which the cost may exceed that of the optimum, is
+small.
 
 The first steps, far from a minimum, leave the rows out.
 """
@@ -41,6 +42,8 @@ GROWTH = 2.0
 """Factor of the penalties in an update."""
 LARGEST_PENALTY = 3e6
 """Beyond it rounding hides what a step gains."""
+STIFFENING, FIRST_STIFFNESS = 2.0, 1e3
+"""Largest growth of a row's stiffness in an update, and the least stiffness to grow to."""
 GAIN_STIFFNESS = 1e3
 """Largest stiffness of a row in feedback gains: with more they would follow noise."""
 BEGIN = 1e-2
@@ -117,10 +120,13 @@ class AugmentedLagrangian:
     def update(self, states: FloatArray, controls: FloatArray) -> None:
         """Let the multipliers follow a trajectory, states (N + 1, n_x) and controls (N, n_u)."""
         penalties, residuals = self.constraints.penalties, self.constraints.find(states, controls)
+        stiffness = np.maximum(STIFFENING * self.constraints.multipliers * penalties, FIRST_STIFFNESS)
         self._move(residuals, CHANGE)
         self.near = max(NEARER * self.near, NEAREST)
         exhausted = penalties.max(initial=0.0) >= LARGEST_PENALTY
         np.minimum(GROWTH * penalties, LARGEST_PENALTY, out=penalties)
+        softer = stiffness / np.maximum(self.constraints.multipliers, LEAST_MULTIPLIER)
+        np.minimum(penalties, softer, out=penalties, where=self._inequalities)
         violation = float(self._violations(residuals).max(initial=0.0))
         stands = exhausted and violation > max(PROGRESS * self._least_violation, FEASIBILITY)
         self._idle_updates = self._idle_updates + 1 if stands else 0
