@@ -60,7 +60,7 @@ DIMENSIONLESS = {
 } | {
     f"{model.__name__}.{name}"
     for model in keys.models_of(dq_space_arm_env.Scene)
-    for name in ("margin", "tolerance", "observed")
+    for name in ("margin", "tolerance")
     if issubclass(model, Constraint)
 }
 """Keys of a scene without a unit, or, the last ones, with that of an actuator's limit or a residual."""

@@ -248,7 +248,7 @@ class Momentum(Constraint):
         default=None, description="greatest angular momentum about the center of mass, N m s; absent: any"
     )
     energy: Positive | None = Field(
-        default=None, description="greatest kinetic energy with that of joint springs, J; absent: any"
+        default=None, description="greatest kinetic energy with that of joint springs, N m; absent: any"
     )
 
     def _problems(self) -> Iterator[Problem]:

@@ -83,7 +83,10 @@ def test_completion_loads_nothing_heavy_and_knows_the_names() -> None:
 
     assert completed("dq-space-arm solve pl", 2) == "plain,planar\n"
     assert "plain,gains" in completed("dq-space-arm simulate paper --policy ", 4)
-    assert completed("dq-space-arm train pp", 2) == "plain,ppo\nplain,ppo-from-clone\nplain,ppo-tumbling-target\n"
+    assert (
+        completed("dq-space-arm train pp", 2)
+        == "plain,ppo\nplain,ppo-from-clone\nplain,ppo-tumbling-target\n"
+    )
     assert completed("dq-space-arm evaluate --scene plan", 3) == "plain,planar\n"
 
 

@@ -17,6 +17,7 @@ import dq_space_arm_env
 from dq_space_arm_env import list_scenes, load_scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Actuators
+from dq_space_arm_env.scene.constraint_rows import path_rows
 from dq_space_arm_env.validation.fields import MOST_STEPS
 
 TARGET = np.array([0.5, 0.5, -0.5, -0.5, 0.25, 2.25, 0.25, 2.25])
@@ -124,7 +125,9 @@ def test_observation_is_what_the_documentation_says(scene):
         assert info["angular_velocity_error"] == pytest.approx(np.degrees(np.linalg.norm(relative[:3])))
         assert info["velocity_error"] == pytest.approx(np.linalg.norm(relative[3:]))
     phase = [info["phase"]] if env.unwrapped.scene.phases else []
-    expected = np.concatenate([error, *(x[part] for part in parts), phase, *twists, [19 * 0.015]])
+    rows = [row for row in path_rows(env.unwrapped.scene) if row.observed is not None]
+    margins = [np.tanh(-info["constraints"][row.name] / row.observed) for row in rows]
+    expected = np.concatenate([error, *(x[part] for part in parts), phase, margins, *twists, [19 * 0.015]])
     np.testing.assert_allclose(observation, expected, atol=1e-14)
     tip = tuple(kernels.tip_pose(x))
     assert info["attitude_error"] == pytest.approx(np.degrees(poses.error_angle(tip, target)))
