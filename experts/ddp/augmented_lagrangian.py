@@ -25,7 +25,7 @@ FEASIBILITY = 1e-6
 SERIOUS = 1e-3
 """Violation with which a problem counts as infeasible where no step is left."""
 COMPLEMENTARITY = 1e-7
-"""Largest sum of |l c| at the end of a solve, relative to the cost."""
+"""Largest sum of |l c| at the end of a solve, relative to the cost, or to 1 if that is larger."""
 STATIONARITY = 1e-12
 """Predicted reduction, relative to the cost, below which multipliers are slopes of the penalties."""
 FIRST_MULTIPLIER = 1.0
@@ -153,7 +153,7 @@ class AugmentedLagrangian:
         residuals = self.constraints.find(states, controls)
         gap = np.abs(self.constraints.multipliers * residuals).sum()
         feasible = self._violations(residuals).max(initial=0.0) <= FEASIBILITY
-        return bool(feasible and gap <= COMPLEMENTARITY * abs(cost))
+        return bool(feasible and gap <= COMPLEMENTARITY * max(abs(cost), 1.0))
 
     def soften(self) -> None:
         """Limit the stiffness of rows to what feedback gains may have."""

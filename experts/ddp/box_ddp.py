@@ -193,8 +193,11 @@ class BoxDDP:
         cost, alpha = work.current.cost, 0.0
         for direction in self._backward_passes(state):
             stop = self._stopping_criteria(state, direction)
-            if stop is not None and not self._is_unfinished(state, stop):
-                return stop
+            if stop is not None:
+                if not self._is_unfinished(state, stop):
+                    return stop
+                if limit := state.iteration_limit(self.max_iterations):
+                    return limit
             alpha = line_search(work, direction)
             if alpha > 0.0 or stop is not None:
                 break
