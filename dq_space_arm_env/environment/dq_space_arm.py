@@ -394,7 +394,9 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             self._show()
         if self._more_names:
             flags = {"is_success": success, "diverged": diverged}
-            info = grouped(dict(zip(self._more_names, report[1:], strict=True))) | flags
+            info = dict(zip(self._more_names, report[1:], strict=True)) | flags
+            if self.scene.constraints:
+                info = grouped(info)
             return self._observation.copy(), report[0], over, False, info
         # Written out: a call, or a loop over names, would make a step some per cent slower.
         reward, pose, velocity, control, end_pose, end_velocity, angle, distance, error = report

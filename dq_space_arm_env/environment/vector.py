@@ -477,8 +477,9 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         """Entries of `DQSpaceArmEnv`'s info, as arrays."""
         _, success, diverged = result.flags
         whole = mask is self._all
-        values = grouped(dict(zip(self._names, result.report[1:], strict=True)))
-        if "constraints" in values:  # as Gymnasium nests dictionaries
+        values: dict[str, Any] = dict(zip(self._names, result.report[1:], strict=True))
+        if self.scene.constraints:  # as Gymnasium nests dictionaries
+            values = grouped(values)
             inner = values["constraints"]
             values["constraints"] = inner | {f"_{name}": mask.copy() for name in inner}
         return {

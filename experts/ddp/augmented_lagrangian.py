@@ -54,7 +54,7 @@ NEARER, NEAREST = 0.5, 1e-5
 """Factor of that from one update to the next, and its least value."""
 LONG_ENOUGH = 0.5
 """Length of such a step."""
-EXACT_MU = (1e-3, 1e-1, 1e1)
+CONSTRAINED_EXACT_MU = (1e-3, 1e-1, 1e1)
 """Regularizations with which the hybrid tries the exact model where rows count."""
 PATIENCE = 8
 """Updates without progress at the largest penalty after which a problem counts as infeasible."""

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from experts.ddp import augmented_lagrangian
 from experts.ddp.augmented_lagrangian import (
+    CONSTRAINED_EXACT_MU,
     LONG_ENOUGH,
     SERIOUS,
     STATIONARITY,
@@ -159,6 +159,7 @@ class BoxDDP:
             stop = shooting.close_gaps(guess, state, self.max_iterations, callback)
         state.first_cost = work.current.cost
         if work.current.failing_stage != FINISHED:
+            self._begin_multipliers(None)
             message = f"the first rollout is not finite from stage {work.current.failing_stage} on"
             return self._solution(state, Stop(StopReason.DIVERGED, message), np.zeros_like(work.update.K))
         state.moved = True
@@ -214,21 +215,25 @@ class BoxDDP:
             if stop is not None and self._meets_constraints():
                 return None if state.moved else stop
             is_near = alpha >= LONG_ENOUGH and record.optimality <= self._lagrangian.near
-            if stop is not None or is_near:
+            if stop is not None or (is_near and (self._lagrangian.counts or not self._meets_constraints())):
                 return self._follow_constraints(state)
         return self._no_progress(state, record)
 
     def _is_unfinished(self, state: SolverState, stop: Stop) -> bool:
-        """Whether only the constraints ask for more: a step too small to count still serves their rows."""
+        """Whether only the constraints ask for more: a step too small to count still serves their rows.
+
+        An unconstrained minimum that keeps to them is theirs.
+        """
         if self._lagrangian is None or stop.reason is not StopReason.CONVERGED:
             return False
-        return state.optimality > STATIONARITY or not self._meets_constraints()
+        is_rough = self._lagrangian.counts and state.optimality > STATIONARITY
+        return is_rough or not self._meets_constraints()
 
     def _meets_constraints(self) -> bool:
-        """Whether the current trajectory keeps to all rows that count."""
+        """Whether the current trajectory keeps to all rows."""
         current, lagrangian = self._work.current, self._lagrangian
         assert lagrangian is not None  # or it is not called
-        return lagrangian.counts and lagrangian.is_met(current.states, current.controls, current.cost)
+        return lagrangian.is_met(current.states, current.controls, current.cost)
 
     def _follow_constraints(self, state: SolverState) -> Stop | None:
         """Let constraints begin to count, or multipliers follow the trajectory."""
@@ -280,7 +285,7 @@ class BoxDDP:
                 direction = self._work.backward_pass(remembered.mu, exact=True)
             return direction
         rows_count = self._lagrangian is not None and self._lagrangian.counts
-        for mu in augmented_lagrangian.EXACT_MU if rows_count else EXACT_MU:
+        for mu in CONSTRAINED_EXACT_MU if rows_count else EXACT_MU:
             direction = self._work.backward_pass(mu, exact=True)
             if direction.status != PASS_NOT_POSITIVE_DEFINITE:
                 break
@@ -400,8 +405,9 @@ class BoxDDP:
         """Compute the gains with moderate penalties, and the cost without any."""
         work, lagrangian = self._work, self._lagrangian
         assert lagrangian is not None  # or it is not called
-        lagrangian.settle(work.current.states, work.current.controls)
-        lagrangian.soften()
+        if lagrangian.counts:
+            lagrangian.settle(work.current.states, work.current.controls)
+            lagrangian.soften()
         work.differentiate()
         gains, message = np.zeros_like(work.update.K), stop.message
         if self._final_backward_pass().completed:
