@@ -1,6 +1,7 @@
 """Scenes: validated descriptions of a spacecraft with an arm, and of the maneuver asked of it."""
 
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
+from dq_space_arm_env.scene.constraint_rows import Row, path_rows, terminal_rows
 from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
 from dq_space_arm_env.scene.layout import ControlEntries, StateEntries, StateLayout, TangentEntries
 from dq_space_arm_env.scene.loading import list_scenes, load_scene, scenes_directory
@@ -36,6 +37,7 @@ __all__ = [
     "Link",
     "Payload",
     "Pose",
+    "Row",
     "Scene",
     "SceneError",
     "Shape",
@@ -52,5 +54,7 @@ __all__ = [
     "initial_state",
     "list_scenes",
     "load_scene",
+    "path_rows",
     "scenes_directory",
+    "terminal_rows",
 ]

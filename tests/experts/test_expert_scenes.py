@@ -6,6 +6,7 @@ import pytest
 
 import dq_space_arm_env  # noqa: F401 - registers the environment
 from dq_space_arm_env import compile_scene, list_scenes, load_scene
+from dq_space_arm_env.scene import path_rows, terminal_rows
 from experts import BoxDDP, GuidedDDP, StopReason
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.paper_problem import PaperProblem
@@ -120,25 +121,46 @@ def test_every_scene_ends_with_a_truthful_reason(scene):
 
 
 def best_gradient_step(scene, solution):
-    """Relative decrease of the cost along the best of many projected gradient steps, measured by rollouts."""
+    """Relative decrease along the best of many projected gradient steps, measured by rollouts.
+
+    That of the cost, or of the Lagrangian where constraints hold: its multipliers make their rows worth it.
+    """
     kernels = compile_scene(scene)
     states, controls, limit = solution.states, solution.controls, kernels.layout.control_limit
+    n_t, path, end = kernels.n_t, *multipliers_of(solution, kernels)
     a, b = kernels.linearize(states[:-1], controls)
     lx, lu, _, luu = kernels.call("cost_derivatives", x=states[:-1], u=controls)
     adjoint = kernels.call("terminal_cost_derivatives", x=states[-1], emphasis=[1.0])[0]
+    if path.size:
+        by_stage = np.einsum("ki,kij->kj", path, kernels.constraint_jacobian(states[:-1], controls))
+        lx, lu = lx + by_stage[:, :n_t], lu + by_stage[:, n_t:]
+        adjoint = adjoint + end @ kernels.terminal_constraint_jacobian(states[-1])
     gradient = np.zeros_like(controls)
     for k in reversed(range(len(controls))):
         gradient[k] = lu[k] + b[k].T @ adjoint
         adjoint = lx[k] + a[k].T @ adjoint
     direction = gradient / np.diagonal(luu[0].reshape(kernels.n_u, kernels.n_u))
-    lengths = 10.0 ** np.arange(-6.0, 1.0, 0.5)
+    lengths = np.concatenate([[0.0], 10.0 ** np.arange(-6.0, 1.0, 0.5)])
     x = np.tile(states[0], (len(lengths), 1))
-    cost = np.zeros(len(lengths))
+    value = np.zeros(len(lengths))
     for k in range(len(controls)):
         u = np.clip(controls[k] - lengths[:, None] * direction[k], -limit, limit)
-        cost += kernels.cost(x, u)
+        value += kernels.cost(x, u)
+        if path.size:
+            value += kernels.constraints(x, u) @ path[k]
         x = kernels.step(x, u)
-    return 1.0 - (cost + kernels.terminal_cost(x)).min() / solution.cost
+    value += kernels.terminal_cost(x)
+    if path.size:
+        value += kernels.terminal_constraints(x) @ end
+    return (value[0] - value.min()) / solution.cost
+
+
+def multipliers_of(solution, kernels):
+    """Multipliers of the path's rows, (N, n_c), and of those at the end, (n_g,); empty without any."""
+    if solution.constraints is None:
+        return np.zeros((0, 0)), np.zeros(0)
+    count, count_at_end = len(path_rows(kernels.scene)), len(terminal_rows(kernels.scene))
+    return solution.multipliers[:-1, :count], solution.multipliers[-1, :count_at_end]
 
 
 def test_the_papers_state_starts_where_the_minimal_one_does():
