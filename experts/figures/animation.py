@@ -1,4 +1,4 @@
-"""A maneuver as an animated GIF, drawn by the environment's renderer."""
+"""A maneuver as an animated GIF or a strip of moments, drawn by the environment's renderer."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ Image = NDArray[np.uint8]
 FASTEST = 50.0
 """Pictures per second, 1/s: players slow down pictures shorter than 0.02 s."""
 
-NO_PILLOW = 'a GIF needs Pillow, which is not installed: pip install "dq-space-arm[plots]"'
+NO_PILLOW = 'a GIF or PNG needs Pillow, which is not installed: pip install "dq-space-arm[plots]"'
 _LONGEST_HOLD = 600.0  # s; the file has 16 bits for hundredths of a second
+_GAP = 4  # pixels between the pictures of a strip
 _PALETTE_PICTURES = 12  # from which the colors of all are chosen
 _PALETTE_POWER = 0.5  # of how often a color occurs, for its share of the palette
 
@@ -53,6 +54,20 @@ def draw_maneuver(maneuver: Maneuver, picture: PictureFormat, fps: float, second
         renderer.aim_at(target, body, payload)
         pictures.append(renderer.draw(maneuver.frames[stage], tips[: stage + 1]))
     return pictures
+
+
+def encode_strip(pictures: Sequence[Image], colors: int = 192) -> bytes:
+    """Encode RGB pictures of one height as a PNG, side by side, with white between them."""
+    try:
+        from PIL import Image as Pillow
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(NO_PILLOW) from error
+    between = np.full((len(pictures[0]), _GAP, 3), 255, np.uint8)
+    row = [part for picture in pictures for part in (between, picture)][1:]
+    strip = Pillow.fromarray(np.hstack(row)).quantize(colors, Pillow.Quantize.MEDIANCUT)
+    file = io.BytesIO()
+    strip.save(file, "PNG", optimize=True)
+    return file.getvalue()
 
 
 def check_gif(fps: float, hold: float, colors: int) -> None:

@@ -11,7 +11,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 from dq_space_arm_env.viewing.rendering import Renderer
-from experts.figures.animation import check_gif, draw_maneuver, encode_gif
+from experts.figures.animation import check_gif, draw_maneuver, encode_gif, encode_strip
 from experts.maneuver import Maneuver
 
 SMALL = PictureFormat(64, 48)
@@ -85,6 +85,16 @@ def test_gif_plays_what_was_drawn(maneuver):
         shown = np.asarray(file.convert("RGB")).astype(int)
         assert np.abs(shown - picture).mean() < 4.0
         assert (np.abs(shown - picture).max(axis=2) > 60).mean() < 0.02
+
+
+def test_a_strip_shows_moments_side_by_side(maneuver):
+    pillow = pytest.importorskip("PIL.Image")
+    pictures = draw_maneuver(maneuver, SMALL, fps=2.0 / 1.5, seconds=1.5)
+    strip = np.asarray(pillow.open(io.BytesIO(encode_strip(pictures))).convert("RGB")).astype(int)
+    assert strip.shape == (48, 3 * 64 + 2 * 4, 3)
+    for number, picture in enumerate(pictures):
+        assert np.abs(strip[:, 68 * number : 68 * number + 64] - picture).mean() < 4.0
+    assert (strip[:, 64:68] > 250).all()
 
 
 def test_a_payload_stays_where_it_was_let_go_and_the_target_is_that_of_the_phase():
