@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, rotations, screw
-from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale, transposed_matrix_vector
+from dq_space_arm_env.algebra.vectors import (
+    add,
+    cross,
+    matrix_vector,
+    scale,
+    subtract,
+    transposed_matrix_vector,
+)
 from dq_space_arm_env.scene.motion import ScrewMotion, Tumbling, Waypoints
 from dq_space_arm_env.scene.pose import Matrix3
 
@@ -55,28 +62,22 @@ def advanced(
 def _turned(inertia: Matrix3, angular: Scalars, h: Scalar) -> tuple[Scalars, Scalars]:
     """Rotation vector and angular velocity of a free rigid body after h seconds, to fourth order.
 
-    Runge and Kutta's method on the rotation vector, phi' = w + phi x w / 2 + phi x (phi x w) / 12 (Munthe-
-    Kaas), and on Euler's equations, J w' = J w x w.
+    Runge and Kutta's method for Euler's equations, J w' = J w x w; Magnus' expansion by Hermite's rule,
+    phi = h (w_0 + w_1) / 2 + h^2 (w_0' - w_1' + w_0 x w_1) / 12.
     """
     inverse = np.linalg.inv(np.array(inertia)).tolist()
 
-    def rates(vector: Scalars, w: Scalars) -> tuple[Scalars, Scalars]:
-        once = cross(vector, w)
-        turning = add(w, add(scale(0.5, once), scale(1.0 / 12.0, cross(vector, once))))
-        return turning, matrix_vector(inverse, cross(matrix_vector(inertia, w), w))
+    def rate(w: Scalars) -> Scalars:
+        return matrix_vector(inverse, cross(matrix_vector(inertia, w), w))
 
-    start = (0.0, 0.0, 0.0), tuple(angular)
-    slopes: list[tuple[Scalars, Scalars]] = []
-    for share in (0.0, 0.5, 0.5, 1.0):
-        vector, w = start
-        if slopes:
-            vector, w = scale(share * h, slopes[-1][0]), add(w, scale(share * h, slopes[-1][1]))
-        slopes.append(rates(vector, w))
-    sums = []
-    for first, second, third, fourth in zip(*slopes, strict=True):
-        middle = scale(2.0, add(second, third))
-        sums.append(scale(h / 6.0, add(add(first, fourth), middle)))
-    return sums[0], add(angular, sums[1])
+    slopes = [rate(angular)]
+    for share in (0.5, 0.5, 1.0):
+        slopes.append(rate(add(angular, scale(share * h, slopes[-1]))))
+    first, second, third, fourth = slopes
+    rise = add(add(first, fourth), scale(2.0, add(second, third)))
+    after = add(angular, scale(h / 6.0, rise))
+    bend = add(subtract(first, rate(after)), cross(angular, after))
+    return add(scale(0.5 * h, add(angular, after)), scale(h * h / 12.0, bend)), after
 
 
 def shown_target(scene: Scene) -> tuple[Array, Array | None]:
