@@ -18,6 +18,7 @@ from dq_space_arm_env import Scene, SceneError, load_scene, scene_from_urdf, sce
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.interoperability.exporting import joint_limits
 from dq_space_arm_env.interoperability.urdf_elements import read_robot
 from dq_space_arm_env.scene import Simulation
 from dq_space_arm_env.scene.path import shown_target
@@ -101,6 +102,10 @@ def summary(imported: Imported, file: str, added: bool) -> Iterator[str]:
     yield f"  base    {scene.base.mass:.4g} kg{more}"
     yield f"  links   {links}"
     yield f"  limits  {'; '.join(_limits(scene)) or 'no motors'}; edit actuators and links"
+    limits_of_joints = joint_limits(scene)
+    ranges = sum(math.isfinite(lower) or math.isfinite(upper) for lower, upper, _ in limits_of_joints)
+    rates = sum(math.isfinite(rate) for *_, rate in limits_of_joints)
+    yield f"  joints  {ranges} with limits of the angle, {rates} of the rate; edit constraints"
     yield f"  start   at rest, joints at {_numbers(scene.initial_state.joint_angles)} rad; edit initial_state"
     yield f"  target  {degrees:.3g} degrees and {meters:.3g} m from the start; edit target"
     if scene.simulation.integrator != Simulation().integrator:

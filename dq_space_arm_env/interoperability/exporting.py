@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable
 
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
 from dq_space_arm_env.scene import Scene, SceneError
+from dq_space_arm_env.scene.constraint_rows import sides
+from dq_space_arm_env.scene.constraints import JointLimits
 
 
 def words(numbers: Iterable[float]) -> str:
@@ -41,6 +44,21 @@ def refuse(scene: Scene, language: str, wrist: str, *, springs: bool = False, pl
         problems.append("it has no base that moves in a plane: set base.motion to spatial")
     if problems:
         raise SceneError("\n  - ".join([f"scene {scene.name!r} cannot be written as {language}:", *problems]))
+
+
+def joint_limits(scene: Scene) -> list[tuple[float, float, float]]:
+    """Smallest and largest angle, rad, and largest rate, rad/s, of each joint; infinite for none."""
+    limits = [[-math.inf, math.inf, math.inf] for _ in scene.links]
+    for constraint in scene.constraints:
+        for side in sides(scene, constraint) if isinstance(constraint, JointLimits) else ():
+            of_joint = limits[side.link]
+            if side.is_rate:
+                of_joint[2] = min(of_joint[2], side.bound)
+            elif side.sign > 0:
+                of_joint[1] = min(of_joint[1], side.bound)
+            else:
+                of_joint[0] = max(of_joint[0], -side.bound)
+    return [(lower, upper, rate) for lower, upper, rate in limits]
 
 
 def tip_from_last_link(scene: Scene) -> tuple[float, ...]:

@@ -11,7 +11,13 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from dq_space_arm_env.algebra import poses, rotations
-from dq_space_arm_env.interoperability.exporting import free_name, refuse, tip_from_last_link, words
+from dq_space_arm_env.interoperability.exporting import (
+    free_name,
+    joint_limits,
+    refuse,
+    tip_from_last_link,
+    words,
+)
 from dq_space_arm_env.scene import Base, Link, Payload, Scene, Shape, StateLayout
 from dq_space_arm_env.scene.shapes import COLORS, color_of
 from dq_space_arm_env.validation.fields import Three
@@ -26,8 +32,9 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     There is no gravity, and nothing collides: the scene's shapes, if it gives any, are there to be seen.
     Body `base` has the frame e0 and a free joint, called `base joint`; in a planar scene it slides along x
     and y and turns about z. Each link is a body with the frame of its joint, a hinge about z called by the
-    link's name and " joint", with the scene's damping and spring and no armature. Site `tip` has the frame G,
-    body `payload` is held at the tip.
+    link's name and " joint", with the scene's damping, spring and limits of the angle, and no armature.
+    MuJoCo pushes joints back from their limits, the scene's kernels do not, and it has no limits of rates.
+    Site `tip` has the frame G, body `payload` is held at the tip.
 
     Actuators are motors with the names, limits and order of the scene's inputs, without the wrist's rates;
     forces and torques act in base axes at e0. MuJoCo clips controls at the limits, the scene's kernels do
@@ -61,9 +68,9 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     _add_shapes(base, scene.base.geometry, COLORS["foil"])
     SubElement(base, "site", name="e0")
     body = base
-    for link in scene.links:
+    for link, (lower, upper, _) in zip(scene.links, joint_limits(scene), strict=True):
         body = _add_body(body, link.name, link.joint.dual_quaternion)
-        _add_hinge(body, link)
+        _add_hinge(body, link, lower, upper)
         _add_inertial(body, link, link.center_of_mass)
         _add_shapes(body, link.geometry, COLORS["white"])
     tip = tip_from_last_link(scene)
@@ -128,8 +135,10 @@ def _add_shapes(body: Element, shapes: Sequence[Shape], color: Three) -> None:
         SubElement(body, "geom", {**look, **place, "contype": "0", "conaffinity": "0"})
 
 
-def _add_hinge(body: Element, link: Link) -> None:
+def _add_hinge(body: Element, link: Link, lower: float, upper: float) -> None:
     joint = SubElement(body, "joint", name=f"{link.name} joint", type="hinge", axis="0 0 1")
+    if math.isfinite(lower) or math.isfinite(upper):
+        joint.set("range", words([lower, upper]))
     if link.damping:
         joint.set("damping", words([link.damping]))
     if link.stiffness:

@@ -31,6 +31,9 @@ _MOST = 10_000  # links or joints, a hundred times those of a humanoid
 _LONGEST_NAME = 200  # characters
 _LARGEST = 1e15  # number, whose square times another's has digits to spare
 
+UNLIMITED = 1e4
+"""Limit of an angle or a rate, rad and rad/s, from which it limits nothing: URDF has no word for none."""
+
 Pose = tuple[float, ...]
 
 
@@ -53,7 +56,8 @@ class UrdfJoint:
     origin: Pose  # pose of the joint frame, and of the child at zero angle, in the parent's, 8 numbers, m
     axis: Array  # unit vector in the joint frame, shape (3,)
     effort: float | None  # largest torque, N m; None for none or 0, which many files write for unknown
-    limits: tuple[float, float] | None  # smallest and largest angle, rad
+    limits: tuple[float, float] | None  # smallest and largest angle, rad; infinite or None for none
+    rate: float  # largest rate, rad/s; infinite for none
     damping: float  # viscous, N m s/rad
     friction: float  # Coulomb, N m
     mimics: str | None  # the joint that it follows
@@ -177,17 +181,29 @@ def _read_joint(element: Element) -> UrdfJoint:
         axis=_axis(element, where) if kind in MOVABLE else np.array([0.0, 0.0, 1.0]),
         effort=effort or None,
         limits=_limits(limit, where) if kind == "revolute" else None,
+        rate=_rate(limit, where) if kind in MOVABLE else math.inf,
         damping=damping,
         friction=friction,
         mimics=None if mimic is None else _required(mimic, "joint", f"{where}, <mimic>"),
     )
 
 
-def _limits(limit: Element | None, where: str) -> tuple[float, float]:
+def _limits(limit: Element | None, where: str) -> tuple[float, float] | None:
+    """Smallest and largest angle; none where both are 0, which many files write for unknown."""
     lower, upper = (_optional(limit, key, f"{where}, <limit>") for key in ("lower", "upper"))
     if lower > upper:
         raise SceneError(f"URDF: {where}: lower = {lower:g} rad is greater than upper = {upper:g} rad")
-    return lower, upper
+    if lower == upper == 0.0:
+        return None
+    return lower if lower > -UNLIMITED else -math.inf, upper if upper < UNLIMITED else math.inf
+
+
+def _rate(limit: Element | None, where: str) -> float:
+    """Largest rate; none where it is 0, which many files write for unknown."""
+    rate = _optional(limit, "velocity", f"{where}, <limit>")
+    if rate < 0:
+        raise SceneError(f"URDF: {where}: velocity = {rate:g} rad/s, it must be 0 or greater")
+    return rate if 0.0 < rate < UNLIMITED else math.inf
 
 
 def _axis(element: Element, where: str) -> Array:

@@ -9,13 +9,17 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from dq_space_arm_env.algebra import dual_quaternion, poses
-from dq_space_arm_env.interoperability.exporting import free_name, refuse, tip_from_last_link, words
+from dq_space_arm_env.interoperability.exporting import (
+    free_name,
+    joint_limits,
+    refuse,
+    tip_from_last_link,
+    words,
+)
+from dq_space_arm_env.interoperability.urdf_elements import UNLIMITED
 from dq_space_arm_env.scene import Base, Link, Payload, Scene, Shape
 from dq_space_arm_env.scene.shapes import COLORS, color_of
 from dq_space_arm_env.validation.fields import Three
-
-# URDF asks for a limit of the rate wherever there is one of the torque; this one limits nothing.
-_ANY_RATE = "1e+06"
 
 
 def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
@@ -23,9 +27,11 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
 
     The root link `base` has the frame e0, at the center of mass; tell the simulator that it floats
     (Pinocchio: `JointModelFreeFlyer`). Each further link has the frame of its joint and carries the scene's
-    name; its joint is continuous, turns about z, and is called by the link's name and " joint". A link `tip`
-    without mass, or with that of the payload, has the frame G. Torque limits become efforts, 0 for a joint
-    without motor; URDF has no thrusters, wheels, start or task. Shapes become visuals.
+    name; its joint turns about z and is called by the link's name and " joint". A link `tip` without mass, or
+    with that of the payload, has the frame G. Torque limits become efforts, 0 for a joint without motor.
+    The scene's joint limits, without their margins, make a joint revolute, others are continuous; 1e4 rad
+    and rad/s stand for none where URDF asks for a number. It has no thrusters, wheels, start, task or other
+    constraints. Shapes become visuals.
 
     Features that URDF lacks and that change the motion are refused: joint springs, a wrench at the tip, a
     planar base. The massless wrist as three joints would have infinite accelerations; fixed at its initial
@@ -46,9 +52,9 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     names = [link.name for link in scene.links]
     parent = free_name("base", names)
     _add_link(root, parent, scene.base, (0.0, 0.0, 0.0))
-    for link, limit in zip(scene.links, _efforts(scene), strict=True):
+    for link, effort, limits in zip(scene.links, _efforts(scene), joint_limits(scene), strict=True):
         _add_link(root, link.name, link, link.center_of_mass)
-        _add_joint(root, link, parent, limit)
+        _add_joint(root, link, parent, effort, limits)
         parent = link.name
     tip = free_name("tip", names)
     payload = scene.payload
@@ -99,12 +105,22 @@ def _add_visual(link: Element, shape: Shape, default: Three, material: str) -> N
     SubElement(SubElement(visual, "material", name=material), "color", rgba=color)
 
 
-def _add_joint(root: Element, link: Link, parent: str, effort: float) -> None:
-    joint = SubElement(root, "joint", name=f"{link.name} joint", type="continuous")
+def _add_joint(
+    root: Element, link: Link, parent: str, effort: float, limits: tuple[float, float, float]
+) -> None:
+    lower, upper, rate = limits
+    has_range = math.isfinite(lower) or math.isfinite(upper)
+    kind = "revolute" if has_range else "continuous"
+    joint = SubElement(root, "joint", name=f"{link.name} joint", type=kind)
     _connect(joint, parent, link.name, link.joint.dual_quaternion)
     SubElement(joint, "axis", xyz="0 0 1")
-    if math.isfinite(effort):
-        SubElement(joint, "limit", effort=words([effort]), velocity=_ANY_RATE)
+    if has_range or math.isfinite(effort) or math.isfinite(rate):
+        # URDF wants effort and velocity in every <limit>; effort 0 stands for unknown.
+        limit = SubElement(joint, "limit", effort=words([effort if math.isfinite(effort) else 0.0]))
+        limit.set("velocity", words([min(rate, UNLIMITED)]))
+        if has_range:
+            limit.set("lower", words([max(lower, -UNLIMITED)]))
+            limit.set("upper", words([min(upper, UNLIMITED)]))
     if link.damping:
         SubElement(joint, "dynamics", damping=words([link.damping]))
 

@@ -30,6 +30,7 @@ _BEND = 0.5
 _SINGULAR = 0.01
 # Natural frequency of the joint that is the hardest to move under the default cost, rad/s.
 _FREQUENCY = 0.7
+_ANY_ANGLE = (-math.inf, math.inf)
 
 
 def scene_from_urdf(
@@ -57,10 +58,12 @@ def scene_from_urdf(
     frame of a scene's joint has its z axis along the joint's axis; where the URDF has another axis, it is the
     child link's frame turned. The tip frame G is the tip link's. Joint angles are the URDF's.
 
-    The efforts of the URDF limit the joint torques. Limits of joint angles and rates, shapes and meshes,
-    transmissions and simulator settings are left out, Coulomb friction with a warning. Start: at rest, the
-    base link's axes along the inertial ones, joints at zero, or midway between limits that exclude zero; an
-    arm that is singular there, as a straight one, begins with every joint bent by 0.5 rad.
+    The efforts of the URDF limit the joint torques; its limits of angles and rates become the constraint
+    `joint limits`, which the expert keeps to. Equal limits of 0 and rates of 0 are placeholders and limit
+    nothing, as limits of 1e4 rad or rad/s and more. Shapes and meshes, transmissions and simulator settings
+    are left out, Coulomb friction with a warning. Start: at rest, the base link's axes along the inertial
+    ones, joints at zero, or midway between limits that exclude zero; an arm that is singular there, as a
+    straight one, begins with every joint bent by 0.5 rad.
     Cost: the defaults, but with a weight of the joint torques that lets an arm of any size move within
     seconds. Integrator: `rk4`, or `rodas4` for dampers too stiff for it. Change anything else with
     `scene.replace(...)`.
@@ -82,7 +85,7 @@ def scene_from_urdf(
         lock_branches: Whether movable joints beside the chain, as those of a gripper, are held at zero;
             otherwise they are an error if they move a mass.
         target: Pose of the target as in a scene, {"position": ..., "rotation": ...} in m; by default the pose
-            of the tip at the start but with every joint 0.3 rad further.
+            of the tip at the start but with every joint 0.3 rad further, or back where its limits ask for it.
 
     Returns:
         The scene.
@@ -114,9 +117,10 @@ def scene_from_urdf(
         "cost": {"joint_torque": _torque_weight(arm, angles)},
         "initial_state": {"joint_angles": angles},
         "target": {"pose": {} if target is None else target},
+        "constraints": _joint_limits(arm),
     }
     scene = stable(_validated(data, robot.name))
-    return scene if target is not None else scene.replace(target={"pose": _default_target(scene)})
+    return scene if target is not None else scene.replace(target={"pose": _default_target(scene, arm)})
 
 
 class _Spacecraft(Model):
@@ -229,6 +233,21 @@ def _motors(arm: Arm, joint_torque: float | None, passive: Collection[str]) -> d
     return {"limit": max(limits)}
 
 
+def _joint_limits(arm: Arm) -> list[dict[str, Any]]:
+    """The scene's constraint of joint angles and rates, if there are limits."""
+    joints = [part.joint for part in arm.joints]
+    for joint in joints:
+        if joint.limits is not None and joint.limits[0] == joint.limits[1]:
+            raise SceneError(
+                f"URDF: joint {joint.name!r}: lower = upper = {joint.limits[0]:g} rad, it cannot move: "
+                "make it fixed, or give it a range"
+            )
+    lower, upper = zip(*(joint.limits or _ANY_ANGLE for joint in joints), strict=True)
+    bounds = {"lower": lower, "upper": upper, "rate": tuple(joint.rate for joint in joints)}
+    finite = {name: limits for name, limits in bounds.items() if any(map(math.isfinite, limits))}
+    return [{"name": "joint limits", "kind": "joint_limits", **finite}] if finite else []
+
+
 def _link(part: ArmJoint, joint_torque: float | None, passive: Collection[str]) -> dict[str, Any]:
     joint = part.joint
     driven = joint.name not in passive
@@ -261,15 +280,23 @@ def _start(arm: Arm) -> list[float]:
 
 
 def _at_rest(joint: UrdfJoint) -> float:
-    if joint.limits is None or joint.limits[0] <= 0.0 <= joint.limits[1]:
-        return 0.0
-    return 0.5 * (joint.limits[0] + joint.limits[1])
+    """Zero where the limits allow it, or midway between them; at the one that there is."""
+    lower, upper = joint.limits or _ANY_ANGLE
+    middle = 0.5 * (lower + upper)
+    return min(max(0.0, lower), upper) if lower <= 0.0 <= upper or math.isinf(middle) else middle
+
+
+def _moved(joint: UrdfJoint, angle: float, step: float) -> float | None:
+    """An angle and a step, upward where the limits allow it; None if they allow neither."""
+    lower, upper = joint.limits or _ANY_ANGLE
+    return next((turned for turned in (angle + step, angle - step) if lower <= turned <= upper), None)
 
 
 def _bent(joint: UrdfJoint) -> float:
-    """Angle at rest and the bend, upward where the limits allow it."""
-    angle, (lower, upper) = _at_rest(joint), joint.limits or (-math.inf, math.inf)
-    return next((turned for turned in (angle + _BEND, angle - _BEND) if lower <= turned <= upper), angle)
+    """Angle at rest and the bend, where the limits allow it."""
+    angle = _at_rest(joint)
+    bent = _moved(joint, angle, _BEND)
+    return angle if bent is None else bent
 
 
 def _dexterity(arm: Arm, angles: Sequence[float]) -> float:
@@ -291,9 +318,14 @@ def _dexterity(arm: Arm, angles: Sequence[float]) -> float:
     return float(values[-1] / values[0])
 
 
-def _default_target(scene: Scene) -> dict[str, Any]:
-    """Pose of the tip with every joint moved by the offset."""
-    start = scene.initial_state
-    angles = [angle + _TARGET_OFFSET for angle in start.joint_angles]
+def _default_target(scene: Scene, arm: Arm) -> dict[str, Any]:
+    """Pose of the tip with every joint moved by the offset, or halfway to the farther limit."""
+    start, angles = scene.initial_state, []
+    for part, angle in zip(arm.joints, start.joint_angles, strict=True):
+        moved = _moved(part.joint, angle, _TARGET_OFFSET)
+        if moved is None:
+            farther = max(part.joint.limits or _ANY_ANGLE, key=lambda limit: abs(limit - angle))
+            moved = 0.5 * (angle + farther)
+        angles.append(moved)
     pose = kinematics.tip_pose(Chain.from_scene(scene), start.base_pose.dual_quaternion, angles, ())
     return _pose(tuple(pose))

@@ -332,8 +332,9 @@ def constraint_problems(scene: Scene) -> Iterator[Problem]:
     """Find constraints that do not fit the scene."""
     links = [link.name for link in scene.links]
     known = (*FRAMES[:2], *links, *FRAMES[2:])
+    names_frames = any(True for constraint in scene.constraints for _ in constraint.frames())
     for name in links:
-        if name in FRAMES and scene.constraints:
+        if name in FRAMES and names_frames:
             place = ("links", links.index(name), "name")
             yield Problem(place, name, "is a frame of every scene, which constraints name: rename the link")
     names = [constraint.name for constraint in scene.constraints]

@@ -31,7 +31,7 @@ STATIONARITY = 1e-12
 FIRST_MULTIPLIER = 1.0
 """First multiplier of a row c <= 0."""
 LEAST_MULTIPLIER = 1e-9
-"""Least multiplier of such a row: zero would stay zero."""
+"""Least multiplier of such a row: zero would stay zero. Where a solve is judged it counts as zero."""
 LEAST_WARM_MULTIPLIER = 1e-2
 """The same where the multipliers of a similar maneuver are the first."""
 CHANGE = (1e-3, 1e2)
@@ -151,7 +151,7 @@ class AugmentedLagrangian:
     def is_met(self, states: FloatArray, controls: FloatArray, cost: float) -> bool:
         """Whether a trajectory keeps to all rows, with multipliers only where it must."""
         residuals = self.constraints.find(states, controls)
-        gap = np.abs(self.constraints.multipliers * residuals).sum()
+        gap = self._complementarity(residuals)
         feasible = self._violations(residuals).max(initial=0.0) <= FEASIBILITY
         return bool(feasible and gap <= COMPLEMENTARITY * max(abs(cost), 1.0))
 
@@ -160,6 +160,13 @@ class AugmentedLagrangian:
         multipliers, penalties = self.constraints.multipliers, self.constraints.penalties
         most = GAIN_STIFFNESS / np.where(self._inequalities, np.maximum(multipliers, LEAST_MULTIPLIER), 1.0)
         np.minimum(penalties, most, out=penalties)
+
+    def _complementarity(self, residuals: FloatArray) -> float:
+        """Sum of |l c|; wide limits of many stages would add up to much with the least multipliers."""
+        multipliers = self.constraints.multipliers
+        return float(
+            np.abs(np.where(np.abs(multipliers) > LEAST_MULTIPLIER, multipliers * residuals, 0.0)).sum()
+        )
 
     def _violations(self, residuals: FloatArray) -> FloatArray:
         """Violations of the rows, negative where they are met, shape (N + 1, m); -inf where there is none."""
@@ -173,7 +180,7 @@ class AugmentedLagrangian:
         residuals = constraints.find(states, controls)
         violations = self._violations(residuals)
         stage, column = np.unravel_index(violations.argmax(), violations.shape)
-        gap = float(np.abs(constraints.multipliers * residuals).sum())
+        gap = self._complementarity(residuals)
         active: NDArray[np.bool_] = (constraints.multipliers > -residuals)[self._inequalities]
         return ConstraintReport(
             violation=float(violations[stage, column]),

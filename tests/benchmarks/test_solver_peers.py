@@ -18,9 +18,9 @@ from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.peers import crocoddyl_maneuver, crocoddyl_peer
 from scripts.benchmarks.peers.crocoddyl_maneuver import CrocoddylManeuver
 from scripts.benchmarks.peers.crocoddyl_peer import solve_with_crocoddyl
-from scripts.benchmarks.peers.ipopt_peer import solve_with_ipopt
-from scripts.benchmarks.peers.ipopt_transcription import transcribe
-from scripts.benchmarks.solvers.runs import SolverRun, roll_out
+from scripts.benchmarks.peers.interior_point_peer import InteriorPoint
+from scripts.benchmarks.peers.transcription import transcribe
+from scripts.benchmarks.solvers.runs import FATROP, SolverRun, roll_out
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
 
 pytestmark = pytest.mark.slow  # they compile many variants of scenes
@@ -53,9 +53,9 @@ def check_record(run: SolverRun, problem: ArmProblem, start: FloatArray) -> None
 
 
 @pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
-def test_ipopt_finds_the_optimum_of_the_expert(short_scene: Scene, integrator: str) -> None:
+def test_interior_point_methods_find_the_optimum_of_the_expert(short_scene: Scene, integrator: str) -> None:
     problem = ArmProblem(short_scene, integrator)
-    run, expected = solve_with_ipopt(problem), BoxDDP(problem).solve()
+    run, expected = InteriorPoint(problem).solve(), BoxDDP(problem).solve()
     assert run.converged
     assert run.stop_reason == "Solve_Succeeded"
     assert run.replayed_cost == pytest.approx(expected.cost, rel=1e-6)
@@ -63,6 +63,11 @@ def test_ipopt_finds_the_optimum_of_the_expert(short_scene: Scene, integrator: s
     zero = roll_out(problem, problem.initial_state, np.zeros_like(run.controls)).cost
     assert run.costs[0] == pytest.approx(zero, rel=1e-2)  # IPOPT moves a guess off the bounds
     check_record(run, problem, problem.initial_state)
+    other = InteriorPoint(problem, FATROP).solve()
+    assert other.converged
+    assert 0 < other.iterations < 100
+    assert other.replayed_cost == pytest.approx(expected.cost, rel=1e-6)
+    assert other.controls == pytest.approx(run.controls, abs=1e-2)
 
 
 def test_ipopt_takes_another_start_and_a_guess_of_states_and_controls(short_scene: Scene) -> None:
@@ -70,8 +75,8 @@ def test_ipopt_takes_another_start_and_a_guess_of_states_and_controls(short_scen
     start = problem.initial_state.copy()
     start[problem.kernels.layout.state.joint_angles] += 0.3
     plan = BoxDDP(problem).solve(start)
-    guess: dict[str, Any] = {"u_init": plan.controls, "x_init": plan.states, "first_barrier": 1e-5}
-    warm, cold = solve_with_ipopt(problem, start, **guess), solve_with_ipopt(problem, start)
+    warm = InteriorPoint(problem, first_barrier=1e-5).solve(start, plan.controls, x_init=plan.states)
+    cold = InteriorPoint(problem).solve(start)
     for run in (warm, cold):
         assert run.replayed_cost == pytest.approx(plan.cost, rel=1e-6)
         check_record(run, problem, start)
@@ -81,7 +86,8 @@ def test_ipopt_takes_another_start_and_a_guess_of_states_and_controls(short_scen
 
 def test_ipopt_says_when_iterations_or_time_are_used_up(short_scene: Scene) -> None:
     problem = ArmProblem(short_scene)
-    few, brief = solve_with_ipopt(problem, max_iterations=2), solve_with_ipopt(problem, max_seconds=1e-3)
+    settings: tuple[dict[str, Any], ...] = ({"max_iterations": 2}, {"max_seconds": 1e-3})
+    few, brief = (InteriorPoint(problem, **setting).solve() for setting in settings)
     assert (few.converged, few.iterations, few.stop_reason) == (False, 2, "Maximum_Iterations_Exceeded")
     assert (brief.converged, brief.stop_reason) == (False, "Maximum_WallTime_Exceeded")
 
@@ -92,7 +98,7 @@ def test_transcription_has_the_experts_steps_and_costs(integrator: str) -> None:
     trajectory = roll_out(problem, problem.initial_state, random_controls(problem))
     program = transcribe(problem.scene)
     values = casadi.Function("values", [program.variables], [program.cost, program.gaps])
-    cost, gaps = values(np.concatenate([trajectory.states.ravel(), trajectory.controls.ravel()]))
+    cost, gaps = values(program.join(trajectory.states, trajectory.controls))
     assert float(cost) == pytest.approx(trajectory.cost, rel=1e-12)
     # Of RK4, the pose is integrated otherwise: order 4 as well, another error.
     assert float(casadi.norm_inf(gaps)) < (1e-9 if integrator == "rk4" else 1e-12)
@@ -100,19 +106,18 @@ def test_transcription_has_the_experts_steps_and_costs(integrator: str) -> None:
 
 @pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
 def test_transcription_has_the_derivatives_that_casadi_finds(short_scene: Scene, integrator: str) -> None:
-    scene = short_scene.replace(simulation={"dt": 0.05, "steps": 3, "integrator": integrator})
+    limits = {"kind": "joint_limits", "name": "limits", "lower": -1, "upper": 1, "rate": 0.5}
+    short = {"dt": 0.05, "steps": 3, "integrator": integrator}
+    scene = short_scene.replace(simulation=short, constraints=[limits])
     program = transcribe(scene)
     rng = np.random.default_rng(0)
-    values, gaps = rng.normal(size=program.variables.numel()), rng.normal(size=program.gaps.numel())
-    symbols = casadi.MX.sym("l", len(gaps))
-    jacobian = casadi.jacobian(program.gaps, program.variables)
-    lagrangian = 1.7 * program.cost + casadi.dot(symbols, program.gaps)
-    hessian = casadi.triu(casadi.hessian(lagrangian, program.variables)[0])
-    expected = casadi.Function("expected", [program.variables, symbols], [jacobian, hessian])(values, gaps)
-    found = (
-        program.derivatives["jac_g"](values, [])[1],
-        program.derivatives["hess_lag"](values, [], 1.7, gaps),
-    )
+    values, pushed = rng.normal(size=program.variables.numel()), rng.normal(size=program.rows.numel())
+    symbols = casadi.MX.sym("l", len(pushed))
+    jacobian = casadi.jacobian(program.rows, program.variables)
+    lagrangian = 1.7 * program.cost + casadi.dot(symbols, program.rows)
+    hessian = casadi.hessian(lagrangian, program.variables)[0]
+    expected = casadi.Function("expected", [program.variables, symbols], [jacobian, hessian])(values, pushed)
+    found = program.jacobian(values, [])[1], program.hessian(values, [], 1.7, pushed)
     for ours, theirs in zip(found, expected, strict=True):
         assert float(casadi.norm_inf(theirs)) > 1.0
         assert float(casadi.norm_inf(ours - theirs)) < 1e-11

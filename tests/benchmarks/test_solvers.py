@@ -169,7 +169,7 @@ def test_other_problems_are_measured_by_their_own_best(problem: ArmProblem, guid
 def test_solvers_that_are_not_there_are_named(
     problem: ArmProblem, guided: GuidedDDP, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for peer in (contenders_module.crocoddyl_peer, contenders_module.ipopt_peer):
+    for peer in (contenders_module.crocoddyl_peer, contenders_module.interior_point_peer):
         monkeypatch.setattr(peer, "is_available", lambda: False)
     found, notes = contenders(problem, guided, replace(SHORT, peers=True))
     assert [contender.name for contender in found] == [*TITLES.values(), GUIDED]

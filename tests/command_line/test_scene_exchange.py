@@ -12,6 +12,7 @@ from dq_space_arm_env import load_scene, scene_from_urdf, scene_to_mjcf, scene_t
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.command_line.names import PartOf
 from dq_space_arm_env.common.console import SUCCESS, UNUSABLE
+from experts import Solution
 
 ARM = str(Path(__file__).parents[2] / "scripts" / "examples" / "small-arm.urdf")
 HAND = ["import", ARM, "--tip", "hand"]
@@ -149,6 +150,10 @@ def test_the_maneuver_to_begin_with_is_solved_and_flown(
     assert solved["converged"]
     assert solved["is_success"]
     plan = str(Path(solved["files"][0]))
+    kept = Solution.load(plan).constraints
+    assert kept is not None
+    assert kept.violation <= 1e-6
+    assert kept.worst_row.startswith("joint limits: ")
     assert main(["simulate", "arm.yaml", "--policy", plan, "--json"]) == SUCCESS
     assert json.loads(capsys.readouterr().out)["is_success"]
 

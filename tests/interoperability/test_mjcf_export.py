@@ -52,8 +52,9 @@ def limited(scene, u):
 
 
 def check_accelerations(scene, samples=5):
-    """MuJoCo's accelerations, inverse dynamics and tip at random states."""
+    """MuJoCo's accelerations, inverse dynamics and tip at random states, also beyond joint limits."""
     model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene, wrist="fixed"))
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     for _ in range(samples):
         x, u = drawn(scene, rng)

@@ -7,6 +7,7 @@ random_starts   how often the expert converges, succeeds, and finds the best kno
 receding        the receding-horizon expert under disturbances
 tracking        the tip's error behind a target that moves, beside the paper's formulation
 own_problems    problems of one's own: cart-pole and planar quadrotor, beside Crocoddyl
+constrained     random starts of scenes with constraints, beside IPOPT and fatrop
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from experts.receding_horizon import RecedingHorizonExpert
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, note, time_column
 from scripts.benchmarks.solvers.accuracy import NOMINAL_START, compare_solvers, contenders
+from scripts.benchmarks.solvers.constrained import measure_constrained
 from scripts.benchmarks.solvers.iterations import measure_iterations
 from scripts.benchmarks.solvers.own_problems import measure_own_problems
 from scripts.benchmarks.solvers.random_starts import draw_starts, measure_starts
@@ -32,13 +34,14 @@ from scripts.benchmarks.solvers.runs import GAPS, Search, uninterrupted
 from scripts.benchmarks.solvers.tracking import measure_tracking
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
 
-ITERATIONS, ACCURACY, STARTS, HORIZON, TRACKING, OWN = PARTS = (
+ITERATIONS, ACCURACY, STARTS, HORIZON, TRACKING, OWN, CONSTRAINED = PARTS = (
     "iterations",
     "accuracy",
     "starts",
     "horizon",
     "tracking",
     "own",
+    "constrained",
 )
 
 
@@ -80,6 +83,8 @@ def measure(effort: Effort) -> Iterator[Row]:
         yield from measure_tracking()
     if OWN in parts:
         yield from measure_own_problems(effort)
+    if CONSTRAINED in parts:
+        yield from measure_constrained(effort)
 
 
 def _compare(problem: ArmProblem, guided: GuidedDDP, effort: Effort) -> Iterator[Row]:
@@ -227,6 +232,36 @@ BENCHMARK = Benchmark(
             ),
             by=("name",),
         ),
+        Table(
+            "constrained summaries",
+            "Scene {scene}, N = 50: random starts under constraints\nmedians of the starts that are solved; "
+            "solver: its time without derivatives and rollouts",
+            (
+                "solver",
+                "starts",
+                Column("solved", format=".0%"),
+                Column("best", "within\n0.1 % of\nbest", ".0%"),
+                Column("iterations", "itera-\ntions", ".0f"),
+                time_column("seconds"),
+                time_column("sweep_ms", "solver,\nms per\niter."),
+            ),
+            by=("scene",),
+        ),
+        Table(
+            "constrained",
+            "Scene {scene}, start {start}",
+            (
+                "solver",
+                "solved",
+                Column("cost", "cost J", ".8g"),
+                Column("above_best", "above\nbest", ".0e"),
+                Column("violation", format=".0e"),
+                Column("iterations", "itera-\ntions"),
+                time_column("seconds"),
+                Column("stop_reason", "end"),
+            ),
+            by=("scene", "start"),
+        ),
     ),
     pictures=(
         Picture(
@@ -250,6 +285,19 @@ BENCHMARK = Benchmark(
             "random starts",
             "Cost of each random start over the time of the solve.",
             {"x": "seconds", "y": "cost", "color": "solver", "facet": "scene", "log": "x", "join": False},
+        ),
+        Picture(
+            "constrained",
+            "solved shares",
+            "Share of random starts under constraints that are solved within a time.",
+            {
+                "x": "seconds",
+                "y": "share",
+                "color": "solver",
+                "facet": "scene",
+                "log": "x",
+                "labels": {"seconds": "time of a solve [s]", "share": "solved starts, share [$-$]"},
+            },
         ),
     ),
     packages=("crocoddyl", "pin"),

@@ -18,11 +18,12 @@ from experts.problems.paper_problem import beyond_the_paper
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim, note
-from scripts.benchmarks.peers import crocoddyl_peer, ipopt_peer
+from scripts.benchmarks.peers import crocoddyl_peer, interior_point_peer
 from scripts.benchmarks.peers.crocoddyl_maneuver import CrocoddylManeuver, obstacle
 from scripts.benchmarks.solvers.runs import (
     GAPS,
     GUIDED,
+    IPOPT,
     PAPERS_STATES,
     TITLES,
     Search,
@@ -195,10 +196,11 @@ def _crocoddyl(problem: ArmProblem, effort: Effort) -> tuple[list[Contender], li
 
 
 def _ipopt(problem: ArmProblem, effort: Effort) -> tuple[list[Contender], list[str]]:
-    if not ipopt_peer.is_available():
+    if not interior_point_peer.is_available():
         return [], ["IPOPT is left out: it is not installed."]
     if not effort.slow_peers:
         return [], ["IPOPT is left out: it takes minutes; --set slow_peers=true or --full have it."]
     if more := beyond_the_paper(problem.scene):
         return [], [f"IPOPT is left out: it is not given {' or '.join(more)}."]
-    return [Contender("IPOPT", partial(ipopt_peer.solve_with_ipopt, problem), is_slow=True)], []
+    ipopt = interior_point_peer.InteriorPoint(problem)
+    return [Contender(IPOPT, ipopt.solve, is_slow=True)], []

@@ -34,8 +34,8 @@ class SolverRun:
     """One solve of a maneuver by any solver."""
 
     solver: str
-    costs: FloatArray  # of our problem after 0, 1, .. iterations, shape (n + 1,)
-    seconds: FloatArray  # since the solve began, at which these costs were reached, shape (n + 1,)
+    costs: FloatArray  # of our problem after 0, 1, .. iterations, shape (n + 1,); or only first and last
+    seconds: FloatArray  # since the solve began, at which these costs were reached, same shape
     iterations: int
     converged: bool
     stop_reason: str
@@ -96,6 +96,7 @@ TITLES = {
 """The variants of `BoxDDP` in tables."""
 GUIDED = "GuidedDDP"
 PAPERS_STATES = "paper's states"
+IPOPT, FATROP = INTERIOR_POINT = ("IPOPT", "fatrop")
 
 Solve = Callable[[FloatArray | None], SolverRun]
 """A solver, ready to solve from a state of our problem, shape (n_x,); from the initial state if None."""

@@ -16,6 +16,7 @@ LIMITS = {
     "name": "limits",
     "lower": [-2.0, -0.6, -1.7],
     "upper": [math.inf, 1.0, math.inf],
+    "rate": 1e3,  # that no joint comes near
 }
 BALL = {
     "kind": "distance",

@@ -1,13 +1,14 @@
-"""The expert's optimum on scene `paper`, handed to an independent solver: IPOPT."""
+"""The expert's optima, handed to independent solvers: IPOPT and fatrop."""
 
 import casadi
-import numpy as np
 import pytest
 
+from dq_space_arm_env import load_scene
 from experts import BoxDDP, GuidedDDP
 from experts.problems.arm_problem import ArmProblem
-from scripts.benchmarks.peers.ipopt_peer import solve_with_ipopt
-from scripts.benchmarks.peers.ipopt_transcription import transcribe
+from scripts.benchmarks.peers.interior_point_peer import InteriorPoint
+from scripts.benchmarks.peers.transcription import transcribe
+from scripts.benchmarks.solvers.runs import FATROP
 
 
 @pytest.mark.slow
@@ -16,13 +17,13 @@ def test_ipopt_finds_nothing_better_near_the_experts_plan():
     solution = BoxDDP(problem).solve()
     program = transcribe(problem.scene)
     # The two discretizations differ by 1e-7: the expert moves the pose by exponentials.
-    plan = np.concatenate([solution.states.ravel(), solution.controls.ravel()])
+    plan = program.join(solution.states, solution.controls)
     replay = casadi.Function("replay", [program.variables], [program.cost, program.gaps])
     cost, gaps = replay(plan)
     assert float(cost) == pytest.approx(solution.cost, rel=1e-7)
     assert float(casadi.norm_inf(gaps)) < 1e-6
 
-    run = solve_with_ipopt(problem, u_init=solution.controls, x_init=solution.states, first_barrier=1e-4)
+    run = InteriorPoint(problem, first_barrier=1e-4).solve(u_init=solution.controls, x_init=solution.states)
     assert run.converged, run.stop_reason
     assert solution.cost <= (1.0 + 1e-4) * run.replayed_cost
 
@@ -30,7 +31,7 @@ def test_ipopt_finds_nothing_better_near_the_experts_plan():
 @pytest.mark.slow
 def test_ipopt_finds_the_experts_plan_from_zero_controls():
     problem = ArmProblem("paper")
-    run = solve_with_ipopt(problem)
+    run = InteriorPoint(problem).solve()
     assert run.converged, run.stop_reason
     assert run.replayed_cost == pytest.approx(BoxDDP(problem).solve().cost, rel=1e-5)
 
@@ -41,12 +42,21 @@ def test_ipopt_finds_the_experts_plan_under_constraints(name):
     """From the plan's neighborhood an interior-point method arrives at the same cost."""
     solution = GuidedDDP(name).solve()
     assert solution.converged
-    run = solve_with_ipopt(
-        ArmProblem(name),
-        u_init=solution.controls,
-        x_init=solution.states,
-        first_barrier=1e-3,
-        tolerance=1e-8,
+    ipopt = InteriorPoint(ArmProblem(name), first_barrier=1e-3, tolerance=1e-8)
+    run = ipopt.solve(u_init=solution.controls, x_init=solution.states)
+    assert run.converged, run.stop_reason
+    assert solution.cost == pytest.approx(run.replayed_cost, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_fatrop_finds_the_experts_plan_under_constraints():
+    """In long steps: CasADi finds the derivatives here, a thousand steps would take minutes."""
+    scene = load_scene("joint-limits").replace(simulation={"steps": 50, "dt": 0.3})
+    problem = ArmProblem(scene)
+    solution = BoxDDP(problem).solve()
+    assert solution.converged
+    run = InteriorPoint(problem, FATROP, first_barrier=1e-4, tolerance=1e-6).solve(
+        u_init=solution.controls, x_init=solution.states
     )
     assert run.converged, run.stop_reason
     assert solution.cost == pytest.approx(run.replayed_cost, rel=1e-6)
