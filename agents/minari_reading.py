@@ -193,7 +193,6 @@ def packed_episodes(
         "iterations": np.array([_number(each, "iterations") for each in facts], dtype=np.int64),
         "stop_reason": np.full(count, REASONS.index(StopReason.CONVERGED.value), dtype=np.uint8),
         "guess": np.array([GUESSES.index(each["guess"]) for each in facts], dtype=np.uint8),
-        "emphasis": np.full(count, np.nan),
         **errors,
         "clamped_share": np.array([_number(each, "clamped_share") for each in facts], dtype=np.float64),
         **_no_failures(n_x),

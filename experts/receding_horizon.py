@@ -7,8 +7,8 @@ iteration is enough.
 
 The iterations are Gauss-Newton's: their model is convex wherever noise and pushes take the state, even where
 exact second derivatives have no minimum; near the plan the value function contains the curvature that they
-neglect. Where the cheapest maneuver would end outside the tolerances, plan and steps emphasize the final pose
-as much as reaching the target requires.
+neglect. Where the cheapest maneuver would end outside the tolerances, they become constraints of plan and
+steps, with a share of them kept free for disturbances.
 """
 
 from collections.abc import Sequence
@@ -34,6 +34,9 @@ from experts.problems.shooting_problem import FloatArray, check_array, check_at_
 WORTHWHILE = 1e-12
 """A smaller predicted reduction, relative to the plan's cost, is not tried: rounding would decide."""
 
+RESERVE = 0.05
+"""Share of the tolerances that a plan keeps free for disturbances where they are constraints."""
+
 
 @dataclass(frozen=True, eq=False)
 class ManeuverPlan:
@@ -42,11 +45,9 @@ class ManeuverPlan:
     first_stage: int  # of the episode
     solution: Solution
     policy: Policy  # of the solution; counts stages from the plan's start
-    # factor of the final pose's weights at which the solution is a minimum: 1, or as much as reaching the
-    # target requires (`reaching`)
-    emphasis: float
+    maneuver: ArmProblem  # the episode's, with success as constraint where the solution needs it
     multipliers: FloatArray  # and penalties of constraints at every stage and the end, shape (M + 1, 2 m)
-    Vx: FloatArray  # at every stage, with this emphasis, shape (M, n_t)
+    Vx: FloatArray  # at every stage, shape (M, n_t)
     # at every stage, shape (M, n_t, n_t), without negative curvature: off the plan it would predict costs
     # without a lower bound
     Vxx: FloatArray
@@ -62,26 +63,29 @@ class ManeuverPlan:
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         problem.begin_at(stage)
         library = [_last_stages(solution, problem.horizon) for solution in known]
-        solver = GuidedDDP(problem, library=library) if stage > 0 else planner
+        solver = GuidedDDP(problem, library=library, reserve=planner.reserve) if stage > 0 else planner
         solution = solver.solve(state, parameters=problem.parameters.rows)
-        emphasis = float(solution.metadata["emphasis"])
+        if solution.constraints is not None and problem.constraints is None:
+            rows, maneuver = maneuver.parameters.rows, maneuver.constrained(planner.reserve)
+            maneuver.parameters.set(rows)
+            problem = WindowProblem(maneuver, problem.horizon)
+            problem.begin_at(stage)
         if problem.constraints is not None:
             AugmentedLagrangian(problem.constraints).hold(solution.multipliers)
         exact = problem.has_second_order
         work = ShootingWorkspace(problem, second_order=exact, keep_values=True)
-        with maneuver.emphasized(emphasis):
-            work.start(state, solution.controls)
-            work.differentiate()
-            if exact:
-                work.differentiate_twice()
-            # The exact model may have no minimum where the solver ran out of iterations.
-            models = (True, False) if exact else (False,)
-            found = any(work.backward_pass(0.0, exact=model).completed for model in models)
+        work.start(state, solution.controls)
+        work.differentiate()
+        if exact:
+            work.differentiate_twice()
+        # The exact model may have no minimum where the solver ran out of iterations.
+        models = (True, False) if exact else (False,)
+        found = any(work.backward_pass(0.0, exact=model).completed for model in models)
         if solution.stop_reason is StopReason.DIVERGED or not found:
             raise RuntimeError(f"there is no plan from the state at stage {stage}: {solution.message}")
         hessians = _convex_part(work.update.Vxx_all)
         held = problem.parameters.more.copy()
-        return cls(stage, solution, solution.policy(), emphasis, held, work.update.Vx_all, hessians)
+        return cls(stage, solution, solution.policy(), maneuver, held, work.update.Vx_all, hessians)
 
 
 def _last_stages(solution: Solution, count: int) -> Solution:
@@ -237,9 +241,7 @@ class RecedingHorizonExpert:
             self._plan_anew(state, stage)
         assert self.plan is not None
         work = self._window(self.plan, stage)
-        with self.maneuver.emphasized(self.plan.emphasis):
-            is_finite = self._optimize(work, state, self.plan.solution.cost)
-        if is_finite:
+        if self._optimize(work, state, self.plan.solution.cost):
             self._work, self.control = work, work.current.controls[0].copy()
         else:
             self._work, self.control = None, _planned_control(self.plan, state, stage)
@@ -317,7 +319,7 @@ class RecedingHorizonExpert:
     def _begin(self, state: FloatArray, stage: int) -> None:
         """Plan an episode."""
         if self._planner is None:
-            self._planner = GuidedDDP(self.maneuver)
+            self._planner = GuidedDDP(self.maneuver, reserve=RESERVE)
         known: tuple[Solution, ...] = ()
         if stage > 0:
             with self.maneuver.parameters.being(None):
@@ -341,7 +343,7 @@ class RecedingHorizonExpert:
         last = self._work if stage == self._next_stage else None
         horizon = min(self.horizon, self.maneuver.horizon - stage)
         end = stage + horizon
-        work = self._workspace(horizon, ends_early=end < self.maneuver.horizon)
+        work = self._workspace(plan.maneuver, horizon, ends_early=end < self.maneuver.horizon)
         assert isinstance(work.problem, WindowProblem)
         work.problem.begin_at(stage)
         first = stage - plan.first_stage
@@ -363,7 +365,7 @@ class RecedingHorizonExpert:
             self._model_hessian[0] = plan.Vxx[rest.stop]
         return work
 
-    def _workspace(self, horizon: int, *, ends_early: bool) -> ShootingWorkspace:
+    def _workspace(self, maneuver: ArmProblem, horizon: int, *, ends_early: bool) -> ShootingWorkspace:
         """Return the last workspace if it fits; only near the end of the episode it does not."""
         if self._work is not None:
             problem = self._work.problem
@@ -371,7 +373,7 @@ class RecedingHorizonExpert:
             if (problem.horizon, problem.ends_early) == (horizon, ends_early):
                 return self._work
         model = (self._model_state, self._model_gradient, self._model_hessian) if ends_early else ()
-        return ShootingWorkspace(WindowProblem(self.maneuver, horizon, model), second_order=False)
+        return ShootingWorkspace(WindowProblem(maneuver, horizon, model), second_order=False)
 
     def _optimize(self, work: ShootingWorkspace, state: FloatArray, scale: float) -> bool:
         """Follow the reference from a state and improve it; return whether the rollout is finite."""

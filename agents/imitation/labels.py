@@ -11,6 +11,7 @@ from dq_space_arm_env.environment.rollouts import Rollout
 from experts.ddp.box_ddp import BoxDDP
 from experts.demonstrations import Demonstrations, DemonstrationsError
 from experts.demonstrations.reading import Demonstration
+from experts.guesses.guided import NEAR_REGULARIZATION
 from experts.problems.arm_problem import ArmProblem, WindowProblem
 from experts.problems.shooting_problem import FloatArray
 
@@ -64,11 +65,6 @@ class Solver:
         the expert would; its initial guess is the demonstration's feedback policy from there. Plans that do
         not converge are dropped. Returns the labels and the number of plans, dropped ones included.
         """
-        if np.isnan(demonstrations.column("emphasis")).any():
-            raise ValueError(
-                f"{demonstrations.path}: these demonstrations lack the weight on the final pose that the "
-                "expert planned with, so it cannot replan: set labels to gains"
-            )
         plans: list[Corrections | None] = []
         for i, demonstration in enumerate(demonstrations):
             plans += self._plans(demonstration, visits, i, solves, rng)
@@ -97,9 +93,10 @@ class Solver:
         rows = maneuver.parameters.rows[stage:]
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         guess = self._followed(demonstration, state, stage, limits, rows) * limits
-        # The demonstration's own weight on the final pose: without it some plans miss the target.
-        with maneuver.emphasized(float(demonstration.facts["emphasis"])):
-            solution = BoxDDP(problem).solve(x0=state, u_init=guess, parameters=rows)
+        solution = BoxDDP(problem).solve(x0=state, u_init=guess, parameters=rows)
+        if solution.converged and problem.misses(solution.states[-1]) > 1.0:
+            within = BoxDDP(problem.constrained(), initial_regularization=NEAR_REGULARIZATION)
+            solution = within.solve(x0=state, u_init=solution.controls, parameters=rows)
         if not solution.converged:
             return None
         steps = slice(0, end - stage)

@@ -185,11 +185,14 @@ def table(run: SolveRun) -> Table:
         seconds += f", after {sum(attempt['iterations'] for attempt in long_steps)} in long steps"
     if solution.converged and solution.iterations == 0:
         seconds += ": the initial guess is already optimal"
+    led = ""
+    if solution.constraints is not None and not run.scene.constraints:
+        led = "the tolerances are constraints: the cheapest maneuver would miss the target"
     rows = [
         ("start", run.start.title, ""),
         ("preparation", f"{run.preparation_seconds:.1f} s", prepared),
         ("solver", run.solver, f"initial guess: {guess}"),
-        ("cost J", f"{solution.cost:.6f}", ""),
+        ("cost J", f"{solution.cost:.6f}", led),
         ("end", verdict, solution.message),
         ("iterations", str(solution.iterations), seconds),
         ("attitude error", f"{attitude:.3g} deg", f"tolerance {success.attitude_error_deg:g} deg; {reached}"),

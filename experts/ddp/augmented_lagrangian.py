@@ -10,6 +10,11 @@ Lagrangian, no row is violated, and the sum of |l c|, by which the cost may exce
 small.
 
 The first steps, far from a minimum, leave the rows out.
+
+Where all rows are at the end, they are few, and Newton's method finds their multipliers: the Lagrangian is
+minimized with hardly any penalty, and the response of the final state (`end_response`) tells which
+multipliers meet the rows. No penalty makes the problem stiff. Rows of success are squares of errors, which
+fall ever more slowly as their multipliers grow: steps from small multipliers are therefore not too long.
 """
 
 from typing import NamedTuple
@@ -17,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from experts.ddp.end_response import EndResponse
 from experts.problems.shooting_problem import FloatArray
 from experts.problems.stage_constraints import StageConstraints
 
@@ -38,6 +44,8 @@ CHANGE = (1e-3, 1e2)
 """Least and greatest factor of such a multiplier in an update."""
 FIRST_PENALTY, FIRST_EQUALITY_PENALTY = 1e2, 1e4
 """First penalties of rows c <= 0 and c = 0."""
+WEAK_PENALTY = 1e-3
+"""Penalty of rows c <= 0 where all are at the end: next to none."""
 GROWTH = 2.0
 """Factor of the penalties in an update."""
 LARGEST_PENALTY = 3e6
@@ -50,6 +58,8 @@ BEGIN = 1e-2
 """Predicted reduction, relative to the cost, at which the rows begin to count."""
 NEAR = 1e-3
 """Predicted reduction, relative to the cost, of a step after which the multipliers follow."""
+NEAR_AT_END = 3e-3
+"""The same where all rows are at the end."""
 NEARER, NEAREST = 0.5, 1e-5
 """Factor of that from one update to the next, and its least value."""
 LONG_ENOUGH = 0.5
@@ -86,12 +96,14 @@ class AugmentedLagrangian:
     Attributes:
         counts: Whether the rows count.
         near: Predicted reduction, relative to the cost, of a step after which an update follows.
+        is_at_end: Whether there are rows at the end only, see `update_by_response`.
     """
 
     def __init__(self, constraints: StageConstraints) -> None:
         self.constraints = constraints
         self._holds, self._equalities = constraints.holds, constraints.equalities
         self._inequalities = self._holds & ~self._equalities
+        self.is_at_end = not constraints.path
         self.counts, self.near = False, BEGIN
         self._least_violation, self._idle_updates = np.inf, 0
 
@@ -105,10 +117,11 @@ class AugmentedLagrangian:
         present, penalties = self.constraints.multipliers, self.constraints.penalties
         present[:] = 0.0 if multipliers is None else np.where(self._holds, multipliers, 0.0)
         least = FIRST_MULTIPLIER if multipliers is None else LEAST_WARM_MULTIPLIER
+        least, penalty = (LEAST_MULTIPLIER, WEAK_PENALTY) if self.is_at_end else (least, FIRST_PENALTY)
         present[self._inequalities] = np.maximum(present[self._inequalities], least)
-        penalties[:] = np.where(self._equalities, FIRST_EQUALITY_PENALTY, FIRST_PENALTY)
+        penalties[:] = np.where(self._equalities, FIRST_EQUALITY_PENALTY, penalty)
         penalties[~self._holds] = 0.0
-        self.counts, self.near = True, NEAR
+        self.counts, self.near = True, NEAR_AT_END if self.is_at_end else NEAR
         self._least_violation, self._idle_updates = np.inf, 0
 
     def hold(self, multipliers: FloatArray) -> None:
@@ -116,6 +129,12 @@ class AugmentedLagrangian:
         self.begin(multipliers)
         self.constraints.penalties[:] = np.where(self._holds, LARGEST_PENALTY, 0.0)
         self.soften()
+        # Where a reserve is left, c = -reserve, the slopes l f'(r c) of the penalties are these multipliers.
+        reserve = self.constraints.reserve
+        end = (-1, slice(len(reserve)))
+        softer = np.minimum(self.constraints.penalties[end], 0.5 / np.maximum(reserve, 1e-300))
+        self.constraints.penalties[end] = softer
+        self.constraints.multipliers[end] /= 1.0 - softer * reserve
 
     def update(self, states: FloatArray, controls: FloatArray) -> None:
         """Let the multipliers follow a trajectory, states (N + 1, n_x) and controls (N, n_u)."""
@@ -127,8 +146,28 @@ class AugmentedLagrangian:
         np.minimum(GROWTH * penalties, LARGEST_PENALTY, out=penalties)
         softer = stiffness / np.maximum(self.constraints.multipliers, LEAST_MULTIPLIER)
         np.minimum(penalties, softer, out=penalties, where=self._inequalities)
+        self._note_progress(residuals, exhausted)
+
+    def update_by_response(self, states: FloatArray, controls: FloatArray, response: EndResponse) -> None:
+        """Take a Newton step towards the multipliers with which a trajectory's end meets its rows.
+
+        Multipliers of rows that are met without them are dropped.
+        """
+        count = len(response.residuals)
+        present, equalities = self.constraints.multipliers[-1, :count], self._equalities[-1, :count]
+        active = equalities | (present > LEAST_MULTIPLIER) | (response.residuals > 0.0)
+        wanted = response.slopes @ present - response.residuals  # slopes l = wanted where rows are met
+        for _ in range(count):
+            found = np.zeros(count)
+            found[active] = np.linalg.lstsq(response.slopes[np.ix_(active, active)], wanted[active])[0]
+            active &= equalities | (found >= 0.0)
+        present[:] = np.where(equalities, found, np.maximum(found, LEAST_MULTIPLIER))
+        self._note_progress(self.constraints.find(states, controls), True)
+
+    def _note_progress(self, residuals: FloatArray, counts: bool) -> None:
+        """Compare the violation with those before, where a lack of progress counts."""
         violation = float(self._violations(residuals).max(initial=0.0))
-        stands = exhausted and violation > max(PROGRESS * self._least_violation, FEASIBILITY)
+        stands = counts and violation > max(PROGRESS * self._least_violation, FEASIBILITY)
         self._idle_updates = self._idle_updates + 1 if stands else 0
         self._least_violation = min(self._least_violation, violation)
 

@@ -34,6 +34,7 @@ from experts.ddp.augmented_lagrangian import (
     ConstraintReport,
 )
 from experts.ddp.backward_pass import PASS_NOT_FINITE, PASS_NOT_POSITIVE_DEFINITE, PassResult
+from experts.ddp.end_response import end_response
 from experts.ddp.multiple_shooting import MultipleShooting
 from experts.ddp.rollout import FINISHED
 from experts.ddp.second_order import EXACT_MU, Regularization, SecondOrder, SolverState
@@ -239,11 +240,16 @@ class BoxDDP:
         """Let constraints begin to count, or multipliers follow the trajectory."""
         work, lagrangian = self._work, self._lagrangian
         assert lagrangian is not None  # or it is not called
-        if lagrangian.counts:
-            lagrangian.update(work.current.states, work.current.controls)
-        else:
+        begins = not lagrangian.counts
+        if begins:
             lagrangian.begin()
             state.switch.request_exact()
+        if lagrangian.is_at_end:
+            response = end_response(work, lagrangian.constraints, exact=self._has_exact)
+            if response is not None:
+                lagrangian.update_by_response(work.current.states, work.current.controls, response)
+        elif not begins:
+            lagrangian.update(work.current.states, work.current.controls)
         work.evaluate_anew()
         state.moved, state.idle_iterations, state.optimality = True, 0, np.inf
         if not lagrangian.is_infeasible:
@@ -284,8 +290,8 @@ class BoxDDP:
             while direction.status == PASS_NOT_POSITIVE_DEFINITE and remembered.increase():
                 direction = self._work.backward_pass(remembered.mu, exact=True)
             return direction
-        rows_count = self._lagrangian is not None and self._lagrangian.counts
-        for mu in CONSTRAINED_EXACT_MU if rows_count else EXACT_MU:
+        is_stiff = self._lagrangian is not None and self._lagrangian.counts and not self._lagrangian.is_at_end
+        for mu in CONSTRAINED_EXACT_MU if is_stiff else EXACT_MU:
             direction = self._work.backward_pass(mu, exact=True)
             if direction.status != PASS_NOT_POSITIVE_DEFINITE:
                 break

@@ -29,7 +29,6 @@ MEANINGS = {
     "iterations": "of the solve",
     "stop_reason": "why the solve ended; in words when loaded",
     "guess": "initial guess of the solve; in words when loaded",
-    "emphasis": "factor of the final pose's weights in the solve; 1 is the scene's own cost",
     "start_errors": "of the tip: attitude [deg] and position [m]",
     "final_errors": "the same at the end",
     "clamped_share": "share of the inputs, over all stages, at a limit",
@@ -111,9 +110,9 @@ The same code and versions on the same kind of processor give the same bytes. Th
 ## What to keep in mind
 
 - Each demonstration is a local minimum. Neighbors have checked it, but nothing proves it to be global.
-- Where the cheapest maneuver ends outside the tolerances, the solve, and with it the gains, multiplies the
-  weights of the final pose by `emphasis`: $emphasized of $demonstrations demonstrations. Their cost J is that
-  of the scene, slightly above its minimum.
+- Where the cheapest maneuver would end outside the tolerances, these are constraints of the solve, and their
+  multipliers shape the gains: $at_tolerance of $demonstrations demonstrations end at a tolerance. Their
+  cost J is the least with which the target is reached.
 - The model is exact: no noise, delay or disturbance. The gains respond to small deviations, and become less
   accurate as these grow.
 - Starts cover the spread of the scene and nothing beyond it. Failed problems are missing, so the hardest
@@ -157,7 +156,7 @@ def data_card(facts: Facts, minari_id: str | None = None) -> str:
         attitude_tolerance=f"{success.attitude_error_deg:g}",
         position_tolerance=f"{success.position_error:g}",
         failures=_failures(facts),
-        emphasized=int((facts.emphases != 1.0).sum()),
+        at_tolerance=int(facts.at_tolerance.sum()),
         numbers=_numbers(facts),
         arrays="\n\n".join(line for table in _arrays(facts) for line in table.markdown()),
         failure_columns=", ".join(with_parameters(FAILURES, layout)).replace("_", " "),

@@ -21,6 +21,8 @@ from experts.demonstrations.shard import PARAMETERS, tip_errors
 from experts.problems.shooting_problem import FloatArray
 
 _LOG_BYTES = 2**26  # of a part: tens of thousands of shards
+AT_TOLERANCE = 0.998
+"""Least share of a tolerance that a final error at it has: the solver keeps a margin of a thousandth."""
 REPLAYED = 1000
 """Demonstrations, evenly spaced, whose return is compared with the cost."""
 
@@ -58,7 +60,8 @@ class Facts:
     demonstrations: Demonstrations
     quantities: tuple[Quantity, ...]  # whose distributions are shown
     guesses: NDArray[np.str_]  # initial guess of each solve, shape (M,)
-    emphases: FloatArray  # factor of the final pose's weights in each solve, shape (M,)
+    # whether each ends at a tolerance, as where the cheapest maneuver would end outside, shape (M,)
+    at_tolerance: NDArray[np.bool_]
     # from `Demonstrations.failures`, and `start_errors`, shape (F, 2), deg and m
     failures: Mapping[str, NDArray[Any]]
     log: Log
@@ -83,9 +86,13 @@ def gather(demonstrations: Demonstrations) -> Facts:
     gaps = [_return_gap(demonstrations, int(position)) for position in some if len(demonstrations)]
     guesses = np.array(GUESSES)[demonstrations.column("guess")]
     quantities = tuple(_quantities(demonstrations, failures, log))
-    emphases = demonstrations.column("emphasis")
+    success = demonstrations.scene.success
+    tolerances = success.attitude_error_deg, success.position_error
+    near: NDArray[np.bool_] = demonstrations.column("final_errors") >= AT_TOLERANCE * np.array(tolerances)
     gap = max(gaps, default=0.0)
-    return Facts(demonstrations, quantities, guesses, emphases, failures, log, len(gaps), gap)
+    return Facts(
+        demonstrations, quantities, guesses, np.asarray(near.any(axis=1)), failures, log, len(gaps), gap
+    )
 
 
 def read_log(demonstrations: Demonstrations) -> Log:
@@ -201,18 +208,14 @@ def guesses(facts: Facts) -> TextTable:
     return _groups(title, "guess", facts.guesses.tolist(), facts)
 
 
-def emphases(facts: Facts) -> TextTable:
-    """One row per decade of the factor, most frequent first."""
+def ends(facts: Facts) -> TextTable:
+    """One row for demonstrations within the tolerances, one for those at them; most frequent first."""
     title = (
-        "Emphasis of the final pose\nwhere the cheapest maneuver ends outside the tolerances, the weights "
-        "of the final pose are multiplied until it ends within them"
+        "Ends\nwhere the cheapest maneuver would end outside the tolerances, these are constraints, and the "
+        "maneuver ends at them"
     )
-    decades = np.floor(np.log10(facts.emphases)).astype(np.int64).tolist()
-    names = [
-        "1" if emphasis == 1.0 else f"{10.0**decade:g} to {10.0 ** (decade + 1):g}"
-        for emphasis, decade in zip(facts.emphases.tolist(), decades, strict=True)
-    ]
-    return _groups(title, "factor", names, facts)
+    names = np.where(facts.at_tolerance, "at a tolerance", "within the tolerances").tolist()
+    return _groups(title, "end", names, facts)
 
 
 def _groups(title: str, heading: str, names: list[str], facts: Facts) -> TextTable:

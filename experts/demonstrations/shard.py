@@ -13,7 +13,6 @@ Arrays of a shard with M demonstrations and F failures, N stages:
 | `cost` | (M,) | J, dimensionless |
 | `iterations`, `stop_reason` | (M,) | of the solve; the latter is an index into `REASONS` |
 | `guess` | (M,) | initial guess of the solve, an index into `GUESSES` |
-| `emphasis` | (M,) | factor of the final pose's weights, see `experts.guesses.reaching` |
 | `start_errors`, `final_errors` | (M, 2) | of the tip: attitude [deg] and position [m] |
 | `clamped_share` | (M,) | share of the inputs, over all stages, at a limit |
 | `parameters` | (M, n_p) | what varied in the scene, units of the parameters |
@@ -67,7 +66,6 @@ SUMMARIES = (
     "iterations",
     "stop_reason",
     "guess",
-    "emphasis",
     "start_errors",
     "final_errors",
     "clamped_share",
@@ -197,7 +195,6 @@ _ARRAYS: Mapping[str, tuple[str, ...]] = {  # type, and axes after the first
     "iterations": ("int64",),
     "stop_reason": ("uint8",),
     "guess": ("uint8",),
-    "emphasis": ("float64",),
     "start_errors": ("float64", "2"),
     "final_errors": ("float64", "2"),
     "clamped_share": ("float64",),
@@ -274,9 +271,6 @@ def _demonstration_arrays(
         **_common(problem, outcomes),
         "iterations": np.array([outcome.solution.iterations for outcome in outcomes], dtype=np.int64),
         "guess": np.array([GUESSES.index(outcome.guess) for outcome in outcomes], dtype=np.uint8),
-        "emphasis": np.array(
-            [outcome.solution.metadata["emphasis"] for outcome in outcomes], dtype=np.float64
-        ),
         "start_errors": episodes.initial_errors[:count],
         "final_errors": final_errors[:count],
         "clamped_share": np.mean(np.abs(actions) == 1.0, axis=(1, 2)),

@@ -14,6 +14,10 @@ All of this happens in few, long steps first, where a solve takes a tenth of the
 be compared. The policy found there, followed in the problem's own steps, is a few iterations away from their
 minimum; where it is more, a solve in half the long steps comes between. Nothing is compiled for it: the
 length of a step is an input of the kernels.
+
+Where thrust is expensive and the base drifts, the cheapest maneuver may end outside the tolerances of the
+task. Then they become constraints, and the solve goes on from there: it finds the cheapest maneuver that
+reaches the target. Kernels with constraints are compiled for the first start that needs them.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,10 +32,9 @@ from experts.ddp.second_order import SecondOrder
 from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason
 from experts.guesses.policies import coarsened, follow, policies, refined, track
 from experts.guesses.preparation import Preparation, keep_preparation, preparation_key, read_preparation
-from experts.guesses.reaching import HasTolerances, Reached, reach, solve_emphasized
 from experts.guesses.screw_motion import ScrewMotion
 from experts.guesses.screw_motion import screw_motion as guess_screw_motion
-from experts.problems.arm_problem import ArmProblem
+from experts.problems.arm_problem import ArmProblem, WindowProblem
 from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array, check_at_least
 
 START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
@@ -45,7 +48,7 @@ SCREW_REGULARIZATION = 1e2
 ZERO_REGULARIZATION = 1e4
 """First regularization from zero controls: short first steps rarely end in a poor minimum."""
 NEAR_REGULARIZATION = 0.0
-"""First regularization after an increase of the emphasis, or of the number of steps: the minimum is near."""
+"""First regularization where constraints begin, or steps become shorter: the minimum is near."""
 LARGEST_COARSENING = 8
 """Most steps in a long one."""
 NEAR_ITERATIONS = 10
@@ -54,6 +57,8 @@ NEAR_ITERATIONS_CONSTRAINED = 40
 """The same where there are constraints, whose multipliers follow."""
 CREEPING = 30
 """Iterations in long steps beyond which Gauss-Newton's model creeps, and the mirrored one is tried."""
+SAME_MINIMUM = 1e-6
+"""Minima whose costs differ by a smaller share are the same."""
 CHEAPER = 0.999
 """The mirrored model is taken if the cost of its minimum is below this share of Gauss-Newton's."""
 
@@ -65,10 +70,9 @@ class _Guess(NamedTuple):
     controls: FloatArray | None  # shape (N, n_u); None for zeros
     cost: float  # of their rollout; inf if not finite or unknown
     regularization: float  # first one of the solve
-    emphasis: float = 1.0  # factor of the final pose's weights
     interrupted: bool = False  # whether the user stopped the solve that led to it
     long_steps: tuple[dict[str, Any], ...] = ()  # the attempts in long steps that led to it
-    multipliers: FloatArray | None = None  # of the maneuver that it comes from; None without constraints
+    multipliers: FloatArray | None = None  # of the constrained maneuver that it comes from, if it is one
 
 
 class _Attempt(NamedTuple):
@@ -76,7 +80,6 @@ class _Attempt(NamedTuple):
 
     guess: str
     solution: Solution
-    emphasis: float = 1.0
 
 
 class GuidedDDP:
@@ -85,7 +88,7 @@ class GuidedDDP:
     The guesses, cheapest rollout first, are the policies of a library of solved maneuvers and, where all of
     them stray, the screw motion of an arm's tip to its target; then zero controls. They are solved one after
     another until one converges and, if the problem has tolerances, ends within them. A minimum that ends
-    outside is led to the target: the weights of the final pose are raised as far as necessary (`reaching`).
+    outside is led to the target: the tolerances become constraints (`ArmProblem.constrained`).
     The cheapest solution wins, among those that reach the target if there are any.
     """
 
@@ -96,6 +99,7 @@ class GuidedDDP:
         library: Iterable[Solution] | None = None,
         screw_motion: bool = True,
         reach_target: bool = True,
+        reserve: float = 0.0,
         remember: int = 0,
         attempts: int = 2,
         compare: bool = False,
@@ -113,8 +117,9 @@ class GuidedDDP:
                 solves the problem's own initial state, once, on first use; an empty library leaves the other
                 guesses.
             screw_motion: Whether to guess the tip's screw motion where no policy is near; arms only.
-            reach_target: Whether to raise the weights of the final pose where the cheapest maneuver ends
-                outside the tolerances.
+            reach_target: Whether the tolerances become constraints where the cheapest maneuver ends outside
+                them; arms only.
+            reserve: Share of the tolerances to keep free where they become constraints, for disturbances.
             remember: Number of converged solutions that may join the library. With 0 a solution depends on
                 its start alone, otherwise also on those solved before.
             attempts: Most guesses to solve for a start.
@@ -137,6 +142,8 @@ class GuidedDDP:
         """
         check_at_least("remember", remember, 0)
         check_at_least("attempts", attempts, 1)
+        if not 0.0 <= reserve < 0.5:
+            raise ValueError(f"reserve is {reserve}; it must be at least 0 and less than 0.5")
         self._settings: dict[str, Any] = {
             "max_iterations": max_iterations,
             "tolerance": tolerance,
@@ -145,8 +152,9 @@ class GuidedDDP:
         self._solver = BoxDDP(scene_or_problem, **self._settings)
         self.problem: ShootingProblem = self._solver.problem
         self.attempts = attempts
-        self.reach_target = reach_target
-        self._target = cast(HasTolerances, self.problem) if hasattr(self.problem, "misses") else None
+        self.reach_target, self.reserve = reach_target, reserve
+        self._has_constraints = getattr(self.problem, "constraints", None) is not None
+        self._constrained_solver: BoxDDP | None = None  # nothing is compiled for it until it is needed
         self._kinematic_guess: Callable[[FloatArray], ScrewMotion] | None = None
         if screw_motion and isinstance(self.problem, ArmProblem):
             self._kinematic_guess = partial(guess_screw_motion, self.problem)
@@ -213,10 +221,11 @@ class GuidedDDP:
                 for nominal ones.
 
         Returns:
-            The best trajectory found; its cost is always the problem's own. `metadata["guess"]` names its
-            guess, `metadata["emphasis"]` is the factor of the final pose's weights at which it is a minimum,
-            and `metadata["attempts"]` lists guess, emphasis, cost, iterations and stop reason of each solve,
-            `metadata["long_steps"]` those in long steps before.
+            The best trajectory found; its cost is always the problem's own. Its multipliers, and its report
+            `constraints`, tell what reaching the target took, if the cheapest maneuver would have missed it.
+            `metadata["guess"]` names its guess, and `metadata["attempts"]` lists guess, cost, iterations and
+            stop reason of each solve and whether it was constrained, `metadata["long_steps"]` those in long
+            steps before.
 
         Raises:
             ValueError: If x0 or parameters have the wrong shape or are not finite, or an input has no cost of
@@ -234,36 +243,41 @@ class GuidedDDP:
         long_steps: tuple[dict[str, Any], ...] = ()
         for guess in self._guesses(start, callback):
             long_steps += guess.long_steps
-            attempts += self._attempts(guess, start, callback)
+            attempts += self._attempts(guess, start, callback, attempts)
             last = attempts[-1].solution
             if last.stop_reason is StopReason.INTERRUPTED or (self._is_good(last) and not self.compare):
                 break
-        # An emphasis that did not help is dropped.
+        # Constraints that did not help are dropped.
         good = [attempt for attempt in attempts if self._is_good(attempt.solution)]
-        plain = [attempt for attempt in attempts if attempt.emphasis == 1.0]
-        best = min(good or plain or attempts, key=lambda attempt: attempt.solution.cost)
+        own = [attempt for attempt in attempts if attempt.solution.problem is self.problem]
+        best = min(good or own or attempts, key=lambda attempt: attempt.solution.cost)
         solution = best.solution
-        solution.metadata["guess"], solution.metadata["emphasis"] = best.guess, best.emphasis
+        solution.metadata["guess"] = best.guess
         solution.metadata["attempts"] = [_summary(attempt) for attempt in attempts]
         solution.metadata["long_steps"] = list(long_steps)
         self._remember(solution)
         return solution
 
-    def _attempts(self, guess: _Guess, start: FloatArray, callback: Callback | None) -> list[_Attempt]:
-        """Solve from a guess, and lead a minimum that ends outside the tolerances to the target."""
-        found = Reached(guess.emphasis, self._solve_from(guess, start, callback))
-        attempts = [_Attempt(guess.name, found.solution, found.emphasis)]
-        solution, target = found.solution, self._target
-        if not solution.converged or self._is_good(solution) or not self.reach_target or target is None:
-            return attempts
-        if solution.constraints is not None:  # the tolerances are among them
-            return attempts
+    def _attempts(
+        self, guess: _Guess, start: FloatArray, callback: Callback | None, before: Sequence[_Attempt]
+    ) -> list[_Attempt]:
+        """Solve from a guess, and lead a minimum that ends outside the tolerances to the target.
 
-        def solve(controls: FloatArray) -> Solution:
-            return self._solve_from(_Guess("", controls, np.inf, NEAR_REGULARIZATION), start, callback)
-
-        steps = reach(target, found, solve)
-        return attempts + [_Attempt(guess.name, step.solution, step.emphasis) for step in steps]
+        A minimum that one of the attempts before found was led from there.
+        """
+        solution = self._solve_from(guess, start, callback)
+        attempts = [_Attempt(guess.name, solution)]
+        misses = solution.converged and not self._is_good(solution)
+        can_be_led = isinstance(self.problem, ArmProblem | WindowProblem) and solution.constraints is None
+        costs = [attempt.solution.cost for attempt in before]
+        known = np.isclose(costs, solution.cost, rtol=SAME_MINIMUM, atol=0.0).any()
+        if self.reach_target and misses and can_be_led and not known:
+            solver = self._constrained
+            solver.initial_regularization = NEAR_REGULARIZATION
+            rows = self.problem.parameters.rows
+            led = solver.solve(start, solution.controls, callback, parameters=rows)
+            attempts.append(_Attempt(guess.name, led))
+        return attempts
 
     def _remember(self, solution: Solution) -> None:
         """Add a solution to the library if there is room and it is new."""
@@ -289,7 +303,9 @@ class GuidedDDP:
             for name, policy in policies(solution, self.problem).items():
                 trial = follow(policy, self.problem, start)
                 guess = _Guess(f"policy {i}{name}", trial.controls, trial.cost, POLICY_REGULARIZATION)
-                rollouts.append(guess._replace(multipliers=_multipliers(solution)))
+                if self._has_constraints:
+                    guess = guess._replace(multipliers=_multipliers(solution))
+                rollouts.append(guess)
                 strayed = strayed and trial.cost > STRAYED * solution.cost
         if strayed and self._kinematic_guess is not None:
             motion = self._kinematic_guess(start)
@@ -325,35 +341,41 @@ class GuidedDDP:
             trial.controls,
             trial.cost,
             NEAR_REGULARIZATION,
-            facts["emphasis"],
             interrupted=found.stop_reason is StopReason.INTERRUPTED,
             long_steps=tuple({**attempt, "cost": factor * attempt["cost"]} for attempt in attempts),
             multipliers=_multipliers(policy),
         )
 
     def _solve_from(self, guess: _Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
-        """Solve with the guess's emphasis; the cost is the problem's own."""
+        """Solve, with the tolerances as constraints if the guess has multipliers of theirs."""
+        solver = self._solver_for(guess)
+        solver.initial_regularization = guess.regularization
+        return solver.solve(
+            start,
+            guess.controls,
+            _interrupt if guess.interrupted else callback,
+            parameters=self.problem.parameters.rows,
+            multipliers=guess.multipliers,
+        )
 
-        def solve() -> Solution:
-            return self._solver.solve(
-                start,
-                guess.controls,
-                callback,
-                parameters=self.problem.parameters.rows,
-                multipliers=guess.multipliers,
-            )
+    def _solver_for(self, guess: _Guess) -> BoxDDP:
+        """The solver of a guess; its multipliers may be those of tolerances."""
+        return self._solver if self._has_constraints or guess.multipliers is None else self._constrained
 
-        callback = _interrupt if guess.interrupted else callback
-        self._solver.initial_regularization = guess.regularization
-        if self._target is None or guess.emphasis == 1.0:
-            return solve()
-        return solve_emphasized(self._target, guess.emphasis, solve).solution
+    @property
+    def _constrained(self) -> BoxDDP:
+        """The solver of the same problem with its tolerances as constraints."""
+        if self._constrained_solver is None:
+            problem = cast(ArmProblem | WindowProblem, self.problem).constrained(self.reserve)
+            self._constrained_solver = BoxDDP(problem, **self._settings)
+        return self._constrained_solver
 
     def _is_good(self, solution: Solution) -> bool:
         """Whether a solution has converged, and ends within the tolerances if the problem has any."""
         if not solution.converged:
             return False
-        return self._target is None or self._target.misses(solution.states[-1]) <= 1.0
+        misses: Callable[[FloatArray], float] | None = getattr(self.problem, "misses", None)
+        return misses is None or misses(solution.states[-1]) <= 1.0
 
     def _check_coarsening(self, given: int | Sequence[int]) -> tuple[int, ...]:
         """Return the factors that are more than 1; raise ValueError if one is no multiple of the next."""
@@ -376,6 +398,7 @@ class GuidedDDP:
             library=None if known is None else [coarsened(member, factor) for member in known],
             screw_motion=self._kinematic_guess is not None,
             reach_target=self.reach_target,
+            reserve=self.reserve,
             remember=self._vacancies,
             attempts=self.attempts,
             compare=len(coarsening) == 1,
@@ -387,7 +410,7 @@ class GuidedDDP:
         """Find how to solve this maneuver, or read what another process found."""
         key, known = None, None
         if type(self.problem) is ArmProblem and self._library is None and self._vacancies == 0:
-            names = ("attempts", "reach_target")
+            names = ("attempts", "reach_target", "reserve")
             settings = {**self._settings, **{name: getattr(self, name) for name in names}}
             kinematic = self._kinematic_guess is not None
             key = preparation_key(self.problem, {**settings, "screw_motion": kinematic})
@@ -413,7 +436,7 @@ class GuidedDDP:
     def _take_model(self, second_order: str) -> None:
         """Solve with other second derivatives from now on."""
         self._settings = {**self._settings, "second_order": second_order}
-        self._solver = BoxDDP(self.problem, **self._settings)
+        self._solver, self._constrained_solver = BoxDDP(self.problem, **self._settings), None
         self._chooses_model = False
 
     def _find_coarsening(self) -> tuple[int, ...]:
@@ -463,17 +486,19 @@ class GuidedDDP:
 
     def _leads_to_minimum(self, coarse: "GuidedDDP") -> bool:
         """Whether the policy in long steps is near a minimum in the problem's own, from its own start."""
-        most, start = self._solver.max_iterations, self.problem.initial_state
+        start = self.problem.initial_state
         self.problem.parameters.set(None)
         guess = self._coarse_guess(coarse, start, None)
         if guess is None:
             return False
         constrained = guess.multipliers is not None
-        self._solver.max_iterations = NEAR_ITERATIONS_CONSTRAINED if constrained else NEAR_ITERATIONS
+        solver = self._solver_for(guess)
+        most = solver.max_iterations
+        solver.max_iterations = NEAR_ITERATIONS_CONSTRAINED if constrained else NEAR_ITERATIONS
         try:
             solution = self._solve_from(guess, start)
         finally:
-            self._solver.max_iterations = most
+            solver.max_iterations = most
         if solution.stop_reason is StopReason.INTERRUPTED:
             raise KeyboardInterrupt
         return solution.converged
@@ -516,7 +541,7 @@ def _summary(attempt: _Attempt) -> dict[str, Any]:
     solution = attempt.solution
     return {
         "guess": attempt.guess,
-        "emphasis": attempt.emphasis,
+        "constrained": solution.constraints is not None,
         "cost": solution.cost,
         "iterations": solution.iterations,
         "stop_reason": solution.stop_reason.value,

@@ -2,8 +2,7 @@
 
 import copy
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ import numpy as np
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
-from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
 from dq_space_arm_env.kernels.library import PENALIZED
 from dq_space_arm_env.scene import INTEGRATORS
 from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, terminal_rows
@@ -35,8 +33,8 @@ class ArmProblem:
 
     Attributes:
         parameters: What varies in the scene, as in `kernels.parameters`.
-        terminal_inputs: The last stage's parameters, if there are any, and the emphasis on the pose in the
-            terminal cost, shape (1,); see `emphasized`.
+        terminal_inputs: The last stage's parameters, if there are any, and the weight of the terminal cost's
+            pose, shape (1,): 1, or less in long steps, see `coarsened`.
         constraints: Those of the scene and of success at its end; None without.
         has_second_order: Whether the registry of integrators names second derivatives for the scene's; the
             solver uses Gauss-Newton's model where there are none.
@@ -48,15 +46,13 @@ class ArmProblem:
         self,
         scene: Scene | str | Path | Mapping[str, Any],
         integrator: str | None = None,
-        *,
-        constrained: bool | None = None,
     ) -> None:
         self.scene = in_double_precision(load_scene(scene), integrator)
         self.kernels = compile_scene(self.scene)
         self.integrator: str = self.scene.simulation.integrator
         self.has_second_order = INTEGRATORS[self.integrator].curvature is not None
         layout = self.kernels.layout
-        self.is_constrained = bool(self.scene.constraints) if constrained is None else constrained
+        self.is_constrained = bool(self.scene.constraints)
         mixed_rows = self.is_constrained and any(row.has_input for row in path_rows(self.scene))
         # The wrist's rates turn the tip.
         twists = any(self.scene.cost.tip_twist) and "wrist psi rate" in layout.control.names
@@ -66,36 +62,52 @@ class ArmProblem:
         self.time_step = self.scene.simulation.dt
         self.initial_state: FloatArray = layout.initial_state
         self._limits_vary = not set(layout.control.limits).isdisjoint(layout.parameters.names)
-        self._make_inputs(usual_emphasis=1.0)
+        self._end_weight, self._reserve = 1.0, 0.0
+        self._make_inputs()
 
-    def _make_inputs(self, usual_emphasis: float) -> None:
-        """Allocate what may change between solves: parameters, and the emphasis on the final pose."""
+    def constrained(self, reserve: float = 0.0) -> "ArmProblem":
+        """Return the same maneuver with success as constraint, for a scene that has no constraints.
+
+        Args:
+            reserve: Share of the tolerances to keep free.
+        """
+        twin = copy.copy(self)
+        twin.is_constrained, twin._reserve = True, reserve
+        twin._make_inputs()
+        return twin
+
+    def _make_inputs(self) -> None:
+        """Allocate what may change between solves, and what follows from the number of stages."""
         entries = self.kernels.parameters
         changing = self._in_stages if entries.moving or entries.staged else None
         n_rows = n_multipliers(self.scene) if self.is_constrained else 0
         nominal = self.kernels.parameters.nominal
         self.parameters = StageParameters(self.horizon, nominal, changing, 2 * n_rows)
         self.constraints = self.constraints_of(self.parameters)
-        self._usual_emphasis = usual_emphasis
-        self._emphasis: FloatArray = np.full(1, self._usual_emphasis)
         last = (rows[-1:] for rows in self.parameters.inputs)
-        self.terminal_inputs: tuple[FloatArray, ...] = (*last, self._emphasis)
+        self.terminal_inputs: tuple[FloatArray, ...] = (*last, np.full(1, self._end_weight))
 
     def constraints_of(self, parameters: StageParameters) -> StageConstraints | None:
         """Constraints of stages with given parameters, whose further numbers are their multipliers."""
         if not self.is_constrained:
             return None
         path, terminal, kernels = path_rows(self.scene), terminal_rows(self.scene), self.kernels
+        reserve = self._reserve * np.array([row.tolerance for row in terminal])
 
         def residuals(states: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
             rows, along = parameters.rows, np.zeros((len(controls), 0))
             if path:
                 along = kernels.constraints(states[:-1], controls, p=rows[:-1])
             at_end = kernels.terminal_constraints(states[-1], p=rows[-1])
-            return along + [row.margin for row in path], at_end + [row.margin for row in terminal]
+            at_end = at_end + [row.margin for row in terminal] + reserve
+            return along + [row.margin for row in path], at_end
+
+        def slopes(state: FloatArray) -> FloatArray:
+            return kernels.terminal_constraint_jacobian(state, p=parameters.rows[-1])
 
         multipliers, penalties = np.split(parameters.more, 2, axis=1)
-        return StageConstraints(path, terminal, multipliers, penalties, residuals)
+        given = path, terminal, multipliers, penalties, residuals, slopes
+        return StageConstraints(*given, reserve, self._end_weight)
 
     def _in_stages(self, parameters: FloatArray) -> FloatArray:
         """Parameters of the stages, (N + 1, n_p), from those at the start: the target moves."""
@@ -144,7 +156,8 @@ class ArmProblem:
         coarse = copy.copy(self)
         coarse.horizon, coarse.time_step = self.horizon // factor, self.time_step * factor
         coarse.integrator = INTEGRATORS[self.integrator].curvature or self.integrator
-        coarse._make_inputs(self._usual_emphasis / factor)
+        coarse._end_weight = self._end_weight / factor
+        coarse._make_inputs()
         return coarse
 
     @property
@@ -170,22 +183,6 @@ class ArmProblem:
     def carried(self, states: FloatArray, parameters: FloatArray) -> FloatArray | None:
         """See `carried_along`, with the present parameters."""
         return carried_along(self.kernels.layout, states, parameters, self.parameters.rows)
-
-    @contextmanager
-    def emphasized(self, emphasis: float) -> Iterator[None]:
-        """Multiply the weights of the tip's final pose inside a `with` block."""
-        self._emphasis[0] = emphasis * self._usual_emphasis
-        try:
-            yield
-        finally:
-            self._emphasis[0] = self._usual_emphasis
-
-    def end_cost(self, state: FloatArray) -> float:
-        """Terminal cost of a final state, shape (n_x,), with the current emphasis."""
-        row, cost = np.ascontiguousarray(state, dtype=np.float64), np.zeros(1)
-        buffers = buffer_table(row, *self.terminal_inputs, cost)
-        run_kernel(self.kernel("terminal_cost").address, 0, 1, buffers)
-        return float(cost[0])
 
     def misses(self, state: FloatArray) -> float:
         """Largest of the tip's errors at a final state, each relative to its tolerance."""
@@ -314,6 +311,10 @@ class WindowProblem:
         """See `ArmProblem.control_lower`."""
         return -self.control_upper
 
+    def constrained(self, reserve: float = 0.0) -> "WindowProblem":
+        """See `ArmProblem.constrained`; for the last stages of a maneuver."""
+        return WindowProblem(self.maneuver.constrained(reserve), self.horizon)
+
     def begin_at(self, stage: int) -> None:
         """Take the parameters of the maneuver's stages from a stage on."""
         self.parameters.rows[:] = self.maneuver.parameters.rows[stage : stage + self.horizon + 1]
@@ -330,11 +331,3 @@ class WindowProblem:
     def misses(self, state: FloatArray) -> float:
         """See `ArmProblem.misses`; 0 for a window after which the maneuver continues."""
         return 0.0 if self.ends_early else self.maneuver.misses(state)
-
-    def emphasized(self, emphasis: float) -> AbstractContextManager[None]:
-        """See `ArmProblem.emphasized`."""
-        return self.maneuver.emphasized(emphasis)
-
-    def end_cost(self, state: FloatArray) -> float:
-        """See `ArmProblem.end_cost`."""
-        return self.maneuver.end_cost(state)

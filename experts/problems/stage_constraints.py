@@ -25,6 +25,10 @@ class StageConstraints:
         penalties: Present penalties, shape (N + 1, m); with zeros the rows do not count.
         residuals: Function of states (N + 1, n_x) and controls (N, n_u) to residuals with the margins of
             their rows, (N, n_c) and (n_g,).
+        slopes: Function of a final state (n_x,) to the derivatives of the rows at the end by the tangent
+            state, (n_g, n_t).
+        reserve: Margins of the rows at the end besides their own, shape (n_g,); only residuals have them.
+        end_weight: Factor of multipliers and penalties at the end, see `ArmProblem.coarsened`.
     """
 
     path: Sequence[Row]
@@ -32,6 +36,9 @@ class StageConstraints:
     multipliers: FloatArray
     penalties: FloatArray
     residuals: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+    slopes: Callable[[FloatArray], FloatArray]
+    reserve: FloatArray
+    end_weight: float
 
     def find(self, states: FloatArray, controls: FloatArray) -> FloatArray:
         """Residuals, shape (N + 1, m), zero where there is no row."""

@@ -96,7 +96,7 @@ def _solves(facts: Facts) -> Section:
         "A solve begins with the best of several guesses. Then neighbors check each other: where another "
         "problem's policy, followed from the same start, points to a cheaper minimum, the problem is solved "
         "again from there.",
-        [tables.guesses(facts), tables.emphases(facts)],
+        [tables.guesses(facts), tables.ends(facts)],
     )
     if facts.log.shards:
         section.tables.append(tables.times(facts))

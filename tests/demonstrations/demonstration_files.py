@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from experts.demonstrations.outcomes import Expert, Outcome, expert_of, solve
+from experts.demonstrations.reading import Demonstration
 from experts.demonstrations.settings import Settings
 from experts.demonstrations.shard import NOTES, ShardResult, Task, draw_starts, make_shard
 from experts.demonstrations.tensors import map_tensors, pack
@@ -26,6 +27,13 @@ def rewrite(file: Path, change: Callable[[Any], Any]) -> None:
     content = json.loads(file.read_text())
     changed = change(content)
     file.write_text(json.dumps(content if changed is None else changed, indent=2) + "\n")
+
+
+def ends_inside(demonstration: Demonstration) -> bool:
+    """Whether a maneuver ends well within the tolerances: they had no say."""
+    attitude, position = demonstration.facts["final_errors"]
+    success = demonstration.scene.success
+    return bool(attitude < 0.9 * success.attitude_error_deg and position < 0.9 * success.position_error)
 
 
 def replace_first_shard(folder: Path, **changes: Any) -> None:

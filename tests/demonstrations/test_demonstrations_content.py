@@ -8,6 +8,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from demonstration_files import ends_inside
 
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.scene import Spread
@@ -36,7 +37,7 @@ def test_each_is_an_episode_of_the_environment_bit_for_bit(whole: Demonstrations
 def test_no_neighboring_solve_finds_anything_cheaper(whole: Demonstrations):
     """Started from its own controls, the solver has nothing to improve."""
     problem = ArmProblem(whole.scene)
-    demonstration = next(d for d in whole if d.facts["emphasis"] == 1.0)
+    demonstration = next(d for d in whole if ends_inside(d))
     controls = np.clip(
         demonstration.actions * problem.control_upper, problem.control_lower, problem.control_upper
     )

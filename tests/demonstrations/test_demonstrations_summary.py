@@ -64,7 +64,7 @@ def test_quantities_are_those_of_the_data(facts: Facts, whole: Demonstrations):
     assert rows["cost J"][2] == tables.number(float(np.median(cost)))
     assert rows["attitude error at the end [°]"][-1] == "3"
     assert sum(int(row[1]) for row in tables.guesses(facts).rows) == 18
-    assert sum(int(row[1]) for row in tables.emphases(facts).rows) == 18
+    assert sum(int(row[1]) for row in tables.ends(facts).rows) == 18
 
 
 def test_the_log_counts_each_shard_once(folder: Path):

@@ -98,7 +98,7 @@ def _solution() -> Solution:
         iterations=2,
         history=np.zeros(2, dtype=HISTORY_DTYPE),
         parameters=np.zeros((4, 0)),
-        metadata={"scene": scene.model_dump(mode="json"), "emphasis": 1.0},
+        metadata={"scene": scene.model_dump(mode="json")},
     )
 
 
@@ -176,7 +176,6 @@ def _shard(scene: Scene) -> bytes:
         "iterations": np.ones(count, dtype=np.int64),
         "stop_reason": np.zeros(count, dtype=np.uint8),
         "guess": np.zeros(count, dtype=np.uint8),
-        "emphasis": np.ones(count),
         "start_errors": np.ones((count, 2)),
         "final_errors": np.ones((count, 2)),
         "clamped_share": np.zeros(count),

@@ -61,8 +61,7 @@ def test_what_minari_gives_back_is_what_was_exported(demonstrations, datasets, t
         assert read.scene == demonstrations.scene
         assert len(read) == len(demonstrations)
     for name in SUMMARIES:
-        if name != "emphasis":
-            np.testing.assert_array_equal(read.column(name), demonstrations.column(name), err_msg=name)
+        np.testing.assert_array_equal(read.column(name), demonstrations.column(name), err_msg=name)
     for ours, theirs in zip(read, demonstrations, strict=True):
         for name in TRAJECTORIES:
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)

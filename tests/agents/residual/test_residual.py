@@ -279,7 +279,7 @@ def test_the_command_refuses_before_it_plans(small_scene, tmp_path, capsys):
 
 
 def test_the_receding_horizon_plans_every_flight_and_pays_no_more_than_the_plan(small_scene, plans):
-    """Some demonstrations have an emphasis on the final pose, which costs a little; its plans have none."""
+    """Where the tolerances bind, its plans keep a share of them free, which costs a little."""
     few = plans.choose([3, 5])
     replanned = fly_mismatched(RecedingHorizon(small_scene, 20).policy(), small_scene, few, CALM)
     planned = fly_with_gains(small_scene, few, CALM)

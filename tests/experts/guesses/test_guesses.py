@@ -1,6 +1,5 @@
 """The guessing expert: policies of solved maneuvers as guesses, what wins, and what it says about it."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 
 import gymnasium
@@ -20,8 +19,8 @@ from dq_space_arm_env.scene.start import (
 from experts import BoxDDP, GuidedDDP, StopReason
 from experts.guesses.guided import START_REGULARIZATIONS, STRAYED, ZERO_REGULARIZATION
 from experts.guesses.policies import coarsened, follow, refined
-from experts.guesses.reaching import MOST_SOLVES
 from experts.guesses.screw_motion import ScrewMotion
+from scripts.benchmarks.solvers.runs import roll_out
 
 ELSEWHERE = np.array([0.6, 0.8, -0.2, 0.7])  # another start of the unicycle
 
@@ -31,7 +30,7 @@ def names(solution):
 
 
 class WithGoal:
-    """A problem whose task counts every final state as a success, or none, whatever is emphasized."""
+    """A problem whose task counts every final state as a success, or none."""
 
     def __init__(self, problem, success):
         self._problem, self._success = problem, success
@@ -41,12 +40,6 @@ class WithGoal:
 
     def misses(self, state):
         return 0.5 if self._success else 2.0
-
-    def emphasized(self, emphasis):
-        return nullcontext()
-
-    def end_cost(self, state):
-        return 0.0
 
 
 # The guess -------------------------------------------------------------------------------------------------
@@ -188,16 +181,6 @@ def test_a_final_state_that_is_no_success_calls_for_another_guess(unicycle, succ
     assert len(names(solution)) == attempts
 
 
-def test_an_emphasis_that_does_not_help_is_given_up(unicycle):
-    solution = GuidedDDP(WithGoal(unicycle, False), attempts=1).solve(ELSEWHERE)
-    emphases = [attempt["emphasis"] for attempt in solution.metadata["attempts"]]
-    assert emphases[0] == 1.0
-    assert emphases[1:] == sorted(emphases[1:])
-    assert 1 < len(emphases) <= 1 + MOST_SOLVES
-    assert solution.metadata["emphasis"] == 1.0
-    assert solution.cost == GuidedDDP(unicycle, attempts=1).solve(ELSEWHERE).cost
-
-
 def test_if_every_rollout_diverges_the_solution_says_so(double_integrator):
     double_integrator.A = np.diag([1e60, 1.0])
     solver = GuidedDDP(double_integrator.problem())
@@ -328,7 +311,7 @@ def test_fifty_random_starts(paper):
     """Convergence, success, effort, and cost beside the best that either expert finds.
 
     Of the cheapest maneuvers a third ends farther than 10 cm from the target, for thrusters are dear: these
-    starts need the emphasis.
+    starts need constraints.
     """
     starts = [random_start("paper", seed) for seed in range(50)]
     guided = [paper.solve(start) for start in starts]
@@ -373,16 +356,18 @@ def test_a_policy_in_longer_steps_is_itself_again_in_the_shorter_ones(paper):
     assert np.abs(fine.states[:, position] - solution.states[:, position]).max() < 5e-3
 
 
+def resting_cost(problem, start):
+    """Cost of doing nothing."""
+    return roll_out(problem, start, np.zeros((problem.horizon, problem.n_controls))).cost
+
+
 def test_costs_in_long_steps_are_those_of_fewer_stages(paper):
     """The stages' costs fall by the factor, as their number does; so does the weight of the final pose."""
     problem, start = paper.problem, random_start("paper", 0)
     coarse = problem.coarsened(8)
     assert (coarse.horizon, coarse.time_step) == (problem.horizon // 8, 8 * problem.time_step)
     start[problem.kernels.layout.state.pose.stop :] = 0.0  # at rest only the pose costs
-    assert 8.0 * coarse.end_cost(start) == pytest.approx(problem.end_cost(start), rel=1e-12)
-    with coarse.emphasized(3.0), problem.emphasized(3.0):
-        assert 8.0 * coarse.end_cost(start) == pytest.approx(problem.end_cost(start), rel=1e-12)
-    assert 8.0 * coarse.end_cost(start) == pytest.approx(problem.end_cost(start), rel=1e-12)
+    assert 8.0 * resting_cost(coarse, start) == pytest.approx(resting_cost(problem, start), rel=1e-12)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -402,7 +387,7 @@ def test_twice_coarsened_is_coarsened_by_the_product(paper):
     once, twice = paper.problem.coarsened(8), paper.problem.coarsened(2).coarsened(4)
     assert (twice.horizon, twice.time_step) == (once.horizon, once.time_step)
     start = random_start("paper", 0)
-    assert twice.end_cost(start) == once.end_cost(start)
+    assert resting_cost(twice, start) == resting_cost(once, start)
 
 
 def nothing_kept(monkeypatch):
