@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from dq_space_arm_env.scene.constraints import (
+    Constraint,
     Distance,
     JointLimits,
     Momentum,
@@ -55,32 +56,36 @@ def path_rows(scene: Scene) -> tuple[Row, ...]:
     Returns:
         One row per residual of `task.constraint_residuals.path_residuals`.
     """
+    return tuple(row for each in scene.constraints for row in rows_of(scene, each))
+
+
+def rows_of(scene: Scene, each: Constraint) -> list[Row]:
+    """The rows of `path_rows` that one constraint has."""
+    common = each.tolerance, each.margin, each.terminates, each.observed
     rows: list[Row] = []
-    for each in scene.constraints:
-        common = each.tolerance, each.margin, each.terminates, each.observed
-        if isinstance(each, JointLimits):
-            for side in sides(scene, each):
-                words = ("rate " if side.is_rate else "") + ("upper" if side.sign > 0 else "lower")
-                unit = "rad/s" if side.is_rate else "rad"
-                rows.append(Row(f"{each.name}: {scene.links[side.link].name} {words}", unit, *common))
-        elif isinstance(each, Distance):
-            pairs = pairs_that_may_touch(scene, each)
-            found = [f"{each.name}: {a.frame} {i} to {b.frame} {j}" for i, a, j, b in pairs]
-            rows += [Row(name, "m", *common) for name in found]
-        elif isinstance(each, Momentum):
-            bounded = {"linear": "N s", "angular": "N m s", "energy": "J"}
-            found = [name for name in bounded if getattr(each, name) is not None]
-            rows += [Row(f"{each.name}: {name}", bounded[name], *common) for name in found]
-        elif isinstance(each, WheelMomentum):
-            axes = AXES[2:] if scene.base.motion == "planar" else AXES
-            names = [f"{each.name}: {sign}{axis}" for axis in axes for sign in "+-"]
-            rows += [Row(name, "N m s", *common) for name in names]
-        elif isinstance(each, Plume):
-            rows.append(Row(each.name, "N m", *common, has_input=True))
-        elif not isinstance(each, Terminal):
-            is_length = hasattr(each, "point")  # line of sight and corridor; the others compare cosines
-            rows.append(Row(each.name, "m" if is_length else "1", *common))
-    return tuple(rows)
+    if isinstance(each, JointLimits):
+        for side in sides(scene, each):
+            words = ("rate " if side.is_rate else "") + ("upper" if side.sign > 0 else "lower")
+            unit = "rad/s" if side.is_rate else "rad"
+            rows.append(Row(f"{each.name}: {scene.links[side.link].name} {words}", unit, *common))
+    elif isinstance(each, Distance):
+        pairs = pairs_that_may_touch(scene, each)
+        found = [f"{each.name}: {a.frame} {i} to {b.frame} {j}" for i, a, j, b in pairs]
+        rows += [Row(name, "m", *common) for name in found]
+    elif isinstance(each, Momentum):
+        bounded = {"linear": "N s", "angular": "N m s", "energy": "J"}
+        found = [name for name in bounded if getattr(each, name) is not None]
+        rows += [Row(f"{each.name}: {name}", bounded[name], *common) for name in found]
+    elif isinstance(each, WheelMomentum):
+        axes = AXES[2:] if scene.base.motion == "planar" else AXES
+        names = [f"{each.name}: {sign}{axis}" for axis in axes for sign in "+-"]
+        rows += [Row(name, "N m s", *common) for name in names]
+    elif isinstance(each, Plume):
+        rows.append(Row(each.name, "N m", *common, has_input=True))
+    elif not isinstance(each, Terminal):
+        is_length = hasattr(each, "point")  # line of sight and corridor; the others compare cosines
+        rows.append(Row(each.name, "m" if is_length else "1", *common))
+    return rows
 
 
 def success_tolerances(scene: Scene) -> list[tuple[str, str, float]]:

@@ -68,7 +68,13 @@ def test_hashes_and_files_of_scenes_without_them_are_as_old_as_the_scenes() -> N
         "00c7f1939550ce9bb98c79cbbbf75369abecf77800cac4d08bb71fb2ec370d27"
     )
     with_shapes = [name for name in list_scenes() if "geometry:" in load_scene(name).to_yaml()]
-    assert with_shapes == ["capture-and-detumble", "release", "tracking", "tumbling-target"]
+    assert with_shapes == [
+        "approach-corridor",
+        "capture-and-detumble",
+        "release",
+        "tracking",
+        "tumbling-target",
+    ]
 
 
 def test_one_shape_changes_by_its_path(drawn: Scene) -> None:

@@ -23,11 +23,13 @@ from dq_space_arm_env.scene import (
 Change = Callable[..., dict[str, Any]]
 
 SIZES = {  # n_x, n_t, n_u
+    "approach-corridor": (23, 21, 12),
     "capture-and-detumble": (20, 18, 9),
     "far": (23, 21, 12),
     "free-floating": (23, 21, 6),
     "joint-limits": (23, 21, 12),
     "keep-out": (23, 21, 12),
+    "line-of-sight": (23, 21, 12),
     "no-wrist": (20, 18, 9),
     "paper": (23, 21, 12),
     "payload": (20, 18, 9),
@@ -43,6 +45,7 @@ SIZES = {  # n_x, n_t, n_u
     "tracking": (23, 21, 12),
     "tumbling": (23, 21, 12),
     "tumbling-target": (23, 21, 12),
+    "wheel-saturation": (23, 21, 9),
 }
 
 

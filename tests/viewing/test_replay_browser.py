@@ -331,3 +331,24 @@ def test_a_long_flight_is_drawn_fast_and_keeps_its_peaks(open_flights, make_flig
     opened.page.keyboard.press("t")  # draws all anew
     opened.page.wait_for_timeout(400)
     assert 5_000 < opened.page.evaluate("lines") < 100_000  # of 14 curves; one by one they would be 520,000
+
+
+@pytest.mark.slow
+def test_violated_constraints_are_red_and_can_be_switched_off(open_flights, make_flight, paper):
+    """A star tracker on the base looks into the sun all along; no joint turns too fast."""
+    sun = {
+        "name": "sun",
+        "kind": "keep_out_direction",
+        "axis": {"frame": "base", "direction": [1, 0, 0]},
+        "direction": {"frame": "inertial", "direction": [1, 0, 0]},
+        "angle_deg": 20,
+    }
+    limits = {"name": "limits", "kind": "joint_limits", "rate": 1.0}
+    scene = paper.replace(constraints=[sun, limits])
+    opened = open_flights([make_flight(scene)], scene)
+    labels = "[...document.querySelectorAll('#constraints label')].map(l => [l.textContent, l.className])"
+    assert opened.page.evaluate(labels) == [["sun", "broken"], ["limits", ""]]
+    seen = opened.picture()
+    opened.page.locator("#constraints input").first.uncheck()
+    assert opened.picture() != seen
+    assert open_flights([make_flight(paper)], paper).page.is_hidden("#constraints")

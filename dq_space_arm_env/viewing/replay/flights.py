@@ -16,6 +16,7 @@ from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.task.step_report import STATE_LIMIT
 from dq_space_arm_env.task.trajectory import Trajectory
+from dq_space_arm_env.viewing.constraint_shapes import violations
 from dq_space_arm_env.viewing.payload_places import payload_path
 
 FloatArray = NDArray[np.float64]
@@ -43,6 +44,7 @@ class ShownFlight:
     angle: FloatArray  # Euler angle of the tip's attitude error, shape (M + 1,), deg
     distance: FloatArray  # from tip to target, shape (M + 1,), m
     note: str  # why it is cut off; empty if it is not
+    violated: NDArray[np.bool_]  # whether rows of constraints are, shape (rows, M + 1)
 
     @property
     def steps(self) -> int:
@@ -97,17 +99,20 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
         payload = _target(f"{what}: payload", path, shown, shown)
     tip, aim = tuple(frames[:, -1].T), tuple(target.T) if target.ndim == 2 else tuple(target.tolist())
     seconds = shown * scene.simulation.dt
+    body = None if body is None else _target(f"{what}: target_body", body, steps, shown)
+    placed = flight.scene or scene, states[: shown + 1], controls[:shown], target if body is None else body
     return ShownFlight(
         label=flight.label,
         controls=controls[:shown],
         noise=None if noise is None else noise[:shown],
         target=target,
-        target_body=None if body is None else _target(f"{what}: target_body", body, steps, shown),
+        target_body=body,
         payload=payload,
         frames=frames,
         angle=np.degrees(poses.error_angle(tip, aim)),
         distance=np.asarray(poses.error_distance(tip, aim)),
         note="" if shown == steps else f"diverges after {seconds:.4g} s",
+        violated=violations(*placed) if scene.constraints else np.zeros((0, shown + 1), np.bool_),
     )
 
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.scene.constraint_rows import rows_of
+from dq_space_arm_env.viewing.constraint_shapes import constraint_shapes
 from dq_space_arm_env.viewing.rendering.solids import Mesh
 from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
 from dq_space_arm_env.viewing.replay.flights import FloatArray, ShownFlight, poses_at
@@ -19,22 +21,31 @@ from dq_space_arm_env.viewing.replay.flights import FloatArray, ShownFlight, pos
 _CREASE = math.cos(math.radians(40.0))
 _STEPS_PER_METER = 1e5  # resolution of corners; equal ones share a vertex
 _INSTANTS = 9
+_CONES = 4.0  # length of cones over that of the axes at the tip
 _FLOWN_AWAY = 3.0  # times the size of robot, reach and target
 _AZIMUTHS = tuple(math.radians(angle) for angle in range(0, 360, 15))
 _ELEVATIONS = tuple(math.radians(angle) for angle in (12, 24, 36))
 _PLANAR_VIEW = (math.radians(-90.0), math.radians(62.0))
 
 
-class Solids(NamedTuple):
-    """T triangles, each fixed in a frame, that share V vertices."""
+class Triangles(NamedTuple):
+    """T triangles, each part of a group, that share V vertices."""
 
-    positions: NDArray[np.float32]  # in the vertex's frame, shape (V, 3), m
-    normals: NDArray[np.int8]  # in that frame, units of 1/127, shape (V, 4); the last is 0
+    positions: NDArray[np.float32]  # shape (V, 3), m
+    normals: NDArray[np.int8]  # units of 1/127, shape (V, 4); the last is 0
     colors: NDArray[np.uint8]  # red, green, blue in units of 1/255, shape (V, 4); the last is 255
     triangles: NDArray[np.uint16]  # vertices, counterclockwise seen from outside, shape (T, 3)
-    # Of triangles in each frame, frame by frame, in the end those of target, target's body and payload.
-    counts: tuple[int, ...]
-    axis_length: float  # m
+    counts: tuple[int, ...]  # of triangles in each group, group by group
+
+
+class ConstraintDrawing(NamedTuple):
+    """The shapes of a scene's constraints."""
+
+    triangles: Triangles  # each group is a shape, in its axes
+    frames: tuple[tuple[int, int], ...]  # of each shape: of its origin, and of its axes; -1 is inertial
+    owners: tuple[int, ...]  # number of the constraint of each shape
+    violated: tuple[NDArray[np.bool_], ...]  # by flight: whether a shape is violated, (shapes, M + 1)
+    broken: tuple[NDArray[np.bool_], ...]  # by flight: whether a constraint is, (constraints, M + 1)
 
 
 class View(NamedTuple):
@@ -46,10 +57,38 @@ class View(NamedTuple):
     pivot: FloatArray  # center of rotation, shape (3,), m
 
 
-def solids_of(scene: Scene) -> Solids:
-    """Solids of the environment's pictures, with smooth shading where they are round."""
+def solids_of(scene: Scene) -> Triangles:
+    """Solids of the environment's pictures, with smooth shading where they are round.
+
+    The groups are the frames, in the end those of target, target's body and payload.
+    """
     model = SpacecraftModel(scene)
-    mesh = model.mesh
+    return _triangles_of(model.mesh, model.frame_count + 3, f"scene {scene.name!r}")
+
+
+def constraints_of(scene: Scene, flights: Sequence[ShownFlight]) -> ConstraintDrawing | None:
+    """Shapes of the constraints, and where flights violate them; None without constraints."""
+    if not scene.constraints:
+        return None
+    groups = constraint_shapes(scene, _CONES * SpacecraftModel(scene).axis_length)
+    shapes = [(number, shape) for number, group in enumerate(groups) for shape in group]
+    frames = [(shape.place, shape.axes) for _, shape in shapes]
+    meshes = [shape.mesh.moved(index, np.eye(3), np.zeros(3)) for index, (_, shape) in enumerate(shapes)]
+    triangles = _triangles_of(Mesh.joined(meshes), len(shapes), "constraints") if meshes else _NO_TRIANGLES
+    parts = [rows_of(scene, each) for each in scene.constraints]
+    ends = np.cumsum([len(rows) for rows in parts])
+    violated, broken = [], []
+    for flight in flights:
+        rows = flight.violated
+        violated.append(np.array([rows[list(shape.rows)].any(axis=0) for _, shape in shapes]))
+        spans = [rows[end - len(part) : end].any(axis=0) for part, end in zip(parts, ends, strict=True)]
+        broken.append(np.array(spans))
+    owners = tuple(number for number, _ in shapes)
+    return ConstraintDrawing(triangles, tuple(frames), owners, tuple(violated), tuple(broken))
+
+
+def _triangles_of(mesh: Mesh, groups: int, what: str) -> Triangles:
+    """Triangles of a mesh, whose frames are the groups; `what` it is, for errors."""
     corners = np.concatenate([mesh.corners[:, [0, 1, 2]], mesh.corners[:, [0, 2, 3]]])
     smooth = smooth_normals(mesh)
     normals = np.concatenate([smooth[:, [0, 1, 2]], smooth[:, [0, 2, 3]]])
@@ -70,16 +109,24 @@ def solids_of(scene: Scene) -> Solids:
     )
     distinct, triangles = np.unique(np.rint(vertices), axis=0, return_inverse=True)
     if len(distinct) > 2**16:
-        raise ValueError(f"scene {scene.name!r} has {len(distinct)} corners to draw, should be at most 65536")
+        raise ValueError(f"{what} has {len(distinct)} corners to draw, should be at most 65536")
     count = len(distinct)
-    return Solids(
+    return Triangles(
         (distinct[:, 7:] / _STEPS_PER_METER).astype(np.float32),
         np.column_stack([distinct[:, 4:7], np.zeros(count)]).astype(np.int8),
         np.column_stack([distinct[:, 1:4], np.full(count, 255)]).astype(np.uint8),
         triangles.reshape(-1, 3).astype(np.uint16),
-        tuple(np.bincount(looks[kept, 0].astype(int), minlength=model.frame_count + 3).tolist()),
-        model.axis_length,
+        tuple(np.bincount(looks[kept, 0].astype(int), minlength=groups).tolist()),
     )
+
+
+_NO_TRIANGLES = Triangles(
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 4), np.int8),
+    np.zeros((0, 4), np.uint8),
+    np.zeros((0, 3), np.uint16),
+    (),
+)
 
 
 def smooth_normals(mesh: Mesh) -> FloatArray:

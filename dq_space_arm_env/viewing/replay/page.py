@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.task.trajectory import Trajectory
+from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
 from dq_space_arm_env.viewing.replay.curves import panels
 from dq_space_arm_env.viewing.replay.flights import prepare, verdict
-from dq_space_arm_env.viewing.replay.geometry import solids_of, view_of
+from dq_space_arm_env.viewing.replay.geometry import Triangles, constraints_of, solids_of, view_of
 
 # In the order of their dependencies.
 SCRIPTS = (
@@ -136,10 +137,17 @@ def _poses(poses: NDArray[np.float64] | None, blob: _Blob) -> list[float] | dict
     return poses.tolist() if poses.ndim == 1 else blob.add(poses.astype(np.float32))
 
 
+def _triangles(triangles: Triangles, blob: _Blob) -> dict[str, Any]:
+    """Places of the arrays of triangles."""
+    arrays = triangles._asdict()
+    counts = arrays.pop("counts")
+    return {**{name: blob.add(array) for name, array in arrays.items()}, "counts": counts}
+
+
 def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
     """Content of the page as JSON values."""
     shown = prepare(flights, scene)
-    solids, view, blob = solids_of(scene), view_of(shown, scene), _Blob()
+    view, blob = view_of(shown, scene), _Blob()
     data: dict[str, Any] = {
         "scene": {
             "name": scene.name,
@@ -148,14 +156,7 @@ def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
             "dt": scene.simulation.dt,
             "tolerance": scene.success.position_error,
         },
-        "solids": {
-            "positions": blob.add(solids.positions),
-            "normals": blob.add(solids.normals),
-            "colors": blob.add(solids.colors),
-            "triangles": blob.add(solids.triangles),
-            "counts": solids.counts,
-            "axisLength": solids.axis_length,
-        },
+        "solids": {**_triangles(solids_of(scene), blob), "axisLength": SpacecraftModel(scene).axis_length},
         "view": {
             "azimuth": view.azimuth,
             "elevation": view.elevation,
@@ -191,5 +192,15 @@ def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
             for panel in panels(shown, scene)
         ],
     }
+    drawn = constraints_of(scene, shown)
+    if drawn is not None:
+        data["constraints"] = {
+            **_triangles(drawn.triangles, blob),
+            "names": [each.name for each in scene.constraints],
+            "frames": drawn.frames,
+            "owners": drawn.owners,
+            "violated": [blob.add(each.astype(np.uint8)) for each in drawn.violated],
+            "broken": [blob.add(each.astype(np.uint8)) for each in drawn.broken],
+        }
     data["blob"] = blob.encoded()
     return data

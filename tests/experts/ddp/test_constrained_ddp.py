@@ -37,6 +37,14 @@ CASES = {
     "all": ([LIMITS, BALL, POSE], 1447.8408),
 }
 FREE = 1422.18983
+CONSTRAINED = (
+    "approach-corridor",
+    "joint-limits",
+    "keep-out",
+    "line-of-sight",
+    "pointing",
+    "wheel-saturation",
+)
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +178,7 @@ def test_multipliers_of_another_problem_are_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["joint-limits", "keep-out", "pointing"])
+@pytest.mark.parametrize("name", CONSTRAINED)
 def test_random_starts_keep_to_the_constraints(name):
     solver, kernels = GuidedDDP(name), compile_scene(name)
     env = DQSpaceArmEnv(name)

@@ -10,6 +10,15 @@ from scripts.benchmarks.peers.interior_point_peer import InteriorPoint
 from scripts.benchmarks.peers.transcription import transcribe
 from scripts.benchmarks.solvers.runs import FATROP
 
+CONSTRAINED = (
+    "approach-corridor",
+    "joint-limits",
+    "keep-out",
+    "line-of-sight",
+    "pointing",
+    "wheel-saturation",
+)
+
 
 @pytest.mark.slow
 def test_ipopt_finds_nothing_better_near_the_experts_plan():
@@ -37,7 +46,7 @@ def test_ipopt_finds_the_experts_plan_from_zero_controls():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["joint-limits", "keep-out", "pointing"])
+@pytest.mark.parametrize("name", CONSTRAINED)
 def test_ipopt_finds_the_experts_plan_under_constraints(name):
     """From the plan's neighborhood an interior-point method arrives at the same cost."""
     solution = GuidedDDP(name).solve()

@@ -68,6 +68,14 @@ export function poseMatrix(q, start) {
   ]);
 }
 
+/** Matrix from the axes of one frame, about the origin of another; those of number -1 are inertial. */
+export function placedMatrix(poses, place, axes) {
+  const identity = [1, 0, 0, 0, 0, 0, 0, 0];
+  const matrix = axes < 0 ? poseMatrix(identity, 0) : poseMatrix(poses, 8 * axes);
+  if (place !== axes) matrix.set(place < 0 ? [0, 0, 0] : positionOf(poses, 8 * place), 12);
+  return matrix;
+}
+
 /**
  * Blend poses: `share` of the way from those at `from` to those at `to`, `count` of them in a row. The blend
  * of two near dual quaternions, made a unit again, is the screw motion between the two poses.

@@ -15,10 +15,11 @@ const REST = 180; // ms without a change after which the picture is drawn finely
 
 const find = (id) => document.getElementById(id);
 const recording = readRecording(find("replay-data").textContent);
-const { scene, flights } = recording;
+const { scene, flights, constraints } = recording;
 const player = new Player(Math.max(...flights.map((flight) => flight.duration)), scene.dt);
 const camera = new Camera(recording.view);
 const moment = { time: 0, solid: 0, visible: flights.map(() => true) };
+moment.shown = constraints ? constraints.names.map(() => true) : [];
 const canvas = find("view"), viewport = find("viewport"), slider = find("time"), root = document.documentElement;
 const plots = new Plots(find("plots"), recording, player);
 const labels = new Labels(find("labels"), find("compass"));
@@ -53,6 +54,8 @@ function readLook() {
     ambient: Number(style("--ambient")),
     bubble: channels("--bubble"),
     ahead: Number(style("--trail-ahead")),
+    kept: channels("--kept"),
+    violated: channels("--violated"),
     flights: flights.map((_, index) => channels(`--flight-${index + 1}`)),
   };
 }
@@ -83,6 +86,7 @@ function drawNow(now) {
   }
   plots.update(player.time, player.playing, now);
   showTime();
+  if (constraints) showConstraints();
   if (player.playing) refresh();
 }
 
@@ -157,6 +161,27 @@ function buildFlights() {
     add(name, "span", { className: "verdict", textContent: flight.verdict });
     find("flights").append(row);
   });
+}
+
+/** A row for each constraint: whether its shapes are seen, and whether the solid flight violates it. */
+function buildConstraints() {
+  find("constraints").hidden = false;
+  constraints.names.forEach((name, index) => {
+    const label = document.createElement("label");
+    const box = Object.assign(document.createElement("input"), { type: "checkbox", checked: true });
+    box.addEventListener("change", () => {
+      moment.shown[index] = box.checked;
+      refresh();
+    });
+    label.append(box, name);
+    find("constraints").append(label);
+  });
+}
+
+function showConstraints() {
+  const flight = flights[moment.solid];
+  const broken = flight.setAt(constraints.broken[moment.solid], player.time);
+  find("constraints").querySelectorAll("label").forEach((label, index) => label.classList.toggle("broken", broken[index]));
 }
 
 function choose(index) {
@@ -237,6 +262,7 @@ find("missing").hidden = renderer !== null;
 viewport.classList.toggle("flat", renderer === null);
 followTheme();
 buildFlights();
+if (constraints) buildConstraints();
 connect();
 showControls();
 showFlights();

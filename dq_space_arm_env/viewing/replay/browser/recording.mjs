@@ -12,8 +12,11 @@ export function readRecording(text) {
   // Of a long flight these are tens of millions: a loop takes a tenth of a second, a callback for each seconds.
   for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
   const array = (place) => new ARRAYS[place.type](bytes.buffer, place.start, place.length);
-  const { solids, view } = data;
-  for (const name of ["positions", "normals", "colors", "triangles"]) solids[name] = array(solids[name]);
+  const { solids, view, constraints = null } = data;
+  for (const each of constraints ? [solids, constraints] : [solids]) {
+    for (const name of ["positions", "normals", "colors", "triangles"]) each[name] = array(each[name]);
+  }
+  if (constraints) for (const name of ["violated", "broken"]) constraints[name] = constraints[name].map(array);
   view.points = array(view.points);
   const frameCount = solids.counts.length - 3; // the last three are those of the target, of its body, of the payload
   const poses = (place) => (place && !Array.isArray(place) ? array(place) : place);
@@ -27,7 +30,7 @@ export function readRecording(text) {
     curves: panel.curves.map(array),
     disturbed: panel.disturbed.map((place) => place && array(place)),
   }));
-  return { scene: data.scene, solids, view, flights, panels };
+  return { scene: data.scene, solids, view, flights, panels, constraints };
 }
 
 /** A flight: its poses at any time; before its beginning the first, after its end the last. */
@@ -60,6 +63,12 @@ export class Flight {
       if (source.length > 8) blendPoses(source, 8 * before, 8 * (before + 1), place - before, 1, poses);
     }
     if (!this.payload) this.poses.copyWithin(8 * (this.frameCount + 2), size - 8, size); // the tip holds it
+  }
+
+  /** Of the rows of a table, one number for each instant: which are set at a time, in s. */
+  setAt(table, time) {
+    const size = this.steps + 1, instant = Math.min(Math.floor(Math.max(time / this.dt, 0) + 1e-6), this.steps);
+    return Array.from({ length: table.length / size }, (_, row) => table[row * size + instant] === 1);
   }
 
   /** Position of the tip at an instant. */

@@ -1,12 +1,13 @@
 // Draws a moment of the flights with WebGL: one flight solid, the others as ghosts.
 
-import { dot, multiply, poseMatrix, positionOf } from "./algebra.mjs";
+import { dot, multiply, placedMatrix, positionOf } from "./algebra.mjs";
 import { ball, grid, ribbon, stars } from "./shapes.mjs";
 import { GRID_SHADERS, RIBBON_SHADERS, SKY_SHADERS, SOLID_SHADERS, STAR_SHADERS } from "./shaders.mjs";
 
 const STARS = 1200; // over the whole sky, of which a picture shows a few percent
 const RIBBON_WIDTH = 3.2; // CSS pixels
 const GHOST_OPACITY = 0.5;
+const CONSTRAINT_OPACITY = 0.5; // at the rim of a shape
 const GHOST_TINT = 0.75;
 const GHOST_GLOW = 0.25; // so that a ghost is seen against a dark sky
 
@@ -28,7 +29,7 @@ export class Renderer {
   /** Hand programs and shapes to the graphics processor; again when it has lost them. */
   build() {
     const { gl } = this;
-    const { solids, flights, scene } = this.recording;
+    const { solids, flights, scene, constraints } = this.recording;
     this.programs = {
       solid: this.program(SOLID_SHADERS),
       ribbon: this.program(RIBBON_SHADERS),
@@ -38,11 +39,15 @@ export class Renderer {
     };
     // Frame by frame: where its triangles begin, and how many there are; the last three frames are those of the
     // target, of its body and of the payload.
-    const starts = solids.counts.map((_, frame) => solids.counts.slice(0, frame).reduce((a, b) => a + b, 0));
-    this.parts = solids.counts.map((count, frame) => ({ frame, start: starts[frame], count }));
+    this.parts = partsOf(solids.counts);
     this.targetParts = this.parts.slice(-3, -1);
     this.robotParts = [...this.parts.slice(0, -3), ...this.parts.slice(-1)];
     this.robot = this.solid(solids);
+    if (constraints) {
+      this.constraints = this.solid(constraints);
+      const [frames, parts] = [constraints.frames, partsOf(constraints.counts)];
+      this.constraintParts = parts.map((part, index) => ({ ...part, frame: frames[index][0], axes: frames[index][1] }));
+    }
     const bubble = ball(scene.tolerance);
     this.bubble = this.solid(bubble);
     this.bubbleParts = [{ frame: this.parts.length - 3, start: 0, count: bubble.triangles.length / 3 }];
@@ -163,6 +168,7 @@ export class Renderer {
     for (const index of ghosts) this.drawGhost(flights[index], look.flights[index]);
     gl.depthMask(false);
     const tint = [...look.bubble, 1];
+    if (this.constraints) this.drawConstraints(front, moment);
     this.drawSolid(front, { shape: this.bubble, parts: this.bubbleParts, tint, opacity: 0.55, rim: 1 });
     gl.depthMask(true);
   }
@@ -203,12 +209,26 @@ export class Renderer {
     gl.uniform1f(uniforms.u_opacity, opacity);
     gl.uniform1f(uniforms.u_rim, rim);
     gl.uniform1f(uniforms.u_ambient, this.look.ambient + glow);
-    for (const { frame, start, count } of parts) {
+    for (const { frame, axes = frame, start, count } of parts) {
       if (count === 0) continue;
-      const matrix = multiply(this.matrices.view, poseMatrix(flight.poses, 8 * frame));
+      const matrix = multiply(this.matrices.view, placedMatrix(flight.poses, frame, axes));
       gl.uniformMatrix4fv(uniforms.u_frame, false, matrix);
       gl.drawElements(gl.TRIANGLES, 3 * count, gl.UNSIGNED_SHORT, 6 * start);
     }
+  }
+
+  /** Cones and volumes of the constraints that the flight in front must keep to; red where it does not. */
+  drawConstraints(flight, { solid, time, shown }) {
+    const { gl, look } = this;
+    const { violated, owners } = this.recording.constraints;
+    const broken = flight.setAt(violated[solid], time);
+    gl.disable(gl.CULL_FACE); // cones are open
+    for (const state of [false, true]) {
+      const parts = this.constraintParts.filter((_, index) => shown[owners[index]] && broken[index] === state);
+      const tint = [...(state ? look.violated : look.kept), 1];
+      this.drawSolid(flight, { shape: this.constraints, parts, tint, opacity: CONSTRAINT_OPACITY, rim: 1, glow: 0.3 });
+    }
+    gl.enable(gl.CULL_FACE);
   }
 
   /**
@@ -252,6 +272,12 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, shape.vertexCount);
     gl.enable(gl.CULL_FACE);
   }
+}
+
+/** Group by group: where its triangles begin, and how many there are. */
+function partsOf(counts) {
+  const starts = counts.map((_, group) => counts.slice(0, group).reduce((a, b) => a + b, 0));
+  return counts.map((count, frame) => ({ frame, start: starts[frame], count }));
 }
 
 /** Whether pictures are computed without a graphics processor. */

@@ -1,0 +1,196 @@
+"""Constraints as shapes in frames for pictures: cones, volumes, directions; and where flights violate any."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.constraint_rows import pairs_that_may_touch, rows_of
+from dq_space_arm_env.scene.constraints import (
+    ApproachCorridor,
+    Constraint,
+    Distance,
+    KeepInDirection,
+    KeepOutDirection,
+    LineOfSight,
+    Plume,
+    Volume,
+)
+from dq_space_arm_env.scene.parameters import target_entries, target_numbers
+from dq_space_arm_env.viewing.rendering.solids import Color, Mesh, ball, lathe
+
+FloatArray = NDArray[np.float64]
+
+VISIBLE = 0.01
+"""Share of its tolerance by which a row must be violated to be shown as violated."""
+INERTIAL = -1
+"""Number of the inertial frame; the others are numbered as in `SpacecraftModel`."""
+
+_COLOR: Color = (1.0, 1.0, 1.0)  # the page tints them
+_SIDES = 32
+_NEEDLE = 0.012  # radius of a direction over its length
+_POINT = 0.02  # radius of what a camera sees over the length of its cone
+
+
+class ConstraintShape(NamedTuple):
+    """A shape that stands for a constraint, or for a part of one."""
+
+    mesh: Mesh  # in a frame's axes, about its origin
+    place: int  # frame that carries the origin
+    axes: int  # frame that gives the axes
+    rows: tuple[int, ...]  # rows of `path_rows` whose violation it shows
+
+
+def constraint_shapes(scene: Scene, length: float) -> list[list[ConstraintShape]]:
+    """Find the shapes of a scene's constraints.
+
+    Args:
+        scene: The scene.
+        length: How far cones and directions are drawn, m.
+
+    Returns:
+        The shapes of each constraint; none of what has no place in space, such as limits of joints.
+    """
+    numbers = _frame_numbers(scene)
+    found, first = [], 0
+    for each in scene.constraints:
+        rows = tuple(range(first, first + len(rows_of(scene, each))))
+        first += len(rows)
+        make = _SHAPES.get(type(each))
+        found.append([] if make is None else list(make(scene, each, rows, numbers, length)))
+    return found
+
+
+def violations(scene: Scene, states: FloatArray, controls: FloatArray, body: FloatArray) -> NDArray[np.bool_]:
+    """Find where the rows of a scene's constraints are violated.
+
+    Args:
+        scene: The scene.
+        states: Shape (M + 1, n_x).
+        controls: Shape (M, n_u), N, N m, rad/s; none acts in the last state.
+        body: Pose of the target's body, shape (8,) or (M + 1, 8), dimensionless and m.
+
+    Returns:
+        Whether a row is violated by more than `VISIBLE` of its tolerance, shape (rows, M + 1).
+    """
+    # CasADi, which these import, is needed here only.
+    from dq_space_arm_env.task.constraint_residuals import path_residuals
+    from dq_space_arm_env.task.equations import SceneEquations, body_pose, grasp_pose
+
+    nominal = StateLayout.of(scene).parameters.nominal
+    equations = SceneEquations.of(scene, nominal.tolist())
+    entries = np.moveaxis(np.broadcast_to(body, (len(states), 8)), 1, 0)
+    places = {n.name: entries[i] for n, i in zip(target_numbers(scene), target_entries(scene), strict=True)}
+    given = {**equations.given, **places}
+    grasp = dq.multiply(body_pose(scene, given), grasp_pose(scene, given))
+    equations = replace(equations, given=given, target=grasp)
+    x, u = list(states.T), list(np.vstack([controls, np.zeros_like(controls[:1])]).T)
+    residuals = path_residuals(equations, equations.base_pose(x), equations.y(x), u)
+    rows = [row for each in scene.constraints for row in rows_of(scene, each)]
+    limits = [VISIBLE * row.tolerance for row in rows]
+    shape = (len(states),)
+    return np.array(
+        [np.broadcast_to(c > limit, shape) for c, limit in zip(residuals, limits, strict=True)],
+        dtype=np.bool_,
+    ).reshape(len(rows), *shape)
+
+
+def _frame_numbers(scene: Scene) -> dict[str, int]:
+    """Numbers of the frames by their names in constraints."""
+    names = ["base", *(link.name for link in scene.links)]
+    tip = len(names) + (scene.wrist is not None)
+    numbers = {name: number for number, name in enumerate(names)}
+    return {**numbers, "tip": tip, "grasp": tip + 1, "target": tip + 2, "inertial": INERTIAL}
+
+
+Rows = tuple[int, ...]
+Numbers = dict[str, int]
+
+
+def _distance(
+    scene: Scene, each: Distance, rows: Rows, numbers: Numbers, length: float
+) -> Iterator[ConstraintShape]:
+    pairs = pairs_that_may_touch(scene, each)
+    for volumes, place in ((each.bodies, 0), (each.obstacles, 2)):
+        for index, volume in enumerate(volumes):
+            own = tuple(row for row, pair in zip(rows, pairs, strict=True) if pair[place] == index)
+            frame = numbers[volume.frame]
+            yield ConstraintShape(_capsule(volume), frame, frame, own)
+
+
+def _directions(
+    scene: Scene, each: KeepInDirection | KeepOutDirection, rows: Rows, numbers: Numbers, length: float
+) -> Iterator[ConstraintShape]:
+    """The cone about the body's axis, and the direction that stays in, or out of, it."""
+    frame, axis = numbers[each.axis.frame], each.axis.direction
+    yield ConstraintShape(_cone((0.0, 0.0, 0.0), axis, each.angle_deg, length), frame, frame, rows)
+    needle = [(0.0, 0.0), (0.0, _NEEDLE * length), (1.2 * length, _NEEDLE * length), (1.2 * length, 0.0)]
+    mesh = lathe(0, (0.0, 0.0, 0.0), each.direction.direction, needle, _COLOR, _SIDES)
+    yield ConstraintShape(mesh, frame, numbers[each.direction.frame], rows)
+
+
+def _line_of_sight(
+    scene: Scene, each: LineOfSight, rows: Rows, numbers: Numbers, length: float
+) -> Iterator[ConstraintShape]:
+    frame = numbers[each.camera.frame]
+    yield ConstraintShape(
+        _cone(each.camera.position, each.boresight, each.angle_deg, length), frame, frame, rows
+    )
+    seen = numbers[each.point.frame]
+    yield ConstraintShape(ball(0, each.point.position, _POINT * length, _COLOR), seen, seen, rows)
+
+
+def _approach_corridor(
+    scene: Scene, each: ApproachCorridor, rows: Rows, numbers: Numbers, length: float
+) -> Iterator[ConstraintShape]:
+    frame = numbers[each.apex.frame]
+    mesh = _cone(each.apex.position, each.direction, each.angle_deg, length, each.width)
+    yield ConstraintShape(mesh, frame, frame, rows)
+
+
+def _plume(
+    scene: Scene, each: Plume, rows: Rows, numbers: Numbers, length: float
+) -> Iterator[ConstraintShape]:
+    frame = numbers[each.keeps_clear.frame]
+    yield ConstraintShape(_capsule(each.keeps_clear), frame, frame, rows)
+
+
+_SHAPES: dict[type[Constraint], Callable[..., Iterator[ConstraintShape]]] = {
+    Distance: _distance,
+    KeepInDirection: _directions,
+    KeepOutDirection: _directions,
+    LineOfSight: _line_of_sight,
+    ApproachCorridor: _approach_corridor,
+    Plume: _plume,
+}
+
+
+def _cone(apex: Any, axis: Any, angle_deg: float, length: float, width: float = 0.0) -> Mesh:
+    """Cone with its half angle, open at its wide end; beyond 90 degrees it opens backward."""
+    angle = math.radians(angle_deg)
+    narrow = abs(math.sin(angle)) > 1.0 - 1e-3
+    height = (1e-3 if narrow else math.cos(angle)) * length
+    radius = width + math.sin(angle) * length
+    if height < 0.0:
+        axis, height = [-entry for entry in axis], -height
+    return lathe(0, apex, axis, [(0.0, width), (height, radius)], _COLOR, _SIDES)
+
+
+def _capsule(volume: Volume) -> Mesh:
+    """Sphere or capsule."""
+    start, end = (np.array(point) for point in volume.ends)
+    extent = float(np.linalg.norm(end - start))
+    if extent == 0.0:
+        return ball(0, start, volume.radius, _COLOR, _SIDES)
+    angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _SIDES // 2)
+    offsets = np.where(angles < 0.0, 0.0, extent)
+    heights, radii = offsets + volume.radius * np.sin(angles), volume.radius * np.cos(angles)
+    profile = list(zip(heights.tolist(), radii.tolist(), strict=True))
+    return lathe(0, start, end - start, profile, _COLOR, _SIDES, smooth=True)

@@ -1,0 +1,113 @@
+"""Constraints in pictures: shapes of the right size, red where the compiled residuals are violated."""
+
+import json
+import re
+from base64 import b64decode
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env import compile_scene, load_scene
+from dq_space_arm_env.scene.constraint_rows import path_rows
+from dq_space_arm_env.viewing.constraint_shapes import INERTIAL, VISIBLE, constraint_shapes, violations
+from dq_space_arm_env.viewing.replay import replay_page
+
+CAPSULE = {"frame": "link 2", "position": [0.1, 0, 0], "to": [0.1, 0.6, 0], "radius": 0.05}
+KINDS = [
+    {
+        "name": "far",
+        "kind": "distance",
+        "bodies": [CAPSULE],
+        "obstacles": [{"frame": "inertial", "radius": 6.0}],
+    },
+    {
+        "name": "sun",
+        "kind": "keep_out_direction",
+        "axis": {"frame": "base", "direction": [0, 0, 2]},
+        "direction": {"frame": "inertial", "direction": [1, 0, 0]},
+        "angle_deg": 120,
+    },
+    {
+        "name": "camera",
+        "kind": "line_of_sight",
+        "camera": {"frame": "base", "position": [0, 0, 0.5]},
+        "boresight": [0, -1, 0],
+        "angle_deg": 30,
+        "point": {"frame": "grasp"},
+    },
+    {
+        "name": "corridor",
+        "kind": "approach_corridor",
+        "apex": {"frame": "target"},
+        "direction": [-1, 0, 0],
+        "angle_deg": 25,
+        "width": 0.1,
+    },
+    {"name": "limits", "kind": "joint_limits", "rate": 1.0},
+    {"name": "gas", "kind": "plume", "angle_deg": 20, "keeps_clear": {"frame": "tip", "radius": 0.2}},
+]
+
+
+@pytest.fixture(scope="module")
+def constrained(paper):
+    return paper.replace(constraints=KINDS)
+
+
+def test_shapes_have_the_sizes_and_frames_of_the_constraints(constrained):
+    far, sun, camera, corridor, limits, gas = constraint_shapes(constrained, 2.0)
+    body, obstacle = (shape.mesh.corners.reshape(-1, 3) for shape in far)
+    axis = np.clip(body[:, 1], 0.0, 0.6)
+    offsets = np.linalg.norm(body - np.stack([np.full_like(axis, 0.1), axis, 0 * axis], axis=1), axis=1)
+    np.testing.assert_allclose(offsets, 0.05, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(obstacle, axis=1), 6.0, atol=1e-12)
+    assert (far[1].place, far[1].axes) == (INERTIAL, INERTIAL)
+    cone, needle = sun
+    rim = cone.mesh.corners.reshape(-1, 3)
+    rim = rim[np.linalg.norm(rim, axis=1) > 1e-9]
+    np.testing.assert_allclose(rim[:, 2] / np.linalg.norm(rim, axis=1), np.cos(np.radians(120)), atol=1e-12)
+    assert (needle.place, needle.axes) == (0, INERTIAL)
+    seen = camera[0].mesh.corners.reshape(-1, 3) - [0, 0, 0.5]
+    seen = seen[np.linalg.norm(seen, axis=1) > 1e-9]
+    np.testing.assert_allclose(-seen[:, 1] / np.linalg.norm(seen, axis=1), np.cos(np.radians(30)), atol=1e-12)
+    wall = corridor[0].mesh.corners.reshape(-1, 3)
+    radius = 0.1 - wall[:, 0] * np.tan(np.radians(25))
+    np.testing.assert_allclose(np.linalg.norm(wall[:, 1:], axis=1), radius, atol=1e-12)
+    assert limits == []
+    assert gas[0].rows == (10,)
+
+
+def test_what_is_red_is_what_the_compiled_residuals_call_violated(constrained, make_flight):
+    kernels, flight = compile_scene(constrained), make_flight(constrained)
+    found = violations(
+        constrained, flight.states, flight.controls, np.array(constrained.target.pose.dual_quaternion)
+    )
+    residuals = kernels.constraints(flight.states[:-1], flight.controls)
+    tolerance = [row.tolerance for row in path_rows(constrained)]
+    expected = residuals > VISIBLE * np.array(tolerance)
+    np.testing.assert_array_equal(found[:, :-1], expected.T)
+    assert expected.any(axis=0).sum() >= 3  # of several kinds
+
+
+def test_the_page_knows_shapes_and_violations(constrained, make_flight, paper):
+    flight = make_flight(constrained)
+    pages = [replay_page([flight], scene) for scene in (paper, constrained)]
+    text = r'<script type="application/json" id="replay-data">(.*?)</script>'
+    plain, data = (json.loads(re.search(text, page, re.DOTALL)[1]) for page in pages)
+    assert "constraints" not in plain
+    drawn, blob = data["constraints"], b64decode(data["blob"])
+
+    def table(place, rows):
+        return np.frombuffer(blob, place["type"], place["length"], place["start"]).reshape(rows, -1)
+
+    assert drawn["names"] == [each["name"] for each in KINDS]
+    assert drawn["owners"] == [0, 0, 1, 1, 2, 2, 3, 5]
+    assert drawn["frames"][:3] == [[2, 2], [-1, -1], [0, 0]]
+    shapes, broken = table(drawn["violated"][0], 8), table(drawn["broken"][0], 6)
+    np.testing.assert_array_equal(shapes, broken[drawn["owners"]])  # each of these has one row, or none
+    assert broken.any()
+    assert not broken.all()
+
+
+def test_scenes_that_ship_have_few_shapes():
+    counts = [len(group) for group in constraint_shapes(load_scene("keep-out"), 1.0)]
+    assert counts == [3, 2]
