@@ -19,16 +19,21 @@ from experts.ddp.solution import Solution
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 
-FORGETTING = 0.1
-"""Weight of the last innovation in mean and scatter."""
+FORGETTING = 0.02
+"""Weight of the last innovation in means."""
 CERTAIN = 4.0
-"""Mean of the innovations, in standard deviations of the mean, that counts as a mismatch."""
-NEGLIGIBLE = 1e-3
-"""Mean of the innovations that does not count, relative to what the inputs can do in a stage."""
+"""Mean of the innovations, or of their products with the last ones, that counts as a mismatch, in standard
+deviations of such means of independent ones."""
+NEGLIGIBLE = 1e-2
+"""Size of innovations that do not count, relative to what the inputs can do in a stage."""
+LARGEST = 10.0
+"""Largest innovation, relative to what the inputs can do to any velocity: more is a wild measurement."""
 LEAST_COUNT = 10
 """Innovations before which nothing is certain."""
 GATE = 5.0
-"""Innovations count up to so many standard deviations: a push is no property of the model."""
+"""An innovation of more standard deviations is an outlier: a push is no property of the model."""
+OUTLIER_GROWTH = 4.0
+"""Growth of the scatter after an outlier: where all are, the world has changed."""
 PASSES, CLOSE_ENOUGH = 4, 1e-3
 """Most linearizations of an update, and the change, in prior deviations, that ends it."""
 WANDERING = 1e-3
@@ -37,11 +42,11 @@ ROUGHNESS = 0.1
 """Share of the first innovations that counts as scatter: the filter's model is linear."""
 SETTLING = 0.05
 """Weight of the last residual in the scatter."""
-LEAST_SCATTER = 1e-7
-"""Least standard deviation of a velocity, rad/s, m/s."""
+LEAST_SCATTER, LARGEST_SCATTER = 1e-7, 1.0
+"""Least and largest standard deviation of a velocity, rad/s, m/s."""
 LEAST_SHARE = 0.1
 """Least mass or inertia, relative to the known one."""
-FIRST_WAIT, WAITS = 20, 2
+FIRST_WAIT, WAITS = 10, 2
 """Stages of measurements before the first new plan, and the growth of this number from plan to plan."""
 WORTH_A_PLAN = 0.05
 """Change of an estimate, in prior deviations, that asks for a new plan."""
@@ -58,15 +63,16 @@ class Doubtful(NamedTuple):
 def doubtful_numbers(maneuver: ArmProblem) -> list[Doubtful]:
     """Stiffness and damping of the joints, mass and inertia of the load; none that a phase changes.
 
-    A spring or damper may take the joint's largest torque at 1 rad or 1 rad/s, 1 N m without a motor; a mass
-    may be half as large again.
+    A spring may take the joint's largest torque at 1 rad, 1 N m without a motor; a damper a tenth at 1 rad/s;
+    a mass may be half as large again.
     """
     scene, layout, found = maneuver.scene, maneuver.kernels.layout, []
     limits = layout.control_limit[layout.control.joint_torque]
     torques = dict(zip(layout.actuated_joints, map(float, limits), strict=True))
     for index in range(layout.n_joints):
-        deviation = torques.get(index, 1.0)
-        found += [Doubtful(f"links.{index}.{part}", deviation, -np.inf) for part in ("stiffness", "damping")]
+        torque = torques.get(index, 1.0)
+        found.append(Doubtful(f"links.{index}.stiffness", torque, -np.inf))
+        found.append(Doubtful(f"links.{index}.damping", 0.1 * torque, -np.inf))
     for number in load_numbers(scene):
         least = (LEAST_SHARE - 1.0) * number.nominal if number.nominal > 0.0 else -np.inf
         found.append(Doubtful(number.name, 0.5 * abs(number.nominal), least))
@@ -84,31 +90,51 @@ def velocity_entries(maneuver: ArmProblem) -> tuple[slice, slice]:
 
 
 class MismatchDetector:
-    """Watches the innovations of an episode."""
+    """Watches the innovations of an episode.
+
+    Those of a wrong model last, or change slowly; those of noise change sign, and pushes come alone.
+    """
 
     def __init__(self, count: int) -> None:
         """Watch so many velocities."""
-        self._mean, self._square, self._seen = np.zeros(count), np.zeros(count), 0
+        self._mean, self._square, self._product, self._last, self._authority = np.zeros((5, count))
+        self._seen, self._is_outlier = 0, False
 
-    def observe(self, innovation: FloatArray) -> None:
-        """Take another innovation, shape (n_v,), rad/s, m/s."""
+    def observe(self, innovation: FloatArray, authority: FloatArray) -> None:
+        """Take another innovation, rad/s, m/s, and what the inputs can do in a stage, shape (n_v,) each."""
+        was_outlier = self._is_outlier
+        self._is_outlier = not np.all(np.abs(innovation) <= LARGEST * authority.max())
+        if self._is_outlier or was_outlier:
+            return
         self._mean += FORGETTING * (innovation - self._mean)
         self._square += FORGETTING * (innovation**2 - self._square)
+        self._product += FORGETTING * (innovation * self._last - self._product)
+        self._last, self._authority = innovation, authority
         self._seen += 1
 
-    def is_certain(self, authority: FloatArray) -> bool:
-        """Whether the model is wrong; the authority is what the inputs can do in a stage, shape (n_v,)."""
+    @property
+    def is_certain(self) -> bool:
+        """Whether the model is wrong: mean or autocorrelation is too large for independent innovations."""
         if self._seen < LEAST_COUNT:
             return False
-        # Standard deviation of an exponential mean of white noise; that of differences scatters less.
-        uncertainty = np.sqrt(self._square * FORGETTING / (2.0 - FORGETTING))
-        size = np.abs(self._mean)
-        return bool(((size > CERTAIN * uncertainty) & (size > NEGLIGIBLE * authority)).any())
+        kept = (1.0 - FORGETTING) ** self._seen
+        # Variance of such an exponential mean, relative to that of an innovation.
+        share = FORGETTING / (2.0 - FORGETTING) * (1.0 + kept) / (1.0 - kept)
+        size, square, variance = np.abs(self._mean), self._square, self._variance
+        stands_out = size > CERTAIN * np.sqrt(variance * (1.0 - kept) * share)
+        lasts = self._product > CERTAIN * np.sqrt(share) * square
+        counts = square > (NEGLIGIBLE * self._authority) ** 2 * (1.0 - kept)
+        return bool(((stands_out | lasts) & counts).any())
+
+    @property
+    def _variance(self) -> FloatArray:
+        """Half the mean square of the innovations' differences, whatever their slow changes."""
+        return np.maximum(self._square - self._product, 0.0)
 
     @property
     def variance(self) -> FloatArray:
-        """Scatter about the mean, and a share of the mean itself, squared, shape (n_v,)."""
-        return self._square - self._mean**2 + (ROUGHNESS * self._mean) ** 2
+        """Scatter of the innovations, and a share of their size, squared, shape (n_v,)."""
+        return self._variance + ROUGHNESS**2 * self._square
 
 
 class Identification:
@@ -142,7 +168,7 @@ class Identification:
         self._planned = self.estimates
         self._covariance = np.diag(self._deviations**2)
         self._variance = np.maximum(variance, LEAST_SCATTER**2)
-        self._waited, self._wait = 0, FIRST_WAIT
+        self._waited, self._wait, self._is_outlier = 0, FIRST_WAIT, False
         self.tell()
 
     def tell(self) -> None:
@@ -159,18 +185,24 @@ class Identification:
         return replace(solution, parameters=rows)
 
     def update(self, state: FloatArray, control: FloatArray, measured: FloatArray, stage: int) -> None:
-        """Learn from a stage: a measured state (n_x,), a control (n_u,), and the state measured next."""
-        kernels, row = self.problem.kernels, self.problem.parameters.rows[stage].copy()
+        """Learn from a stage: a measured state (n_x,), a control (n_u,), and the state measured next.
+
+        Nothing is learnt from an outlier, nor from what follows it.
+        """
+        row = self.problem.parameters.rows[stage].copy()
         known, prior, noise = row[self._estimated] - self.estimates, self._covariance, self._variance
         found = self.estimates
-        for _ in range(PASSES):
-            landed = kernels.step(state, control, integrator=self.problem.integrator, p=row)
-            by_parameters = kernels.linearize_parameters(state, control, p=row)
-            sensitivity = by_parameters[self._rates][:, self._estimated]  # S
+        for iteration in range(PASSES):
+            landed, sensitivity = self._predict(state, control, row)  # x+, S
             spread = sensitivity @ prior @ sensitivity.T
-            limit = GATE * np.sqrt(np.diag(spread) + noise)
-            innovation = np.clip((measured - landed)[self._stored], -limit, limit)
-            gain = np.linalg.solve(spread + np.diag(noise), sensitivity @ prior).T  # K = P S' (S P S' + R)^-1
+            innovation = (measured - landed)[self._stored]
+            if iteration == 0:
+                was_outlier = self._is_outlier
+                self._is_outlier = not np.all(np.abs(innovation) <= GATE * np.sqrt(np.diag(spread) + noise))
+                if self._is_outlier or was_outlier:
+                    self._variance = np.minimum(OUTLIER_GROWTH * noise, LARGEST_SCATTER**2)
+                    return
+            gain = np.linalg.solve(spread + np.diag(noise), sensitivity @ prior).T  # P S' (S P S' + R)^-1
             better = self.estimates + gain @ (innovation + sensitivity @ (found - self.estimates))
             better = np.maximum(better, self._least)
             change, found = better - found, better
@@ -184,6 +216,14 @@ class Identification:
         self._variance = np.maximum(noise + SETTLING * (residual**2 - noise), LEAST_SCATTER**2)
         self._waited += 1
         self.tell()
+
+    def _predict(
+        self, state: FloatArray, control: FloatArray, row: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Next state with given parameters, and the derivatives of its velocities by the estimated ones."""
+        kernels = self.problem.kernels
+        by_parameters = kernels.linearize_parameters(state, control, p=row)
+        return kernels.step(state, control, p=row), by_parameters[self._rates][:, self._estimated]
 
     @property
     def asks_for_plan(self) -> bool:
@@ -236,9 +276,9 @@ class ModelWatch:
         if self.identification is not None:
             self.identification.update(before, control, measured, stage)
             return None
-        self._detector.observe((measured - landed)[self._stored])
         authority = np.abs(work.derivatives.B[0][self._rates]) @ work.bounds[1][0]
-        if not self._detector.is_certain(authority):
+        self._detector.observe((measured - landed)[self._stored], authority)
+        if not self._detector.is_certain:
             return None
         if self._prepared is None:
             self._prepared = Identification(self._maneuver)
