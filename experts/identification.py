@@ -265,6 +265,7 @@ class ModelWatch:
         self._stored, self._rates = velocity_entries(self._maneuver)
         self._detector = MismatchDetector(self._stored.stop - self._stored.start)
 
+    @np.errstate(over="ignore", invalid="ignore")  # wild measurements are outliers
     def learn(
         self, work: ShootingWorkspace, control: FloatArray, measured: FloatArray, stage: int
     ) -> Identification | None:

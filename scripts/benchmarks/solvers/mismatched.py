@@ -15,7 +15,7 @@ import numpy as np
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
 from experts.guesses.guided import GuidedDDP
-from experts.identification import Identification
+from experts.identification import Identification, doubtful_numbers
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from experts.receding_horizon import RecedingHorizonExpert
@@ -57,6 +57,8 @@ def measure_mismatches(effort: Effort) -> Iterator[Row]:
     """Fly each scene in its worlds."""
     for name in effort.scenes or SCENES:
         maneuver = ArmProblem(load_scene(name))
+        if not doubtful_numbers(maneuver):
+            continue
         world = Identification(maneuver).problem
         experts = {each: RecedingHorizonExpert(maneuver.scene, identify=each) for each in (False, True)}
         subject = _Subject(maneuver, world, GuidedDDP(world), experts)
