@@ -12,6 +12,7 @@ steps, with a share of them kept free for disturbances.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self, cast
@@ -28,6 +29,7 @@ from experts.ddp.augmented_lagrangian import AugmentedLagrangian
 from experts.ddp.shooting import ShootingWorkspace, line_search
 from experts.ddp.solution import Policy, Solution, StopReason
 from experts.guesses.guided import GuidedDDP
+from experts.identification import ModelWatch
 from experts.problems.arm_problem import ArmProblem, WindowProblem, as_problem
 from experts.problems.shooting_problem import FloatArray, check_array, check_at_least
 
@@ -53,13 +55,22 @@ class ManeuverPlan:
     Vxx: FloatArray
 
     @classmethod
-    def make(cls, planner: GuidedDDP, state: FloatArray, stage: int, known: Sequence[Solution] = ()) -> Self:
+    def make(
+        cls,
+        planner: GuidedDDP,
+        state: FloatArray,
+        stage: int,
+        known: Sequence[Solution] = (),
+        model: ArmProblem | None = None,
+    ) -> Self:
         """Plan from a state at a stage; after the first one, policies of known solutions are the guesses.
+
+        The model is the planner's problem, or after the first stage another one.
 
         Raises:
             RuntimeError: If the maneuver cannot be simulated or differentiated from this state.
         """
-        maneuver = cast(ArmProblem, planner.problem)
+        maneuver = model or cast(ArmProblem, planner.problem)
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         problem.begin_at(stage)
         library = [_last_stages(solution, problem.horizon) for solution in known]
@@ -123,6 +134,11 @@ class RecedingHorizonExpert:
     the stage takes the place of the measurement, and `dropouts` counts it. The next good measurement corrects
     the prediction.
 
+    Where joints have springs or dampers that the scene does not know, or the load has another mass, the
+    measured velocities contradict the predicted ones for long. The expert then estimates these numbers and
+    plans the rest of the episode anew, a few times (`experts.identification`). Where measurements agree with
+    the scene, nothing of this happens.
+
     The call that begins an episode plans it first, which takes a fraction of a second; so does `reset` with a
     state. What varies in the scene, such as the target, has its nominal value until `reset` or `inform` says
     otherwise: `expert.reset(observation, parameters=env.unwrapped.parameters)`.
@@ -136,15 +152,25 @@ class RecedingHorizonExpert:
         fallbacks: Actions of this episode from the plan's feedback policy u = clip(u_k + K_k (x (-) x_k)), or
             from u_k alone where that is not finite, because no finite rollout started at the state.
         dropouts: Actions of this episode from a predicted state, because the measurement was none.
+        replans: Plans of this episode that better estimates have asked for.
     """
 
-    def __init__(self, scene: Scene | str | Path, horizon: int = 100, iterations: int = 1) -> None:
+    def __init__(
+        self,
+        scene: Scene | str | Path,
+        horizon: int = 100,
+        iterations: int = 1,
+        *,
+        identify: bool = True,
+    ) -> None:
         """Prepare the expert; planning comes later.
 
         Args:
             scene: A scene, the name of a shipped one, or a path to a YAML file.
             horizon: Stages to optimize at every step, or the rest of the episode if that is shorter.
             iterations: Iterations per step; 0 only applies the plan's feedback.
+            identify: Whether to estimate springs, dampers and the load where measurements contradict the
+                scene. The first time that this happens compiles the scene with these numbers as parameters.
 
         Raises:
             SceneError: If the scene cannot be loaded.
@@ -161,8 +187,10 @@ class RecedingHorizonExpert:
         self.horizon, self.iterations = horizon, iterations
         self.plan: ManeuverPlan | None = None
         self.control: FloatArray = np.zeros(self.maneuver.n_controls)
-        self.fallbacks = self.dropouts = 0
+        self.fallbacks = self.dropouts = self.replans = 0
         self._next_stage, self._informed = 0, False
+        self._observation_size = n_observations(self.maneuver.scene)
+        self._watch, self._measured = ModelWatch(self.maneuver, corrects=identify and iterations > 0), False
         self._planner: GuidedDDP | None = None
         self._work: ShootingWorkspace | None = None
         self._model_state = np.zeros((1, self.maneuver.n_states))
@@ -192,10 +220,16 @@ class RecedingHorizonExpert:
             with self.maneuver.parameters.being(rows):
                 start = self._state_of(given, stage), stage
         self.maneuver.parameters.set(rows)
-        self.plan, self._work, self._next_stage, self.fallbacks, self.dropouts = None, None, 0, 0, 0
-        self._informed = False
+        self._forget(0)
+        self.plan = None
         if start is not None:
             self._begin(*start)
+
+    @property
+    def estimates(self) -> dict[str, float]:
+        """Numbers of the scene as this episode shows them, by their paths; empty while it agrees."""
+        found = self._watch.identification
+        return {} if found is None else found.values
 
     def inform(self, parameters: ArrayLike) -> None:
         """Take other parameters in mid-flight, a new target or mass; the next call plans the rest anew.
@@ -237,8 +271,12 @@ class RecedingHorizonExpert:
             state, dropped = self._predicted(stage), True
         if begins:
             self._begin(state, stage)
-        elif self._informed:
-            self._plan_anew(state, stage)
+        else:
+            both_measured = self._measured and not dropped and stage == self._next_stage
+            if self._watch.corrects and both_measured and self._work is not None:
+                self._learn(state, stage)
+            if self._informed:
+                self._plan_anew(state, stage)
         assert self.plan is not None
         work = self._window(self.plan, stage)
         if self._optimize(work, state, self.plan.solution.cost):
@@ -247,13 +285,13 @@ class RecedingHorizonExpert:
             self._work, self.control = None, _planned_control(self.plan, state, stage)
             self.fallbacks += 1
         self.dropouts += dropped
-        self._next_stage = stage + 1
+        self._next_stage, self._measured = stage + 1, not dropped
         limits = self.maneuver.control_upper
         return self.control / (limits if limits.ndim == 1 else limits[stage])
 
     def _checked(self, observation_or_state: ArrayLike) -> FloatArray:
         """Return an observation or a state, or raise for another shape; its numbers may be wrong."""
-        n_states, size = self.maneuver.n_states, n_observations(self.maneuver.scene)
+        n_states, size = self.maneuver.n_states, self._observation_size
         given = real_array("observation_or_state", observation_or_state, np.float64)
         if given.shape not in ((n_states,), (size,)):
             raise ValueError(
@@ -325,14 +363,39 @@ class RecedingHorizonExpert:
             with self.maneuver.parameters.being(None):
                 known = self._planner.library
         self.plan = ManeuverPlan.make(self._planner, state, stage, known)
-        self._work, self._next_stage, self.fallbacks, self.dropouts = None, stage, 0, 0
-        self._informed = False
+        self._forget(stage)
+
+    def _forget(self, stage: int) -> None:
+        """Begin an episode at a stage with nothing but the scene."""
+        self._work, self._next_stage, self._informed = None, stage, False
+        self.fallbacks = self.dropouts = self.replans = 0
+        self._watch.begin()
+
+    def _learn(self, state: FloatArray, stage: int) -> None:
+        """Correct the model where measurements contradict its predictions for long."""
+        assert self._work is not None
+        assert self.plan is not None
+        begun = self._watch.learn(self._work, self.control, state, stage - 1)
+        if begun is not None:
+            needs_success = self.plan.maneuver is not self.maneuver
+            maneuver = begun.problem.constrained(RESERVE) if needs_success else begun.problem
+            solution = begun.converted(self.plan.solution, self.plan.first_stage)
+            self.plan = replace(self.plan, solution=solution, maneuver=maneuver)
+        found = self._watch.identification
+        if found is not None and found.asks_for_plan:
+            found.note_plan()
+            with suppress(RuntimeError):  # the present plan serves on
+                self._plan_anew(state, stage)
+                self.replans += 1
 
     def _plan_anew(self, state: FloatArray, stage: int) -> None:
         """Plan the rest of the episode with other parameters; the present plan's policy is a guess."""
         assert self._planner is not None
         assert self.plan is not None
-        self.plan = ManeuverPlan.make(self._planner, state, stage, [self.plan.solution])
+        if self._watch.identification is not None:
+            self._watch.identification.tell()
+        known = [self.plan.solution]
+        self.plan = ManeuverPlan.make(self._planner, state, stage, known, self._watch.model)
         self._work, self._informed = None, False
 
     def _window(self, plan: ManeuverPlan, stage: int) -> ShootingWorkspace:
@@ -340,6 +403,8 @@ class RecedingHorizonExpert:
 
         Its reference is the last solution, if that is one stage old, then the plan beyond its end.
         """
+        if plan.maneuver is not self._watch.model:  # it has parameters of its own
+            plan.maneuver.parameters.rows[:] = self._watch.model.parameters.rows
         last = self._work if stage == self._next_stage else None
         horizon = min(self.horizon, self.maneuver.horizon - stage)
         end = stage + horizon
@@ -370,7 +435,8 @@ class RecedingHorizonExpert:
         if self._work is not None:
             problem = self._work.problem
             assert isinstance(problem, WindowProblem)
-            if (problem.horizon, problem.ends_early) == (horizon, ends_early):
+            same_maneuver = problem.maneuver is maneuver
+            if same_maneuver and (problem.horizon, problem.ends_early) == (horizon, ends_early):
                 return self._work
         model = (self._model_state, self._model_gradient, self._model_hessian) if ends_early else ()
         return ShootingWorkspace(WindowProblem(maneuver, horizon, model), second_order=False)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.scene import Scene, StateLayout
-from dq_space_arm_env.scene.parameters import body_numbers, is_part
+from dq_space_arm_env.scene.parameters import Number, body_numbers, is_part
 
 FloatArray = NDArray[np.float64]
 
@@ -101,6 +101,14 @@ def load_place(scene: Scene) -> str | None:
     return f"links.{len(scene.links) - 1}" if scene.links else None
 
 
+def load_numbers(scene: Scene) -> list[Number]:
+    """Mass and inertia of that body, without the entries that are zero; none for a base alone."""
+    place = load_place(scene)
+    found = () if place is None else body_numbers(scene, place)
+    parts = f"{place}.mass", f"{place}.inertia"
+    return [each for each in found if each.nominal and any(is_part(each.name, part) for part in parts)]
+
+
 def with_loads(
     scene: Scene, factors: ArrayLike, parameters: ArrayLike | None = None
 ) -> tuple[Scene, FloatArray]:
@@ -120,13 +128,8 @@ def with_loads(
     Raises:
         ValueError: If there is no mass to multiply.
     """
-    factors, place = np.asarray(factors, dtype=np.float64), load_place(scene)
-    numbers = () if place is None else body_numbers(scene, place)
-    names = [
-        number.name
-        for number in numbers
-        if number.nominal and any(is_part(number.name, f"{place}.{part}") for part in ("mass", "inertia"))
-    ]
+    factors = np.asarray(factors, dtype=np.float64)
+    names = [number.name for number in load_numbers(scene)]
     if not names and (factors != 1.0).any():
         raise ValueError(
             f"scene {scene.name!r} has neither payload nor links: mass_factors should be 1 alone"

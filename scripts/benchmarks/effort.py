@@ -55,6 +55,7 @@ class Effort:
     starts: int = 40  # random starts of each scene
     horizons: tuple[int, ...] = (25, 50, 100, 200)  # stages
     episodes: int = 1  # of each random disturbance
+    flown_starts: int = 20  # random starts from which each mismatch is flown
     other_masses: bool = True  # each is a scene to compile
     papers_states: bool = True  # the paper's formulation: half a minute to compile
     peers: bool = True  # other solvers, those that are installed
@@ -108,6 +109,7 @@ FULL = Effort(
     compared_starts=4,
     starts=200,
     episodes=5,
+    flown_starts=100,
     slow_peers=True,
 )
 QUICK = Effort(

@@ -9,12 +9,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dq_space_arm_env import Scene, load_scene
 from experts.problems.shooting_problem import StageParameters
 
 Array = NDArray[np.float64]
 NATIVE_SIGNATURE = ctypes.CFUNCTYPE(
     None, ctypes.c_int64, ctypes.c_int64, ctypes.POINTER(ctypes.POINTER(ctypes.c_double))
 )
+
+
+@pytest.fixture(scope="session")
+def varying_scene() -> Scene:
+    """A maneuver of 15 s; target, two links, and springs and dampers of the joints are inputs."""
+    joints = [f"links.{index}.{part}" for index in range(3) for part in ("stiffness", "damping")]
+    loads = [f"links.{index}.{part}" for index in (1, 2) for part in ("mass", "inertia")]
+    varying = ["target.pose", *loads, *joints]
+    return load_scene("planar").replace(simulation={"dt": 0.1, "steps": 150}, parameters=varying)
 
 
 class PythonKernel:

@@ -5,6 +5,7 @@ iterations      what an iteration costs, whole and in pieces
 accuracy        how soon solvers come close to the best known cost, from the same start
 random_starts   how often the expert converges, succeeds, and finds the best known minimum
 receding        the receding-horizon expert under disturbances
+mismatched      the receding-horizon expert in worlds with springs or loads that its scene does not have
 tracking        the tip's error behind a target that moves, beside the paper's formulation
 own_problems    problems of one's own: cart-pole and planar quadrotor, beside Crocoddyl
 constrained     random starts of scenes with constraints, beside IPOPT and fatrop
@@ -27,6 +28,7 @@ from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, note, tim
 from scripts.benchmarks.solvers.accuracy import NOMINAL_START, compare_solvers, contenders
 from scripts.benchmarks.solvers.constrained import measure_constrained
 from scripts.benchmarks.solvers.iterations import measure_iterations
+from scripts.benchmarks.solvers.mismatched import measure_mismatches
 from scripts.benchmarks.solvers.own_problems import measure_own_problems
 from scripts.benchmarks.solvers.random_starts import draw_starts, measure_starts
 from scripts.benchmarks.solvers.receding import measure_flights
@@ -34,11 +36,12 @@ from scripts.benchmarks.solvers.runs import GAPS, Search, uninterrupted
 from scripts.benchmarks.solvers.tracking import measure_tracking
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
 
-ITERATIONS, ACCURACY, STARTS, HORIZON, TRACKING, OWN, CONSTRAINED = PARTS = (
+ITERATIONS, ACCURACY, STARTS, HORIZON, MISMATCH, TRACKING, OWN, CONSTRAINED = PARTS = (
     "iterations",
     "accuracy",
     "starts",
     "horizon",
+    "mismatch",
     "tracking",
     "own",
     "constrained",
@@ -79,6 +82,8 @@ def measure(effort: Effort) -> Iterator[Row]:
                 yield from measure_starts(problem, guided, seconds, effort)
         if HORIZON in parts:
             yield from measure_flights(ArmProblem(scene), effort)
+    if MISMATCH in parts and effort.other_masses:
+        yield from measure_mismatches(effort)
     if TRACKING in parts:
         yield from measure_tracking()
     if OWN in parts:
@@ -201,6 +206,26 @@ BENCHMARK = Benchmark(
                 Column("open_loop_cost", "plan's\ncontrols", ".6g"),
                 Column("attitude_error_deg", "error\ndeg"),
                 Column("position_error_m", "error\nm"),
+            ),
+            by=("scene",),
+        ),
+        Table(
+            "mismatches",
+            "Scene {scene}: receding horizon in worlds that its scene does not know\nunaware, and estimating "
+            "what differs; over the starts from which the informed optimum succeeds",
+            (
+                "mismatch",
+                "starts",
+                Column("informed", "informed\noptimum", ".0%"),
+                Column("unaware", "success:\nunaware", ".0%"),
+                Column("identified", "esti-\nmating", ".0%"),
+                Column("unaware_above", "cost above:\nunaware", ".1%"),
+                Column("identified_above", "esti-\nmating", ".1%"),
+                Column("unaware_violated", "violated:\nunaware", ".1%"),
+                Column("identified_violated", "esti-\nmating", ".1%"),
+                Column("replans", "new\nplans", ".1f"),
+                time_column("unaware_ms", "ms:\nunaware"),
+                time_column("identified_ms", "esti-\nmating"),
             ),
             by=("scene",),
         ),
