@@ -16,29 +16,12 @@ SMOOTH_ACTIVATIONS = ("tanh", "silu")  # differentiable everywhere, as matching 
 WholeNumber = Annotated[StrictInt, Field(ge=0)]
 
 
-class InputWeights(Model):
-    """Weights of the errors of actuators, in units of the spread of their actions."""
-
-    base_force: Positive = Field(default=1.0, description="relative to the others")
-    base_torque: Positive = Field(default=1.0, description="relative to the others")
-    joint_torque: Positive = Field(default=1.0, description="relative to the others")
-    wrist_rate: Positive = Field(default=1.0, description="relative to the others")
-
-
 class ObjectiveWeights(Model):
     """Weights of the training loss, relative to the error of actions."""
 
     gain_weight: NonNegative = Field(
         default=0.3,
         description="weight of the error between the policy's derivative and the feedback gain; 0: none",
-    )
-    inputs: InputWeights = Field(
-        default_factory=InputWeights, description="weights of the actuators in all errors"
-    )
-    relative_gains: StrictBool = Field(
-        default=False,
-        description="whether errors of gains above their mean size count relative to them, in directions "
-        "with rates up to a hundred times the spread's",
     )
     augmentation_weight: NonNegative = Field(
         default=0.0,
@@ -72,15 +55,10 @@ class Cloning(Model):
     name: Literal["cloning"] = "cloning"
     objective: ObjectiveWeights = Field(default_factory=ObjectiveWeights, description="the loss")
     optimization: Optimization = Field(default_factory=Optimization, description="the optimizer")
-    clock: WholeNumber = Field(
-        default=0,
-        description="units of the first layer that begin as steps at times left, ever closer to the end, for "
-        "gains that grow toward a terminal cost",
-    )
-    late_share: NonNegative = Field(
-        default=0.0,
-        description="share of time steps in a batch, less than 1, that are equally many at each scale of the "
-        "time left; the others are spread evenly",
+    stationary: StrictBool = Field(
+        default=False,
+        description="whether the policy does without the time left: it then goes on to the end as in the middle "
+        "of an episode, where an expert with a finite horizon lets go",
     )
     validation_share: NonNegative = Field(
         default=0.05,
@@ -94,8 +72,6 @@ class Cloning(Model):
     def _problems(self) -> Iterator[Problem]:
         if self.validation_share >= 1.0:
             yield Problem(("validation_share",), self.validation_share, "must be less than 1")
-        if self.late_share >= 1.0:
-            yield Problem(("late_share",), self.late_share, "must be less than 1")
 
 
 class Dagger(Model):
@@ -153,10 +129,6 @@ class ImitationConfiguration(AgentConfiguration):
         return self.algorithm if isinstance(self.algorithm, Cloning) else self.algorithm.cloning
 
     def _problems(self) -> Iterator[Problem]:
-        first = (*self.network.hidden, 0)[0]
-        if self.cloning.clock > first:
-            sentence = f"must be at most {first}, the units of the first layer"
-            yield Problem(("algorithm", "clock"), self.cloning.clock, sentence)
         if self.network.activation not in SMOOTH_ACTIVATIONS:
             yield Problem(
                 ("network", "activation"),

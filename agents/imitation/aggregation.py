@@ -25,7 +25,7 @@ from agents.configuration.imitation import Dagger
 from agents.imitation.cloning import Cloned, Making, fingerprint
 from agents.imitation.labels import Solver, label_by_gains
 from agents.imitation.objective import Objective
-from agents.imitation.samples import COLUMNS, Corrections, Mixture, Statistics, with_late
+from agents.imitation.samples import COLUMNS, Corrections, Mixture, Statistics
 from agents.imitation.trainer import CheckpointError, Progress, Record, Spent, Trainer, Watch, torch_threads
 from agents.policies.exported import ExportedPolicy
 from agents.policies.network import PolicyNetwork
@@ -102,7 +102,6 @@ def aggregate(
     facts = {**cloned.facts, "aggregation": {**chosen, "starts": fingerprint(starts)}}
     network = copy.deepcopy(cloned.network)
     statistics = Statistics.of(demonstrations)
-    source = with_late(demonstrations, settings.cloning.late_share)
     expert = _Expert(starts, settings, making.seed, progress)
     environment_steps = expert.episodes * starts.scene.simulation.steps  # per round
     rounds: list[Round] = []
@@ -114,7 +113,7 @@ def aggregate(
         done, found = _corrections(place, identity, partial(expert.correct, network, number))
         corrections.append(found)
         rounds.append(done._replace(corrections=sum(len(part) for part in corrections)))
-        mixture = Mixture(source, Corrections.joined(corrections), settings.share)
+        mixture = Mixture(demonstrations, Corrections.joined(corrections), settings.share)
         with torch_threads(making.threads):
             trainer = Trainer(
                 network,
@@ -167,10 +166,7 @@ class _Expert:
         else:
             tell = partial(self._tell, number, count)
             corrections, solves = self._solver.label(starts, visits, settings.solves, rng, tell)
-        if settings.cloning.late_share:
-            corrections = corrections.only_late(starts.scene)
-        else:
-            corrections = corrections.thinned(settings.every)
+        corrections = corrections.thinned(settings.every)
         success = float(visits.is_success.mean())
         seconds = perf_counter() - started
         return Round(number, success, gap, len(corrections), solves, seconds), corrections

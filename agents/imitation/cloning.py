@@ -14,7 +14,7 @@ from agents.configuration.imitation import Cloning
 from agents.configuration.schema import Network
 from agents.demonstrations import check_scene
 from agents.imitation.objective import Objective
-from agents.imitation.samples import Statistics, with_late
+from agents.imitation.samples import Statistics
 from agents.imitation.trainer import Progress, Record, Trainer, Watch, torch_threads
 from agents.policies.exported import ExportedPolicy
 from agents.policies.network import PolicyNetwork
@@ -81,7 +81,8 @@ def clone(
     with torch_threads(making.threads):
         statistics = Statistics.of(training)
         network = new_network(statistics, making)
-        set_clock(network, settings.clock)
+        if settings.stationary:
+            network.observation_scale[-1] = 0.0  # of the time left
         trainer = Trainer(
             network,
             Objective(demonstrations.kernels, statistics, settings.objective),
@@ -91,14 +92,7 @@ def clone(
             part="cloning",
         )
         place = None if folder is None else Path(folder)
-        trainer.train(
-            with_late(training, settings.late_share),
-            validation and with_late(validation, settings.late_share),
-            place,
-            facts["training"],
-            progress=progress,
-            watch=watch,
-        )
+        trainer.train(training, validation, place, facts["training"], progress=progress, watch=watch)
     return Cloned(network, trainer.history, facts)
 
 
@@ -115,18 +109,6 @@ def new_network(statistics: Statistics, making: Making) -> PolicyNetwork:
         statistics.action_deviation,
     )
     return network
-
-
-def set_clock(network: PolicyNetwork, units: int) -> None:
-    """Have some units of the first layer tell times left, from the whole episode to a thousandth of it."""
-    scale, mean = float(network.observation_scale[-1]), float(network.observation_mean[-1])
-    times = torch.logspace(0.0, -3.0, units, dtype=torch.float64) * 2.0 * mean
-    first = network.layers[0]
-    assert isinstance(first, torch.nn.Linear)
-    with torch.no_grad():  # tanh((time left - t) / t)
-        first.weight[:units] = 0.0
-        first.weight[:units, -1] = 1.0 / (times * scale)
-        first.bias[:units] = mean / times - 1.0
 
 
 def _facts(demonstrations: Demonstrations, settings: Cloning, making: Making, scene: Scene) -> dict[str, Any]:

@@ -27,7 +27,6 @@ from experts.demonstrations.reading import Batch
 from experts.demonstrations.shard import PARAMETERS
 from experts.problems.shooting_problem import FloatArray
 
-FASTER = 100.0  # at most, times the rates of the spread
 STEP = 1e-5  # of central differences, relative to the direction: truncation and rounding errors near 1e-10
 
 
@@ -46,11 +45,7 @@ class Objective:
 
     def __init__(self, kernels: Kernels, statistics: Statistics, weights: ObjectiveWeights) -> None:
         self._kernels, self._weights, self._spread = kernels, weights, statistics.spread
-        self._is_rate = np.char.endswith(kernels.layout.tangent.units, "/s")
-        importance = np.ones(kernels.n_u, dtype=np.float32)
-        for name, weight in weights.inputs:
-            importance[getattr(kernels.layout.control, name)] = weight
-        self._importance = torch.from_numpy(importance / importance.mean())
+        self._action_deviation = statistics.action_deviation
         self._gain_size = torch.from_numpy(statistics.gain_size.astype(np.float32))
 
     @property
@@ -67,65 +62,41 @@ class Objective:
         none = torch.zeros(())
         gain, augmentation = none, none
         if weights.gain_weight:
-            scale = self._scale(len(arrays["states"]), rng)
-            directions = rng.standard_normal(scale.shape) * scale
+            directions = self._directions(arrays["states"], rng)
             seen = arrays["states"], arrays["observations"]
             change = observation_change(self._kernels, *seen, directions, arrays.get(PARAMETERS))
             tangent = torch.from_numpy((change * network.observation_scale.numpy()).astype(np.float32))
             outputs, slopes = network.forward_with_tangent(normalized, tangent)
-            gain = self._gain_error(network, slopes, batch, directions, scale)
+            gain = self._gain_error(network, slopes, batch, directions)
         else:
             outputs = network(normalized)
-        action = self._action_error(network, outputs, arrays["actions"])
+        action = _action_error(network, outputs, arrays["actions"])
         if weights.augmentation_weight:
             augmentation = self._augmentation_error(network, batch, rng)
         total = action + weights.gain_weight * gain + weights.augmentation_weight * augmentation
         return Losses(total, action, gain, augmentation)
 
-    def _scale(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Standard deviations of directions, shape (B, n_t)."""
-        if not self._weights.relative_gains:
-            return np.broadcast_to(self._spread, (count, len(self._spread)))
-        # The less time is left, the larger are the rates that errors of the pose are made up for with.
-        faster = FASTER ** rng.uniform(size=(count, 1))
-        return np.where(self._is_rate, faster * self._spread, self._spread)
+    def _directions(self, states: FloatArray, rng: np.random.Generator) -> FloatArray:
+        return rng.standard_normal((len(states), len(self._spread))) * self._spread
 
     def _gain_error(
-        self,
-        network: PolicyNetwork,
-        slopes: Tensor,
-        batch: Batch,
-        directions: FloatArray,
-        scale: FloatArray,
+        self, network: PolicyNetwork, slopes: Tensor, batch: Batch, directions: FloatArray
     ) -> Tensor:
         """Error of d/de pi(o(x (+) e d)) - G d, each input relative to the size of its gains."""
         wanted = torch.from_numpy(_times(batch.arrays["feedback_gains"], directions).astype(np.float32))
         free = torch.from_numpy(np.abs(batch.arrays["actions"]) < 1.0)
-        size = self._gain_size
-        if self._weights.relative_gains:
-            own = np.sqrt(((batch.arrays["feedback_gains"] * scale[:, None]) ** 2).sum(axis=2))
-            size = torch.maximum(size, torch.from_numpy(own.astype(np.float32)))
-        errors = (slopes * network.action_scale.float() - wanted) / size
-        return (self._importance * torch.where(free, errors, 0.0).square()).mean()
+        errors = (slopes * network.action_scale.float() - wanted) / self._gain_size
+        return torch.where(free, errors, 0.0).square().mean()
 
     def _augmentation_error(self, network: PolicyNetwork, batch: Batch, rng: np.random.Generator) -> Tensor:
         """Error of actions at x (+) d, against clip(a + G d)."""
         arrays = batch.arrays
-        directions = rng.standard_normal((len(arrays["states"]), len(self._spread))) * self._spread
-        directions *= self._weights.augmentation_scale
+        directions = self._weights.augmentation_scale * self._directions(arrays["states"], rng)
         states = self._kernels.retract(arrays["states"], directions)
         time_left, parameters = arrays["observations"][:, -1:], arrays.get(PARAMETERS)
         observations = self._kernels.observation(states, time_left, p=parameters)[0]
         wanted = np.clip(arrays["actions"] + _times(arrays["feedback_gains"], directions), -1.0, 1.0)
-        return self._action_error(network, network(network.normalized(observations)), wanted)
-
-    def _action_error(self, network: PolicyNetwork, outputs: Tensor, actions: FloatArray) -> Tensor:
-        """Error of actions; one that is at a limit may be wanted beyond it, which clipping undoes."""
-        wanted = torch.from_numpy(actions)
-        errors = network.action_mean + network.action_scale * outputs - wanted
-        beyond = ((wanted >= 1.0) & (errors > 0.0)) | ((wanted <= -1.0) & (errors < 0.0))
-        squares = (torch.where(beyond, 0.0, errors) / network.action_scale).float().square()
-        return (self._importance * squares).mean()
+        return _action_error(network, network(network.normalized(observations)), wanted)
 
 
 def observation_change(
@@ -147,3 +118,11 @@ def observation_change(
 def _times(gains: NDArray[np.float32], directions: FloatArray) -> FloatArray:
     """G d, shape (B, n_u)."""
     return np.asarray(np.matmul(gains, directions[:, :, None].astype(np.float32))[:, :, 0])
+
+
+def _action_error(network: PolicyNetwork, outputs: Tensor, actions: FloatArray) -> Tensor:
+    """Error of actions; one that is at a limit may be wanted beyond it, which clipping undoes."""
+    wanted = torch.from_numpy(actions)
+    errors = network.action_mean + network.action_scale * outputs - wanted
+    beyond = ((wanted >= 1.0) & (errors > 0.0)) | ((wanted <= -1.0) & (errors < 0.0))
+    return (torch.where(beyond, 0.0, errors) / network.action_scale).float().square().mean()

@@ -7,7 +7,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dq_space_arm_env import Scene
 from experts.demonstrations import Demonstrations
 from experts.demonstrations.reading import Batch
 from experts.demonstrations.shard import PARAMETERS
@@ -15,7 +14,6 @@ from experts.problems.shooting_problem import FloatArray
 
 NAMES = ("states", "observations", "actions", "feedback_gains")
 COLUMNS = (*NAMES, PARAMETERS)  # the last one without columns where nothing varies in the scene
-LATE_STAGES = 80  # of each demonstration, some of them equal
 SPREAD_STAGES = 50  # at which the spread of demonstrations is measured
 
 
@@ -26,12 +24,6 @@ class Source(Protocol):
         self, size: int, names: Sequence[str], *, seed: int | None, drop_last: bool
     ) -> Iterator[Batch]:
         """One pass over all time steps, see `Demonstrations.batches`."""
-
-
-def late_stages(scene: Scene) -> NDArray[np.int64]:
-    """Stages, equally many at each scale of the time left."""
-    steps = scene.simulation.steps
-    return steps - np.unique(np.geomspace(1, steps, LATE_STAGES).round().astype(np.int64))
 
 
 @dataclass(frozen=True)
@@ -112,23 +104,6 @@ class Corrections:
     def joined(cls, parts: Sequence["Corrections"]) -> "Corrections":
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS))
 
-    @classmethod
-    def late(cls, demonstrations: Demonstrations) -> "Corrections":
-        """Time steps of demonstrations, equally many at each scale of the time left."""
-        stages = late_stages(demonstrations.scene)
-        in_stages = demonstrations.kernels.stage_parameters
-        parts = [
-            [*(getattr(each, name)[stages] for name in NAMES), in_stages(each.parameters)[stages]]
-            for each in demonstrations
-        ]
-        return cls.joined([cls(*part) for part in parts])
-
-    def only_late(self, scene: Scene) -> "Corrections":
-        """Keep the stages of `late`."""
-        stages = scene.simulation.steps - np.rint(self.observations[:, -1] / scene.simulation.dt)
-        kept = np.isin(stages, late_stages(scene))
-        return Corrections(*(getattr(self, name)[kept] for name in COLUMNS))
-
     def thinned(self, every: int) -> "Corrections":
         """Keep one time step in `every`."""
         return Corrections(*(getattr(self, name)[::every].copy() for name in COLUMNS))
@@ -174,8 +149,3 @@ class Mixture:
                 size, names, seed=None if seed is None else seed + turn, drop_last=False
             )
             turn += 1
-
-
-def with_late(demonstrations: Demonstrations, share: float) -> Source:
-    """Demonstrations, of which a share of each batch is `Corrections.late`."""
-    return Mixture(demonstrations, Corrections.late(demonstrations), share) if share else demonstrations

@@ -113,8 +113,6 @@ def test_the_algorithm_decides_about_the_class():
         ({"algorithm": {"name": "clonin"}}, "algorithm.name = 'clonin': did you mean 'cloning'"),
         ({"algorithm": {"name": ["cloning"]}}, "algorithm.name = ['cloning']: it must be one of PPO"),
         ({"algorithm": {"name": "dagger", "share": 1.0}}, "share = 1.0: must be less than 1"),
-        ({"algorithm": {"name": "cloning", "late_share": 1.0}}, "late_share = 1.0: must be less than 1"),
-        ({"algorithm": {"name": "cloning", "clock": 200}}, "clock = 200: must be at most 128"),
         ({"algorithm": {"name": "cloning", "optimization": {"update": 5}}}, "did you mean 'updates'"),
         ({"demonstrations": {"tolerance_scale": 2}}, "tolerance_scale = 2.0: must be at most 1"),
     ],

@@ -109,6 +109,16 @@ def test_demonstrations_may_be_stricter_than_the_scene(demonstrations):
 
 
 @pytest.mark.slow
+def test_a_stationary_policy_does_without_the_time_left(demonstrations, quick):
+    few = cloning(updates=5)
+    stationary = learn(demonstrations, few.model_copy(update={"stationary": True})).export()
+    seen = demonstrations[0].observations[::50].copy()
+    later = seen.copy()
+    later[:, -1] = 0.0
+    np.testing.assert_array_equal(stationary(later), stationary(seen))
+    assert np.abs(quick.export()(later) - quick.export()(seen)).max() > 1e-3
+
+
 def test_gains_teach_more_than_actions_alone(demonstrations):
     """From eight demonstrations, flights from other starts cost less with gains than without."""
     few, others = demonstrations[:8], demonstrations[8:]

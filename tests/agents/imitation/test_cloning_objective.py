@@ -5,11 +5,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from agents.configuration import Network  # noqa: E402
 from agents.configuration.imitation import ObjectiveWeights  # noqa: E402
-from agents.imitation.cloning import Making, new_network, set_clock  # noqa: E402
 from agents.imitation.objective import Objective, observation_change  # noqa: E402
-from agents.imitation.samples import COLUMNS, NAMES, Corrections, Statistics  # noqa: E402
+from agents.imitation.samples import COLUMNS, NAMES, Statistics  # noqa: E402
 from agents.policies import PolicyNetwork  # noqa: E402
 from dq_space_arm_env import compile_scene, load_scene  # noqa: E402
 from experts.demonstrations.reading import Batch  # noqa: E402
@@ -121,64 +119,6 @@ def test_a_policy_with_the_right_gains_has_no_gain_loss(demonstrations, statisti
     # Gains that are a tenth too large are wrong by a hundredth of their mean square.
     assert size.gain.item() == pytest.approx(0.01 * whole.gain.item(), rel=1e-3)
     assert size.total.item() == pytest.approx(size.action.item() + 2.0 * size.gain.item())
-
-
-def test_large_gains_may_count_relative_to_themselves(demonstrations, statistics, batch):
-    network, exact = linear_network(demonstrations, statistics, batch)
-
-    def loss(factor):
-        gains = np.float32(factor) * exact.arrays["feedback_gains"]
-        changed = Batch(batch.demonstration, batch.stage, {**exact.arrays, "feedback_gains": gains})
-        settings = {"gain_weight": 1.0, "relative_gains": True}
-        return losses(demonstrations, statistics, network, changed, **settings).gain.item()
-
-    assert loss(1.0) < 1e-10
-    assert loss(1e5) == pytest.approx(loss(1e4), rel=1e-3)
-
-
-def test_late_time_steps_are_equally_many_at_each_scale_of_the_time_left(staged):
-    late, simulation = Corrections.late(staged), staged.scene.simulation
-    left = np.rint(late.observations[:, -1] / simulation.dt).astype(int).reshape(len(staged), -1)
-    assert (left == left[0]).all()
-    assert left.min() == 1
-    assert left.max() == simulation.steps
-    assert np.isin(np.arange(1, 11), left).all()
-    assert 15 < (left[0] > simulation.steps // 10).sum() < 40
-    rows = staged.kernels.stage_parameters(staged[-1].parameters)[simulation.steps - left[-1]]
-    np.testing.assert_array_equal(late.parameters[-len(rows) :], rows)
-    states = staged[-1].states[simulation.steps - left[-1]]
-    np.testing.assert_array_equal(late.states[-len(rows) :], states)
-    whole = Corrections(**next(staged[-1:].batches(simulation.steps, COLUMNS)).arrays)
-    np.testing.assert_array_equal(whole.only_late(staged.scene).states, states[::-1])
-
-
-def test_a_clock_tells_the_time_left_alone(demonstrations, statistics, batch):
-    network = new_network(statistics, Making(Network(hidden=(12, 8))))
-    set_clock(network, 4)
-    duration = 2.0 * statistics.observation_mean[-1]
-    for unit, left in enumerate(duration * np.array([1.0, 0.1, 0.01, 0.001])):
-        observations = batch.arrays["observations"].copy()
-        observations[:, -1] = left
-        seen = network.layers[0](network.normalized(observations))[:, unit]
-        np.testing.assert_allclose(seen.detach(), 0.0, atol=1e-3)
-        observations[:, -1] = 2.0 * left
-        seen = network.layers[0](network.normalized(observations))[:, unit]
-        np.testing.assert_allclose(seen.detach(), 1.0, atol=1e-3)
-
-
-def test_weights_of_inputs_are_relative(demonstrations, statistics, batch):
-    network = linear_network(demonstrations, statistics, batch)[0]
-
-    def loss(**inputs):
-        return losses(demonstrations, statistics, network, batch, gain_weight=1.0, inputs=inputs)
-
-    names = ("base_force", "base_torque", "joint_torque", "wrist_rate")
-    plain, equal = loss(), loss(**dict.fromkeys(names, 3.0))
-    assert equal.total.item() == pytest.approx(plain.total.item(), rel=1e-6)
-    alone = [loss(**{name: 1e6}).action.item() for name in names[:3]]
-    inputs = np.arange(demonstrations.kernels.n_u)
-    counts = [len(inputs[getattr(demonstrations.kernels.layout.control, name)]) for name in names[:3]]
-    assert np.average(alone, weights=counts) == pytest.approx(plain.action.item(), rel=1e-3)
 
 
 def test_gains_of_inputs_at_a_limit_do_not_count(demonstrations, statistics, batch):
