@@ -50,7 +50,7 @@ def test_it_learns(quick):
     assert last["updates"] == QUICK.optimization.updates
     # One is what the mean action, and no feedback, would leave.
     assert last["validation_action"] < 0.5
-    assert last["validation_gain"] < 0.7
+    assert last["validation_gain"] < 0.85
 
 
 def test_a_training_that_diverges_gives_no_policy(demonstrations):
