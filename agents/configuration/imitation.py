@@ -57,8 +57,8 @@ class Cloning(Model):
     optimization: Optimization = Field(default_factory=Optimization, description="the optimizer")
     stationary: StrictBool = Field(
         default=False,
-        description="whether the policy does without the time left: to the end it acts as in the middle of an "
-        "episode, where an expert with a finite horizon lets go",
+        description="whether the policy does without the time left: to the end it acts as in the middle of "
+        "an episode, where an expert with a finite horizon lets go",
     )
     validation_share: NonNegative = Field(
         default=0.05,
