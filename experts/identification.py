@@ -33,7 +33,7 @@ LEAST_COUNT = 10
 GATE = 5.0
 """An innovation of more standard deviations is an outlier: a push is no property of the model."""
 OUTLIER_GROWTH = 4.0
-"""Growth of the scatter after an outlier: where all are, the world has changed."""
+"""Growth of the scatter after an outlier: where all are, the scatter is larger than was thought."""
 PASSES, CLOSE_ENOUGH = 4, 1e-3
 """Most linearizations of an update, and the change, in prior deviations, that ends it."""
 WANDERING = 1e-3
@@ -134,7 +134,8 @@ class MismatchDetector:
     @property
     def variance(self) -> FloatArray:
         """Scatter of the innovations, and a share of their size, squared, shape (n_v,)."""
-        return self._variance + ROUGHNESS**2 * self._square
+        seen = max(1.0 - (1.0 - FORGETTING) ** self._seen, FORGETTING)  # the means began with zero
+        return (self._variance + ROUGHNESS**2 * self._square) / seen
 
 
 class Identification:
@@ -159,23 +160,34 @@ class Identification:
         self._deviations = np.array([number.deviation for number in doubtful])
         self._least = np.array([number.least for number in doubtful])
         self._maneuver = maneuver
+        self._shared = [(i, known.index(name)) for i, name in enumerate(self.names) if name in known]
         self._stored, self._rates = velocity_entries(maneuver)
         self.begin(np.zeros(self._stored.stop - self._stored.start))
 
     def begin(self, variance: FloatArray) -> None:
         """Know nothing but the scatter of the measured velocities, shape (n_v,)."""
-        self.estimates = np.zeros(len(self.names))
-        self._planned = self.estimates
+        self.estimates, self._planned = np.zeros((2, len(self.names)))
+        self._told: FloatArray | None = None
         self._covariance = np.diag(self._deviations**2)
         self._variance = np.maximum(variance, LEAST_SCATTER**2)
         self._waited, self._wait, self._is_outlier = 0, FIRST_WAIT, False
         self.tell()
 
     def tell(self) -> None:
-        """Give the problem what is known of the maneuver, and the estimates."""
-        rows = self.problem.parameters.rows
+        """Give the problem what is known of the maneuver, and the estimates.
+
+        A number that the maneuver has been told anew is estimated anew.
+        """
+        rows, told = self.problem.parameters.rows, self._maneuver.parameters.rows
+        before = told if self._told is None else self._told
+        for i, column in self._shared:
+            if not np.array_equal(told[:, column], before[:, column]):
+                self.estimates[i] = self._planned[i] = 0.0
+                self._covariance[i, :] = self._covariance[:, i] = 0.0
+                self._covariance[i, i] = self._deviations[i] ** 2
+        self._told = told.copy()
         rows[:] = self.problem.parameters.nominal
-        rows[:, self._known] = self._maneuver.parameters.rows
+        rows[:, self._known] = told
         rows[:, self._estimated] += self.estimates
 
     def converted(self, solution: Solution, stage: int) -> Solution:
@@ -233,7 +245,7 @@ class Identification:
 
     def note_plan(self) -> None:
         """Wait longer before the next plan, which starts from the present estimates."""
-        self._planned, self._waited, self._wait = self.estimates, 0, WAITS * self._wait
+        self._planned, self._waited, self._wait = self.estimates.copy(), 0, WAITS * self._wait
 
     @property
     def values(self) -> dict[str, float]:

@@ -222,7 +222,9 @@ def import_(
 ) -> None:
     """Write a scene of ROBOT, a URDF file: its arm, from the base link to the tip, free in space.
 
-    The default target is reached with every joint 0.3 rad further. The file has a comment at every key.
+    The default target is the tip's pose with every joint 0.3 rad further, or back where its
+    limits ask for it. Limits of angles and rates become a constraint. The file has a comment
+    at every key.
     """
     from dq_space_arm_env.command_line import scene_exchange
     from dq_space_arm_env.command_line.scene_template import commented_yaml

@@ -32,7 +32,7 @@ _LONGEST_NAME = 200  # characters
 _LARGEST = 1e15  # number, whose square times another's has digits to spare
 
 UNLIMITED = 1e4
-"""Limit of an angle or a rate, rad and rad/s, from which it limits nothing: URDF has no word for none."""
+"""Limit of an angle, a rate or an effort, rad, rad/s and N m, from which it limits nothing."""
 
 Pose = tuple[float, ...]
 
@@ -55,7 +55,7 @@ class UrdfJoint:
     child: str
     origin: Pose  # pose of the joint frame, and of the child at zero angle, in the parent's, 8 numbers, m
     axis: Array  # unit vector in the joint frame, shape (3,)
-    effort: float | None  # largest torque, N m; None for none or 0, which many files write for unknown
+    effort: float | None  # largest torque, N m; None for none, UNLIMITED, or 0: many files' word for unknown
     limits: tuple[float, float] | None  # smallest and largest angle, rad; infinite or None for none
     rate: float  # largest rate, rad/s; infinite for none
     damping: float  # viscous, N m s/rad
@@ -179,7 +179,7 @@ def _read_joint(element: Element) -> UrdfJoint:
         child=_required(_child(element, "child", where), "link", f"{where}, <child>"),
         origin=_origin(element, where),
         axis=_axis(element, where) if kind in MOVABLE else np.array([0.0, 0.0, 1.0]),
-        effort=effort or None,
+        effort=effort if effort and effort < UNLIMITED else None,
         limits=_limits(limit, where) if kind == "revolute" else None,
         rate=_rate(limit, where) if kind in MOVABLE else math.inf,
         damping=damping,

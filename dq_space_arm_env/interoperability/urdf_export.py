@@ -115,8 +115,8 @@ def _add_joint(
     _connect(joint, parent, link.name, link.joint.dual_quaternion)
     SubElement(joint, "axis", xyz="0 0 1")
     if has_range or math.isfinite(effort) or math.isfinite(rate):
-        # URDF wants effort and velocity in every <limit>; effort 0 stands for unknown.
-        limit = SubElement(joint, "limit", effort=words([effort if math.isfinite(effort) else 0.0]))
+        # URDF wants effort and velocity in every <limit>.
+        limit = SubElement(joint, "limit", effort=words([min(effort, UNLIMITED)]))
         limit.set("velocity", words([min(rate, UNLIMITED)]))
         if has_range:
             limit.set("lower", words([max(lower, -UNLIMITED)]))

@@ -12,8 +12,8 @@ small.
 The first steps, far from a minimum, leave the rows out.
 
 Where all rows are at the end, they are few, and Newton's method finds their multipliers: the Lagrangian is
-minimized with hardly any penalty, and the response of the final state (`end_response`) tells which
-multipliers meet the rows. No penalty makes the problem stiff. Rows of success are squares of errors, which
+minimized with hardly any penalty of rows c <= 0, and the response of the final state (`end_response`) tells
+which multipliers meet the rows. Rows of success are squares of errors, which
 fall ever more slowly as their multipliers grow: steps from small multipliers are therefore not too long.
 """
 

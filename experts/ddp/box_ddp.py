@@ -245,7 +245,9 @@ class BoxDDP:
             lagrangian.begin()
             state.switch.request_exact()
         if lagrangian.is_at_end:
-            response = end_response(work, lagrangian.constraints, exact=self._has_exact)
+            models = (True, False) if self._has_exact else (False,)  # the exact one may have no minimum
+            found = (end_response(work, lagrangian.constraints, exact=exact) for exact in models)
+            response = next((each for each in found if each is not None), None)
             if response is not None:
                 lagrangian.update_by_response(work.current.states, work.current.controls, response)
         elif not begins:

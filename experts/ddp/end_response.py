@@ -43,13 +43,15 @@ def end_response(
     count, step, slopes = len(by_state), work.update.k.copy(), np.zeros((len(by_state), len(by_state)))
     residuals = constraints.find(states, controls)[-1, :count] + by_state @ _moved_end(work, step)
     gradient = d.terminal_lx.copy()
-    for j, row in enumerate(by_state):
-        force = FORCE * max(abs(constraints.multipliers[-1, j]), 1.0)
-        d.terminal_lx[0] = gradient[0] + constraints.end_weight * force * row
-        if not work.backward_pass(0.0, exact=exact).completed:
-            return None
-        slopes[:, j] = by_state @ _moved_end(work, (work.update.k - step) / force)
-    d.terminal_lx[:] = gradient
+    try:
+        for j, row in enumerate(by_state):
+            force = FORCE * max(abs(constraints.multipliers[-1, j]), 1.0)
+            d.terminal_lx[0] = gradient[0] + constraints.end_weight * force * row
+            if not work.backward_pass(0.0, exact=exact).completed:
+                return None
+            slopes[:, j] = by_state @ _moved_end(work, (work.update.k - step) / force)
+    finally:
+        d.terminal_lx[:] = gradient
     return EndResponse(residuals, 0.5 * (slopes + slopes.T))
 
 

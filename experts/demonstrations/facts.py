@@ -60,7 +60,7 @@ class Facts:
     demonstrations: Demonstrations
     quantities: tuple[Quantity, ...]  # whose distributions are shown
     guesses: NDArray[np.str_]  # initial guess of each solve, shape (M,)
-    # whether each ends at a tolerance, as where the cheapest maneuver would end outside, shape (M,)
+    # whether each ends at a tolerance of the pose, where the cheapest maneuver would end outside, (M,)
     at_tolerance: NDArray[np.bool_]
     # from `Demonstrations.failures`, and `start_errors`, shape (F, 2), deg and m
     failures: Mapping[str, NDArray[Any]]
@@ -214,7 +214,7 @@ def ends(facts: Facts) -> TextTable:
         "Ends\nwhere the cheapest maneuver would end outside the tolerances, these are constraints, and the "
         "maneuver ends at them"
     )
-    names = np.where(facts.at_tolerance, "at a tolerance", "within the tolerances").tolist()
+    names = np.where(facts.at_tolerance, "at a tolerance of the pose", "within it").tolist()
     return _groups(title, "end", names, facts)
 
 

@@ -92,7 +92,7 @@ class ArmProblem:
         if not self.is_constrained:
             return None
         path, terminal, kernels = path_rows(self.scene), terminal_rows(self.scene), self.kernels
-        reserve = self._reserve * np.array([row.tolerance for row in terminal])
+        reserve = self._reserve * np.array([0.0 if row.is_equality else row.tolerance for row in terminal])
 
         def residuals(states: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
             rows, along = parameters.rows, np.zeros((len(controls), 0))

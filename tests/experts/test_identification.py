@@ -66,9 +66,26 @@ def test_the_numbers_are_found(changes, factors, experts):
     truth = dict(zip(expert.maneuver.kernels.parameters.names, p, strict=True))
     assert expert.estimates.keys() == {number.name for number in doubtful_numbers(expert.maneuver)}
     for name, value in expert.estimates.items():
-        assert value == pytest.approx(truth[name], abs=0.02), name
+        assert value == pytest.approx(truth[name], rel=5e-3, abs=0.02), name
     expert.reset()
     assert expert.estimates == {}
+
+
+def test_what_is_told_in_mid_flight_is_not_estimated_on_top(experts):
+    expert, told = experts[True], 40
+    kernels = expert.maneuver.kernels
+    p = world(kernels, {}, LOADS)
+    x = kernels.layout.initial_state
+    expert.reset(x)
+    for k in range(60):
+        if k == told:
+            assert expert.estimates["links.2.mass"] > 1.5 * expert.maneuver.scene.links[2].mass
+            expert.inform(p)
+        x = kernels.step(x, expert(x) * kernels.layout.control_limit, p=p)
+        if k >= told:
+            assert expert.estimates["links.2.mass"] == pytest.approx(
+                p[kernels.parameters.names.index("links.2.mass")], rel=1e-2
+            )
 
 
 def test_where_the_scene_is_right_actions_are_the_same_bits(experts):

@@ -39,8 +39,9 @@ class Triangles(NamedTuple):
 
 
 class ConstraintDrawing(NamedTuple):
-    """The shapes of a scene's constraints."""
+    """The shapes of a scene's constraints along the path."""
 
+    names: tuple[str, ...]  # of the constraints
     triangles: Triangles  # each group is a shape, in its axes
     frames: tuple[tuple[int, int], ...]  # of each shape: of its origin, and of its axes; -1 is inertial
     owners: tuple[int, ...]  # number of the constraint of each shape
@@ -67,15 +68,17 @@ def solids_of(scene: Scene) -> Triangles:
 
 
 def constraints_of(scene: Scene, flights: Sequence[ShownFlight]) -> ConstraintDrawing | None:
-    """Shapes of the constraints, and where flights violate them; None without constraints."""
-    if not scene.constraints:
+    """Shapes of the constraints along the path, and where flights violate them; None without any."""
+    listed = [each for each in scene.constraints if rows_of(scene, each)]
+    if not listed:
         return None
     groups = constraint_shapes(scene, _CONES * SpacecraftModel(scene).axis_length)
-    shapes = [(number, shape) for number, group in enumerate(groups) for shape in group]
+    along = [group for each, group in zip(scene.constraints, groups, strict=True) if each in listed]
+    shapes = [(number, shape) for number, group in enumerate(along) for shape in group]
     frames = [(shape.place, shape.axes) for _, shape in shapes]
     meshes = [shape.mesh.moved(index, np.eye(3), np.zeros(3)) for index, (_, shape) in enumerate(shapes)]
     triangles = _triangles_of(Mesh.joined(meshes), len(shapes), "constraints") if meshes else _NO_TRIANGLES
-    parts = [rows_of(scene, each) for each in scene.constraints]
+    parts = [rows_of(scene, each) for each in listed]
     ends = np.cumsum([len(rows) for rows in parts])
     violated, broken = [], []
     for flight in flights:
@@ -83,8 +86,8 @@ def constraints_of(scene: Scene, flights: Sequence[ShownFlight]) -> ConstraintDr
         violated.append(np.array([rows[list(shape.rows)].any(axis=0) for _, shape in shapes]))
         spans = [rows[end - len(part) : end].any(axis=0) for part, end in zip(parts, ends, strict=True)]
         broken.append(np.array(spans))
-    owners = tuple(number for number, _ in shapes)
-    return ConstraintDrawing(triangles, tuple(frames), owners, tuple(violated), tuple(broken))
+    names, owners = tuple(each.name for each in listed), tuple(number for number, _ in shapes)
+    return ConstraintDrawing(names, triangles, tuple(frames), owners, tuple(violated), tuple(broken))
 
 
 def _triangles_of(mesh: Mesh, groups: int, what: str) -> Triangles:

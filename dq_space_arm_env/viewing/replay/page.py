@@ -196,7 +196,7 @@ def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
     if drawn is not None:
         data["constraints"] = {
             **_triangles(drawn.triangles, blob),
-            "names": [each.name for each in scene.constraints],
+            "names": drawn.names,
             "frames": drawn.frames,
             "owners": drawn.owners,
             "violated": [blob.add(each.astype(np.uint8)) for each in drawn.violated],
