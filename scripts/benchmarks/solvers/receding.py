@@ -14,9 +14,10 @@ import numpy as np
 from dq_space_arm_env import Scene
 from dq_space_arm_env.environment.disturbances import Disturbances, with_loads
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
+from experts.maneuver_plan import ManeuverPlan
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
-from experts.receding_horizon import ManeuverPlan, RecedingHorizonExpert
+from experts.receding_horizon import RecedingHorizonExpert
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim, note
 

@@ -24,9 +24,9 @@ from experts.ddp.second_order import (
     SecondOrder,
 )
 from experts.ddp.solution import IterationRecord
+from experts.maneuver_plan import ManeuverPlan
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.paper_problem import PaperProblem
-from experts.receding_horizon import ManeuverPlan
 from scripts.benchmarks.robots import OTHER_MOTIONS, robots
 
 ONE_OF_EACH_KIND = ("free-floating", "no-wrist", "paper", "planar", "reaction-wheels", "tip-load")
