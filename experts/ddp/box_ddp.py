@@ -245,10 +245,8 @@ class BoxDDP:
             lagrangian.begin()
             state.switch.request_exact()
         if lagrangian.is_at_end:
-            models = (True, False) if self._has_exact else (False,)  # the exact one may have no minimum
-            found = (end_response(work, lagrangian.constraints, exact=exact) for exact in models)
-            response = next((each for each in found if each is not None), None)
-            if response is not None:
+            response = end_response(work, lagrangian.constraints, exact=self._has_exact)
+            if response is not None:  # else the model has no minimum yet
                 lagrangian.update_by_response(work.current.states, work.current.controls, response)
         elif not begins:
             lagrangian.update(work.current.states, work.current.controls)
