@@ -13,9 +13,6 @@ from experts.guesses.guided import GuidedDDP
 from experts.problems.arm_problem import ArmProblem, WindowProblem
 from experts.problems.shooting_problem import FloatArray
 
-RESERVE = 0.05
-"""Share of the tolerances that a plan keeps free for disturbances where they are constraints."""
-
 
 @dataclass(frozen=True, eq=False)
 class ManeuverPlan:

@@ -25,9 +25,9 @@ from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.task.step_report import n_observations
 from experts.ddp.shooting import ShootingWorkspace, line_search
 from experts.ddp.solution import Solution
-from experts.guesses.guided import GuidedDDP
+from experts.guesses.guided import RESERVE, GuidedDDP
 from experts.identification import ModelWatch
-from experts.maneuver_plan import RESERVE, ManeuverPlan
+from experts.maneuver_plan import ManeuverPlan
 from experts.problems.arm_problem import ArmProblem, WindowProblem, as_problem
 from experts.problems.shooting_problem import FloatArray, check_array, check_at_least
 

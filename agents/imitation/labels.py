@@ -11,7 +11,7 @@ from dq_space_arm_env.environment.rollouts import Rollout
 from experts.ddp.box_ddp import BoxDDP
 from experts.demonstrations import Demonstrations, DemonstrationsError
 from experts.demonstrations.reading import Demonstration
-from experts.guesses.guided import NEAR_REGULARIZATION
+from experts.guesses.guided import NEAR_REGULARIZATION, RESERVE
 from experts.problems.arm_problem import ArmProblem, WindowProblem
 from experts.problems.shooting_problem import FloatArray
 
@@ -95,8 +95,9 @@ class Solver:
         guess = self._followed(demonstration, state, stage, limits, rows) * limits
         solution = BoxDDP(problem).solve(x0=state, u_init=guess, parameters=rows)
         if solution.converged and problem.misses(solution.states[-1]) > 1.0:
-            within = BoxDDP(problem.constrained(), initial_regularization=NEAR_REGULARIZATION)
-            solution = within.solve(x0=state, u_init=solution.controls, parameters=rows)
+            within = BoxDDP(problem.constrained(RESERVE), initial_regularization=NEAR_REGULARIZATION)
+            reached = within.solve(x0=state, u_init=solution.controls, parameters=rows)
+            solution = reached if reached.converged else solution  # too late to reach the target
         if not solution.converged:
             return None
         steps = slice(0, end - stage)

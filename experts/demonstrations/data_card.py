@@ -112,7 +112,7 @@ The same code and versions on the same kind of processor give the same bytes. Th
 - Each demonstration is a local minimum. Neighbors have checked it, but nothing proves it to be global.
 - Where the cheapest maneuver would end outside the tolerances, these are constraints of the solve, and their
   multipliers shape the gains: $at_tolerance of $demonstrations demonstrations end at a tolerance of the pose.
-  Their cost J is the least with which the target is reached.
+  Their cost J is the least with which the target is reached, with 5 % of the tolerances kept free.
 - The model is exact: no noise, delay or disturbance. The gains respond to small deviations, and become less
   accurate as these grow.
 - Starts cover the spread of the scene and nothing beyond it. Failed problems are missing, so the hardest

@@ -18,11 +18,12 @@ from experts.demonstrations import Demonstrations
 from experts.demonstrations.folder import LOG
 from experts.demonstrations.outcomes import GUESSES
 from experts.demonstrations.shard import PARAMETERS, tip_errors
+from experts.guesses.guided import RESERVE
 from experts.problems.shooting_problem import FloatArray
 
 _LOG_BYTES = 2**26  # of a part: tens of thousands of shards
-AT_TOLERANCE = 0.998
-"""Least share of a tolerance that a final error at it has: the solver keeps a margin of a thousandth."""
+AT_TOLERANCE = 0.99 * (1.0 - RESERVE)
+"""Least share of a tolerance that a final error at it has: the solver keeps the reserve free."""
 REPLAYED = 1000
 """Demonstrations, evenly spaced, whose return is compared with the cost."""
 

@@ -17,7 +17,7 @@ import numpy as np
 from dq_space_arm_env import Scene
 from experts.ddp.rollout import Trajectory
 from experts.ddp.solution import Solution, StopReason
-from experts.guesses.guided import GuidedDDP
+from experts.guesses.guided import RESERVE, GuidedDDP
 from experts.guesses.policies import follow, policies
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
@@ -85,7 +85,7 @@ class Retry(NamedTuple):
 def expert_of(scene: Scene) -> Expert:
     """Return the expert of this process, ready to solve: kernels compiled, the nominal maneuver solved."""
     problem = ArmProblem(scene)
-    solver = GuidedDDP(problem, remember=0)
+    solver = GuidedDDP(problem, reserve=RESERVE)
     _ = solver.library
     return Expert(problem, solver)
 
@@ -113,6 +113,7 @@ def solve_again(expert: Expert, outcomes: list[Outcome], retries: list[Retry]) -
             expert.problem,
             library=[retry.neighbor],
             screw_motion=False,
+            reserve=RESERVE,
             attempts=1,
             coarsening=1,  # the rollout that promises more was in the problem's own steps
             second_order=expert.solver.second_order,

@@ -63,6 +63,10 @@ CHEAPER = 0.999
 """The mirrored model is taken if the cost of its minimum is below this share of Gauss-Newton's."""
 
 
+RESERVE = 0.05
+"""Share of the tolerances that demonstrations and controllers keep free for rounding and disturbances."""
+
+
 class _Guess(NamedTuple):
     """Controls to start a solve from."""
 

@@ -7,7 +7,8 @@ import pytest
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.scene import StateLayout
 from experts import BoxDDP, GuidedDDP, RecedingHorizonExpert
-from experts.maneuver_plan import RESERVE, ManeuverPlan, _convex_part
+from experts.guesses.guided import RESERVE
+from experts.maneuver_plan import ManeuverPlan, _convex_part
 from experts.problems.arm_problem import ArmProblem
 
 SCENES = ("paper", "payload")
