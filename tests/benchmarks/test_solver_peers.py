@@ -272,7 +272,7 @@ def test_crocoddyl_is_left_out_with_a_sentence(name: str, reason: str) -> None:
 )
 def test_what_knows_a_target_at_rest_only_refuses_more(name: str, more: str) -> None:
     scene = load_scene(name)
-    with pytest.raises(ValueError, match=f"IPOPT is left out: it is not given {more}"):
+    with pytest.raises(ValueError, match=f"interior-point methods are left out: they are not given {more}"):
         transcribe(scene)
     with pytest.raises(ValueError, match="formulation knows only a target at rest"):
         PaperProblem(scene)

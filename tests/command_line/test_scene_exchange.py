@@ -167,9 +167,9 @@ def heavy(arm: str, tip: str) -> object:
 @pytest.mark.parametrize(
     ("arm", "tip"),
     [
-        ("z1", "link06"),
         ("borinot-arm", "flying_arm_2__ee"),
         ("so100", "gripper"),
+        heavy("z1", "link06"),
         heavy("open-manipulator-x", "end_effector_link"),
         heavy("px100", "px100/ee_arm_link"),
         heavy("so101", "gripper_frame_link"),
