@@ -106,6 +106,7 @@ TESTS: dict[str, dict[str, list[str]]] = {
     "experts/ddp/rollout.py": _solver("rollout", "solution"),
     "experts/ddp/second_order.py": _solver("second_order", "box_ddp"),
     "experts/ddp/": _solver("line_search", "box_ddp", "second_order"),
+    "experts/maneuver_plan.py": {"quick": [_RECEDING], "default": []},
     "experts/receding_horizon.py": {
         "quick": [f"{_RECEDING}::test_{name}" for name in _RECEDING_QUICK],
         "default": [_RECEDING],

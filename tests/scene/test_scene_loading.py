@@ -54,7 +54,7 @@ def test_installed_package_uses_scenes_inside_it(tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("papre", r"no scene is named 'papre'; did you mean 'paper'\? The scenes are capture-and-detumble, "),
+        ("papre", r"no scene is named 'papre'; did you mean 'paper'\? The scenes are approach-corridor, "),
         ("zzz", r"no scene is named 'zzz'; The scenes are .*paper.*ending in \.yaml"),
     ],
 )

@@ -10,14 +10,13 @@ from scripts.benchmarks.peers.interior_point_peer import InteriorPoint
 from scripts.benchmarks.peers.transcription import transcribe
 from scripts.benchmarks.solvers.runs import FATROP
 
-CONSTRAINED = (
-    "approach-corridor",
+MINUTES = ("approach-corridor", "line-of-sight", "wheel-saturation")  # that IPOPT takes
+CONSTRAINED = [
     "joint-limits",
     "keep-out",
-    "line-of-sight",
     "pointing",
-    "wheel-saturation",
-)
+    *(pytest.param(name, marks=pytest.mark.endurance) for name in MINUTES),
+]
 
 
 @pytest.mark.slow
