@@ -522,8 +522,8 @@ class GuidedDDP:
 
 
 def _multipliers(solution: Solution) -> FloatArray | None:
-    """Multipliers of a solution to start another solve with."""
-    return None if solution.constraints is None else solution.multipliers
+    """Multipliers of a solution to start another solve with; None where it needs none."""
+    return solution.multipliers if solution.multipliers.any() else None
 
 
 def _interrupt(record: IterationRecord) -> None:
