@@ -125,16 +125,19 @@ def best_gradient_step(scene, solution):
 
     That of the cost, or of the Lagrangian where constraints hold: its multipliers make their rows worth it.
     """
-    kernels = compile_scene(scene)
-    states, controls, limit = solution.states, solution.controls, kernels.layout.control_limit
+    kernels, states, controls = compile_scene(scene), solution.states, solution.controls
+    rows = solution.parameters  # of the stages, (N + 1, n_p)
+    limits = kernels.layout.limits_with(rows[:-1]) if kernels.n_p else kernels.layout.control_limit
+    limits, here = np.broadcast_to(limits, controls.shape), {"x": states[:-1], "u": controls, "p": rows[:-1]}
     n_t, path, end = kernels.n_t, *multipliers_of(solution, kernels)
-    a, b = kernels.linearize(states[:-1], controls)
-    lx, lu, _, luu = kernels.call("cost_derivatives", x=states[:-1], u=controls)
-    adjoint = kernels.call("terminal_cost_derivatives", x=states[-1], emphasis=[1.0])[0]
+    a, b = kernels.linearize(**here)
+    lx, lu, _, luu = kernels.call("cost_derivatives", **here)
+    last = {"x": states[-1], "p": rows[-1]}
+    adjoint = kernels.call("terminal_cost_derivatives", **last, emphasis=[1.0])[0]
     if path.size:
-        by_stage = np.einsum("ki,kij->kj", path, kernels.constraint_jacobian(states[:-1], controls))
+        by_stage = np.einsum("ki,kij->kj", path, kernels.constraint_jacobian(**here))
         lx, lu = lx + by_stage[:, :n_t], lu + by_stage[:, n_t:]
-        adjoint = adjoint + end @ kernels.terminal_constraint_jacobian(states[-1])
+        adjoint = adjoint + end @ kernels.terminal_constraint_jacobian(**last)
     gradient = np.zeros_like(controls)
     for k in reversed(range(len(controls))):
         gradient[k] = lu[k] + b[k].T @ adjoint
@@ -144,14 +147,14 @@ def best_gradient_step(scene, solution):
     x = np.tile(states[0], (len(lengths), 1))
     value = np.zeros(len(lengths))
     for k in range(len(controls)):
-        u = np.clip(controls[k] - lengths[:, None] * direction[k], -limit, limit)
-        value += kernels.cost(x, u)
+        u = np.clip(controls[k] - lengths[:, None] * direction[k], -limits[k], limits[k])
+        value += kernels.cost(x, u, p=rows[k])
         if path.size:
-            value += kernels.constraints(x, u) @ path[k]
-        x = kernels.step(x, u)
-    value += kernels.terminal_cost(x)
+            value += kernels.constraints(x, u, p=rows[k]) @ path[k]
+        x = kernels.step(x, u, p=rows[k])
+    value += kernels.terminal_cost(x, p=rows[-1])
     if path.size:
-        value += kernels.terminal_constraints(x) @ end
+        value += kernels.terminal_constraints(x, p=rows[-1]) @ end
     return (value[0] - value.min()) / solution.cost
 
 
