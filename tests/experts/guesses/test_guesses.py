@@ -251,7 +251,9 @@ def test_a_library_of_another_problem_is_refused(unicycle, changes, message):
 
 @pytest.fixture(scope="module")
 def paper():
-    return GuidedDDP("paper")
+    solver = GuidedDDP("paper")
+    assert solver.coarsening == (8,)  # prepared before a test takes a part of the preparation's place
+    return solver
 
 
 def random_start(scene, seed):
