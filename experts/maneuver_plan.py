@@ -10,6 +10,7 @@ from experts.ddp.augmented_lagrangian import AugmentedLagrangian
 from experts.ddp.shooting import ShootingWorkspace
 from experts.ddp.solution import Policy, Solution, StopReason
 from experts.guesses.guided import GuidedDDP
+from experts.guesses.policies import follow
 from experts.problems.arm_problem import ArmProblem, WindowProblem
 from experts.problems.shooting_problem import FloatArray
 
@@ -22,6 +23,7 @@ class ManeuverPlan:
     solution: Solution
     policy: Policy  # of the solution; counts stages from the plan's start
     maneuver: ArmProblem  # the episode's, with success as constraint where the solution needs it
+    reaches_target: bool  # whether the solution converged within the tolerances
     multipliers: FloatArray  # and penalties of constraints at every stage and the end, shape (M + 1, 2 m)
     Vx: FloatArray  # at every stage, shape (M, n_t)
     # at every stage, shape (M, n_t, n_t), without negative curvature: off the plan it would predict costs
@@ -70,7 +72,16 @@ class ManeuverPlan:
             raise RuntimeError(f"there is no plan from the state at stage {stage}: {solution.message}")
         hessians = _convex_part(work.update.Vxx_all)
         held = problem.parameters.more.copy()
-        return cls(stage, solution, solution.policy(), maneuver, held, work.update.Vx_all, hessians)
+        reached = solution.converged and maneuver.is_success(solution.states[-1])
+        policy = solution.policy()
+        return cls(stage, solution, policy, maneuver, reached, held, work.update.Vx_all, hessians)
+
+    def reaches_target_from(self, state: FloatArray, stage: int) -> bool:
+        """Whether its policy, followed from a state at a stage, ends within the tolerances."""
+        problem = WindowProblem(self.maneuver, self.maneuver.horizon - stage)
+        problem.begin_at(stage)
+        flight = follow(_last_stages(self.solution, problem.horizon), problem, state)
+        return bool(np.isfinite(flight.cost)) and self.maneuver.is_success(flight.states[-1])
 
 
 def _last_stages(solution: Solution, count: int) -> Solution:

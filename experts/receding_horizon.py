@@ -11,7 +11,6 @@ neglect. Where the cheapest maneuver would end outside the tolerances, they beco
 steps, with a share of them kept free for disturbances.
 """
 
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,6 +30,8 @@ from experts.maneuver_plan import ManeuverPlan
 from experts.problems.arm_problem import ArmProblem, WindowProblem, as_problem
 from experts.problems.shooting_problem import FloatArray, check_array, check_at_least
 
+PREDICTIONS = 40
+"""Predictions in an episode of where the plan's policy ends."""
 WORTHWHILE = 1e-12
 """A smaller predicted reduction, relative to the plan's cost, is not tried: rounding would decide."""
 
@@ -54,8 +55,12 @@ class RecedingHorizonExpert:
 
     Where joints have springs or dampers that the scene does not know, or the load has another mass, the
     measured velocities contradict the predicted ones for long. The expert then estimates these numbers and
-    plans the rest of the episode anew, a few times (`experts.identification`). Where measurements agree with
-    the scene, nothing of this happens.
+    plans the rest of the episode anew, a few times (`experts.identification`).
+
+    So it does where pushes or noise have led off the way to the target: forty times in an episode it predicts
+    where the plan's policy ends. If that misses twice in a row, a new plan that reaches the target takes its
+    place. Where measurements agree with the scene, nothing of this happens. A call that plans takes as long
+    as the first one.
 
     The call that begins an episode plans it first, which takes a fraction of a second; so does `reset` with a
     state. What varies in the scene, such as the target, has its nominal value until `reset` or `inform` says
@@ -70,7 +75,8 @@ class RecedingHorizonExpert:
         fallbacks: Actions of this episode from the plan's feedback policy u = clip(u_k + K_k (x (-) x_k)), or
             from u_k alone where that is not finite, because no finite rollout started at the state.
         dropouts: Actions of this episode from a predicted state, because the measurement was none.
-        replans: Plans of this episode that better estimates have asked for.
+        replans: New plans of this episode, for better estimates or because it had left the way to the target.
+        rejected_plans: Such plans that were none or did not lead to the target: the present one served on.
     """
 
     def __init__(
@@ -105,8 +111,8 @@ class RecedingHorizonExpert:
         self.horizon, self.iterations = horizon, iterations
         self.plan: ManeuverPlan | None = None
         self.control: FloatArray = np.zeros(self.maneuver.n_controls)
-        self.fallbacks = self.dropouts = self.replans = 0
-        self._next_stage, self._informed = 0, False
+        self.fallbacks = self.dropouts = self.replans = self.rejected_plans = 0
+        self._next_stage, self._informed, self._strays = 0, False, False
         self._observation_size = n_observations(self.maneuver.scene)
         self._watch, self._measured = ModelWatch(self.maneuver, corrects=identify and iterations > 0), False
         self._planner: GuidedDDP | None = None
@@ -194,7 +200,9 @@ class RecedingHorizonExpert:
             if self._watch.corrects and both_measured and self._work is not None:
                 self._learn(state, stage)
             if self._informed:
-                self._plan_anew(state, stage)
+                self._informed = not self._plan_anew(state, stage)
+            elif self.iterations > 0:
+                self._return_to_target(state, stage)
         assert self.plan is not None
         work = self._window(self.plan, stage)
         if self._optimize(work, state, self.plan.solution.cost):
@@ -285,8 +293,8 @@ class RecedingHorizonExpert:
 
     def _forget(self, stage: int) -> None:
         """Begin an episode at a stage with nothing but the scene."""
-        self._work, self._next_stage, self._informed = None, stage, False
-        self.fallbacks = self.dropouts = self.replans = 0
+        self._work, self._next_stage, self._informed, self._strays = None, stage, False, False
+        self.fallbacks = self.dropouts = self.replans = self.rejected_plans = 0
         self._watch.begin()
 
     def _learn(self, state: FloatArray, stage: int) -> None:
@@ -302,27 +310,46 @@ class RecedingHorizonExpert:
         found = self._watch.identification
         if found is not None and found.asks_for_plan:
             found.note_plan()
-            with suppress(RuntimeError):  # the present plan serves on
-                self._plan_anew(state, stage)
-                self.replans += 1
+            self._plan_anew(state, stage)
 
-    def _plan_anew(self, state: FloatArray, stage: int) -> None:
-        """Plan the rest of the episode with other parameters; the present plan's policy is a guess."""
+    def _return_to_target(self, state: FloatArray, stage: int) -> None:
+        """Plan anew where the plan reaches the target, but its policy would miss it from where it is now."""
+        assert self.plan is not None
+        if stage % max(self.maneuver.horizon // PREDICTIONS, 1) == 0:
+            self._take_parameters(self.plan)
+            strayed = self._strays
+            self._strays = self.plan.reaches_target and not self.plan.reaches_target_from(state, stage)
+            if strayed and self._strays:
+                self._strays = not self._plan_anew(state, stage, must_reach=True)
+
+    def _plan_anew(self, state: FloatArray, stage: int, *, must_reach: bool = False) -> bool:
+        """Plan the rest of the episode; the present policy is a guess. Return whether the new plan serves."""
         assert self._planner is not None
         assert self.plan is not None
         if self._watch.identification is not None:
             self._watch.identification.tell()
-        known = [self.plan.solution]
-        self.plan = ManeuverPlan.make(self._planner, state, stage, known, self._watch.model)
-        self._work, self._informed = None, False
+        try:
+            plan = ManeuverPlan.make(self._planner, state, stage, [self.plan.solution], self._watch.model)
+        except RuntimeError:  # nothing can be simulated from there
+            plan = None
+        if plan is None or (must_reach and not plan.reaches_target):
+            self.rejected_plans += 1
+            return False
+        self.plan, self._work = plan, None
+        self.replans += 1
+        return True
+
+    def _take_parameters(self, plan: ManeuverPlan) -> None:
+        """Give a plan's maneuver, where it has parameters of its own, those of the model."""
+        if plan.maneuver is not self._watch.model:
+            plan.maneuver.parameters.rows[:] = self._watch.model.parameters.rows
 
     def _window(self, plan: ManeuverPlan, stage: int) -> ShootingWorkspace:
         """Prepare the problem that starts at a stage.
 
         Its reference is the last solution, if that is one stage old, then the plan beyond its end.
         """
-        if plan.maneuver is not self._watch.model:  # it has parameters of its own
-            plan.maneuver.parameters.rows[:] = self._watch.model.parameters.rows
+        self._take_parameters(plan)
         last = self._work if stage == self._next_stage else None
         horizon = min(self.horizon, self.maneuver.horizon - stage)
         end = stage + horizon

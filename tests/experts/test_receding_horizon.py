@@ -180,6 +180,50 @@ def test_a_new_mass_in_mid_flight_is_planned_with(varying):
     assert missed <= 1.0
 
 
+def fly_with_pushes(expert, seed):
+    """Largest error at the end of an episode, relative to its tolerance; pushes of 0.02 rad/s, m/s."""
+    kernels, maneuver = expert.maneuver.kernels, expert.maneuver
+    rng = np.random.default_rng(seed)
+    x, velocity = kernels.layout.initial_state, kernels.layout.tangent.base_velocity
+    jump = np.zeros(kernels.n_t)
+    expert.reset(x)
+    for k in range(maneuver.horizon):
+        if k % 25 == 0 and k > 0:
+            jump[velocity] = 0.02 * rng.normal(size=jump[velocity].size)
+            x = kernels.retract(x, jump)
+        x = kernels.step(x, expert(x) * kernels.layout.control_limit)
+    return maneuver.misses(x)
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_pushes_off_the_way_to_the_target_are_planned_for(seed, varying, monkeypatch):
+    """The plan's value function knows no tolerances: with it alone the pushed arm misses."""
+    assert fly_with_pushes(varying, seed) <= 1.0
+    assert 1 <= varying.replans <= 5
+    assert varying.rejected_plans == varying.fallbacks == 0
+    monkeypatch.setattr("experts.receding_horizon.PREDICTIONS", 1)
+    assert fly_with_pushes(varying, seed) > 3.0
+    assert varying.replans == 0
+
+
+def test_without_a_better_plan_the_present_one_serves_on(varying, monkeypatch):
+    made = []
+
+    def fail(*_):
+        made.append(1)
+        if len(made) > 1:
+            raise RuntimeError("there is no plan")
+        return plan
+
+    varying.reset(varying.maneuver.initial_state)
+    plan = varying.plan
+    monkeypatch.setattr(ManeuverPlan, "make", fail)
+    assert fly_with_pushes(varying, 2) > 1.0
+    assert varying.plan is plan
+    assert (varying.replans, varying.rejected_plans) == (0, len(made) - 1)
+    assert varying.rejected_plans > 0
+
+
 def test_negative_curvature_is_cut_off_and_the_rest_stays():
     rng = np.random.default_rng(0)
     basis = np.linalg.qr(rng.normal(size=(3, 4, 4)))[0]

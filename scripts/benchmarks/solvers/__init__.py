@@ -204,6 +204,8 @@ BENCHMARK = Benchmark(
                 Column("cost", "expert", ".6g"),
                 Column("policy_cost", "plan's\nfeedback", ".6g"),
                 Column("open_loop_cost", "plan's\ncontrols", ".6g"),
+                Column("success", format=".0%"),
+                Column("replans", "new\nplans", ".1f"),
                 Column("attitude_error_deg", "error\ndeg"),
                 Column("position_error_m", "error\nm"),
             ),

@@ -114,11 +114,12 @@ def _plan(expert: RecedingHorizonExpert, problem: ArmProblem) -> ManeuverPlan:
 
 def _flight(problem: ArmProblem, expert: RecedingHorizonExpert, world: World, seeds: list[int]) -> Row:
     """Fly the expert and time its actions; the plan is made before the clock starts."""
-    flights, fallbacks, plan_cost = [], 0, 0.0
+    flights, fallbacks, replans, plan_cost = [], 0, 0, 0.0
     for seed in seeds:
         plan_cost = _plan(expert, problem).solution.cost
         flights.append(fly(problem, lambda x, k: expert(x) * problem.control_upper, world, seed))
         fallbacks += expert.fallbacks
+        replans += expert.replans
     times = 1e3 * np.concatenate([flight.action_seconds for flight in flights])
     period = 1e3 * problem.time_step
     return {
@@ -132,6 +133,8 @@ def _flight(problem: ArmProblem, expert: RecedingHorizonExpert, world: World, se
         "late": float(np.mean(times > period)),
         "plan_cost": plan_cost,
         "cost": float(np.mean([cost_of(flight) for flight in flights])),
+        "success": float(np.mean([flight.is_success[0] for flight in flights])),
+        "replans": replans / len(flights),
         "attitude_error_deg": max(float(flight.attitude_error[0]) for flight in flights),
         "position_error_m": max(float(flight.position_error[0]) for flight in flights),
         "fallbacks": fallbacks,
