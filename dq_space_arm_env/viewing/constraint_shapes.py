@@ -84,8 +84,7 @@ def violations(scene: Scene, states: FloatArray, controls: FloatArray, body: Flo
     from dq_space_arm_env.task.constraint_residuals import path_residuals
     from dq_space_arm_env.task.equations import SceneEquations, body_pose, grasp_pose
 
-    nominal = StateLayout.of(scene).parameters.nominal
-    equations = SceneEquations.of(scene, nominal.tolist())
+    equations = SceneEquations.of(scene, _numbers_during(scene, len(states)))
     entries = np.moveaxis(np.broadcast_to(body, (len(states), 8)), 1, 0)
     places = {n.name: entries[i] for n, i in zip(target_numbers(scene), target_entries(scene), strict=True)}
     given = {**equations.given, **places}
@@ -100,6 +99,17 @@ def violations(scene: Scene, states: FloatArray, controls: FloatArray, body: Flo
         [np.broadcast_to(c > limit, shape) for c, limit in zip(residuals, limits, strict=True)],
         dtype=np.bool_,
     ).reshape(len(rows), *shape)
+
+
+def _numbers_during(scene: Scene, count: int) -> list[Any]:
+    """Nominal parameters: numbers, or arrays (M + 1,) of those that phases change."""
+    parameters, staged = StateLayout.of(scene).parameters, scene.staged
+    found: list[Any] = parameters.nominal.tolist()
+    phases = np.searchsorted(staged.starts, np.arange(count), side="right") - 1
+    for name, values in staged.values.items():
+        if name in parameters.names:
+            found[parameters.names.index(name)] = np.array(values)[phases]
+    return found
 
 
 def _frame_numbers(scene: Scene) -> dict[str, int]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import compile_scene, load_scene
+from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.constraint_rows import path_rows
 from dq_space_arm_env.viewing.constraint_shapes import INERTIAL, VISIBLE, constraint_shapes, violations
 from dq_space_arm_env.viewing.replay import replay_page
@@ -86,6 +87,23 @@ def test_what_is_red_is_what_the_compiled_residuals_call_violated(constrained, m
     expected = residuals > VISIBLE * np.array(tolerance)
     np.testing.assert_array_equal(found[:, :-1], expected.T)
     assert expected.any(axis=0).sum() >= 3  # of several kinds
+
+
+def test_what_the_tip_holds_in_a_phase_counts():
+    """The momentum of an arm that has let its payload go is that of the scene without payload."""
+    scene = load_scene("release").replace(constraints=[{"name": "spin", "kind": "momentum", "angular": 3.0}])
+    layout, rng = StateLayout.of(scene), np.random.default_rng(0)
+    states = np.tile(layout.initial_state, (1201, 1))
+    states[:, layout.state.joint_rates] = rng.normal(scale=0.3, size=(1201, 3))
+    controls, aim = np.zeros((1200, layout.n_u)), np.array(scene.target.pose.dual_quaternion)
+    found = violations(scene, states, controls, aim)
+    laden, empty = (
+        violations(each, states, controls, aim)
+        for each in (scene.replace(phases=()), scene.replace({"phases": (), "payload": None}))
+    )
+    assert (laden != empty).any(axis=1).all()
+    np.testing.assert_array_equal(found[:, :800], laden[:, :800])
+    np.testing.assert_array_equal(found[:, 800:], empty[:, 800:])
 
 
 def test_the_page_knows_shapes_and_violations(constrained, make_flight, paper):
