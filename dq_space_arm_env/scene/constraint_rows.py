@@ -81,7 +81,7 @@ def rows_of(scene: Scene, each: Constraint) -> list[Row]:
         names = [f"{each.name}: {sign}{axis}" for axis in axes for sign in "+-"]
         rows += [Row(name, "N m s", *common) for name in names]
     elif isinstance(each, Plume):
-        rows.append(Row(each.name, "N m", *common, has_input=True))
+        rows.append(Row(each.name, "N", *common, has_input=True))
     elif not isinstance(each, Terminal):
         is_length = hasattr(each, "point")  # line of sight and corridor; the others compare cosines
         rows.append(Row(each.name, "m" if is_length else "1", *common))

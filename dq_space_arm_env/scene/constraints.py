@@ -218,7 +218,7 @@ class ApproachCorridor(Constraint):
 
 
 class Plume(Constraint):
-    """The gas of the thrusters, which leaves against their net force, misses a sphere; residual in N m."""
+    """The gas of the thrusters, which leaves against their net force, misses a sphere; residual in N."""
 
     kind: Literal["plume"] = Field(description="'plume'")
     thruster: Position = Field(

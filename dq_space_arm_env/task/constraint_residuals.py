@@ -19,6 +19,7 @@ from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.algebra.scalars import select, sqrt
 from dq_space_arm_env.algebra.vectors import (
     add,
+    cross,
     dot,
     matrix_vector,
     scale,
@@ -304,22 +305,28 @@ def _approach_corridor(situation: _Situation, constraint: ApproachCorridor) -> I
 
 
 def _plume(situation: _Situation, constraint: Plume) -> Iterator[Scalar]:
-    """-f . d - cos(plume + asin(R / |d|)) |f| |d|: the gas leaves along -f, the sphere is seen along d."""
+    """How deep -f is in the cone in which gas meets the sphere; half angle al = plume + asin(R / |d|).
+
+    Its distance from the surface is sin(al) (-f . n) - cos(al) |f x n| with n = d / |d| toward the sphere:
+    linear in f but for the turn about n.
+    """
     force, sphere = situation.inputs.force, constraint.keeps_clear
     d = subtract(situation.point(sphere.frame, sphere.position), constraint.thruster)
     # Within the sphere its half angle stays that at the surface, 90 deg.
     square = dot(d, d) + SMALLEST_LENGTH**2
     nearest = select(square > sphere.radius**2, square, sphere.radius**2)
     sine, half = sphere.radius / sqrt(nearest), math.radians(constraint.angle_deg)
-    square_of_cosine = 1.0 - sine * sine
-    cosine = sqrt(square_of_cosine + 1e-12)
+    cosine = sqrt(1.0 - sine * sine + 1e-12)
+    sine_of_both = math.sin(half) * cosine + math.cos(half) * sine
     cosine_of_both = math.cos(half) * cosine - math.sin(half) * sine
     thrusters = situation.scene.actuators.base_force
     assert thrusters is not None  # or the scene is refused
     strongest = max(thrusters.limit)
     rounded_off = 1e-3 * (strongest if math.isfinite(strongest) else 1.0)
-    strength = sqrt(dot(force, force) + rounded_off**2)
-    yield -dot(force, d) - cosine_of_both * strength * sqrt(square)
+    n = scale(1.0 / sqrt(square), d)
+    aside = cross(force, n)
+    aside_length = sqrt(dot(aside, aside) + rounded_off**2)
+    yield -sine_of_both * dot(force, n) - cosine_of_both * aside_length
 
 
 def _momentum(situation: _Situation, constraint: Momentum) -> Iterator[Scalar]:

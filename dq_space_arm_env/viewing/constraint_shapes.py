@@ -32,6 +32,8 @@ VISIBLE = 0.01
 """Share of its tolerance by which a row must be violated to be shown as violated."""
 INERTIAL = -1
 """Number of the inertial frame; the others are numbered as in `SpacecraftModel`."""
+GAS = -2
+"""Number of the axes of which z is where the gas of the thrusters goes."""
 
 _COLOR: Color = (1.0, 1.0, 1.0)  # the page tints them
 _SIDES = 32
@@ -46,6 +48,7 @@ class ConstraintShape(NamedTuple):
     place: int  # frame that carries the origin
     axes: int  # frame that gives the axes
     rows: tuple[int, ...]  # rows of `path_rows` whose violation it shows
+    nozzle: tuple[float, ...] = (0.0, 0.0, 0.0)  # origin in the frame that carries it, m
 
 
 def constraint_shapes(scene: Scene, length: float) -> list[list[ConstraintShape]]:
@@ -66,6 +69,25 @@ def constraint_shapes(scene: Scene, length: float) -> list[list[ConstraintShape]
         make = _SHAPES.get(type(each))
         found.append([] if make is None else list(make(scene, each, rows, numbers, length)))
     return found
+
+
+def gas_of(scene: Scene, controls: FloatArray) -> FloatArray:
+    """Find where the gas of the thrusters goes.
+
+    Args:
+        scene: The scene, with thrusters.
+        controls: Shape (M, n_u), N, N m, rad/s; none acts in the last state.
+
+    Returns:
+        Vectors along -f in base axes, shape (M + 1, 3); of length 1 for the largest force along an axis.
+    """
+    layout, thrusters = StateLayout.of(scene), scene.actuators.base_force
+    assert thrusters is not None  # or there is no plume
+    given = controls[:, layout.control.base_force]
+    force = np.zeros((len(controls) + 1, 3))
+    force[:-1, : given.shape[1]] = given  # planar: x and y
+    limits = [limit for limit in thrusters.limit if math.isfinite(limit) and limit > 0.0]
+    return -force / max(limits, default=max(float(np.abs(force).max()), 1.0))
 
 
 def violations(scene: Scene, states: FloatArray, controls: FloatArray, body: FloatArray) -> NDArray[np.bool_]:
@@ -168,8 +190,11 @@ def _approach_corridor(
 def _plume(
     scene: Scene, each: Plume, rows: Rows, numbers: Numbers, length: float
 ) -> Iterator[ConstraintShape]:
+    """The sphere, and the gas: a cone along -f."""
     frame = numbers[each.keeps_clear.frame]
     yield ConstraintShape(_capsule(each.keeps_clear), frame, frame, rows)
+    gas = _cone((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), each.angle_deg, length)
+    yield ConstraintShape(gas, numbers["base"], GAS, rows, each.thruster)
 
 
 _SHAPES: dict[type[Constraint], Callable[..., Iterator[ConstraintShape]]] = {

@@ -34,6 +34,7 @@ SIZES = {  # n_x, n_t, n_u
     "paper": (23, 21, 12),
     "payload": (20, 18, 9),
     "planar": (13, 12, 6),
+    "plume": (23, 21, 12),
     "pointing": (23, 21, 12),
     "random-masses": (20, 18, 9),
     "random-target": (23, 21, 12),

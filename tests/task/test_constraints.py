@@ -224,8 +224,8 @@ def test_cones_and_plume_against_vectors():
         force = base.apply(u[:3])
         d = there - at - base.apply([0, 0.1, -0.2])
         opening = math.radians(20) + math.asin(0.3 / np.linalg.norm(d))
-        limit = math.cos(opening) * np.linalg.norm(force) * np.linalg.norm(d)
-        expected.append(-force @ d - limit)
+        between = math.acos(-unit(force) @ unit(d))
+        expected.append(np.linalg.norm(force) * math.sin(opening - between))
         np.testing.assert_allclose(kernels.constraints(x, u), expected, atol=2e-3)
 
 

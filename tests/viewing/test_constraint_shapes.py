@@ -10,7 +10,14 @@ import pytest
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.constraint_rows import path_rows
-from dq_space_arm_env.viewing.constraint_shapes import INERTIAL, VISIBLE, constraint_shapes, violations
+from dq_space_arm_env.viewing.constraint_shapes import (
+    GAS,
+    INERTIAL,
+    VISIBLE,
+    constraint_shapes,
+    gas_of,
+    violations,
+)
 from dq_space_arm_env.viewing.replay import replay_page
 
 CAPSULE = {"frame": "link 2", "position": [0.1, 0, 0], "to": [0.1, 0.6, 0], "radius": 0.05}
@@ -45,7 +52,13 @@ KINDS = [
         "width": 0.1,
     },
     {"name": "limits", "kind": "joint_limits", "rate": 1.0},
-    {"name": "gas", "kind": "plume", "angle_deg": 20, "keeps_clear": {"frame": "tip", "radius": 0.2}},
+    {
+        "name": "gas",
+        "kind": "plume",
+        "thruster": [0.1, 0, -0.4],
+        "angle_deg": 20,
+        "keeps_clear": {"frame": "tip", "radius": 0.2},
+    },
 ]
 
 
@@ -74,7 +87,19 @@ def test_shapes_have_the_sizes_and_frames_of_the_constraints(constrained):
     radius = 0.1 - wall[:, 0] * np.tan(np.radians(25))
     np.testing.assert_allclose(np.linalg.norm(wall[:, 1:], axis=1), radius, atol=1e-12)
     assert limits == []
-    assert gas[0].rows == (10,)
+    assert gas[0].rows == gas[1].rows == (10,)
+    assert (gas[1].place, gas[1].axes, gas[1].nozzle) == (0, GAS, (0.1, 0.0, -0.4))
+    blown = gas[1].mesh.corners.reshape(-1, 3)
+    blown = blown[np.linalg.norm(blown, axis=1) > 1e-9]
+    np.testing.assert_allclose(
+        blown[:, 2] / np.linalg.norm(blown, axis=1), np.cos(np.radians(20)), atol=1e-12
+    )
+
+
+def test_gas_leaves_against_the_force(paper):
+    controls = np.zeros((2, 12))
+    controls[:, :3] = [[10, 0, 0], [0, -5, 2.5]]
+    np.testing.assert_array_equal(gas_of(paper, controls), [[-1, 0, 0], [0, 0.5, -0.25], [0, 0, 0]])
 
 
 def test_what_is_red_is_what_the_compiled_residuals_call_violated(constrained, make_flight):
@@ -112,15 +137,19 @@ def test_the_page_knows_shapes_and_violations(constrained, make_flight, paper):
     text = r'<script type="application/json" id="replay-data">(.*?)</script>'
     plain, data = (json.loads(re.search(text, page, re.DOTALL)[1]) for page in pages)
     assert "constraints" not in plain
-    drawn, blob = data["constraints"], b64decode(data["blob"])
+    drawn, blob, flight = data["constraints"], b64decode(data["blob"]), make_flight(constrained)
 
     def table(place, rows):
         return np.frombuffer(blob, place["type"], place["length"], place["start"]).reshape(rows, -1)
 
     assert drawn["names"] == [each["name"] for each in KINDS]
-    assert drawn["owners"] == [0, 0, 1, 1, 2, 2, 3, 5]
+    assert drawn["owners"] == [0, 0, 1, 1, 2, 2, 3, 5, 5]
+    assert drawn["frames"][-1] == [0, GAS]
+    np.testing.assert_array_equal(
+        table(drawn["gas"][0], len(flight.states)), gas_of(constrained, flight.controls).astype(np.float32)
+    )
     assert drawn["frames"][:3] == [[2, 2], [-1, -1], [0, 0]]
-    shapes, broken = table(drawn["violated"][0], 8), table(drawn["broken"][0], 6)
+    shapes, broken = table(drawn["violated"][0], 9), table(drawn["broken"][0], 6)
     np.testing.assert_array_equal(shapes, broken[drawn["owners"]])  # each of these has one row, or none
     assert broken.any()
     assert not broken.all()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.constraint_rows import rows_of
-from dq_space_arm_env.viewing.constraint_shapes import constraint_shapes
+from dq_space_arm_env.viewing.constraint_shapes import GAS, constraint_shapes, gas_of
 from dq_space_arm_env.viewing.rendering.solids import Mesh
 from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
 from dq_space_arm_env.viewing.replay.flights import FloatArray, ShownFlight, poses_at
@@ -43,7 +43,9 @@ class ConstraintDrawing(NamedTuple):
 
     names: tuple[str, ...]  # of the constraints
     triangles: Triangles  # each group is a shape, in its axes
-    frames: tuple[tuple[int, int], ...]  # of each shape: of its origin, and of its axes; -1 is inertial
+    frames: tuple[tuple[int, int], ...]  # of each shape: of its origin, and of its axes
+    nozzles: tuple[tuple[float, ...], ...]  # of each shape: its origin in its frame, m
+    gas: tuple[FloatArray, ...]  # by flight: where it goes, base axes, shape (M + 1, 3); empty for none
     owners: tuple[int, ...]  # number of the constraint of each shape
     violated: tuple[NDArray[np.bool_], ...]  # by flight: whether a shape is violated, (shapes, M + 1)
     broken: tuple[NDArray[np.bool_], ...]  # by flight: whether a constraint is, (constraints, M + 1)
@@ -86,8 +88,13 @@ def constraints_of(scene: Scene, flights: Sequence[ShownFlight]) -> ConstraintDr
         violated.append(np.array([rows[list(shape.rows)].any(axis=0) for _, shape in shapes]))
         spans = [rows[end - len(part) : end].any(axis=0) for part, end in zip(parts, ends, strict=True)]
         broken.append(np.array(spans))
+    nozzles = tuple(shape.nozzle for _, shape in shapes)
+    has_gas = any(shape.axes == GAS for _, shape in shapes)
+    gas = tuple(gas_of(scene, flight.controls) for flight in flights) if has_gas else ()
     names, owners = tuple(each.name for each in listed), tuple(number for number, _ in shapes)
-    return ConstraintDrawing(names, triangles, tuple(frames), owners, tuple(violated), tuple(broken))
+    return ConstraintDrawing(
+        names, triangles, tuple(frames), nozzles, gas, owners, tuple(violated), tuple(broken)
+    )
 
 
 def _triangles_of(mesh: Mesh, groups: int, what: str) -> Triangles:

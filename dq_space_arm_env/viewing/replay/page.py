@@ -198,6 +198,8 @@ def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
             **_triangles(drawn.triangles, blob),
             "names": drawn.names,
             "frames": drawn.frames,
+            "nozzles": drawn.nozzles,
+            "gas": [blob.add(each.astype(np.float32)) for each in drawn.gas],
             "owners": drawn.owners,
             "violated": [blob.add(each.astype(np.uint8)) for each in drawn.violated],
             "broken": [blob.add(each.astype(np.uint8)) for each in drawn.broken],

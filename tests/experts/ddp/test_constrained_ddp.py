@@ -42,6 +42,7 @@ CONSTRAINED = (
     "joint-limits",
     "keep-out",
     "line-of-sight",
+    "plume",
     "pointing",
     "wheel-saturation",
 )

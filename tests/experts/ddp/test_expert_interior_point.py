@@ -10,7 +10,7 @@ from scripts.benchmarks.peers.interior_point_peer import InteriorPoint
 from scripts.benchmarks.peers.transcription import transcribe
 from scripts.benchmarks.solvers.runs import FATROP
 
-MINUTES = ("approach-corridor", "line-of-sight", "wheel-saturation")  # that IPOPT takes
+MINUTES = ("approach-corridor", "line-of-sight", "plume", "wheel-saturation")  # that IPOPT takes
 CONSTRAINED = [
     "joint-limits",
     "keep-out",

@@ -77,6 +77,20 @@ export function placedMatrix(poses, place, axes) {
 }
 
 /**
+ * Matrix from axes whose z is along a vector in a frame, about a point of that frame; they are scaled by the root of
+ * the vector's length, which shows weak ones too.
+ */
+export function turnedMatrix(poses, place, point, vector) {
+  const length = Math.hypot(...vector);
+  const z = length > 0 ? [...vector].map((part) => part / length) : [0, 0, 1];
+  const aside = Math.abs(z[0]) < 0.7 ? [1, 0, 0] : [0, 1, 0];
+  const across = cross(z, aside);
+  const y = across.map((part) => part / Math.hypot(...across));
+  const scaled = [cross(y, z), y, z].map((axis) => [...axis.map((part) => Math.sqrt(length) * part), 0]);
+  return multiply(poseMatrix(poses, 8 * place), new Float32Array([...scaled.flat(), ...point, 1]));
+}
+
+/**
  * Blend poses: `share` of the way from those at `from` to those at `to`, `count` of them in a row. The blend
  * of two near dual quaternions, made a unit again, is the screw motion between the two poses.
  */

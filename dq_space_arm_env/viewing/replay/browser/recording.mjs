@@ -16,7 +16,7 @@ export function readRecording(text) {
   for (const each of constraints ? [solids, constraints] : [solids]) {
     for (const name of ["positions", "normals", "colors", "triangles"]) each[name] = array(each[name]);
   }
-  if (constraints) for (const name of ["violated", "broken"]) constraints[name] = constraints[name].map(array);
+  if (constraints) for (const name of ["violated", "broken", "gas"]) constraints[name] = constraints[name].map(array);
   view.points = array(view.points);
   const frameCount = solids.counts.length - 3; // the last three are those of the target, of its body, of the payload
   const poses = (place) => (place && !Array.isArray(place) ? array(place) : place);
@@ -69,6 +69,12 @@ export class Flight {
   setAt(table, time) {
     const size = this.steps + 1, instant = Math.min(Math.floor(Math.max(time / this.dt, 0) + 1e-6), this.steps);
     return Array.from({ length: table.length / size }, (_, row) => table[row * size + instant] === 1);
+  }
+
+  /** Of the rows of a table of vectors, one for each instant: that at a time, in s. */
+  vectorAt(table, time) {
+    const instant = Math.min(Math.floor(Math.max(time / this.dt, 0) + 1e-6), this.steps);
+    return table.subarray(3 * instant, 3 * instant + 3);
   }
 
   /** Position of the tip at an instant. */

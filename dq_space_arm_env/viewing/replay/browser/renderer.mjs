@@ -1,6 +1,6 @@
 // Draws a moment of the flights with WebGL: one flight solid, the others as ghosts.
 
-import { dot, multiply, placedMatrix, positionOf } from "./algebra.mjs";
+import { dot, multiply, placedMatrix, positionOf, turnedMatrix } from "./algebra.mjs";
 import { ball, grid, ribbon, stars } from "./shapes.mjs";
 import { GRID_SHADERS, RIBBON_SHADERS, SKY_SHADERS, SOLID_SHADERS, STAR_SHADERS } from "./shaders.mjs";
 
@@ -8,6 +8,7 @@ const STARS = 1200; // over the whole sky, of which a picture shows a few percen
 const RIBBON_WIDTH = 3.2; // CSS pixels
 const GHOST_OPACITY = 0.5;
 const CONSTRAINT_OPACITY = 0.5; // at the rim of a shape
+const GAS = -2; // axes of which z is where the gas of the thrusters goes
 const GHOST_TINT = 0.75;
 const GHOST_GLOW = 0.25; // so that a ghost is seen against a dark sky
 
@@ -46,7 +47,12 @@ export class Renderer {
     if (constraints) {
       this.constraints = this.solid(constraints);
       const [frames, parts] = [constraints.frames, partsOf(constraints.counts)];
-      this.constraintParts = parts.map((part, index) => ({ ...part, frame: frames[index][0], axes: frames[index][1] }));
+      this.constraintParts = parts.map((part, index) => ({
+        ...part,
+        frame: frames[index][0],
+        axes: frames[index][1],
+        point: constraints.nozzles[index],
+      }));
     }
     const bubble = ball(scene.tolerance);
     this.bubble = this.solid(bubble);
@@ -201,7 +207,7 @@ export class Renderer {
     gl.depthMask(true);
   }
 
-  drawSolid(flight, { shape, parts, tint, opacity, rim = 0, glow = 0 }) {
+  drawSolid(flight, { shape, parts, tint, opacity, rim = 0, glow = 0, gas = null }) {
     const { gl } = this;
     const uniforms = this.use("solid", shape);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, shape.triangles);
@@ -209,9 +215,11 @@ export class Renderer {
     gl.uniform1f(uniforms.u_opacity, opacity);
     gl.uniform1f(uniforms.u_rim, rim);
     gl.uniform1f(uniforms.u_ambient, this.look.ambient + glow);
-    for (const { frame, axes = frame, start, count } of parts) {
+    for (const { frame, axes = frame, point, start, count } of parts) {
       if (count === 0) continue;
-      const matrix = multiply(this.matrices.view, placedMatrix(flight.poses, frame, axes));
+      const { poses } = flight;
+      const place = axes === GAS ? turnedMatrix(poses, frame, point, gas) : placedMatrix(poses, frame, axes);
+      const matrix = multiply(this.matrices.view, place);
       gl.uniformMatrix4fv(uniforms.u_frame, false, matrix);
       gl.drawElements(gl.TRIANGLES, 3 * count, gl.UNSIGNED_SHORT, 6 * start);
     }
@@ -220,13 +228,15 @@ export class Renderer {
   /** Cones and volumes of the constraints that the flight in front must keep to; red where it does not. */
   drawConstraints(flight, { solid, time, shown }) {
     const { gl, look } = this;
-    const { violated, owners } = this.recording.constraints;
+    const { violated, owners, gas } = this.recording.constraints;
+    const blown = gas.length ? flight.vectorAt(gas[solid], time) : null;
     const broken = flight.setAt(violated[solid], time);
     gl.disable(gl.CULL_FACE); // cones are open
     for (const state of [false, true]) {
       const parts = this.constraintParts.filter((_, index) => shown[owners[index]] && broken[index] === state);
       const tint = [...(state ? look.violated : look.kept), 1];
-      this.drawSolid(flight, { shape: this.constraints, parts, tint, opacity: CONSTRAINT_OPACITY, rim: 1, glow: 0.3 });
+      const seen = { tint, opacity: CONSTRAINT_OPACITY, rim: 1, glow: 0.3, gas: blown };
+      this.drawSolid(flight, { shape: this.constraints, parts, ...seen });
     }
     gl.enable(gl.CULL_FACE);
   }
