@@ -73,6 +73,7 @@ def test_hashes_and_files_of_scenes_without_them_are_as_old_as_the_scenes() -> N
         "capture-and-detumble",
         "plume",
         "release",
+        "servicing",
         "tracking",
         "tumbling-target",
     ]

@@ -41,6 +41,7 @@ SIZES = {  # n_x, n_t, n_u
     "reaction-wheels": (23, 21, 9),
     "refuelling": (23, 21, 12),
     "release": (20, 18, 9),
+    "servicing": (23, 21, 12),
     "six-joint": (26, 24, 12),
     "tip-load": (23, 21, 12),
     "tracking": (23, 21, 12),

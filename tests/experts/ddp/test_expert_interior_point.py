@@ -10,7 +10,8 @@ from scripts.benchmarks.peers.interior_point_peer import InteriorPoint
 from scripts.benchmarks.peers.transcription import transcribe
 from scripts.benchmarks.solvers.runs import FATROP
 
-MINUTES = ("approach-corridor", "line-of-sight", "plume", "wheel-saturation")  # that IPOPT takes
+MINUTES = ("approach-corridor", "line-of-sight", "wheel-saturation")  # that IPOPT takes
+IN_LONG_STEPS = ("approach-corridor", "line-of-sight", "plume")
 CONSTRAINED = [
     "joint-limits",
     "keep-out",
@@ -51,6 +52,18 @@ def test_ipopt_finds_the_experts_plan_under_constraints(name):
     solution = GuidedDDP(name).solve()
     assert solution.converged
     ipopt = InteriorPoint(ArmProblem(name), first_barrier=1e-3, tolerance=1e-8)
+    run = ipopt.solve(u_init=solution.controls, x_init=solution.states)
+    assert run.converged, run.stop_reason
+    assert solution.cost == pytest.approx(run.replayed_cost, rel=1e-6)
+
+
+@pytest.mark.endurance
+@pytest.mark.parametrize("name", IN_LONG_STEPS)
+def test_ipopt_finds_the_experts_plan_in_long_steps(name):
+    scene = load_scene(name).replace(simulation={"steps": 125, "dt": 0.12})
+    solution = GuidedDDP(scene, coarsening=1).solve()
+    assert solution.converged
+    ipopt = InteriorPoint(ArmProblem(scene), first_barrier=1e-3, tolerance=1e-8)
     run = ipopt.solve(u_init=solution.controls, x_init=solution.states)
     assert run.converged, run.stop_reason
     assert solution.cost == pytest.approx(run.replayed_cost, rel=1e-6)
