@@ -1,19 +1,10 @@
-"""Guided DDP: initial guesses from solved maneuvers, rolled out from the requested start.
+"""Guided DDP: box-DDP from initial guesses (`initial_guesses`), which reaches the target.
 
-From zero controls a solve may end in a poor minimum, with joints wound up and the tip far from its target;
-the controls of a maneuver solved for another start do little better, because their errors accumulate over the
-stages. The policy of a solved maneuver, u = u_k + K_k (x (-) x_k), rolled out from the new start, corrects
-itself: its trajectory lies in the valley of its own minimum. One good maneuver per scene is therefore enough,
-and worth some effort (`START_REGULARIZATIONS`). It serves other targets as well, as it is or moved along with
-the target: in empty space a maneuver may begin anywhere.
+One good maneuver per scene is enough to guess from, and worth some effort (`START_REGULARIZATIONS`).
 
-Where a policy strays too far from its maneuver, kinematics provide a guess: one screw motion leads the tip to
-the target, and the arm follows (`screw_motion`).
-
-All of this happens in few, long steps first, where a solve takes a tenth of the time and several guesses can
-be compared. The policy found there, followed in the problem's own steps, is a few iterations away from their
-minimum; where it is more, a solve in half the long steps comes between. Nothing is compiled for it: the
-length of a step is an input of the kernels.
+All of this happens in few, long steps first (`coarsening`), where a solve takes a tenth of the time and
+several guesses can be compared. The policy found there, followed in the problem's own steps, is a few
+iterations away from their minimum.
 
 Where thrust is expensive and the base drifts, the cheapest maneuver may end outside the tolerances of the
 task. Then they become constraints, and the solve goes on from there: it finds the cheapest maneuver that
@@ -22,68 +13,39 @@ reaches the target. Kernels with constraints are compiled for the first start th
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from experts.ddp.box_ddp import BoxDDP
-from experts.ddp.second_order import SecondOrder
 from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason
-from experts.guesses.policies import coarsened, follow, policies, refined, track
+from experts.guesses.attempts import Attempt, best_solution, is_known
+from experts.guesses.coarsening import checked_factors, find_coarsening
+from experts.guesses.initial_guesses import (
+    Guess,
+    KinematicGuess,
+    multipliers_of,
+    ranked_guesses,
+    zero_controls,
+)
+from experts.guesses.policies import coarsened, follow, refined
 from experts.guesses.preparation import Preparation, keep_preparation, preparation_key, read_preparation
-from experts.guesses.screw_motion import ScrewMotion
 from experts.guesses.screw_motion import screw_motion as guess_screw_motion
 from experts.problems.arm_problem import ArmProblem, WindowProblem
 from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array, check_at_least
 
 START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
 """First regularizations of solves of the initial state from zero controls; the cheapest solution is kept."""
-POLICY_REGULARIZATION = 1e2
-"""First regularization from a policy's trajectory: near a minimum, longer steps than usual are safe."""
-STRAYED = 3.0
-"""A policy whose rollout costs this many times its own maneuver has strayed too far from it."""
-SCREW_REGULARIZATION = 1e2
-"""First regularization from a screw motion: the arm is not wound up, and long steps rarely wind it up."""
-ZERO_REGULARIZATION = 1e4
-"""First regularization from zero controls: short first steps rarely end in a poor minimum."""
 NEAR_REGULARIZATION = 0.0
 """First regularization where constraints begin, or steps become shorter: the minimum is near."""
-LARGEST_COARSENING = 8
-"""Most steps in a long one."""
 NEAR_ITERATIONS = 10
 """Long steps are short enough if their policy is within so many iterations of the problem's own minimum."""
 NEAR_ITERATIONS_CONSTRAINED = 40
 """The same where there are constraints, whose multipliers follow."""
-CREEPING = 30
-"""Iterations in long steps beyond which Gauss-Newton's model creeps, and the mirrored one is tried."""
-SAME_MINIMUM = 1e-6
-"""Minima whose costs differ by a smaller share are the same."""
-CHEAPER = 0.999
-"""The mirrored model is taken if the cost of its minimum is below this share of Gauss-Newton's."""
-
 
 RESERVE = 0.05
 """Share of the tolerances that demonstrations and controllers keep free for rounding and disturbances."""
-
-
-class _Guess(NamedTuple):
-    """Controls to start a solve from."""
-
-    name: str  # in the solution's metadata
-    controls: FloatArray | None  # shape (N, n_u); None for zeros
-    cost: float  # of their rollout; inf if not finite or unknown
-    regularization: float  # first one of the solve
-    interrupted: bool = False  # whether the user stopped the solve that led to it
-    long_steps: tuple[dict[str, Any], ...] = ()  # the attempts in long steps that led to it
-    multipliers: FloatArray | None = None  # of the constrained maneuver that it comes from, if it is one
-
-
-class _Attempt(NamedTuple):
-    """A solve."""
-
-    guess: str
-    solution: Solution
 
 
 class GuidedDDP:
@@ -159,11 +121,11 @@ class GuidedDDP:
         self.reach_target, self.reserve = reach_target, reserve
         self._has_constraints = getattr(self.problem, "constraints", None) is not None
         self._constrained_solver: BoxDDP | None = None  # nothing is compiled for it until it is needed
-        self._kinematic_guess: Callable[[FloatArray], ScrewMotion] | None = None
+        self._kinematic_guess: KinematicGuess | None = None
         if screw_motion and isinstance(self.problem, ArmProblem):
             self._kinematic_guess = partial(guess_screw_motion, self.problem)
         self.compare = compare
-        self._chooses_model = second_order is None and self.problem.has_second_order
+        self.chooses_model = second_order is None and self.problem.has_second_order
         self._vacancies = remember
         self._library = None if library is None else list(library)
         for i, solution in enumerate(self._library or ()):
@@ -171,9 +133,9 @@ class GuidedDDP:
         self._coarse: GuidedDDP | None = None
         self._coarsening: tuple[int, ...] | None = None if isinstance(self.problem, ArmProblem) else ()
         if coarsening is not None:
-            self._coarsening = self._check_coarsening(coarsening)
+            self._coarsening = checked_factors(coarsening, self.problem)
             if self._coarsening:
-                self._coarse = self._in_long_steps(self._coarsening)
+                self._coarse = self.in_long_steps(self._coarsening)
 
     @property
     def library(self) -> tuple[Solution, ...]:
@@ -243,7 +205,7 @@ class GuidedDDP:
         self.problem.parameters.set(given)
         start = np.asarray(self.problem.initial_state if x0 is None else x0, dtype=np.float64)
         check_array("x0", start, (self.problem.n_states,))
-        attempts: list[_Attempt] = []
+        attempts: list[Attempt] = []
         long_steps: tuple[dict[str, Any], ...] = ()
         for guess in self._guesses(start, callback):
             long_steps += guess.long_steps
@@ -251,36 +213,28 @@ class GuidedDDP:
             last = attempts[-1].solution
             if last.stop_reason is StopReason.INTERRUPTED or (self._is_good(last) and not self.compare):
                 break
-        # Constraints that did not help are dropped.
-        good = [attempt for attempt in attempts if self._is_good(attempt.solution)]
-        own = [attempt for attempt in attempts if attempt.solution.problem is self.problem]
-        best = min(good or own or attempts, key=lambda attempt: attempt.solution.cost)
-        solution = best.solution
-        solution.metadata["guess"] = best.guess
-        solution.metadata["attempts"] = [_summary(attempt) for attempt in attempts]
+        solution = best_solution(attempts, self.problem, self._is_good)
         solution.metadata["long_steps"] = list(long_steps)
         self._remember(solution)
         return solution
 
     def _attempts(
-        self, guess: _Guess, start: FloatArray, callback: Callback | None, before: Sequence[_Attempt]
-    ) -> list[_Attempt]:
+        self, guess: Guess, start: FloatArray, callback: Callback | None, before: Sequence[Attempt]
+    ) -> list[Attempt]:
         """Solve from a guess, and lead a minimum that ends outside the tolerances to the target.
 
         A minimum that one of the attempts before found was led from there.
         """
         solution = self._solve_from(guess, start, callback)
-        attempts = [_Attempt(guess.name, solution)]
+        attempts = [Attempt(guess.name, solution)]
         misses = solution.converged and not self._is_good(solution)
         can_be_led = isinstance(self.problem, ArmProblem | WindowProblem) and solution.constraints is None
-        costs = [attempt.solution.cost for attempt in before]
-        known = np.isclose(costs, solution.cost, rtol=SAME_MINIMUM, atol=0.0).any()
-        if self.reach_target and misses and can_be_led and not known:
+        if self.reach_target and misses and can_be_led and not is_known(solution, before):
             solver = self._constrained
             solver.initial_regularization = NEAR_REGULARIZATION
             rows = self.problem.parameters.rows
             led = solver.solve(start, solution.controls, callback, parameters=rows)
-            attempts.append(_Attempt(guess.name, led))
+            attempts.append(Attempt(guess.name, led))
         return attempts
 
     def _remember(self, solution: Solution) -> None:
@@ -292,38 +246,19 @@ class GuidedDDP:
             self._library.append(solution)
             self._vacancies -= 1
 
-    def _guesses(self, start: FloatArray, callback: Callback | None) -> Iterator[_Guess]:
+    def _guesses(self, start: FloatArray, callback: Callback | None) -> Iterator[Guess]:
         """Make the guesses to solve, one after another."""
         if self._coarse is not None:
             guess = self._coarse_guess(self._coarse, start, callback)
             if guess is not None:
                 yield guess
-        yield from self._own_guesses(start, self.library)
-
-    def _own_guesses(self, start: FloatArray, library: Sequence[Solution]) -> list[_Guess]:
-        """List the guesses to solve, cheapest rollout first; zero controls are the last resort."""
-        rollouts, strayed = [], True
-        for i, solution in enumerate(library):
-            for name, policy in policies(solution, self.problem).items():
-                trial = follow(policy, self.problem, start)
-                guess = _Guess(f"policy {i}{name}", trial.controls, trial.cost, POLICY_REGULARIZATION)
-                if self._has_constraints:
-                    guess = guess._replace(multipliers=_multipliers(solution))
-                rollouts.append(guess)
-                strayed = strayed and trial.cost > STRAYED * solution.cost
-        if strayed and self._kinematic_guess is not None:
-            motion = self._kinematic_guess(start)
-            rollouts.append(_Guess("screw motion", *track(self.problem, *motion), SCREW_REGULARIZATION))
-        ranked = sorted(
-            (guess for guess in rollouts if np.isfinite(guess.cost)), key=lambda guess: guess.cost
-        )
-        zero = _Guess("zero controls", None, np.inf, ZERO_REGULARIZATION)
         # The last of two or more attempts starts from zero controls.
-        return [*ranked[: max(self.attempts - 1, 1)], zero][: self.attempts]
+        ranked = ranked_guesses(self.problem, start, self.library, self._kinematic_guess)
+        yield from [*ranked[: max(self.attempts - 1, 1)], zero_controls()][: self.attempts]
 
     def _coarse_guess(
         self, coarse: "GuidedDDP", start: FloatArray, callback: Callback | None
-    ) -> _Guess | None:
+    ) -> Guess | None:
         """Solve in long steps, and follow the policy in the problem's own; None if that diverges."""
         factor = self.problem.horizon // coarse.problem.horizon
 
@@ -340,17 +275,17 @@ class GuidedDDP:
             return None
         facts = found.metadata
         attempts = facts["long_steps"] + facts["attempts"]  # those in steps twice as long come first
-        return _Guess(
+        return Guess(
             facts["guess"],
             trial.controls,
             trial.cost,
             NEAR_REGULARIZATION,
             interrupted=found.stop_reason is StopReason.INTERRUPTED,
             long_steps=tuple({**attempt, "cost": factor * attempt["cost"]} for attempt in attempts),
-            multipliers=_multipliers(policy),
+            multipliers=multipliers_of(policy),
         )
 
-    def _solve_from(self, guess: _Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
+    def _solve_from(self, guess: Guess, start: FloatArray, callback: Callback | None = None) -> Solution:
         """Solve, with the tolerances as constraints if the guess has multipliers of theirs."""
         solver = self._solver_for(guess)
         solver.initial_regularization = guess.regularization
@@ -362,7 +297,7 @@ class GuidedDDP:
             multipliers=guess.multipliers,
         )
 
-    def _solver_for(self, guess: _Guess) -> BoxDDP:
+    def _solver_for(self, guess: Guess) -> BoxDDP:
         """The solver of a guess; its multipliers may be those of tolerances."""
         return self._solver if self._has_constraints or guess.multipliers is None else self._constrained
 
@@ -381,23 +316,19 @@ class GuidedDDP:
         misses: Callable[[FloatArray], float] | None = getattr(self.problem, "misses", None)
         return misses is None or misses(solution.states[-1]) <= 1.0
 
-    def _check_coarsening(self, given: int | Sequence[int]) -> tuple[int, ...]:
-        """Return the factors that are more than 1; raise ValueError if one is no multiple of the next."""
-        factors = tuple(given) if isinstance(given, Sequence) else (given,)
-        for factor, next_one in zip(factors, (*factors[1:], 1), strict=True):
-            if not isinstance(factor, int | np.integer) or factor < 1 or factor % next_one:
-                raise ValueError(
-                    f"coarsening is {factors}; it must be whole numbers of steps, each a multiple of the next"
-                )
-        found = tuple(int(factor) for factor in factors if factor > 1)
-        if found and not isinstance(self.problem, ArmProblem):
-            raise ValueError(f"coarsening is {factors}; only the maneuver of a scene has long steps")
-        return found
+    def in_long_steps(
+        self, coarsening: Sequence[int], *, second_order: str | None = None, after: Self | None = None
+    ) -> Self:
+        """Return the solver in long steps, with the settings of this one; its library is this one's.
 
-    def _in_long_steps(self, coarsening: Sequence[int]) -> "GuidedDDP":
-        """Make the solver in long steps, with the settings of this one; its library is this one's."""
+        Args:
+            coarsening: Steps in a long one, the longest first.
+            second_order: Second derivatives that it uses; None for those of this one.
+            after: The solver in longer steps that it begins with, if there is one already.
+        """
         known, factor = self._library, coarsening[-1]
-        return GuidedDDP(
+        settings = {**self._settings, **({} if second_order is None else {"second_order": second_order})}
+        found = type(self)(
             cast(ArmProblem, self.problem).coarsened(factor),
             library=None if known is None else [coarsened(member, factor) for member in known],
             screw_motion=self._kinematic_guess is not None,
@@ -407,8 +338,11 @@ class GuidedDDP:
             attempts=self.attempts,
             compare=len(coarsening) == 1,
             coarsening=[longer // factor for longer in coarsening[:-1]] or 1,
-            **self._settings,
+            **settings,
         )
+        if after is not None:
+            found._coarse = after
+        return found
 
     def _prepare(self) -> None:
         """Find how to solve this maneuver, or read what another process found."""
@@ -420,15 +354,15 @@ class GuidedDDP:
             key = preparation_key(self.problem, {**settings, "screw_motion": kinematic})
             known = read_preparation(key)
         if known is None:
-            self._coarsening = self._find_coarsening()
+            self._coarsening, self._coarse = find_coarsening(self)
             if key is not None:
                 found = self._coarsening, self._solver.second_order.value, self._longest.library
                 keep_preparation(key, Preparation(*found))
             return
         if known.second_order != self._solver.second_order:
-            self._take_model(known.second_order)
+            self.take_model(known.second_order)
         if known.coarsening:
-            self._coarse = self._in_long_steps(known.coarsening)
+            self._coarse = self.in_long_steps(known.coarsening)
         self._longest._library = list(known.library)
         self._coarsening = known.coarsening
 
@@ -437,59 +371,22 @@ class GuidedDDP:
         """The solver in the longest steps, whose library is this one's."""
         return self if self._coarse is None else self._coarse._longest
 
-    def _take_model(self, second_order: str) -> None:
-        """Solve with other second derivatives from now on."""
+    def take_model(self, second_order: str) -> None:
+        """Solve with other second derivatives from now on.
+
+        Args:
+            second_order: See `BoxDDP`.
+        """
         self._settings = {**self._settings, "second_order": second_order}
         self._solver, self._constrained_solver = BoxDDP(self.problem, **self._settings), None
-        self._chooses_model = False
+        self.chooses_model = False
 
-    def _find_coarsening(self) -> tuple[int, ...]:
-        """Find the longest steps whose policy leads to the minimum in the problem's own."""
-        horizon = self.problem.horizon
-        for factor in range(LARGEST_COARSENING, 1, -1):
-            if horizon % factor == 0 and cast(ArmProblem, self.problem).can_coarsen(factor):
-                coarse = self._with_best_model(factor)
-                if self._leads_to_minimum(coarse):
-                    self._coarse = coarse
-                    return (factor,)
-                halved = self._in_halved_steps(coarse)
-                if halved is not None and self._leads_to_minimum(halved):
-                    self._coarse = halved
-                    return (factor, factor // 2)
-        return ()
+    def leads_to_minimum(self, coarse: "GuidedDDP") -> bool:
+        """Tell whether the policy in long steps is near a minimum in the problem's own, from its own start.
 
-    def _in_halved_steps(self, coarse: "GuidedDDP") -> "GuidedDDP | None":
-        """Make the solver in half the long steps, which begins where the long ones end; None if it is no use.
-
-        Where fast motions bend a narrow valley, most iterations lead along it: they are cheaper there. It is
-        no use where long steps are so inaccurate that their policy strays in the problem's own, nor where
-        half of them are those, or no whole number of them.
+        Args:
+            coarse: The solver in them.
         """
-        factor = self.problem.horizon // coarse.problem.horizon
-        if factor % 2 or factor == 2 or not coarse.library:
-            return None
-        policy = refined(coarse.library[0], self.problem)
-        if follow(policy, self.problem, self.problem.initial_state).cost > STRAYED * policy.cost:
-            return None
-        halved = self._in_long_steps((factor, factor // 2))
-        halved._coarse = coarse
-        return halved
-
-    def _with_best_model(self, factor: int) -> "GuidedDDP":
-        """Make the solver in long steps, with the mirrored model from now on if that pays."""
-        coarse = self._in_long_steps((factor,))
-        if self._chooses_model and coarse.library and coarse.library[0].iterations > CREEPING:
-            settings = self._settings
-            self._settings = {**settings, "second_order": SecondOrder.MIRRORED.value}
-            mirrored = self._in_long_steps((factor,))
-            if mirrored.library and mirrored.library[0].cost < CHEAPER * coarse.library[0].cost:
-                self._take_model(SecondOrder.MIRRORED.value)
-                return mirrored
-            self._settings = settings
-        return coarse
-
-    def _leads_to_minimum(self, coarse: "GuidedDDP") -> bool:
-        """Whether the policy in long steps is near a minimum in the problem's own, from its own start."""
         start = self.problem.initial_state
         self.problem.parameters.set(None)
         guess = self._coarse_guess(coarse, start, None)
@@ -513,17 +410,12 @@ class GuidedDDP:
         self.problem.parameters.set(None)
         solutions: list[Solution] = []
         for regularization in START_REGULARIZATIONS:
-            solution = self._solve_from(_Guess("zero controls", None, np.inf, regularization), start)
+            solution = self._solve_from(zero_controls(regularization), start)
             if solution.stop_reason is StopReason.INTERRUPTED:
                 raise KeyboardInterrupt
             solutions.append(solution)
         best = min(solutions, key=lambda solution: solution.cost)
         return [best] if np.isfinite(best.cost) else []
-
-
-def _multipliers(solution: Solution) -> FloatArray | None:
-    """Multipliers of a solution to start another solve with; None where it needs none."""
-    return solution.multipliers if solution.multipliers.any() else None
 
 
 def _interrupt(record: IterationRecord) -> None:
@@ -538,15 +430,3 @@ def _check_sizes(name: str, solution: Solution, problem: ShootingProblem) -> Non
     check_array(f"{name}.controls", solution.controls, (horizon, n_controls))
     gains = (horizon, n_controls, problem.n_tangent)
     check_array(f"{name}.feedback_gains", solution.feedback_gains, gains)
-
-
-def _summary(attempt: _Attempt) -> dict[str, Any]:
-    """Describe an attempt for the metadata, as JSON values."""
-    solution = attempt.solution
-    return {
-        "guess": attempt.guess,
-        "constrained": solution.constraints is not None,
-        "cost": solution.cost,
-        "iterations": solution.iterations,
-        "stop_reason": solution.stop_reason.value,
-    }

@@ -18,7 +18,8 @@ from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.rollout import Trajectory
 from experts.ddp.second_order import SecondOrder
 from experts.ddp.solution import IterationRecord, Solution, StopReason
-from experts.guesses.guided import POLICY_REGULARIZATION, GuidedDDP
+from experts.guesses.guided import GuidedDDP
+from experts.guesses.initial_guesses import POLICY_REGULARIZATION
 from experts.guesses.policies import follow
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.paper_problem import PaperProblem

@@ -17,7 +17,8 @@ from dq_space_arm_env.scene.start import (
     start_from_draws,
 )
 from experts import BoxDDP, GuidedDDP, StopReason
-from experts.guesses.guided import START_REGULARIZATIONS, STRAYED, ZERO_REGULARIZATION
+from experts.guesses.guided import START_REGULARIZATIONS
+from experts.guesses.initial_guesses import STRAYED, ZERO_REGULARIZATION
 from experts.guesses.policies import coarsened, follow, refined
 from experts.guesses.screw_motion import ScrewMotion
 from scripts.benchmarks.solvers.runs import roll_out
@@ -401,7 +402,7 @@ def nothing_kept(monkeypatch):
 @pytest.fixture
 def halving(monkeypatch):
     """A solver whose long steps do not lead to the minimum before they are halved."""
-    monkeypatch.setattr(GuidedDDP, "_leads_to_minimum", lambda self, coarse: coarse.problem.horizon == 250)
+    monkeypatch.setattr(GuidedDDP, "leads_to_minimum", lambda self, coarse: coarse.problem.horizon == 250)
     nothing_kept(monkeypatch)
     return GuidedDDP("paper")
 
@@ -423,8 +424,8 @@ def test_halved_steps_lead_to_the_same_minimum(paper, halving, seed):
 
 
 def test_long_steps_whose_policy_strays_are_not_halved(monkeypatch):
-    monkeypatch.setattr(GuidedDDP, "_leads_to_minimum", lambda self, coarse: coarse.problem.horizon == 250)
-    monkeypatch.setattr("experts.guesses.guided.STRAYED", 0.5)
+    monkeypatch.setattr(GuidedDDP, "leads_to_minimum", lambda self, coarse: coarse.problem.horizon == 250)
+    monkeypatch.setattr("experts.guesses.coarsening.STRAYED", 0.5)
     nothing_kept(monkeypatch)
     solver = GuidedDDP("paper")
     assert solver.coarsening == (4,)
@@ -492,7 +493,7 @@ def test_another_process_reads_what_one_prepared_and_solves_the_same(monkeypatch
     start = random_start("planar", 3)
     expected = first.solve(start)
     assert len(kept()) == 1
-    monkeypatch.setattr(GuidedDDP, "_find_coarsening", None)
+    monkeypatch.setattr("experts.guesses.guided.find_coarsening", None)
     second = GuidedDDP("planar")
     assert (second.coarsening, second.second_order) == (first.coarsening, first.second_order)
     assert second.solve(start).controls.tobytes() == expected.controls.tobytes()
