@@ -64,8 +64,6 @@ NEARER, NEAREST = 0.5, 1e-5
 """Factor of that from one update to the next, and its least value."""
 LONG_ENOUGH = 0.5
 """Length of such a step."""
-CONSTRAINED_EXACT_MU = (1e-3, 1e-1, 1e1)
-"""Regularizations with which the hybrid tries the exact model where rows count."""
 PATIENCE = 8
 """Updates without progress at the largest penalty after which a problem counts as infeasible."""
 PROGRESS = 0.9
@@ -181,6 +179,11 @@ class AugmentedLagrangian:
         slopes = np.where(t < -0.5, -0.25 / np.minimum(t, -0.5), 1.0 + t)  # f'
         grown = np.maximum(multipliers * np.clip(slopes, *change), LEAST_MULTIPLIER)
         multipliers[:] = np.where(self._inequalities, grown, multipliers + t)
+
+    @property
+    def is_stiff(self) -> bool:
+        """Whether rows of stages count."""
+        return self.counts and not self.is_at_end
 
     @property
     def is_infeasible(self) -> bool:

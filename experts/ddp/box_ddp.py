@@ -5,7 +5,7 @@ model of the dynamics (iLQR), exact second derivatives (Newton's method), or a h
 (`second_order`). An iteration differentiates along the trajectory, runs a backward pass for a control update
 and its gains, and a forward pass that searches along the update for a step that reduces the cost as
 predicted. Given a guess of the states, a solve begins by multiple shooting (`multiple_shooting`). Constraints
-become penalties, whose multipliers follow the steps (`augmented_lagrangian`).
+become penalties, whose multipliers follow the steps (`multiplier_method`).
 
 **Convergence** is measured by the reduction of the cost that the model predicts for a full, unregularized
 step, relative to the cost. It does not depend on the units of states, controls or cost, it accounts for the
@@ -17,7 +17,6 @@ exists only if they are positive definite: neither a saddle nor a valley whose c
 overestimates counts as converged.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -25,19 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from experts.ddp.augmented_lagrangian import (
-    CONSTRAINED_EXACT_MU,
-    LONG_ENOUGH,
-    SERIOUS,
-    STATIONARITY,
-    AugmentedLagrangian,
-    ConstraintReport,
-)
-from experts.ddp.backward_pass import PASS_NOT_FINITE, PASS_NOT_POSITIVE_DEFINITE, PassResult
-from experts.ddp.end_response import end_response
+from experts.ddp.backward_pass import PASS_NOT_FINITE, PassResult
+from experts.ddp.directions import Directions
 from experts.ddp.multiple_shooting import MultipleShooting
+from experts.ddp.multiplier_method import MultiplierMethod
 from experts.ddp.rollout import FINISHED
-from experts.ddp.second_order import EXACT_MU, Regularization, SecondOrder, SolverState
+from experts.ddp.second_order import Regularization, SecondOrder, SolverState
 from experts.ddp.shooting import ShootingWorkspace, WorkTime, line_search
 from experts.ddp.solution import HISTORY_DTYPE, Callback, IterationRecord, Solution, Stop, StopReason
 from experts.problems.arm_problem import as_problem
@@ -103,11 +95,13 @@ class BoxDDP:
         self.plateau_iterations = plateau_iterations
         self.initial_regularization = initial_regularization
         self.second_order = SecondOrder.of(second_order, self.problem.has_second_order)
-        # Exact second derivatives, where there are any, have the last word on convergence.
-        self._has_exact = self.second_order is not SecondOrder.GAUSS_NEWTON
-        self._work = ShootingWorkspace(self.problem, self._has_exact, threads=threads)
+        has_exact = self.second_order is not SecondOrder.GAUSS_NEWTON
+        self._work = ShootingWorkspace(self.problem, has_exact, threads=threads)
+        self._directions = Directions(self._work, self.second_order)
         constraints: StageConstraints | None = getattr(self.problem, "constraints", None)
-        self._lagrangian = None if constraints is None else AugmentedLagrangian(constraints)
+        self._constrained: MultiplierMethod | None = None
+        if constraints is not None:
+            self._constrained = MultiplierMethod(self._work, constraints, self._directions)
         self._shooting: MultipleShooting | None = None
 
     def solve(
@@ -175,14 +169,15 @@ class BoxDDP:
 
     def _begin_multipliers(self, multipliers: FloatArray | None) -> None:
         """Begin with the multipliers of a similar maneuver, or without the constraints."""
-        if self._lagrangian is not None:
-            self._lagrangian.leave_out()
+        if self._constrained is not None:
+            self._constrained.lagrangian.leave_out()
         if multipliers is None:
             return
-        if self._lagrangian is None:
+        if self._constrained is None:
             raise ValueError("multipliers are given, but the problem has no constraints; leave them out")
-        check_array("multipliers", multipliers, self._lagrangian.constraints.multipliers.shape)
-        self._lagrangian.begin(multipliers)
+        lagrangian = self._constrained.lagrangian
+        check_array("multipliers", multipliers, lagrangian.constraints.multipliers.shape)
+        lagrangian.begin(multipliers)
 
     def _iterate(self, state: SolverState, callback: Callback | None) -> Stop | None:
         """Run one iteration; return why the solve ends, or None to continue."""
@@ -193,119 +188,29 @@ class BoxDDP:
         if not state.records:
             check_control_weights(work.derivatives.luu)
         cost, alpha = work.current.cost, 0.0
-        for direction in self._backward_passes(state):
+        constrained = self._constrained
+        is_stiff = constrained is not None and constrained.lagrangian.is_stiff
+        for direction in self._directions.tried(state, is_stiff=is_stiff):
             stop = self._stopping_criteria(state, direction)
             if stop is not None:
-                if not self._is_unfinished(state, stop):
+                if constrained is None or not constrained.is_unfinished(state, stop):
                     return stop
                 if limit := state.iteration_limit(self.max_iterations):
                     return limit
             alpha = line_search(work, direction)
             if alpha > 0.0 or stop is not None:
                 break
-        # Beside another model the exact one has a regularization of its own.
-        if direction.exact == (self.second_order is SecondOrder.EXACT):
-            state.regularization.adapt(alpha)
-        else:
-            state.exact_regularization.adapt(alpha)
+        self._directions.adapt(state, direction, alpha)
         state.moved = alpha > 0.0
         record = self._record(state, direction, cost, alpha, started)
         if callback is not None:
             callback(record)
-        if self._lagrangian is not None:
-            if stop is not None and self._meets_constraints():
+        if constrained is not None:
+            if stop is not None and constrained.is_met:
                 return None if state.moved else stop
-            is_near = alpha >= LONG_ENOUGH and record.optimality <= self._lagrangian.near
-            if stop is not None or (is_near and (self._lagrangian.counts or not self._meets_constraints())):
-                return self._follow_constraints(state)
+            if stop is not None or constrained.is_near(record):
+                return constrained.follow(state)
         return self._no_progress(state, record)
-
-    def _is_unfinished(self, state: SolverState, stop: Stop) -> bool:
-        """Whether only the constraints ask for more: a step too small to count still serves their rows.
-
-        An unconstrained minimum that keeps to them is theirs.
-        """
-        if self._lagrangian is None or stop.reason is not StopReason.CONVERGED:
-            return False
-        is_rough = self._lagrangian.counts and state.optimality > STATIONARITY
-        return is_rough or not self._meets_constraints()
-
-    def _meets_constraints(self) -> bool:
-        """Whether the current trajectory keeps to all rows."""
-        current, lagrangian = self._work.current, self._lagrangian
-        assert lagrangian is not None  # or it is not called
-        return lagrangian.is_met(current.states, current.controls, current.cost)
-
-    def _follow_constraints(self, state: SolverState) -> Stop | None:
-        """Let constraints begin to count, or multipliers follow the trajectory."""
-        work, lagrangian = self._work, self._lagrangian
-        assert lagrangian is not None  # or it is not called
-        begins = not lagrangian.counts
-        if begins:
-            lagrangian.begin()
-            state.switch.request_exact()
-        if lagrangian.is_at_end:
-            response = end_response(work, lagrangian.constraints, exact=self._has_exact)
-            if response is not None:  # else the model has no minimum yet
-                lagrangian.update_by_response(work.current.states, work.current.controls, response)
-        elif not begins:
-            lagrangian.update(work.current.states, work.current.controls)
-        work.evaluate_anew()
-        state.moved, state.idle_iterations, state.optimality = True, 0, np.inf
-        if not lagrangian.is_infeasible:
-            return None
-        report = self._constraint_report()
-        return Stop(
-            StopReason.INFEASIBLE,
-            f"{report.worst_row} is violated by {report.violation:.1e} at {report.worst_time:.3g} s, and "
-            "larger penalties do not help",
-        )
-
-    def _constraint_report(self) -> ConstraintReport:
-        """Judge the current trajectory by its constraints."""
-        current, lagrangian = self._work.current, self._lagrangian
-        assert lagrangian is not None  # or it is not called
-        given = current.states, current.controls, current.cost, self.problem.time_step
-        return lagrangian.report(*given)
-
-    def _backward_passes(self, state: SolverState) -> Iterator[PassResult]:
-        """Yield control updates to search along; the next one is asked for if no step was accepted."""
-        if self.second_order in (SecondOrder.HYBRID, SecondOrder.MIRRORED) and state.switch.tries_exact:
-            direction = self._exact_backward_pass(state)
-            if direction.status != PASS_NOT_POSITIVE_DEFINITE:
-                yield direction
-            state.switch.postpone_exact()
-        if self.second_order is SecondOrder.MIRRORED:
-            self._work.mirror()
-        yield self._regularized_backward_pass(
-            state.regularization, exact=self.second_order is SecondOrder.EXACT
-        )
-
-    def _exact_backward_pass(self, state: SolverState) -> PassResult:
-        """Use exact second derivatives under weak regularization only; the pass may fail."""
-        self._work.differentiate_twice()
-        if self.second_order is SecondOrder.MIRRORED:
-            remembered = state.exact_regularization
-            direction = self._work.backward_pass(remembered.mu, exact=True)
-            while direction.status == PASS_NOT_POSITIVE_DEFINITE and remembered.increase():
-                direction = self._work.backward_pass(remembered.mu, exact=True)
-            return direction
-        is_stiff = self._lagrangian is not None and self._lagrangian.counts and not self._lagrangian.is_at_end
-        for mu in CONSTRAINED_EXACT_MU if is_stiff else EXACT_MU:
-            direction = self._work.backward_pass(mu, exact=True)
-            if direction.status != PASS_NOT_POSITIVE_DEFINITE:
-                break
-        return direction
-
-    def _regularized_backward_pass(self, regularization: Regularization, *, exact: bool) -> PassResult:
-        """Increase mu until the backward pass succeeds, or mu leaves its range."""
-        if exact:
-            self._work.differentiate_twice()
-        direction = self._work.backward_pass(regularization.mu, exact=exact)
-        while direction.status == PASS_NOT_POSITIVE_DEFINITE and not regularization.exhausted:
-            regularization.increase()
-            direction = self._work.backward_pass(regularization.mu, exact=exact)
-        return direction
 
     def _stopping_criteria(self, state: SolverState, direction: PassResult) -> Stop | None:
         """Judge a backward pass: has it failed, is the trajectory optimal, may a step follow?"""
@@ -327,11 +232,11 @@ class BoxDDP:
 
         Its update is kept if the trajectory is optimal.
         """
-        if self._has_exact:
+        if self._directions.has_exact:
             state.switch.request_exact()
             self._work.differentiate_twice()
-        if direction.mu > 0.0 or direction.exact != self._has_exact:
-            direction = self._work.backward_pass(0.0, exact=self._has_exact)
+        if direction.mu > 0.0 or direction.exact != self._directions.has_exact:
+            direction = self._work.backward_pass(0.0, exact=self._directions.has_exact)
             if not direction.completed:
                 return False
         state.optimality = self._relative_reduction(state, direction)
@@ -390,54 +295,24 @@ class BoxDDP:
     def _finish(self, state: SolverState, stop: Stop) -> Solution:
         """Compute the gains around the final trajectory, and judge it without regularization."""
         work, (reason, message) = self._work, stop
-        if self._lagrangian is not None:
-            return self._finish_constrained(state, stop)
+        if self._constrained is not None:
+            found = self._constrained.finish(stop)
+            solution = self._solution(state, found.stop, found.gains)
+            return replace(solution, multipliers=found.multipliers, constraints=found.report)
         if reason is not StopReason.CONVERGED:
             state.optimality = np.inf
             work.differentiate()
-            direction = self._final_backward_pass()
+            direction = self._directions.final()
             if not direction.completed:
                 message += "; there are no feedback gains, they are zero"
                 return self._solution(state, Stop(reason, message), np.zeros_like(work.update.K))
-            if direction.mu == 0.0 and direction.exact == self._has_exact:
+            if direction.mu == 0.0 and direction.exact == self._directions.has_exact:
                 state.optimality = self._relative_reduction(state, direction)
             if state.optimality <= self.tolerance and reason is not StopReason.INTERRUPTED:
                 reason, message = StopReason.CONVERGED, CONVERGED
         if np.isfinite(state.optimality):
             message += f"; an unregularized step predicts a relative reduction of {state.optimality:.1e}"
         return self._solution(state, Stop(reason, message), work.update.K.copy())
-
-    def _finish_constrained(self, state: SolverState, stop: Stop) -> Solution:
-        """Compute the gains with moderate penalties, and the cost without any."""
-        work, lagrangian = self._work, self._lagrangian
-        assert lagrangian is not None  # or it is not called
-        if lagrangian.counts:
-            lagrangian.settle(work.current.states, work.current.controls)
-            lagrangian.soften()
-        work.differentiate()
-        gains, message = np.zeros_like(work.update.K), stop.message
-        if self._final_backward_pass().completed:
-            gains = work.update.K.copy()
-        else:
-            message += "; there are no feedback gains, they are zero"
-        multipliers, report = lagrangian.constraints.multipliers.copy(), self._constraint_report()
-        lagrangian.leave_out()
-        work.evaluate_anew()
-        message += f"; the largest violation is {max(report.violation, 0.0):.1e}, of {report.worst_row}"
-        reason = stop.reason
-        if reason is StopReason.REGULARIZATION_LIMIT and report.violation > SERIOUS:
-            reason = StopReason.INFEASIBLE
-        found = self._solution(state, Stop(reason, message), gains)
-        return replace(found, multipliers=multipliers, constraints=report)
-
-    def _final_backward_pass(self) -> PassResult:
-        """Run a backward pass without regularization, with exact second derivatives if that succeeds."""
-        if self._has_exact:
-            self._work.differentiate_twice()
-            direction = self._work.backward_pass(0.0, exact=True)
-            if direction.completed:
-                return direction
-        return self._regularized_backward_pass(Regularization(0.0), exact=False)
 
     def _solution(self, state: SolverState, stop: Stop, gains: FloatArray) -> Solution:
         """Copy the current trajectory into a solution."""

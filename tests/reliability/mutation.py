@@ -100,6 +100,7 @@ TESTS: dict[str, dict[str, list[str]]] = {
     },
     "experts/ddp/backward_pass.py": _solver("backward_pass", "box_ddp"),
     "experts/ddp/box_ddp.py": _solver("box_ddp", "second_order"),
+    "experts/ddp/directions.py": _solver("second_order", "box_ddp"),
     "experts/ddp/box_qp.py": _solver("box_qp", "backward_pass"),
     "experts/ddp/multiple_shooting.py": _solver("line_search", "multiple_shooting", "open_gaps"),
     "experts/ddp/parallel_rollouts.py": _solver("parallel_rollouts", "line_search"),
