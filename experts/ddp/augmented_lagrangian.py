@@ -34,8 +34,10 @@ COMPLEMENTARITY = 1e-7
 """Largest sum of |l c| at the end of a solve, relative to the cost, or to 1 if that is larger."""
 STATIONARITY = 1e-12
 """Predicted reduction, relative to the cost, below which multipliers are slopes of the penalties."""
-FIRST_MULTIPLIER = 1.0
-"""First multiplier of a row c <= 0."""
+FIRST_SHARE = 2e-2
+"""Share of the cost that the first penalties of a row c <= 0 add, over all stages."""
+FIRST_MULTIPLIERS = (1e-2, 1.0)
+"""Least and greatest first multiplier of such a row."""
 LEAST_MULTIPLIER = 1e-9
 """Least multiplier of such a row: zero would stay zero. Where a solve is judged it counts as zero."""
 LEAST_WARM_MULTIPLIER = 1e-2
@@ -47,11 +49,11 @@ FIRST_PENALTY, FIRST_EQUALITY_PENALTY = 1e2, 1e4
 WEAK_PENALTY = 1e-3
 """Penalty of rows c <= 0 where all are at the end: next to none."""
 GROWTH = 2.0
-"""Factor of the penalties in an update."""
+"""Factor of the penalties in an update, and most of a row's stiffness."""
 LARGEST_PENALTY = 3e6
 """Beyond it rounding hides what a step gains."""
-STIFFENING, FIRST_STIFFNESS = 2.0, 1e3
-"""Largest growth of a row's stiffness in an update, and the least stiffness to grow to."""
+FIRST_STIFFNESS = 1e3
+"""Least stiffness of a row to grow to in an update."""
 GAIN_STIFFNESS = 1e3
 """Largest stiffness of a row in feedback gains: with more they would follow noise."""
 BEGIN = 1e-2
@@ -110,13 +112,19 @@ class AugmentedLagrangian:
         self.constraints.multipliers[:], self.constraints.penalties[:] = 0.0, 0.0
         self.counts, self.near = False, BEGIN
 
-    def begin(self, multipliers: FloatArray | None = None) -> None:
-        """Let the rows count, with those multipliers of a similar maneuver, shape (N + 1, m), if any."""
+    def begin(self, states: FloatArray, controls: FloatArray, cost: float) -> None:
+        """Let the rows count, from a trajectory, states (N + 1, n_x) and controls (N, n_u), and its cost."""
+        violations = np.where(self._inequalities, self.constraints.find(states, controls), 0.0).clip(min=0.0)
+        added = (violations + 0.5 * FIRST_PENALTY * violations**2).sum(axis=0)  # with multipliers 1
+        share = FIRST_SHARE * abs(cost)
+        first = np.clip(share / np.maximum(added, share), *FIRST_MULTIPLIERS)
+        self.begin_with(np.zeros_like(self.constraints.multipliers), least=first)
+
+    def begin_with(self, multipliers: FloatArray, least: FloatArray | float = LEAST_WARM_MULTIPLIER) -> None:
+        """Let the rows count, with the multipliers of a similar maneuver, shape (N + 1, m)."""
         present, penalties = self.constraints.multipliers, self.constraints.penalties
-        present[:] = 0.0 if multipliers is None else np.where(self._holds, multipliers, 0.0)
-        least = FIRST_MULTIPLIER if multipliers is None else LEAST_WARM_MULTIPLIER
         least, penalty = (LEAST_MULTIPLIER, WEAK_PENALTY) if self.is_at_end else (least, FIRST_PENALTY)
-        present[self._inequalities] = np.maximum(present[self._inequalities], least)
+        present[:] = np.where(self._inequalities, np.maximum(multipliers, least), multipliers * self._holds)
         penalties[:] = np.where(self._equalities, FIRST_EQUALITY_PENALTY, penalty)
         penalties[~self._holds] = 0.0
         self.counts, self.near = True, NEAR_AT_END if self.is_at_end else NEAR
@@ -124,7 +132,7 @@ class AugmentedLagrangian:
 
     def hold(self, multipliers: FloatArray) -> None:
         """Let the rows count with a solution's multipliers, shape (N + 1, m), as stiff as in its gains."""
-        self.begin(multipliers)
+        self.begin_with(multipliers)
         self.constraints.penalties[:] = np.where(self._holds, LARGEST_PENALTY, 0.0)
         self.soften()
         # Where a reserve is left, c = -reserve, the slopes l f'(r c) of the penalties are these multipliers.
@@ -137,7 +145,7 @@ class AugmentedLagrangian:
     def update(self, states: FloatArray, controls: FloatArray) -> None:
         """Let the multipliers follow a trajectory, states (N + 1, n_x) and controls (N, n_u)."""
         penalties, residuals = self.constraints.penalties, self.constraints.find(states, controls)
-        stiffness = np.maximum(STIFFENING * self.constraints.multipliers * penalties, FIRST_STIFFNESS)
+        stiffness = np.maximum(GROWTH * self.constraints.multipliers * penalties, FIRST_STIFFNESS)
         self._move(residuals, CHANGE)
         self.near = max(NEARER * self.near, NEAREST)
         exhausted = penalties.max(initial=0.0) >= LARGEST_PENALTY

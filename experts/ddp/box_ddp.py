@@ -129,8 +129,8 @@ class BoxDDP:
                 stage and the end, (N + 1, n_p), entries as in `kernels.parameters`; None for nominal ones.
                 Nothing is compiled when they change.
             multipliers: Those of a similar maneuver with the same constraints, shape (N + 1, m), as in
-                `Solution.multipliers`; the constraints then count from the first step on. None begins without
-                them.
+                `Solution.multipliers`; the constraints then count from the first step on, also with zeros.
+                None begins without them.
 
         Returns:
             The best trajectory found, whatever the reason to stop; always a rollout of its controls from x0.
@@ -160,6 +160,7 @@ class BoxDDP:
         state.moved = True
         if multipliers is not None:
             state.switch.request_exact()
+            self._count_rows(multipliers)
         try:
             while stop is None:
                 stop = self._iterate(state, callback)
@@ -177,7 +178,15 @@ class BoxDDP:
             raise ValueError("multipliers are given, but the problem has no constraints; leave them out")
         lagrangian = self._constrained.lagrangian
         check_array("multipliers", multipliers, lagrangian.constraints.multipliers.shape)
-        lagrangian.begin(multipliers)
+        if multipliers.any():
+            lagrangian.begin_with(multipliers)
+
+    def _count_rows(self, multipliers: FloatArray) -> None:
+        """Let the rows count from the first trajectory on, where their multipliers are not known."""
+        if self._constrained is not None and not multipliers.any():
+            current = self._work.current
+            self._constrained.lagrangian.begin(current.states, current.controls, current.cost)
+            self._work.evaluate_anew()
 
     def _iterate(self, state: SolverState, callback: Callback | None) -> Stop | None:
         """Run one iteration; return why the solve ends, or None to continue."""

@@ -1,11 +1,12 @@
 """The solves of a maneuver from several guesses, and the best of them."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from experts.ddp.solution import Solution
+from experts.ddp.solution import Solution, StopReason
 from experts.problems.shooting_problem import ShootingProblem
 
 SAME_MINIMUM = 1e-6
@@ -46,6 +47,10 @@ def best_solution(
     good = [attempt for attempt in attempts if is_good(attempt.solution)]
     own = [attempt for attempt in attempts if attempt.solution.problem is problem]
     best = min(good or own or attempts, key=lambda attempt: attempt.solution.cost)
-    best.solution.metadata["guess"] = best.guess
-    best.solution.metadata["attempts"] = [attempt.summary() for attempt in attempts]
-    return best.solution
+    solution, stop = best.solution, StopReason.INFEASIBLE
+    missed = [each.solution.message for each in attempts if each.solution.stop_reason is stop]
+    if missed and not good and solution.stop_reason is not stop:
+        solution = replace(solution, message=f"{solution.message}; but {missed[-1]}")
+    solution.metadata["guess"] = best.guess
+    solution.metadata["attempts"] = [attempt.summary() for attempt in attempts]
+    return solution

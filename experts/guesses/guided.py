@@ -23,13 +23,15 @@ from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason
 from experts.guesses.attempts import Attempt, best_solution, is_known
 from experts.guesses.coarsening import checked_factors, find_coarsening
 from experts.guesses.initial_guesses import (
+    SCREW_REGULARIZATION,
     Guess,
     KinematicGuess,
     multipliers_of,
     ranked_guesses,
     zero_controls,
 )
-from experts.guesses.policies import coarsened, follow, refined
+from experts.guesses.other_side import other_side
+from experts.guesses.policies import coarsened, follow, refined, track
 from experts.guesses.preparation import Preparation, keep_preparation, preparation_key, read_preparation
 from experts.guesses.screw_motion import screw_motion as guess_screw_motion
 from experts.problems.arm_problem import ArmProblem, WindowProblem
@@ -52,9 +54,10 @@ class GuidedDDP:
     """Box-DDP that makes its own guesses and reaches the target; give each thread its own.
 
     The guesses, cheapest rollout first, are the policies of a library of solved maneuvers and, where all of
-    them stray, the screw motion of an arm's tip to its target; then zero controls. They are solved one after
-    another until one converges and, if the problem has tolerances, ends within them. A minimum that ends
-    outside is led to the target: the tolerances become constraints (`ArmProblem.constrained`).
+    them stray, the screw motion of an arm's tip to its target; then zero controls; in long steps also the
+    other side of an obstacle. They are solved one after another until one converges and, if the problem has
+    tolerances, ends within them. A minimum that ends outside is led to the target: the tolerances become
+    constraints (`ArmProblem.constrained`).
     The cheapest solution wins, among those that reach the target if there are any.
     """
 
@@ -213,6 +216,8 @@ class GuidedDDP:
             last = attempts[-1].solution
             if last.stop_reason is StopReason.INTERRUPTED or (self._is_good(last) and not self.compare):
                 break
+        if self.compare and last.stop_reason is not StopReason.INTERRUPTED:
+            attempts += self._other_side(attempts, start, callback)
         solution = best_solution(attempts, self.problem, self._is_good)
         solution.metadata["long_steps"] = list(long_steps)
         self._remember(solution)
@@ -236,6 +241,23 @@ class GuidedDDP:
             led = solver.solve(start, solution.controls, callback, parameters=rows)
             attempts.append(Attempt(guess.name, led))
         return attempts
+
+    def _other_side(
+        self, attempts: Sequence[Attempt], start: FloatArray, callback: Callback | None
+    ) -> list[Attempt]:
+        """Solve on the other side of an obstacle that is in the way of the best solution so far, if any."""
+        best = best_solution(attempts, self.problem, self._is_good)
+        if not self._has_constraints or not isinstance(self.problem, ArmProblem):
+            return []
+        motion = other_side(self.problem, best)
+        if motion is None:
+            return []
+        controls, cost = track(self.problem, *motion)
+        # The rows count from the first step on: without them the path would slip back through the obstacle.
+        guess = Guess(
+            "other side", controls, cost, SCREW_REGULARIZATION, multipliers=np.zeros_like(best.multipliers)
+        )
+        return self._attempts(guess, start, callback, attempts) if np.isfinite(cost) else []
 
     def _remember(self, solution: Solution) -> None:
         """Add a solution to the library if there is room and it is new."""
@@ -319,12 +341,15 @@ class GuidedDDP:
     def in_long_steps(
         self, coarsening: Sequence[int], *, second_order: str | None = None, after: Self | None = None
     ) -> Self:
-        """Return the solver in long steps, with the settings of this one; its library is this one's.
+        """Make the solver in long steps, with the settings of this one; its library is this one's.
 
         Args:
             coarsening: Steps in a long one, the longest first.
             second_order: Second derivatives that it uses; None for those of this one.
             after: The solver in longer steps that it begins with, if there is one already.
+
+        Returns:
+            That solver.
         """
         known, factor = self._library, coarsening[-1]
         settings = {**self._settings, **({} if second_order is None else {"second_order": second_order})}
@@ -386,6 +411,9 @@ class GuidedDDP:
 
         Args:
             coarse: The solver in them.
+
+        Returns:
+            Whether it is.
         """
         start = self.problem.initial_state
         self.problem.parameters.set(None)

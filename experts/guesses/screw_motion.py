@@ -69,9 +69,14 @@ def screw_motion(
     end = DURATION * horizon if duration is None else float(duration)
     if not 0.0 < end <= horizon:
         raise ValueError(f"duration is {end} s; it must be positive and at most the horizon, {horizon} s")
-    motion = _ArmMotion(problem)
     times = np.linspace(0.0, horizon, N_INTERVALS + 1)
-    return motion.on_stages(motion.follow(start, tip_path(problem, start, end, times), times[1]))
+    return follow_path(problem, start, tip_path(problem, start, end, times))
+
+
+def follow_path(problem: ArmProblem, start: FloatArray, path: TipPath) -> ScrewMotion:
+    """Let the arm follow a path of its tip from a start; the path's times divide the horizon evenly."""
+    motion, step = _ArmMotion(problem), problem.horizon * problem.time_step / (len(path.poses) - 1)
+    return motion.on_stages(motion.follow(start, path, step))
 
 
 def free_floating_arm(problem: ArmProblem) -> FreeFloatingArm:

@@ -8,6 +8,7 @@ import pytest
 
 import dq_space_arm_env  # noqa: F401 - registers the environment
 from dq_space_arm_env import load_scene
+from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.scene.start import (
     draw_initial_state,
     episode_scene,
@@ -19,6 +20,7 @@ from dq_space_arm_env.scene.start import (
 from experts import BoxDDP, GuidedDDP, StopReason
 from experts.guesses.guided import START_REGULARIZATIONS
 from experts.guesses.initial_guesses import STRAYED, ZERO_REGULARIZATION
+from experts.guesses.other_side import other_side
 from experts.guesses.policies import coarsened, follow, refined
 from experts.guesses.screw_motion import ScrewMotion
 from scripts.benchmarks.solvers.runs import roll_out
@@ -517,3 +519,23 @@ def test_a_damaged_preparation_is_made_again(kept):
     with pytest.warns(UserWarning, match="is damaged"):
         _ = GuidedDDP("planar").coarsening
     assert len(path.read_bytes()) == len(content)
+
+
+@pytest.mark.slow
+def test_a_cheaper_way_is_found_on_the_other_side_of_an_obstacle():
+    """Two classes of paths around the ball of `keep-out`, of which the other guesses find the dearer one."""
+    env = DQSpaceArmEnv("keep-out")
+    env.reset(seed=2)
+    solution = GuidedDDP("keep-out").solve(env.state)
+    costs = {"other side": [], "same side": []}
+    for attempt in solution.metadata["long_steps"]:
+        if attempt["stop_reason"] == "converged":
+            side = "other side" if attempt["guess"] == "other side" else "same side"
+            costs[side].append(attempt["cost"])
+    assert solution.converged
+    assert solution.metadata["guess"] == "other side"
+    assert min(costs["other side"]) < 0.998 * min(costs["same side"])
+
+
+def test_where_no_obstacle_is_in_the_way_no_other_side_is_guessed(paper):
+    assert other_side(paper.problem, paper.library[0]) is None

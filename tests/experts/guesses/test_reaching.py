@@ -85,7 +85,7 @@ def test_the_response_of_the_end_is_that_of_minima_with_other_multipliers(start,
 
     def minimum(multipliers):
         """Residuals where the Lagrangian with given multipliers is least."""
-        AugmentedLagrangian(rows).begin(multipliers)
+        AugmentedLagrangian(rows).begin_with(multipliers)
         work.start(start, solution.controls)
         for _ in range(6):
             found = end_response(work, rows, exact=True)
@@ -116,7 +116,7 @@ def test_the_response_of_the_end_is_that_of_minima_with_other_multipliers(start,
 def test_a_newton_step_drops_rows_that_others_meet(residuals, expected):
     problem = ArmProblem("planar").constrained()
     lagrangian = AugmentedLagrangian(problem.constraints)
-    lagrangian.begin()
+    lagrangian.begin_with(np.zeros_like(lagrangian.constraints.multipliers))
     states = np.broadcast_to(problem.initial_state, (problem.horizon + 1, problem.n_states))
     slopes = np.array([[-1.0, -0.5], [-0.5, -1.0]])
     response = EndResponse(np.array(residuals), slopes)
@@ -147,7 +147,7 @@ def test_where_the_cheapest_maneuver_ends_within_the_tolerances_no_constraint_is
 def test_updates_without_progress_end_as_infeasible():
     problem = ArmProblem("planar").constrained()
     lagrangian = AugmentedLagrangian(problem.constraints)
-    lagrangian.begin()
+    lagrangian.begin_with(np.zeros_like(lagrangian.constraints.multipliers))
     states = np.broadcast_to(problem.initial_state, (problem.horizon + 1, problem.n_states))
     controls = np.zeros((problem.horizon, problem.n_controls))
     residuals = problem.constraints.find(states, controls)[-1]
