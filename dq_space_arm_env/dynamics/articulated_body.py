@@ -6,7 +6,7 @@ that body to the wrench it needs while the joints move freely (Featherstone, Rig
 next, until they meet at the root, whose six accelerations are solved for; the joints follow on the way back.
 The cost is linear in the number of joints.
 
-The root is free, and rounding decides it. Eliminating a joint removes all inertia about its axis, exactly;
+The root is free, and rounding decides it. Eliminating a joint removes all inertia along its screw, exactly;
 but rotated to other axes and added to a lighter body, the remainder of a heavy body buries the little inertia
 that the light one has about that axis. Toward the heaviest body, light bodies are added to heavy ones
 instead, and extreme mass ratios cost no digits. A root next to the heaviest body, across its own joint, is as
@@ -14,7 +14,7 @@ good while that body is not far heavier: the joint's axis is an axis of the root
 solved for, but what the body hands across is rounded in proportion to its mass.
 
 Reaction wrenches need no difference of accelerations: a joint transmits what the articulated body beyond it,
-seen from the root, needs at the acceleration of the joint. About the axis it needs nothing, and how fast a
+seen from the root, needs at the acceleration of the joint. Along the screw it needs nothing, and how fast a
 light body turns there does not enter.
 """
 
@@ -35,9 +35,9 @@ from dq_space_arm_env.algebra.vectors import (
     transpose,
     transposed_matrix_vector,
 )
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.dynamics.chain import Chain, RigidBody, Screw
 from dq_space_arm_env.dynamics.linear import factorize_ldl, solve_ldl
-from dq_space_arm_env.dynamics.minimal import ZERO, Accelerations, shift_wrench
+from dq_space_arm_env.dynamics.minimal import ZERO, Accelerations, LinkFrame, along, shift_wrench
 
 Scalar = Any
 Vector3 = Sequence[Scalar]
@@ -95,31 +95,37 @@ class ArticulatedInertia:
 
 @dataclass(frozen=True)
 class _Joint:
-    """An eliminated joint, with the wrench per angular acceleration about its z axis."""
+    """An eliminated joint, with the wrench per acceleration of its coordinate, a screw about its z axis."""
 
-    force: Vector3  # per angular acceleration, kg m
-    torque: Vector3  # per angular acceleration, kg m^2
-    inverse: Scalar  # of the inertia about the axis, 1/(kg m^2)
-    remainder: ArticulatedInertia  # of the body across the joint, none about the axis
+    screw: Screw
+    force: Vector3  # per acceleration, kg m
+    torque: Vector3  # per acceleration, kg m^2
+    inverse: Scalar  # of the inertia along the screw, 1/(kg m^2)
+    remainder: ArticulatedInertia  # of the body across the joint, none along the screw
 
     @classmethod
-    def eliminated(cls, body: ArticulatedInertia) -> _Joint:
-        """Free a body about its z axis."""
-        # I^a = I - U D^-1 U' with U = I s, D = s' I s and the axis s = z (Featherstone, table 7.1).
-        force, torque = body.coupling[2], [row[2] for row in body.inertia]
-        inverse = 1.0 / torque[2]
+    def eliminated(cls, body: ArticulatedInertia, screw: Screw) -> _Joint:
+        """Free a body along a screw about its z axis."""
+        # I^a = I - U D^-1 U' with U = I s, D = s' I s and the screw s (Featherstone, table 7.1).
+        turn, slide = screw
+        force: Vector3 = body.coupling[2]
+        torque: Vector3 = [row[2] for row in body.inertia]
+        if slide:
+            lever = [row[2] for row in body.coupling]
+            force = add(scale(turn, force), scale(slide, [row[2] for row in body.mass]))
+            torque = add(scale(turn, torque), scale(slide, lever))
+        inverse = 1.0 / along(screw, force, torque)
         by_force, by_torque = scale(inverse, force), scale(inverse, torque)
         mass = _symmetric(lambda i, j: body.mass[i][j] - force[i] * by_force[j])
-        coupling = [[body.coupling[i][j] - by_torque[i] * force[j] for j in range(3)] for i in range(2)]
-        inertia = _symmetric(
-            lambda i, j: 0.0 if 2 in (i, j) else body.inertia[i][j] - torque[i] * by_torque[j]
-        )
-        return cls(force, torque, inverse, ArticulatedInertia(mass, [*coupling, ZERO], inertia))
+        coupling = [[body.coupling[i][j] - by_torque[i] * force[j] for j in range(3)] for i in range(3)]
+        inertia = _symmetric(lambda i, j: body.inertia[i][j] - torque[i] * by_torque[j])
+        _clear(screw, mass, coupling, inertia)
+        return cls(screw, force, torque, inverse, ArticulatedInertia(mass, coupling, inertia))
 
     def passed(self, force: Vector3, torque: Vector3, own: Scalar) -> Wrench:
         """Share of a wrench on the body that crosses the joint.
 
-        `own` is the joint's torque on the body plus the wrench's about the axis, N m.
+        `own` is the joint's torque on the body plus the wrench's share along the screw, N m.
         """
         # The wrench on the body minus U D^-1 u.
         turning = own * self.inverse
@@ -130,28 +136,36 @@ class _Joint:
         # qdd = D^-1 (u - U' a') (table 7.1).
         return (own - (dot(self.force, linear) + dot(self.torque, angular))) * self.inverse
 
+    def moved(self, linear: Vector3, angular: Vector3, change: Scalar) -> tuple[Vector3, Vector3]:
+        """Linear and angular acceleration beyond the joint, whose coordinate accelerates."""
+        turn, slide = self.screw
+        if slide:
+            linear = (*linear[:2], linear[2] + slide * change)
+        return linear, (*angular[:2], angular[2] + change) if turn else angular
+
 
 class ArticulatedBodies:
     """Articulated inertias of a chain at given joint angles, with the root's factorized."""
 
-    def __init__(self, chain: Chain, rotations: Sequence[Rows], root: int = 0) -> None:
+    def __init__(self, chain: Chain, frames: Sequence[LinkFrame], root: int = 0) -> None:
         """Eliminate all joints, from both ends of the chain to its root (0 is the base, i link i)."""
-        self._planar, self._rotations, self._root = chain.planar, rotations, root
-        self._positions = [link.joint.position for link in chain.links]
+        self._planar, self._frames, self._root = chain.planar, frames, root
+        screws = [link.screw for link in chain.links]
         bodies = [
             ArticulatedInertia.of_body(body) for body in (chain.base, *(link.body for link in chain.links))
         ]
         self._joints: dict[int, _Joint] = {}
         # From the base up to the root: the parent is carried by the joint, which turns backward.
         for i in range(self._root):
-            body = bodies[i].shifted(scale(-1.0, self._positions[i])).rotated(transpose(rotations[i]))
-            self._joints[i] = _Joint.eliminated(body)
+            rotation, position = frames[i]
+            body = bodies[i].shifted(scale(-1.0, position)).rotated(transpose(rotation))
+            self._joints[i] = _Joint.eliminated(body, screws[i])
             body = self._joints[i].remainder
             bodies[i + 1] = bodies[i + 1].plus(body)
         # From the tip down to the root.
-        for i in reversed(range(self._root, len(rotations))):
-            self._joints[i] = _Joint.eliminated(bodies[i + 1])
-            body = self._joints[i].remainder.rotated(rotations[i]).shifted(self._positions[i])
+        for i in reversed(range(self._root, len(frames))):
+            self._joints[i] = _Joint.eliminated(bodies[i + 1], screws[i])
+            body = self._joints[i].remainder.rotated(frames[i].rotation).shifted(frames[i].position)
             bodies[i] = bodies[i].plus(body)
         self._factor = factorize_ldl(_root_block(bodies[self._root], self._free))
 
@@ -183,17 +197,18 @@ class ArticulatedBodies:
         passed: list[Wrench] = [(ZERO, ZERO)] * len(joints)
         for i in range(self._root):
             force, torque = acting[i]
-            torque = subtract(torque, cross(self._positions[i], force))
-            force = transposed_matrix_vector(self._rotations[i], force)
-            torque = transposed_matrix_vector(self._rotations[i], torque)
-            own[i] = torque[2] - joints[i]
+            rotation, position = self._frames[i]
+            torque = subtract(torque, cross(position, force))
+            force = transposed_matrix_vector(rotation, force)
+            torque = transposed_matrix_vector(rotation, torque)
+            own[i] = along(self._joints[i].screw, force, torque) - joints[i]
             passed[i] = self._joints[i].passed(force, torque, own[i])
             acting[i + 1] = _sum(acting[i + 1], passed[i])
         for i in reversed(range(self._root, len(joints))):
             force, torque = acting[i + 1]
-            own[i] = torque[2] + joints[i]
+            own[i] = along(self._joints[i].screw, force, torque) + joints[i]
             passed[i] = self._joints[i].passed(force, torque, own[i])
-            acting[i] = _sum(acting[i], shift_wrench(self._rotations[i], self._positions[i], *passed[i]))
+            acting[i] = _sum(acting[i], shift_wrench(*self._frames[i], *passed[i]))
         accelerations, reached = self._outward(acting[self._root], own)
         return accelerations, passed, reached
 
@@ -216,21 +231,37 @@ class ArticulatedBodies:
         linear: Vector3 = six[:3]
         angular: Vector3 = six[3:]
         for i in range(self._root, len(own)):
-            rotation, position = self._rotations[i], self._positions[i]
+            rotation, position = self._frames[i]
             linear = transposed_matrix_vector(rotation, add(linear, cross(angular, position)))
             angular = transposed_matrix_vector(rotation, angular)
             reached[i] = linear, angular
             joints[i] = self._joints[i].acceleration(own[i], linear, angular)
-            angular = (*angular[:2], angular[2] + joints[i])
+            linear, angular = self._joints[i].moved(linear, angular, joints[i])
         linear, angular = six[:3], six[3:]
         for i in reversed(range(self._root)):
             reached[i] = linear, angular
-            # The body before the joint turns backward about the axis.
-            turning = self._joints[i].acceleration(own[i], linear, angular)
-            joints[i] = -turning
-            angular = matrix_vector(self._rotations[i], (*angular[:2], angular[2] + turning))
-            linear = subtract(matrix_vector(self._rotations[i], linear), cross(angular, self._positions[i]))
+            # The body before the joint moves backward along the screw.
+            rotation, position = self._frames[i]
+            change = self._joints[i].acceleration(own[i], linear, angular)
+            joints[i] = -change
+            linear, angular = self._joints[i].moved(linear, angular, change)
+            angular = matrix_vector(rotation, angular)
+            linear = subtract(matrix_vector(rotation, linear), cross(angular, position))
         return Accelerations(angular, linear, joints), reached
+
+
+def _clear(
+    screw: Screw, mass: list[list[Scalar]], coupling: list[list[Scalar]], inertia: list[list[Scalar]]
+) -> None:
+    """Take from an eliminated body, exactly, what rounding leaves of its inertia along the screw."""
+    for i in range(3):
+        if screw.turn:  # s = (pitch z, z): the rows and columns of z follow from the others
+            coupling[2][i] = -screw.slide * mass[2][i] if screw.slide else 0.0
+        else:
+            mass[2][i] = mass[i][2] = coupling[i][2] = 0.0
+    if screw.turn:
+        for i in range(3):
+            inertia[2][i] = inertia[i][2] = -screw.slide * coupling[i][2] if screw.slide else 0.0
 
 
 def _symmetric(entry: Callable[[int, int], Scalar]) -> list[list[Scalar]]:

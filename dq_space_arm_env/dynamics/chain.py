@@ -1,7 +1,8 @@
 """The constants of a robot: what the equations of motion need of a scene, as plain scalars.
 
-A `Chain` is a base, revolute links in series, an optional massless wrist, and a tip frame. Link frames are
-the joint frames of the paper: frame i is fixed in the distal body i+1, with its z axis along the joint axis.
+A `Chain` is a base, links in series, an optional massless wrist, and a tip frame. Link frames are the joint
+frames of the paper: frame i is fixed in the distal body i+1, with its z axis along the joint axis. Every
+joint is a screw about and along that axis.
 A payload is merged into the body that holds it. Masses, inertias, stiffness and damping are numbers, or
 symbols where they are parameters of the scene.
 """
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dq_space_arm_env.algebra.vectors import (
     add,
@@ -50,12 +51,26 @@ class Placement:
     dual_quaternion: tuple[float, ...]  # q_{inner/outer}
 
 
+class Screw(NamedTuple):
+    """Motion of a link about and along the z axis of its frame, per unit of its joint's coordinate."""
+
+    turn: float  # 1, or 0 for a prismatic joint
+    slide: float  # 0 for a revolute joint, 1 for a prismatic one, or the pitch, m/rad
+
+
+_SCREWS = {"revolute": Screw(1.0, 0.0), "prismatic": Screw(0.0, 1.0)}
+
+
 @dataclass(frozen=True)
-class RevoluteLink:
-    """A link and the revolute joint that carries it."""
+class JointedLink:
+    """A link and the joint that carries it.
+
+    The units are those of a joint that turns; one that only slides has m and N instead of rad and N m.
+    """
 
     body: RigidBody  # in the joint frame
-    joint: Placement  # joint frame at zero angle in the parent's frame (base center of mass, or joint frame)
+    joint: Placement  # joint frame at zero in the parent's frame (base center of mass, or joint frame)
+    screw: Screw
     stiffness: Scalar  # N m/rad
     rest_angle: float  # of the spring, rad
     damping: Scalar  # N m s/rad
@@ -63,10 +78,10 @@ class RevoluteLink:
 
 @dataclass(frozen=True)
 class Chain:
-    """A free base with a chain of revolute links."""
+    """A free base with a chain of links."""
 
     base: RigidBody  # frame at the center of mass
-    links: tuple[RevoluteLink, ...]  # base to tip
+    links: tuple[JointedLink, ...]  # base to tip
     wrist: Placement | None  # wrist frame at zero angles, in the last link's frame
     tip: Placement  # tip frame G in the wrist frame, or in the last link's without a wrist
     tip_wrench: tuple[float, ...] | None  # force [N], torque [N m] at G, in G axes (16)
@@ -82,9 +97,10 @@ class Chain:
         return cls(
             base=_rigid_body(scene.base, "base", (0.0, 0.0, 0.0), given),
             links=tuple(
-                RevoluteLink(
+                JointedLink(
                     body,
                     _placement(link.joint),
+                    _SCREWS.get(link.joint_type) or Screw(1.0, link.pitch),
                     given.get(f"links.{index}.stiffness", link.stiffness),
                     link.rest_angle,
                     given.get(f"links.{index}.damping", link.damping),

@@ -121,14 +121,12 @@ class EquationsOfMotion:
             pose = dq.multiply(turned, pose)
         return poses.to_matrix(pose)
 
-    def tip_forces(
-        self, motion: Motion, rotations: Sequence[Any], wrench: Sequence[Scalar] | None
-    ) -> Wrenches:
+    def tip_forces(self, motion: Motion, frames: Sequence[Any], wrench: Sequence[Scalar] | None) -> Wrenches:
         """Generalized forces of a wrench at the tip, in tip axes; zeros without one."""
         n = len(self.chain.links)
         if wrench is None:
             return Wrenches(ZERO, ZERO, [0.0] * n, [(ZERO, ZERO)] * n)
-        return minimal.tip_wrench_forces(self.chain, rotations, *self._tip(motion), wrench)
+        return minimal.tip_wrench_forces(self.chain, frames, *self._tip(motion), wrench)
 
     def _acting(self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None) -> list[Any]:
         """External force and torque on base and links, in their frames."""
@@ -139,8 +137,8 @@ class EquationsOfMotion:
         return acting
 
     def _inertia(self, motion: Motion, *, many: bool = False) -> Inertia:
-        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
-        return inertia_of(self._formulation, self.chain, rotations, many=many)
+        frames = minimal.link_frames(self.chain, motion.joint_angles)
+        return inertia_of(self._formulation, self.chain, frames, many=many)
 
     def _solve(
         self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None, inertia: Inertia
@@ -149,10 +147,10 @@ class EquationsOfMotion:
 
     def _driven(self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None) -> tuple[Any, ...]:
         """Rotations of the joints, angular velocity, joint rates, external wrenches and joint torques."""
-        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        frames = minimal.link_frames(self.chain, motion.joint_angles)
         passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
         torques = [motor + other for motor, other in zip(inputs.joint_torques, passive, strict=True)]
-        return rotations, motion.angular, motion.joint_rates, self._acting(motion, inputs, wrench), torques
+        return frames, motion.angular, motion.joint_rates, self._acting(motion, inputs, wrench), torques
 
     def accelerations(
         self, y: Sequence[Scalar], u: Sequence[Scalar], wrench: Sequence[Scalar] | None = None
@@ -174,9 +172,9 @@ class EquationsOfMotion:
 
     def mass_matrix(self, y: Sequence[Scalar]) -> list[list[Scalar]]:
         """Mass matrix by the accelerations (free directions, joints), symmetric."""
-        rotations = minimal.joint_rotations(self.chain, self.motion(y).joint_angles)
+        frames = minimal.link_frames(self.chain, self.motion(y).joint_angles)
         free = (*self.pose.directions, *range(6, 6 + len(self.chain.links)))
-        whole = mass_matrix(self.chain, rotations)
+        whole = mass_matrix(self.chain, frames)
         return [[whole[i][j] for j in free] for i in free]
 
     def bias_forces(self, y: Sequence[Scalar]) -> list[Scalar]:
@@ -185,9 +183,9 @@ class EquationsOfMotion:
         Where v' = 0, an inertial observer sees the acceleration omega x v.
         """
         motion = self.motion(y)
-        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        frames = minimal.link_frames(self.chain, motion.joint_angles)
         given = Accelerations(ZERO, cross(motion.angular, motion.linear), [0.0] * len(self.chain.links))
-        needed = minimal.inverse_dynamics(self.chain, rotations, motion.angular, motion.joint_rates, given)
+        needed = minimal.inverse_dynamics(self.chain, frames, motion.angular, motion.joint_rates, given)
         passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
         dual = [*needed.torque, *needed.force]
         joints = [bias - other for bias, other in zip(needed.joints, passive, strict=True)]
@@ -198,20 +196,27 @@ class EquationsOfMotion:
         return [*self.motion(y).joint_rates, *self.inputs(u).wrist_rates, *self.accelerations(y, u)]
 
     def reaction_wrenches(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
-        """The paper's T (21): fx, fy, fz [N], tx, ty [N m] that each joint transmits, in joint axes, 5 n."""
+        """The paper's T (21): fx, fy, fz [N], tx, ty [N m] that each joint transmits, in joint axes, 5 n.
+
+        A prismatic joint transmits fx, fy [N], tx, ty, tz [N m].
+        """
         driven = self._driven(self.motion(y), self.inputs(u), self.chain.tip_wrench)
         reactions = reaction_wrenches(self.chain, *driven)
-        return [entry for force, torque in reactions for entry in (*force, *torque[:2])]
+        transmitted = [
+            (*force, *torque[:2]) if link.screw.turn else (*force[:2], *torque)
+            for link, (force, torque) in zip(self.chain.links, reactions, strict=True)
+        ]
+        return [entry for five in transmitted for entry in five]
 
     def _missing_wrenches(self, motion: Motion, given: Accelerations) -> list[Any]:
         """Force and torque on base and links that given accelerations need besides the tip's wrench."""
-        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
-        needed = minimal.body_wrenches(self.chain, rotations, motion.angular, motion.joint_rates, given)
+        frames = minimal.link_frames(self.chain, motion.joint_angles)
+        needed = minimal.body_wrenches(self.chain, frames, motion.angular, motion.joint_rates, given)
         acting = self._acting(motion, Inputs(ZERO, ZERO, [], []), self.chain.tip_wrench)
         return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(needed, acting, strict=True)]
 
     def _reactions(self, motion: Motion, solved: Accelerations) -> Sequence[Any]:
         """Force and torque that each joint transmits to its link, in joint axes."""
-        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        frames = minimal.link_frames(self.chain, motion.joint_angles)
         missing = self._missing_wrenches(motion, solved)
-        return minimal.passed_to_base(self.chain, rotations, missing).reactions
+        return minimal.passed_to_base(self.chain, frames, missing).reactions

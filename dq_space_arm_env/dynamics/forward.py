@@ -12,7 +12,7 @@ from dq_space_arm_env.algebra.vectors import subtract
 from dq_space_arm_env.dynamics.articulated_body import ArticulatedBodies
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
-from dq_space_arm_env.dynamics.minimal import ZERO, Accelerations, body_wrenches
+from dq_space_arm_env.dynamics.minimal import ZERO, Accelerations, LinkFrame, body_wrenches
 
 Scalar = Any
 Vector3 = Sequence[Scalar]
@@ -35,12 +35,10 @@ class Inertia(Protocol):
         ...
 
 
-def inertia_of(
-    formulation: str, chain: Chain, rotations: Sequence[Sequence[Vector3]], *, many: bool = False
-) -> Inertia:
+def inertia_of(formulation: str, chain: Chain, frames: Sequence[LinkFrame], *, many: bool = False) -> Inertia:
     """Inertia in the scene's formulation; `many`: for many right-hand sides, as derivatives have."""
     if formulation == "minimal_coordinates":
-        return MassMatrix(chain, rotations)
+        return MassMatrix(chain, frames)
     if formulation != "articulated_body":
         raise ValueError(
             f"formulation: {formulation!r} is unknown; it must be articulated_body or minimal_coordinates"
@@ -49,26 +47,26 @@ def inertia_of(
     if root == 0 and chain.links and (chain.planar or not many) and not chain.heavy_base:
         # The first link is as good a root, and a faster one but for many right-hand sides in space.
         root = 1
-    return ArticulatedBodies(chain, rotations, root)
+    return ArticulatedBodies(chain, frames, root)
 
 
 def forward_dynamics(
     chain: Chain,
     inertia: Inertia,
-    rotations: Sequence[Sequence[Vector3]],
+    frames: Sequence[LinkFrame],
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
     acting: Sequence[Wrench],
     joints: Sequence[Scalar],
 ) -> Accelerations:
     """Accelerations of a motion under external wrenches (as in `Inertia.accelerations`) and joint torques."""
-    left = _left(chain, rotations, angular_velocity, joint_rates, acting)
+    left = _left(chain, frames, angular_velocity, joint_rates, acting)
     return inertia.accelerations(left, joints)
 
 
 def reaction_wrenches(
     chain: Chain,
-    rotations: Sequence[Sequence[Vector3]],
+    frames: Sequence[LinkFrame],
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
     acting: Sequence[Wrench],
@@ -79,13 +77,13 @@ def reaction_wrenches(
     Rooted at the heaviest body, whatever the masses: a light base may accelerate a million times faster than
     the link that drives it, and the link's acceleration would be their difference.
     """
-    left = _left(chain, rotations, angular_velocity, joint_rates, acting)
-    return ArticulatedBodies(chain, rotations, chain.heaviest).reactions(left, joints)
+    left = _left(chain, frames, angular_velocity, joint_rates, acting)
+    return ArticulatedBodies(chain, frames, chain.heaviest).reactions(left, joints)
 
 
 def _left(
     chain: Chain,
-    rotations: Sequence[Sequence[Vector3]],
+    frames: Sequence[LinkFrame],
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
     acting: Sequence[Wrench],
@@ -96,5 +94,5 @@ def _left(
     heavy one needs.
     """
     rest = Accelerations(ZERO, ZERO, [0.0] * len(chain.links))
-    needed = body_wrenches(chain, rotations, angular_velocity, joint_rates, rest)
+    needed = body_wrenches(chain, frames, angular_velocity, joint_rates, rest)
     return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(acting, needed, strict=True)]

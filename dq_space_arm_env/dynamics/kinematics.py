@@ -20,8 +20,8 @@ from dq_space_arm_env.algebra.vectors import (
     subtract,
     transposed_matrix_vector,
 )
-from dq_space_arm_env.dynamics.chain import Chain
-from dq_space_arm_env.dynamics.minimal import ZERO, shift_wrench
+from dq_space_arm_env.dynamics.chain import Chain, Screw
+from dq_space_arm_env.dynamics.minimal import ZERO, LinkFrame, link_frames, shift_wrench
 
 Scalar = Any
 DualQuaternion = Sequence[Scalar]
@@ -33,6 +33,18 @@ def axis_rotation(axis: int, angle: Scalar) -> DualQuaternion:
     result: list[Scalar] = [cos(0.5 * angle), *[0.0] * 7]
     result[1 + axis] = sin(0.5 * angle)
     return result
+
+
+def joint_motion(screw: Screw, coordinate: Scalar) -> DualQuaternion:
+    """Unit dual quaternion of a screw about and along the z axis, exp(1/2 coordinate s)."""
+    turn, slide = screw
+    if not slide:
+        return axis_rotation(2, coordinate)
+    half = 0.5 * slide * coordinate
+    if not turn:
+        return (1.0, *[0.0] * 6, half)
+    c, s = cos(0.5 * coordinate), sin(0.5 * coordinate)
+    return (c, 0.0, 0.0, s, -half * s, 0.0, 0.0, half * c)
 
 
 def wrist_rotation(wrist_angles: Sequence[Scalar]) -> DualQuaternion:
@@ -60,7 +72,7 @@ def frame_poses(
     """Poses of base, joint frames, end effector (if any) and tip in the inertial frame: factors of (27)."""
     poses = [base_pose]
     for link, angle in zip(chain.links, joint_angles, strict=True):
-        joint = dq.multiply(link.joint.dual_quaternion, axis_rotation(2, angle))
+        joint = dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, angle))
         poses.append(dq.multiply(poses[-1], joint))
     if chain.wrist is not None:
         wrist = dq.multiply(chain.wrist.dual_quaternion, wrist_rotation(wrist_angles))
@@ -83,7 +95,7 @@ def arm_pose(chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Sequenc
         arm = dq.multiply(wrist_rotation(wrist_angles), arm)
         arm = dq.multiply(chain.wrist.dual_quaternion, arm)
     for link, angle in zip(reversed(chain.links), reversed(list(joint_angles)), strict=True):
-        arm = dq.multiply(link.joint.dual_quaternion, dq.multiply(axis_rotation(2, angle), arm))
+        arm = dq.multiply(link.joint.dual_quaternion, dq.multiply(joint_motion(link.screw, angle), arm))
     return arm
 
 
@@ -108,8 +120,9 @@ def tip_pose_rate(
     # (30): 1/2 q_{e0/I} w_0 q_{G/e0} + 1/2 sum_i q_{e_i/I} w^{e_i}_{i/e_i} q_{G/e_i}, joint frames for the
     # e_i.
     rate = contribution(base_pose, base_twist)
-    for frame, speed in zip(poses[1:], joint_rates, strict=False):
-        rate = dq.add(rate, contribution(frame, (0.0, 0.0, speed, 0.0, 0.0, 0.0)))
+    for frame, link, speed in zip(poses[1:], chain.links, joint_rates, strict=False):
+        turn, slide = (part * speed for part in link.screw)
+        rate = dq.add(rate, contribution(frame, (0.0, 0.0, turn, 0.0, 0.0, slide)))
     if chain.wrist is not None:
         turning = matrix_vector(wrist_rate_matrix(wrist_angles), wrist_rates)
         rate = dq.add(rate, contribution(poses[-2], (*turning, 0.0, 0.0, 0.0)))
@@ -132,8 +145,9 @@ def tip_jacobian(
         wrist = dq.multiply(chain.wrist.dual_quaternion, wrist_rotation(wrist_angles))
         relative = dq.multiply(wrist, relative)
     for link, angle in zip(reversed(chain.links), reversed(list(joint_angles)), strict=True):
-        columns.insert(0, _carried_to_tip(relative, (0.0, 0.0, 1.0), ZERO))
-        joint = dq.multiply(link.joint.dual_quaternion, axis_rotation(2, angle))
+        turn, slide = link.screw
+        columns.insert(0, _carried_to_tip(relative, (0.0, 0.0, turn), (0.0, 0.0, slide)))
+        joint = dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, angle))
         relative = dq.multiply(joint, relative)
     axes = [[1.0 if j == i else 0.0 for j in range(3)] for i in range(3)]
     turning = [_carried_to_tip(relative, axis, ZERO) for axis in axes]
@@ -153,11 +167,12 @@ def tip_twist(
 
     A fraction of the operations of `tip_jacobian`, half angles shared with the tip's pose.
     """
-    turns = (to_matrix(axis_rotation(2, angle))[0] for angle in joint_angles)
-    rotations = [
-        matrix_product(link.joint.rotation, turn) for link, turn in zip(chain.links, turns, strict=True)
-    ]
-    last = body_velocities(chain, rotations, base_twist, joint_rates)[-1]
+    frames = link_frames(chain, joint_angles)
+    for index, (link, angle) in enumerate(zip(chain.links, joint_angles, strict=True)):
+        if link.screw.turn:
+            turned = matrix_product(link.joint.rotation, to_matrix(axis_rotation(2, angle))[0])
+            frames[index] = frames[index]._replace(rotation=turned)
+    last = body_velocities(chain, frames, base_twist, joint_rates)[-1]
     twist: Sequence[Scalar] = (*last.angular, *last.linear)
     if chain.wrist is not None:
         twist = inverse_transform(chain.wrist.rotation, chain.wrist.position, twist)
@@ -185,24 +200,26 @@ class BodyVelocity:
 
 def body_velocities(
     chain: Chain,
-    rotations: Sequence[Sequence[Vector3]],
+    frames: Sequence[LinkFrame],
     base_twist: Sequence[Scalar],
     joint_rates: Sequence[Scalar],
 ) -> list[BodyVelocity]:
     """Velocities of base and links, n + 1, by the recursion behind (12); `base_twist` in base axes."""
     velocities = [BodyVelocity(tuple(base_twist[:3]), tuple(base_twist[3:]))]
-    for link, rotation, rate in zip(chain.links, rotations, joint_rates, strict=True):
-        parent = velocities[-1]
-        linear = transposed_matrix_vector(
-            rotation, add(parent.linear, cross(parent.angular, link.joint.position))
-        )
+    for link, (rotation, position), rate in zip(chain.links, frames, joint_rates, strict=True):
+        parent, (turn, slide) = velocities[-1], link.screw
+        linear = transposed_matrix_vector(rotation, add(parent.linear, cross(parent.angular, position)))
         angular = transposed_matrix_vector(rotation, parent.angular)
-        velocities.append(BodyVelocity((angular[0], angular[1], angular[2] + rate), linear))
+        if turn:
+            angular = (angular[0], angular[1], angular[2] + rate)
+        if slide:
+            linear = (linear[0], linear[1], linear[2] + slide * rate)
+        velocities.append(BodyVelocity(angular, linear))
     return velocities
 
 
 def momentum(
-    chain: Chain, rotations: Sequence[Sequence[Vector3]], velocities: Sequence[BodyVelocity]
+    chain: Chain, frames: Sequence[LinkFrame], velocities: Sequence[BodyVelocity]
 ) -> tuple[Vector3, Vector3, Vector3]:
     """Linear momentum, angular momentum about the center of mass, and center of mass, in the base frame."""
     bodies = [chain.base, *(link.body for link in chain.links)]
@@ -217,7 +234,7 @@ def momentum(
         moments.append(scale(body.mass, c))
     mass: Scalar = 0.0
     for i in reversed(range(len(chain.links))):
-        rotation, position = rotations[i], chain.links[i].joint.position
+        rotation, position = frames[i]
         mass = mass + chain.links[i].body.mass
         linear_at_parent, angular_at_parent = shift_wrench(rotation, position, linear[i + 1], angular[i + 1])
         linear[i] = add(linear[i], linear_at_parent)

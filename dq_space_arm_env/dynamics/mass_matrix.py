@@ -10,9 +10,16 @@ from collections.abc import Sequence
 from typing import Any
 
 from dq_space_arm_env.algebra.vectors import add, cross, dot, matrix_vector, scale, subtract
-from dq_space_arm_env.dynamics.chain import Chain, Matrix, RigidBody
+from dq_space_arm_env.dynamics.chain import Chain, Matrix, RigidBody, Screw
 from dq_space_arm_env.dynamics.linear import LDLFactor, factorize_ldl, solve_ldl
-from dq_space_arm_env.dynamics.minimal import ZERO, Accelerations, passed_to_base, shift_wrench
+from dq_space_arm_env.dynamics.minimal import (
+    ZERO,
+    Accelerations,
+    LinkFrame,
+    along,
+    passed_to_base,
+    shift_wrench,
+)
 
 Scalar = Any
 Vector3 = Sequence[Scalar]
@@ -28,11 +35,11 @@ class MassMatrix:
     over the mass ratio.
     """
 
-    def __init__(self, chain: Chain, rotations: Sequence[Sequence[Vector3]]) -> None:
+    def __init__(self, chain: Chain, frames: Sequence[LinkFrame]) -> None:
         """Assemble (CRBA, Featherstone tables 6.2 and 9.6) and factorize."""
-        self._chain, self._rotations = chain, rotations
+        self._chain, self._frames = chain, frames
         self._axes = (2,) if chain.planar else (0, 1, 2)
-        mass, moment, inertia, columns, joint_block = _composite_bodies(chain, rotations)
+        mass, moment, inertia, columns, joint_block = _composite_bodies(chain, frames)
         self._mass = mass
         self.center = scale(1.0 / mass, moment)
         # Joint columns of the mass matrix in the base frame: force, and torque about the system's center of
@@ -60,7 +67,7 @@ class MassMatrix:
         self, wrenches: Sequence[tuple[Vector3, Vector3]], joints: Sequence[Scalar]
     ) -> Accelerations:
         """See `forward.Inertia`."""
-        total = passed_to_base(self._chain, self._rotations, wrenches)
+        total = passed_to_base(self._chain, self._frames, wrenches)
         both = [own + other for own, other in zip(joints, total.joints, strict=True)]
         return self.solve(total.force, total.torque, both)
 
@@ -138,12 +145,12 @@ class MassMatrix:
         return omega, subtract([entry / self._mass for entry in linear], cross(omega, self.center))
 
 
-def mass_matrix(chain: Chain, rotations: Sequence[Sequence[Vector3]]) -> list[list[Scalar]]:
+def mass_matrix(chain: Chain, frames: Sequence[LinkFrame]) -> list[list[Scalar]]:
     """The mass matrix by (angular, linear, joints), the base's about the origin of its frame, (6 + n, 6 + n).
 
     [J, [d]x, T; [d]x', m E, F; T', F', H] with the first moment d of all bodies and the joints' columns T, F.
     """
-    mass, moment, inertia, columns, joint_block = _composite_bodies(chain, rotations)
+    mass, moment, inertia, columns, joint_block = _composite_bodies(chain, frames)
     n = len(columns)
     result: list[list[Scalar]] = [[0.0] * (6 + n) for _ in range(6 + n)]
     for i in range(3):
@@ -181,8 +188,21 @@ def _rotated_inertia(rotation: Sequence[Vector3], inertia: Sequence[Vector3]) ->
     return result
 
 
+def _wrench_along(
+    screw: Screw, mass: Scalar, moment: Vector3, inertia: Sequence[Vector3]
+) -> tuple[Vector3, Vector3]:
+    """Force and torque per acceleration along a screw, of a body with a first moment and an inertia."""
+    turn, slide = screw
+    force: Vector3 = (-moment[1], moment[0], 0.0)
+    torque: Vector3 = (inertia[0][2], inertia[1][2], inertia[2][2])
+    if slide:
+        force = add(scale(turn, force), (0.0, 0.0, slide * mass))
+        torque = add(scale(turn, torque), (slide * moment[1], -slide * moment[0], 0.0))
+    return force, torque
+
+
 def _composite_bodies(
-    chain: Chain, rotations: Sequence[Sequence[Vector3]]
+    chain: Chain, frames: Sequence[LinkFrame]
 ) -> tuple[Scalar, Vector3, Sequence[Vector3], list[tuple[Vector3, Vector3]], list[list[Scalar]]]:
     """Composite mass, first moment, inertia at the base; each joint's column (force, torque); joint block."""
 
@@ -197,16 +217,13 @@ def _composite_bodies(
     block: list[list[Scalar]] = [[0.0] * n for _ in range(n)]
     for i in reversed(range(n)):
         # A unit acceleration of joint i needs this wrench on the composite body beyond it.
-        column: tuple[Vector3, Vector3] = (
-            (-moment[1], moment[0], 0.0),
-            (inertia[0][2], inertia[1][2], inertia[2][2]),
-        )
-        block[i][i] = column[1][2]
+        column = _wrench_along(chain.links[i].screw, mass, moment, inertia)
+        block[i][i] = along(chain.links[i].screw, *column)
         for ancestor in reversed(range(i)):
-            column = shift_wrench(rotations[ancestor + 1], chain.links[ancestor + 1].joint.position, *column)
-            block[ancestor][i] = block[i][ancestor] = column[1][2]
-        columns.insert(0, shift_wrench(rotations[0], chain.links[0].joint.position, *column))
-        rotation, p = rotations[i], chain.links[i].joint.position
+            column = shift_wrench(*frames[ancestor + 1], *column)
+            block[ancestor][i] = block[i][ancestor] = along(chain.links[ancestor].screw, *column)
+        columns.insert(0, shift_wrench(*frames[0], *column))
+        rotation, p = frames[i]
         rotated_moment = matrix_vector(rotation, moment)
         shifted = _shifted_inertia(_rotated_inertia(rotation, inertia), mass, p, rotated_moment)
         parent_mass, parent_moment, parent_inertia = about_origin(

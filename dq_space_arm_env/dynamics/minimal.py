@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from dq_space_arm_env.algebra.scalars import cos, sin
 from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale, transposed_matrix_vector
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.dynamics.chain import Chain, RigidBody, Screw
 
 Scalar = Any
 Vector3 = Sequence[Scalar]
@@ -29,7 +29,7 @@ class Accelerations:
 
     angular: Vector3  # of the base, base axes, rad/s^2
     linear: Vector3  # inertial, of the base's center of mass, base axes, m/s^2
-    joints: Sequence[Scalar]  # n, rad/s^2
+    joints: Sequence[Scalar]  # n, rad/s^2 or m/s^2
 
 
 @dataclass(frozen=True)
@@ -38,26 +38,45 @@ class Wrenches:
 
     force: Vector3  # on the base at its center of mass, base axes, N
     torque: Vector3  # on the base about its center of mass, base axes, N m
-    joints: Sequence[Scalar]  # n, N m
-    # Force and torque that each joint transmits to its link, about the joint origin, joint axes; the z torque
-    # is the motor's share, the other five are the paper's W~ (13)-(16).
+    joints: Sequence[Scalar]  # n, N m or N
+    # Force and torque that each joint transmits to its link, about the joint origin, joint axes; a revolute
+    # joint's z torque is the motor's share, the other five are the paper's W~ (13)-(16).
     reactions: Sequence[tuple[Vector3, Vector3]]
 
 
-def joint_rotations(chain: Chain, joint_angles: Sequence[Scalar]) -> list[Sequence[Vector3]]:
-    """Rotation matrices of the joint frames in their parents' frames, C_i Rz(theta_i), n of them."""
-    rotations: list[Sequence[Vector3]] = []
+class LinkFrame(NamedTuple):
+    """Pose of a link's frame in its parent's."""
+
+    rotation: Sequence[Vector3]  # from the link's axes to its parent's, C_i Rz(theta_i)
+    position: Vector3  # of the origin, m
+
+
+def link_frames(chain: Chain, joint_angles: Sequence[Scalar]) -> list[LinkFrame]:
+    """Frames of the links, n, from their joints' coordinates: screws about their z axes."""
+    frames: list[LinkFrame] = []
     for link, angle in zip(chain.links, joint_angles, strict=True):
-        c, s = cos(angle), sin(angle)
-        rotations.append(
-            tuple((row[0] * c + row[1] * s, row[1] * c - row[0] * s, row[2]) for row in link.joint.rotation)
-        )
-    return rotations
+        rotation: Sequence[Vector3] = link.joint.rotation
+        position: Vector3 = link.joint.position
+        axis = [row[2] for row in rotation]  # z, which a turn leaves where it is
+        if link.screw.turn:
+            c, s = cos(angle), sin(angle)
+            rotation = tuple((row[0] * c + row[1] * s, row[1] * c - row[0] * s, row[2]) for row in rotation)
+        if link.screw.slide:
+            position = add(position, scale(link.screw.slide * angle, axis))
+        frames.append(LinkFrame(rotation, position))
+    return frames
+
+
+def along(screw: Screw, force: Vector3, torque: Vector3) -> Scalar:
+    """Share of a wrench that works along a screw, N m or N."""
+    if not screw.slide:
+        return torque[2]
+    return screw.slide * force[2] + torque[2] if screw.turn else force[2]
 
 
 def body_wrenches(
     chain: Chain,
-    rotations: Sequence[Sequence[Vector3]],
+    frames: Sequence[LinkFrame],
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
     acceleration: Accelerations,
@@ -68,35 +87,39 @@ def body_wrenches(
     """
     omega, alpha, a = angular_velocity, acceleration.angular, acceleration.linear
     wrenches = [_newton_euler(chain.base, omega, alpha, a)]
-    for link, rotation, rate, rate_change in zip(
-        chain.links, rotations, joint_rates, acceleration.joints, strict=True
+    for link, (rotation, p), rate, rate_change in zip(
+        chain.links, frames, joint_rates, acceleration.joints, strict=True
     ):
-        p = link.joint.position
         # a_O' = R' (a + alpha x p + omega x (omega x p)), all components now in the link's axes.
         a = transposed_matrix_vector(rotation, add(a, add(cross(alpha, p), cross(omega, cross(omega, p)))))
         omega = transposed_matrix_vector(rotation, omega)
-        # alpha' = R' alpha + omega x (rate z) + (rate change) z.
-        turning = (omega[1] * rate, -omega[0] * rate, 0.0)
-        alpha = add(transposed_matrix_vector(rotation, alpha), (turning[0], turning[1], rate_change))
-        omega = (omega[0], omega[1], omega[2] + rate)
+        alpha = transposed_matrix_vector(rotation, alpha)
+        across = (omega[1] * rate, -omega[0] * rate)  # omega x (rate z)
+        turn, slide = link.screw
+        if slide:  # the origin moves along z: 2 omega x (rate z) and (rate change) z more
+            a = add(a, scale(slide, (2.0 * across[0], 2.0 * across[1], rate_change)))
+        if turn:
+            # alpha' = R' alpha + omega x (rate z) + (rate change) z.
+            alpha = add(alpha, (*across, rate_change))
+            omega = (omega[0], omega[1], omega[2] + rate)
         wrenches.append(_newton_euler(link.body, omega, alpha, a))
     return wrenches
 
 
 def inverse_dynamics(
     chain: Chain,
-    rotations: Sequence[Sequence[Vector3]],
+    frames: Sequence[LinkFrame],
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
     acceleration: Accelerations,
 ) -> Wrenches:
     """Generalized forces for given accelerations (RNEA), without springs, dampers and tip wrench."""
-    wrenches = body_wrenches(chain, rotations, angular_velocity, joint_rates, acceleration)
-    return passed_to_base(chain, rotations, wrenches)
+    wrenches = body_wrenches(chain, frames, angular_velocity, joint_rates, acceleration)
+    return passed_to_base(chain, frames, wrenches)
 
 
 def passed_to_base(
-    chain: Chain, rotations: Sequence[Sequence[Vector3]], wrenches: Sequence[tuple[Vector3, Vector3]]
+    chain: Chain, frames: Sequence[LinkFrame], wrenches: Sequence[tuple[Vector3, Vector3]]
 ) -> Wrenches:
     """Generalized forces of wrenches on the bodies, summed from tip to base: the inward pass of the RNEA."""
     acting = list(wrenches)
@@ -104,11 +127,9 @@ def passed_to_base(
     for i in reversed(range(len(chain.links))):
         force, torque = acting[i + 1]
         reactions.insert(0, (force, torque))
-        force_at_parent, torque_at_parent = shift_wrench(
-            rotations[i], chain.links[i].joint.position, force, torque
-        )
+        force_at_parent, torque_at_parent = shift_wrench(*frames[i], force, torque)
         acting[i] = (add(acting[i][0], force_at_parent), add(acting[i][1], torque_at_parent))
-    joints = [torque[2] for _, torque in reactions]  # the share about the joint axis
+    joints = [along(link.screw, *wrench) for link, wrench in zip(chain.links, reactions, strict=True)]
     return Wrenches(acting[0][0], acting[0][1], joints, reactions)
 
 
@@ -134,7 +155,7 @@ def shift_wrench(
 def passive_torques(
     chain: Chain, joint_angles: Sequence[Scalar], joint_rates: Sequence[Scalar]
 ) -> list[Scalar]:
-    """Torques of the joints' springs and dampers on the links, n, N m."""
+    """Torques (or forces) of the joints' springs and dampers on the links, n, N m (N)."""
     return [
         -link.stiffness * (angle - link.rest_angle) - link.damping * rate
         for link, angle, rate in zip(chain.links, joint_angles, joint_rates, strict=True)
@@ -143,11 +164,11 @@ def passive_torques(
 
 def tip_wrench_forces(
     chain: Chain,
-    rotations: Sequence[Sequence[Vector3]],
+    frames: Sequence[LinkFrame],
     tip_rotation: Sequence[Vector3],
     tip_position: Vector3,
     wrench: Sequence[Scalar],
 ) -> Wrenches:
     """Generalized forces of a wrench at G (force, then torque, in G axes): the last term of (16)."""
     force, torque = shift_wrench(tip_rotation, tip_position, wrench[:3], wrench[3:])
-    return passed_to_base(chain, rotations, [*[(ZERO, ZERO)] * len(chain.links), (force, torque)])
+    return passed_to_base(chain, frames, [*[(ZERO, ZERO)] * len(chain.links), (force, torque)])

@@ -44,18 +44,18 @@ class SpaceArmMomentum:
     def external_wrench(self, y: Scalars, u: Scalars) -> tuple[Scalars, Scalars]:
         """External force and torque on the system, about the base origin; zeros without any."""
         motion, inputs = self._field.motion(y), self._field.inputs(u)
-        rotations = minimal.joint_rotations(self._chain, motion.joint_angles)
-        tip = self._field.tip_forces(motion, rotations, self._chain.tip_wrench)
+        frames = minimal.link_frames(self._chain, motion.joint_angles)
+        tip = self._field.tip_forces(motion, frames, self._chain.tip_wrench)
         return add(inputs.force, tip.force), add(inputs.torque, tip.torque)
 
     def joint_torques(self, y: Scalars, u: Scalars) -> list[Scalar]:
         """Torques of motors, springs and dampers on the joints, and what a wrench at the tip adds, n."""
         motion = self._field.motion(y)
-        rotations = minimal.joint_rotations(self._chain, motion.joint_angles)
+        frames = minimal.link_frames(self._chain, motion.joint_angles)
         parts = (
             self._field.inputs(u).joint_torques,
             self.passive_torques(y),
-            self._field.tip_forces(motion, rotations, self._chain.tip_wrench).joints,
+            self._field.tip_forces(motion, frames, self._chain.tip_wrench).joints,
         )
         return [sum(torques) for torques in zip(*parts, strict=True)]
 
@@ -70,4 +70,4 @@ class SpaceArmMomentum:
 
     def _mass_matrix(self, y: Scalars) -> tuple[Motion, MassMatrix]:
         motion = self._field.motion(y)
-        return motion, MassMatrix(self._chain, minimal.joint_rotations(self._chain, motion.joint_angles))
+        return motion, MassMatrix(self._chain, minimal.link_frames(self._chain, motion.joint_angles))

@@ -18,8 +18,8 @@ from typing import Any
 
 from dq_space_arm_env.algebra import dual_matrices
 from dq_space_arm_env.algebra import dual_quaternion as dq
-from dq_space_arm_env.dynamics.chain import Chain
-from dq_space_arm_env.dynamics.kinematics import axis_rotation, tip_pose_rate, wrist_rotation
+from dq_space_arm_env.dynamics.chain import Chain, Screw
+from dq_space_arm_env.dynamics.kinematics import joint_motion, tip_pose_rate, wrist_rotation
 from dq_space_arm_env.dynamics.linear import factorize_ldl, solve_ldl
 from dq_space_arm_env.dynamics.minimal import passive_torques
 
@@ -28,8 +28,9 @@ DualQuaternion = Sequence[Scalar]
 Matrix = list[list[Scalar]]
 
 # E_158 keeps what a revolute joint can transmit, E_145 the velocities that it forbids (counted from zero).
-TRANSMITTED = (1, 2, 3, 5, 6)
-FORBIDDEN = (1, 2, 5, 6, 7)
+TRANSMITTED, FORBIDDEN = (1, 2, 3, 5, 6), (1, 2, 5, 6, 7)
+# A prismatic joint transmits a torque about its axis, and no force along it.
+PRISMATIC_TRANSMITTED, PRISMATIC_FORBIDDEN = (1, 2, 5, 6, 7), (1, 2, 3, 5, 6)
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class NewtonEulerSystem:
 class JointFrames:
     """Relative poses around each joint."""
 
-    distal: Sequence[DualQuaternion]  # q_{i/e_i} = C_i Rz(theta), joint frame i in the body before it
+    distal: Sequence[DualQuaternion]  # q_{i/e_i} = C_i exp(1/2 theta s), joint frame i in the body before it
     proximal: Sequence[DualQuaternion]  # q_{e_{i+1}/i} = D_i, body after the joint in joint frame i; constant
     tip: DualQuaternion  # q_{G/e_n}
 
@@ -62,7 +63,7 @@ def joint_frames(chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Seq
     center: Sequence[float] = (0.0, 0.0, 0.0)
     for link, angle in zip(chain.links, joint_angles, strict=True):
         fixed = dq.multiply(_translation([-c for c in center]), link.joint.dual_quaternion)
-        distal.append(dq.multiply(fixed, axis_rotation(2, angle)))
+        distal.append(dq.multiply(fixed, joint_motion(link.screw, angle)))
         center = link.body.center_of_mass
         proximal.append(_translation(center))
     tip: DualQuaternion = _translation([-c for c in center])
@@ -74,7 +75,8 @@ def joint_frames(chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Seq
 def joint_velocity(frames: JointFrames, joint: int, velocities: Sequence[DualQuaternion]) -> DualQuaternion:
     """Dual velocity of a joint in its own axes, omega^i_{i/e_i}.
 
-    Entry 3 is the joint rate (12); the others vanish when the bodies obey the joint.
+    Entry 3, or 7 of a prismatic joint, is the joint rate (12). A screw's entry 7 is pitch times its rate; the
+    others vanish when the bodies obey the joint.
     """
     after, before = frames.proximal[joint], frames.distal[joint]
     # (12): Ad(q_{e_{i+1}/i}) w_{i+1} - Ad(q_{i/e_i}*) w_i.
@@ -113,20 +115,39 @@ def assemble(
     for j in range(n):
         before, after = frames.distal[j], frames.proximal[j]
         # (13)-(16): +-Ad(.) E158' W~_{j+1/j} on the left, -+Ad(.) W_act,j+1 on the right.
-        actuation = (0.0,) * 7 + (joint_torques[j],)
+        screw = chain.links[j].screw
+        actuation = [0.0] * 8
+        actuation[7 if screw.turn else 3] = joint_torques[j]
         for body_index, pose, sign in ((j, before, 1.0), (j + 1, dq.conjugate(after), -1.0)):
             transfer = dual_matrices.adjoint_matrix(pose)
-            _place(s12, 8 * body_index, 5 * j, [[sign * row[c] for c in TRANSMITTED] for row in transfer])
+            columns = [[sign * entry for entry in _transmitted(screw, row)] for row in transfer]
+            _place(s12, 8 * body_index, 5 * j, columns)
             _accumulate(b1, 8 * body_index, dq.scale(-sign, dq.adjoint(pose, actuation)))
         # (19): E145 Ad(q_{e_{j+1}/j}) wdot_{j+1} - E145 Ad(q_{j/e_j}*) wdot_j = E145 (w^j_{e_j/I} x
         # w^j_{j/e_j}).
         back = dual_matrices.adjoint_matrix(dq.conjugate(before))
-        _place(s21, 5 * j, 8 * (j + 1), [dual_matrices.adjoint_matrix(after)[row] for row in FORBIDDEN])
-        _place(s21, 5 * j, 8 * j, [[-entry for entry in back[row]] for row in FORBIDDEN])
+        _place(s21, 5 * j, 8 * (j + 1), _forbidden(screw, dual_matrices.adjoint_matrix(after)))
+        _place(s21, 5 * j, 8 * j, [[-entry for entry in row] for row in _forbidden(screw, back)])
         carried = dq.inverse_adjoint(before, velocities[j])
         centripetal = dq.cross(carried, joint_velocity(frames, j, velocities))
-        b2 += [centripetal[row] for row in FORBIDDEN]
+        b2 += [row[0] for row in _forbidden(screw, [[entry] for entry in centripetal])]
     return NewtonEulerSystem(s11, s12, s21, b1, b2)
+
+
+def _transmitted(screw: Screw, row: Sequence[Scalar]) -> list[Scalar]:
+    """Combine a row's columns into those of the five wrenches that a joint transmits."""
+    kept = [row[column] for column in (TRANSMITTED if screw.turn else PRISMATIC_TRANSMITTED)]
+    if screw.turn and screw.slide:  # a force along the axis comes with a torque: no work along the screw
+        kept[2] = kept[2] - screw.slide * row[7]
+    return kept
+
+
+def _forbidden(screw: Screw, rows: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
+    """Combine the rows of a dual velocity into those of the five velocities that a joint forbids."""
+    kept = [list(rows[row]) for row in (FORBIDDEN if screw.turn else PRISMATIC_FORBIDDEN)]
+    if screw.turn and screw.slide:
+        kept[4] = [along - screw.slide * about for along, about in zip(rows[7], rows[3], strict=True)]
+    return kept
 
 
 class SchurComplement:
@@ -140,8 +161,11 @@ class SchurComplement:
         self._system = system
         self._bodies = [chain.base, *(link.body for link in chain.links)]
         count = len(system.s21)
-        # A force enforces a linear velocity, a torque an angular one: (vx, vy, vz, wx, wy) within each joint.
-        order = [5 * (k // 5) + (2, 3, 4, 0, 1)[k % 5] for k in range(count)]
+        # A force enforces a linear velocity, a torque an angular one: (vx, vy, vz, wx, wy) within each joint,
+        # (vx, vy, wx, wy, wz) within a prismatic one.
+        turning, sliding = (2, 3, 4, 0, 1), (3, 4, 0, 1, 2)
+        orders = [turning if link.screw.turn else sliding for link in chain.links]
+        order = [5 * (k // 5) + orders[k // 5][k % 5] for k in range(count)]
         self._order = order
         self._constraints = [system.s21[row] for row in order]
         columns = [[row[c] for row in system.s12] for c in range(count)]
@@ -274,7 +298,8 @@ def system_of(
 def joint_speeds(chain: Chain, state: PaperState) -> list[Scalar]:
     """Joint rates (12) from the dual velocities of the bodies."""
     frames = joint_frames(chain, state.joint_angles, state.wrist_angles)
-    return [joint_velocity(frames, j, state.velocities)[3] for j in range(len(chain.links))]
+    entries = [3 if link.screw.turn else 7 for link in chain.links]
+    return [joint_velocity(frames, j, state.velocities)[entry] for j, entry in enumerate(entries)]
 
 
 def paper_position_rates(chain: Chain, state: PaperState, wrist_rates: Sequence[Scalar]) -> list[Scalar]:

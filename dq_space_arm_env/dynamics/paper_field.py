@@ -54,9 +54,9 @@ class PaperField:
         field, chain = self.minimal, self.chain
         stored, y = split_state(field, x)
         pose, motion = field.pose.full(stored), field.motion(y)
-        rotations = minimal.joint_rotations(chain, motion.joint_angles)
+        frames = minimal.link_frames(chain, motion.joint_angles)
         velocities = kinematics.body_velocities(
-            chain, rotations, (*motion.angular, *motion.linear), motion.joint_rates
+            chain, frames, (*motion.angular, *motion.linear), motion.joint_rates
         )
         duals: list[Scalar] = []
         for body, velocity in zip(

@@ -18,7 +18,7 @@ from dq_space_arm_env.dynamics.minimal import (
     ZERO,
     Accelerations,
     inverse_dynamics,
-    joint_rotations,
+    link_frames,
     tip_wrench_forces,
 )
 
@@ -47,20 +47,20 @@ def capture(
     The payload's mass properties are in tip axes, its twist (angular [rad/s], linear [m/s]) at the tip's
     origin in tip axes; the robot has no wrist.
     """
-    rotations = joint_rotations(free, joint_angles)
+    frames = link_frames(free, joint_angles)
     still = [0.0] * len(free.links)
     # Without velocities, what accelerations need is M a: here the momentum M v.
     own = inverse_dynamics(
         free,
-        rotations,
+        frames,
         ZERO,
         still,
         Accelerations(velocities.angular, velocities.linear, velocities.joint_rates),
     )
     linear, angular = momentum_at_tip(payload, payload_twist)
-    brought = tip_wrench_forces(free, rotations, free.tip.rotation, free.tip.position, (*linear, *angular))
+    brought = tip_wrench_forces(free, frames, free.tip.rotation, free.tip.position, (*linear, *angular))
     joints = [a + b for a, b in zip(own.joints, brought.joints, strict=True)]
-    after = MassMatrix(loaded, rotations).solve(
+    after = MassMatrix(loaded, frames).solve(
         add(own.force, brought.force), add(own.torque, brought.torque), joints
     )
     return Velocities(after.angular, after.linear, after.joints)

@@ -12,7 +12,7 @@ from typing import Any
 import casadi
 
 from dq_space_arm_env.algebra.symbolic import column, columns, dense_entries, symbols, zeros
-from dq_space_arm_env.algebra.vectors import add, cross, subtract
+from dq_space_arm_env.algebra.vectors import add, cross, scale, subtract
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.forward import Inertia
@@ -132,8 +132,9 @@ class SpaceArmField(EquationsOfMotion):
     def _body_residual_jacobian(self, y: Sequence[Scalar], solved: Accelerations) -> Matrix:
         """Jacobian by y of the body wrenches and joint torques that fixed accelerations need.
 
-        A joint's angle turns the wrench that reaches the body before it. At a fixed angle the effect is the
-        same if the body after the joint takes, besides its own, the wrench's change z x (force, torque).
+        A joint's coordinate moves the wrench that reaches the body before it along its screw s. At a fixed
+        coordinate the effect is the same if the body after the joint takes the wrench's change, s x (force,
+        torque), besides its own.
         """
         n = len(self.chain.links)
         free, acceleration = symbols("v", self.n_y), symbols("a", 6 + n)
@@ -146,9 +147,12 @@ class SpaceArmField(EquationsOfMotion):
         by_y = casadi.substitute(by_y, column(*free, *acceleration), values)
         angles = self._in_y(self.layout.state.joint_angles)
         for j, (force, torque) in enumerate(self._reactions(self.motion(y), solved)):
-            turned = column(-force[1], force[0], 0.0, -torque[1], torque[0], 0.0)
+            turn, slide = self.chain.links[j].screw
+            across = (-force[1], force[0], 0.0)  # z x force
+            moved = add(scale(turn, (-torque[1], torque[0], 0.0)), scale(slide, across))
+            change = column(*scale(turn, across), *moved)
             rows = list(range(6 * (j + 1), 6 * (j + 2)))
-            by_y[rows, angles[j]] = by_y[rows, angles[j]] + turned
+            by_y[rows, angles[j]] = by_y[rows, angles[j]] + change
         return casadi.sparsify(by_y)
 
     def _residual(self, y: Sequence[Scalar]) -> Residual:
@@ -156,10 +160,10 @@ class SpaceArmField(EquationsOfMotion):
         n = len(self.chain.links)
         acceleration = symbols("a", 6 + n)
         motion = self.motion(y)
-        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        frames = minimal.link_frames(self.chain, motion.joint_angles)
         given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
-        needed = minimal.inverse_dynamics(self.chain, rotations, motion.angular, motion.joint_rates, given)
-        tip = self.tip_forces(motion, rotations, self.chain.tip_wrench)
+        needed = minimal.inverse_dynamics(self.chain, frames, motion.angular, motion.joint_rates, given)
+        tip = self.tip_forces(motion, frames, self.chain.tip_wrench)
         passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
         joints = [
             bias - other - load for bias, other, load in zip(needed.joints, passive, tip.joints, strict=True)

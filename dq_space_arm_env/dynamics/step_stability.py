@@ -9,7 +9,7 @@ import numpy as np
 
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
-from dq_space_arm_env.dynamics.minimal import joint_rotations
+from dq_space_arm_env.dynamics.minimal import link_frames
 from dq_space_arm_env.scene import INTEGRATORS, Scene
 
 STIFF = "rodas4"
@@ -36,9 +36,7 @@ def joint_motion(scene: Scene) -> JointMotion:
     chain, links = Chain.from_scene(scene), scene.links
     if not any(link.stiffness or link.damping for link in links):
         return JointMotion(0.0, 0.0)
-    whole = np.array(
-        mass_matrix(chain, joint_rotations(chain, scene.initial_state.joint_angles)), dtype=float
-    )
+    whole = np.array(mass_matrix(chain, link_frames(chain, scene.initial_state.joint_angles)), dtype=float)
     free = [2, 3, 4, *range(6, len(whole))] if chain.planar else range(len(whole))
     inverse = np.linalg.inv(whole[np.ix_(free, free)])[-len(links) :, -len(links) :]
 

@@ -136,8 +136,8 @@ def generalized_forces(scene: Scene, x: ArrayLike, u: ArrayLike) -> Array:
     values = _checked("x", x, equations.n_x)
     motion = equations.motion(values[entries.pose.stop :].tolist())
     inputs = equations.inputs(_checked("u", u, equations.n_u).tolist())
-    rotations = minimal.joint_rotations(equations.chain, motion.joint_angles)
-    tip = equations.tip_forces(motion, rotations, equations.chain.tip_wrench)
+    frames = minimal.link_frames(equations.chain, motion.joint_angles)
+    tip = equations.tip_forces(motion, frames, equations.chain.tip_wrench)
     passive = minimal.passive_torques(equations.chain, motion.joint_angles, motion.joint_rates)
     base = [*map(sum, zip(inputs.force, tip.force, strict=True))]
     base += map(sum, zip(inputs.torque, tip.torque, strict=True))

@@ -1,5 +1,6 @@
 """Bodies of a scene: base, links, wrist and payload, and the physics that constrains their numbers."""
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -10,6 +11,7 @@ from dq_space_arm_env.scene.shapes import Shape, geometry_field
 from dq_space_arm_env.validation.fields import (
     INERTIAS,
     Angle,
+    Finite,
     Limit,
     Mass,
     Name,
@@ -19,7 +21,7 @@ from dq_space_arm_env.validation.fields import (
     Three,
     read_numbers,
 )
-from dq_space_arm_env.validation.problems import Model, problem
+from dq_space_arm_env.validation.problems import Model, Problem, problem
 
 _TOLERANCE = 1e-9  # fractions of the largest moment
 _SINGULAR = 1e-12
@@ -84,8 +86,15 @@ class Base(Model):
     geometry: tuple[Shape, ...] = geometry_field("the box of its inertia, with wings")
 
 
+JointType = Literal["revolute", "prismatic", "screw"]
+
+
 class Link(Model):
-    """A link and the revolute joint that carries it; the joint turns about the z axis of its own frame."""
+    """A link and the joint that carries it; the joint moves about and along the z axis of its own frame.
+
+    Its coordinate is an angle, rad, and its effort a torque, N m; those of a prismatic joint are a distance,
+    m, and a force, N.
+    """
 
     name: Name = Field(description="name of the link, unique in the scene")
     mass: Mass = Field(description="mass of the link, kg")
@@ -94,20 +103,43 @@ class Link(Model):
     )
     center_of_mass: Position = Field(description="center of mass of the link in its joint frame, m")
     joint: Pose = Field(
-        description="pose of the joint frame at zero angle in the parent's frame, m (first link: base frame "
-        "e0 at the center of mass; others: joint frame of the link before)"
+        description="pose of the joint frame at zero (angle or distance) in the parent's frame, m (first "
+        "link: base frame e0 at the center of mass; others: joint frame of the link before)"
+    )
+    joint_type: JointType = Field(
+        default="revolute",
+        exclude_if=lambda joint_type: joint_type == "revolute",
+        description="'revolute': the joint turns about z; 'prismatic': it slides along z; 'screw': both, by "
+        "its pitch",
+    )
+    pitch: Finite = Field(
+        default=0.0,
+        exclude_if=lambda pitch: pitch == 0.0,
+        description="slide of a screw joint along z per angle about z, m/rad",
     )
     actuated: StrictBool = Field(
         default=True, description="whether a motor drives the joint; false: the joint is passive"
     )
     torque_limit: Limit | None = Field(
         default=None,
-        description="largest motor torque of this joint, N m; absent: the limit of actuators.joint_torque",
+        description="largest motor torque of this joint, N m (prismatic: force, N); absent: the limit of "
+        "actuators.joint_torque",
     )
-    stiffness: NonNegative = Field(default=0.0, description="stiffness of the joint spring, N m/rad")
-    rest_angle: Angle = Field(default=0.0, description="joint angle at which the spring is at rest, rad")
-    damping: NonNegative = Field(default=0.0, description="viscous damping of the joint, N m s/rad")
+    stiffness: NonNegative = Field(default=0.0, description="stiffness of the joint spring, N m/rad (N/m)")
+    rest_angle: Angle = Field(default=0.0, description="joint angle at which the spring is at rest, rad (m)")
+    damping: NonNegative = Field(default=0.0, description="viscous damping of the joint, N m s/rad (N s/m)")
     geometry: tuple[Shape, ...] = geometry_field("a joint, and a rod to the next one")
+
+    @property
+    def turns(self) -> bool:
+        """Whether the joint's coordinate is an angle."""
+        return self.joint_type != "prismatic"
+
+    def _problems(self) -> Iterator[Problem]:
+        if self.joint_type == "screw" and self.pitch == 0.0:
+            yield Problem(("pitch",), 0.0, "a screw joint needs one; without it the joint is revolute")
+        if self.joint_type != "screw" and self.pitch != 0.0:
+            yield Problem(("pitch",), self.pitch, f"a {self.joint_type} joint has none; a screw has one")
 
 
 class Wrist(Model):

@@ -224,7 +224,9 @@ def _tip_rotation(scene: Scene, joint_angles: Sequence[Any], wrist_angles: Seque
     """Rotation of q_{G/e0}: real parts of eq. (27), without the base."""
     q: Sequence[Any] = (1.0, 0.0, 0.0, 0.0)
     for link, angle in zip(scene.links, joint_angles, strict=True):
-        q = multiply(multiply(q, link.joint.rotation), rotations.from_axis_angle(_Z, angle))
+        q = multiply(q, link.joint.rotation)
+        if link.turns:
+            q = multiply(q, rotations.from_axis_angle(_Z, angle))
     if scene.wrist:
         psi, theta, phi = wrist_angles
         q = multiply(multiply(q, scene.wrist.frame.rotation), rotations.from_euler_321(psi, theta, phi))

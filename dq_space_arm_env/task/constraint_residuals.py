@@ -107,10 +107,10 @@ class _Situation:
     def momentum(self) -> tuple[Scalars, Scalars, Scalar]:
         """Linear momentum, angular momentum about the center of mass, base axes; energy."""
         chain, motion = self.equations.chain, self.motion
-        rotations = minimal.joint_rotations(chain, motion.joint_angles)
+        frames = minimal.link_frames(chain, motion.joint_angles)
         twist = (*motion.angular, *motion.linear)
-        velocities = kinematics.body_velocities(chain, rotations, twist, motion.joint_rates)
-        linear, angular, _ = kinematics.momentum(chain, rotations, velocities)
+        velocities = kinematics.body_velocities(chain, frames, twist, motion.joint_rates)
+        linear, angular, _ = kinematics.momentum(chain, frames, velocities)
         kinetic, potential = kinematics.energy(chain, motion.joint_angles, velocities)
         return linear, angular, kinetic + potential
 

@@ -1,4 +1,4 @@
-"""Random chains, and the same robots as Pinocchio models: a free flyer with revolute joints about z."""
+"""Random chains, and the same robots as Pinocchio models: a free flyer with joints about and along z."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.dynamics.chain import Chain, Placement, RevoluteLink, RigidBody
+from dq_space_arm_env.dynamics.chain import Chain, JointedLink, Placement, RigidBody, Screw
 
 pin = pytest.importorskip("pinocchio")
 
@@ -35,8 +35,17 @@ def random_body(rng: np.random.Generator, at_origin: bool = False) -> RigidBody:
     return RigidBody(mass, tuple(center.tolist()), tuple(tuple(row) for row in inertia.tolist()))
 
 
+def random_screw(rng: np.random.Generator) -> Screw:
+    """A revolute joint as often as one of another kind."""
+    kinds = [Screw(1.0, 0.0), Screw(1.0, 0.0), Screw(0.0, 1.0), Screw(1.0, float(rng.uniform(-0.5, 0.5)))]
+    return kinds[rng.integers(len(kinds))]
+
+
 def random_chain(rng: np.random.Generator, joints: int, wrist: bool = True) -> Chain:
-    links = tuple(RevoluteLink(random_body(rng), random_placement(rng), 0.0, 0.0, 0.0) for _ in range(joints))
+    links = tuple(
+        JointedLink(random_body(rng), random_placement(rng), random_screw(rng), 0.0, 0.0, 0.0)
+        for _ in range(joints)
+    )
     return Chain(
         base=random_body(rng, at_origin=True),
         links=links,
@@ -55,7 +64,10 @@ def pinocchio_model(chain: Chain) -> Any:
     model.appendBodyToJoint(parent, _inertia(chain.base), pin.SE3.Identity())
     for index, link in enumerate(chain.links):
         placement = pin.SE3(np.array(link.joint.rotation), np.array(link.joint.position))
-        parent = model.addJoint(parent, pin.JointModelRZ(), placement, f"joint {index}")
+        turn, slide = link.screw
+        joint = pin.JointModelHZ(slide) if slide else pin.JointModelRZ()
+        joint = joint if turn else pin.JointModelPZ()
+        parent = model.addJoint(parent, joint, placement, f"joint {index}")
         model.appendBodyToJoint(parent, _inertia(link.body), pin.SE3.Identity())
     return model
 

@@ -35,7 +35,7 @@ def test_both_formulations_respond_alike_to_wrenches_on_every_body(scene):
     chain, rng = Chain.from_scene(load_scene(scene)), np.random.default_rng(0)
     for _ in range(5):
         angles = rng.uniform(-3.0, 3.0, len(chain.links)).tolist()
-        rotations = minimal.joint_rotations(chain, angles)
+        rotations = minimal.link_frames(chain, angles)
         wrenches, joints = random_wrenches(rng, chain)
         expected = flat(MassMatrix(chain, rotations).accelerations(wrenches, joints))
         for root in range(len(chain.links) + 1):
@@ -49,7 +49,7 @@ def test_both_formulations_respond_alike_to_wrenches_on_every_body(scene):
 def test_inverse_dynamics_at_rest_undoes_the_response_to_generalized_forces(scene, formulation, many):
     chain, rng = Chain.from_scene(load_scene(scene)), np.random.default_rng(1)
     n = len(chain.links)
-    rotations = minimal.joint_rotations(chain, rng.uniform(-3.0, 3.0, n).tolist())
+    rotations = minimal.link_frames(chain, rng.uniform(-3.0, 3.0, n).tolist())
     (force, torque), joints = random_wrenches(rng, replace(chain, links=()))[0][0], rng.normal(size=n)
     solved = inertia_of(formulation, chain, rotations, many=many).solve(force, torque, joints.tolist())
     needed = minimal.inverse_dynamics(chain, rotations, ZERO, [0.0] * n, solved)
@@ -66,7 +66,7 @@ def test_a_light_base_keeps_its_digits_where_the_mass_matrix_loses_them():
     inertia = (1e-7 * np.array(paper.base.inertia)).tolist()
     base = {**paper.base.model_dump(), "mass": 1e-7 * paper.base.mass, "inertia": inertia}
     chain = Chain.from_scene(paper.replace(base=base))
-    rotations = minimal.joint_rotations(chain, [0.3, -0.7, 1.1])
+    rotations = minimal.link_frames(chain, [0.3, -0.7, 1.1])
     errors = {}
     for formulation in ("articulated_body", "minimal_coordinates"):
         solved = inertia_of(formulation, chain, rotations).solve(ZERO, ZERO, [1.0, 0.0, 0.0])

@@ -71,23 +71,23 @@ def pinocchio_accelerations(case):
 
 
 def accelerations(case, inertia_at):
-    """Dual accelerations of base and joints, given how a formulation's inertia is made of rotations."""
+    """Dual accelerations of base and joints, given how a formulation's inertia is made of the links' frames."""
     chain = case.chain
-    rotations = minimal.joint_rotations(chain, case.angles)
+    frames = minimal.link_frames(chain, case.angles)
     acting = [(case.force, case.torque), *[(ZERO, ZERO)] * len(chain.links)]
     if chain.tip_wrench is not None:
         tip, wrench = twin.tip_in_last_link(chain, case.wrist), chain.tip_wrench
         acting[-1] = minimal.shift_wrench(*tip, wrench[:3], wrench[3:])
-    inertia = inertia_at(chain, rotations)
-    solved = forward_dynamics(chain, inertia, rotations, case.angular, case.rates, acting, case.motors)
+    inertia = inertia_at(chain, frames)
+    solved = forward_dynamics(chain, inertia, frames, case.angular, case.rates, acting, case.motors)
     linear = vectors.subtract(solved.linear, vectors.cross(case.angular, case.linear))
     return np.array([*solved.angular, *linear, *solved.joints], dtype=float)
 
 
 def paper_state(case):
     """The case in the paper's coordinates: dual velocities of all bodies at their centers of mass."""
-    rotations = minimal.joint_rotations(case.chain, case.angles)
-    velocities = kinematics.body_velocities(case.chain, rotations, (*case.angular, *case.linear), case.rates)
+    frames = minimal.link_frames(case.chain, case.angles)
+    velocities = kinematics.body_velocities(case.chain, frames, (*case.angular, *case.linear), case.rates)
     bodies = [case.chain.base, *(link.body for link in case.chain.links)]
     duals = [
         (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
@@ -107,8 +107,8 @@ def newton_euler_accelerations(case):
     rates, _ = paper_rates(case)
     bodies = np.reshape(rates[-8 * (len(case.chain.links) + 1) :], (-1, 8))
     joints = [
-        newton_euler.joint_velocity(frames, j, [tuple(body) for body in bodies])[3]
-        for j in range(len(case.chain.links))
+        newton_euler.joint_velocity(frames, j, [tuple(body) for body in bodies])[3 if link.screw.turn else 7]
+        for j, link in enumerate(case.chain.links)
     ]
     return np.array([*bodies[0][1:4], *bodies[0][5:8], *joints], dtype=float)
 
@@ -136,7 +136,10 @@ def test_reaction_wrenches_agree_with_pinocchio_21(joints):
         acceleration = np.array([*a[3:6], *a[:3], *a[6:]])
         pin.rnea(case.model, case.data, case.q, case.v, acceleration, external_forces(case))
         forces = list(case.data.f)[2:]
-        expected = [entry for force in forces for entry in (*force.linear, *force.angular[:2])]
+        expected = []
+        for link, force in zip(case.chain.links, forces, strict=True):
+            turns = link.screw.turn
+            expected += [*force.linear, *force.angular[:2]] if turns else [*force.linear[:2], *force.angular]
         assert relative_error(reactions, expected) < 1e-12
 
 
@@ -187,10 +190,10 @@ def test_tip_pose_27_and_its_rate_30():
 def test_momentum_and_energy_agree_with_pinocchio():
     for joints in range(8):
         case = random_case(joints, 2)
-        rotations = minimal.joint_rotations(case.chain, case.angles)
+        frames = minimal.link_frames(case.chain, case.angles)
         twist = (*case.angular, *case.linear)
-        velocities = kinematics.body_velocities(case.chain, rotations, twist, case.rates)
-        linear, angular, _ = kinematics.momentum(case.chain, rotations, velocities)
+        velocities = kinematics.body_velocities(case.chain, frames, twist, case.rates)
+        linear, angular, _ = kinematics.momentum(case.chain, frames, velocities)
         kinetic, potential = kinematics.energy(case.chain, case.angles, velocities)
         arguments = (case.model, case.data, case.q, case.v)
         centroidal = pin.computeCentroidalMomentum(*arguments)
@@ -204,10 +207,10 @@ def test_momentum_and_energy_agree_with_pinocchio():
 def test_inverse_dynamics_undoes_forward_dynamics():
     for joints in range(8):
         case = random_case(joints, 3)
-        rotations = minimal.joint_rotations(case.chain, case.angles)
+        frames = minimal.link_frames(case.chain, case.angles)
         a = accelerations(case, MassMatrix)
         linear = vectors.add(tuple(a[3:6]), vectors.cross(case.angular, case.linear))
         solved = Accelerations(tuple(a[:3]), linear, a[6:].tolist())
-        found = minimal.inverse_dynamics(case.chain, rotations, case.angular, case.rates, solved)
+        found = minimal.inverse_dynamics(case.chain, frames, case.angular, case.rates, solved)
         given = [*case.force, *case.torque, *case.motors]
         assert relative_error([*found.force, *found.torque, *found.joints], given) < 1e-12

@@ -50,7 +50,7 @@ def test_the_forces_that_the_accelerations_need_are_those_that_act(name: str, fo
     twist = field.pose.full_twist(found[: len(field.pose.directions)])
     inertial = add(twist[3:], cross(motion.angular, motion.linear))
     given = Accelerations(twist[:3], inertial, found[len(field.pose.directions) :])
-    rotations = minimal.joint_rotations(chain, motion.joint_angles)
+    rotations = minimal.link_frames(chain, motion.joint_angles)
     needed = minimal.inverse_dynamics(chain, rotations, motion.angular, motion.joint_rates, given)
 
     control, u = layout.control, np.array(u)
@@ -75,7 +75,7 @@ def test_a_wrench_at_the_tip_replaces_the_scenes() -> None:
     wrench = loaded.chain.tip_wrench
     assert wrench is not None
     np.testing.assert_allclose(field.accelerations(y, u, wrench), loaded.accelerations(y, u), rtol=1e-12)
-    rotations = minimal.joint_rotations(field.chain, field.motion(y).joint_angles)
+    rotations = minimal.link_frames(field.chain, field.motion(y).joint_angles)
     idle = field.tip_forces(field.motion(y), rotations, None)
     assert not any([*idle.force, *idle.torque, *idle.joints])
     assert len(idle.joints) == len(idle.reactions) == len(field.chain.links)

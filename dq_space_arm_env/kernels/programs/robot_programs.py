@@ -67,7 +67,7 @@ class RobotPrograms:
             base, arm = self._tip_columns(x)
             n = len(self.chain.links)
             angles = self.field.motion(self.equations.y(x)).joint_angles
-            system = MassMatrix(self.chain, minimal.joint_rotations(self.chain, angles))
+            system = MassMatrix(self.chain, minimal.link_frames(self.chain, angles))
             for joint in range(n):
                 rates = [1.0 if i == joint else 0.0 for i in range(n)]
                 # -H_b^-1 H_bm: the base moves such that the momentum stays zero.

@@ -155,16 +155,16 @@ class ScenePrograms:
 
     def _velocities(self, x: Scalars) -> tuple[Any, Any, Any]:
         motion = self.field.motion(self.equations.y(x))
-        rotations = minimal.joint_rotations(self.chain, motion.joint_angles)
+        frames = minimal.link_frames(self.chain, motion.joint_angles)
         velocities = kinematics.body_velocities(
-            self.chain, rotations, (*motion.angular, *motion.linear), motion.joint_rates
+            self.chain, frames, (*motion.angular, *motion.linear), motion.joint_rates
         )
-        return motion, rotations, velocities
+        return motion, frames, velocities
 
     def _momentum(self) -> Program:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
-            _, rotations, velocities = self._velocities(x)
-            linear, angular, _ = kinematics.momentum(self.chain, rotations, velocities)
+            _, frames, velocities = self._velocities(x)
+            linear, angular, _ = kinematics.momentum(self.chain, frames, velocities)
             attitude, _ = poses.to_matrix(self.equations.base_pose(x))
             return {"momentum": [*matrix_vector(attitude, linear), *matrix_vector(attitude, angular)]}
 

@@ -20,7 +20,7 @@ from mpmath import mpf
 from dq_space_arm_env import Kernels, Scene, compile_scene
 from dq_space_arm_env.algebra.vectors import add, cross
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
-from dq_space_arm_env.dynamics.chain import Chain, RevoluteLink
+from dq_space_arm_env.dynamics.chain import Chain, JointedLink
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.peers.pinocchio_peer import PinocchioPeer
 
@@ -77,7 +77,7 @@ def _cross(a: Vector, b: Vector) -> Vector:
     return skew(a) * b
 
 
-def _turned(link: RevoluteLink, angle: float) -> Matrix:
+def _turned(link: JointedLink, angle: float) -> Matrix:
     return _square(link.joint.rotation) * turn(2, angle)
 
 
@@ -220,9 +220,9 @@ def _compiled(sample: Sample, **simulation: str) -> FloatArray:
 def _system(sample: Sample) -> tuple[newton_euler.NewtonEulerSystem, newton_euler.JointFrames]:
     chain, motion = sample.chain, sample.motion
     angles, rates = motion.joint_angles.tolist(), motion.joint_rates.tolist()
-    rotations = minimal.joint_rotations(chain, angles)
+    frames = minimal.link_frames(chain, angles)
     twist = (*motion.angular.tolist(), *motion.linear.tolist())
-    velocities = kinematics.body_velocities(chain, rotations, twist, rates)
+    velocities = kinematics.body_velocities(chain, frames, twist, rates)
     bodies = [chain.base, *(link.body for link in chain.links)]
     duals = [
         (0.0, *v.angular, 0.0, *add(v.linear, cross(v.angular, body.center_of_mass)))
