@@ -147,8 +147,9 @@ def _bodies(scene: Scene) -> Iterator[tuple[str, float, str]]:
     yield "base", scene.base.mass, "floats freely" if scene.base.motion == "spatial" else "moves in the plane"
     for link in scene.links:
         drive = "driven joint" if link.actuated and scene.actuators.joint_torque else "passive joint"
-        spring = f", spring of {link.stiffness:g} N m/rad" if link.stiffness else ""
-        damper = f", damper of {link.damping:g} N m s/rad" if link.damping else ""
+        drive = drive if link.joint_type == "revolute" else f"{link.joint_type}, {drive}"
+        spring = f", spring of {link.stiffness:g} {link.effort_unit}/{link.unit}" if link.stiffness else ""
+        damper = f", damper of {link.damping:g} {link.effort_unit} s/{link.unit}" if link.damping else ""
         yield link.name, link.mass, f"{drive}{spring}{damper}"
     if scene.wrist is not None:
         yield "wrist", 0.0, "spherical joint, commanded by its Euler rates"
@@ -158,13 +159,14 @@ def _bodies(scene: Scene) -> Iterator[tuple[str, float, str]]:
 
 def _state_parts(layout: StateLayout) -> list[tuple[str, slice, str]]:
     state = layout.state
+    units = [", ".join(dict.fromkeys(state.units[part])) for part in (state.joint_angles, state.joint_rates)]
     return [
         ("pose of the base q_{e0/I}", state.pose, "1, m"),
-        ("joint angles", state.joint_angles, "rad"),
+        ("joint angles", state.joint_angles, units[0]),
         ("wrist angles psi, theta, phi", state.wrist_angles, "rad"),
         ("angular velocity of the base, base axes", state.angular_velocity, "rad/s"),
         ("linear velocity of the base, base axes", state.linear_velocity, "m/s"),
-        ("joint rates", state.joint_rates, "rad/s"),
+        ("joint rates", state.joint_rates, units[1]),
     ]
 
 

@@ -58,7 +58,7 @@ class Screw(NamedTuple):
     slide: float  # 0 for a revolute joint, 1 for a prismatic one, or the pitch, m/rad
 
 
-_SCREWS = {"revolute": Screw(1.0, 0.0), "prismatic": Screw(0.0, 1.0)}
+SCREWS = {"revolute": Screw(1.0, 0.0), "prismatic": Screw(0.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Chain:
                 JointedLink(
                     body,
                     _placement(link.joint),
-                    _SCREWS.get(link.joint_type) or Screw(1.0, link.pitch),
+                    SCREWS.get(link.joint_type) or Screw(1.0, link.pitch),
                     given.get(f"links.{index}.stiffness", link.stiffness),
                     link.rest_angle,
                     given.get(f"links.{index}.damping", link.damping),

@@ -85,6 +85,12 @@ def joint_velocity(frames: JointFrames, joint: int, velocities: Sequence[DualQua
     )
 
 
+def along_joints(chain: Chain, frames: JointFrames, velocities: Sequence[DualQuaternion]) -> list[Scalar]:
+    """Joint rates (12) from the dual velocities of the bodies; likewise of their rates."""
+    entries = [3 if link.screw.turn else 7 for link in chain.links]
+    return [joint_velocity(frames, j, velocities)[entry] for j, entry in enumerate(entries)]
+
+
 def assemble(
     chain: Chain,
     frames: JointFrames,
@@ -298,8 +304,7 @@ def system_of(
 def joint_speeds(chain: Chain, state: PaperState) -> list[Scalar]:
     """Joint rates (12) from the dual velocities of the bodies."""
     frames = joint_frames(chain, state.joint_angles, state.wrist_angles)
-    entries = [3 if link.screw.turn else 7 for link in chain.links]
-    return [joint_velocity(frames, j, state.velocities)[entry] for j, entry in enumerate(entries)]
+    return along_joints(chain, frames, state.velocities)
 
 
 def paper_position_rates(chain: Chain, state: PaperState, wrist_rates: Sequence[Scalar]) -> list[Scalar]:

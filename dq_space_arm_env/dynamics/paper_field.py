@@ -97,7 +97,7 @@ class PaperField:
         # The turning of the joint's axes has no component along them: (12) holds for accelerations too.
         bodies = [ydot[8 * i : 8 * i + 8] for i in range(len(self.chain.links) + 1)]
         frames = newton_euler.joint_frames(self.chain, state.joint_angles, state.wrist_angles)
-        joints = [newton_euler.joint_velocity(frames, j, bodies)[3] for j in range(len(self.chain.links))]
+        joints = newton_euler.along_joints(self.chain, frames, bodies)
         base = (*ydot[1:4], *ydot[5:8])
         return [*(base[i] for i in self.minimal.pose.directions), *joints]
 

@@ -42,12 +42,15 @@ def refuse(scene: Scene, language: str, wrist: str, *, springs: bool = False, pl
         problems.append(f"it has no joint springs, and link {stiff[0]!r} has one: set its stiffness to 0")
     if planar and scene.base.motion == "planar":
         problems.append("it has no base that moves in a plane: set base.motion to spatial")
+    screws = [link.name for link in scene.links if link.joint_type == "screw"]
+    if screws:
+        problems.append(f"it has no screw joints, and link {screws[0]!r} has one")
     if problems:
         raise SceneError("\n  - ".join([f"scene {scene.name!r} cannot be written as {language}:", *problems]))
 
 
 def joint_limits(scene: Scene) -> list[tuple[float, float, float]]:
-    """Smallest and largest angle, rad, and largest rate, rad/s, of each joint; infinite for none."""
+    """Smallest and largest coordinate, rad or m, and largest rate of each joint; infinite for none."""
     limits = [[-math.inf, math.inf, math.inf] for _ in scene.links]
     for constraint in scene.constraints:
         for side in sides(scene, constraint) if isinstance(constraint, JointLimits) else ():

@@ -31,8 +31,9 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
 
     There is no gravity, and nothing collides: the scene's shapes, if it gives any, are there to be seen.
     Body `base` has the frame e0 and a free joint, called `base joint`; in a planar scene it slides along x
-    and y and turns about z. Each link is a body with the frame of its joint, a hinge about z called by the
-    link's name and " joint", with the scene's damping, spring and limits of the angle, and no armature.
+    and y and turns about z. Each link is a body with the frame of its joint, a hinge about z or a slide along
+    it called by the link's name and " joint", with the scene's damping, spring and limits of the joint, and
+    no armature.
     MuJoCo pushes joints back from their limits, the scene's kernels do not, and it has no limits of rates.
     Site `tip` has the frame G, body `payload` is held at the tip.
 
@@ -55,7 +56,8 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
         The MJCF text, all numbers with 17 digits, in m, kg, s, rad.
 
     Raises:
-        SceneError: If the scene has a wrist that is not to be fixed, or a constant wrench at the tip.
+        SceneError: If the scene has a wrist that is not to be fixed, a constant wrench at the tip, or a screw
+            joint.
     """
     refuse(scene, "MJCF", wrist)
     root = Element("mujoco", model=scene.name)
@@ -70,7 +72,7 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     body = base
     for link, (lower, upper, _) in zip(scene.links, joint_limits(scene), strict=True):
         body = _add_body(body, link.name, link.joint.dual_quaternion)
-        _add_hinge(body, link, lower, upper)
+        _add_joint(body, link, lower, upper)
         _add_inertial(body, link, link.center_of_mass)
         _add_shapes(body, link.geometry, COLORS["white"])
     tip = tip_from_last_link(scene)
@@ -135,8 +137,9 @@ def _add_shapes(body: Element, shapes: Sequence[Shape], color: Three) -> None:
         SubElement(body, "geom", {**look, **place, "contype": "0", "conaffinity": "0"})
 
 
-def _add_hinge(body: Element, link: Link, lower: float, upper: float) -> None:
-    joint = SubElement(body, "joint", name=f"{link.name} joint", type="hinge", axis="0 0 1")
+def _add_joint(body: Element, link: Link, lower: float, upper: float) -> None:
+    kind = "hinge" if link.turns else "slide"
+    joint = SubElement(body, "joint", name=f"{link.name} joint", type=kind, axis="0 0 1")
     if math.isfinite(lower) or math.isfinite(upper):
         joint.set("range", words([lower, upper]))
     if link.damping:

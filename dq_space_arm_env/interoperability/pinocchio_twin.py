@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import minimal
-from dq_space_arm_env.dynamics.chain import Chain, Placement, RigidBody
+from dq_space_arm_env.dynamics.chain import Chain, Placement, RigidBody, Screw
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.interoperability.exporting import tip_from_last_link
 from dq_space_arm_env.scene import Scene, StateLayout
@@ -23,10 +23,10 @@ def pinocchio_model(scene: Scene) -> Any:
     """Build a scene's robot as a `pinocchio.Model`.
 
     Joint `base` is a free flyer (planar scenes: a planar joint) with the frame e0, at the center of mass;
-    each link has a joint about z, called by its name. There is no gravity; limits are not set. Frame `tip` is
-    G, with the wrist at its initial angles. `to_pinocchio` and `generalized_forces` give the arguments of
-    Pinocchio's algorithms: `pinocchio.aba(model, data, q, v, tau)` is (dv, dw, joint accelerations), where
-    (dw, dv) are the scene's base accelerations.
+    each link has a joint about or along z, called by its name. There is no gravity; limits are not set. Frame
+    `tip` is G, with the wrist at its initial angles. `to_pinocchio` and `generalized_forces` give the
+    arguments of Pinocchio's algorithms: `pinocchio.aba(model, data, q, v, tau)` is (dv, dw, joint
+    accelerations), where (dw, dv) are the scene's base accelerations.
 
     Args:
         scene: A validated scene; its nominal masses and inertias, the payload merged into the last link.
@@ -46,12 +46,18 @@ def pinocchio_model(scene: Scene) -> Any:
     joint = model.addJoint(0, free, pin.SE3.Identity(), "base")
     model.appendBodyToJoint(joint, _inertia(pin, chain.base), pin.SE3.Identity())
     for link, name in zip(chain.links, [link.name for link in scene.links], strict=True):
-        joint = model.addJoint(joint, pin.JointModelRZ(), _placement(pin, link.joint), name)
+        joint = model.addJoint(joint, _joint(pin, link.screw), _placement(pin, link.joint), name)
         model.appendBodyToJoint(joint, _inertia(pin, link.body), pin.SE3.Identity())
     rotation, position = poses.to_matrix(tip_from_last_link(scene))
     tip = pin.SE3(np.array(rotation), np.array(position))
     model.addFrame(pin.Frame("tip", joint, tip, pin.FrameType.OP_FRAME))
     return model
+
+
+def _joint(pin: Any, screw: Screw) -> Any:
+    if not screw.turn:
+        return pin.JointModelPZ()
+    return pin.JointModelHZ(screw.slide) if screw.slide else pin.JointModelRZ()
 
 
 def to_pinocchio(scene: Scene, x: ArrayLike) -> tuple[Array, Array]:

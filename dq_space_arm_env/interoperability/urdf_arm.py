@@ -1,4 +1,4 @@
-"""From the tree of a URDF to a free base with a chain of revolute joints, as a scene has them.
+"""From the tree of a URDF to a free base with a chain of joints, as a scene has them.
 
 The chain runs from the base link to the tip link. Bodies fixed to it are lumped into those that carry them.
 Joint frames are turned until z is the axis, and the base frame moves to the center of mass.
@@ -35,7 +35,7 @@ class ArmJoint:
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A free base with a chain of revolute joints."""
+    """A free base with a chain of joints."""
 
     base: Body  # in e0: origin at the center of mass, axes of the base link
     base_link: str

@@ -24,8 +24,8 @@ from dq_space_arm_env.common.shown_text import printable, shortened
 from dq_space_arm_env.interoperability.rigid_body import Array, Body
 from dq_space_arm_env.scene import SceneError
 
-MOVABLE = ("revolute", "continuous")
-TYPES = (*MOVABLE, "fixed", "prismatic", "planar", "floating")
+MOVABLE = ("revolute", "continuous", "prismatic")
+TYPES = (*MOVABLE, "fixed", "planar", "floating")
 
 _MOST = 10_000  # links or joints, a hundred times those of a humanoid
 _LONGEST_NAME = 200  # characters
@@ -61,6 +61,16 @@ class UrdfJoint:
     damping: float  # viscous, N m s/rad
     friction: float  # Coulomb, N m
     mimics: str | None  # the joint that it follows
+
+    @property
+    def slides(self) -> bool:
+        """Whether it moves along its axis; its units are then m and N instead of rad and N m."""
+        return self.type == "prismatic"
+
+    @property
+    def unit(self) -> str:
+        """Unit of its coordinate."""
+        return "m" if self.slides else "rad"
 
 
 @dataclass(frozen=True)
@@ -166,6 +176,7 @@ def _read_joint(element: Element) -> UrdfJoint:
     kind = element.get("type", "")
     if kind not in TYPES:
         raise SceneError(f"URDF: {where}: type = {shortened(kind)}, it must be one of {', '.join(TYPES)}")
+    unit = "m" if kind == "prismatic" else "rad"
     limit, dynamics, mimic = (_only(element, tag, where) for tag in ("limit", "dynamics", "mimic"))
     effort = _optional(limit, "effort", f"{where}, <limit>")
     damping, friction = (_optional(dynamics, key, f"{where}, <dynamics>") for key in ("damping", "friction"))
@@ -180,29 +191,29 @@ def _read_joint(element: Element) -> UrdfJoint:
         origin=_origin(element, where),
         axis=_axis(element, where) if kind in MOVABLE else np.array([0.0, 0.0, 1.0]),
         effort=effort if effort and effort < UNLIMITED else None,
-        limits=_limits(limit, where) if kind == "revolute" else None,
-        rate=_rate(limit, where) if kind in MOVABLE else math.inf,
+        limits=_limits(limit, where, unit) if kind in ("revolute", "prismatic") else None,
+        rate=_rate(limit, where, unit) if kind in MOVABLE else math.inf,
         damping=damping,
         friction=friction,
         mimics=None if mimic is None else _required(mimic, "joint", f"{where}, <mimic>"),
     )
 
 
-def _limits(limit: Element | None, where: str) -> tuple[float, float] | None:
-    """Smallest and largest angle; none where both are 0, which many files write for unknown."""
+def _limits(limit: Element | None, where: str, unit: str) -> tuple[float, float] | None:
+    """Smallest and largest coordinate; none where both are 0, which many files write for unknown."""
     lower, upper = (_optional(limit, key, f"{where}, <limit>") for key in ("lower", "upper"))
     if lower > upper:
-        raise SceneError(f"URDF: {where}: lower = {lower:g} rad is greater than upper = {upper:g} rad")
+        raise SceneError(f"URDF: {where}: lower = {lower:g} {unit} is greater than upper = {upper:g} {unit}")
     if lower == upper == 0.0:
         return None
     return lower if lower > -UNLIMITED else -math.inf, upper if upper < UNLIMITED else math.inf
 
 
-def _rate(limit: Element | None, where: str) -> float:
+def _rate(limit: Element | None, where: str, unit: str) -> float:
     """Largest rate; none where it is 0, which many files write for unknown."""
     rate = _optional(limit, "velocity", f"{where}, <limit>")
     if rate < 0:
-        raise SceneError(f"URDF: {where}: velocity = {rate:g} rad/s, it must be 0 or greater")
+        raise SceneError(f"URDF: {where}: velocity = {rate:g} {unit}/s, it must be 0 or greater")
     return rate if 0.0 < rate < UNLIMITED else math.inf
 
 

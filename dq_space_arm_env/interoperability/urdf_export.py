@@ -27,15 +27,15 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
 
     The root link `base` has the frame e0, at the center of mass; tell the simulator that it floats
     (Pinocchio: `JointModelFreeFlyer`). Each further link has the frame of its joint and carries the scene's
-    name; its joint turns about z and is called by the link's name and " joint". A link `tip` without mass, or
-    with that of the payload, has the frame G. Torque limits become efforts, 0 for a joint without motor.
-    The scene's joint limits, without their margins, make a joint revolute, others are continuous; 1e4 rad
-    and rad/s stand for none where URDF asks for a number. It has no thrusters, wheels, start, task or other
-    constraints. Shapes become visuals.
+    name; its joint turns about z, or slides along it, and is called by the link's name and " joint". A link
+    `tip` without mass, or with that of the payload, has the frame G. Torque limits become efforts, 0 for a
+    joint without motor. The scene's joint limits, without their margins, make a joint revolute, others are
+    continuous; 1e4 rad (m) and rad/s (m/s) stand for none where URDF asks for a number. It has no thrusters,
+    wheels, start, task or other constraints. Shapes become visuals.
 
-    Features that URDF lacks and that change the motion are refused: joint springs, a wrench at the tip, a
-    planar base. The massless wrist as three joints would have infinite accelerations; fixed at its initial
-    angles it changes no acceleration, but the tip cannot turn.
+    Features that URDF lacks and that change the motion are refused: joint springs, screw joints, a wrench at
+    the tip, a planar base. The massless wrist as three joints would have infinite accelerations; fixed at its
+    initial angles it changes no acceleration, but the tip cannot turn.
 
     Args:
         scene: A validated scene.
@@ -110,10 +110,11 @@ def _add_joint(
 ) -> None:
     lower, upper, rate = limits
     has_range = math.isfinite(lower) or math.isfinite(upper)
-    kind = "revolute" if has_range else "continuous"
+    kind = ("revolute" if has_range else "continuous") if link.turns else "prismatic"
     joint = SubElement(root, "joint", name=f"{link.name} joint", type=kind)
     _connect(joint, parent, link.name, link.joint.dual_quaternion)
     SubElement(joint, "axis", xyz="0 0 1")
+    has_range = has_range or kind == "prismatic"  # URDF wants one
     if has_range or math.isfinite(effort) or math.isfinite(rate):
         # URDF wants effort and velocity in every <limit>.
         limit = SubElement(joint, "limit", effort=words([min(effort, UNLIMITED)]))

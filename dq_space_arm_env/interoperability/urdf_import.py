@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.chain import SCREWS, Chain
 from dq_space_arm_env.dynamics.step_stability import stable
 from dq_space_arm_env.interoperability.rigid_body import Body, lumped, tidied
 from dq_space_arm_env.interoperability.urdf_arm import Arm, ArmJoint, arm_of
@@ -80,7 +80,7 @@ def scene_from_urdf(
             thrusters.
         base_torque: Limit of the wheels' torque on the base, N m, for each axis or one for all; None for no
             wheels.
-        joint_torque: Limit of the joints for which the URDF gives no effort, or zero, N m.
+        joint_torque: Limit of the joints for which the URDF gives no effort, or zero, N m (N of slides).
         passive: Names of the joints that have no motor.
         lock_branches: Whether movable joints beside the chain, as those of a gripper, are held at zero;
             otherwise they are an error if they move a mass.
@@ -191,7 +191,7 @@ def _torque_weight(arm: Arm, angles: Sequence[float]) -> float:
     The optimal regulator of an inertia I with the damping c and the cost a theta^2 + b tau^2 moves within
     1 / omega where a / b = omega^2 (I^2 omega^2 + c^2): without damper omega is its natural frequency,
     without inertia its decay. Turned by theta, a tip at distance d costs a = w (1 + d^2) / 4, w the pose's
-    weight.
+    weight; moved along a slide, a = w / 4.
     """
     bodies: list[Body] = []
     tip, largest = arm.tip, (0.0, 0.0)
@@ -201,21 +201,25 @@ def _torque_weight(arm: Arm, angles: Sequence[float]) -> float:
         assert moved is not None
         x, y, _ = moved.center_of_mass
         distance = math.dist(poses.to_rotation_and_position(tip)[1], (0.0, 0.0, 0.0))
-        about_axis = float(moved.inertia[2, 2] + moved.mass * (x * x + y * y))
-        largest = max(largest, (math.hypot(about_axis * _FREQUENCY, part.joint.damping), distance))
+        inertia, lever = float(moved.inertia[2, 2] + moved.mass * (x * x + y * y)), 1.0 + distance**2
+        if part.joint.slides:
+            inertia, lever = moved.mass, 1.0
+        largest = max(largest, (math.hypot(inertia * _FREQUENCY, part.joint.damping), lever))
         # On to the frame before, the joint at its start.
-        bodies = [moved.seen_from(pose := _turned(part, angle))]
+        bodies = [moved.seen_from(pose := _displaced(part, angle))]
         tip = tuple(dual_quaternion.multiply(pose, tip))
-    impedance, distance = largest  # N m s/rad
-    pose_weight = Cost().pose[0]
-    return float(f"{0.25 * pose_weight * (1.0 + distance**2) / (impedance * _FREQUENCY) ** 2:.2g}")
+    impedance, lever = largest  # N m s/rad or N s/m; 1 + d^2
+    return float(f"{0.25 * Cost().pose[0] * lever / (impedance * _FREQUENCY) ** 2:.2g}")
 
 
-def _turned(part: ArmJoint, angle: float) -> Pose:
-    """Pose of a joint's frame, turned by an angle, in the frame before."""
-    half = 0.5 * angle
-    turned = poses.from_rotation_and_position((math.cos(half), 0.0, 0.0, math.sin(half)), (0.0, 0.0, 0.0))
-    return tuple(dual_quaternion.multiply(part.pose, turned))
+def _displaced(part: ArmJoint, coordinate: float) -> Pose:
+    """Pose of a joint's frame, turned or slid by its coordinate, in the frame before."""
+    motion = kinematics.joint_motion(SCREWS[_joint_type(part.joint)], coordinate)
+    return tuple(dual_quaternion.multiply(part.pose, motion))
+
+
+def _joint_type(joint: UrdfJoint) -> str:
+    return "prismatic" if joint.slides else "revolute"
 
 
 def _motors(arm: Arm, joint_torque: float | None, passive: Collection[str]) -> dict[str, Any] | None:
@@ -239,8 +243,8 @@ def _joint_limits(arm: Arm) -> list[dict[str, Any]]:
     for joint in joints:
         if joint.limits is not None and joint.limits[0] == joint.limits[1]:
             raise SceneError(
-                f"URDF: joint {joint.name!r}: lower = upper = {joint.limits[0]:g} rad, it cannot move: "
-                "make it fixed, or give it a range"
+                f"URDF: joint {joint.name!r}: lower = upper = {joint.limits[0]:g} {joint.unit}, it cannot "
+                "move: make it fixed, or give it a range"
             )
     lower, upper = zip(*(joint.limits or _ANY_ANGLE for joint in joints), strict=True)
     bounds = {"lower": lower, "upper": upper, "rate": tuple(joint.rate for joint in joints)}
@@ -257,6 +261,7 @@ def _link(part: ArmJoint, joint_torque: float | None, passive: Collection[str]) 
         "inertia": tidied(part.body.inertia).tolist(),
         "center_of_mass": tidied(part.body.center_of_mass).tolist(),
         "joint": _pose(part.pose),
+        "joint_type": _joint_type(joint),
         "actuated": driven,
         "torque_limit": (joint.effort or joint_torque) if driven else None,
         "damping": joint.damping,
@@ -293,8 +298,10 @@ def _moved(joint: UrdfJoint, angle: float, step: float) -> float | None:
 
 
 def _bent(joint: UrdfJoint) -> float:
-    """Angle at rest and the bend, where the limits allow it."""
+    """Angle at rest and the bend, where the limits allow it; a slide does not bend."""
     angle = _at_rest(joint)
+    if joint.slides:
+        return angle
     bent = _moved(joint, angle, _BEND)
     return angle if bent is None else bent
 
@@ -306,15 +313,18 @@ def _dexterity(arm: Arm, angles: Sequence[float]) -> float:
     """
     frame: Pose = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     axes, origins = [], []
+    slides = np.array([part.joint.slides for part in arm.joints])
     for part, angle in zip(arm.joints, angles, strict=True):
-        frame = tuple(dual_quaternion.multiply(frame, _turned(part, angle)))
+        frame = tuple(dual_quaternion.multiply(frame, _displaced(part, angle)))
         rotation, position = poses.to_matrix(frame)
         axes.append([row[2] for row in rotation])
         origins.append(position)
     tip = poses.to_matrix(tuple(dual_quaternion.multiply(frame, arm.tip)))[1]
     levers = np.array(tip) - np.array(origins)
     reach = float(np.linalg.norm(levers, axis=1).max()) or 1.0
-    values = np.linalg.svd(np.hstack([axes, np.cross(axes, levers) / reach]), compute_uv=False)
+    turning = np.where(slides[:, None], 0.0, axes)
+    moving = np.where(slides[:, None], axes, np.cross(axes, levers)) / reach
+    values = np.linalg.svd(np.hstack([turning, moving]), compute_uv=False)
     return float(values[-1] / values[0])
 
 

@@ -135,6 +135,16 @@ class Link(Model):
         """Whether the joint's coordinate is an angle."""
         return self.joint_type != "prismatic"
 
+    @property
+    def unit(self) -> str:
+        """Unit of the joint's coordinate."""
+        return "rad" if self.turns else "m"
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of the joint's effort."""
+        return "N m" if self.turns else "N"
+
     def _problems(self) -> Iterator[Problem]:
         if self.joint_type == "screw" and self.pitch == 0.0:
             yield Problem(("pitch",), 0.0, "a screw joint needs one; without it the joint is revolute")

@@ -66,8 +66,9 @@ def rows_of(scene: Scene, each: Constraint) -> list[Row]:
     if isinstance(each, JointLimits):
         for side in sides(scene, each):
             words = ("rate " if side.is_rate else "") + ("upper" if side.sign > 0 else "lower")
-            unit = "rad/s" if side.is_rate else "rad"
-            rows.append(Row(f"{each.name}: {scene.links[side.link].name} {words}", unit, *common))
+            link = scene.links[side.link]
+            unit = f"{link.unit}/s" if side.is_rate else link.unit
+            rows.append(Row(f"{each.name}: {link.name} {words}", unit, *common))
     elif isinstance(each, Distance):
         pairs = pairs_that_may_touch(scene, each)
         found = [f"{each.name}: {a.frame} {i} to {b.frame} {j}" for i, a, j, b in pairs]
@@ -222,6 +223,9 @@ def _may_touch(scene: Scene, a: Volume, b: Volume) -> bool:
     if scene.wrist is None and {a.frame, b.frame} == set(chain[-2:]):
         return False
     near, far = sorted((a, b), key=lambda volume: chain.index(volume.frame))
+    between = scene.links[chain.index(near.frame) : chain.index(far.frame)]
+    if not all(link.joint_type == "revolute" for link in between):
+        return True  # one slides as far as it may
     # In the frame of the near volume, the far one is within its reach of the origin of the next frame.
     first = chain.index(near.frame)
     steps = [_offset(scene, index) for index in range(first, chain.index(far.frame))]

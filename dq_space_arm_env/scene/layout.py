@@ -19,7 +19,6 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.parameters import (
-    CONTROL_UNITS,
     GRASP,
     PHASE,
     TARGET,
@@ -324,9 +323,13 @@ class _Collector:
 
     def add(self, unit: str, names: Sequence[str]) -> slice:
         """Append entries of one unit and return their place."""
+        return self.add_each([unit] * len(names), names)
+
+    def add_each(self, units: Sequence[str], names: Sequence[str]) -> slice:
+        """Append entries and return their place."""
         start = len(self.names)
         self.names += names
-        self.units += [unit] * len(names)
+        self.units += units
         return slice(start, len(self.names))
 
     def collected(self) -> dict[str, Any]:
@@ -336,7 +339,8 @@ class _Collector:
         """Append what state and tangent have in common."""
         turning, moving = free_axes(scene)
         wrist = _EULER_ANGLES if scene.wrist else ()
-        joint_angles = self.add("rad", [f"{link.name} angle" for link in scene.links])
+        units, kinds = ([link.unit for link in scene.links], ("displacement", "angle"))
+        joint_angles = self.add_each(units, [f"{link.name} {kinds[link.turns]}" for link in scene.links])
         wrist_angles = self.add("rad", [f"wrist {angle}" for angle in wrist])
         angular = self.add("rad/s", [f"base omega_{_AXES[axis]}" for axis in turning])
         linear = self.add("m/s", [f"base v_{_AXES[axis]}" for axis in moving])
@@ -346,7 +350,9 @@ class _Collector:
             "base_velocity": slice(angular.start, linear.stop),
             "angular_velocity": angular,
             "linear_velocity": linear,
-            "joint_rates": self.add("rad/s", [f"{link.name} rate" for link in scene.links]),
+            "joint_rates": self.add_each(
+                [f"{unit}/s" for unit in units], [f"{link.name} rate" for link in scene.links]
+            ),
         }
 
 
@@ -371,7 +377,7 @@ def _lay_out_tangent(scene: Scene) -> TangentEntries:
 def _lay_out_controls(controls: Mapping[str, Sequence[ControlNumbers]]) -> ControlEntries:
     entries = _Collector()
     slices = {
-        field: entries.add(CONTROL_UNITS[field], [number.name for number in numbers])
+        field: entries.add_each([each.limit.unit for each in numbers], [each.name for each in numbers])
         for field, numbers in controls.items()
     }
     everything = [number for numbers in controls.values() for number in numbers]

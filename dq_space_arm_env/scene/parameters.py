@@ -86,8 +86,8 @@ def numbers(scene: Scene) -> Iterator[Number]:
     for index, link in enumerate(scene.links):
         place = f"links.{index}"
         yield from body_numbers(scene, place)
-        yield _number(f"{place}.stiffness", "N m/rad", link.stiffness)
-        yield _number(f"{place}.damping", "N m s/rad", link.damping)
+        yield _number(f"{place}.stiffness", f"{link.effort_unit}/{link.unit}", link.stiffness)
+        yield _number(f"{place}.damping", f"{link.effort_unit} s/{link.unit}", link.damping)
     if scene.payload is not None:
         yield from body_numbers(scene, "payload")
     for field, (entries, planar) in _STATE_WEIGHTS.items():
@@ -271,15 +271,15 @@ def _axis_controls(scene: Scene, field: str, axes: Sequence[int]) -> Iterator[Co
 
 
 def _joint_controls(scene: Scene) -> Iterator[ControlNumbers]:
-    motors, field = scene.actuators.joint_torque, "joint_torque"
-    weight = _number("cost.joint_torque", _per_square(field), scene.cost.joint_torque)
+    motors = scene.actuators.joint_torque
     for index, link in enumerate(scene.links):
         if motors is None or not link.actuated:
             continue
-        limit = _number("actuators.joint_torque.limit", CONTROL_UNITS[field], motors.limit)
+        weight = _number("cost.joint_torque", f"({link.effort_unit})^-2", scene.cost.joint_torque)
+        limit = _number("actuators.joint_torque.limit", link.effort_unit, motors.limit)
         if link.torque_limit is not None:
-            limit = _number(f"links.{index}.torque_limit", CONTROL_UNITS[field], link.torque_limit)
-        yield ControlNumbers(f"{link.name} torque", limit, weight)
+            limit = _number(f"links.{index}.torque_limit", link.effort_unit, link.torque_limit)
+        yield ControlNumbers(f"{link.name} {'torque' if link.turns else 'force'}", limit, weight)
 
 
 def _per_square(field: str) -> str:

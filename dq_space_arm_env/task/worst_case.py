@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import poses, quaternion
-from dq_space_arm_env.algebra.vectors import dot, matrix_vector, norm, subtract
-from dq_space_arm_env.dynamics.chain import RigidBody
+from dq_space_arm_env.algebra.vectors import cross, dot, matrix_vector, norm, subtract
+from dq_space_arm_env.dynamics.chain import Chain, RigidBody
 from dq_space_arm_env.scene.motion import Tumbling, Waypoints
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.task.equations import SceneEquations, body_pose, body_velocity, grasp_pose, total
@@ -47,9 +47,14 @@ class WorstCase:
         equations, base = self.equations, self.chain.base
         duration = steps * equations.scene.simulation.dt
         motion = equations.field.motion(equations.y(x))
-        turning = norm(motion.angular) + total([casadi.fabs(rate) for rate in motion.joint_rates])
-        moving = norm(motion.linear) + self.reach * turning
+        turning = norm(motion.angular) + total(_parts(self.chain, motion.joint_rates, 0))
+        reach = self.reach + total(_parts(self.chain, motion.joint_angles, 1))
+        sliding = total(_parts(self.chain, motion.joint_rates, 1))
+        moving = norm(motion.linear) + reach * turning + sliding
         speed = self._root_energy(motion.joint_angles, moving, turning) + duration * self._growth()
+        if any(link.screw.slide for link in self.chain.links):  # bodies move apart: the last one by so much
+            fastest = total([speed / casadi.sqrt(body.mass) for body in (base, self.bodies[-1])])
+            reach = reach + duration * fastest
         wrench = self.chain.tip_wrench or (0.0,) * 6
         drift = moving + duration * (norm(self.inputs.force) + norm(wrench[:3])) / self.mass
         # The dual part of a pose has half the length of its position; unit quaternions are at most 2 apart.
@@ -57,7 +62,7 @@ class WorstCase:
         if equations.scene.target.motion is not None:  # its body is at |r| = 2 |q_d|
             body = body_pose(equations.scene, equations.given)
             target = 2.0 * quaternion.norm(body[4:]) + self._target_way(duration)
-        gaps = 2.0, 0.5 * (start + target + duration * drift + 2.0 * self.reach)
+        gaps = 2.0, 0.5 * (start + target + duration * drift + 2.0 * reach)
         references = equations.scene.target.base_velocity
         carried = (0.0, 0.0)
         if equations.scene.target.base_velocity_relative:
@@ -70,7 +75,7 @@ class WorstCase:
         def state_cost(pose: str, velocity: str, twist: str) -> Scalar:
             cost = self._weighted(pose, 4, gaps) + self._weighted(velocity, 3, speeds)
             if any(getattr(equations.scene.cost, twist)):
-                cost = cost + self._weighted(twist, 3, self._relative_speeds(speed, 2.0 * gaps[1]))
+                cost = cost + self._weighted(twist, 3, self._relative_speeds(speed, reach, 2.0 * gaps[1]))
             return cost
 
         effort = equations.effort(equations.control_limits)
@@ -99,12 +104,12 @@ class WorstCase:
             turning = turning * scene.target.motion.rate_growth
         return turning, moving + turning * self._grasp_length()
 
-    def _relative_speeds(self, speed: Scalar, distance: Scalar) -> tuple[Scalar, Scalar]:
+    def _relative_speeds(self, speed: Scalar, reach: Scalar, distance: Scalar) -> tuple[Scalar, Scalar]:
         """Bounds of angular velocity and velocity of the tip relative to a target at most so far away."""
         hand, carried = self.bodies[-1], self._carried_speeds(distance)
         wrist = total([0.0, *(casadi.fabs(rate) for rate in self.inputs.wrist_rates)])
         turning = _turned(hand, speed) + wrist
-        moving = speed / casadi.sqrt(hand.mass) + self.reach * turning
+        moving = speed / casadi.sqrt(hand.mass) + reach * turning
         return turning + carried[0], moving + carried[1]
 
     def _carried_speeds(self, distance: Scalar) -> tuple[Scalar, Scalar]:
@@ -151,10 +156,17 @@ class WorstCase:
         # Components of the torques as they act in I^-1/2, added as if all pointed the same way.
         torques = [_turned(self.chain.base, norm(inputs.torque)), *[0.0] * len(links)]
         for i, (link, limit) in enumerate(zip(links, inputs.joint_torques, strict=True)):
-            axis = matrix_vector(link.joint.rotation, _Z)
-            torque = casadi.fabs(limit)
-            torques[i] = torques[i] + torque * casadi.sqrt(_inverse_moment(bodies[i], axis))
-            torques[i + 1] = torques[i + 1] + torque * casadi.sqrt(_inverse_moment(bodies[i + 1], _Z))
+            axis, effort = matrix_vector(link.joint.rotation, _Z), casadi.fabs(limit)
+            if link.screw.turn:
+                torques[i] = torques[i] + effort * casadi.sqrt(_inverse_moment(bodies[i], axis))
+                torques[i + 1] = torques[i + 1] + effort * casadi.sqrt(_inverse_moment(bodies[i + 1], _Z))
+                continue
+            # A force along the line of the joint, at a constant distance from both centers of mass.
+            places = (link.joint.position, (0.0, 0.0, 0.0))
+            for body, place, direction in zip((i, i + 1), places, (axis, _Z), strict=True):
+                arm = norm(cross(subtract(place, bodies[body].center_of_mass), direction))
+                forces[body] = forces[body] + effort
+                torques[body] = torques[body] + _turned(bodies[body], effort * arm)
         if self.chain.tip_wrench is not None:
             inner = (0.0, 0.0, 0.0) if self.chain.wrist is None else self.chain.wrist.position
             arm = norm(subtract(inner, bodies[-1].center_of_mass)) + norm(self.chain.tip.position)
@@ -163,6 +175,12 @@ class WorstCase:
             torques[-1] = torques[-1] + _turned(bodies[-1], torque + force * arm)
         squares = [force * force / body.mass for force, body in zip(forces, bodies, strict=True)]
         return casadi.sqrt(total([*squares, *(torque * torque for torque in torques)]))
+
+
+def _parts(chain: Chain, coordinates: Scalars, part: int) -> list[Scalar]:
+    """Sizes by which joints turn (part 0) or slide (part 1)."""
+    pairs = zip(chain.links, coordinates, strict=True)
+    return [abs(link.screw[part]) * casadi.fabs(each) for link, each in pairs if link.screw[part]]
 
 
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), _Z)

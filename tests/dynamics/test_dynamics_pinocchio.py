@@ -71,7 +71,7 @@ def pinocchio_accelerations(case):
 
 
 def accelerations(case, inertia_at):
-    """Dual accelerations of base and joints, given how a formulation's inertia is made of the links' frames."""
+    """Dual accelerations of base and joints, given how a formulation's inertia is made of frames."""
     chain = case.chain
     frames = minimal.link_frames(chain, case.angles)
     acting = [(case.force, case.torque), *[(ZERO, ZERO)] * len(chain.links)]
@@ -106,10 +106,7 @@ def newton_euler_accelerations(case):
     frames = newton_euler.joint_frames(case.chain, case.angles, case.wrist)
     rates, _ = paper_rates(case)
     bodies = np.reshape(rates[-8 * (len(case.chain.links) + 1) :], (-1, 8))
-    joints = [
-        newton_euler.joint_velocity(frames, j, [tuple(body) for body in bodies])[3 if link.screw.turn else 7]
-        for j, link in enumerate(case.chain.links)
-    ]
+    joints = newton_euler.along_joints(case.chain, frames, [tuple(body) for body in bodies])
     return np.array([*bodies[0][1:4], *bodies[0][5:8], *joints], dtype=float)
 
 

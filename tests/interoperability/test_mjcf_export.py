@@ -86,6 +86,14 @@ def test_springs_dampers_and_passive_joints_are_the_same(name):
     check_accelerations(scene.replace(links=links))
 
 
+def test_slides_are_the_same_and_screws_are_refused():
+    scene = load_scene("sliding")
+    with pytest.raises(SceneError, match="it has no screw joints, and link 'drive' has one"):
+        scene_to_mjcf(scene)
+    parts = {"joint_type": "prismatic", "pitch": 0.0, "stiffness": 20.0, "rest_angle": 0.1, "damping": 0.7}
+    check_accelerations(scene.replace({f"links.3.{name}": part for name, part in parts.items()}))
+
+
 @pytest.mark.parametrize("name", ROBOTS)
 def test_robots_of_others_accelerate_the_same(name):
     check_accelerations(foreign_scene(name))

@@ -11,8 +11,8 @@ from dq_space_arm_env.scene import StateLayout
 
 pin = pytest.importorskip("pinocchio")
 
-# With wrist, without; planar; a payload; a wrench at the tip; six joints; no thrusters; passive joints.
-SCENES = ("paper", "no-wrist", "planar", "payload", "tip-load", "six-joint", "free-floating")
+# With wrist, without; planar; a payload; a wrench at the tip; six joints; no thrusters; a slide and a screw.
+SCENES = ("paper", "no-wrist", "planar", "payload", "tip-load", "six-joint", "free-floating", "sliding")
 
 
 def sprung(scene):

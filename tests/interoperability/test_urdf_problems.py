@@ -1,5 +1,6 @@
 """What no scene can be made of, or written as URDF, is refused with a sentence that names it."""
 
+import math
 from time import process_time
 
 import numpy as np
@@ -66,7 +67,10 @@ MIMIC = '<mimic joint="j1"/>'
         (robot(*GOOD, B, joint("j2", "base", "b"), joint("j3", "arm", "b")), "on two joints, 'j2' and 'j3'"),
         (robot(*GOOD, B), "exactly one link must be no joint's child, the root; there are several: base, b"),
         (robot(*GOOD, B, link("c"), joint("j2", "b", "c"), joint("j3", "c", "b")), "j.' is part of a loop"),
-        (arm("prismatic"), "joint 'j1' on the way to link 'arm' is prismatic; a scene has revolute, "),
+        (
+            arm("planar"),
+            "joint 'j1' on the way to link 'arm' is planar; a scene has revolute, continuous, pris",
+        ),
         (
             robot(BASE, joint("j1", "base", "b"), B, joint("j2", "b", "arm", content=MIMIC), ARM),
             "joint 'j2' on the way to link 'arm' mimics joint 'j1'",
@@ -243,6 +247,23 @@ def test_a_scene_comes_back_from_its_urdf():
     np.testing.assert_array_equal(found.control_limit, expected.control_limit)
     assert found.state.names == expected.state.names
     assert again.tip.position == pytest.approx(scene.tip.position, abs=1e-15)
+
+
+def test_a_slide_comes_back_from_its_urdf():
+    scene = load_scene("sliding")
+    with pytest.raises(SceneError, match="it has no screw joints, and link 'drive' has one"):
+        scene_to_urdf(scene)
+    upper = [math.inf, math.inf, 0.9, 0.5]
+    limits = {"name": "joint limits", "kind": "joint_limits", "upper": upper}
+    turned = {"links.3.joint_type": "revolute", "links.3.pitch": 0.0, "links.2.damping": 0.5}
+    scene = scene.replace(turned, constraints=[limits])
+    again = scene_from_urdf(scene_to_urdf(scene), "tip", base_force=10, base_torque=5)
+    x, u = drawn(scene, np.random.default_rng(0))
+    assert relative_error(accelerations(again, x, u), accelerations(scene, x, u)) < 1e-13
+    expected, found = StateLayout.of(scene), StateLayout.of(again)
+    np.testing.assert_array_equal(found.control_limit, expected.control_limit)
+    assert (found.state.units, found.control.units) == (expected.state.units, expected.control.units)
+    assert again.constraints == scene.constraints
 
 
 def test_a_fixed_wrist_changes_no_acceleration():

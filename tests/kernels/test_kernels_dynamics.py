@@ -22,9 +22,9 @@ def paper_solution(kernels, x, u):
     field = SpaceArmField(chain, kernels.layout)
     stored, y = split_state(field, x.tolist())
     motion, inputs = field.motion(y), field.inputs(u.tolist())
-    rotations = minimal.joint_rotations(chain, motion.joint_angles)
+    link_frames = minimal.link_frames(chain, motion.joint_angles)
     twist = (*motion.angular, *motion.linear)
-    velocities = kinematics.body_velocities(chain, rotations, twist, motion.joint_rates)
+    velocities = kinematics.body_velocities(chain, link_frames, twist, motion.joint_rates)
     bodies = [chain.base, *(link.body for link in chain.links)]
     duals = [
         (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
@@ -36,7 +36,7 @@ def paper_solution(kernels, x, u):
     rates, reactions = newton_euler.paper_rates(chain, state, *given)
     accelerations = [tuple(body) for body in np.reshape(rates[-8 * len(bodies) :], (-1, 8))]
     frames = newton_euler.joint_frames(chain, motion.joint_angles, motion.wrist_angles)
-    joints = [newton_euler.joint_velocity(frames, j, accelerations)[3] for j in range(len(chain.links))]
+    joints = newton_euler.along_joints(chain, frames, accelerations)
     base = np.array([*accelerations[0][1:4], *accelerations[0][5:8]])
     return np.array([*base[list(field.pose.directions)], *joints]), np.array(reactions)
 

@@ -74,6 +74,7 @@ def test_hashes_and_files_of_scenes_without_them_are_as_old_as_the_scenes() -> N
         "plume",
         "release",
         "servicing",
+        "sliding",
         "tracking",
         "tumbling-target",
     ]

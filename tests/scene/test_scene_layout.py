@@ -44,6 +44,7 @@ SIZES = {  # n_x, n_t, n_u
     "servicing": (23, 21, 12),
     "six-joint": (26, 24, 12),
     "tip-load": (23, 21, 12),
+    "sliding": (22, 20, 10),
     "tracking": (23, 21, 12),
     "tumbling": (23, 21, 12),
     "tumbling-target": (23, 21, 12),

@@ -18,6 +18,8 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.kinematics import frame_poses
 from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.scene.constraint_rows import sides
+from dq_space_arm_env.scene.constraints import JointLimits
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.scene.shapes import COLORS, Shape
 from dq_space_arm_env.viewing.payload_places import leaves_tip
@@ -107,7 +109,7 @@ class SpacecraftModel:
         wing = rotation @ (self._body_axes[:, self._wing_axes[0]] * self._wing_tip[self._wing_axes[0]])
         shoulder = frames[min(1, len(frames) - 1)]
         # Less than the arm's reach: it works between start and target, and is seen better from near.
-        reach = self._arm_length + self._overhang()
+        reach = self._arm_length + sum(self._masts) + self._overhang()
         target = 1.2 * self.axis_length + math.sqrt(3.0) * spread.target_position
         body = [
             (frames[0], 0.75 * float(np.linalg.norm(self._body_size))),
@@ -259,6 +261,17 @@ class SpacecraftModel:
             frame = len(self.scene.links) + 1
             yield ball(frame, (0.0, 0.0, 0.0), 1.5 * self._radius(frame), JOINT)
 
+    @cached_property
+    def _masts(self) -> list[float]:
+        """Farthest slide of each joint, at the start or by its limits, m."""
+        farthest = [max(angle, 0.0) for angle in self.scene.initial_state.joint_angles]
+        for limits in (each for each in self.scene.constraints if isinstance(each, JointLimits)):
+            for side in sides(self.scene, limits):
+                if side.sign > 0 and not side.is_rate:
+                    farthest[side.link] = max(farthest[side.link], side.bound)
+        chain = Chain.from_scene(self.scene)
+        return [max(link.screw.slide * most, 0.0) for link, most in zip(chain.links, farthest, strict=True)]
+
     @property
     def _geometry(self) -> list[tuple[Shape, ...]]:
         """Given shapes of what is fixed in each frame but the tip's; a wrist has none."""
@@ -271,7 +284,9 @@ class SpacecraftModel:
         return not self._geometry[-1]
 
     def _joint(self, frame: int) -> Iterator[Mesh]:
-        """A beveled housing along the joint's z axis."""
+        """A beveled housing along the joint's z axis, and a mast as long as the joint slides."""
+        if mast := self._masts[frame - 1]:
+            yield cylinder(frame, (0.0, 0.0, 0.0), (0.0, 0.0, -mast), 0.7 * self._radius(frame), METAL)
         radius, half = 1.5 * self._radius(frame), 1.6 * self._radius(frame)
         bevel = 0.2 * radius
         profile = [(-half, 0.0), (-half, radius - bevel), (bevel - half, radius), (half - bevel, radius)]

@@ -220,9 +220,9 @@ def _compiled(sample: Sample, **simulation: str) -> FloatArray:
 def _system(sample: Sample) -> tuple[newton_euler.NewtonEulerSystem, newton_euler.JointFrames]:
     chain, motion = sample.chain, sample.motion
     angles, rates = motion.joint_angles.tolist(), motion.joint_rates.tolist()
-    frames = minimal.link_frames(chain, angles)
+    link_frames = minimal.link_frames(chain, angles)
     twist = (*motion.angular.tolist(), *motion.linear.tolist())
-    velocities = kinematics.body_velocities(chain, frames, twist, rates)
+    velocities = kinematics.body_velocities(chain, link_frames, twist, rates)
     bodies = [chain.base, *(link.body for link in chain.links)]
     duals = [
         (0.0, *v.angular, 0.0, *add(v.linear, cross(v.angular, body.center_of_mass)))
@@ -237,7 +237,7 @@ def _system(sample: Sample) -> tuple[newton_euler.NewtonEulerSystem, newton_eule
 
 def _from_duals(sample: Sample, frames: newton_euler.JointFrames, duals: FloatArray) -> FloatArray:
     bodies = [tuple(body) for body in duals.reshape(-1, 8).tolist()]
-    joints = [newton_euler.joint_velocity(frames, j, bodies)[3] for j in range(len(sample.chain.links))]
+    joints = newton_euler.along_joints(sample.chain, frames, bodies)
     return np.array([*bodies[0][1:4], *bodies[0][5:8], *joints])
 
 
