@@ -1,13 +1,14 @@
-"""Constrained maneuvers from random starts: the expert, IPOPT and fatrop in turns, all from zero controls.
+"""Constrained maneuvers from random starts: the expert, IPOPT, fatrop and Crocoddyl, all from zero controls.
 
-`GuidedDDP` also has its own guesses. Steps are long: CasADi interprets the derivatives of a thousand short
-ones for minutes. A maneuver is solved where the solver says so and its controls, rolled out in our problem,
-keep to all rows and reach the target.
+`GuidedDDP` also has its own guesses. Crocoddyl has penalties, see `crocoddyl_penalties`. Steps are long:
+CasADi interprets the derivatives of a thousand short ones for minutes. A maneuver is solved where the solver
+says so and its controls, rolled out in our problem, keep to all rows and reach the target.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim, note
-from scripts.benchmarks.peers import interior_point_peer
+from scripts.benchmarks.peers import crocoddyl_kernels, crocoddyl_penalties, interior_point_peer
 from scripts.benchmarks.solvers.random_starts import draw_starts
 from scripts.benchmarks.solvers.runs import (
     GUIDED,
@@ -31,7 +32,14 @@ from scripts.benchmarks.solvers.runs import (
     roll_out,
 )
 
-SCENES = ("joint-limits", "keep-out", "pointing")
+SCENES = (
+    "joint-limits",
+    "keep-out",
+    "pointing",
+    "line-of-sight",
+    "approach-corridor",
+    "wheel-saturation",
+)
 STEPS, MOST_STARTS, MOST_ITERATIONS, TOLERANCE = 50, 20, 150, 1e-6
 """Stages, random starts, and iterations and tolerance of the interior-point methods."""
 FEASIBLE = 1e-5
@@ -46,6 +54,9 @@ def measure_constrained(effort: Effort) -> Iterator[Row]:
         sentence = "they take minutes; --set slow_peers=true or --full have them"
         yield note(f"Constrained maneuvers beside IPOPT and fatrop are left out: {sentence}.")
         return
+    missing = crocoddyl_kernels.obstacle()
+    if missing is not None:
+        yield note(missing)
     for name in effort.scenes or SCENES:
         scene = load_scene(name)
         if not scene.constraints:
@@ -60,6 +71,9 @@ def measure_constrained(effort: Effort) -> Iterator[Row]:
             solvers[each] = interior_point_peer.InteriorPoint(
                 problem, each, max_iterations=MOST_ITERATIONS, tolerance=TOLERANCE
             ).solve
+        if missing is None:
+            solve = partial(crocoddyl_penalties.solve_with_penalties, problem)
+            solvers[crocoddyl_penalties.CROCODDYL] = partial(solve, max_iterations=effort.max_iterations)
         rows: list[Row] = []
         for number, x0 in enumerate(draw_starts(problem, min(effort.starts, MOST_STARTS), effort.seed)):
             runs = {each: solve(x0) for each, solve in solvers.items()}
@@ -79,10 +93,11 @@ def compared(problem: ArmProblem, start: int, x0: FloatArray, runs: Mapping[str,
     violations = {each: violation(problem, x0, run) for each, run in runs.items()}
     solved = [each for each, run in runs.items() if run.converged and violations[each] <= FEASIBLE]
     best = min((runs[each].replayed_cost for each in solved), default=np.inf)
-    theirs = [runs[each].replayed_cost for each in INTERIOR_POINT if each in solved]
+    peers = (*INTERIOR_POINT, crocoddyl_penalties.CROCODDYL)
+    theirs = [runs[each].replayed_cost for each in peers if each in solved]
     for each, run in runs.items():
         gaps = [relative_gap(run.replayed_cost, cost) for cost in theirs]
-        same = [gap for gap in gaps if each in solved and each not in INTERIOR_POINT and abs(gap) <= SAME]
+        same = [gap for gap in gaps if each in solved and each not in peers and abs(gap) <= SAME]
         yield {
             "table": "constrained",
             "scene": problem.scene.name,
@@ -117,7 +132,8 @@ def summarized(scene: str, solver: str, rows: Sequence[Row]) -> Iterator[Row]:
     summary["solved"] = len(solved) / len(rows)
     summary["best"] = sum(row["above_best"] <= SAME for row in solved) / len(rows)
     for key in ("iterations", "seconds", "sweep_ms"):
-        summary[key] = float(np.median([row[key] for row in solved])) if solved else None
+        known = [row[key] for row in solved if row[key] is not None]
+        summary[key] = float(np.median(known)) if known else None
     yield summary
     for count, row in enumerate(solved, 1):
         share = {"seconds": row["seconds"], "share": count / len(rows)}
