@@ -167,6 +167,7 @@ def _state_parts(layout: StateLayout) -> list[tuple[str, slice, str]]:
         ("angular velocity of the base, base axes", state.angular_velocity, "rad/s"),
         ("linear velocity of the base, base axes", state.linear_velocity, "m/s"),
         ("joint rates", state.joint_rates, units[1]),
+        ("previous controls", state.actuators, ", ".join(dict.fromkeys(state.units[state.actuators]))),
     ]
 
 

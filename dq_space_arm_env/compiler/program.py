@@ -89,8 +89,11 @@ class Program:
 
     def append(self, other: Program, **buffers: str) -> None:
         """Append the calls of another program; `buffers` map names of its buffers to others."""
-        if other.loops:
-            raise ValueError(f"program {other.name!r} has a loop, and cannot become part of {self.name!r}")
+        begin = len(self.calls)
+        for loop in other.loops:
+            condition = buffers.get(loop.condition, loop.condition)
+            self.loops.append(Loop(begin + loop.begin, begin + loop.end, condition))
+        self.held |= {buffers.get(name, name) for name in other.held}
         for call in other.calls:
             names = [name for name, _ in (*call.graph.inputs, *call.graph.outputs)]
             bound = {name: call.bindings.get(name, name) for name in names}

@@ -33,6 +33,7 @@ class Motion:
     angular: Sequence[Scalar]  # of the base, base axes, rad/s
     linear: Sequence[Scalar]  # of the base's center of mass, base axes, m/s
     joint_rates: Sequence[Scalar]  # n, rad/s
+    previous_controls: Sequence[Scalar]  # those of the layout, N, N m, rad/s
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,7 @@ class EquationsOfMotion:
             twist[:3],
             twist[3:],
             part(layout.state.joint_rates),
+            part(layout.state.actuators),
         )
 
     def inputs(self, u: Sequence[Scalar]) -> Inputs:

@@ -35,6 +35,11 @@ class SpaceArmField(EquationsOfMotion):
         return SpaceArmMomentum(self)
 
     @property
+    def of_motion(self) -> SpaceArmField:
+        """The same equations without what actuators keep from step to step, which no equation moves."""
+        return SpaceArmField(self.chain, self.layout.of_motion, self.parameters, self._given_formulation)
+
+    @property
     def beside_momentum(self) -> SpaceArmField:
         """The same equations, formulated for use beside the momentum, which needs the mass matrix anyway."""
         formulation = self._given_formulation or "minimal_coordinates"

@@ -90,7 +90,9 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | 32-34 | velocity of the target, as if it reached to the tip                   | -1e12 | 1e12 | m/s  |
     | 35    | time left in the episode                                              | 0    | T   | s     |
 
-    In a scene with phases the number of the phase, from 0, is one more entry: before the twists, or the time left.
+    Where rates of controls are limited, the controls before, those of `layout.previous_controls`, stand after the
+    joint rates, in N, N m, rad/s. In a scene with phases the number of the phase, from 0, is one more entry: before
+    the twists, or the time left.
 
     ## Rewards
 

@@ -38,7 +38,8 @@ class CasadiDynamics:
         layout: Names, units and places of the entries of states and inputs.
         forward_dynamics: (x, u) to accelerations: those of the base, in base axes, angular then linear, the
             time derivatives of its twist, 6 (planar: 3), rad/s^2 and m/s^2, then the joints', rad/s^2.
-        xdot: (x, u) to the time derivative of the state, (n_x,); that of the pose is q_{e0/I} omega / 2.
+        xdot: (x, u) to the time derivative of the state, (n_x,); that of the pose is q_{e0/I} omega / 2; that
+            of previous controls, which only steps change, 0.
         step: (x, u, h) to the state after h seconds under constant inputs, (n_x,), by the integrator.
         tip_pose: (x) to the pose q_{G/I} of the tip, 8 numbers, m.
         cost: (x, u) to the stage cost, without a factor dt, dimensionless.
@@ -102,7 +103,8 @@ def _state_derivative(programs: ScenePrograms) -> Program:
         motion = field.motion(y)
         twist = (*motion.angular, *motion.linear)
         pose = field.pose.reduced(dual_quaternion.derivative(equations.base_pose(x), twist))
-        return {"xdot": [*pose, *field.rates(y, u)]}
+        kept = [0.0] * len(motion.previous_controls)
+        return {"xdot": [*pose, *field.rates(y, u), *kept]}
 
     inputs = program_inputs(field, Buffer("x", field.n_x), Buffer("u", field.n_u))
     program = Program("xdot", inputs, [Buffer("xdot", field.n_x)])

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from dq_space_arm_env.scene.constraints import (
     Constraint,
+    ControlRate,
     Distance,
     JointLimits,
     Momentum,
@@ -19,6 +20,7 @@ from dq_space_arm_env.scene.constraints import (
     WheelMomentum,
     per_link,
 )
+from dq_space_arm_env.scene.parameters import CONTROL_UNITS, control_numbers
 from dq_space_arm_env.scene.pose import PLANAR_TWIST
 
 Scene = Any  # `schema.Scene`
@@ -36,6 +38,16 @@ class Row(NamedTuple):
     observed: float | None = None  # scale of its entry in the observation, in its unit
     is_equality: bool = False
     has_input: bool = False
+    is_rate: bool = False  # of a control: the expert keeps to it by the bounds of its inputs
+
+
+class RateLimit(NamedTuple):
+    """A limit of a control's rate."""
+
+    control: int  # its index
+    name: str  # of the control
+    unit: str  # of the control
+    rate: float  # its unit per second
 
 
 class Side(NamedTuple):
@@ -57,6 +69,11 @@ def path_rows(scene: Scene) -> tuple[Row, ...]:
         One row per residual of `task.constraint_residuals.path_residuals`.
     """
     return tuple(row for each in scene.constraints for row in rows_of(scene, each))
+
+
+def penalized_rows(scene: Scene) -> tuple[Row, ...]:
+    """The rows of `path_rows` that the expert keeps to by penalties, not by the bounds of its inputs."""
+    return tuple(row for row in path_rows(scene) if not row.is_rate)
 
 
 def rows_of(scene: Scene, each: Constraint) -> list[Row]:
@@ -81,6 +98,10 @@ def rows_of(scene: Scene, each: Constraint) -> list[Row]:
         axes = AXES[2:] if scene.base.motion == "planar" else AXES
         names = [f"{each.name}: {sign}{axis}" for axis in axes for sign in "+-"]
         rows += [Row(name, "N m s", *common) for name in names]
+    elif isinstance(each, ControlRate):
+        for limit in rate_limits(scene, each):
+            names = [f"{each.name}: {limit.name} {word}" for word in ("falls", "rises")]
+            rows += [Row(name, limit.unit, *common, has_input=True, is_rate=True) for name in names]
     elif isinstance(each, Plume):
         rows.append(Row(each.name, "N", *common, has_input=True))
     elif not isinstance(each, Terminal):
@@ -180,7 +201,7 @@ def n_multipliers(scene: Scene) -> int:
     Returns:
         The number.
     """
-    return max(len(path_rows(scene)), len(terminal_rows(scene)))
+    return max(len(penalized_rows(scene)), len(terminal_rows(scene)))
 
 
 def sides(scene: Scene, limits: JointLimits) -> Iterator[Side]:
@@ -196,6 +217,50 @@ def sides(scene: Scene, limits: JointLimits) -> Iterator[Side]:
         ):
             if math.isfinite(bound):
                 yield Side(link, is_rate, sign, bound)
+
+
+def rate_limits(scene: Scene, each: ControlRate) -> list[RateLimit]:
+    """The controls whose rates a constraint limits, in their order."""
+    # The name of a control's limit in the scene ends with its axis.
+    found, index = [], 0
+    for field, numbers in control_numbers(scene).items():
+        given = getattr(each, field)
+        for number in numbers:
+            axis = number.limit.paths[0].rpartition(".")[2]
+            rate = given[int(axis)] if isinstance(given, tuple) else given
+            if rate is not None and math.isfinite(rate):
+                found.append(RateLimit(index, number.name, CONTROL_UNITS[field], rate))
+            index += 1
+    return found
+
+
+def previous_controls(scene: Scene) -> tuple[int, ...]:
+    """Indices of the controls that the state keeps for a step: those whose rates are limited.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        One index per entry `StateEntries.previous_controls`, in their order.
+    """
+    return tuple(limit.control for limit in rates_of(scene))
+
+
+def rates_of(scene: Scene) -> tuple[RateLimit, ...]:
+    """What limits the controls of `previous_controls`, each less its margin per step.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        The strictest limit of each.
+    """
+    found: dict[int, RateLimit] = {}
+    for each in scene.constraints:
+        for limit in rate_limits(scene, each) if isinstance(each, ControlRate) else ():
+            kept = limit._replace(rate=max(limit.rate - each.margin / scene.simulation.dt, 0.0))
+            found[limit.control] = min(found.get(limit.control, kept), kept, key=lambda known: known.rate)
+    return tuple(found[control] for control in sorted(found))
 
 
 def pairs_that_may_touch(scene: Scene, constraint: Distance) -> list[tuple[int, Volume, int, Volume]]:

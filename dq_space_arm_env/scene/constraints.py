@@ -13,6 +13,8 @@ from pydantic import BeforeValidator, Field, StrictBool
 from dq_space_arm_env.validation.fields import (
     ANGLES,
     LENGTHS,
+    Limit,
+    Limits3,
     Name,
     NonNegative,
     Position,
@@ -30,6 +32,7 @@ FRAMES = ("inertial", "base", "tip", "target", "grasp")
 
 _FRAME = "inertial, base, a link, tip, target or grasp"
 _PER_LINK = "one number for all links, or one per link"
+_PER_AXIS = "one number for all three axes, or three; .inf or absent: any"
 
 
 def _read_bounds(value: Any) -> tuple[float, ...]:
@@ -267,6 +270,27 @@ class WheelMomentum(Constraint):
     capacity: Positive = Field(description="greatest momentum about each axis of the base, N m s")
 
 
+class ControlRate(Constraint):
+    """Greatest change of controls per second, from step to step; residuals in N, N m, rad/s.
+
+    The first step counts against `initial_state.previous_controls`. Those controls become part of the state.
+    """
+
+    kind: Literal["control_rate"] = Field(description="'control_rate'")
+    base_force: Limits3 | None = Field(
+        default=None, description=f"greatest rate of the base force, N/s: {_PER_AXIS}"
+    )
+    base_torque: Limits3 | None = Field(
+        default=None, description=f"greatest rate of the base torque, N m/s: {_PER_AXIS}"
+    )
+    joint_torque: Limit | None = Field(
+        default=None, description="greatest rate of each joint torque, one number, N m/s; absent: any"
+    )
+    wrist_rate: Limits3 | None = Field(
+        default=None, description=f"greatest rate of the wrist's rates, rad/s^2: {_PER_AXIS}"
+    )
+
+
 class Terminal(Constraint):
     """Quantities that are exact at the end: equalities in rad, m, rad/s, m/s, N s, N m s."""
 
@@ -294,6 +318,7 @@ _KINDS: dict[str, type[Constraint]] = {
     "plume": Plume,
     "momentum": Momentum,
     "wheel_momentum": WheelMomentum,
+    "control_rate": ControlRate,
     "terminal": Terminal,
 }
 
@@ -318,6 +343,7 @@ AnyConstraint = Annotated[
     | Plume
     | Momentum
     | WheelMomentum
+    | ControlRate
     | Terminal,
     BeforeValidator(_read_constraint),
 ]
@@ -351,7 +377,9 @@ def constraint_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem((*here, "kind"), constraint.kind, "the scene has no thrusters: remove it")
         elif isinstance(constraint, WheelMomentum):
             yield from _wheel_problems(scene, (*here, "kind"))
-        if isinstance(constraint, Plume | Terminal) and constraint.observed is not None:
+        elif isinstance(constraint, ControlRate):
+            yield from _control_rate_problems(scene, here, constraint)
+        if isinstance(constraint, Plume | ControlRate | Terminal) and constraint.observed is not None:
             sentence = "must be absent: a residual with the input, or of the end, is not observed"
             yield Problem((*here, "observed"), constraint.observed, sentence)
         if isinstance(constraint, Terminal) and constraint.terminates:
@@ -378,6 +406,19 @@ def _joint_limit_problems(
             yield Problem((*here, "upper"), upper[index], sentence)
         if not rate[index] > 0.0:
             yield Problem((*here, "rate"), rate[index], "must be greater than 0")
+
+
+def _control_rate_problems(
+    scene: Scene, here: tuple[str | int, ...], constraint: ControlRate
+) -> Iterator[Problem]:
+    fields = ("base_force", "base_torque", "joint_torque", "wrist_rate")
+    given = {field: getattr(constraint, field) for field in fields if getattr(constraint, field) is not None}
+    rates = [rate for each in given.values() for rate in (each if isinstance(each, tuple) else [each])]
+    if not any(math.isfinite(rate) for rate in rates):
+        yield Problem(here, constraint, f"must limit at least one of {', '.join(fields)}")
+    for field, rate in given.items():
+        if getattr(scene.actuators, field) is None:
+            yield Problem((*here, field), rate, f"must be absent: the scene has no actuators.{field}")
 
 
 def _wheel_problems(scene: Scene, place: tuple[str | int, ...]) -> Iterator[Problem]:

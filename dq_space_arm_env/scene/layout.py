@@ -1,6 +1,7 @@
 """Layout of the state, the tangent, the controls and the parameters of a scene.
 
-State: base pose, joint angles, wrist angles, base velocity, joint rates. Tangent: the same, with a twist
+State: base pose, joint angles, wrist angles, base velocity, joint rates, and what actuators keep from step to
+step: the previous controls whose rates are limited. Tangent: the same, with a twist
 increment of the base in base axes (rotation, then translation) in place of the pose. Controls: base force,
 base torque, joint torques of the actuated joints, wrist rates. Parameters: target, bodies from base to
 payload, weights, limits. What a scene does not have is missing; the order stays.
@@ -9,8 +10,8 @@ v_x, v_y.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.parameters import (
     GRASP,
     PHASE,
@@ -34,6 +36,7 @@ from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import Array, free_axes, initial_state, is_planar
 
+_Part = TypeVar("_Part", bound="_MotionEntries")
 _AXES = ("x", "y", "z")
 _EULER_ANGLES = ("psi", "theta", "phi")
 _POSE = tuple(f"base pose q_{part}{index}" for part in "rd" for index in range(4))
@@ -55,6 +58,7 @@ class _MotionEntries(_Entries):
     angular_velocity: slice  # part of base_velocity
     linear_velocity: slice  # part of base_velocity
     joint_rates: slice  # base to tip
+    actuators: slice  # previous controls, those of `StateLayout.previous_controls`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +131,7 @@ class StateLayout:
         state: Entries of the state x.
         tangent: Entries of the tangent of the state.
         control: Entries of the controls u.
+        previous_controls: Indices of the controls that the state keeps for a step: their rates are limited.
         parameters: Entries of the parameters p.
         target: The nominal pose of the target's body at the start, shape (8,), real part dimensionless, dual
             part m; without a grasp frame the target q_{D/I}.
@@ -143,6 +148,7 @@ class StateLayout:
     state: StateEntries
     tangent: TangentEntries
     control: ControlEntries
+    previous_controls: tuple[int, ...]
     parameters: ParameterEntries
     target: Array
     grasp: Array
@@ -169,6 +175,15 @@ class StateLayout:
     def n_p(self) -> int:
         """Number of parameters."""
         return len(self.parameters.names)
+
+    @property
+    def of_motion(self) -> "StateLayout":
+        """The layout without what actuators keep: of the state that the equations of motion advance."""
+        if not self.previous_controls:
+            return self
+        state, tangent = _without_actuators(self.state), _without_actuators(self.tangent)
+        start = self.initial_state[: self.state.actuators.start]
+        return replace(self, state=state, tangent=tangent, previous_controls=(), initial_state=start)
 
     def target_with(self, parameters: Array) -> Array:
         """Target where it may be a parameter.
@@ -305,6 +320,7 @@ class StateLayout:
             state=_lay_out_state(scene),
             tangent=_lay_out_tangent(scene),
             control=_lay_out_controls(controls),
+            previous_controls=previous_controls(scene),
             parameters=_lay_out_parameters(scene),
             target=_constant(scene.target.pose.dual_quaternion),
             grasp=_constant(scene.target.grasp.dual_quaternion),
@@ -344,16 +360,24 @@ class _Collector:
         wrist_angles = self.add("rad", [f"wrist {angle}" for angle in wrist])
         angular = self.add("rad/s", [f"base omega_{_AXES[axis]}" for axis in turning])
         linear = self.add("m/s", [f"base v_{_AXES[axis]}" for axis in moving])
+        joint_rates = self.add_each(
+            [f"{unit}/s" for unit in units], [f"{link.name} rate" for link in scene.links]
+        )
         return {
             "joint_angles": joint_angles,
             "wrist_angles": wrist_angles,
             "base_velocity": slice(angular.start, linear.stop),
             "angular_velocity": angular,
             "linear_velocity": linear,
-            "joint_rates": self.add_each(
-                [f"{unit}/s" for unit in units], [f"{link.name} rate" for link in scene.links]
-            ),
+            "joint_rates": joint_rates,
+            "actuators": self.add_previous_controls(scene),
         }
+
+    def add_previous_controls(self, scene: Scene) -> slice:
+        """Append the controls that the state keeps, each with its unit."""
+        controls = [number for numbers in control_numbers(scene).values() for number in numbers]
+        kept = [controls[index] for index in previous_controls(scene)]
+        return self.add_each([each.limit.unit for each in kept], [f"previous {each.name}" for each in kept])
 
 
 def _lay_out_state(scene: Scene) -> StateEntries:
@@ -363,6 +387,12 @@ def _lay_out_state(scene: Scene) -> StateEntries:
     dual = entries.add("m", [name for name in pose if "q_d" in name])
     motion = entries.add_motion(scene)
     return StateEntries(pose=slice(real.start, dual.stop), **motion, **entries.collected())
+
+
+def _without_actuators(entries: _Part) -> _Part:
+    """Entries of the motion alone."""
+    end = entries.actuators.start
+    return replace(entries, names=entries.names[:end], units=entries.units[:end], actuators=slice(end, end))
 
 
 def _lay_out_tangent(scene: Scene) -> TangentEntries:

@@ -15,6 +15,7 @@ from dq_space_arm_env.validation.fields import (
     Limit,
     Limits3,
     Load,
+    Loads,
     Positive,
     Rates,
     RateSpread,
@@ -155,6 +156,12 @@ class InitialState(Model):
     )
     joint_rates: Rates = Field(
         default=(), description="joint rates, base to tip, one per link, rad/s; empty: zeros"
+    )
+    previous_controls: Loads = Field(
+        default=(),
+        exclude_if=lambda controls: not controls,
+        description="controls before the episode, those whose rates a constraint limits, in their order, "
+        "N, N m, rad/s; empty: zeros",
     )
 
 

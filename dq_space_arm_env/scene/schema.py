@@ -17,10 +17,11 @@ from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
+from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.constraints import AnyConstraint, constraint_problems
 from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
 from dq_space_arm_env.scene.motion import Motion, ScrewMotion, Tumbling, Waypoints
-from dq_space_arm_env.scene.parameters import is_part, numbers, parents
+from dq_space_arm_env.scene.parameters import control_numbers, is_part, numbers, parents
 from dq_space_arm_env.scene.phases import Phase, StagedNumbers, phase_problems, staged_numbers
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.scene.simulation import Simulation
@@ -129,7 +130,8 @@ class Scene(Model):
         yield from self._parameter_problems()
         if self.phases:
             yield from phase_problems(self)
-        yield from constraint_problems(self)
+        found = [*constraint_problems(self)]
+        yield from found or self._previous_control_problems()
         if self.base.motion == "planar":
             yield from self._planar_problems()
 
@@ -228,6 +230,15 @@ class Scene(Model):
                     "such are target.pose, base, links.0, payload, cost, actuators, and what is in them"
                 )
                 yield Problem(("parameters", index), path, sentence)
+
+    def _previous_control_problems(self) -> Iterator[Problem]:
+        """Find controls before the episode that are not those whose rates are limited."""
+        given, limited = self.initial_state.previous_controls, previous_controls(self)
+        if given and len(given) != len(limited):
+            controls = [each.name for numbers in control_numbers(self).values() for each in numbers]
+            names = ", ".join(controls[index] for index in limited) or "constraints limit no control's rate"
+            sentence = f"must be {len(limited)} numbers ({names}); it has {len(given)}"
+            yield Problem(("initial_state", "previous_controls"), given, sentence)
 
     def _planar_problems(self) -> Iterator[Problem]:
         """Find what leaves the x-y plane or turns about another axis than z."""

@@ -11,6 +11,7 @@ from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.algebra.quaternion import multiply
 from dq_space_arm_env.algebra.scalars import select
 from dq_space_arm_env.algebra.vectors import matrix_vector, transposed_matrix_vector
+from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.maneuver import Spread
 from dq_space_arm_env.scene.motion import ScrewMotion, Tumbling
 from dq_space_arm_env.scene.parameters import (
@@ -158,7 +159,8 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     if is_planar(scene):
         pose = [pose[index] for index in PLANAR_POSE]
         velocity = [velocity[index] for index in PLANAR_TWIST]
-    state = [*pose, *joint_angles, *wrist_angles, *velocity, *joint_rates]
+    previous = start.previous_controls or (0.0,) * len(previous_controls(scene))
+    state = [*pose, *joint_angles, *wrist_angles, *velocity, *joint_rates, *previous]
     return EpisodeStart(state, drawn)
 
 

@@ -20,9 +20,9 @@ from typing import Any, NamedTuple, Self
 import casadi
 
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
-from dq_space_arm_env.scene.constraint_rows import Row, n_multipliers, path_rows, terminal_rows
+from dq_space_arm_env.scene.constraint_rows import Row, n_multipliers, penalized_rows, terminal_rows
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.task.constraint_residuals import path_residuals, terminal_residuals
+from dq_space_arm_env.task.constraint_residuals import penalized_residuals, terminal_residuals
 from dq_space_arm_env.task.equations import SceneEquations, total
 
 Scalar = Any
@@ -59,8 +59,8 @@ class PenalizedEquations(SceneEquations):
 
     def cost_terms(self, x: Scalars, u: Scalars) -> list[Scalar]:
         """The terms of the stage cost, and the penalty of the path's rows."""
-        residuals = path_residuals(self, self.base_pose(x), self.y(x), u)
-        penalties = self.penalized(path_rows(self.scene), residuals)
+        residuals = penalized_residuals(self, self.base_pose(x), self.y(x), u)
+        penalties = self.penalized(penalized_rows(self.scene), residuals)
         return [*super().cost_terms(x, u), total([each.value for each in penalties])]
 
     def terminal_cost_terms(self, x: Scalars) -> list[Scalar]:

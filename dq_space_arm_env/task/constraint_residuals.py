@@ -31,12 +31,14 @@ from dq_space_arm_env.scene.constraint_rows import (
     exact_rows,
     pairs_that_may_touch,
     path_rows,
+    rate_limits,
     sides,
     success_tolerances,
 )
 from dq_space_arm_env.scene.constraints import (
     ApproachCorridor,
     Constraint,
+    ControlRate,
     Distance,
     JointLimits,
     KeepInDirection,
@@ -67,7 +69,7 @@ class _Situation:
     def __init__(self, equations: SceneEquations, base: Scalars, y: Scalars, u: Scalars) -> None:
         self.equations, self.base, self.scene = equations, base, equations.scene
         self.motion = equations.field.motion(y)
-        self.inputs = equations.field.inputs(u)
+        self.u, self.inputs = u, equations.field.inputs(u)
         chain, motion = equations.chain, self.motion
         frames = kinematics.frame_poses(chain, dq.IDENTITY, motion.joint_angles, motion.wrist_angles)
         names = ["base", *(link.name for link in self.scene.links)]
@@ -134,6 +136,13 @@ def path_residuals(equations: SceneEquations, base: Scalars, y: Scalars, u: Scal
         if type(constraint) in _RESIDUALS
         for residual in _RESIDUALS[type(constraint)](situation, constraint)
     ]
+
+
+def penalized_residuals(equations: SceneEquations, base: Scalars, y: Scalars, u: Scalars) -> list[Scalar]:
+    """Those of `path_residuals` that the expert penalizes."""
+    residuals = path_residuals(equations, base, y, u)
+    rows = path_rows(equations.scene)
+    return [residual for residual, row in zip(residuals, rows, strict=True) if not row.is_rate]
 
 
 def state_residuals(equations: SceneEquations, base: Scalars, y: Scalars) -> list[Scalar]:
@@ -346,6 +355,15 @@ def _wheel_momentum(situation: _Situation, constraint: WheelMomentum) -> Iterato
         yield angular[axis] - constraint.capacity
 
 
+def _control_rate(situation: _Situation, constraint: ControlRate) -> Iterator[Scalar]:
+    scene, layout = situation.scene, situation.equations.layout
+    before = dict(zip(layout.previous_controls, situation.motion.previous_controls, strict=True))
+    for limit in rate_limits(scene, constraint):
+        change, most = situation.u[limit.control] - before[limit.control], limit.rate * scene.simulation.dt
+        yield -change - most
+        yield change - most
+
+
 _RESIDUALS: dict[type[Constraint], Callable[..., Iterator[Scalar]]] = {
     JointLimits: _joint_limits,
     Distance: _distance,
@@ -356,6 +374,7 @@ _RESIDUALS: dict[type[Constraint], Callable[..., Iterator[Scalar]]] = {
     Plume: _plume,
     Momentum: _momentum,
     WheelMomentum: _wheel_momentum,
+    ControlRate: _control_rate,
 }
 
 

@@ -191,6 +191,7 @@ class SceneEquations:
             *motion.joint_angles,
             *motion.wrist_angles,
             *motion.joint_rates,
+            *motion.previous_controls,
             *([self.given[PHASE]] if self.scene.phases else []),
             *margins,
             *twists,

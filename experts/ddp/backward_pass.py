@@ -109,6 +109,11 @@ class PassWorkspace(NamedTuple):
     room_below: FloatArray  # lower bounds minus the control, shape (n_u,)
     room_above: FloatArray  # upper bounds minus the control, shape (n_u,)
     box: BoxQPWorkspace
+    # Tangent coordinates that the lower and upper bound of an input follow one to one, -1 where a bound is
+    # fixed; shape (N, 2, n_u), or (0, 2, n_u) if all are
+    follows: NDArray[np.int64]
+    followed: NDArray[np.int64]  # what a clamped input follows, -1 for nothing, shape (n_u,)
+    response: FloatArray  # of the free inputs to one that follows, in their order, shape (n_u,)
 
 
 def allocate_update(horizon: int, n_tangent: int, n_controls: int, *, keep_values: bool = False) -> Update:
@@ -162,6 +167,9 @@ def pass_workspace(
         room_below=np.zeros(n_controls),
         room_above=np.zeros(n_controls),
         box=box,
+        follows=np.zeros((0, 2, n_controls), np.int64),
+        followed=np.full(n_controls, -1),
+        response=np.zeros(n_controls),
     )
 
 
@@ -219,7 +227,11 @@ def backward_pass(
         quadratic += stage_quadratic
         clamped += n_controls - n_free
         prefetch_to_write(update.K[max(stage - 1, 0)])
+        if work.follows.shape[0] > 0:
+            _follow_bounds(stage, n_free, work)
         _update_value(derivatives.luu[stage], mu, n_free, work)
+        if work.follows.shape[0] > 0:
+            _update_value_of_followers(n_tangent, n_free, work)
         _store(stage, n_tangent, n_free, update, work)
     mirror_upper(work.Vxx, n_tangent)
     for i in range(n_tangent):
@@ -302,14 +314,69 @@ def _update_value(luu: FloatArray, mu: float, n_free: int, work: PassWorkspace) 
 
 
 @inlined
+def _follow_bounds(stage: int, n_free: int, work: PassWorkspace) -> None:
+    """Let inputs that are clamped at bounds of their rates follow those, and the free ones respond.
+
+    K_c is a row of the identity, and (Quu + mu R)_ff K_f = -Qux_f - Quu_fc K_c.
+    """
+    system, pivots = work.box.system, work.box.inverse_pivots
+    for c in range(work.k.shape[0]):
+        side, t = work.box.sides[c], -1
+        if side != 0:
+            t = work.follows[stage, 0 if side < 0 else 1, c]
+        work.followed[c] = t
+        if t < 0:
+            continue
+        for a in range(n_free):
+            work.response[a] = -work.Quu[work.box.free[a], c]
+            for b in range(a):
+                work.response[a] -= system[b, a] * pivots[b] * work.response[b]
+        for a in range(n_free - 1, -1, -1):
+            for b in range(a + 1, n_free):
+                work.response[a] -= system[a, b] * work.response[b]
+            work.response[a] *= pivots[a]
+            work.K[a, t] += work.response[a]
+
+
+@inlined
+def _update_value_of_followers(n_tangent: int, n_free: int, work: PassWorkspace) -> None:
+    """Add to the value function what clamped inputs that follow contribute.
+
+    With their rows E of K, Vxx gains K_f' Quu_fc E + E' Qux_c + Qux_c' E + E' Quu_cc E, and Vx gains E' times
+    their part of Quu k + Qu.
+    """
+    for c in range(work.k.shape[0]):
+        t = work.followed[c]
+        if t < 0:
+            continue
+        work.Vx[t] += work.slope[c]
+        for j in range(n_tangent):
+            if j <= t:
+                work.Vxx[j, t] += work.Qux[c, j]
+            if j >= t:
+                work.Vxx[t, j] += work.Qux[c, j]
+        for a in range(n_free):
+            for i in range(t + 1):
+                work.Vxx[i, t] += work.K[a, i] * work.Quu[work.box.free[a], c]
+        for d in range(work.k.shape[0]):
+            if work.followed[d] >= t:
+                work.Vxx[t, work.followed[d]] += work.Quu[c, d]
+
+
+@inlined
 def _store(stage: int, n_tangent: int, n_free: int, update: Update, work: PassWorkspace) -> None:
-    """Write k and K of a stage, zero rows for clamped inputs, and the value function if it is kept."""
+    """Write k and K of a stage, and the value function if it is kept.
+
+    Clamped inputs have rows of zeros, or of the identity if they follow a bound of their rate.
+    """
     gains = update.K[stage]
     for i in range(work.k.shape[0]):
         update.k[stage, i] = work.k[i]
         if work.box.sides[i] != 0:
             for j in range(n_tangent):
                 gains[i, j] = 0.0
+            if work.followed[i] >= 0:
+                gains[i, work.followed[i]] = 1.0
     for a in range(n_free):
         copy_row_out(gains, work.box.free[a], work.K, a)
     if update.Vx_all.shape[0] > 0:

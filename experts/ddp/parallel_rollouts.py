@@ -12,7 +12,7 @@ from dq_space_arm_env.kernels.bound import buffer_table
 from experts.ddp.backward_pass import Update
 from experts.native.compilation import BufferTable, call_kernel, compiled
 from experts.native.padded_algebra import FloatArray, set_product_sum
-from experts.problems.shooting_problem import ShootingProblem, native_calls
+from experts.problems.shooting_problem import RateLimits, ShootingProblem, native_calls, rate_limits
 
 LANES = 8
 """Step lengths per call: a whole number of vectors on any processor."""
@@ -32,6 +32,7 @@ class _Work(NamedTuple):
     end_state: FloatArray  # last state of a lane, shape (1, n_x)
     end_cost: FloatArray  # its terminal cost, shape (1,)
     parameters: FloatArray  # inputs of the stages, the same in every lane, shape (N, LANES, n_p and more)
+    rates: RateLimits
 
 
 class _Kernels(NamedTuple):
@@ -64,6 +65,7 @@ class ParallelRollouts:
             end_state=np.zeros((1, n_x)),
             end_cost=np.zeros(1),
             parameters=np.zeros((horizon, LANES, inputs[0].shape[1] if inputs else 0)),
+            rates=rate_limits(problem),
         )
         parameters = (work.parameters,) if inputs else ()
         # Keeps the kernels' code and the arrays behind the tables alive.
@@ -189,3 +191,8 @@ def _apply_update(
             # A lane of NaN ends up in the box; its cost reveals it.
             control = min(max(control, control_lower[stage, i]), control_upper[stage, i])
             work.controls[stage, lane, i] = control
+    for a in range(work.rates.change.shape[0]):
+        i, change = work.rates.controls[a], work.rates.change[a]
+        for lane in range(LANES):
+            control, previous = work.controls[stage, lane, i], work.states[stage, lane, work.rates.states[a]]
+            work.controls[stage, lane, i] = min(max(control, previous - change), previous + change)

@@ -10,8 +10,10 @@ from experts.problems.shooting_problem import (
     RETRACTION_KERNEL_NAME,
     FloatArray,
     Kernel,
+    RateLimits,
     ShootingProblem,
     native_calls,
+    rate_limits,
 )
 
 FINISHED = -1
@@ -64,6 +66,7 @@ def closed_loop_rollout(
     deviations: FloatArray,
     stage_costs: FloatArray,
     terminal_cost: FloatArray,
+    rates: RateLimits,
 ) -> tuple[float, int]:
     """Roll out u = clip(u_ref + alpha k + K (x (-) x_ref)); return as `rollout` does.
 
@@ -82,6 +85,9 @@ def closed_loop_rollout(
             if not np.isfinite(control):
                 return np.inf, k
             controls[k, i] = min(max(control, control_lower[k, i]), control_upper[k, i])
+        for a in range(rates.change.shape[0]):
+            i, previous = rates.controls[a], states[k, rates.states[a]]
+            controls[k, i] = min(max(controls[k, i], previous - rates.change[a]), previous + rates.change[a])
         call_kernel(step, k, k + 1, step_buffers)
         if retract != NO_RETRACTION:
             call_kernel(retract, k, k + 1, retract_buffers)
@@ -201,5 +207,6 @@ class Trajectory:
                 self._deviations,
                 self.stage_costs,
                 self.terminal_cost,
+                rate_limits(self._problem),
             )
         return self.cost

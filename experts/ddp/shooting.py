@@ -37,7 +37,9 @@ from experts.problems.shooting_problem import (
     FloatArray,
     ShootingProblem,
     native_calls,
+    rate_limits,
     stage_bounds,
+    within_rates,
 )
 
 BATCHED_KERNELS = ("linearize", "cost_derivatives", "lagrangian_hessian")
@@ -121,10 +123,14 @@ class ShootingWorkspace:
 
     @timed("rollout")
     def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
-        """Roll out given controls and make the result the current trajectory."""
+        """Roll out given controls, as far as rates let them be, and make that the current trajectory."""
         self.bounds, trajectory = stage_bounds(self.problem), self.current
         trajectory.states[0] = self.trial.states[0] = initial_state
         trajectory.controls[:] = controls
+        limits = rate_limits(self.problem)
+        previous = initial_state[limits.states]
+        for control in trajectory.controls if previous.size else ():
+            previous = within_rates(control, previous, limits)
         trajectory.roll_out(self._kernels)
 
     @timed("rollout")
@@ -197,15 +203,16 @@ class ShootingWorkspace:
         called, or else Gauss-Newton's. Gaps of the current trajectory, shape (N, n_t), are closed by the
         update.
         """
+        bounds, follows = self._present_bounds()
         outcome = backward_pass(
             self.derivatives,
             self._exact if exact else self._mirrored or self._gauss_newton,
             self._no_gaps if gaps is None else gaps,
             self.current.controls,
-            *self.bounds,
+            *bounds,
             float(mu),
             self._spare_update,
-            self._pass_work,
+            self._pass_work._replace(follows=follows),
         )
         result = PassResult(*outcome, float(mu), exact)
         if result.status == PASS_NOT_FINITE:
@@ -214,6 +221,20 @@ class ShootingWorkspace:
         if result.completed:
             self.update, self._spare_update = self._spare_update, self.update
         return result
+
+    def _present_bounds(self) -> tuple[tuple[FloatArray, FloatArray], NDArray[np.int64]]:
+        """Bounds of the controls around the current trajectory, and what they follow, see `PassWorkspace`."""
+        limits = rate_limits(self.problem)
+        if not limits.change.size:
+            return self.bounds, self._pass_work.follows
+        previous, which = self.current.states[:-1, limits.states], limits.controls
+        follows = np.full((self.problem.horizon, 2, self.problem.n_controls), -1)
+        bounds = self.bounds[0].copy(), self.bounds[1].copy()
+        for side, bound in enumerate(bounds):
+            fixed = bound[:, which]
+            bound[:, which] = np.clip(fixed, previous - limits.change, previous + limits.change)
+            follows[:, side, which] = np.where(bound[:, which] != fixed, limits.tangents, -1)
+        return bounds, follows
 
     def cost_rounding(self) -> float:
         """Estimate how much rounding of the states changes the cost; smaller changes mean nothing."""

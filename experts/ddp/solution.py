@@ -21,7 +21,13 @@ from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.kernels.bound import address_of, buffer_table, one_row_call
 from experts.ddp.augmented_lagrangian import ConstraintReport
 from experts.problems.arm_problem import as_problem
-from experts.problems.shooting_problem import FloatArray, ShootingProblem, stage_bounds
+from experts.problems.shooting_problem import (
+    FloatArray,
+    ShootingProblem,
+    rate_limits,
+    stage_bounds,
+    within_rates,
+)
 
 Policy = Callable[[FloatArray, int], FloatArray]
 
@@ -301,6 +307,7 @@ class FeedbackPolicy:
         # Limits may be among the parameters; without any, the solution was made with constants.
         with problem.parameters.being(solution.parameters if solution.parameters.size else None):
             self._lower, self._upper = stage_bounds(problem)
+        self._rates = rate_limits(problem)
         self._difference = problem.kernel("difference")
         self._reference = np.zeros((1, problem.n_states))
         self._state = np.zeros((1, problem.n_states))
@@ -318,4 +325,7 @@ class FeedbackPolicy:
         self._find_deviation()
         control = self._solution.controls[k] + self._solution.feedback_gains[k] @ self._deviation[0]
         # Twice as fast as np.clip.
-        return np.asarray(np.minimum(np.maximum(control, self._lower[k]), self._upper[k]))
+        control = np.asarray(np.minimum(np.maximum(control, self._lower[k]), self._upper[k]))
+        if self._rates.change.size:
+            within_rates(control, state[self._rates.states], self._rates)
+        return control

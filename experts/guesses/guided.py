@@ -352,10 +352,11 @@ class GuidedDDP:
             That solver.
         """
         known, factor = self._library, coarsening[-1]
+        problem = cast(ArmProblem, self.problem).coarsened(factor)
         settings = {**self._settings, **({} if second_order is None else {"second_order": second_order})}
         found = type(self)(
-            cast(ArmProblem, self.problem).coarsened(factor),
-            library=None if known is None else [coarsened(member, factor) for member in known],
+            problem,
+            library=None if known is None else [coarsened(member, problem) for member in known],
             screw_motion=self._kinematic_guess is not None,
             reach_target=self.reach_target,
             reserve=self.reserve,

@@ -23,13 +23,16 @@ def policies(solution: Solution, problem: ShootingProblem) -> dict[str, Solution
     return found if states is None else {**found, ", moved": replace(solution, states=states)}
 
 
-def coarsened(solution: Solution, factor: int) -> Solution:
-    """The policy of a solution in steps longer by a factor; its cost becomes that of fewer stages."""
-    stages = solution.controls.reshape(-1, factor, solution.controls.shape[1])
+def coarsened(solution: Solution, problem: ArmProblem) -> Solution:
+    """The policy of a solution in the longer steps of a problem; its cost becomes that of fewer stages."""
+    factor = len(solution.controls) // problem.horizon
+    controls = solution.controls.reshape(-1, factor, solution.controls.shape[1]).mean(axis=1)
+    states = solution.states[::factor].copy()
+    problem.keep_previous(states, controls)
     return replace(
         solution,
-        states=solution.states[::factor],
-        controls=stages.mean(axis=1),
+        states=states,
+        controls=controls,
         feedback_gains=solution.feedback_gains[::factor],
         parameters=solution.parameters[::factor],
         multipliers=solution.multipliers[::factor],
@@ -38,7 +41,10 @@ def coarsened(solution: Solution, factor: int) -> Solution:
 
 
 def refined(solution: Solution, problem: ShootingProblem) -> Solution:
-    """The policy of a solution in the shorter steps of a problem; states between its own are interpolated."""
+    """The policy of a solution in the shorter steps of a problem; states between its own are interpolated.
+
+    Controls whose rates are limited change evenly in a long step, the others at its start.
+    """
     stages = len(solution.controls)
     factor = problem.horizon // stages
     references, ends = np.ascontiguousarray(solution.states[:-1]), np.ascontiguousarray(solution.states[1:])
@@ -53,10 +59,18 @@ def refined(solution: Solution, problem: ShootingProblem) -> Solution:
         np.concatenate([np.repeat(rows[:-1], factor, axis=0), rows[-1:]])
         for rows in (solution.parameters, solution.multipliers)
     )
+    states = np.concatenate([between, solution.states[-1:]])
+    controls = np.repeat(solution.controls, factor, axis=0)
+    if isinstance(problem, ArmProblem):
+        layout, share = problem.kernels.layout, np.tile(np.arange(1.0, factor + 1.0) / factor, stages)
+        before = np.repeat(solution.states[:-1, layout.state.actuators], factor, axis=0)
+        change = controls[:, layout.previous_controls] - before
+        controls[:, layout.previous_controls] = before + share[:, None] * change
+        problem.keep_previous(states, controls)
     return replace(
         solution,
-        states=np.concatenate([between, solution.states[-1:]]),
-        controls=np.repeat(solution.controls, factor, axis=0),
+        states=states,
+        controls=controls,
         feedback_gains=np.repeat(solution.feedback_gains, factor, axis=0),
         parameters=parameters,
         multipliers=multipliers,

@@ -229,8 +229,9 @@ class _ArmMotion:
         self._add_base_motion(states, knots, place)
         states[0] = knots.states[0]
         accelerations = np.diff(states[:, self.arm.velocity_entries], axis=0) / dt
-        controls += self.arm.controls(states[:-1], accelerations)
-        return ScrewMotion(states, self._within_bounds(controls))
+        controls = self._within_bounds(controls + self.arm.controls(states[:-1], accelerations))
+        problem.keep_previous(states, controls)
+        return ScrewMotion(states, controls)
 
     def _within_bounds(self, controls: FloatArray) -> FloatArray:
         return np.clip(controls, self.problem.control_lower, self.problem.control_upper)

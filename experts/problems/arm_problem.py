@@ -13,13 +13,21 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.kernels.library import PENALIZED
 from dq_space_arm_env.scene import INTEGRATORS
-from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, terminal_rows
+from dq_space_arm_env.scene.constraint_rows import (
+    n_multipliers,
+    path_rows,
+    penalized_rows,
+    rates_of,
+    terminal_rows,
+)
+from dq_space_arm_env.scene.constraints import ControlRate
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.parameters import CATCH, PHASE
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from experts.problems.shooting_problem import (
     FloatArray,
     Kernel,
+    RateLimits,
     ShootingProblem,
     StageParameters,
     check_interface,
@@ -52,8 +60,9 @@ class ArmProblem:
         self.integrator: str = self.scene.simulation.integrator
         self.has_second_order = INTEGRATORS[self.integrator].curvature is not None
         layout = self.kernels.layout
-        self.is_constrained = bool(self.scene.constraints)
-        mixed_rows = self.is_constrained and any(row.has_input for row in path_rows(self.scene))
+        # Rates of controls are bounds of the inputs.
+        self.is_constrained = any(not isinstance(each, ControlRate) for each in self.scene.constraints)
+        mixed_rows = any(row.has_input for row in penalized_rows(self.scene))
         # The wrist's rates turn the tip.
         twists = any(self.scene.cost.tip_twist) and "wrist psi rate" in layout.control.names
         self.has_mixed_cost = twists or mixed_rows
@@ -87,17 +96,35 @@ class ArmProblem:
         last = (rows[-1:] for rows in self.parameters.inputs)
         self.terminal_inputs: tuple[FloatArray, ...] = (*last, np.full(1, self._end_weight))
 
+    @property
+    def rate_limits(self) -> RateLimits:
+        """Limits of how much controls change from stage to stage."""
+        layout = self.kernels.layout
+        state, tangent = layout.state.actuators, layout.tangent.actuators
+        return RateLimits(
+            controls=np.array(layout.previous_controls, np.int64),
+            states=np.arange(state.start, state.stop),
+            tangents=np.arange(tangent.start, tangent.stop),
+            change=np.array([limit.rate for limit in rates_of(self.scene)]) * self.time_step,
+        )
+
+    def keep_previous(self, states: FloatArray, controls: FloatArray) -> None:
+        """Set the previous controls in states, (N + 1, n_x), to those of a guess, (N, n_u), in place."""
+        layout = self.kernels.layout
+        states[1:, layout.state.actuators] = controls[:, layout.previous_controls]
+
     def constraints_of(self, parameters: StageParameters) -> StageConstraints | None:
         """Constraints of stages with given parameters, whose further numbers are their multipliers."""
         if not self.is_constrained:
             return None
-        path, terminal, kernels = path_rows(self.scene), terminal_rows(self.scene), self.kernels
+        path, terminal, kernels = penalized_rows(self.scene), terminal_rows(self.scene), self.kernels
+        which = [not row.is_rate for row in path_rows(self.scene)]
         reserve = self._reserve * np.array([0.0 if row.is_equality else row.tolerance for row in terminal])
 
         def residuals(states: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
             rows, along = parameters.rows, np.zeros((len(controls), 0))
             if path:
-                along = kernels.constraints(states[:-1], controls, p=rows[:-1])
+                along = kernels.constraints(states[:-1], controls, p=rows[:-1])[:, which]
             at_end = kernels.terminal_constraints(states[-1], p=rows[-1])
             at_end = at_end + [row.margin for row in terminal] + reserve
             return along + [row.margin for row in path], at_end
@@ -298,7 +325,7 @@ class WindowProblem:
         self.has_second_order = maneuver.has_second_order and not self.ends_early
         self.n_states, self.n_tangent = maneuver.n_states, maneuver.n_tangent
         self.n_controls, self.has_mixed_cost = maneuver.n_controls, maneuver.has_mixed_cost
-        self.time_step = maneuver.time_step
+        self.time_step, self.rate_limits = maneuver.time_step, maneuver.rate_limits
         self.initial_state: FloatArray = maneuver.initial_state
 
     @property

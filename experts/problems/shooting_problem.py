@@ -34,7 +34,7 @@ serves guesses of the states, and only problems with `has_retraction` need it.
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -118,6 +118,25 @@ class StageParameters:
             yield
         finally:
             self.rows[:] = present
+
+
+class RateLimits(NamedTuple):
+    """Limits of how much m of the controls change from stage to stage: |u - x| <= change, x in the state.
+
+    A problem with such limits has an attribute `rate_limits`, and keeps a control in its state for a stage.
+    """
+
+    controls: NDArray[np.int64]  # their indices, shape (m,)
+    states: NDArray[np.int64]  # indices of their previous values in the state, shape (m,)
+    tangents: NDArray[np.int64]  # the same in tangent coordinates, in which they are flat, shape (m,)
+    change: FloatArray  # largest change, units of the controls, shape (m,)
+
+
+def rate_limits(problem: "ShootingProblem") -> RateLimits:
+    """Limits of a problem; of no control where it has none."""
+    none = np.zeros(0, np.int64)
+    found: RateLimits = getattr(problem, "rate_limits", RateLimits(none, none, none, np.zeros(0)))
+    return found
 
 
 class Kernel(Protocol):
@@ -248,6 +267,13 @@ def stage_bounds(problem: ShootingProblem) -> tuple[FloatArray, FloatArray]:
     bounds = (problem.control_lower, problem.control_upper)
     lower, upper = (np.array(np.broadcast_to(bound, shape), dtype=np.float64) for bound in bounds)
     return lower, upper
+
+
+def within_rates(control: FloatArray, previous: FloatArray, limits: RateLimits) -> FloatArray:
+    """Move a control, (n_u,), in place to where its previous values, (m,), let it be; return its own."""
+    near = np.clip(control[limits.controls], previous - limits.change, previous + limits.change)
+    control[limits.controls] = near
+    return near
 
 
 def check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:

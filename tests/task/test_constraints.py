@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dq_space_arm_env import SceneError, compile_scene, load_scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.kernels.library import PENALIZED
-from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
+from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows
 from dq_space_arm_env.scene.constraints import Volume
 from dq_space_arm_env.task.constraint_residuals import _Segment, _segment_distance
 
@@ -54,6 +54,7 @@ KINDS = {
         "keeps_clear": {"frame": "target", "radius": 0.3},
     },
     "momentum": {"linear": 3.0, "angular": 2.0, "energy": 1.5},
+    "control_rate": {"base_force": [1, math.inf, 2], "wrist_rate": 0.3},
     "terminal": {
         "exact": ["pose", "twist", "base_velocity", "linear_momentum", "angular_momentum"],
     },
@@ -121,7 +122,7 @@ def test_derivatives_of_the_augmented_lagrangian(scene):
     kernels = compile_scene(scene())
     n_t, n_u, rng = kernels.n_t, kernels.n_u, np.random.default_rng(3)
     x, u, p = random_point(kernels, 3)
-    count = max(len(path_rows(kernels.scene)), len(terminal_rows(kernels.scene)))
+    count = n_multipliers(kernels.scene)
     parameters = np.concatenate([p, rng.uniform(0.1, 1.0, count), rng.uniform(1.0, 5.0, count)])
 
     def call(name, **inputs):
@@ -273,10 +274,13 @@ MISTAKES = [
     ({"kind": "wheel_momentum", "capacity": 1.0}, "thrusters change the total momentum"),
     ({"kind": "terminal", "exact": []}, "must list at least one quantity"),
     ({"kind": "plume", "observed": 1.0}, "is not observed"),
+    ({"kind": "control_rate"}, "must limit at least one of base_force"),
+    ({"kind": "control_rate", "wrist_rate": 0.0}, "each greater than 0"),
+    ({"kind": "control_rate", "joint_torque": 1.0, "observed": 1.0}, "is not observed"),
     ({"kind": "approach_corridor", "tolerance": 0.0}, "must be a finite number greater than 0"),
     ({"kind": "approach_corridor", "marign": 0.1}, "unknown key; did you mean"),
 ]
-WITHOUT_DEFAULTS = ("joint_limits", "momentum")
+WITHOUT_DEFAULTS = ("joint_limits", "momentum", "control_rate")
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES)

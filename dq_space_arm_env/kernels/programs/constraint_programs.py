@@ -21,7 +21,10 @@ Matrix = Any
 
 
 def constraint_residuals(
-    equations: SceneEquations, x: Scalars, u: Scalars | None
+    equations: SceneEquations,
+    x: Scalars,
+    u: Scalars | None,
+    of_path: Callable[..., list[Scalar]] = path_residuals,
 ) -> tuple[list[Scalar], Matrix, Matrix]:
     """Residuals as functions of tangent state and input around x and u, those symbols, and their values.
 
@@ -29,6 +32,7 @@ def constraint_residuals(
         equations: The scene's.
         x: State, n_x scalars.
         u: Input, n_u scalars; None for the rows at the end, of a tangent state alone.
+        of_path: Which of the path's rows.
 
     Returns:
         The residuals, the column of symbols, and the column of their values.
@@ -41,7 +45,7 @@ def constraint_residuals(
         return terminal_residuals(equations, *moved), column(*z), values
     w = symbols("w", field.n_u)
     values = casadi.densify(column(*[0.0] * field.n_t, *u))
-    return path_residuals(equations, *moved, w), column(*z, *w), values
+    return of_path(equations, *moved, w), column(*z, *w), values
 
 
 class ConstraintPrograms:

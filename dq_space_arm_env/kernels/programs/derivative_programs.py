@@ -26,9 +26,10 @@ from dq_space_arm_env.integrators.method import (
     program_inputs,
 )
 from dq_space_arm_env.kernels.programs.constraint_programs import constraint_residuals
-from dq_space_arm_env.kernels.programs.stage_programs import stage_method, with_catch
-from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
+from dq_space_arm_env.kernels.programs.stage_programs import of_stage, stage_method
+from dq_space_arm_env.scene.constraint_rows import penalized_rows, terminal_rows
 from dq_space_arm_env.task.augmented_lagrangian import PenalizedEquations
+from dq_space_arm_env.task.constraint_residuals import penalized_residuals
 from dq_space_arm_env.task.equations import SceneEquations
 
 Scalar = Any
@@ -121,8 +122,8 @@ class DerivativePrograms:
 
         Those of the path's rows; without input those of the rows at the end, by the tangent state.
         """
-        residuals, moved, values = constraint_residuals(equations, x, u)
-        rows = terminal_rows(self.scene) if u is None else path_rows(self.scene)
+        residuals, moved, values = constraint_residuals(equations, x, u, penalized_residuals)
+        rows = terminal_rows(self.scene) if u is None else penalized_rows(self.scene)
         penalties = equations.penalized(rows, residuals)
         slopes = casadi.densify(column(*(each.slope for each in penalties)))
         jacobian, factor = casadi.jacobian(column(*residuals), moved), symbols("factor", len(rows))
@@ -139,7 +140,7 @@ class DerivativePrograms:
         """Gradients and Hessians by tangent state and input of what only some stage costs have."""
         for cost in self._twist_costs():
             yield self._twist_cost_derivatives(x, u, cost, exact=exact)
-        if isinstance(self.equations, PenalizedEquations) and path_rows(self.scene):
+        if isinstance(self.equations, PenalizedEquations) and penalized_rows(self.scene):
             yield self._penalty_derivatives(self.equations, x, u, exact=exact)
 
     def _further_terminal_terms(
@@ -236,7 +237,7 @@ class DerivativePrograms:
         if not isinstance(method, TwiceDifferentiableIntegrator):
             name = integrator or self.scene.simulation.integrator
             raise ValueError(f"integrator: {name!r} has no second derivatives, which this asks for")
-        method = with_catch(self.equations, method)
+        method = of_stage(self.equations, method)
         field = self.field
         buffers = [Buffer("x", field.n_x), Buffer("u", field.n_u), Buffer("multiplier", field.n_t)]
         buffers.append(Buffer("h", 1, shared=True))

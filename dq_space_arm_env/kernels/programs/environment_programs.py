@@ -14,6 +14,7 @@ from typing import Any
 from dq_space_arm_env.compiler.graph import Graph, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.integrators import checked_integrator_of, integrator_of
+from dq_space_arm_env.integrators.actuated import actuated
 from dq_space_arm_env.integrators.method import program_inputs
 from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.parameters import parameters
@@ -99,7 +100,8 @@ class EnvironmentPrograms:
         program.call(trace("inputs_graph", {"action": n_u}, command, parameters=self._parameters))
         program.call(trace("time_step_graph", {}, lambda: {"h": [simulation.dt]}))
         method = checked_integrator_of(simulation, integrator)
-        (method or integrator_of(simulation, integrator)).append_step(program, equations.field)
+        stepper = actuated(method or integrator_of(simulation, integrator), equations.field)
+        stepper.append_step(program, equations.field)
         sizes = {"x": n_x, "x_next": n_x, "u": n_u, "memory": n_memory}
         sizes |= ({"checked_error": 1} if method else {}) | following
         report = trace("report_graph", sizes, partial(episode.step, equations), parameters=self._parameters)

@@ -17,14 +17,14 @@ from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators import checked_integrator_of
-from dq_space_arm_env.integrators.dormand_prince import append_measured_step
+from dq_space_arm_env.integrators.actuated import append_measured_step
 from dq_space_arm_env.integrators.method import MomentumIntegrator, program_inputs
 from dq_space_arm_env.kernels.programs.constraint_programs import ConstraintPrograms
 from dq_space_arm_env.kernels.programs.derivative_programs import DerivativePrograms
 from dq_space_arm_env.kernels.programs.parameter_programs import ParameterPrograms
 from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
 from dq_space_arm_env.kernels.programs.robot_programs import RobotPrograms
-from dq_space_arm_env.kernels.programs.stage_programs import stage_method, with_catch
+from dq_space_arm_env.kernels.programs.stage_programs import of_stage, stage_method
 from dq_space_arm_env.scene.parameters import moving_numbers
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.task.augmented_lagrangian import PenalizedEquations
@@ -255,7 +255,8 @@ class ScenePrograms:
     def _state_from_observation(self) -> Program:
         field, state = self.field, self.layout.state
         n_pose = len(field.pose.stored)
-        parts = (state.base_velocity, state.joint_angles, state.wrist_angles, state.joint_rates)
+        angles = (state.joint_angles, state.wrist_angles)
+        parts = (state.base_velocity, *angles, state.joint_rates, state.actuators)
 
         def outputs(observation: Scalars) -> Mapping[str, Scalars]:
             x: list[Scalar] = [0.0] * field.n_x
@@ -285,7 +286,7 @@ class ScenePrograms:
         if name == "checked_step":
             checked = checked_integrator_of(self.scene.simulation, integrator)
             assert checked is not None  # `Kernels.checked_step` refuses it
-            method = with_catch(self.equations, checked)
+            method = of_stage(self.equations, checked)
         method.append_step(program, field)
         if name == "checked_step":
             program.outputs = [*program.outputs, Buffer("checked_error", 1)]

@@ -185,6 +185,19 @@ def _piece(
 
 def _step(equations: SceneEquations, x: Any, u: Any, multiplier: Any) -> tuple[Any, Any, Any]:
     """A step, its Jacobian by (x, u), and the Hessian of multiplier . step."""
+    kept, n = list(equations.layout.previous_controls), equations.layout.of_motion.n_x
+    motion, by_both, twice = _motion_step(equations, x[:n], u, multiplier[:n])
+    # Previous controls, the last entries of the state, move nothing, and follow from the input.
+    size, places = x.numel() + u.numel(), [*range(n), *range(x.numel(), x.numel() + u.numel())]
+    jacobian, hessian = casadi.SX(x.numel(), size), casadi.SX(size, size)
+    jacobian[:n, places], hessian[places, places] = by_both, twice
+    for row, control in enumerate(kept, n):
+        jacobian[row, x.numel() + control] = 1.0
+    return casadi.vertcat(motion, u[kept]), jacobian, hessian
+
+
+def _motion_step(equations: SceneEquations, x: Any, u: Any, multiplier: Any) -> tuple[Any, Any, Any]:
+    """The same of the motion alone."""
     if equations.scene.simulation.integrator == "rk4":
         rates = _rates(equations)
         return _runge_kutta_step(rates, x, u, multiplier, equations.scene.simulation.dt)
@@ -194,8 +207,8 @@ def _step(equations: SceneEquations, x: Any, u: Any, multiplier: Any) -> tuple[A
 
 
 def _rates(equations: SceneEquations) -> Any:
-    """Time derivative of the stored state, a function of (x, u)."""
-    field = equations.field
+    """Time derivative of the stored motion, a function of (x, u)."""
+    field = equations.field.of_motion
     x, u = casadi.SX.sym("x", field.n_x), casadi.SX.sym("u", field.n_u)
     stored = field.n_x - field.n_y
     others = field.rates(casadi.vertsplit(x[stored:]), casadi.vertsplit(u))
@@ -214,7 +227,7 @@ def _pose_rates(equations: SceneEquations, pose: Any, y: Any) -> Any:
 
 def _euler_step(equations: SceneEquations, x: Any, u: Any) -> Any:
     """Symplectic Euler: new velocities, then all else with them."""
-    field, h = equations.field, equations.scene.simulation.dt
+    field, h = equations.field.of_motion, equations.scene.simulation.dt
     stored, inputs = field.n_x - field.n_y, casadi.vertsplit(u)
     velocities = list(field.rate_indices)
     others = [i for i in range(field.n_y) if i not in set(velocities)]

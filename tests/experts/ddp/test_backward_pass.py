@@ -110,6 +110,40 @@ def test_agrees_with_the_formulas(
     np.testing.assert_allclose(update.Vxx, Vxx, atol=1e-8 * np.abs(Vxx).max())
 
 
+def test_clamped_inputs_follow_what_bounds_them() -> None:
+    """Bounds that move with a state one to one: the others respond, and the value function knows."""
+    horizon, n_tangent, n_controls = 15, 7, 4
+    d = random_derivatives(9, horizon, n_tangent, n_controls)
+    rng = np.random.default_rng(2)
+    controls, bound = rng.uniform(-0.2, 0.2, d.lu.shape), np.full(d.lu.shape, 0.25)
+    follows = rng.integers(-1, n_tangent, (horizon, 2, n_controls))
+    update = allocate_update(horizon, n_tangent, n_controls)
+    work = pass_workspace(n_tangent, n_controls)._replace(follows=follows)
+    hessians = gauss_newton_hessians(d)
+    backward_pass(d, hessians, NO_GAPS, controls, -bound, bound, 0.0, update, work)
+    Vx, Vxx = d.terminal_lx[0], hessians.terminal_xx[0]
+    followed = 0
+    for stage in range(horizon - 1, -1, -1):
+        A, B = d.A[stage], d.B[stage]
+        Qx, Qu, Qxx = d.lx[stage] + A.T @ Vx, d.lu[stage] + B.T @ Vx, d.lxx[stage] + A.T @ Vxx @ A
+        Quu, Qux = d.luu[stage] + B.T @ Vxx @ B, d.lux[stage] + B.T @ Vxx @ A
+        k, K = update.k[stage], np.zeros((n_controls, n_tangent))
+        at_bound = np.isclose(np.abs(controls[stage] + k), 0.25, atol=1e-12)
+        for i in np.flatnonzero(at_bound):
+            t = follows[stage, 0 if k[i] < 0.0 else 1, i]
+            K[i, t] = 1.0 if t >= 0 else 0.0
+            followed += t >= 0
+        free = np.ix_(~at_bound, ~at_bound)
+        right = Qux[~at_bound] + Quu[np.ix_(~at_bound, at_bound)] @ K[at_bound]
+        K[~at_bound] = -np.linalg.solve(Quu[free], right)
+        np.testing.assert_allclose(update.K[stage], K, atol=1e-9)
+        Vx = Qx + K.T @ Quu @ k + K.T @ Qu + Qux.T @ k
+        Vxx = Qxx + K.T @ Quu @ K + K.T @ Qux + Qux.T @ K
+    assert followed > 10
+    np.testing.assert_allclose(update.Vx, Vx, atol=1e-9 * np.abs(Vx).max())
+    np.testing.assert_allclose(update.Vxx, Vxx, atol=1e-9 * np.abs(Vxx).max())
+
+
 def random_hessians(d: Derivatives, seed: int) -> Hessians:
     """Symmetric blocks that no Gauss-Newton model has: mixed ones, and indefinite ones of the state."""
     rng = np.random.default_rng(seed)

@@ -3,7 +3,7 @@ import pytest
 
 from dq_space_arm_env.kernels.bound import buffer_table
 from experts.ddp.rollout import FINISHED, NO_RETRACTION, closed_loop_rollout, rollout
-from experts.problems.shooting_problem import stage_bounds
+from experts.problems.shooting_problem import rate_limits, stage_bounds
 
 
 class Arrays:
@@ -56,6 +56,7 @@ class Arrays:
             deviations,
             self.stage_costs,
             self.terminal_cost,
+            rate_limits(self.problem),
         )
 
 

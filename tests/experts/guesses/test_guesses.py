@@ -9,6 +9,7 @@ import pytest
 import dq_space_arm_env  # noqa: F401 - registers the environment
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
+from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.start import (
     draw_initial_state,
     episode_scene,
@@ -23,6 +24,7 @@ from experts.guesses.initial_guesses import STRAYED, ZERO_REGULARIZATION
 from experts.guesses.other_side import other_side
 from experts.guesses.policies import coarsened, follow, refined
 from experts.guesses.screw_motion import ScrewMotion
+from experts.problems.arm_problem import ArmProblem
 from scripts.benchmarks.solvers.runs import roll_out
 
 ELSEWHERE = np.array([0.6, 0.8, -0.2, 0.7])  # another start of the unicycle
@@ -349,16 +351,33 @@ def test_a_second_guess_helps_where_the_first_does_not_converge():
 
 def test_a_policy_in_longer_steps_is_itself_again_in_the_shorter_ones(paper):
     problem, solution = paper.problem, BoxDDP(paper.problem, max_iterations=3).solve()
-    coarse = coarsened(solution, 8)
+    longer = problem.coarsened(8)
+    coarse = coarsened(solution, longer)
     fine = refined(coarse, problem)
     assert coarse.states.shape == (126, problem.n_states)
     assert fine.states.shape == solution.states.shape
-    again = coarsened(fine, 8)
+    again = coarsened(fine, longer)
     for name in ("states", "controls", "feedback_gains", "parameters"):
         np.testing.assert_allclose(getattr(again, name), getattr(coarse, name), rtol=1e-14, atol=1e-14)
     # Between its own states the policy stays close to the solution's.
     position = problem.kernels.layout.state.joint_angles
     assert np.abs(fine.states[:, position] - solution.states[:, position]).max() < 5e-3
+
+
+def test_limited_controls_change_evenly_in_the_shorter_steps():
+    """A change that a long step may have is within the limits of its short ones."""
+    rates = {"kind": "control_rate", "name": "slew", "joint_torque": 2.0}
+    scene = load_scene("planar").replace(constraints=[rates], simulation={"steps": 80, "dt": 0.05})
+    problem, layout = ArmProblem(scene), StateLayout.of(scene)
+    coarse = problem.coarsened(8)
+    np.testing.assert_allclose(coarse.rate_limits.change, 8.0 * problem.rate_limits.change, rtol=1e-14)
+    policy = refined(BoxDDP(coarse, max_iterations=5).solve(), problem)
+    trial = follow(policy, problem, policy.states[0])
+    for states, controls in ((policy.states, policy.controls), (trial.states, trial.controls)):
+        kept = controls[:, layout.previous_controls]
+        np.testing.assert_array_equal(states[1:, layout.state.actuators], kept)
+        change = np.abs(np.diff(kept, axis=0, prepend=states[:1, layout.state.actuators]))
+        assert change.max() == pytest.approx(0.1, rel=1e-9)
 
 
 def resting_cost(problem, start):

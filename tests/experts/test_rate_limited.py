@@ -1,0 +1,84 @@
+"""The expert where rates of controls are limited: exactly within them, and as good as another method."""
+
+import numpy as np
+import pytest
+
+from dq_space_arm_env import DQSpaceArmEnv, load_scene
+from experts import BoxDDP, GuidedDDP, RecedingHorizonExpert
+from experts.problems.arm_problem import ArmProblem
+from scripts.benchmarks.peers.interior_point_peer import InteriorPoint
+
+PLAIN = load_scene("planar").replace(simulation={"steps": 200, "dt": 0.075})
+RATES = {"kind": "control_rate", "name": "slew", "base_torque": 20.0, "joint_torque": 5.0}
+LIMITED = PLAIN.replace(constraints=[RATES])
+
+
+def changes(solution, problem):
+    """Largest change of each control that the state keeps, relative to its limit."""
+    layout = problem.kernels.layout
+    previous = solution.states[:-1, layout.state.actuators]
+    change = np.abs(solution.controls[:, layout.previous_controls] - previous)
+    np.testing.assert_array_equal(
+        solution.states[1:, layout.state.actuators], solution.controls[:, layout.previous_controls]
+    )
+    return change.max(axis=0) / problem.rate_limits.change
+
+
+def test_maneuver_keeps_to_the_rates():
+    plain, solver = BoxDDP(PLAIN).solve(), BoxDDP(LIMITED)
+    problem = solver.problem
+    assert isinstance(problem, ArmProblem)
+    solution = solver.solve()
+    assert solution.converged
+    assert solution.iterations <= 110
+    found = changes(solution, problem)
+    assert found.max() <= 1.0 + 1e-12
+    assert found[1:].min() > 1.0 - 1e-12  # the motors meet their limits
+    assert solution.cost > 1.001 * plain.cost
+    assert problem.kernels.constraints(solution.states[:-1], solution.controls).max() <= 1e-12
+    # Whatever the guess, the first rollout keeps to the rates too.
+    solver.max_iterations = 1
+    assert changes(solver.solve(u_init=plain.controls), problem).max() <= 1.0 + 1e-12
+
+
+def test_interior_point_method_finds_the_same_maneuver():
+    scene = LIMITED.replace(simulation={"steps": 50, "dt": 0.3})
+    problem = ArmProblem(scene)
+    solution = BoxDDP(problem, tolerance=1e-10).solve()
+    run = InteriorPoint(problem).solve(u_init=solution.controls, x_init=solution.states)
+    assert run.converged
+    assert run.replayed_cost == pytest.approx(solution.cost, rel=1e-6)
+    np.testing.assert_allclose(run.controls, solution.controls, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_guided_solver_flies_in_the_environment():
+    """Long steps may change controls more; their policy is followed within the limits of short ones."""
+    wrist = {"kind": "control_rate", "name": "wrist", "wrist_rate": 10.0}
+    scene = load_scene("paper").replace(constraints=[wrist])
+    solver, env = GuidedDDP(scene), DQSpaceArmEnv(scene)
+    assert solver.coarsening == (8,)
+    assert solver.solve().cost == pytest.approx(1461.0639, rel=1e-6)
+    for seed in (2, 3):
+        env.reset(seed=seed)
+        solution = solver.solve(env.state)
+        assert solution.converged
+        assert solution.iterations <= 20
+        assert changes(solution, solver.problem).max() <= 1.0 + 1e-12
+        policy, charge = solution.policy(), 0.0
+        for k in range(scene.simulation.steps):
+            *_, info = env.step(env.kernels.layout.to_action(policy(env.state, k)))
+            charge += info["cost"]
+        assert info["is_success"]
+        assert charge <= 1e-9
+
+
+def test_receding_horizon_keeps_to_the_rates():
+    env, expert = DQSpaceArmEnv(LIMITED), RecedingHorizonExpert(LIMITED, horizon=30)
+    env.reset(seed=4)
+    charge = 0.0
+    for _ in range(LIMITED.simulation.steps):
+        *_, info = env.step(expert(env.state))
+        charge += info["cost"]
+    assert info["is_success"]
+    assert charge <= 1e-9
