@@ -20,7 +20,7 @@ from dq_space_arm_env.scene.constraints import (
     WheelMomentum,
     per_link,
 )
-from dq_space_arm_env.scene.parameters import CONTROL_UNITS, control_numbers
+from dq_space_arm_env.scene.parameters import control_numbers
 from dq_space_arm_env.scene.pose import PLANAR_TWIST
 
 Scene = Any  # `schema.Scene`
@@ -229,7 +229,7 @@ def rate_limits(scene: Scene, each: ControlRate) -> list[RateLimit]:
             axis = number.limit.paths[0].rpartition(".")[2]
             rate = given[int(axis)] if isinstance(given, tuple) else given
             if rate is not None and math.isfinite(rate):
-                found.append(RateLimit(index, number.name, CONTROL_UNITS[field], rate))
+                found.append(RateLimit(index, number.name, number.limit.unit, rate))
             index += 1
     return found
 
