@@ -81,7 +81,7 @@ def test_completion_loads_nothing_heavy_and_knows_the_names() -> None:
         assert result.stderr == "[]\n"
         return result.stdout
 
-    assert completed("dq-space-arm solve pl", 2) == "plain,planar\n"
+    assert completed("dq-space-arm solve pla", 2) == "plain,planar\n"
     assert "plain,gains" in completed("dq-space-arm simulate paper --policy ", 4)
     assert (
         completed("dq-space-arm train pp", 2)
