@@ -34,10 +34,8 @@ COMPLEMENTARITY = 1e-7
 """Largest sum of |l c| at the end of a solve, relative to the cost, or to 1 if that is larger."""
 STATIONARITY = 1e-12
 """Predicted reduction, relative to the cost, below which multipliers are slopes of the penalties."""
-FIRST_SHARE = 2e-2
-"""Share of the cost that the first penalties of a row c <= 0 add, over all stages."""
-FIRST_MULTIPLIERS = (1e-2, 1.0)
-"""Least and greatest first multiplier of such a row."""
+FIRST_MULTIPLIER = 1.0
+"""First multiplier of a row c <= 0."""
 LEAST_MULTIPLIER = 1e-9
 """Least multiplier of such a row: zero would stay zero. Where a solve is judged it counts as zero."""
 LEAST_WARM_MULTIPLIER = 1e-2
@@ -112,15 +110,11 @@ class AugmentedLagrangian:
         self.constraints.multipliers[:], self.constraints.penalties[:] = 0.0, 0.0
         self.counts, self.near = False, BEGIN
 
-    def begin(self, states: FloatArray, controls: FloatArray, cost: float) -> None:
-        """Let the rows count, from a trajectory, states (N + 1, n_x) and controls (N, n_u), and its cost."""
-        violations = np.where(self._inequalities, self.constraints.find(states, controls), 0.0).clip(min=0.0)
-        added = (violations + 0.5 * FIRST_PENALTY * violations**2).sum(axis=0)  # with multipliers 1
-        share = FIRST_SHARE * abs(cost)
-        first = np.clip(share / np.maximum(added, share), *FIRST_MULTIPLIERS)
-        self.begin_with(np.zeros_like(self.constraints.multipliers), least=first)
+    def begin(self) -> None:
+        """Let the rows count."""
+        self.begin_with(np.zeros_like(self.constraints.multipliers), least=FIRST_MULTIPLIER)
 
-    def begin_with(self, multipliers: FloatArray, least: FloatArray | float = LEAST_WARM_MULTIPLIER) -> None:
+    def begin_with(self, multipliers: FloatArray, least: float = LEAST_WARM_MULTIPLIER) -> None:
         """Let the rows count, with the multipliers of a similar maneuver, shape (N + 1, m)."""
         present, penalties = self.constraints.multipliers, self.constraints.penalties
         least, penalty = (LEAST_MULTIPLIER, WEAK_PENALTY) if self.is_at_end else (least, FIRST_PENALTY)

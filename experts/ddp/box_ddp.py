@@ -160,7 +160,6 @@ class BoxDDP:
         state.moved = True
         if multipliers is not None:
             state.switch.request_exact()
-            self._count_rows(multipliers)
         try:
             while stop is None:
                 stop = self._iterate(state, callback)
@@ -180,13 +179,8 @@ class BoxDDP:
         check_array("multipliers", multipliers, lagrangian.constraints.multipliers.shape)
         if multipliers.any():
             lagrangian.begin_with(multipliers)
-
-    def _count_rows(self, multipliers: FloatArray) -> None:
-        """Let the rows count from the first trajectory on, where their multipliers are not known."""
-        if self._constrained is not None and not multipliers.any():
-            current = self._work.current
-            self._constrained.lagrangian.begin(current.states, current.controls, current.cost)
-            self._work.evaluate_anew()
+        else:
+            lagrangian.begin()
 
     def _iterate(self, state: SolverState, callback: Callback | None) -> Stop | None:
         """Run one iteration; return why the solve ends, or None to continue."""

@@ -10,8 +10,8 @@ from experts.ddp.backward_pass import PASS_NOT_POSITIVE_DEFINITE, PassResult
 from experts.ddp.second_order import EXACT_MU, Regularization, SecondOrder, SolverState
 from experts.ddp.shooting import ShootingWorkspace
 
-STIFF_EXACT_MU = (1e-3, 1e1)
-"""The same where rows of stages count: fewer passes, and no step that is held back along their surface."""
+STIFF_EXACT_MU = (1e-3, 1e-1, 1e1)
+"""Regularizations with which the hybrid tries the exact model where rows of stages count."""
 
 
 class Directions:

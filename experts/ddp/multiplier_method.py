@@ -73,7 +73,7 @@ class MultiplierMethod:
         work, lagrangian = self._work, self.lagrangian
         begins = not lagrangian.counts
         if begins:
-            lagrangian.begin(work.current.states, work.current.controls, work.current.cost)
+            lagrangian.begin()
             state.switch.request_exact()
         if lagrangian.is_at_end:
             response = end_response(work, lagrangian.constraints, exact=self._directions.has_exact)
