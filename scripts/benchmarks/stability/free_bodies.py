@@ -50,7 +50,13 @@ class _Joint:
 
 
 def free_bodies(sample: Sample) -> Solution:
-    """Solve for the accelerations of base and joints and for the reactions of the joints."""
+    """Solve for the accelerations of base and joints and for the reactions of the joints.
+
+    Raises:
+        ValueError: If a joint slides: Pinocchio is the reference of those.
+    """
+    if not all(link.joint_type == "revolute" for link in sample.scene.links):
+        raise ValueError(f"scene {sample.scene.name!r} has a joint that slides; these all turn")
     with mpmath.workdps(DIGITS):
         bodies, joints = _cut_free(sample)
         return _solved(sample, bodies, joints)
