@@ -246,9 +246,9 @@ class GuidedDDP:
         self, attempts: Sequence[Attempt], start: FloatArray, callback: Callback | None
     ) -> list[Attempt]:
         """Solve on the other side of an obstacle that is in the way of the best solution so far, if any."""
-        best = best_solution(attempts, self.problem, self._is_good)
         if not self._has_constraints or not isinstance(self.problem, ArmProblem):
             return []
+        best = best_solution(attempts, self.problem, self._is_good)
         motion = other_side(self.problem, best)
         if motion is None:
             return []
