@@ -36,6 +36,7 @@ CASES = {
     "pose": ([POSE], 1422.2509),
     "all": ([LIMITS, BALL, POSE], 1447.8408),
 }
+MOST_ITERATIONS = {"limits": 35, "ball": 50, "pose": 12, "all": 60}
 FREE = 1422.18983
 CONSTRAINED = (
     "approach-corridor",
@@ -62,6 +63,16 @@ def solved(request, free):
     none = np.zeros_like(problem.constraints.multipliers)
     solution = BoxDDP(problem, initial_regularization=1e-3).solve(u_init=free.controls, multipliers=none)
     return problem, solution, cost
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_minimum_from_the_unconstrained_one(case, free):
+    constraints, cost = CASES[case]
+    problem = ArmProblem(load_scene("paper").replace(constraints=constraints))
+    solution = BoxDDP(problem, initial_regularization=1e-3).solve(u_init=free.controls)
+    assert solution.converged, solution.message
+    assert solution.cost == pytest.approx(cost, rel=1e-6)
+    assert solution.iterations <= MOST_ITERATIONS[case]
 
 
 def test_minimum(solved):
