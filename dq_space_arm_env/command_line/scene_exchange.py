@@ -17,7 +17,7 @@ import numpy as np
 from dq_space_arm_env import Scene, SceneError, load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.interoperability.exporting import joint_limits
 from dq_space_arm_env.interoperability.urdf_elements import read_robot
 from dq_space_arm_env.scene import Simulation
@@ -135,7 +135,7 @@ def _way(scene: Scene) -> tuple[float, float]:
     """Attitude [deg] and distance [m] from the tip at the start to the target."""
     start = scene.initial_state
     base = start.base_pose.dual_quaternion
-    tip = kinematics.tip_pose(Chain.from_scene(scene), base, start.joint_angles, start.wrist_angles)
+    tip = kinematics.tip_pose(KinematicTree.from_scene(scene), base, start.joint_angles, start.wrist_angles)
     target = np.atleast_2d(shown_target(scene)[0])[0]
     way = dual_quaternion.multiply(dual_quaternion.conjugate(tip), tuple(target.tolist()))
     rotation, position = poses.to_rotation_and_position(way)

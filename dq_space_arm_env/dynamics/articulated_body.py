@@ -35,7 +35,7 @@ from dq_space_arm_env.algebra.vectors import (
     transpose,
     transposed_matrix_vector,
 )
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody, Screw
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody, Screw
 from dq_space_arm_env.dynamics.linear import factorize_ldl, solve_ldl
 from dq_space_arm_env.dynamics.minimal import ZERO, Accelerations, LinkFrame, along, shift_wrench
 
@@ -147,12 +147,12 @@ class _Joint:
 class ArticulatedBodies:
     """Articulated inertias of a chain at given joint angles, with the root's factorized."""
 
-    def __init__(self, chain: Chain, frames: Sequence[LinkFrame], root: int = 0) -> None:
+    def __init__(self, tree: KinematicTree, frames: Sequence[LinkFrame], root: int = 0) -> None:
         """Eliminate all joints, from both ends of the chain to its root (0 is the base, i link i)."""
-        self._planar, self._frames, self._root = chain.planar, frames, root
-        screws = [link.screw for link in chain.links]
+        self._planar, self._frames, self._root = tree.planar, frames, root
+        screws = [link.screw for link in tree.links]
         bodies = [
-            ArticulatedInertia.of_body(body) for body in (chain.base, *(link.body for link in chain.links))
+            ArticulatedInertia.of_body(body) for body in (tree.base, *(link.body for link in tree.links))
         ]
         self._joints: dict[int, _Joint] = {}
         # From the base up to the root: the parent is carried by the joint, which turns backward.

@@ -10,8 +10,8 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
 from dq_space_arm_env.dynamics import minimal
-from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of, reaction_wrenches
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
 from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
 from dq_space_arm_env.dynamics.minimal import Accelerations, Wrenches
@@ -51,16 +51,16 @@ class EquationsOfMotion:
 
     def __init__(
         self,
-        chain: Chain,
+        tree: KinematicTree,
         layout: StateLayout,
         parameters: Sequence[Scalar] = (),
         formulation: str | None = None,
     ) -> None:
-        """Lay out the coordinates; `parameters` are symbols among the chain's constants.
+        """Lay out the coordinates; `parameters` are symbols among the tree's constants.
 
         `formulation` is a name that `forward.inertia_of` knows; None takes the fastest.
         """
-        self.chain = chain
+        self.tree = tree
         self._given_formulation = formulation
         self._formulation = formulation or "articulated_body"
         self.parameters = tuple(parameters)
@@ -72,8 +72,8 @@ class EquationsOfMotion:
         twist = self._in_y(layout.state.base_velocity)
         self.rate_indices = (*twist, *self._in_y(layout.state.joint_rates))
         self.pose = PoseCoordinates(
-            stored=PLANAR_POSE if chain.planar else tuple(range(8)),
-            directions=PLANAR_TWIST if chain.planar else tuple(range(6)),
+            stored=PLANAR_POSE if tree.planar else tuple(range(8)),
+            directions=PLANAR_TWIST if tree.planar else tuple(range(6)),
             twist_indices=twist,
         )
 
@@ -100,13 +100,13 @@ class EquationsOfMotion:
 
     def inputs(self, u: Sequence[Scalar]) -> Inputs:
         """Name the parts of u, with zeros for absent actuators."""
-        layout, planar = self.layout, self.chain.planar
+        layout, planar = self.layout, self.tree.planar
         force, torque = list(u[layout.control.base_force]), list(u[layout.control.base_torque])
         torques: list[Scalar] = [0.0] * layout.n_joints
         for joint, value in zip(layout.actuated_joints, u[layout.control.joint_torque], strict=True):
             torques[joint] = value
         wrist = list(u[layout.control.wrist_rate])
-        if not wrist and self.chain.wrist is not None:
+        if not wrist and self.tree.wrist is not None:
             wrist = [0.0, 0.0, 0.0]
         return Inputs(
             force=spread(force, (0, 1) if planar else (0, 1, 2), 3) if force else ZERO,
@@ -117,40 +117,40 @@ class EquationsOfMotion:
 
     def _tip(self, motion: Motion) -> tuple[Any, Any]:
         """Rotation and position of the tip in the last link's frame."""
-        pose: Sequence[Scalar] = self.chain.tip.dual_quaternion
-        if self.chain.wrist is not None:
-            turned = dq.multiply(self.chain.wrist.dual_quaternion, wrist_rotation(motion.wrist_angles))
+        pose: Sequence[Scalar] = self.tree.tip.dual_quaternion
+        if self.tree.wrist is not None:
+            turned = dq.multiply(self.tree.wrist.dual_quaternion, wrist_rotation(motion.wrist_angles))
             pose = dq.multiply(turned, pose)
         return poses.to_matrix(pose)
 
     def tip_forces(self, motion: Motion, frames: Sequence[Any], wrench: Sequence[Scalar] | None) -> Wrenches:
         """Generalized forces of a wrench at the tip, in tip axes; zeros without one."""
-        n = len(self.chain.links)
+        n = len(self.tree.links)
         if wrench is None:
             return Wrenches(ZERO, ZERO, [0.0] * n, [(ZERO, ZERO)] * n)
-        return minimal.tip_wrench_forces(self.chain, frames, *self._tip(motion), wrench)
+        return minimal.tip_wrench_forces(self.tree, frames, *self._tip(motion), wrench)
 
     def _acting(self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None) -> list[Any]:
         """External force and torque on base and links, in their frames."""
-        acting: list[Any] = [(inputs.force, inputs.torque), *[(ZERO, ZERO)] * len(self.chain.links)]
+        acting: list[Any] = [(inputs.force, inputs.torque), *[(ZERO, ZERO)] * len(self.tree.links)]
         if wrench is not None:
             force, torque = minimal.shift_wrench(*self._tip(motion), wrench[:3], wrench[3:])
             acting[-1] = (add(acting[-1][0], force), add(acting[-1][1], torque))
         return acting
 
     def _inertia(self, motion: Motion, *, many: bool = False) -> Inertia:
-        frames = minimal.link_frames(self.chain, motion.joint_angles)
-        return inertia_of(self._formulation, self.chain, frames, many=many)
+        frames = minimal.link_frames(self.tree, motion.joint_angles)
+        return inertia_of(self._formulation, self.tree, frames, many=many)
 
     def _solve(
         self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None, inertia: Inertia
     ) -> Accelerations:
-        return forward_dynamics(self.chain, inertia, *self._driven(motion, inputs, wrench))
+        return forward_dynamics(self.tree, inertia, *self._driven(motion, inputs, wrench))
 
     def _driven(self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None) -> tuple[Any, ...]:
         """Rotations of the joints, angular velocity, joint rates, external wrenches and joint torques."""
-        frames = minimal.link_frames(self.chain, motion.joint_angles)
-        passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
+        frames = minimal.link_frames(self.tree, motion.joint_angles)
+        passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
         torques = [motor + other for motor, other in zip(inputs.joint_torques, passive, strict=True)]
         return frames, motion.angular, motion.joint_rates, self._acting(motion, inputs, wrench), torques
 
@@ -162,7 +162,7 @@ class EquationsOfMotion:
         A `wrench` at the tip, 6 in tip axes, replaces the scene's.
         """
         motion = self.motion(y)
-        wrench = self.chain.tip_wrench if wrench is None else wrench
+        wrench = self.tree.tip_wrench if wrench is None else wrench
         solved = self._solve(motion, self.inputs(u), wrench, self._inertia(motion))
         return self._dual(motion, solved)
 
@@ -174,9 +174,9 @@ class EquationsOfMotion:
 
     def mass_matrix(self, y: Sequence[Scalar]) -> list[list[Scalar]]:
         """Mass matrix by the accelerations (free directions, joints), symmetric."""
-        frames = minimal.link_frames(self.chain, self.motion(y).joint_angles)
-        free = (*self.pose.directions, *range(6, 6 + len(self.chain.links)))
-        whole = mass_matrix(self.chain, frames)
+        frames = minimal.link_frames(self.tree, self.motion(y).joint_angles)
+        free = (*self.pose.directions, *range(6, 6 + len(self.tree.links)))
+        whole = mass_matrix(self.tree, frames)
         return [[whole[i][j] for j in free] for i in free]
 
     def bias_forces(self, y: Sequence[Scalar]) -> list[Scalar]:
@@ -185,10 +185,10 @@ class EquationsOfMotion:
         Where v' = 0, an inertial observer sees the acceleration omega x v.
         """
         motion = self.motion(y)
-        frames = minimal.link_frames(self.chain, motion.joint_angles)
-        given = Accelerations(ZERO, cross(motion.angular, motion.linear), [0.0] * len(self.chain.links))
-        needed = minimal.inverse_dynamics(self.chain, frames, motion.angular, motion.joint_rates, given)
-        passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
+        frames = minimal.link_frames(self.tree, motion.joint_angles)
+        given = Accelerations(ZERO, cross(motion.angular, motion.linear), [0.0] * len(self.tree.links))
+        needed = minimal.inverse_dynamics(self.tree, frames, motion.angular, motion.joint_rates, given)
+        passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
         dual = [*needed.torque, *needed.force]
         joints = [bias - other for bias, other in zip(needed.joints, passive, strict=True)]
         return [*(dual[i] for i in self.pose.directions), *joints]
@@ -202,23 +202,23 @@ class EquationsOfMotion:
 
         A prismatic joint transmits fx, fy [N], tx, ty, tz [N m].
         """
-        driven = self._driven(self.motion(y), self.inputs(u), self.chain.tip_wrench)
-        reactions = reaction_wrenches(self.chain, *driven)
+        driven = self._driven(self.motion(y), self.inputs(u), self.tree.tip_wrench)
+        reactions = reaction_wrenches(self.tree, *driven)
         transmitted = [
             (*force, *torque[:2]) if link.screw.turn else (*force[:2], *torque)
-            for link, (force, torque) in zip(self.chain.links, reactions, strict=True)
+            for link, (force, torque) in zip(self.tree.links, reactions, strict=True)
         ]
         return [entry for five in transmitted for entry in five]
 
     def _missing_wrenches(self, motion: Motion, given: Accelerations) -> list[Any]:
         """Force and torque on base and links that given accelerations need besides the tip's wrench."""
-        frames = minimal.link_frames(self.chain, motion.joint_angles)
-        needed = minimal.body_wrenches(self.chain, frames, motion.angular, motion.joint_rates, given)
-        acting = self._acting(motion, Inputs(ZERO, ZERO, [], []), self.chain.tip_wrench)
+        frames = minimal.link_frames(self.tree, motion.joint_angles)
+        needed = minimal.body_wrenches(self.tree, frames, motion.angular, motion.joint_rates, given)
+        acting = self._acting(motion, Inputs(ZERO, ZERO, [], []), self.tree.tip_wrench)
         return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(needed, acting, strict=True)]
 
     def _reactions(self, motion: Motion, solved: Accelerations) -> Sequence[Any]:
         """Force and torque that each joint transmits to its link, in joint axes."""
-        frames = minimal.link_frames(self.chain, motion.joint_angles)
+        frames = minimal.link_frames(self.tree, motion.joint_angles)
         missing = self._missing_wrenches(motion, solved)
-        return minimal.passed_to_base(self.chain, frames, missing).reactions
+        return minimal.passed_to_base(self.tree, frames, missing).reactions

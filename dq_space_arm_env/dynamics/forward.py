@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from dq_space_arm_env.algebra.vectors import subtract
 from dq_space_arm_env.dynamics.articulated_body import ArticulatedBodies
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 from dq_space_arm_env.dynamics.minimal import ZERO, Accelerations, LinkFrame, body_wrenches
 
@@ -35,23 +35,25 @@ class Inertia(Protocol):
         ...
 
 
-def inertia_of(formulation: str, chain: Chain, frames: Sequence[LinkFrame], *, many: bool = False) -> Inertia:
+def inertia_of(
+    formulation: str, tree: KinematicTree, frames: Sequence[LinkFrame], *, many: bool = False
+) -> Inertia:
     """Inertia in the scene's formulation; `many`: for many right-hand sides, as derivatives have."""
     if formulation == "minimal_coordinates":
-        return MassMatrix(chain, frames)
+        return MassMatrix(tree, frames)
     if formulation != "articulated_body":
         raise ValueError(
             f"formulation: {formulation!r} is unknown; it must be articulated_body or minimal_coordinates"
         )
-    root = chain.heaviest
-    if root == 0 and chain.links and (chain.planar or not many) and not chain.heavy_base:
+    root = tree.heaviest
+    if root == 0 and tree.links and (tree.planar or not many) and not tree.heavy_base:
         # The first link is as good a root, and a faster one but for many right-hand sides in space.
         root = 1
-    return ArticulatedBodies(chain, frames, root)
+    return ArticulatedBodies(tree, frames, root)
 
 
 def forward_dynamics(
-    chain: Chain,
+    tree: KinematicTree,
     inertia: Inertia,
     frames: Sequence[LinkFrame],
     angular_velocity: Vector3,
@@ -60,12 +62,12 @@ def forward_dynamics(
     joints: Sequence[Scalar],
 ) -> Accelerations:
     """Accelerations of a motion under external wrenches (as in `Inertia.accelerations`) and joint torques."""
-    left = _left(chain, frames, angular_velocity, joint_rates, acting)
+    left = _left(tree, frames, angular_velocity, joint_rates, acting)
     return inertia.accelerations(left, joints)
 
 
 def reaction_wrenches(
-    chain: Chain,
+    tree: KinematicTree,
     frames: Sequence[LinkFrame],
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
@@ -77,12 +79,12 @@ def reaction_wrenches(
     Rooted at the heaviest body, whatever the masses: a light base may accelerate a million times faster than
     the link that drives it, and the link's acceleration would be their difference.
     """
-    left = _left(chain, frames, angular_velocity, joint_rates, acting)
-    return ArticulatedBodies(chain, frames, chain.heaviest).reactions(left, joints)
+    left = _left(tree, frames, angular_velocity, joint_rates, acting)
+    return ArticulatedBodies(tree, frames, tree.heaviest).reactions(left, joints)
 
 
 def _left(
-    chain: Chain,
+    tree: KinematicTree,
     frames: Sequence[LinkFrame],
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
@@ -90,9 +92,9 @@ def _left(
 ) -> list[Wrench]:
     """External wrenches, less those that the motion needs at zero acceleration.
 
-    They are subtracted body by body: summed over the chain, what acts on a light body would drown in what a
+    They are subtracted body by body: summed over the tree, what acts on a light body would drown in what a
     heavy one needs.
     """
-    rest = Accelerations(ZERO, ZERO, [0.0] * len(chain.links))
-    needed = body_wrenches(chain, frames, angular_velocity, joint_rates, rest)
+    rest = Accelerations(ZERO, ZERO, [0.0] * len(tree.links))
+    needed = body_wrenches(tree, frames, angular_velocity, joint_rates, rest)
     return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(acting, needed, strict=True)]

@@ -1,4 +1,4 @@
-"""Kinematics of the chain: poses (27) and their rates (30), body velocities, momentum, energy."""
+"""Kinematics of the tree: poses (27) and their rates (30), body velocities, momentum, energy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dq_space_arm_env.algebra.vectors import (
     subtract,
     transposed_matrix_vector,
 )
-from dq_space_arm_env.dynamics.chain import Chain, Screw
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Screw
 from dq_space_arm_env.dynamics.minimal import ZERO, LinkFrame, link_frames, shift_wrench
 
 Scalar = Any
@@ -67,40 +67,48 @@ def wrist_rate_matrix(wrist_angles: Sequence[Scalar]) -> Sequence[Vector3]:
 
 
 def frame_poses(
-    chain: Chain, base_pose: DualQuaternion, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
+    tree: KinematicTree,
+    base_pose: DualQuaternion,
+    joint_angles: Sequence[Scalar],
+    wrist_angles: Sequence[Scalar],
 ) -> list[DualQuaternion]:
     """Poses of base, joint frames, end effector (if any) and tip in the inertial frame: factors of (27)."""
     poses = [base_pose]
-    for link, angle in zip(chain.links, joint_angles, strict=True):
+    for link, angle in zip(tree.links, joint_angles, strict=True):
         joint = dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, angle))
         poses.append(dq.multiply(poses[-1], joint))
-    if chain.wrist is not None:
-        wrist = dq.multiply(chain.wrist.dual_quaternion, wrist_rotation(wrist_angles))
+    if tree.wrist is not None:
+        wrist = dq.multiply(tree.wrist.dual_quaternion, wrist_rotation(wrist_angles))
         poses.append(dq.multiply(poses[-1], wrist))
-    poses.append(dq.multiply(poses[-1], chain.tip.dual_quaternion))
+    poses.append(dq.multiply(poses[-1], tree.tip.dual_quaternion))
     return poses
 
 
 def tip_pose(
-    chain: Chain, base_pose: DualQuaternion, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
+    tree: KinematicTree,
+    base_pose: DualQuaternion,
+    joint_angles: Sequence[Scalar],
+    wrist_angles: Sequence[Scalar],
 ) -> DualQuaternion:
     """Pose of the tip q_{G/I}, eq. (27)."""
-    return dq.multiply(base_pose, arm_pose(chain, joint_angles, wrist_angles))
+    return dq.multiply(base_pose, arm_pose(tree, joint_angles, wrist_angles))
 
 
-def arm_pose(chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]) -> DualQuaternion:
+def arm_pose(
+    tree: KinematicTree, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
+) -> DualQuaternion:
     """Pose of the tip in the base frame, q_{G/e0}: (27) without its first factor."""
-    arm: DualQuaternion = chain.tip.dual_quaternion
-    if chain.wrist is not None:
+    arm: DualQuaternion = tree.tip.dual_quaternion
+    if tree.wrist is not None:
         arm = dq.multiply(wrist_rotation(wrist_angles), arm)
-        arm = dq.multiply(chain.wrist.dual_quaternion, arm)
-    for link, angle in zip(reversed(chain.links), reversed(list(joint_angles)), strict=True):
+        arm = dq.multiply(tree.wrist.dual_quaternion, arm)
+    for link, angle in zip(reversed(tree.links), reversed(list(joint_angles)), strict=True):
         arm = dq.multiply(link.joint.dual_quaternion, dq.multiply(joint_motion(link.screw, angle), arm))
     return arm
 
 
 def tip_pose_rate(
-    chain: Chain,
+    tree: KinematicTree,
     base_pose: DualQuaternion,
     joint_angles: Sequence[Scalar],
     wrist_angles: Sequence[Scalar],
@@ -109,7 +117,7 @@ def tip_pose_rate(
     wrist_rates: Sequence[Scalar],
 ) -> DualQuaternion:
     """Time derivative of q_{G/I}, eq. (30); its last factor is q_{G/e3}, where the paper prints q_{G/3}."""
-    poses = frame_poses(chain, base_pose, joint_angles, wrist_angles)
+    poses = frame_poses(tree, base_pose, joint_angles, wrist_angles)
     tip = poses[-1]
 
     def contribution(frame: DualQuaternion, twist: Sequence[Scalar]) -> DualQuaternion:
@@ -120,17 +128,17 @@ def tip_pose_rate(
     # (30): 1/2 q_{e0/I} w_0 q_{G/e0} + 1/2 sum_i q_{e_i/I} w^{e_i}_{i/e_i} q_{G/e_i}, joint frames for the
     # e_i.
     rate = contribution(base_pose, base_twist)
-    for frame, link, speed in zip(poses[1:], chain.links, joint_rates, strict=False):
+    for frame, link, speed in zip(poses[1:], tree.links, joint_rates, strict=False):
         turn, slide = (part * speed for part in link.screw)
         rate = dq.add(rate, contribution(frame, (0.0, 0.0, turn, 0.0, 0.0, slide)))
-    if chain.wrist is not None:
+    if tree.wrist is not None:
         turning = matrix_vector(wrist_rate_matrix(wrist_angles), wrist_rates)
         rate = dq.add(rate, contribution(poses[-2], (*turning, 0.0, 0.0, 0.0)))
     return rate
 
 
 def tip_jacobian(
-    chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
+    tree: KinematicTree, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
 ) -> list[list[Scalar]]:
     """Columns of the tip's body Jacobian: base (angular, linear), joints, Euler rates of the wrist.
 
@@ -138,13 +146,13 @@ def tip_jacobian(
     frame X.
     """
     columns: list[list[Scalar]] = []
-    relative: DualQuaternion = chain.tip.dual_quaternion  # q_{G/X}, from the tip's side of X = e_n to e0
-    if chain.wrist is not None:
+    relative: DualQuaternion = tree.tip.dual_quaternion  # q_{G/X}, from the tip's side of X = e_n to e0
+    if tree.wrist is not None:
         rates = wrist_rate_matrix(wrist_angles)
         columns = [_carried_to_tip(relative, axis, ZERO) for axis in zip(*rates, strict=True)]
-        wrist = dq.multiply(chain.wrist.dual_quaternion, wrist_rotation(wrist_angles))
+        wrist = dq.multiply(tree.wrist.dual_quaternion, wrist_rotation(wrist_angles))
         relative = dq.multiply(wrist, relative)
-    for link, angle in zip(reversed(chain.links), reversed(list(joint_angles)), strict=True):
+    for link, angle in zip(reversed(tree.links), reversed(list(joint_angles)), strict=True):
         turn, slide = link.screw
         columns.insert(0, _carried_to_tip(relative, (0.0, 0.0, turn), (0.0, 0.0, slide)))
         joint = dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, angle))
@@ -156,7 +164,7 @@ def tip_jacobian(
 
 
 def tip_twist(
-    chain: Chain,
+    tree: KinematicTree,
     joint_angles: Sequence[Scalar],
     wrist_angles: Sequence[Scalar],
     base_twist: Sequence[Scalar],
@@ -167,20 +175,20 @@ def tip_twist(
 
     A fraction of the operations of `tip_jacobian`, half angles shared with the tip's pose.
     """
-    frames = link_frames(chain, joint_angles)
-    for index, (link, angle) in enumerate(zip(chain.links, joint_angles, strict=True)):
+    frames = link_frames(tree, joint_angles)
+    for index, (link, angle) in enumerate(zip(tree.links, joint_angles, strict=True)):
         if link.screw.turn:
             turned = matrix_product(link.joint.rotation, to_matrix(axis_rotation(2, angle))[0])
             frames[index] = frames[index]._replace(rotation=turned)
-    last = body_velocities(chain, frames, base_twist, joint_rates)[-1]
+    last = body_velocities(tree, frames, base_twist, joint_rates)[-1]
     twist: Sequence[Scalar] = (*last.angular, *last.linear)
-    if chain.wrist is not None:
-        twist = inverse_transform(chain.wrist.rotation, chain.wrist.position, twist)
+    if tree.wrist is not None:
+        twist = inverse_transform(tree.wrist.rotation, tree.wrist.position, twist)
         twist = inverse_transform(*to_matrix(wrist_rotation(wrist_angles)), twist)
         if wrist_rates:
             turning = matrix_vector(wrist_rate_matrix(wrist_angles), wrist_rates)
             twist = (*add(twist[:3], turning), *twist[3:])
-    return inverse_transform(chain.tip.rotation, chain.tip.position, twist)
+    return inverse_transform(tree.tip.rotation, tree.tip.position, twist)
 
 
 def _carried_to_tip(relative: DualQuaternion, angular: Vector3, linear: Vector3) -> list[Scalar]:
@@ -199,14 +207,14 @@ class BodyVelocity:
 
 
 def body_velocities(
-    chain: Chain,
+    tree: KinematicTree,
     frames: Sequence[LinkFrame],
     base_twist: Sequence[Scalar],
     joint_rates: Sequence[Scalar],
 ) -> list[BodyVelocity]:
     """Velocities of base and links, n + 1, by the recursion behind (12); `base_twist` in base axes."""
     velocities = [BodyVelocity(tuple(base_twist[:3]), tuple(base_twist[3:]))]
-    for link, (rotation, position), rate in zip(chain.links, frames, joint_rates, strict=True):
+    for link, (rotation, position), rate in zip(tree.links, frames, joint_rates, strict=True):
         parent, (turn, slide) = velocities[-1], link.screw
         linear = transposed_matrix_vector(rotation, add(parent.linear, cross(parent.angular, position)))
         angular = transposed_matrix_vector(rotation, parent.angular)
@@ -219,10 +227,10 @@ def body_velocities(
 
 
 def momentum(
-    chain: Chain, frames: Sequence[LinkFrame], velocities: Sequence[BodyVelocity]
+    tree: KinematicTree, frames: Sequence[LinkFrame], velocities: Sequence[BodyVelocity]
 ) -> tuple[Vector3, Vector3, Vector3]:
     """Linear momentum, angular momentum about the center of mass, and center of mass, in the base frame."""
-    bodies = [chain.base, *(link.body for link in chain.links)]
+    bodies = [tree.base, *(link.body for link in tree.links)]
     linear: list[Vector3] = []
     angular: list[Vector3] = []
     moments: list[Vector3] = []
@@ -233,28 +241,28 @@ def momentum(
         angular.append(add(matrix_vector(body.inertia, velocity.angular), cross(c, p)))
         moments.append(scale(body.mass, c))
     mass: Scalar = 0.0
-    for i in reversed(range(len(chain.links))):
+    for i in reversed(range(len(tree.links))):
         rotation, position = frames[i]
-        mass = mass + chain.links[i].body.mass
+        mass = mass + tree.links[i].body.mass
         linear_at_parent, angular_at_parent = shift_wrench(rotation, position, linear[i + 1], angular[i + 1])
         linear[i] = add(linear[i], linear_at_parent)
         angular[i] = add(angular[i], angular_at_parent)
         moments[i] = add(moments[i], add(matrix_vector(rotation, moments[i + 1]), scale(mass, position)))
-    center = scale(1.0 / (mass + chain.base.mass), moments[0])
+    center = scale(1.0 / (mass + tree.base.mass), moments[0])
     return linear[0], subtract(angular[0], cross(center, linear[0])), center  # L_c = L_O - c x p
 
 
 def energy(
-    chain: Chain, joint_angles: Sequence[Scalar], velocities: Sequence[BodyVelocity]
+    tree: KinematicTree, joint_angles: Sequence[Scalar], velocities: Sequence[BodyVelocity]
 ) -> tuple[Scalar, Scalar]:
     """Kinetic energy and potential energy of the joint springs, J."""
     kinetic: Scalar = 0.0
-    for body, velocity in zip([chain.base, *(link.body for link in chain.links)], velocities, strict=True):
+    for body, velocity in zip([tree.base, *(link.body for link in tree.links)], velocities, strict=True):
         v = add(velocity.linear, cross(velocity.angular, body.center_of_mass))
         rotational = dot(velocity.angular, matrix_vector(body.inertia, velocity.angular))
         kinetic = kinetic + 0.5 * (body.mass * dot(v, v) + rotational)
     potential: Scalar = 0.0
-    for link, angle in zip(chain.links, joint_angles, strict=True):
+    for link, angle in zip(tree.links, joint_angles, strict=True):
         stretch = angle - link.rest_angle
         potential = potential + 0.5 * link.stiffness * (stretch * stretch)
     return kinetic, potential

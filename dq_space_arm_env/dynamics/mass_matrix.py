@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from dq_space_arm_env.algebra.vectors import add, cross, dot, matrix_vector, scale, subtract
-from dq_space_arm_env.dynamics.chain import Chain, Matrix, RigidBody, Screw
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Matrix, RigidBody, Screw
 from dq_space_arm_env.dynamics.linear import LDLFactor, factorize_ldl, solve_ldl
 from dq_space_arm_env.dynamics.minimal import (
     ZERO,
@@ -35,11 +35,11 @@ class MassMatrix:
     over the mass ratio.
     """
 
-    def __init__(self, chain: Chain, frames: Sequence[LinkFrame]) -> None:
+    def __init__(self, tree: KinematicTree, frames: Sequence[LinkFrame]) -> None:
         """Assemble (CRBA, Featherstone tables 6.2 and 9.6) and factorize."""
-        self._chain, self._frames = chain, frames
-        self._axes = (2,) if chain.planar else (0, 1, 2)
-        mass, moment, inertia, columns, joint_block = _composite_bodies(chain, frames)
+        self._tree, self._frames = tree, frames
+        self._axes = (2,) if tree.planar else (0, 1, 2)
+        mass, moment, inertia, columns, joint_block = _composite_bodies(tree, frames)
         self._mass = mass
         self.center = scale(1.0 / mass, moment)
         # Joint columns of the mass matrix in the base frame: force, and torque about the system's center of
@@ -67,7 +67,7 @@ class MassMatrix:
         self, wrenches: Sequence[tuple[Vector3, Vector3]], joints: Sequence[Scalar]
     ) -> Accelerations:
         """See `forward.Inertia`."""
-        total = passed_to_base(self._chain, self._frames, wrenches)
+        total = passed_to_base(self._tree, self._frames, wrenches)
         both = [own + other for own, other in zip(joints, total.joints, strict=True)]
         return self.solve(total.force, total.torque, both)
 
@@ -145,12 +145,12 @@ class MassMatrix:
         return omega, subtract([entry / self._mass for entry in linear], cross(omega, self.center))
 
 
-def mass_matrix(chain: Chain, frames: Sequence[LinkFrame]) -> list[list[Scalar]]:
+def mass_matrix(tree: KinematicTree, frames: Sequence[LinkFrame]) -> list[list[Scalar]]:
     """The mass matrix by (angular, linear, joints), the base's about the origin of its frame, (6 + n, 6 + n).
 
     [J, [d]x, T; [d]x', m E, F; T', F', H] with the first moment d of all bodies and the joints' columns T, F.
     """
-    mass, moment, inertia, columns, joint_block = _composite_bodies(chain, frames)
+    mass, moment, inertia, columns, joint_block = _composite_bodies(tree, frames)
     n = len(columns)
     result: list[list[Scalar]] = [[0.0] * (6 + n) for _ in range(6 + n)]
     for i in range(3):
@@ -202,7 +202,7 @@ def _wrench_along(
 
 
 def _composite_bodies(
-    chain: Chain, frames: Sequence[LinkFrame]
+    tree: KinematicTree, frames: Sequence[LinkFrame]
 ) -> tuple[Scalar, Vector3, Sequence[Vector3], list[tuple[Vector3, Vector3]], list[list[Scalar]]]:
     """Composite mass, first moment, inertia at the base; each joint's column (force, torque); joint block."""
 
@@ -211,24 +211,22 @@ def _composite_bodies(
         inertia: Matrix | list[list[Scalar]] = _shifted_inertia(body.inertia, body.mass, c, ZERO)
         return body.mass, scale(body.mass, c), inertia
 
-    n = len(chain.links)
-    mass, moment, inertia = about_origin(chain.links[-1].body) if n else about_origin(chain.base)
+    n = len(tree.links)
+    mass, moment, inertia = about_origin(tree.links[-1].body) if n else about_origin(tree.base)
     columns: list[tuple[Vector3, Vector3]] = []
     block: list[list[Scalar]] = [[0.0] * n for _ in range(n)]
     for i in reversed(range(n)):
         # A unit acceleration of joint i needs this wrench on the composite body beyond it.
-        column = _wrench_along(chain.links[i].screw, mass, moment, inertia)
-        block[i][i] = along(chain.links[i].screw, *column)
+        column = _wrench_along(tree.links[i].screw, mass, moment, inertia)
+        block[i][i] = along(tree.links[i].screw, *column)
         for ancestor in reversed(range(i)):
             column = shift_wrench(*frames[ancestor + 1], *column)
-            block[ancestor][i] = block[i][ancestor] = along(chain.links[ancestor].screw, *column)
+            block[ancestor][i] = block[i][ancestor] = along(tree.links[ancestor].screw, *column)
         columns.insert(0, shift_wrench(*frames[0], *column))
         rotation, p = frames[i]
         rotated_moment = matrix_vector(rotation, moment)
         shifted = _shifted_inertia(_rotated_inertia(rotation, inertia), mass, p, rotated_moment)
-        parent_mass, parent_moment, parent_inertia = about_origin(
-            chain.links[i - 1].body if i else chain.base
-        )
+        parent_mass, parent_moment, parent_inertia = about_origin(tree.links[i - 1].body if i else tree.base)
         moment = add(parent_moment, add(rotated_moment, scale(mass, p)))
         inertia = [list(add(row, other)) for row, other in zip(parent_inertia, shifted, strict=True)]
         mass = parent_mass + mass

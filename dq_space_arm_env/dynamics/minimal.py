@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from dq_space_arm_env.algebra.scalars import cos, sin
 from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale, transposed_matrix_vector
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody, Screw
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody, Screw
 
 Scalar = Any
 Vector3 = Sequence[Scalar]
@@ -51,10 +51,10 @@ class LinkFrame(NamedTuple):
     position: Vector3  # of the origin, m
 
 
-def link_frames(chain: Chain, joint_angles: Sequence[Scalar]) -> list[LinkFrame]:
+def link_frames(tree: KinematicTree, joint_angles: Sequence[Scalar]) -> list[LinkFrame]:
     """Frames of the links, n, from their joints' coordinates: screws about their z axes."""
     frames: list[LinkFrame] = []
-    for link, angle in zip(chain.links, joint_angles, strict=True):
+    for link, angle in zip(tree.links, joint_angles, strict=True):
         rotation: Sequence[Vector3] = link.joint.rotation
         position: Vector3 = link.joint.position
         axis = [row[2] for row in rotation]  # z, which a turn leaves where it is
@@ -75,7 +75,7 @@ def along(screw: Screw, force: Vector3, torque: Vector3) -> Scalar:
 
 
 def body_wrenches(
-    chain: Chain,
+    tree: KinematicTree,
     frames: Sequence[LinkFrame],
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
@@ -86,9 +86,9 @@ def body_wrenches(
     They act about the origin of each body's frame, in its axes, n + 1 pairs: the outward pass of the RNEA.
     """
     omega, alpha, a = angular_velocity, acceleration.angular, acceleration.linear
-    wrenches = [_newton_euler(chain.base, omega, alpha, a)]
+    wrenches = [_newton_euler(tree.base, omega, alpha, a)]
     for link, (rotation, p), rate, rate_change in zip(
-        chain.links, frames, joint_rates, acceleration.joints, strict=True
+        tree.links, frames, joint_rates, acceleration.joints, strict=True
     ):
         # a_O' = R' (a + alpha x p + omega x (omega x p)), all components now in the link's axes.
         a = transposed_matrix_vector(rotation, add(a, add(cross(alpha, p), cross(omega, cross(omega, p)))))
@@ -107,29 +107,29 @@ def body_wrenches(
 
 
 def inverse_dynamics(
-    chain: Chain,
+    tree: KinematicTree,
     frames: Sequence[LinkFrame],
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
     acceleration: Accelerations,
 ) -> Wrenches:
     """Generalized forces for given accelerations (RNEA), without springs, dampers and tip wrench."""
-    wrenches = body_wrenches(chain, frames, angular_velocity, joint_rates, acceleration)
-    return passed_to_base(chain, frames, wrenches)
+    wrenches = body_wrenches(tree, frames, angular_velocity, joint_rates, acceleration)
+    return passed_to_base(tree, frames, wrenches)
 
 
 def passed_to_base(
-    chain: Chain, frames: Sequence[LinkFrame], wrenches: Sequence[tuple[Vector3, Vector3]]
+    tree: KinematicTree, frames: Sequence[LinkFrame], wrenches: Sequence[tuple[Vector3, Vector3]]
 ) -> Wrenches:
     """Generalized forces of wrenches on the bodies, summed from tip to base: the inward pass of the RNEA."""
     acting = list(wrenches)
     reactions: list[tuple[Vector3, Vector3]] = []
-    for i in reversed(range(len(chain.links))):
+    for i in reversed(range(len(tree.links))):
         force, torque = acting[i + 1]
         reactions.insert(0, (force, torque))
         force_at_parent, torque_at_parent = shift_wrench(*frames[i], force, torque)
         acting[i] = (add(acting[i][0], force_at_parent), add(acting[i][1], torque_at_parent))
-    joints = [along(link.screw, *wrench) for link, wrench in zip(chain.links, reactions, strict=True)]
+    joints = [along(link.screw, *wrench) for link, wrench in zip(tree.links, reactions, strict=True)]
     return Wrenches(acting[0][0], acting[0][1], joints, reactions)
 
 
@@ -153,17 +153,17 @@ def shift_wrench(
 
 
 def passive_torques(
-    chain: Chain, joint_angles: Sequence[Scalar], joint_rates: Sequence[Scalar]
+    tree: KinematicTree, joint_angles: Sequence[Scalar], joint_rates: Sequence[Scalar]
 ) -> list[Scalar]:
     """Torques (or forces) of the joints' springs and dampers on the links, n, N m (N)."""
     return [
         -link.stiffness * (angle - link.rest_angle) - link.damping * rate
-        for link, angle, rate in zip(chain.links, joint_angles, joint_rates, strict=True)
+        for link, angle, rate in zip(tree.links, joint_angles, joint_rates, strict=True)
     ]
 
 
 def tip_wrench_forces(
-    chain: Chain,
+    tree: KinematicTree,
     frames: Sequence[LinkFrame],
     tip_rotation: Sequence[Vector3],
     tip_position: Vector3,
@@ -171,4 +171,4 @@ def tip_wrench_forces(
 ) -> Wrenches:
     """Generalized forces of a wrench at G (force, then torque, in G axes): the last term of (16)."""
     force, torque = shift_wrench(tip_rotation, tip_position, wrench[:3], wrench[3:])
-    return passed_to_base(chain, frames, [*[(ZERO, ZERO)] * len(chain.links), (force, torque)])
+    return passed_to_base(tree, frames, [*[(ZERO, ZERO)] * len(tree.links), (force, torque)])

@@ -22,12 +22,12 @@ class SpaceArmMomentum:
     """Momentum of a robot; all vectors have 3 entries in base axes, y is a state without the pose."""
 
     def __init__(self, equations: EquationsOfMotion) -> None:
-        self._field, self._chain = equations, equations.chain
+        self._field, self._tree = equations, equations.tree
 
     @property
     def mass(self) -> Scalar:
         """Mass of the whole system, kg."""
-        return sum((link.body.mass for link in self._chain.links), start=self._chain.base.mass)
+        return sum((link.body.mass for link in self._tree.links), start=self._tree.base.mass)
 
     def momentum(self, y: Scalars) -> tuple[Scalars, Scalars, Scalars]:
         """Linear momentum, angular momentum about the center of mass, and the latter in the base frame."""
@@ -44,25 +44,25 @@ class SpaceArmMomentum:
     def external_wrench(self, y: Scalars, u: Scalars) -> tuple[Scalars, Scalars]:
         """External force and torque on the system, about the base origin; zeros without any."""
         motion, inputs = self._field.motion(y), self._field.inputs(u)
-        frames = minimal.link_frames(self._chain, motion.joint_angles)
-        tip = self._field.tip_forces(motion, frames, self._chain.tip_wrench)
+        frames = minimal.link_frames(self._tree, motion.joint_angles)
+        tip = self._field.tip_forces(motion, frames, self._tree.tip_wrench)
         return add(inputs.force, tip.force), add(inputs.torque, tip.torque)
 
     def joint_torques(self, y: Scalars, u: Scalars) -> list[Scalar]:
         """Torques of motors, springs and dampers on the joints, and what a wrench at the tip adds, n."""
         motion = self._field.motion(y)
-        frames = minimal.link_frames(self._chain, motion.joint_angles)
+        frames = minimal.link_frames(self._tree, motion.joint_angles)
         parts = (
             self._field.inputs(u).joint_torques,
             self.passive_torques(y),
-            self._field.tip_forces(motion, frames, self._chain.tip_wrench).joints,
+            self._field.tip_forces(motion, frames, self._tree.tip_wrench).joints,
         )
         return [sum(torques) for torques in zip(*parts, strict=True)]
 
     def passive_torques(self, y: Scalars) -> list[Scalar]:
         """Torques of springs and dampers on the joints, n."""
         motion = self._field.motion(y)
-        return minimal.passive_torques(self._chain, motion.joint_angles, motion.joint_rates)
+        return minimal.passive_torques(self._tree, motion.joint_angles, motion.joint_rates)
 
     def mass_matrix(self, y: Scalars) -> MassMatrix:
         """The mass matrix at the joint angles."""
@@ -70,4 +70,4 @@ class SpaceArmMomentum:
 
     def _mass_matrix(self, y: Scalars) -> tuple[Motion, MassMatrix]:
         motion = self._field.motion(y)
-        return motion, MassMatrix(self._chain, minimal.link_frames(self._chain, motion.joint_angles))
+        return motion, MassMatrix(self._tree, minimal.link_frames(self._tree, motion.joint_angles))

@@ -18,7 +18,7 @@ from typing import Any
 
 from dq_space_arm_env.algebra import dual_matrices
 from dq_space_arm_env.algebra import dual_quaternion as dq
-from dq_space_arm_env.dynamics.chain import Chain, Screw
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Screw
 from dq_space_arm_env.dynamics.kinematics import joint_motion, tip_pose_rate, wrist_rotation
 from dq_space_arm_env.dynamics.linear import factorize_ldl, solve_ldl
 from dq_space_arm_env.dynamics.minimal import passive_torques
@@ -57,19 +57,21 @@ def _translation(position: Sequence[Scalar]) -> DualQuaternion:
     return (1.0, 0.0, 0.0, 0.0, 0.0, 0.5 * position[0], 0.5 * position[1], 0.5 * position[2])
 
 
-def joint_frames(chain: Chain, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]) -> JointFrames:
+def joint_frames(
+    tree: KinematicTree, joint_angles: Sequence[Scalar], wrist_angles: Sequence[Scalar]
+) -> JointFrames:
     """Relative poses that (13)-(19) refer to."""
     distal, proximal = [], []
     center: Sequence[float] = (0.0, 0.0, 0.0)
-    for link, angle in zip(chain.links, joint_angles, strict=True):
+    for link, angle in zip(tree.links, joint_angles, strict=True):
         fixed = dq.multiply(_translation([-c for c in center]), link.joint.dual_quaternion)
         distal.append(dq.multiply(fixed, joint_motion(link.screw, angle)))
         center = link.body.center_of_mass
         proximal.append(_translation(center))
     tip: DualQuaternion = _translation([-c for c in center])
-    if chain.wrist is not None:
-        tip = dq.multiply(dq.multiply(tip, chain.wrist.dual_quaternion), wrist_rotation(wrist_angles))
-    return JointFrames(distal, proximal, dq.multiply(tip, chain.tip.dual_quaternion))
+    if tree.wrist is not None:
+        tip = dq.multiply(dq.multiply(tip, tree.wrist.dual_quaternion), wrist_rotation(wrist_angles))
+    return JointFrames(distal, proximal, dq.multiply(tip, tree.tip.dual_quaternion))
 
 
 def joint_velocity(frames: JointFrames, joint: int, velocities: Sequence[DualQuaternion]) -> DualQuaternion:
@@ -85,14 +87,16 @@ def joint_velocity(frames: JointFrames, joint: int, velocities: Sequence[DualQua
     )
 
 
-def along_joints(chain: Chain, frames: JointFrames, velocities: Sequence[DualQuaternion]) -> list[Scalar]:
+def along_joints(
+    tree: KinematicTree, frames: JointFrames, velocities: Sequence[DualQuaternion]
+) -> list[Scalar]:
     """Joint rates (12) from the dual velocities of the bodies; likewise of their rates."""
-    entries = [3 if link.screw.turn else 7 for link in chain.links]
+    entries = [3 if link.screw.turn else 7 for link in tree.links]
     return [joint_velocity(frames, j, velocities)[entry] for j, entry in enumerate(entries)]
 
 
 def assemble(
-    chain: Chain,
+    tree: KinematicTree,
     frames: JointFrames,
     velocities: Sequence[DualQuaternion],
     base_wrench: DualQuaternion,
@@ -102,8 +106,8 @@ def assemble(
 
     `velocities` holds omega^{e_i}_{e_i/I}, 8 per body; `joint_torques` include springs and dampers.
     """
-    n = len(chain.links)
-    bodies = [chain.base, *(link.body for link in chain.links)]
+    n = len(tree.links)
+    bodies = [tree.base, *(link.body for link in tree.links)]
     s11 = _zeros(8 * (n + 1), 8 * (n + 1))
     s12, s21 = _zeros(8 * (n + 1), 5 * n), _zeros(5 * n, 8 * (n + 1))
     b1: list[Scalar] = []
@@ -115,13 +119,13 @@ def assemble(
         momentum = dual_matrices.matrix_multiply(inertia, dq.swap(velocity))
         b1 += dq.scale(-1.0, dq.cross(velocity, momentum))
     _accumulate(b1, 0, base_wrench)  # W_0 of (13)
-    if chain.tip_wrench is not None:
-        wrench = (0.0, *chain.tip_wrench[:3], 0.0, *chain.tip_wrench[3:])
+    if tree.tip_wrench is not None:
+        wrench = (0.0, *tree.tip_wrench[:3], 0.0, *tree.tip_wrench[3:])
         _accumulate(b1, 8 * n, dq.adjoint(frames.tip, wrench))  # Ad(q_{G/e_n}) W_ext of (16)
     for j in range(n):
         before, after = frames.distal[j], frames.proximal[j]
         # (13)-(16): +-Ad(.) E158' W~_{j+1/j} on the left, -+Ad(.) W_act,j+1 on the right.
-        screw = chain.links[j].screw
+        screw = tree.links[j].screw
         actuation = [0.0] * 8
         actuation[7 if screw.turn else 3] = joint_torques[j]
         for body_index, pose, sign in ((j, before, 1.0), (j + 1, dq.conjugate(after), -1.0)):
@@ -163,14 +167,14 @@ class SchurComplement:
     positive definite.
     """
 
-    def __init__(self, chain: Chain, system: NewtonEulerSystem) -> None:
+    def __init__(self, tree: KinematicTree, system: NewtonEulerSystem) -> None:
         self._system = system
-        self._bodies = [chain.base, *(link.body for link in chain.links)]
+        self._bodies = [tree.base, *(link.body for link in tree.links)]
         count = len(system.s21)
         # A force enforces a linear velocity, a torque an angular one: (vx, vy, vz, wx, wy) within each joint,
         # (vx, vy, wx, wy, wz) within a prismatic one.
         turning, sliding = (2, 3, 4, 0, 1), (3, 4, 0, 1, 2)
-        orders = [turning if link.screw.turn else sliding for link in chain.links]
+        orders = [turning if link.screw.turn else sliding for link in tree.links]
         order = [5 * (k // 5) + orders[k // 5][k % 5] for k in range(count)]
         self._order = order
         self._constraints = [system.s21[row] for row in order]
@@ -218,10 +222,10 @@ class SchurComplement:
 
 
 def solve_schur(
-    chain: Chain, system: NewtonEulerSystem, refinements: int = 0
+    tree: KinematicTree, system: NewtonEulerSystem, refinements: int = 0
 ) -> tuple[list[Scalar], list[Scalar]]:
     """Dual accelerations (22) and reaction wrenches (21), refined a number of times."""
-    complement = SchurComplement(chain, system)
+    complement = SchurComplement(tree, system)
     solution = complement.solve(system.b1, system.b2)
     for _ in range(refinements):
         solution = complement.refine(system.b1, system.b2, solution)
@@ -270,58 +274,60 @@ class PaperState:
     velocities: Sequence[DualQuaternion]  # dual velocities omega^{e_i}_{e_i/I} of all bodies
 
     @classmethod
-    def from_vector(cls, chain: Chain, x: Sequence[Scalar]) -> PaperState:
+    def from_vector(cls, tree: KinematicTree, x: Sequence[Scalar]) -> PaperState:
         """Split a state vector of 8 + n + (3) + 8 (n + 1) numbers."""
-        n, wrist = len(chain.links), 0 if chain.wrist is None else 3
+        n, wrist = len(tree.links), 0 if tree.wrist is None else 3
         start = 8 + n + wrist
         velocities = [x[start + 8 * i : start + 8 * i + 8] for i in range(n + 1)]
         return cls(x[:8], x[8 : 8 + n], x[8 + n : start], velocities)
 
 
 def paper_rates(
-    chain: Chain,
+    tree: KinematicTree,
     state: PaperState,
     base_wrench: DualQuaternion,
     joint_torques: Sequence[Scalar],
     wrist_rates: Sequence[Scalar],
 ) -> tuple[list[Scalar], list[Scalar]]:
     """Time derivative of the paper's state (11), (12), (22), and the reaction wrenches (21)."""
-    system = system_of(chain, state, base_wrench, joint_torques)
-    accelerations, reactions = solve_schur(chain, system)
-    return [*paper_position_rates(chain, state, wrist_rates), *accelerations], reactions
+    system = system_of(tree, state, base_wrench, joint_torques)
+    accelerations, reactions = solve_schur(tree, system)
+    return [*paper_position_rates(tree, state, wrist_rates), *accelerations], reactions
 
 
 def system_of(
-    chain: Chain, state: PaperState, base_wrench: DualQuaternion, joint_torques: Sequence[Scalar]
+    tree: KinematicTree, state: PaperState, base_wrench: DualQuaternion, joint_torques: Sequence[Scalar]
 ) -> NewtonEulerSystem:
     """The system (20) of a state and its inputs, springs and dampers included."""
-    frames = joint_frames(chain, state.joint_angles, state.wrist_angles)
-    passive = passive_torques(chain, state.joint_angles, joint_speeds(chain, state))
+    frames = joint_frames(tree, state.joint_angles, state.wrist_angles)
+    passive = passive_torques(tree, state.joint_angles, joint_speeds(tree, state))
     torques = [motor + other for motor, other in zip(joint_torques, passive, strict=True)]
-    return assemble(chain, frames, state.velocities, base_wrench, torques)
+    return assemble(tree, frames, state.velocities, base_wrench, torques)
 
 
-def joint_speeds(chain: Chain, state: PaperState) -> list[Scalar]:
+def joint_speeds(tree: KinematicTree, state: PaperState) -> list[Scalar]:
     """Joint rates (12) from the dual velocities of the bodies."""
-    frames = joint_frames(chain, state.joint_angles, state.wrist_angles)
-    return along_joints(chain, frames, state.velocities)
+    frames = joint_frames(tree, state.joint_angles, state.wrist_angles)
+    return along_joints(tree, frames, state.velocities)
 
 
-def paper_position_rates(chain: Chain, state: PaperState, wrist_rates: Sequence[Scalar]) -> list[Scalar]:
+def paper_position_rates(
+    tree: KinematicTree, state: PaperState, wrist_rates: Sequence[Scalar]
+) -> list[Scalar]:
     """Rates of base pose (11), joint angles (12) and wrist angles."""
     pose_rate = dq.scale(0.5, dq.multiply(state.base_pose, state.velocities[0]))  # (8), (11)
-    return [*pose_rate, *joint_speeds(chain, state), *wrist_rates]
+    return [*pose_rate, *joint_speeds(tree, state), *wrist_rates]
 
 
-def paper_tip_rate(chain: Chain, state: PaperState, wrist_rates: Sequence[Scalar]) -> DualQuaternion:
+def paper_tip_rate(tree: KinematicTree, state: PaperState, wrist_rates: Sequence[Scalar]) -> DualQuaternion:
     """Time derivative of q_{G/I} (30), which the 54-dimensional formulation appends."""
     base = state.velocities[0]
     return tip_pose_rate(
-        chain,
+        tree,
         state.base_pose,
         state.joint_angles,
         state.wrist_angles,
         (*base[1:4], *base[5:8]),
-        joint_speeds(chain, state),
+        joint_speeds(tree, state),
         wrist_rates,
     )

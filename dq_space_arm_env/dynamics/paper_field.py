@@ -37,10 +37,10 @@ class PaperField:
     def __init__(self, minimal_field: SpaceArmField) -> None:
         self.minimal = minimal_field
         self.parameters = minimal_field.parameters
-        self.chain = minimal_field.chain
+        self.tree = minimal_field.tree
         self.n_u = minimal_field.n_u
-        n = len(self.chain.links)
-        self._positions = 8 + n + (0 if self.chain.wrist is None else 3)
+        n = len(self.tree.links)
+        self._positions = 8 + n + (0 if self.tree.wrist is None else 3)
         self.tip = slice(self._positions + 8 * (n + 1), self._positions + 8 * (n + 2))
         self.base_twist = (
             *range(self._positions + 1, self._positions + 4),
@@ -51,20 +51,18 @@ class PaperField:
 
     def state_from_minimal(self, x: Sequence[Scalar]) -> list[Scalar]:
         """The redundant state of the same motion."""
-        field, chain = self.minimal, self.chain
+        field, tree = self.minimal, self.tree
         stored, y = split_state(field, x)
         pose, motion = field.pose.full(stored), field.motion(y)
-        frames = minimal.link_frames(chain, motion.joint_angles)
+        frames = minimal.link_frames(tree, motion.joint_angles)
         velocities = kinematics.body_velocities(
-            chain, frames, (*motion.angular, *motion.linear), motion.joint_rates
+            tree, frames, (*motion.angular, *motion.linear), motion.joint_rates
         )
         duals: list[Scalar] = []
-        for body, velocity in zip(
-            [chain.base, *(link.body for link in chain.links)], velocities, strict=True
-        ):
+        for body, velocity in zip([tree.base, *(link.body for link in tree.links)], velocities, strict=True):
             at_center = vectors.add(velocity.linear, vectors.cross(velocity.angular, body.center_of_mass))
             duals += [0.0, *velocity.angular, 0.0, *at_center]
-        tip = kinematics.tip_pose(chain, pose, motion.joint_angles, motion.wrist_angles)
+        tip = kinematics.tip_pose(tree, pose, motion.joint_angles, motion.wrist_angles)
         return [*pose, *motion.joint_angles, *motion.wrist_angles, *duals, *tip]
 
     def minimal_from_state(self, y: Sequence[Scalar]) -> list[Scalar]:
@@ -74,7 +72,7 @@ class PaperField:
         forbid are dropped, and so is the pose's deviation from a unit dual quaternion.
         """
         field, layout = self.minimal, self.minimal.layout.state
-        state = PaperState.from_vector(self.chain, y[: self.tip.start])
+        state = PaperState.from_vector(self.tree, y[: self.tip.start])
         base = state.velocities[0]
         twist = (*base[1:4], *base[5:8])
         x: list[Scalar] = [0.0] * field.n_x
@@ -82,36 +80,36 @@ class PaperField:
         x[layout.joint_angles] = list(state.joint_angles)
         x[layout.wrist_angles] = list(state.wrist_angles)
         x[layout.base_velocity] = [twist[i] for i in field.pose.directions]
-        x[layout.joint_rates] = newton_euler.joint_speeds(self.chain, state)
+        x[layout.joint_rates] = newton_euler.joint_speeds(self.tree, state)
         return x
 
     def system(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> newton_euler.NewtonEulerSystem:
         """The linear system (20) for dual accelerations and reaction wrenches."""
         state, inputs = self._parts(y, u)
         base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
-        return newton_euler.system_of(self.chain, state, base_wrench, inputs.joint_torques)
+        return newton_euler.system_of(self.tree, state, base_wrench, inputs.joint_torques)
 
     def free_accelerations(self, y: Sequence[Scalar], ydot: Sequence[Scalar]) -> list[Scalar]:
         """Accelerations of base (free directions) and joints among the dual accelerations of all bodies."""
-        state = PaperState.from_vector(self.chain, y[: self.tip.start])
+        state = PaperState.from_vector(self.tree, y[: self.tip.start])
         # The turning of the joint's axes has no component along them: (12) holds for accelerations too.
-        bodies = [ydot[8 * i : 8 * i + 8] for i in range(len(self.chain.links) + 1)]
-        frames = newton_euler.joint_frames(self.chain, state.joint_angles, state.wrist_angles)
-        joints = newton_euler.along_joints(self.chain, frames, bodies)
+        bodies = [ydot[8 * i : 8 * i + 8] for i in range(len(self.tree.links) + 1)]
+        frames = newton_euler.joint_frames(self.tree, state.joint_angles, state.wrist_angles)
+        joints = newton_euler.along_joints(self.tree, frames, bodies)
         base = (*ydot[1:4], *ydot[5:8])
         return [*(base[i] for i in self.minimal.pose.directions), *joints]
 
     def _parts(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> tuple[PaperState, Inputs]:
-        return PaperState.from_vector(self.chain, y[: self.tip.start]), self.minimal.inputs(u)
+        return PaperState.from_vector(self.tree, y[: self.tip.start]), self.minimal.inputs(u)
 
     def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
         """Time derivative of the state: (11), (12), (22), and (30) for the tip."""
         state, inputs = self._parts(y, u)
         base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
         rates, _ = newton_euler.paper_rates(
-            self.chain, state, base_wrench, inputs.joint_torques, inputs.wrist_rates
+            self.tree, state, base_wrench, inputs.joint_torques, inputs.wrist_rates
         )
-        return [*rates, *newton_euler.paper_tip_rate(self.chain, state, inputs.wrist_rates)]
+        return [*rates, *newton_euler.paper_tip_rate(self.tree, state, inputs.wrist_rates)]
 
     def linearized_rates(
         self, y: Sequence[Scalar], u: Sequence[Scalar]
@@ -122,7 +120,7 @@ class PaperField:
         variables = column(*y, *u)
         state, inputs = self._parts(y, u)
         system = self.system(y, u)
-        schur = SchurComplement(self.chain, system)
+        schur = SchurComplement(self.tree, system)
         accelerations, reactions = schur.solve(system.b1, system.b2)
         residual, unknowns = _residual(system)
         change = casadi.substitute(
@@ -137,8 +135,8 @@ class PaperField:
             right = [-entry for entry in casadi.vertsplit(casadi.densify(by_variable))]
             response, _ = schur.solve(right[: len(accelerations)], right[len(accelerations) :])
             responses.append(column(*response))
-        positions = newton_euler.paper_position_rates(self.chain, state, inputs.wrist_rates)
-        tip = newton_euler.paper_tip_rate(self.chain, state, inputs.wrist_rates)
+        positions = newton_euler.paper_position_rates(self.tree, state, inputs.wrist_rates)
+        tip = newton_euler.paper_tip_rate(self.tree, state, inputs.wrist_rates)
         rates = casadi.densify(column(*positions, *accelerations, *tip))
         jacobian = casadi.vertcat(
             casadi.jacobian(column(*positions), variables),

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 from dq_space_arm_env.dynamics.minimal import (
     ZERO,
@@ -35,14 +35,14 @@ class Velocities(NamedTuple):
 
 
 def capture(
-    free: Chain,
-    loaded: Chain,
+    free: KinematicTree,
+    loaded: KinematicTree,
     payload: RigidBody,
     joint_angles: Sequence[Scalar],
     velocities: Velocities,
     payload_twist: Sequence[Scalar],
 ) -> Velocities:
-    """Velocities right after a capture, from the chain without and with the payload.
+    """Velocities right after a capture, from the tree without and with the payload.
 
     The payload's mass properties are in tip axes, its twist (angular [rad/s], linear [m/s]) at the tip's
     origin in tip axes; the robot has no wrist.

@@ -37,13 +37,13 @@ class SpaceArmField(EquationsOfMotion):
     @property
     def of_motion(self) -> SpaceArmField:
         """The same equations without what actuators keep from step to step, which no equation moves."""
-        return SpaceArmField(self.chain, self.layout.of_motion, self.parameters, self._given_formulation)
+        return SpaceArmField(self.tree, self.layout.of_motion, self.parameters, self._given_formulation)
 
     @property
     def beside_momentum(self) -> SpaceArmField:
         """The same equations, formulated for use beside the momentum, which needs the mass matrix anyway."""
         formulation = self._given_formulation or "minimal_coordinates"
-        return SpaceArmField(self.chain, self.layout, self.parameters, formulation)
+        return SpaceArmField(self.tree, self.layout, self.parameters, formulation)
 
     def linearized_rates(
         self, y: Sequence[Scalar], u: Sequence[Scalar]
@@ -55,7 +55,7 @@ class SpaceArmField(EquationsOfMotion):
         """
         motion, inputs = self.motion(y), self.inputs(u)
         inertia = self._inertia(motion, many=True)
-        solved = self._solve(motion, inputs, self.chain.tip_wrench, inertia)
+        solved = self._solve(motion, inputs, self.tree.tip_wrench, inertia)
         by_y = self._body_residual_jacobian(y, solved)
         # da/dy = -M^-1 dID/dy, column by column; da/du = M^-1 df/du.
         responses = [
@@ -128,7 +128,7 @@ class SpaceArmField(EquationsOfMotion):
         motion = self.motion(free_y)
         angles = column(*motion.joint_rates, *self.inputs(free_u).wrist_rates)
         turning = [*ZERO, *(-entry for entry in cross(motion.angular, motion.linear))]
-        kept = column(*(turning[i] for i in self.pose.directions), *[0.0] * len(self.chain.links))
+        kept = column(*(turning[i] for i in self.pose.directions), *[0.0] * len(self.tree.links))
         by_y = casadi.substitute(
             casadi.jacobian(kept, column(*free_y)), column(*free_y), casadi.densify(column(*y))
         )
@@ -141,18 +141,18 @@ class SpaceArmField(EquationsOfMotion):
         coordinate the effect is the same if the body after the joint takes the wrench's change, s x (force,
         torque), besides its own.
         """
-        n = len(self.chain.links)
+        n = len(self.tree.links)
         free, acceleration = symbols("v", self.n_y), symbols("a", 6 + n)
         motion = self.motion(free)
         given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
-        passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
+        passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
         missing = [entry for pair in self._missing_wrenches(motion, given) for part in pair for entry in part]
         by_y = casadi.jacobian(column(*missing, *(-torque for torque in passive)), column(*free))
         values = casadi.densify(column(*y, *solved.angular, *solved.linear, *solved.joints))
         by_y = casadi.substitute(by_y, column(*free, *acceleration), values)
         angles = self._in_y(self.layout.state.joint_angles)
         for j, (force, torque) in enumerate(self._reactions(self.motion(y), solved)):
-            turn, slide = self.chain.links[j].screw
+            turn, slide = self.tree.links[j].screw
             across = (-force[1], force[0], 0.0)  # z x force
             moved = add(scale(turn, (-torque[1], torque[0], 0.0)), scale(slide, across))
             change = column(*scale(turn, across), *moved)
@@ -162,14 +162,14 @@ class SpaceArmField(EquationsOfMotion):
 
     def _residual(self, y: Sequence[Scalar]) -> Residual:
         """Forces that given accelerations need, minus those that depend on y, over symbols."""
-        n = len(self.chain.links)
+        n = len(self.tree.links)
         acceleration = symbols("a", 6 + n)
         motion = self.motion(y)
-        frames = minimal.link_frames(self.chain, motion.joint_angles)
+        frames = minimal.link_frames(self.tree, motion.joint_angles)
         given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
-        needed = minimal.inverse_dynamics(self.chain, frames, motion.angular, motion.joint_rates, given)
-        tip = self.tip_forces(motion, frames, self.chain.tip_wrench)
-        passive = minimal.passive_torques(self.chain, motion.joint_angles, motion.joint_rates)
+        needed = minimal.inverse_dynamics(self.tree, frames, motion.angular, motion.joint_rates, given)
+        tip = self.tip_forces(motion, frames, self.tree.tip_wrench)
+        passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
         joints = [
             bias - other - load for bias, other, load in zip(needed.joints, passive, tip.joints, strict=True)
         ]
@@ -179,11 +179,11 @@ class SpaceArmField(EquationsOfMotion):
 
     def _on_base(self, forces: Sequence[Scalar]) -> list[Scalar]:
         """Generalized forces (force, torque, joints) as wrenches on the bodies and joint torques."""
-        return [*forces[:6], *[0.0] * (6 * len(self.chain.links)), *forces[6:]]
+        return [*forces[:6], *[0.0] * (6 * len(self.tree.links)), *forces[6:]]
 
     def _response(self, inertia: Inertia, forces: Sequence[Scalar]) -> list[Scalar]:
         """Accelerations (free directions, joints) from wrenches on the bodies and joint torques."""
-        n = len(self.chain.links)
+        n = len(self.tree.links)
         if all(casadi.SX(entry).is_zero() for entry in forces):
             return [0.0] * (len(self.pose.directions) + n)
         wrenches = [(forces[6 * i : 6 * i + 3], forces[6 * i + 3 : 6 * i + 6]) for i in range(n + 1)]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
 from dq_space_arm_env.dynamics.minimal import link_frames
 from dq_space_arm_env.scene import INTEGRATORS, Scene
@@ -33,11 +33,11 @@ def joint_motion(scene: Scene) -> JointMotion:
     Returns:
         Square root of the largest eigenvalue of the first, and largest of the second; zeros without any.
     """
-    chain, links = Chain.from_scene(scene), scene.links
+    tree, links = KinematicTree.from_scene(scene), scene.links
     if not any(link.stiffness or link.damping for link in links):
         return JointMotion(0.0, 0.0)
-    whole = np.array(mass_matrix(chain, link_frames(chain, scene.initial_state.joint_angles)), dtype=float)
-    free = [2, 3, 4, *range(6, len(whole))] if chain.planar else range(len(whole))
+    whole = np.array(mass_matrix(tree, link_frames(tree, scene.initial_state.joint_angles)), dtype=float)
+    free = [2, 3, 4, *range(6, len(whole))] if tree.planar else range(len(whole))
     inverse = np.linalg.inv(whole[np.ix_(free, free)])[-len(links) :, -len(links) :]
 
     def largest(diagonal: list[float]) -> float:

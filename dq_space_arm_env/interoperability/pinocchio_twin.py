@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import minimal
-from dq_space_arm_env.dynamics.chain import Chain, Placement, RigidBody, Screw
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Placement, RigidBody, Screw
 from dq_space_arm_env.interoperability.exporting import tip_from_last_link
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.pose import PLANAR_POSE
@@ -38,14 +38,14 @@ def pinocchio_model(scene: Scene) -> Any:
         ImportError: If Pinocchio is not installed.
     """
     pin = _pinocchio()
-    chain = Chain.from_scene(scene)
+    tree = KinematicTree.from_scene(scene)
     model = pin.Model()
     model.name = scene.name
     model.gravity = pin.Motion.Zero()
-    free = pin.JointModelPlanar() if chain.planar else pin.JointModelFreeFlyer()
+    free = pin.JointModelPlanar() if tree.planar else pin.JointModelFreeFlyer()
     joint = model.addJoint(0, free, pin.SE3.Identity(), "base")
-    model.appendBodyToJoint(joint, _inertia(pin, chain.base), pin.SE3.Identity())
-    for link, name in zip(chain.links, [link.name for link in scene.links], strict=True):
+    model.appendBodyToJoint(joint, _inertia(pin, tree.base), pin.SE3.Identity())
+    for link, name in zip(tree.links, [link.name for link in scene.links], strict=True):
         joint = model.addJoint(joint, _joint(pin, link.screw), _placement(pin, link.joint), name)
         model.appendBodyToJoint(joint, _inertia(pin, link.body), pin.SE3.Identity())
     rotation, position = poses.to_matrix(tip_from_last_link(scene))
@@ -81,7 +81,7 @@ def to_pinocchio(scene: Scene, x: ArrayLike) -> tuple[Array, Array]:
     pose = tuple(equations.pose.full(values[entries.pose].tolist()))
     position, (w, i, j, k) = poses.position(pose), pose[:4]
     motion = equations.motion(values[entries.pose.stop :].tolist())
-    if equations.chain.planar:
+    if equations.tree.planar:
         base = [*position[:2], w * w - k * k, 2.0 * w * k]
         velocity = [*motion.linear[:2], motion.angular[2]]
     else:
@@ -143,12 +143,12 @@ def generalized_forces(scene: Scene, x: ArrayLike, u: ArrayLike) -> Array:
     values = _checked("x", x, equations.n_x)
     motion = equations.motion(values[entries.pose.stop :].tolist())
     inputs = equations.inputs(_checked("u", u, equations.n_u).tolist())
-    frames = minimal.link_frames(equations.chain, motion.joint_angles)
-    tip = equations.tip_forces(motion, frames, equations.chain.tip_wrench)
-    passive = minimal.passive_torques(equations.chain, motion.joint_angles, motion.joint_rates)
+    frames = minimal.link_frames(equations.tree, motion.joint_angles)
+    tip = equations.tip_forces(motion, frames, equations.tree.tip_wrench)
+    passive = minimal.passive_torques(equations.tree, motion.joint_angles, motion.joint_rates)
     base = [*map(sum, zip(inputs.force, tip.force, strict=True))]
     base += map(sum, zip(inputs.torque, tip.torque, strict=True))
-    if equations.chain.planar:
+    if equations.tree.planar:
         base = [*base[:2], base[5]]
     joints = map(sum, zip(inputs.joint_torques, passive, tip.joints, strict=True))
     return np.array([*base, *joints], dtype=np.float64)
@@ -162,7 +162,7 @@ def _pinocchio() -> Any:
 
 
 def _equations(scene: Scene) -> EquationsOfMotion:
-    return EquationsOfMotion(Chain.from_scene(scene), StateLayout.of(scene))
+    return EquationsOfMotion(KinematicTree.from_scene(scene), StateLayout.of(scene))
 
 
 def _checked(name: str, values: ArrayLike, size: int) -> Array:

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
-from dq_space_arm_env.dynamics.chain import SCREWS, Chain
+from dq_space_arm_env.dynamics.kinematic_tree import SCREWS, KinematicTree
 from dq_space_arm_env.dynamics.step_stability import stable
 from dq_space_arm_env.interoperability.rigid_body import Body, lumped, tidied
 from dq_space_arm_env.interoperability.urdf_arm import Arm, ArmJoint, arm_of
@@ -337,5 +337,5 @@ def _default_target(scene: Scene, arm: Arm) -> dict[str, Any]:
             farther = max(part.joint.limits or _ANY_ANGLE, key=lambda limit: abs(limit - angle))
             moved = 0.5 * (angle + farther)
         angles.append(moved)
-    pose = kinematics.tip_pose(Chain.from_scene(scene), start.base_pose.dual_quaternion, angles, ())
+    pose = kinematics.tip_pose(KinematicTree.from_scene(scene), start.base_pose.dual_quaternion, angles, ())
     return _pose(tuple(pose))

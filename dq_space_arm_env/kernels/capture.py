@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.real_arrays import real_array
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from dq_space_arm_env.dynamics.plastic_impact import Velocities, capture
 from dq_space_arm_env.dynamics.vector_field import spread
 from dq_space_arm_env.kernels.kernels import Kernels
@@ -56,8 +56,8 @@ def catch_payload(free: Kernels, loaded: Kernels, x: ArrayLike, payload_twist: A
     directions = PLANAR_TWIST if layout.planar else tuple(range(6))
     base = spread(state[where.base_velocity].tolist(), directions, 6)
     after = capture(
-        Chain.from_scene(free.scene),
-        Chain.from_scene(loaded.scene),
+        KinematicTree.from_scene(free.scene),
+        KinematicTree.from_scene(loaded.scene),
         RigidBody(payload.mass, payload.center_of_mass, payload.inertia),
         state[where.joint_angles].tolist(),
         Velocities(base[:3], base[3:], state[where.joint_rates].tolist()),

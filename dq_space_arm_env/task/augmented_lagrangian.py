@@ -53,7 +53,7 @@ class PenalizedEquations(SceneEquations):
         names = ("multiplier", "penalty")
         multipliers, penalties = ([casadi.SX.sym(f"{name}_{i}") for i in range(count)] for name in names)
         symbols = [*plain.field.parameters, *multipliers, *penalties]
-        field = SpaceArmField(plain.chain, plain.layout, symbols, scene.simulation.formulation)
+        field = SpaceArmField(plain.tree, plain.layout, symbols, scene.simulation.formulation)
         parts = {name: getattr(plain, name) for name in SceneEquations.__dataclass_fields__}
         return cls(**{**parts, "field": field}, multipliers=multipliers, penalties=penalties)
 

@@ -8,7 +8,7 @@ from typing import Any
 import casadi
 
 from dq_space_arm_env.algebra.vectors import norm, subtract
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from dq_space_arm_env.dynamics.plastic_impact import Velocities, capture, momentum_at_tip
 from dq_space_arm_env.scene.parameters import body_numbers, catch_numbers, velocity_entries
 from dq_space_arm_env.task.equations import SceneEquations
@@ -29,8 +29,8 @@ class Catching:
         self.equations = equations
         own = {number.name for number in body_numbers(scene, "payload")}
         others = {name: value for name, value in equations.given.items() if name not in own}
-        self._free = Chain.from_scene(scene, others | dict.fromkeys(own, 0.0))
-        self._loaded = Chain.from_scene(scene, others)
+        self._free = KinematicTree.from_scene(scene, others | dict.fromkeys(own, 0.0))
+        self._loaded = KinematicTree.from_scene(scene, others)
         payload = scene.payload
         self._payload = RigidBody(payload.mass, payload.center_of_mass, payload.inertia)
 

@@ -70,8 +70,8 @@ class _Situation:
         self.equations, self.base, self.scene = equations, base, equations.scene
         self.motion = equations.field.motion(y)
         self.u, self.inputs = u, equations.field.inputs(u)
-        chain, motion = equations.chain, self.motion
-        frames = kinematics.frame_poses(chain, dq.IDENTITY, motion.joint_angles, motion.wrist_angles)
+        tree, motion = equations.tree, self.motion
+        frames = kinematics.frame_poses(tree, dq.IDENTITY, motion.joint_angles, motion.wrist_angles)
         names = ["base", *(link.name for link in self.scene.links)]
         self._poses: dict[str, Scalars] = dict(zip(names, frames, strict=False))
         self._poses["tip"] = frames[-1]
@@ -108,12 +108,12 @@ class _Situation:
 
     def momentum(self) -> tuple[Scalars, Scalars, Scalar]:
         """Linear momentum, angular momentum about the center of mass, base axes; energy."""
-        chain, motion = self.equations.chain, self.motion
-        frames = minimal.link_frames(chain, motion.joint_angles)
+        tree, motion = self.equations.tree, self.motion
+        frames = minimal.link_frames(tree, motion.joint_angles)
         twist = (*motion.angular, *motion.linear)
-        velocities = kinematics.body_velocities(chain, frames, twist, motion.joint_rates)
-        linear, angular, _ = kinematics.momentum(chain, frames, velocities)
-        kinetic, potential = kinematics.energy(chain, motion.joint_angles, velocities)
+        velocities = kinematics.body_velocities(tree, frames, twist, motion.joint_rates)
+        linear, angular, _ = kinematics.momentum(tree, frames, velocities)
+        kinetic, potential = kinematics.energy(tree, motion.joint_angles, velocities)
         return linear, angular, kinetic + potential
 
 

@@ -27,8 +27,8 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.algebra.vectors import norm
 from dq_space_arm_env.dynamics import kinematics
-from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.equations_of_motion import Motion
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.scene.layout import StateLayout
@@ -53,7 +53,7 @@ class SceneEquations:
     """A scene's equations of motion with its cost and observation."""
 
     scene: Scene
-    chain: Chain
+    tree: KinematicTree
     target: Scalars  # q_{D/I}, 8 numbers or symbols
     target_velocity: Scalars  # twist of D in its axes, 6 numbers or symbols
     layout: StateLayout
@@ -74,9 +74,9 @@ class SceneEquations:
             grasp = grasp_pose(scene, given)
             target = dq.multiply(target, grasp)
             velocity = dual_vectors.inverse_transform(*poses.to_matrix(grasp), velocity)
-        chain = Chain.from_scene(scene, given)
-        field = SpaceArmField(chain, layout, symbols, scene.simulation.formulation)
-        return cls(scene, chain, target, velocity, layout, field, given)
+        tree = KinematicTree.from_scene(scene, given)
+        field = SpaceArmField(tree, layout, symbols, scene.simulation.formulation)
+        return cls(scene, tree, target, velocity, layout, field, given)
 
     def y(self, x: Scalars) -> Scalars:
         """State without the pose."""
@@ -101,7 +101,7 @@ class SceneEquations:
     def tip(self, x: Scalars) -> Scalars:
         """Pose of the tip q_{G/I}, 8 numbers, eq. (27)."""
         motion = self.field.motion(self.y(x))
-        return kinematics.tip_pose(self.chain, self.base_pose(x), motion.joint_angles, motion.wrist_angles)
+        return kinematics.tip_pose(self.tree, self.base_pose(x), motion.joint_angles, motion.wrist_angles)
 
     def state_cost_terms(self, x: Scalars) -> list[Scalar]:
         """Pose and base velocity: the stage cost's terms of the state."""
@@ -139,7 +139,7 @@ class SceneEquations:
         """Twist of the tip in its axes, 6."""
         base = (*motion.angular, *motion.linear)
         angles = motion.joint_angles, motion.wrist_angles
-        return kinematics.tip_twist(self.chain, *angles, base, motion.joint_rates, wrist_rates)
+        return kinematics.tip_twist(self.tree, *angles, base, motion.joint_rates, wrist_rates)
 
     def target_twist(self, tip: Scalars) -> Scalars:
         """Twist of the target in the axes of a tip or another frame, 6: Ad(q_{D/G}) w^D."""

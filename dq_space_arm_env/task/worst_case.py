@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import poses, quaternion
 from dq_space_arm_env.algebra.vectors import cross, dot, matrix_vector, norm, subtract
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from dq_space_arm_env.scene.motion import Tumbling, Waypoints
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.task.equations import SceneEquations, body_pose, body_velocity, grasp_pose, total
@@ -33,29 +33,29 @@ class WorstCase:
     """Bounds of one scene's motions over the rest of an episode."""
 
     def __init__(self, equations: SceneEquations) -> None:
-        self.equations, self.chain = equations, equations.chain
+        self.equations, self.tree = equations, equations.tree
         self.inputs = equations.field.inputs(equations.control_limits)
-        self.bodies = [self.chain.base, *(link.body for link in self.chain.links)]
+        self.bodies = [self.tree.base, *(link.body for link in self.tree.links)]
         self.mass = total([body.mass for body in self.bodies])
         # Of any point of the arm from the base's center of mass.
-        places = [*(link.joint for link in self.chain.links), self.chain.wrist, self.chain.tip]
+        places = [*(link.joint for link in self.tree.links), self.tree.wrist, self.tree.tip]
         lengths = [norm(place.position) for place in places if place is not None]
         self.reach = total([*lengths, *(norm(body.center_of_mass) for body in self.bodies)])
 
     def cost(self, x: Scalars, steps: Scalar) -> Scalar:
         """Bound of the cost of a number of steps from a state, terminal cost included."""
-        equations, base = self.equations, self.chain.base
+        equations, base = self.equations, self.tree.base
         duration = steps * equations.scene.simulation.dt
         motion = equations.field.motion(equations.y(x))
-        turning = norm(motion.angular) + total(_parts(self.chain, motion.joint_rates, 0))
-        reach = self.reach + total(_parts(self.chain, motion.joint_angles, 1))
-        sliding = total(_parts(self.chain, motion.joint_rates, 1))
+        turning = norm(motion.angular) + total(_parts(self.tree, motion.joint_rates, 0))
+        reach = self.reach + total(_parts(self.tree, motion.joint_angles, 1))
+        sliding = total(_parts(self.tree, motion.joint_rates, 1))
         moving = norm(motion.linear) + reach * turning + sliding
         speed = self._root_energy(motion.joint_angles, moving, turning) + duration * self._growth()
-        if any(link.screw.slide for link in self.chain.links):  # bodies move apart: the last one by so much
+        if any(link.screw.slide for link in self.tree.links):  # bodies move apart: the last one by so much
             fastest = total([speed / casadi.sqrt(body.mass) for body in (base, self.bodies[-1])])
             reach = reach + duration * fastest
-        wrench = self.chain.tip_wrench or (0.0,) * 6
+        wrench = self.tree.tip_wrench or (0.0,) * 6
         drift = moving + duration * (norm(self.inputs.force) + norm(wrench[:3])) / self.mass
         # The dual part of a pose has half the length of its position; unit quaternions are at most 2 apart.
         start, target = (norm(poses.position(pose)) for pose in (equations.base_pose(x), equations.target))
@@ -145,16 +145,16 @@ class WorstCase:
         moments = total([body.inertia[i][i] for body in self.bodies for i in range(3)])
         springs = [
             casadi.sqrt(link.stiffness) * casadi.fabs(angle - link.rest_angle)
-            for link, angle in zip(self.chain.links, joint_angles, strict=True)
+            for link, angle in zip(self.tree.links, joint_angles, strict=True)
         ]
         return casadi.sqrt(self.mass) * moving + casadi.sqrt(moments) * turning + total(springs)
 
     def _growth(self) -> Scalar:
         """The bound c: root of the sum of f^2 / m + t' I^-1 t over the bodies' forces f and torques t."""
-        inputs, links, bodies = self.inputs, self.chain.links, self.bodies
+        inputs, links, bodies = self.inputs, self.tree.links, self.bodies
         forces: list[Scalar] = [norm(inputs.force), *[0.0] * len(links)]
         # Components of the torques as they act in I^-1/2, added as if all pointed the same way.
-        torques = [_turned(self.chain.base, norm(inputs.torque)), *[0.0] * len(links)]
+        torques = [_turned(self.tree.base, norm(inputs.torque)), *[0.0] * len(links)]
         for i, (link, limit) in enumerate(zip(links, inputs.joint_torques, strict=True)):
             axis, effort = matrix_vector(link.joint.rotation, _Z), casadi.fabs(limit)
             if link.screw.turn:
@@ -167,19 +167,19 @@ class WorstCase:
                 arm = norm(cross(subtract(place, bodies[body].center_of_mass), direction))
                 forces[body] = forces[body] + effort
                 torques[body] = torques[body] + _turned(bodies[body], effort * arm)
-        if self.chain.tip_wrench is not None:
-            inner = (0.0, 0.0, 0.0) if self.chain.wrist is None else self.chain.wrist.position
-            arm = norm(subtract(inner, bodies[-1].center_of_mass)) + norm(self.chain.tip.position)
-            force, torque = norm(self.chain.tip_wrench[:3]), norm(self.chain.tip_wrench[3:])
+        if self.tree.tip_wrench is not None:
+            inner = (0.0, 0.0, 0.0) if self.tree.wrist is None else self.tree.wrist.position
+            arm = norm(subtract(inner, bodies[-1].center_of_mass)) + norm(self.tree.tip.position)
+            force, torque = norm(self.tree.tip_wrench[:3]), norm(self.tree.tip_wrench[3:])
             forces[-1] = forces[-1] + force
             torques[-1] = torques[-1] + _turned(bodies[-1], torque + force * arm)
         squares = [force * force / body.mass for force, body in zip(forces, bodies, strict=True)]
         return casadi.sqrt(total([*squares, *(torque * torque for torque in torques)]))
 
 
-def _parts(chain: Chain, coordinates: Scalars, part: int) -> list[Scalar]:
+def _parts(tree: KinematicTree, coordinates: Scalars, part: int) -> list[Scalar]:
     """Sizes by which joints turn (part 0) or slide (part 1)."""
-    pairs = zip(chain.links, coordinates, strict=True)
+    pairs = zip(tree.links, coordinates, strict=True)
     return [abs(link.screw[part]) * casadi.fabs(each) for link, each in pairs if link.screw[part]]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from experts.report.part_costs import moving_states
 from scripts.benchmarks.peers import peers_of
 from scripts.benchmarks.peers.mujoco_peer import MujocoPeer, mujoco_spec, robot_xml
@@ -30,7 +30,7 @@ def test_peer_has_the_same_accelerations(package: str, name: str) -> None:
 @pytest.fixture
 def mujoco_twin(short_scene: Scene) -> MujocoPeer:
     pytest.importorskip("mujoco")
-    return MujocoPeer(compile_scene(short_scene), Chain.from_scene(short_scene))
+    return MujocoPeer(compile_scene(short_scene), KinematicTree.from_scene(short_scene))
 
 
 @pytest.mark.parametrize("name", COMPARED_INTEGRATORS)
@@ -83,10 +83,10 @@ def test_missing_engines_and_unsuitable_scenes_leave_a_note(
 
 def test_mujoco_leaves_out_springs_and_dampers_only_where_there_are_none() -> None:
     scene = load_scene("paper")
-    xml = robot_xml(Chain.from_scene(scene), 0.01, "RK4")
+    xml = robot_xml(KinematicTree.from_scene(scene), 0.01, "RK4")
     assert 'spring="disable"' in xml
     first = scene.links[0].model_copy(update={"stiffness": 3.0, "rest_angle": 0.25})
-    xml = robot_xml(Chain.from_scene(scene.replace(links=(first, *scene.links[1:]))), 0.01, "RK4")
+    xml = robot_xml(KinematicTree.from_scene(scene.replace(links=(first, *scene.links[1:]))), 0.01, "RK4")
     assert 'spring="disable"' not in xml
     assert 'damper="disable"' in xml
     assert 'stiffness="3.0" springref="0.25"' in xml

@@ -10,7 +10,7 @@ from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import kinematics
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from experts import BoxDDP
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.paper_problem import PaperProblem
@@ -171,12 +171,12 @@ def test_crocoddyl_approximates_the_pose_cost(
     """The tip a rotation and a displacement away from the target, in random directions."""
     problem = shortened("paper", 1)
     layout, rng = problem.kernels.layout, np.random.default_rng(0)
-    chain, target = Chain.from_scene(problem.scene), problem.scene.target.pose.dual_quaternion
+    tree, target = KinematicTree.from_scene(problem.scene), problem.scene.target.pose.dual_quaternion
     angles = (
         problem.initial_state[layout.state.joint_angles],
         problem.initial_state[layout.state.wrist_angles],
     )
-    to_base = dq.conjugate(kinematics.arm_pose(chain, *angles))
+    to_base = dq.conjugate(kinematics.arm_pose(tree, *angles))
     exact, approximate = (CrocoddylManeuver(problem, exact_pose_cost=flag).shooting for flag in (True, False))
     maneuver = CrocoddylManeuver(problem)
     for _ in range(50):

@@ -1,4 +1,4 @@
-"""Random chains, and the same robots as Pinocchio models: a free flyer with joints about and along z."""
+"""Random robots, and the same robots as Pinocchio models: a free flyer with joints about and along z."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.dynamics.chain import Chain, JointedLink, Placement, RigidBody, Screw
+from dq_space_arm_env.dynamics.kinematic_tree import JointedLink, KinematicTree, Placement, RigidBody, Screw
 
 pin = pytest.importorskip("pinocchio")
 
@@ -41,12 +41,12 @@ def random_screw(rng: np.random.Generator) -> Screw:
     return kinds[rng.integers(len(kinds))]
 
 
-def random_chain(rng: np.random.Generator, joints: int, wrist: bool = True) -> Chain:
+def random_tree(rng: np.random.Generator, joints: int, wrist: bool = True) -> KinematicTree:
     links = tuple(
         JointedLink(random_body(rng), random_placement(rng), random_screw(rng), 0.0, 0.0, 0.0)
         for _ in range(joints)
     )
-    return Chain(
+    return KinematicTree(
         base=random_body(rng, at_origin=True),
         links=links,
         wrist=random_placement(rng) if wrist else None,
@@ -56,13 +56,13 @@ def random_chain(rng: np.random.Generator, joints: int, wrist: bool = True) -> C
     )
 
 
-def pinocchio_model(chain: Chain) -> Any:
-    """The chain as a Pinocchio model without gravity."""
+def pinocchio_model(tree: KinematicTree) -> Any:
+    """The tree as a Pinocchio model without gravity."""
     model = pin.Model()
     model.gravity = pin.Motion.Zero()
     parent = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
-    model.appendBodyToJoint(parent, _inertia(chain.base), pin.SE3.Identity())
-    for index, link in enumerate(chain.links):
+    model.appendBodyToJoint(parent, _inertia(tree.base), pin.SE3.Identity())
+    for index, link in enumerate(tree.links):
         placement = pin.SE3(np.array(link.joint.rotation), np.array(link.joint.position))
         turn, slide = link.screw
         joint = pin.JointModelHZ(slide) if slide else pin.JointModelRZ()
@@ -88,12 +88,12 @@ def velocity(angular: Any, linear: Any, joint_rates: Any) -> np.ndarray:
     return np.array([*linear, *angular, *joint_rates])
 
 
-def tip_in_last_link(chain: Chain, wrist_angles: Any) -> tuple[np.ndarray, np.ndarray]:
+def tip_in_last_link(tree: KinematicTree, wrist_angles: Any) -> tuple[np.ndarray, np.ndarray]:
     """Rotation matrix and position of the tip in the last link's frame, by matrices."""
     rotation, position = np.eye(3), np.zeros(3)
-    if chain.wrist is not None:
+    if tree.wrist is not None:
         psi, theta, phi = wrist_angles
-        rotation = np.array(chain.wrist.rotation) @ Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix()
-        position = np.array(chain.wrist.position)
-    position = position + rotation @ np.array(chain.tip.position)
-    return rotation @ np.array(chain.tip.rotation), position
+        rotation = np.array(tree.wrist.rotation) @ Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix()
+        position = np.array(tree.wrist.position)
+    position = position + rotation @ np.array(tree.tip.position)
+    return rotation @ np.array(tree.tip.rotation), position

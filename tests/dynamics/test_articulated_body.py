@@ -8,8 +8,8 @@ import pytest
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.dynamics import minimal, newton_euler
 from dq_space_arm_env.dynamics.articulated_body import ArticulatedBodies
-from dq_space_arm_env.dynamics.chain import Chain
 from dq_space_arm_env.dynamics.forward import inertia_of
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 
 ZERO = (0.0, 0.0, 0.0)
@@ -19,27 +19,27 @@ def flat(solved):
     return np.array([*solved.angular, *solved.linear, *solved.joints], dtype=float)
 
 
-def random_wrenches(rng, chain):
+def random_wrenches(rng, tree):
     """Wrenches on the bodies, within the plane for a planar base, and joint torques."""
     wrenches = []
-    for _ in range(len(chain.links) + 1):
+    for _ in range(len(tree.links) + 1):
         force, torque = rng.normal(size=3), rng.normal(size=3)
-        if chain.planar:
+        if tree.planar:
             force[2], torque[:2] = 0.0, 0.0
         wrenches.append((tuple(force.tolist()), tuple(torque.tolist())))
-    return wrenches, rng.normal(size=len(chain.links)).tolist()
+    return wrenches, rng.normal(size=len(tree.links)).tolist()
 
 
 @pytest.mark.parametrize("scene", ["paper", "planar", "payload", "six-joint"])
 def test_both_formulations_respond_alike_to_wrenches_on_every_body(scene):
-    chain, rng = Chain.from_scene(load_scene(scene)), np.random.default_rng(0)
+    tree, rng = KinematicTree.from_scene(load_scene(scene)), np.random.default_rng(0)
     for _ in range(5):
-        angles = rng.uniform(-3.0, 3.0, len(chain.links)).tolist()
-        rotations = minimal.link_frames(chain, angles)
-        wrenches, joints = random_wrenches(rng, chain)
-        expected = flat(MassMatrix(chain, rotations).accelerations(wrenches, joints))
-        for root in range(len(chain.links) + 1):
-            found = flat(ArticulatedBodies(chain, rotations, root).accelerations(wrenches, joints))
+        angles = rng.uniform(-3.0, 3.0, len(tree.links)).tolist()
+        rotations = minimal.link_frames(tree, angles)
+        wrenches, joints = random_wrenches(rng, tree)
+        expected = flat(MassMatrix(tree, rotations).accelerations(wrenches, joints))
+        for root in range(len(tree.links) + 1):
+            found = flat(ArticulatedBodies(tree, rotations, root).accelerations(wrenches, joints))
             assert np.linalg.norm(found - expected) < 1e-12 * np.linalg.norm(expected)
 
 
@@ -47,15 +47,15 @@ def test_both_formulations_respond_alike_to_wrenches_on_every_body(scene):
 @pytest.mark.parametrize("formulation", ["articulated_body", "minimal_coordinates"])
 @pytest.mark.parametrize("many", [False, True])
 def test_inverse_dynamics_at_rest_undoes_the_response_to_generalized_forces(scene, formulation, many):
-    chain, rng = Chain.from_scene(load_scene(scene)), np.random.default_rng(1)
-    n = len(chain.links)
-    rotations = minimal.link_frames(chain, rng.uniform(-3.0, 3.0, n).tolist())
-    (force, torque), joints = random_wrenches(rng, replace(chain, links=()))[0][0], rng.normal(size=n)
-    solved = inertia_of(formulation, chain, rotations, many=many).solve(force, torque, joints.tolist())
-    needed = minimal.inverse_dynamics(chain, rotations, ZERO, [0.0] * n, solved)
+    tree, rng = KinematicTree.from_scene(load_scene(scene)), np.random.default_rng(1)
+    n = len(tree.links)
+    rotations = minimal.link_frames(tree, rng.uniform(-3.0, 3.0, n).tolist())
+    (force, torque), joints = random_wrenches(rng, replace(tree, links=()))[0][0], rng.normal(size=n)
+    solved = inertia_of(formulation, tree, rotations, many=many).solve(force, torque, joints.tolist())
+    needed = minimal.inverse_dynamics(tree, rotations, ZERO, [0.0] * n, solved)
     found = np.array([*needed.force, *needed.torque, *needed.joints])
     given = np.array([*force, *torque, *joints])
-    if chain.planar:  # what holds the base in its plane is nobody's input
+    if tree.planar:  # what holds the base in its plane is nobody's input
         found[2:5] = given[2:5] = 0.0
     np.testing.assert_allclose(found, given, atol=1e-13 * np.abs(given).max())
 
@@ -65,11 +65,11 @@ def test_a_light_base_keeps_its_digits_where_the_mass_matrix_loses_them():
     paper = load_scene("paper")
     inertia = (1e-7 * np.array(paper.base.inertia)).tolist()
     base = {**paper.base.model_dump(), "mass": 1e-7 * paper.base.mass, "inertia": inertia}
-    chain = Chain.from_scene(paper.replace(base=base))
-    rotations = minimal.link_frames(chain, [0.3, -0.7, 1.1])
+    tree = KinematicTree.from_scene(paper.replace(base=base))
+    rotations = minimal.link_frames(tree, [0.3, -0.7, 1.1])
     errors = {}
     for formulation in ("articulated_body", "minimal_coordinates"):
-        solved = inertia_of(formulation, chain, rotations).solve(ZERO, ZERO, [1.0, 0.0, 0.0])
+        solved = inertia_of(formulation, tree, rotations).solve(ZERO, ZERO, [1.0, 0.0, 0.0])
         turning = solved.angular[2] * inertia[2][2]
         errors[formulation] = abs(turning + 1.0)
     assert errors["articulated_body"] < 1e-15
@@ -79,17 +79,17 @@ def test_a_light_base_keeps_its_digits_where_the_mass_matrix_loses_them():
 def test_one_refinement_brings_back_what_needles_cost_the_schur_complement_21():
     paper, rng = load_scene("paper"), np.random.default_rng(2)
     needles = [{**link.model_dump(), "inertia": [5e-9, 0.5, 0.5]} for link in paper.links]
-    chain = Chain.from_scene(paper.replace(links=needles))
-    frames = newton_euler.joint_frames(chain, [0.3, -0.7, 1.1], [0.0] * 3)
+    tree = KinematicTree.from_scene(paper.replace(links=needles))
+    frames = newton_euler.joint_frames(tree, [0.3, -0.7, 1.1], [0.0] * 3)
     resting = [(0.0,) * 8] * 4
     wrench = (0.0, *rng.normal(size=3).tolist(), 0.0, *rng.normal(size=3).tolist())
-    system = newton_euler.assemble(chain, frames, resting, wrench, rng.normal(size=3).tolist())
+    system = newton_euler.assemble(tree, frames, resting, wrench, rng.normal(size=3).tolist())
     corner = np.zeros((len(system.b2),) * 2)
     full = np.block([[np.array(system.s11), np.array(system.s12)], [np.array(system.s21), corner]])
     expected = np.linalg.solve(full, [*system.b1, *system.b2])[: len(system.b1)]
 
     def error(refinements):
-        found = np.array(newton_euler.solve_schur(chain, system, refinements)[0])
+        found = np.array(newton_euler.solve_schur(tree, system, refinements)[0])
         return np.abs(found - expected).max() / np.abs(expected).max()
 
     assert error(0) > 1e-12

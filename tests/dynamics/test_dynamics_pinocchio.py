@@ -28,12 +28,12 @@ def relative_error(actual, expected):
 
 def random_case(joints, seed, wrench=False):
     rng = np.random.default_rng((joints, seed))
-    chain = twin.random_chain(rng, joints)
+    tree = twin.random_tree(rng, joints)
     tip_wrench = tuple(rng.normal(size=6).tolist()) if wrench else None
-    chain = replace(chain, tip_wrench=tip_wrench)
-    model = twin.pinocchio_model(chain)
+    tree = replace(tree, tip_wrench=tip_wrench)
+    model = twin.pinocchio_model(tree)
     case = SimpleNamespace(
-        chain=chain,
+        tree=tree,
         model=model,
         data=model.createData(),
         base_pose=twin.random_placement(rng).dual_quaternion,
@@ -56,10 +56,10 @@ def external_forces(case):
     forces = pin.StdVec_Force()
     for _ in range(case.model.njoints):
         forces.append(pin.Force.Zero())
-    if case.chain.tip_wrench is not None:
-        rotation, position = twin.tip_in_last_link(case.chain, case.wrist)
-        force = rotation @ case.chain.tip_wrench[:3]
-        torque = rotation @ case.chain.tip_wrench[3:] + np.cross(position, force)
+    if case.tree.tip_wrench is not None:
+        rotation, position = twin.tip_in_last_link(case.tree, case.wrist)
+        force = rotation @ case.tree.tip_wrench[:3]
+        torque = rotation @ case.tree.tip_wrench[3:] + np.cross(position, force)
         forces[case.model.njoints - 1] = pin.Force(force, torque)
     return forces
 
@@ -72,23 +72,23 @@ def pinocchio_accelerations(case):
 
 def accelerations(case, inertia_at):
     """Dual accelerations of base and joints, given how a formulation's inertia is made of frames."""
-    chain = case.chain
-    frames = minimal.link_frames(chain, case.angles)
-    acting = [(case.force, case.torque), *[(ZERO, ZERO)] * len(chain.links)]
-    if chain.tip_wrench is not None:
-        tip, wrench = twin.tip_in_last_link(chain, case.wrist), chain.tip_wrench
+    tree = case.tree
+    frames = minimal.link_frames(tree, case.angles)
+    acting = [(case.force, case.torque), *[(ZERO, ZERO)] * len(tree.links)]
+    if tree.tip_wrench is not None:
+        tip, wrench = twin.tip_in_last_link(tree, case.wrist), tree.tip_wrench
         acting[-1] = minimal.shift_wrench(*tip, wrench[:3], wrench[3:])
-    inertia = inertia_at(chain, frames)
-    solved = forward_dynamics(chain, inertia, frames, case.angular, case.rates, acting, case.motors)
+    inertia = inertia_at(tree, frames)
+    solved = forward_dynamics(tree, inertia, frames, case.angular, case.rates, acting, case.motors)
     linear = vectors.subtract(solved.linear, vectors.cross(case.angular, case.linear))
     return np.array([*solved.angular, *linear, *solved.joints], dtype=float)
 
 
 def paper_state(case):
     """The case in the paper's coordinates: dual velocities of all bodies at their centers of mass."""
-    frames = minimal.link_frames(case.chain, case.angles)
-    velocities = kinematics.body_velocities(case.chain, frames, (*case.angular, *case.linear), case.rates)
-    bodies = [case.chain.base, *(link.body for link in case.chain.links)]
+    frames = minimal.link_frames(case.tree, case.angles)
+    velocities = kinematics.body_velocities(case.tree, frames, (*case.angular, *case.linear), case.rates)
+    bodies = [case.tree.base, *(link.body for link in case.tree.links)]
     duals = [
         (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
         for body, v in zip(bodies, velocities, strict=True)
@@ -98,15 +98,15 @@ def paper_state(case):
 
 def paper_rates(case):
     base_wrench = (0.0, *case.force, 0.0, *case.torque)
-    return newton_euler.paper_rates(case.chain, paper_state(case), base_wrench, case.motors, [0.0] * 3)
+    return newton_euler.paper_rates(case.tree, paper_state(case), base_wrench, case.motors, [0.0] * 3)
 
 
 def newton_euler_accelerations(case):
     """Base and joint accelerations that the paper's dual accelerations imply: the rate of (12)."""
-    frames = newton_euler.joint_frames(case.chain, case.angles, case.wrist)
+    frames = newton_euler.joint_frames(case.tree, case.angles, case.wrist)
     rates, _ = paper_rates(case)
-    bodies = np.reshape(rates[-8 * (len(case.chain.links) + 1) :], (-1, 8))
-    joints = newton_euler.along_joints(case.chain, frames, [tuple(body) for body in bodies])
+    bodies = np.reshape(rates[-8 * (len(case.tree.links) + 1) :], (-1, 8))
+    joints = newton_euler.along_joints(case.tree, frames, [tuple(body) for body in bodies])
     return np.array([*bodies[0][1:4], *bodies[0][5:8], *joints], dtype=float)
 
 
@@ -134,7 +134,7 @@ def test_reaction_wrenches_agree_with_pinocchio_21(joints):
         pin.rnea(case.model, case.data, case.q, case.v, acceleration, external_forces(case))
         forces = list(case.data.f)[2:]
         expected = []
-        for link, force in zip(case.chain.links, forces, strict=True):
+        for link, force in zip(case.tree.links, forces, strict=True):
             turns = link.screw.turn
             expected += [*force.linear, *force.angular[:2]] if turns else [*force.linear[:2], *force.angular]
         assert relative_error(reactions, expected) < 1e-12
@@ -144,14 +144,14 @@ def test_schur_complement_solves_the_full_system_20():
     for joints in range(1, 6):
         case = random_case(joints, 0, wrench=True)
         state = paper_state(case)
-        frames = newton_euler.joint_frames(case.chain, case.angles, case.wrist)
+        frames = newton_euler.joint_frames(case.tree, case.angles, case.wrist)
         wrench = (0.0, *case.force, 0.0, *case.torque)
-        system = newton_euler.assemble(case.chain, frames, state.velocities, wrench, case.motors)
+        system = newton_euler.assemble(case.tree, frames, state.velocities, wrench, case.motors)
         size = 8 * (joints + 1)
         full = np.zeros((size + 5 * joints, size + 5 * joints))
         full[:size, :size], full[:size, size:], full[size:, :size] = system.s11, system.s12, system.s21
         expected = np.linalg.solve(full, [*system.b1, *system.b2])
-        accelerations, reactions = newton_euler.solve_schur(case.chain, system)
+        accelerations, reactions = newton_euler.solve_schur(case.tree, system)
         assert relative_error([*accelerations, *reactions], expected) < 1e-12
 
 
@@ -159,10 +159,10 @@ def test_tip_pose_27_and_its_rate_30():
     for joints in range(5):
         case = random_case(joints, 1)
         twist, wrist_rates = (*case.angular, *case.linear), (0.3, -0.4, 0.5)
-        arguments = (case.chain, case.base_pose, case.angles, case.wrist)
+        arguments = (case.tree, case.base_pose, case.angles, case.wrist)
         pin.forwardKinematics(case.model, case.data, case.q)
         last = case.data.oMi[joints + 1]
-        rotation, position = twin.tip_in_last_link(case.chain, case.wrist)
+        rotation, position = twin.tip_in_last_link(case.tree, case.wrist)
         matrix, origin = poses.to_matrix(kinematics.tip_pose(*arguments))
         np.testing.assert_allclose(matrix, last.rotation @ rotation, atol=1e-13)
         np.testing.assert_allclose(origin, last.translation + last.rotation @ position, atol=1e-12)
@@ -173,7 +173,7 @@ def test_tip_pose_27_and_its_rate_30():
             base = dual_quaternion.multiply(case.base_pose, screw.exponential([h * w for w in twist]))
             angles = [a + h * r for a, r in zip(case.angles, case.rates, strict=True)]
             wrist = [a + h * r for a, r in zip(case.wrist, wrist_rates, strict=True)]
-            return np.array(kinematics.tip_pose(case.chain, base, angles, wrist))
+            return np.array(kinematics.tip_pose(case.tree, base, angles, wrist))
 
         h = 1e-3
         eighth_order = sum(
@@ -187,11 +187,11 @@ def test_tip_pose_27_and_its_rate_30():
 def test_momentum_and_energy_agree_with_pinocchio():
     for joints in range(8):
         case = random_case(joints, 2)
-        frames = minimal.link_frames(case.chain, case.angles)
+        frames = minimal.link_frames(case.tree, case.angles)
         twist = (*case.angular, *case.linear)
-        velocities = kinematics.body_velocities(case.chain, frames, twist, case.rates)
-        linear, angular, _ = kinematics.momentum(case.chain, frames, velocities)
-        kinetic, potential = kinematics.energy(case.chain, case.angles, velocities)
+        velocities = kinematics.body_velocities(case.tree, frames, twist, case.rates)
+        linear, angular, _ = kinematics.momentum(case.tree, frames, velocities)
+        kinetic, potential = kinematics.energy(case.tree, case.angles, velocities)
         arguments = (case.model, case.data, case.q, case.v)
         centroidal = pin.computeCentroidalMomentum(*arguments)
         attitude, _ = poses.to_matrix(case.base_pose)
@@ -204,10 +204,10 @@ def test_momentum_and_energy_agree_with_pinocchio():
 def test_inverse_dynamics_undoes_forward_dynamics():
     for joints in range(8):
         case = random_case(joints, 3)
-        frames = minimal.link_frames(case.chain, case.angles)
+        frames = minimal.link_frames(case.tree, case.angles)
         a = accelerations(case, MassMatrix)
         linear = vectors.add(tuple(a[3:6]), vectors.cross(case.angular, case.linear))
         solved = Accelerations(tuple(a[:3]), linear, a[6:].tolist())
-        found = minimal.inverse_dynamics(case.chain, frames, case.angular, case.rates, solved)
+        found = minimal.inverse_dynamics(case.tree, frames, case.angular, case.rates, solved)
         given = [*case.force, *case.torque, *case.motors]
         assert relative_error([*found.force, *found.torque, *found.joints], given) < 1e-12

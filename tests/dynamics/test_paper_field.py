@@ -1,4 +1,4 @@
-"""The constants of a chain, and the paper's redundant state against the minimal one, in plain numbers."""
+"""The constants of a tree, and the paper's redundant state against the minimal one, in plain numbers."""
 
 import casadi
 import numpy as np
@@ -7,7 +7,7 @@ import pytest
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.dynamics import kinematics
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.paper_field import PaperField
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
@@ -26,18 +26,18 @@ def about(body: object, point: np.ndarray) -> tuple[float, np.ndarray, np.ndarra
 
 def test_masses_of_a_chain_are_those_of_the_scene() -> None:
     scene = load_scene("paper")
-    chain = Chain.from_scene(scene)
+    tree = KinematicTree.from_scene(scene)
     for body, given, center in (
-        (chain.base, scene.base, (0.0, 0.0, 0.0)),
+        (tree.base, scene.base, (0.0, 0.0, 0.0)),
         *(
             (link.body, given, given.center_of_mass)
-            for link, given in zip(chain.links, scene.links, strict=True)
+            for link, given in zip(tree.links, scene.links, strict=True)
         ),
     ):
         assert body.mass == given.mass
         assert tuple(body.center_of_mass) == tuple(center)
         np.testing.assert_array_equal(body.inertia, given.inertia)
-    assert chain.heaviest == np.argmax([scene.base.mass, *(link.mass for link in scene.links)])
+    assert tree.heaviest == np.argmax([scene.base.mass, *(link.mass for link in scene.links)])
 
 
 def test_a_payload_and_its_link_add_up() -> None:
@@ -46,7 +46,7 @@ def test_a_payload_and_its_link_add_up() -> None:
     payload = {**scene.payload.model_dump(), "inertia": inertia, "center_of_mass": [0.1, -0.2, 0.3]}
     tip = {"position": [0.4, 0.1, -0.1], "rotation": {"axis": [1, 2, 3], "angle": 50}}
     scene = scene.replace(payload=payload, tip=tip)
-    held, bare = Chain.from_scene(scene), Chain.from_scene(scene.replace(payload=None))
+    held, bare = KinematicTree.from_scene(scene), KinematicTree.from_scene(scene.replace(payload=None))
     rotation = np.array(scene.tip.rotation_matrix)
 
     class Moved:
@@ -64,7 +64,7 @@ def test_a_payload_and_its_link_add_up() -> None:
 def test_both_states_describe_the_same_motion(name: str) -> None:
     scene = load_scene(name)
     layout = StateLayout.of(scene)
-    minimal = SpaceArmField(Chain.from_scene(scene), layout)
+    minimal = SpaceArmField(KinematicTree.from_scene(scene), layout)
     field = PaperField(minimal)
     rng = np.random.default_rng(0)
     x = layout.initial_state.copy()
@@ -90,7 +90,7 @@ def test_both_states_describe_the_same_motion(name: str) -> None:
     z = casadi.SX.sym("z", 8 + count + wrist)
     parts = casadi.vertsplit(z)
     tip = casadi.vertcat(
-        *kinematics.tip_pose(minimal.chain, parts[:8], parts[8 : 8 + count], parts[8 + count :])
+        *kinematics.tip_pose(minimal.tree, parts[:8], parts[8 : 8 + count], parts[8 + count :])
     )
     moving = [
         *dq.derivative(pose, (*motion.angular, *motion.linear)),

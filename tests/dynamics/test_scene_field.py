@@ -14,7 +14,7 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import screw
 from dq_space_arm_env.algebra.vectors import add, cross
 from dq_space_arm_env.dynamics import linear, minimal
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.minimal import Accelerations
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.scene import Actuators, InitialState, JointLimit, Pose, Spread
@@ -31,7 +31,7 @@ def sprung(name: str) -> Scene:
 
 
 def field_of(scene: Scene, formulation: str | None = None) -> SpaceArmField:
-    return SpaceArmField(Chain.from_scene(scene), StateLayout.of(scene), formulation=formulation)
+    return SpaceArmField(KinematicTree.from_scene(scene), StateLayout.of(scene), formulation=formulation)
 
 
 def drawn(field: SpaceArmField, seed: int = 0) -> tuple[list[float], list[float]]:
@@ -43,28 +43,28 @@ def drawn(field: SpaceArmField, seed: int = 0) -> tuple[list[float], list[float]
 @pytest.mark.parametrize("name", ["paper", "planar", "tip-load", "payload"])
 def test_the_forces_that_the_accelerations_need_are_those_that_act(name: str, formulation: str) -> None:
     field = field_of(sprung(name), formulation)
-    chain, layout = field.chain, field.layout
+    tree, layout = field.tree, field.layout
     y, u = drawn(field)
     found = field.accelerations(y, u)
     motion = field.motion(y)
     twist = field.pose.full_twist(found[: len(field.pose.directions)])
     inertial = add(twist[3:], cross(motion.angular, motion.linear))
     given = Accelerations(twist[:3], inertial, found[len(field.pose.directions) :])
-    rotations = minimal.link_frames(chain, motion.joint_angles)
-    needed = minimal.inverse_dynamics(chain, rotations, motion.angular, motion.joint_rates, given)
+    rotations = minimal.link_frames(tree, motion.joint_angles)
+    needed = minimal.inverse_dynamics(tree, rotations, motion.angular, motion.joint_rates, given)
 
     control, u = layout.control, np.array(u)
-    if chain.planar:
+    if tree.planar:
         expected = [*u[control.base_force], 0.0, 0.0, 0.0, *u[control.base_torque]]
     else:
         expected = [*u[control.base_force], *u[control.base_torque]]
-    joints = np.zeros(len(chain.links))
+    joints = np.zeros(len(tree.links))
     joints[list(layout.actuated_joints)] = u[control.joint_torque]
     joints -= 3.0 * (np.array(motion.joint_angles) - 0.2) + 0.7 * np.array(motion.joint_rates)
-    tip = field.tip_forces(motion, rotations, chain.tip_wrench)
+    tip = field.tip_forces(motion, rotations, tree.tip_wrench)
     expected = np.add([*expected, *joints], [*tip.force, *tip.torque, *tip.joints])
     actual = np.array([*needed.force, *needed.torque, *needed.joints])
-    if chain.planar:  # what holds the base in its plane
+    if tree.planar:  # what holds the base in its plane
         actual[2:5] = 0.0
     np.testing.assert_allclose(actual, expected, atol=1e-11)
 
@@ -72,13 +72,13 @@ def test_the_forces_that_the_accelerations_need_are_those_that_act(name: str, fo
 def test_a_wrench_at_the_tip_replaces_the_scenes() -> None:
     field, loaded = (field_of(load_scene(name)) for name in ("paper", "tip-load"))
     y, u = drawn(field)
-    wrench = loaded.chain.tip_wrench
+    wrench = loaded.tree.tip_wrench
     assert wrench is not None
     np.testing.assert_allclose(field.accelerations(y, u, wrench), loaded.accelerations(y, u), rtol=1e-12)
-    rotations = minimal.link_frames(field.chain, field.motion(y).joint_angles)
+    rotations = minimal.link_frames(field.tree, field.motion(y).joint_angles)
     idle = field.tip_forces(field.motion(y), rotations, None)
     assert not any([*idle.force, *idle.torque, *idle.joints])
-    assert len(idle.joints) == len(idle.reactions) == len(field.chain.links)
+    assert len(idle.joints) == len(idle.reactions) == len(field.tree.links)
 
 
 def test_a_missing_actuator_pushes_nothing() -> None:
@@ -139,19 +139,19 @@ def test_momentum_changes_by_the_external_wrench_alone(name: str) -> None:
     changes = [casadi.jtimes(part, z, rates) + casadi.cross(spin, part) for part in (p, moment)]
     wanted = [f, tau - casadi.cross(arm, f)]
     found = values([*changes, *wanted], z, y)
-    free = [0, 1] if field.chain.planar else [0, 1, 2]
-    turning = [2] if field.chain.planar else [0, 1, 2]
+    free = [0, 1] if field.tree.planar else [0, 1, 2]
+    turning = [2] if field.tree.planar else [0, 1, 2]
     np.testing.assert_allclose(found[0][free], found[2][free], atol=1e-10)
     np.testing.assert_allclose(found[1][turning], found[3][turning], atol=1e-10)
     twist = casadi.vertcat(*balance.base_twist(entries, linear_momentum, angular))
     motion = field.motion(y)
     (given_twist,) = values([twist], z, y)
     np.testing.assert_allclose(given_twist.ravel(), [*motion.angular, *motion.linear], atol=1e-11)
-    assert balance.mass == pytest.approx(sum(b.mass for b in bodies(field.chain)))
+    assert balance.mass == pytest.approx(sum(b.mass for b in bodies(field.tree)))
 
 
-def bodies(chain: Chain) -> list[Any]:
-    return [chain.base, *(link.body for link in chain.links)]
+def bodies(tree: KinematicTree) -> list[Any]:
+    return [tree.base, *(link.body for link in tree.links)]
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])

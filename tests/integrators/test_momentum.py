@@ -8,7 +8,7 @@ from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import rotations
 from dq_space_arm_env.algebra.poses import to_rotation_and_position
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.integrators.momentum_coordinates import rotation_matrix, rotation_rate
 
@@ -35,8 +35,8 @@ def slow_walk(kernels, u, steps, integrator, every=100):
 
 def center_of_mass(kernels, states):
     """Center of mass of base and links in inertial axes, from the poses of their frames."""
-    chain = Chain.from_scene(kernels.scene)
-    bodies = [chain.base, *(link.body for link in chain.links)]
+    tree = KinematicTree.from_scene(kernels.scene)
+    bodies = [tree.base, *(link.body for link in tree.links)]
     poses = kernels.frame_poses(states)
     total = np.zeros((len(states), 3))
     for k, row in enumerate(poses):
@@ -107,8 +107,8 @@ def test_the_center_of_mass_moves_on_a_straight_line(name):
     x = moving_start(kernels, joint_rate=0.8, base_rate=0.2)
     steps, dt = 400, 0.1
     states = kernels.simulate(x, np.zeros(kernels.n_u), steps, dt=dt, integrator=name, every=20)
-    chain = Chain.from_scene(kernels.scene)
-    mass = chain.base.mass + sum(link.body.mass for link in chain.links)
+    tree = KinematicTree.from_scene(kernels.scene)
+    mass = tree.base.mass + sum(link.body.mass for link in tree.links)
     times = np.arange(len(states)) * 20 * dt
     path = center_of_mass(kernels, states)
     expected = path[0] + times[:, None] * kernels.momentum(x)[:3] / mass

@@ -6,7 +6,7 @@ import pytest
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.algebra import vectors
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
 from scripts.benchmarks.robots import robots
@@ -18,14 +18,14 @@ def relative_error(actual, expected):
 
 def paper_solution(kernels, x, u):
     """Dual accelerations of base and joints, and reaction wrenches, from the paper's system."""
-    chain = Chain.from_scene(kernels.scene)
-    field = SpaceArmField(chain, kernels.layout)
+    tree = KinematicTree.from_scene(kernels.scene)
+    field = SpaceArmField(tree, kernels.layout)
     stored, y = split_state(field, x.tolist())
     motion, inputs = field.motion(y), field.inputs(u.tolist())
-    link_frames = minimal.link_frames(chain, motion.joint_angles)
+    link_frames = minimal.link_frames(tree, motion.joint_angles)
     twist = (*motion.angular, *motion.linear)
-    velocities = kinematics.body_velocities(chain, link_frames, twist, motion.joint_rates)
-    bodies = [chain.base, *(link.body for link in chain.links)]
+    velocities = kinematics.body_velocities(tree, link_frames, twist, motion.joint_rates)
+    bodies = [tree.base, *(link.body for link in tree.links)]
     duals = [
         (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
         for body, v in zip(bodies, velocities, strict=True)
@@ -33,10 +33,10 @@ def paper_solution(kernels, x, u):
     state = newton_euler.PaperState(field.pose.full(stored), motion.joint_angles, motion.wrist_angles, duals)
     base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
     given = (base_wrench, inputs.joint_torques, inputs.wrist_rates)
-    rates, reactions = newton_euler.paper_rates(chain, state, *given)
+    rates, reactions = newton_euler.paper_rates(tree, state, *given)
     accelerations = [tuple(body) for body in np.reshape(rates[-8 * len(bodies) :], (-1, 8))]
-    frames = newton_euler.joint_frames(chain, motion.joint_angles, motion.wrist_angles)
-    joints = newton_euler.along_joints(chain, frames, accelerations)
+    frames = newton_euler.joint_frames(tree, motion.joint_angles, motion.wrist_angles)
+    joints = newton_euler.along_joints(tree, frames, accelerations)
     base = np.array([*accelerations[0][1:4], *accelerations[0][5:8]])
     return np.array([*base[list(field.pose.directions)], *joints]), np.array(reactions)
 

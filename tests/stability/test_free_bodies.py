@@ -26,7 +26,7 @@ def errors(scene, seed=0):
     """Errors of wrenches and accelerations, each part relative to its own size."""
     sample = samples(scene, seed + 1)[seed]
     exact = free_bodies(sample)
-    field = EquationsOfMotion(sample.chain, sample.kernels.layout)
+    field = EquationsOfMotion(sample.tree, sample.kernels.layout)
     y, u = split_state(field, sample.state.tolist())[1], sample.control.tolist()
     found = np.array(field.reaction_wrenches(y, u)), np.array(field.accelerations(y, u))
     return wrench_error(found[0], exact), acceleration_error(found[1], exact)
@@ -49,7 +49,7 @@ def test_free_bodies_agree_with_every_shipped_robot(name):
 
 def test_free_bodies_agree_with_kanes_equations():
     for sample in samples(load_scene("payload"), 3):
-        right = accelerations(linear_system(sample.chain, sample.motion), sample.motion)
+        right = accelerations(linear_system(sample.tree, sample.motion), sample.motion)
         np.testing.assert_allclose(free_bodies(sample).accelerations, right, rtol=1e-14)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.algebra import rotations
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.integrators.tableaus import CALVO_6, DORMAND_PRINCE_5, DORMAND_PRINCE_8, ButcherTableau
 from dq_space_arm_env.integrators.tableaus import RK4_OFFSETS as OFFSETS
@@ -33,7 +33,7 @@ from scripts.benchmarks.stability.stiff_joints import STIFF_METHODS, rate_left, 
 @pytest.mark.parametrize("name", FORMULATIONS)
 def test_kanes_equations_agree_with_every_formulation(name: str) -> None:
     for sample in samples(load_scene("paper"), 3):
-        exact = accelerations(linear_system(sample.chain, sample.motion), sample.motion)
+        exact = accelerations(linear_system(sample.tree, sample.motion), sample.motion)
         found = FORMULATIONS[name](sample)
         tolerance = 1e-5 if "float32" in name else 1e-12
         assert np.abs(found - exact).max() < tolerance * np.abs(exact).max()
@@ -42,7 +42,7 @@ def test_kanes_equations_agree_with_every_formulation(name: str) -> None:
 def test_a_wrong_acceleration_has_a_backward_error() -> None:
     """A relative error of 1e-6 in one acceleration cannot hide from the row-wise error (Oettli & Prager)."""
     (sample,) = samples(load_scene("paper"), 1)
-    system, found = linear_system(sample.chain, sample.motion), FORMULATIONS[MINIMAL](sample)
+    system, found = linear_system(sample.tree, sample.motion), FORMULATIONS[MINIMAL](sample)
     for entry in range(len(found)):
         wrong = found.copy()
         wrong[entry] *= 1.0 + 1e-6
@@ -56,7 +56,7 @@ def test_springs_and_dampers_are_in_the_reference() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=sample.kernels.n_x)
     sample = Sample.of(spatial, x, rng.normal(size=sample.kernels.n_u))
-    found = errors(linear_system(sample.chain, sample.motion), sample.motion, FORMULATIONS[MINIMAL](sample))
+    found = errors(linear_system(sample.tree, sample.motion), sample.motion, FORMULATIONS[MINIMAL](sample))
     assert found.by_row < 1e-14
 
 
@@ -157,7 +157,7 @@ def test_a_caught_payload_at_rest_relative_to_the_tip_changes_nothing() -> None:
 
 def test_a_bullet_stops_in_a_single_body() -> None:
     """Without joints the plastic impact is that of textbooks: velocities weighted by the masses."""
-    frame = Chain.from_scene(load_scene("payload"))
+    frame = KinematicTree.from_scene(load_scene("payload"))
     unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     tip = replace(frame.tip, position=(0.0,) * 3)
     free = replace(frame, base=RigidBody(3.0, (0.0,) * 3, unit), links=(), tip=tip)

@@ -10,7 +10,7 @@ import pytest
 import dq_space_arm_env
 from dq_space_arm_env import Scene, SceneError, compile_scene, load_scene
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.interoperability.pinocchio_twin import pinocchio_model, to_pinocchio
 from dq_space_arm_env.kernels.capture import catch_payload
 from dq_space_arm_env.scene.phases import phase_scene
@@ -96,9 +96,9 @@ def caught(kernels: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
 
 
 def center_of_mass(scene: Scene, x: np.ndarray, given: dict[str, float]) -> np.ndarray:
-    chain, total, moment = Chain.from_scene(scene, given), 0.0, np.zeros(3)
+    tree, total, moment = KinematicTree.from_scene(scene, given), 0.0, np.zeros(3)
     for body, pose in zip(
-        [chain.base, *(link.body for link in chain.links)], compile_scene(scene).frame_poses(x), strict=False
+        [tree.base, *(link.body for link in tree.links)], compile_scene(scene).frame_poses(x), strict=False
     ):
         rotation, position = poses.to_matrix(tuple(pose.tolist()))
         moment += body.mass * (np.array(position) + np.array(rotation) @ np.array(body.center_of_mass))

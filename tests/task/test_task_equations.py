@@ -49,7 +49,7 @@ def tip_of(equations: SceneEquations, x: np.ndarray) -> np.ndarray:
     layout, pose = equations.layout, np.zeros(8)
     pose[[0, 3, 5, 6] if layout.planar else range(8)] = x[layout.state.pose]
     angles = x[layout.state.joint_angles].tolist(), x[layout.state.wrist_angles].tolist()
-    return np.array(kinematics.tip_pose(equations.chain, pose.tolist(), *angles))
+    return np.array(kinematics.tip_pose(equations.tree, pose.tolist(), *angles))
 
 
 def state_costs(equations: SceneEquations, x: np.ndarray, *, terminal: bool) -> list[float]:

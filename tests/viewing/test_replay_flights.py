@@ -8,7 +8,7 @@ import pytest
 from dq_space_arm_env import compile_scene, list_scenes, load_scene
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.viewing.replay import common_scene
@@ -22,13 +22,13 @@ def test_frames_are_those_of_the_chain_one_state_at_a_time(name, make_flight):
     scene = load_scene(name)
     flight = make_flight(scene, steps=5)
     shown = prepare([flight], scene)[0]
-    layout, chain = StateLayout.of(scene), Chain.from_scene(scene)
+    layout, tree = StateLayout.of(scene), KinematicTree.from_scene(scene)
     targets = compile_scene(scene).layout.target_with(compile_scene(scene).stage_parameters())
     for instant, state in enumerate(flight.states.tolist()):
         base = np.zeros(8)
         base[list(PLANAR_POSE) if layout.planar else list(range(8))] = state[layout.state.pose]
         joints, wrist = state[layout.state.joint_angles], state[layout.state.wrist_angles]
-        expected = kinematics.frame_poses(chain, tuple(base.tolist()), joints, wrist)
+        expected = kinematics.frame_poses(tree, tuple(base.tolist()), joints, wrist)
         np.testing.assert_allclose(shown.frames[instant], expected, atol=1e-14)
         target = tuple(targets[instant].tolist())
         error = poses.error_angle(tuple(expected[-1]), target)

@@ -43,7 +43,7 @@ class DerivativePrograms:
     def __init__(self, equations: SceneEquations) -> None:
         self.equations = equations
         self.scene, self.layout, self.field = equations.scene, equations.layout, equations.field
-        self.chain = equations.chain
+        self.tree = equations.tree
 
     def _state_cost_derivatives(
         self, x: Scalars, weights: tuple[Scalars, Scalars], emphasis: Scalar = 1.0
@@ -55,7 +55,7 @@ class DerivativePrograms:
         """
         field, (pose, velocity) = self.field, weights
         motion = field.motion(self.equations.y(x))
-        arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
+        arm = kinematics.arm_pose(self.tree, motion.joint_angles, motion.wrist_angles)
         base = self.equations.base_pose(x)
         tip = dq.multiply(base, arm)
         angles = column(*self.equations.y(x)[: self._angle_count()])
@@ -88,7 +88,7 @@ class DerivativePrograms:
         frame, y = self.equations.moved(x, z)
         motion = field.motion(y)
         if cost.endswith("tip_twist"):
-            arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
+            arm = kinematics.arm_pose(self.tree, motion.joint_angles, motion.wrist_angles)
             frame = dq.multiply(frame, arm)
             own = self.equations.tip_twist(motion, field.inputs(w).wrist_rates)
         else:
@@ -292,7 +292,7 @@ class DerivativePrograms:
         base = self.equations.base_pose(x)
         increment, angles = symbols("d", n), symbols("angle", self._angle_count())
         n_joints = self.layout.n_joints
-        arm = kinematics.arm_pose(self.chain, angles[:n_joints], angles[n_joints:])
+        arm = kinematics.arm_pose(self.tree, angles[:n_joints], angles[n_joints:])
         half = dq.from_vector([0.5 * entry for entry in field.pose.full_twist(increment)])
         square = dq.multiply(half, half)
         turned = [a + 0.5 * b for a, b in zip(half, square, strict=True)]

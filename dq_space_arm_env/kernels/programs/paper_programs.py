@@ -113,7 +113,7 @@ class PaperPrograms:
 
     def _schur(self, name: str, refinements: int) -> Program:
         def outputs(x: Scalars, u: Scalars) -> dict[str, Scalars]:
-            ydot, _ = newton_euler.solve_schur(self.field.chain, self.field.system(x, u), refinements)
+            ydot, _ = newton_euler.solve_schur(self.field.tree, self.field.system(x, u), refinements)
             return {"accelerations": self.field.free_accelerations(x, ydot)}
 
         return self._of_state_and(name, outputs, u=self.field.n_u)
@@ -122,7 +122,7 @@ class PaperPrograms:
         return self._of_state_and(
             "free_accelerations",
             lambda x, ydot: {"accelerations": self.field.free_accelerations(x, ydot)},
-            ydot=8 * (len(self.field.chain.links) + 1),
+            ydot=8 * (len(self.field.tree.links) + 1),
         )
 
     def _state_weights(self, pose: Scalars, velocity: Scalars) -> tuple[list[float], list[float]]:

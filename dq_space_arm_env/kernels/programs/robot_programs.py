@@ -32,7 +32,7 @@ class RobotPrograms:
 
     def __init__(self, equations: SceneEquations, program: Callable[..., Program]) -> None:
         self.equations, self._program = equations, program
-        self.field, self.chain = equations.field, equations.chain
+        self.field, self.tree = equations.field, equations.tree
 
     def mass_matrix(self) -> Program:
         """Mass matrix, row by row."""
@@ -65,9 +65,9 @@ class RobotPrograms:
 
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             base, arm = self._tip_columns(x)
-            n = len(self.chain.links)
+            n = len(self.tree.links)
             angles = self.field.motion(self.equations.y(x)).joint_angles
-            system = MassMatrix(self.chain, minimal.link_frames(self.chain, angles))
+            system = MassMatrix(self.tree, minimal.link_frames(self.tree, angles))
             for joint in range(n):
                 rates = [1.0 if i == joint else 0.0 for i in range(n)]
                 # -H_b^-1 H_bm: the base moves such that the momentum stays zero.
@@ -146,7 +146,7 @@ class RobotPrograms:
     def _tip_columns(self, x: Scalars) -> tuple[Columns, Columns]:
         """The tip's twists per unit of the base's free directions, and of joint rates and Euler rates."""
         motion = self.field.motion(self.equations.y(x))
-        columns = kinematics.tip_jacobian(self.chain, motion.joint_angles, motion.wrist_angles)
+        columns = kinematics.tip_jacobian(self.tree, motion.joint_angles, motion.wrist_angles)
         return [columns[i] for i in self.field.pose.directions], columns[6:]
 
 

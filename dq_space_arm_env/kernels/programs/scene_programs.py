@@ -42,7 +42,7 @@ class ScenePrograms:
     def __init__(self, scene: Scene, *, penalized: bool = False) -> None:
         self.scene = scene
         self.equations = (PenalizedEquations if penalized else SceneEquations).of(scene)
-        self.chain, self.layout = self.equations.chain, self.equations.layout
+        self.tree, self.layout = self.equations.tree, self.equations.layout
         self.field = self.equations.field
         derivatives = self._derivatives = DerivativePrograms(self.equations)
         quadratic = QuadraticPrograms(self.equations)
@@ -147,7 +147,7 @@ class ScenePrograms:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             motion = self.field.motion(self.equations.y(x))
             frames = kinematics.frame_poses(
-                self.chain, self.equations.base_pose(x), motion.joint_angles, motion.wrist_angles
+                self.tree, self.equations.base_pose(x), motion.joint_angles, motion.wrist_angles
             )
             return {"poses": [entry for frame in frames for entry in frame]}
 
@@ -155,16 +155,16 @@ class ScenePrograms:
 
     def _velocities(self, x: Scalars) -> tuple[Any, Any, Any]:
         motion = self.field.motion(self.equations.y(x))
-        frames = minimal.link_frames(self.chain, motion.joint_angles)
+        frames = minimal.link_frames(self.tree, motion.joint_angles)
         velocities = kinematics.body_velocities(
-            self.chain, frames, (*motion.angular, *motion.linear), motion.joint_rates
+            self.tree, frames, (*motion.angular, *motion.linear), motion.joint_rates
         )
         return motion, frames, velocities
 
     def _momentum(self) -> Program:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             _, frames, velocities = self._velocities(x)
-            linear, angular, _ = kinematics.momentum(self.chain, frames, velocities)
+            linear, angular, _ = kinematics.momentum(self.tree, frames, velocities)
             attitude, _ = poses.to_matrix(self.equations.base_pose(x))
             return {"momentum": [*matrix_vector(attitude, linear), *matrix_vector(attitude, angular)]}
 
@@ -173,7 +173,7 @@ class ScenePrograms:
     def _energy(self) -> Program:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             motion, _, velocities = self._velocities(x)
-            kinetic, potential = kinematics.energy(self.chain, motion.joint_angles, velocities)
+            kinetic, potential = kinematics.energy(self.tree, motion.joint_angles, velocities)
             return {"energy": [kinetic + potential]}
 
         return self._program("energy", outputs, x=self.field.n_x)
@@ -268,7 +268,7 @@ class ScenePrograms:
             # q_{D/G} = q_{G/I}* q_{D/I} and q_{G/I} = q_{e0/I} q_{G/e0}: solved for the base.
             error = dq.normalize(field.pose.full(observation[:n_pose]))
             motion = field.motion(self.equations.y(x))
-            arm = kinematics.arm_pose(self.chain, motion.joint_angles, motion.wrist_angles)
+            arm = kinematics.arm_pose(self.tree, motion.joint_angles, motion.wrist_angles)
             tip = dq.multiply(self.equations.target, dq.conjugate(error))
             x[:n_pose] = field.pose.reduced(dq.multiply(tip, dq.conjugate(arm)))
             return {"x": x}

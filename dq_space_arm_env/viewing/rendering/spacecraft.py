@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.kinematics import frame_poses
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.constraint_rows import sides
@@ -100,9 +100,9 @@ class SpacecraftModel:
     def region(self) -> tuple[Array, Array]:
         """Balls around start, target, and the arm between: centers (n, 3) and radii (n,), m."""
         start, spread = self.scene.initial_state, self.scene.spread
-        chain = Chain.from_scene(self.scene)
+        tree = KinematicTree.from_scene(self.scene)
         poses_at_start = frame_poses(
-            chain, start.base_pose.dual_quaternion, start.joint_angles, start.wrist_angles
+            tree, start.base_pose.dual_quaternion, start.joint_angles, start.wrist_angles
         )
         frames = np.array([poses.position(pose) for pose in poses_at_start], dtype=np.float64)
         rotation = np.array(start.base_pose.rotation_matrix)
@@ -269,8 +269,8 @@ class SpacecraftModel:
             for side in sides(self.scene, limits):
                 if side.sign > 0 and not side.is_rate:
                     farthest[side.link] = max(farthest[side.link], side.bound)
-        chain = Chain.from_scene(self.scene)
-        return [max(link.screw.slide * most, 0.0) for link, most in zip(chain.links, farthest, strict=True)]
+        tree = KinematicTree.from_scene(self.scene)
+        return [max(link.screw.slide * most, 0.0) for link, most in zip(tree.links, farthest, strict=True)]
 
     @property
     def _geometry(self) -> list[tuple[Shape, ...]]:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import kinematics
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.scene.pose import PLANAR_POSE
@@ -123,7 +123,7 @@ def frame_poses(scene: Scene, layout: StateLayout, states: FloatArray) -> FloatA
     stored = list(PLANAR_POSE) if layout.planar else list(range(8))
     base[stored] = states[:, entries.pose].T
     joints, wrist = tuple(states[:, entries.joint_angles].T), tuple(states[:, entries.wrist_angles].T)
-    frames = kinematics.frame_poses(Chain.from_scene(scene), tuple(base), joints, wrist)
+    frames = kinematics.frame_poses(KinematicTree.from_scene(scene), tuple(base), joints, wrist)
     return np.stack([np.stack(frame, axis=1) for frame in frames], axis=1)
 
 

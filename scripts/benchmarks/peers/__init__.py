@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from dq_space_arm_env import Kernels
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.subjects import Case
 
@@ -35,14 +35,14 @@ def peers_of(kernels: Kernels) -> tuple[list[Peer], list[str]]:
     from scripts.benchmarks.peers.mujoco_peer import MujocoPeer
     from scripts.benchmarks.peers.pinocchio_peer import PinocchioPeer
 
-    chain = Chain.from_scene(kernels.scene)
-    if chain.tip_wrench is not None:
+    tree = KinematicTree.from_scene(kernels.scene)
+    if tree.tip_wrench is not None:
         return [], [f"Scene {kernels.scene.name} has no peers: their wrenches do not turn with a wrist."]
     peers: list[Peer] = []
     notes = []
     for title, package, kind in (("Pinocchio", "pin", PinocchioPeer), ("MuJoCo", "mujoco", MujocoPeer)):
         try:
-            peers.append(kind(kernels, chain))
+            peers.append(kind(kernels, tree))
         except ImportError:
             notes.append(f"{title} is left out: it is not installed (pip install {package}).")
         else:

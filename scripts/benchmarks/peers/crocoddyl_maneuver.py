@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.paper_problem import beyond_the_paper
 from experts.problems.shooting_problem import FloatArray
@@ -47,13 +47,13 @@ optimum. More weight brings both down, and takes more iterations.
 
 def obstacle(problem: ArmProblem) -> str | None:
     """The sentence that tells why Crocoddyl cannot take a maneuver; None if it can."""
-    layout, chain = problem.kernels.layout, Chain.from_scene(problem.scene)
+    layout, tree = problem.kernels.layout, KinematicTree.from_scene(problem.scene)
     inputs = 6 + layout.n_joints + 3 * layout.has_wrist
     reasons = {
-        "a planar base": chain.planar,
-        "parts without an actuator": not chain.planar and layout.n_u < inputs,
-        "springs or dampers": any(link.stiffness or link.damping for link in chain.links),
-        "a wrench at the tip": chain.tip_wrench is not None,
+        "a planar base": tree.planar,
+        "parts without an actuator": not tree.planar and layout.n_u < inputs,
+        "springs or dampers": any(link.stiffness or link.damping for link in tree.links),
+        "a wrench at the tip": tree.tip_wrench is not None,
     }
     found = [reason for reason, applies in reasons.items() if applies] + beyond_the_paper(problem.scene)
     return f"Crocoddyl is left out: it is not given {' or '.join(found)}." if found else None
@@ -137,11 +137,11 @@ class CrocoddylManeuver:
 
     def _robot(self) -> tuple[Any, int]:
         """Pinocchio's model, with joints for the wrist, and the index of the tip's frame."""
-        pin, chain = self._pinocchio, Chain.from_scene(self._problem.scene)
-        model = PinocchioPeer(self._problem.kernels, chain).model
+        pin, tree = self._pinocchio, KinematicTree.from_scene(self._problem.scene)
+        model = PinocchioPeer(self._problem.kernels, tree).model
         parent = model.njoints - 1
-        if chain.wrist is not None:
-            placement = pin.SE3(np.array(chain.wrist.rotation), np.array(chain.wrist.position))
+        if tree.wrist is not None:
+            placement = pin.SE3(np.array(tree.wrist.rotation), np.array(tree.wrist.position))
             for axis in ("Z", "Y", "X"):
                 joint = getattr(pin, f"JointModelR{axis}")()
                 parent = model.addJoint(parent, joint, placement, f"wrist {axis}")
@@ -150,7 +150,7 @@ class CrocoddylManeuver:
             armature = model.armature.copy()
             armature[-3:] = self._problem.time_step
             model.armature = armature
-        tip = pin.SE3(np.array(chain.tip.rotation), np.array(chain.tip.position))
+        tip = pin.SE3(np.array(tree.tip.rotation), np.array(tree.tip.position))
         frame = model.addFrame(pin.Frame("tip", parent, tip, pin.FrameType.OP_FRAME))
         return model, frame
 

@@ -20,7 +20,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from dq_space_arm_env import Kernels
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.peers.robot import Robot
 from scripts.benchmarks.subjects import (
@@ -47,10 +47,10 @@ class MujocoPeer:
 
     name = "MuJoCo"
 
-    def __init__(self, kernels: Kernels, chain: Chain) -> None:
+    def __init__(self, kernels: Kernels, tree: KinematicTree) -> None:
         mujoco: Any = import_module("mujoco")  # it has no types
         self._rollout: Any = import_module("mujoco.rollout")
-        self._mujoco, self._kernels, self._chain = mujoco, kernels, chain
+        self._mujoco, self._kernels, self._tree = mujoco, kernels, tree
         self.notes: list[str] = []
         self._batch: Any = None
         try:
@@ -59,7 +59,7 @@ class MujocoPeer:
             self.notes.append(f"mujoco.batch is left out: MuJoCo {mujoco.__version__} has no such module.")
         time_step = kernels.scene.simulation.dt
         self.models = {
-            name: mujoco.MjModel.from_xml_string(robot_xml(chain, time_step, theirs))
+            name: mujoco.MjModel.from_xml_string(robot_xml(tree, time_step, theirs))
             for name, theirs in _INTEGRATORS.items()
         }
 
@@ -68,7 +68,7 @@ class MujocoPeer:
         robot = Robot.of(self._kernels, x, u)
         velocity = np.einsum("bij,bj->bi", robot.to_inertial, robot.linear)
         force = np.einsum("bij,bj->bi", robot.to_inertial, robot.force)
-        if self._chain.planar:
+        if self._tree.planar:
             turn = 2.0 * np.arctan2(robot.rotation[:, 3:], robot.rotation[:, :1])
             qpos = np.hstack([robot.position[:, :2], turn, robot.angles])
         else:
@@ -78,7 +78,7 @@ class MujocoPeer:
 
     def _generalized(self, linear: FloatArray, angular: FloatArray, joints: FloatArray) -> FloatArray:
         """MuJoCo's order of velocities and forces."""
-        if self._chain.planar:
+        if self._tree.planar:
             linear, angular = linear[:, :2], angular[:, 2:]
         return np.hstack([linear, angular, joints])
 
@@ -92,8 +92,8 @@ class MujocoPeer:
             data.qpos[:], data.qvel[:], data.qfrc_applied[:] = qpos, qvel, force
             self._mujoco.mj_forward(model, data)
             theirs[row] = data.qacc
-        linear = 2 if self._chain.planar else 3
-        base = model.nv - len(self._chain.links)
+        linear = 2 if self._tree.planar else 3
+        base = model.nv - len(self._tree.links)
         inertial = np.zeros((len(x), 3))
         inertial[:, :linear] = theirs[:, :linear]
         # The components of the velocity turn with the base: R' a - omega x v.
@@ -106,7 +106,7 @@ class MujocoPeer:
         model = self.models[integrator]
         data = self._mujoco.MjData(model)
         qpos, qvel, _ = self._arguments(x, np.zeros((len(x), self._kernels.n_u)))
-        result = np.zeros((len(x), len(self._chain.links)))
+        result = np.zeros((len(x), len(self._tree.links)))
         for row in range(len(x)):
             self._mujoco.mj_resetData(model, data)
             data.qpos[:], data.qvel[:] = qpos[row], qvel[row]
@@ -197,25 +197,25 @@ class MujocoPeer:
         yield vector_case(subject(way=SYNCHRONOUS, batch=SYNCHRONOUS_COPIES), vector, steps)
 
 
-def robot_xml(chain: Chain, time_step: float, integrator: str) -> str:
+def robot_xml(tree: KinematicTree, time_step: float, integrator: str) -> str:
     """Write a robot as an MJCF model, with nothing that it does not have."""
     slides = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>'
-    freedom = slides + '<joint type="hinge" axis="0 0 1"/>' if chain.planar else "<freejoint/>"
+    freedom = slides + '<joint type="hinge" axis="0 0 1"/>' if tree.planar else "<freejoint/>"
     links = "".join(
         f'<body pos="{_numbers(link.joint.position)}" quat="{_numbers(link.joint.dual_quaternion[:4])}">'
         f'<joint type="hinge" axis="0 0 1" damping="{link.damping!r}" stiffness="{link.stiffness!r}" '
         f'springref="{link.rest_angle!r}"/>{_inertial(link.body)}'
-        for link in chain.links
+        for link in tree.links
     )
     unused = ["contact", "constraint", "gravity"]
-    unused += ["spring"] * (not any(link.stiffness for link in chain.links))
-    unused += ["damper"] * (not any(link.damping for link in chain.links))
+    unused += ["spring"] * (not any(link.stiffness for link in tree.links))
+    unused += ["damper"] * (not any(link.damping for link in tree.links))
     flags = " ".join(f'{flag}="disable"' for flag in unused)
     return (
         '<mujoco><compiler angle="radian"/>'
         f'<option timestep="{time_step!r}" integrator="{integrator}"><flag {flags}/></option>'
-        f"<worldbody><body>{freedom}{_inertial(chain.base)}{links}"
-        f"{'</body>' * (1 + len(chain.links))}</worldbody></mujoco>"
+        f"<worldbody><body>{freedom}{_inertial(tree.base)}{links}"
+        f"{'</body>' * (1 + len(tree.links))}</worldbody></mujoco>"
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from dq_space_arm_env import Kernels
 from dq_space_arm_env.dynamics import minimal
-from dq_space_arm_env.dynamics.chain import Chain, RigidBody
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.peers.robot import Robot
 from scripts.benchmarks.subjects import DYNAMICS, Case, Subject
@@ -20,20 +20,20 @@ class PinocchioPeer:
 
     name = "Pinocchio"
 
-    def __init__(self, kernels: Kernels, chain: Chain) -> None:
+    def __init__(self, kernels: Kernels, tree: KinematicTree) -> None:
         """Build the robot: a free or planar base, then revolute joints about z."""
         import pinocchio
 
-        self._pin, self._kernels, self._chain = pinocchio, kernels, chain
+        self._pin, self._kernels, self._tree = pinocchio, kernels, tree
         self.notes: list[str] = []
         if not hasattr(pinocchio, "abaInParallel"):
             self.notes.append("Pinocchio's batches are left out: this build of it has none.")
         self.model = pinocchio.Model()
         self.model.gravity = pinocchio.Motion.Zero()
-        base = pinocchio.JointModelPlanar() if chain.planar else pinocchio.JointModelFreeFlyer()
+        base = pinocchio.JointModelPlanar() if tree.planar else pinocchio.JointModelFreeFlyer()
         parent = self.model.addJoint(0, base, pinocchio.SE3.Identity(), "base")
-        self.model.appendBodyToJoint(parent, self._inertia(chain.base), pinocchio.SE3.Identity())
-        for index, link in enumerate(chain.links):
+        self.model.appendBodyToJoint(parent, self._inertia(tree.base), pinocchio.SE3.Identity())
+        for index, link in enumerate(tree.links):
             placement = pinocchio.SE3(np.array(link.joint.rotation), np.array(link.joint.position))
             parent = self.model.addJoint(parent, pinocchio.JointModelRZ(), placement, f"joint {index}")
             self.model.appendBodyToJoint(parent, self._inertia(link.body), pinocchio.SE3.Identity())
@@ -45,10 +45,10 @@ class PinocchioPeer:
     def _arguments(self, x: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Pinocchio's q, v and tau, a row for each state."""
         robot = Robot.of(self._kernels, x, u)
-        passive = minimal.passive_torques(self._chain, list(robot.angles.T), list(robot.rates.T))
+        passive = minimal.passive_torques(self._tree, list(robot.angles.T), list(robot.rates.T))
         joints = robot.motors + np.reshape(passive, robot.motors.T.shape).T
         w, z = robot.rotation[:, 0], robot.rotation[:, 3]
-        if self._chain.planar:
+        if self._tree.planar:
             # x, y, then cosine and sine of the angle; velocities along x and y in base axes, then about z
             turned = np.column_stack([w * w - z * z, 2.0 * w * z])
             q = [robot.position[:, :2], turned, robot.angles]
@@ -63,8 +63,8 @@ class PinocchioPeer:
         """The accelerations of `Kernels.forward_dynamics`, by `aba`."""
         rows = zip(*self._arguments(x, u), strict=True)
         a = np.array([self._pin.aba(self.model, self._data, *row) for row in rows])
-        linear = 2 if self._chain.planar else 3
-        base = a.shape[1] - len(self._chain.links)
+        linear = 2 if self._tree.planar else 3
+        base = a.shape[1] - len(self._tree.links)
         return np.hstack([a[:, linear:base], a[:, :linear], a[:, base:]])
 
     def end_angles(self, x: FloatArray, integrator: str, steps: int) -> FloatArray | None:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from dq_space_arm_env import Kernels, compile_scene
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.scene import INTEGRATORS
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
@@ -151,7 +151,9 @@ def _walked_by_mujoco(motion: Motion, integrator: str, count: int) -> Invariants
         return None
     mujoco: Any = import_module("mujoco")  # it has no types
     kernels, x = _arm(motion)
-    model = mujoco.MjModel.from_xml_string(robot_xml(Chain.from_scene(kernels.scene), TIME_STEP, integrator))
+    model = mujoco.MjModel.from_xml_string(
+        robot_xml(KinematicTree.from_scene(kernels.scene), TIME_STEP, integrator)
+    )
     model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     # What blows up is neither started again nor reported to a file.
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)

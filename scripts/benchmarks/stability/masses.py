@@ -168,7 +168,7 @@ def judge(sample: Sample, formulation: str) -> Errors:
         )
         sample = Sample.of(sample.scene, state, control)
     found = FORMULATIONS[formulation](sample)
-    return errors(linear_system(sample.chain, sample.motion), sample.motion, found)
+    return errors(linear_system(sample.tree, sample.motion), sample.motion, found)
 
 
 def _ratios(formulation: str, measure: str, effort: Effort) -> Outcome:

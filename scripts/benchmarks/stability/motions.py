@@ -11,7 +11,7 @@ import numpy as np
 
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from experts.guesses.screw_motion import screw_motion
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
@@ -115,7 +115,9 @@ def _tip_rotation(joint_angles: FloatArray, wrist_angles: FloatArray) -> FloatAr
     """Rotation matrix of the paper's tip in base axes, by matrices with 50 digits."""
     with mpmath.workdps(DIGITS):
         rotation = mpmath.eye(3)
-        for link, angle in zip(Chain.from_scene(load_scene("paper")).links, joint_angles, strict=True):
+        for link, angle in zip(
+            KinematicTree.from_scene(load_scene("paper")).links, joint_angles, strict=True
+        ):
             rotation = rotation * mpmath.matrix([list(row) for row in link.joint.rotation]) * turn(2, angle)
         psi, theta, phi = column(wrist_angles)
         rotation = rotation * turn(2, psi) * turn(1, theta) * turn(0, phi)

@@ -20,7 +20,7 @@ from mpmath import mpf
 from dq_space_arm_env import Kernels, Scene, compile_scene
 from dq_space_arm_env.algebra.vectors import add, cross
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
-from dq_space_arm_env.dynamics.chain import Chain, JointedLink
+from dq_space_arm_env.dynamics.kinematic_tree import JointedLink, KinematicTree
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.peers.pinocchio_peer import PinocchioPeer
 
@@ -81,14 +81,14 @@ def _turned(link: JointedLink, angle: float) -> Matrix:
     return _square(link.joint.rotation) * turn(2, angle)
 
 
-def linear_system(chain: Chain, motion: Motion) -> LinearSystem:
+def linear_system(tree: KinematicTree, motion: Motion) -> LinearSystem:
     """Assemble Kane's equations, all vectors in base axes."""
     with mpmath.workdps(DIGITS):
-        return _linear_system(chain, motion)
+        return _linear_system(tree, motion)
 
 
-def _linear_system(chain: Chain, motion: Motion) -> LinearSystem:
-    n = len(chain.links)
+def _linear_system(tree: KinematicTree, motion: Motion) -> LinearSystem:
+    n = len(tree.links)
     size = 6 + n
     omega, alpha, a = column(motion.angular), mpmath.zeros(3, 1), mpmath.zeros(3, 1)
     rotation, origin = mpmath.eye(3), mpmath.zeros(3, 1)
@@ -96,9 +96,9 @@ def _linear_system(chain: Chain, motion: Motion) -> LinearSystem:
     origins: list[Vector] = []
     mass_matrix, bias, sizes = mpmath.zeros(size), mpmath.zeros(size, 1), mpmath.zeros(size, 1)
     for index in range(n + 1):
-        body = chain.base if index == 0 else chain.links[index - 1].body
+        body = tree.base if index == 0 else tree.links[index - 1].body
         if index:
-            link = chain.links[index - 1]
+            link = tree.links[index - 1]
             arm = rotation * column(link.joint.position)
             a = a + _cross(alpha, arm) + _cross(omega, _cross(omega, arm))
             origin = origin + arm
@@ -129,7 +129,7 @@ def _linear_system(chain: Chain, motion: Motion) -> LinearSystem:
         sizes += _absolute(moving.T) * force_size + _absolute(turning.T) * torque_size
     passive = [
         -mpf(link.stiffness) * (mpf(angle) - mpf(link.rest_angle)) - mpf(link.damping) * mpf(rate)
-        for link, angle, rate in zip(chain.links, motion.joint_angles, motion.joint_rates, strict=True)
+        for link, angle, rate in zip(tree.links, motion.joint_angles, motion.joint_rates, strict=True)
     ]
     motors = [mpf(value) + other for value, other in zip(motion.joint_torques, passive, strict=True)]
     applied = column([*motion.torque, *motion.force, *motors])
@@ -187,14 +187,14 @@ class Sample:
 
     scene: Scene
     kernels: Kernels
-    chain: Chain
+    tree: KinematicTree
     state: FloatArray
     control: FloatArray
 
     @classmethod
     def of(cls, scene: Scene, state: FloatArray, control: FloatArray) -> Sample:
         """Collect what belongs to a scene."""
-        return cls(scene, compile_scene(scene), Chain.from_scene(scene), state, control)
+        return cls(scene, compile_scene(scene), KinematicTree.from_scene(scene), state, control)
 
     @property
     def motion(self) -> Motion:
@@ -218,32 +218,32 @@ def _compiled(sample: Sample, **simulation: str) -> FloatArray:
 
 
 def _system(sample: Sample) -> tuple[newton_euler.NewtonEulerSystem, newton_euler.JointFrames]:
-    chain, motion = sample.chain, sample.motion
+    tree, motion = sample.tree, sample.motion
     angles, rates = motion.joint_angles.tolist(), motion.joint_rates.tolist()
-    link_frames = minimal.link_frames(chain, angles)
+    link_frames = minimal.link_frames(tree, angles)
     twist = (*motion.angular.tolist(), *motion.linear.tolist())
-    velocities = kinematics.body_velocities(chain, link_frames, twist, rates)
-    bodies = [chain.base, *(link.body for link in chain.links)]
+    velocities = kinematics.body_velocities(tree, link_frames, twist, rates)
+    bodies = [tree.base, *(link.body for link in tree.links)]
     duals = [
         (0.0, *v.angular, 0.0, *add(v.linear, cross(v.angular, body.center_of_mass)))
         for body, v in zip(bodies, velocities, strict=True)
     ]
-    passive = minimal.passive_torques(chain, angles, rates)
+    passive = minimal.passive_torques(tree, angles, rates)
     torques = [a + b for a, b in zip(motion.joint_torques.tolist(), passive, strict=True)]
     wrench = (0.0, *motion.force.tolist(), 0.0, *motion.torque.tolist())
-    frames = newton_euler.joint_frames(chain, angles, [0.0] * 3)
-    return newton_euler.assemble(chain, frames, duals, wrench, torques), frames
+    frames = newton_euler.joint_frames(tree, angles, [0.0] * 3)
+    return newton_euler.assemble(tree, frames, duals, wrench, torques), frames
 
 
 def _from_duals(sample: Sample, frames: newton_euler.JointFrames, duals: FloatArray) -> FloatArray:
     bodies = [tuple(body) for body in duals.reshape(-1, 8).tolist()]
-    joints = newton_euler.along_joints(sample.chain, frames, bodies)
+    joints = newton_euler.along_joints(sample.tree, frames, bodies)
     return np.array([*bodies[0][1:4], *bodies[0][5:8], *joints])
 
 
 def _schur(sample: Sample, refinements: int = 0) -> FloatArray:
     system, frames = _system(sample)
-    accelerations, _ = newton_euler.solve_schur(sample.chain, system, refinements)
+    accelerations, _ = newton_euler.solve_schur(sample.tree, system, refinements)
     return _from_duals(sample, frames, np.array(accelerations))
 
 
@@ -257,7 +257,7 @@ def _dense(sample: Sample) -> FloatArray:
 
 
 def _pinocchio(sample: Sample) -> FloatArray:
-    peer = PinocchioPeer(sample.kernels, sample.chain)
+    peer = PinocchioPeer(sample.kernels, sample.tree)
     return np.asarray(peer.accelerations(sample.state[None], sample.control[None])[0])
 
 

@@ -13,7 +13,7 @@ import mpmath
 import numpy as np
 
 from dq_space_arm_env import Kernels, Scene, load_scene
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
 from dq_space_arm_env.kernels.programs.paper_programs import PaperPrograms
 from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
@@ -59,7 +59,7 @@ def measure_formulations(effort: Effort, scene_name: str = "paper") -> Iterator[
             limit = LIMITS[precision]
             yield claim("formulations", name, precision, row["largest_error"], limit, note="of accelerations")
     try:
-        peer = PinocchioPeer(kernels, Chain.from_scene(scene))
+        peer = PinocchioPeer(kernels, KinematicTree.from_scene(scene))
     except ImportError:
         yield note("Pinocchio's articulated body is left out: it is not installed (pip install pin).")
         return
@@ -87,10 +87,10 @@ class _Judge:
     """The accelerations of some states with 50 digits, by which those of all formulations are judged."""
 
     def __init__(self, kernels: Kernels, x: FloatArray, u: FloatArray, right: FloatArray) -> None:
-        chain = Chain.from_scene(kernels.scene)
-        samples = [Sample(kernels.scene, kernels, chain, *row) for row in zip(x, u, strict=True)]
+        tree = KinematicTree.from_scene(kernels.scene)
+        samples = [Sample(kernels.scene, kernels, tree, *row) for row in zip(x, u, strict=True)]
         self._right, self._motions = right, [sample.motion for sample in samples]
-        self._systems = [linear_system(chain, motion) for motion in self._motions]
+        self._systems = [linear_system(tree, motion) for motion in self._motions]
 
     def row(
         self, name: str, precision: str, values: FloatArray, single_ns: float, batch_ns: float | None

@@ -15,7 +15,7 @@ import numpy as np
 from dq_space_arm_env import Kernels, compile_scene
 from dq_space_arm_env.algebra import poses, quaternion, rotations
 from dq_space_arm_env.dynamics import minimal
-from dq_space_arm_env.dynamics.chain import Chain
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.scene import INTEGRATORS
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.peers.pinocchio_peer import PinocchioPeer
@@ -89,7 +89,7 @@ class _Arm:
 
     def __init__(self, case: MotionCase, kernels: Kernels) -> None:
         self._case, self._kernels = case, kernels
-        self._chain = Chain.from_scene(case.scene)
+        self._tree = KinematicTree.from_scene(case.scene)
         self._n, self._wrist = kernels.layout.n_joints, kernels.layout.state.wrist_angles
         self._angles = slice(7, 7 + self._n)
         self._turns = slice(7 + self._n, 7 + self._n + self._wrist.stop - self._wrist.start)
@@ -144,7 +144,7 @@ class _Arm:
         """Pinocchio's accelerations."""
         import pinocchio
 
-        model = PinocchioPeer(self._kernels, self._chain).model
+        model = PinocchioPeer(self._kernels, self._tree).model
         data, start, joints = model.createData(), self._case.start[None], slice(6, None)
         held: dict[bytes, FloatArray] = {}
 
@@ -163,7 +163,7 @@ class _Arm:
             q[3:7] /= np.linalg.norm(q[3:7])
             v = np.concatenate([velocities[3:6], velocities[:3], velocities[6:]])
             tau = forces(u).copy()
-            tau[joints] += minimal.passive_torques(self._chain, angles.tolist(), velocities[joints].tolist())
+            tau[joints] += minimal.passive_torques(self._tree, angles.tolist(), velocities[joints].tolist())
             a = pinocchio.aba(model, data, q, v, tau)
             return np.concatenate([a[3:6], a[:3], a[6:]])
 

@@ -1,6 +1,6 @@
 """The constants of a robot: what the equations of motion need of a scene, as plain scalars.
 
-A `Chain` is a base, links in series, an optional massless wrist, and a tip frame. Link frames are the joint
+A `KinematicTree` is a base, links in series, an optional massless wrist, and a tip frame. Link frames are the joint
 frames of the paper: frame i is fixed in the distal body i+1, with its z axis along the joint axis. Every
 joint is a screw about and along that axis.
 A payload is merged into the body that holds it. Masses, inertias, stiffness and damping are numbers, or
@@ -77,8 +77,8 @@ class JointedLink:
 
 
 @dataclass(frozen=True)
-class Chain:
-    """A free base with a chain of links."""
+class KinematicTree:
+    """A free base with its links."""
 
     base: RigidBody  # frame at the center of mass
     links: tuple[JointedLink, ...]  # base to tip
@@ -90,7 +90,7 @@ class Chain:
     heavy_base: bool = False  # its nominal mass is beyond 100 times the arm's
 
     @classmethod
-    def from_scene(cls, scene: Scene, given: Given | None = None) -> Chain:
+    def from_scene(cls, scene: Scene, given: Given | None = None) -> KinematicTree:
         """Collect a scene's constants; numbers `given` by name (`scene.parameters`) replace its own."""
         wrench, given, masses = scene.tip_wrench, given or {}, _nominal_masses(scene)
         bodies = _link_bodies(scene, given)
