@@ -73,8 +73,8 @@ def _with_load(factor: float) -> Callable[[Scene], Scene]:
     def change(scene: Scene) -> Scene:
         place = load_place(scene)
         if place is None:
-            raise ValueError(f"scene {scene.name!r} has neither payload nor links: no load can be changed")
-        load = scene.payload or scene.links[-1]
+            raise ValueError(f"scene {scene.name!r} has its tip on the base: no load can be changed")
+        load = scene.payload or scene.links[scene.tip_body - 1]
         inertia = (factor * np.array(load.inertia)).tolist()
         return scene.replace({f"{place}.mass": factor * load.mass, f"{place}.inertia": inertia})
 

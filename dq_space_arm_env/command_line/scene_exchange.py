@@ -25,7 +25,10 @@ from dq_space_arm_env.scene.path import shown_target
 
 _OPTIONS = {
     r"spacecraft=\{'mass': \.\.\., 'inertia': \.\.\.\}": "--spacecraft-mass and --spacecraft-inertia",
-    r"lock_branches=True": "--lock-branches",
+    r"lock_branches holds such joints at zero, those named or, if True, all": (
+        "--lock holds such a joint at zero, --lock-branches all of them"
+    ),
+    r"^lock_branches(?=: )": "--lock",
     r"wrist='fixed'": "--wrist fixed",
     r"give joint_torque, N m,": "give --joint-torque, N m,",
     r"in passive$": "with --passive",

@@ -203,8 +203,12 @@ def _write(path: Path, text: str) -> None:
 @click.option(
     "--passive", type=PartOf("joint", "robot"), multiple=True, help="Joint without a motor; may be repeated."
 )
+@click.option("--lock-branches", is_flag=True, help="Hold all joints beside the arm at zero.")
 @click.option(
-    "--lock-branches", is_flag=True, help="Hold joints beside the arm, such as a gripper's, at zero."
+    "--lock",
+    type=PartOf("joint", "robot"),
+    multiple=True,
+    help="Joint beside the arm, such as a gripper's, to hold at zero; may be repeated.",
 )
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @json_option
@@ -216,11 +220,15 @@ def import_(
     spacecraft_inertia: tuple[float, float, float] | None,
     base_force: float,
     base_torque: float,
+    lock_branches: bool,
+    lock: tuple[str, ...],
     force: bool,
     as_json: bool,
     **arguments: Any,
 ) -> None:
     """Write a scene of ROBOT, a URDF file: its arm, from the base link to the tip, free in space.
+
+    Other joints that move a mass are part of the scene too, unless they are locked.
 
     The default target is the tip's pose with every joint 0.3 rad further, or back where its
     limits ask for it. Limits of angles and rates become a constraint. The file has a comment
@@ -241,6 +249,7 @@ def import_(
         "spacecraft": spacecraft or None,
         "base_force": base_force or None,
         "base_torque": base_torque or None,
+        "lock_branches": lock_branches or lock,
     }
     imported = scene_exchange.import_urdf(robot, tip, arguments)
     _write(path, commented_yaml(imported.scene))

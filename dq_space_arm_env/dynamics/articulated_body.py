@@ -2,7 +2,7 @@
 
 An articulated body is a body together with everything its joints carry; its inertia maps an acceleration of
 that body to the wrench it needs while the joints move freely (Featherstone, Rigid Body Dynamics Algorithms,
-2008, chapter 7). From both ends of the chain, each body hands its articulated inertia across the joint to the
+2008, chapter 7). From the ends of the tree, each body hands its articulated inertia across the joint to the
 next, until they meet at the root, whose six accelerations are solved for; the joints follow on the way back.
 The cost is linear in the number of joints.
 
@@ -145,28 +145,26 @@ class _Joint:
 
 
 class ArticulatedBodies:
-    """Articulated inertias of a chain at given joint angles, with the root's factorized."""
+    """Articulated inertias of a tree at given joint angles, with the root's factorized."""
 
     def __init__(self, tree: KinematicTree, frames: Sequence[LinkFrame], root: int = 0) -> None:
-        """Eliminate all joints, from both ends of the chain to its root (0 is the base, i link i)."""
+        """Eliminate all joints, from the ends of the tree to its root (0 is the base, i link i)."""
         self._planar, self._frames, self._root = tree.planar, frames, root
-        screws = [link.screw for link in tree.links]
-        bodies = [
-            ArticulatedInertia.of_body(body) for body in (tree.base, *(link.body for link in tree.links))
-        ]
+        self._parents = tree.parents
+        self._inverted = tree.path_to(root)
+        self._inward = _inward(tree, root)
+        bodies = [ArticulatedInertia.of_body(body) for body in tree.bodies]
         self._joints: dict[int, _Joint] = {}
-        # From the base up to the root: the parent is carried by the joint, which turns backward.
-        for i in range(self._root):
-            rotation, position = frames[i]
-            body = bodies[i].shifted(scale(-1.0, position)).rotated(transpose(rotation))
-            self._joints[i] = _Joint.eliminated(body, screws[i])
-            body = self._joints[i].remainder
-            bodies[i + 1] = bodies[i + 1].plus(body)
-        # From the tip down to the root.
-        for i in reversed(range(self._root, len(frames))):
-            self._joints[i] = _Joint.eliminated(bodies[i + 1], screws[i])
-            body = self._joints[i].remainder.rotated(frames[i].rotation).shifted(frames[i].position)
-            bodies[i] = bodies[i].plus(body)
+        for i in self._inward:
+            (rotation, position), parent, screw = frames[i], self._parents[i], tree.links[i].screw
+            if i in self._inverted:  # the parent is carried by the joint, which moves backward
+                body = bodies[parent].shifted(scale(-1.0, position)).rotated(transpose(rotation))
+                self._joints[i] = _Joint.eliminated(body, screw)
+                bodies[i + 1] = bodies[i + 1].plus(self._joints[i].remainder)
+            else:
+                self._joints[i] = _Joint.eliminated(bodies[i + 1], screw)
+                body = self._joints[i].remainder.rotated(rotation).shifted(position)
+                bodies[parent] = bodies[parent].plus(body)
         self._factor = factorize_ldl(_root_block(bodies[self._root], self._free))
 
     @property
@@ -185,7 +183,7 @@ class ArticulatedBodies:
         for i, (given, acceleration) in enumerate(zip(passed, reached, strict=True)):
             # The body beyond the joint is given I^a a' + p^a, where -p^a is passed on (Featherstone, 7.3).
             needed = self._joints[i].remainder.wrench(*acceleration)
-            plus, minus = (given, needed) if i < self._root else (needed, given)
+            plus, minus = (given, needed) if i in self._inverted else (needed, given)
             reactions.append((subtract(plus[0], minus[0]), subtract(plus[1], minus[1])))
         return reactions
 
@@ -195,20 +193,21 @@ class ArticulatedBodies:
         """Accelerations; per joint, the wrench passed to the root and the acceleration that reaches it."""
         acting, own = list(wrenches), list(joints)
         passed: list[Wrench] = [(ZERO, ZERO)] * len(joints)
-        for i in range(self._root):
-            force, torque = acting[i]
-            rotation, position = self._frames[i]
-            torque = subtract(torque, cross(position, force))
-            force = transposed_matrix_vector(rotation, force)
-            torque = transposed_matrix_vector(rotation, torque)
-            own[i] = along(self._joints[i].screw, force, torque) - joints[i]
-            passed[i] = self._joints[i].passed(force, torque, own[i])
-            acting[i + 1] = _sum(acting[i + 1], passed[i])
-        for i in reversed(range(self._root, len(joints))):
-            force, torque = acting[i + 1]
-            own[i] = along(self._joints[i].screw, force, torque) + joints[i]
-            passed[i] = self._joints[i].passed(force, torque, own[i])
-            acting[i] = _sum(acting[i], shift_wrench(*self._frames[i], *passed[i]))
+        for i in self._inward:
+            parent, joint, inverted = self._parents[i], self._joints[i], i in self._inverted
+            force, torque = acting[parent] if inverted else acting[i + 1]
+            if inverted:
+                rotation, position = self._frames[i]
+                torque = subtract(torque, cross(position, force))
+                force = transposed_matrix_vector(rotation, force)
+                torque = transposed_matrix_vector(rotation, torque)
+            share = along(joint.screw, force, torque)
+            own[i] = share - joints[i] if inverted else share + joints[i]
+            passed[i] = joint.passed(force, torque, own[i])
+            if inverted:
+                acting[i + 1] = _sum(acting[i + 1], passed[i])
+            else:
+                acting[parent] = _sum(acting[parent], shift_wrench(*self._frames[i], *passed[i]))
         accelerations, reached = self._outward(acting[self._root], own)
         return accelerations, passed, reached
 
@@ -228,26 +227,35 @@ class ArticulatedBodies:
             six[index] = value
         joints: list[Scalar] = [0.0] * len(own)
         reached: list[tuple[Vector3, Vector3]] = [(ZERO, ZERO)] * len(own)
-        linear: Vector3 = six[:3]
-        angular: Vector3 = six[3:]
-        for i in range(self._root, len(own)):
-            rotation, position = self._frames[i]
-            linear = transposed_matrix_vector(rotation, add(linear, cross(angular, position)))
-            angular = transposed_matrix_vector(rotation, angular)
-            reached[i] = linear, angular
-            joints[i] = self._joints[i].acceleration(own[i], linear, angular)
-            linear, angular = self._joints[i].moved(linear, angular, joints[i])
-        linear, angular = six[:3], six[3:]
-        for i in reversed(range(self._root)):
-            reached[i] = linear, angular
-            # The body before the joint moves backward along the screw.
-            rotation, position = self._frames[i]
-            change = self._joints[i].acceleration(own[i], linear, angular)
-            joints[i] = -change
-            linear, angular = self._joints[i].moved(linear, angular, change)
-            angular = matrix_vector(rotation, angular)
-            linear = subtract(matrix_vector(rotation, linear), cross(angular, position))
+        motions: dict[int, tuple[Vector3, Vector3]] = {self._root: (six[:3], six[3:])}
+        for i in reversed(self._inward):
+            (rotation, position), parent, joint = self._frames[i], self._parents[i], self._joints[i]
+            if i in self._inverted:  # the body before the joint moves backward along the screw
+                linear, angular = reached[i] = motions[i + 1]
+                change = joint.acceleration(own[i], linear, angular)
+                joints[i] = -change
+                linear, angular = joint.moved(linear, angular, change)
+                angular = matrix_vector(rotation, angular)
+                motions[parent] = subtract(matrix_vector(rotation, linear), cross(angular, position)), angular
+            else:
+                linear, angular = motions[parent]
+                linear = transposed_matrix_vector(rotation, add(linear, cross(angular, position)))
+                angular = transposed_matrix_vector(rotation, angular)
+                reached[i] = linear, angular
+                joints[i] = joint.acceleration(own[i], linear, angular)
+                motions[i + 1] = joint.moved(linear, angular, joints[i])
+        linear, angular = motions[0]
         return Accelerations(angular, linear, joints), reached
+
+
+def _inward(tree: KinematicTree, root: int) -> list[int]:
+    """Order in which joints are eliminated: those of a body before the one that leads on to the root."""
+    inverted, beyond = tree.path_to(root), {root}  # bodies that the root carries, with itself
+    for i, parent in enumerate(tree.parents):
+        beyond |= {i + 1} if parent in beyond else set()
+    others = [i for i in range(len(tree.links)) if i not in inverted]
+    aside = [i for i in others if i + 1 not in beyond]
+    return [*reversed(aside), *inverted, *reversed([i for i in others if i + 1 in beyond])]
 
 
 def _clear(

@@ -116,7 +116,7 @@ class EquationsOfMotion:
         )
 
     def _tip(self, motion: Motion) -> tuple[Any, Any]:
-        """Rotation and position of the tip in the last link's frame."""
+        """Rotation and position of the tip in the frame of the body that carries it."""
         pose: Sequence[Scalar] = self.tree.tip.dual_quaternion
         if self.tree.wrist is not None:
             turned = dq.multiply(self.tree.wrist.dual_quaternion, wrist_rotation(motion.wrist_angles))
@@ -135,7 +135,8 @@ class EquationsOfMotion:
         acting: list[Any] = [(inputs.force, inputs.torque), *[(ZERO, ZERO)] * len(self.tree.links)]
         if wrench is not None:
             force, torque = minimal.shift_wrench(*self._tip(motion), wrench[:3], wrench[3:])
-            acting[-1] = (add(acting[-1][0], force), add(acting[-1][1], torque))
+            body = self.tree.tip_body
+            acting[body] = (add(acting[body][0], force), add(acting[body][1], torque))
         return acting
 
     def _inertia(self, motion: Motion, *, many: bool = False) -> Inertia:

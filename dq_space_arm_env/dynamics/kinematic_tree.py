@@ -1,8 +1,9 @@
 """The constants of a robot: what the equations of motion need of a scene, as plain scalars.
 
-A `KinematicTree` is a base, links in series, an optional massless wrist, and a tip frame. Link frames are the joint
-frames of the paper: frame i is fixed in the distal body i+1, with its z axis along the joint axis. Every
-joint is a screw about and along that axis.
+A `KinematicTree` is a base, links that branch from it, an optional massless wrist, and a tip frame. Body 0 is
+the base, body i+1 link i, and a parent comes before what it carries. Link frames are the joint frames of the
+paper: frame i is fixed in the distal body i+1, with its z axis along the joint axis. Every joint is a screw
+about and along that axis.
 A payload is merged into the body that holds it. Masses, inertias, stiffness and damping are numbers, or
 symbols where they are parameters of the scene.
 """
@@ -71,6 +72,7 @@ class JointedLink:
     body: RigidBody  # in the joint frame
     joint: Placement  # joint frame at zero in the parent's frame (base center of mass, or joint frame)
     screw: Screw
+    parent: int  # body that carries it: 0 is the base, i+1 link i
     stiffness: Scalar  # N m/rad
     rest_angle: float  # of the spring, rad
     damping: Scalar  # N m s/rad
@@ -81,13 +83,32 @@ class KinematicTree:
     """A free base with its links."""
 
     base: RigidBody  # frame at the center of mass
-    links: tuple[JointedLink, ...]  # base to tip
-    wrist: Placement | None  # wrist frame at zero angles, in the last link's frame
-    tip: Placement  # tip frame G in the wrist frame, or in the last link's without a wrist
+    links: tuple[JointedLink, ...]  # each after its parent
+    tip_body: int  # body that carries wrist and tip
+    wrist: Placement | None  # wrist frame at zero angles, in the frame of that body
+    tip: Placement  # tip frame G in the wrist frame, or in that body's without a wrist
     tip_wrench: tuple[float, ...] | None  # force [N], torque [N m] at G, in G axes (16)
     planar: bool  # the base moves in its x-y plane only
     heaviest: int = 0  # body of greatest nominal mass: 0 is the base, i link i
-    heavy_base: bool = False  # its nominal mass is beyond 100 times the arm's
+    heavy_base: bool = False  # its nominal mass is beyond 100 times that of all links
+
+    @property
+    def bodies(self) -> list[RigidBody]:
+        """Base and links, n + 1."""
+        return [self.base, *(link.body for link in self.links)]
+
+    @property
+    def parents(self) -> list[int]:
+        """Bodies that carry the links, n."""
+        return [link.parent for link in self.links]
+
+    def path_to(self, body: int) -> list[int]:
+        """Indices of the links from the base to a body."""
+        path: list[int] = []
+        while body:
+            path.insert(0, body - 1)
+            body = self.links[body - 1].parent
+        return path
 
     @classmethod
     def from_scene(cls, scene: Scene, given: Given | None = None) -> KinematicTree:
@@ -101,12 +122,14 @@ class KinematicTree:
                     body,
                     _placement(link.joint),
                     SCREWS.get(link.joint_type) or Screw(1.0, link.pitch),
+                    scene.parent_bodies[index],
                     given.get(f"links.{index}.stiffness", link.stiffness),
                     link.rest_angle,
                     given.get(f"links.{index}.damping", link.damping),
                 )
                 for index, (body, link) in enumerate(zip(bodies, scene.links, strict=True))
             ),
+            tip_body=scene.tip_body,
             wrist=None if scene.wrist is None else _placement(scene.wrist.frame),
             tip=_placement(scene.tip),
             tip_wrench=None if wrench is None else (*wrench.force, *wrench.torque),
@@ -117,24 +140,23 @@ class KinematicTree:
 
 
 def _nominal_masses(scene: Scene) -> list[float]:
-    """Masses of base and links, the last one's with the payload, kg."""
+    """Masses of base and links, with the payload where the tip is, kg."""
     masses = [scene.base.mass, *(link.mass for link in scene.links)]
     if scene.payload is not None:
-        masses[-1] += scene.payload.mass
+        masses[scene.tip_body] += scene.payload.mass
     return masses
 
 
 def _link_bodies(scene: Scene, given: Given) -> list[RigidBody]:
-    """Mass properties of the links in their joint frames, with the payload merged into the last one."""
+    """Mass properties of the links in their joint frames; the one with the tip includes the payload."""
     bodies = [
         _rigid_body(link, f"links.{index}", link.center_of_mass, given)
         for index, link in enumerate(scene.links)
     ]
     if scene.payload is not None:
-        if not bodies:
-            raise ValueError("payload: a scene without links cannot hold one; add its mass to the base")
         payload = _rigid_body(scene.payload, "payload", scene.payload.center_of_mass, given)
-        bodies[-1] = _merged(bodies[-1], _moved(payload, scene.tip))
+        holding = scene.tip_body - 1
+        bodies[holding] = _merged(bodies[holding], _moved(payload, scene.tip))
     return bodies
 
 

@@ -76,11 +76,13 @@ def frame_poses(
     poses = [base_pose]
     for link, angle in zip(tree.links, joint_angles, strict=True):
         joint = dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, angle))
-        poses.append(dq.multiply(poses[-1], joint))
+        poses.append(dq.multiply(poses[link.parent], joint))
+    last = poses[tree.tip_body]
     if tree.wrist is not None:
         wrist = dq.multiply(tree.wrist.dual_quaternion, wrist_rotation(wrist_angles))
-        poses.append(dq.multiply(poses[-1], wrist))
-    poses.append(dq.multiply(poses[-1], tree.tip.dual_quaternion))
+        last = dq.multiply(last, wrist)
+        poses.append(last)
+    poses.append(dq.multiply(last, tree.tip.dual_quaternion))
     return poses
 
 
@@ -102,8 +104,10 @@ def arm_pose(
     if tree.wrist is not None:
         arm = dq.multiply(wrist_rotation(wrist_angles), arm)
         arm = dq.multiply(tree.wrist.dual_quaternion, arm)
-    for link, angle in zip(reversed(tree.links), reversed(list(joint_angles)), strict=True):
-        arm = dq.multiply(link.joint.dual_quaternion, dq.multiply(joint_motion(link.screw, angle), arm))
+    for index in reversed(tree.path_to(tree.tip_body)):
+        link = tree.links[index]
+        moved = dq.multiply(joint_motion(link.screw, joint_angles[index]), arm)
+        arm = dq.multiply(link.joint.dual_quaternion, moved)
     return arm
 
 
@@ -128,9 +132,9 @@ def tip_pose_rate(
     # (30): 1/2 q_{e0/I} w_0 q_{G/e0} + 1/2 sum_i q_{e_i/I} w^{e_i}_{i/e_i} q_{G/e_i}, joint frames for the
     # e_i.
     rate = contribution(base_pose, base_twist)
-    for frame, link, speed in zip(poses[1:], tree.links, joint_rates, strict=False):
-        turn, slide = (part * speed for part in link.screw)
-        rate = dq.add(rate, contribution(frame, (0.0, 0.0, turn, 0.0, 0.0, slide)))
+    for index in tree.path_to(tree.tip_body):
+        turn, slide = (part * joint_rates[index] for part in tree.links[index].screw)
+        rate = dq.add(rate, contribution(poses[index + 1], (0.0, 0.0, turn, 0.0, 0.0, slide)))
     if tree.wrist is not None:
         turning = matrix_vector(wrist_rate_matrix(wrist_angles), wrist_rates)
         rate = dq.add(rate, contribution(poses[-2], (*turning, 0.0, 0.0, 0.0)))
@@ -143,19 +147,20 @@ def tip_jacobian(
     """Columns of the tip's body Jacobian: base (angular, linear), joints, Euler rates of the wrist.
 
     Each is the tip's twist (angular, linear) in tip axes per unit velocity: Ad(q_{G/X}*) of an axis in its
-    frame X.
+    frame X. Joints off the way from base to tip have zeros.
     """
-    columns: list[list[Scalar]] = []
+    columns: list[list[Scalar]] = [[0.0] * 6 for _ in tree.links]
     relative: DualQuaternion = tree.tip.dual_quaternion  # q_{G/X}, from the tip's side of X = e_n to e0
     if tree.wrist is not None:
         rates = wrist_rate_matrix(wrist_angles)
-        columns = [_carried_to_tip(relative, axis, ZERO) for axis in zip(*rates, strict=True)]
+        columns += [_carried_to_tip(relative, axis, ZERO) for axis in zip(*rates, strict=True)]
         wrist = dq.multiply(tree.wrist.dual_quaternion, wrist_rotation(wrist_angles))
         relative = dq.multiply(wrist, relative)
-    for link, angle in zip(reversed(tree.links), reversed(list(joint_angles)), strict=True):
+    for index in reversed(tree.path_to(tree.tip_body)):
+        link = tree.links[index]
         turn, slide = link.screw
-        columns.insert(0, _carried_to_tip(relative, (0.0, 0.0, turn), (0.0, 0.0, slide)))
-        joint = dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, angle))
+        columns[index] = _carried_to_tip(relative, (0.0, 0.0, turn), (0.0, 0.0, slide))
+        joint = dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, joint_angles[index]))
         relative = dq.multiply(joint, relative)
     axes = [[1.0 if j == i else 0.0 for j in range(3)] for i in range(3)]
     turning = [_carried_to_tip(relative, axis, ZERO) for axis in axes]
@@ -180,7 +185,7 @@ def tip_twist(
         if link.screw.turn:
             turned = matrix_product(link.joint.rotation, to_matrix(axis_rotation(2, angle))[0])
             frames[index] = frames[index]._replace(rotation=turned)
-    last = body_velocities(tree, frames, base_twist, joint_rates)[-1]
+    last = body_velocities(tree, frames, base_twist, joint_rates)[tree.tip_body]
     twist: Sequence[Scalar] = (*last.angular, *last.linear)
     if tree.wrist is not None:
         twist = inverse_transform(tree.wrist.rotation, tree.wrist.position, twist)
@@ -215,7 +220,7 @@ def body_velocities(
     """Velocities of base and links, n + 1, by the recursion behind (12); `base_twist` in base axes."""
     velocities = [BodyVelocity(tuple(base_twist[:3]), tuple(base_twist[3:]))]
     for link, (rotation, position), rate in zip(tree.links, frames, joint_rates, strict=True):
-        parent, (turn, slide) = velocities[-1], link.screw
+        parent, (turn, slide) = velocities[link.parent], link.screw
         linear = transposed_matrix_vector(rotation, add(parent.linear, cross(parent.angular, position)))
         angular = transposed_matrix_vector(rotation, parent.angular)
         if turn:
@@ -230,25 +235,25 @@ def momentum(
     tree: KinematicTree, frames: Sequence[LinkFrame], velocities: Sequence[BodyVelocity]
 ) -> tuple[Vector3, Vector3, Vector3]:
     """Linear momentum, angular momentum about the center of mass, and center of mass, in the base frame."""
-    bodies = [tree.base, *(link.body for link in tree.links)]
     linear: list[Vector3] = []
     angular: list[Vector3] = []
     moments: list[Vector3] = []
-    for body, velocity in zip(bodies, velocities, strict=True):
+    for body, velocity in zip(tree.bodies, velocities, strict=True):
         c = body.center_of_mass
         p = scale(body.mass, add(velocity.linear, cross(velocity.angular, c)))  # m (v + omega x c)
         linear.append(p)
         angular.append(add(matrix_vector(body.inertia, velocity.angular), cross(c, p)))
         moments.append(scale(body.mass, c))
-    mass: Scalar = 0.0
-    for i in reversed(range(len(tree.links))):
+    masses = [body.mass for body in tree.bodies]
+    for i, parent in reversed([*enumerate(tree.parents)]):
         rotation, position = frames[i]
-        mass = mass + tree.links[i].body.mass
         linear_at_parent, angular_at_parent = shift_wrench(rotation, position, linear[i + 1], angular[i + 1])
-        linear[i] = add(linear[i], linear_at_parent)
-        angular[i] = add(angular[i], angular_at_parent)
-        moments[i] = add(moments[i], add(matrix_vector(rotation, moments[i + 1]), scale(mass, position)))
-    center = scale(1.0 / (mass + tree.base.mass), moments[0])
+        linear[parent] = add(linear[parent], linear_at_parent)
+        angular[parent] = add(angular[parent], angular_at_parent)
+        rotated = matrix_vector(rotation, moments[i + 1])
+        moments[parent] = add(moments[parent], add(rotated, scale(masses[i + 1], position)))
+        masses[parent] = masses[i + 1] + masses[parent]
+    center = scale(1.0 / masses[0], moments[0])
     return linear[0], subtract(angular[0], cross(center, linear[0])), center  # L_c = L_O - c x p
 
 
@@ -257,7 +262,7 @@ def energy(
 ) -> tuple[Scalar, Scalar]:
     """Kinetic energy and potential energy of the joint springs, J."""
     kinetic: Scalar = 0.0
-    for body, velocity in zip([tree.base, *(link.body for link in tree.links)], velocities, strict=True):
+    for body, velocity in zip(tree.bodies, velocities, strict=True):
         v = add(velocity.linear, cross(velocity.angular, body.center_of_mass))
         rotational = dot(velocity.angular, matrix_vector(body.inertia, velocity.angular))
         kinetic = kinetic + 0.5 * (body.mass * dot(v, v) + rotational)

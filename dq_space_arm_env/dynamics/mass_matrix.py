@@ -206,28 +206,33 @@ def _composite_bodies(
 ) -> tuple[Scalar, Vector3, Sequence[Vector3], list[tuple[Vector3, Vector3]], list[list[Scalar]]]:
     """Composite mass, first moment, inertia at the base; each joint's column (force, torque); joint block."""
 
-    def about_origin(body: RigidBody) -> tuple[float, Vector3, Sequence[Vector3]]:
+    def about_origin(body: RigidBody) -> tuple[Scalar, Vector3, Sequence[Vector3]]:
         c = body.center_of_mass
         inertia: Matrix | list[list[Scalar]] = _shifted_inertia(body.inertia, body.mass, c, ZERO)
         return body.mass, scale(body.mass, c), inertia
 
     n = len(tree.links)
-    mass, moment, inertia = about_origin(tree.links[-1].body) if n else about_origin(tree.base)
+    composite = [about_origin(body) for body in tree.bodies]
     columns: list[tuple[Vector3, Vector3]] = []
     block: list[list[Scalar]] = [[0.0] * n for _ in range(n)]
-    for i in reversed(range(n)):
+    for i, parent in reversed([*enumerate(tree.parents)]):
         # A unit acceleration of joint i needs this wrench on the composite body beyond it.
+        mass, moment, inertia = composite[i + 1]
         column = _wrench_along(tree.links[i].screw, mass, moment, inertia)
         block[i][i] = along(tree.links[i].screw, *column)
-        for ancestor in reversed(range(i)):
-            column = shift_wrench(*frames[ancestor + 1], *column)
+        carried = i
+        for ancestor in reversed(tree.path_to(parent)):
+            column = shift_wrench(*frames[carried], *column)
             block[ancestor][i] = block[i][ancestor] = along(tree.links[ancestor].screw, *column)
-        columns.insert(0, shift_wrench(*frames[0], *column))
+            carried = ancestor
+        columns.insert(0, shift_wrench(*frames[carried], *column))
         rotation, p = frames[i]
         rotated_moment = matrix_vector(rotation, moment)
         shifted = _shifted_inertia(_rotated_inertia(rotation, inertia), mass, p, rotated_moment)
-        parent_mass, parent_moment, parent_inertia = about_origin(tree.links[i - 1].body if i else tree.base)
-        moment = add(parent_moment, add(rotated_moment, scale(mass, p)))
-        inertia = [list(add(row, other)) for row, other in zip(parent_inertia, shifted, strict=True)]
-        mass = parent_mass + mass
-    return mass, moment, inertia, columns, block
+        parent_mass, parent_moment, parent_inertia = composite[parent]
+        composite[parent] = (
+            parent_mass + mass,
+            add(parent_moment, add(rotated_moment, scale(mass, p))),
+            [list(add(row, other)) for row, other in zip(parent_inertia, shifted, strict=True)],
+        )
+    return *composite[0], columns, block

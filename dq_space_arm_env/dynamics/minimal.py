@@ -81,15 +81,16 @@ def body_wrenches(
     joint_rates: Sequence[Scalar],
     acceleration: Accelerations,
 ) -> list[tuple[Vector3, Vector3]]:
-    """Force [N] and torque [N m] that each body needs for given accelerations, from base to last link.
+    """Force [N] and torque [N m] that each body needs for given accelerations, of base and links.
 
     They act about the origin of each body's frame, in its axes, n + 1 pairs: the outward pass of the RNEA.
     """
-    omega, alpha, a = angular_velocity, acceleration.angular, acceleration.linear
-    wrenches = [_newton_euler(tree.base, omega, alpha, a)]
+    motions = [(angular_velocity, acceleration.angular, acceleration.linear)]
+    wrenches = [_newton_euler(tree.base, *motions[0])]
     for link, (rotation, p), rate, rate_change in zip(
         tree.links, frames, joint_rates, acceleration.joints, strict=True
     ):
+        omega, alpha, a = motions[link.parent]
         # a_O' = R' (a + alpha x p + omega x (omega x p)), all components now in the link's axes.
         a = transposed_matrix_vector(rotation, add(a, add(cross(alpha, p), cross(omega, cross(omega, p)))))
         omega = transposed_matrix_vector(rotation, omega)
@@ -102,6 +103,7 @@ def body_wrenches(
             # alpha' = R' alpha + omega x (rate z) + (rate change) z.
             alpha = add(alpha, (*across, rate_change))
             omega = (omega[0], omega[1], omega[2] + rate)
+        motions.append((omega, alpha, a))
         wrenches.append(_newton_euler(link.body, omega, alpha, a))
     return wrenches
 
@@ -121,14 +123,14 @@ def inverse_dynamics(
 def passed_to_base(
     tree: KinematicTree, frames: Sequence[LinkFrame], wrenches: Sequence[tuple[Vector3, Vector3]]
 ) -> Wrenches:
-    """Generalized forces of wrenches on the bodies, summed from tip to base: the inward pass of the RNEA."""
+    """Generalized forces of wrenches on the bodies, summed toward the base: the inward pass of the RNEA."""
     acting = list(wrenches)
     reactions: list[tuple[Vector3, Vector3]] = []
-    for i in reversed(range(len(tree.links))):
+    for i, parent in reversed([*enumerate(tree.parents)]):
         force, torque = acting[i + 1]
         reactions.insert(0, (force, torque))
         force_at_parent, torque_at_parent = shift_wrench(*frames[i], force, torque)
-        acting[i] = (add(acting[i][0], force_at_parent), add(acting[i][1], torque_at_parent))
+        acting[parent] = (add(acting[parent][0], force_at_parent), add(acting[parent][1], torque_at_parent))
     joints = [along(link.screw, *wrench) for link, wrench in zip(tree.links, reactions, strict=True)]
     return Wrenches(acting[0][0], acting[0][1], joints, reactions)
 
@@ -170,5 +172,6 @@ def tip_wrench_forces(
     wrench: Sequence[Scalar],
 ) -> Wrenches:
     """Generalized forces of a wrench at G (force, then torque, in G axes): the last term of (16)."""
-    force, torque = shift_wrench(tip_rotation, tip_position, wrench[:3], wrench[3:])
-    return passed_to_base(tree, frames, [*[(ZERO, ZERO)] * len(tree.links), (force, torque)])
+    acting: list[tuple[Vector3, Vector3]] = [(ZERO, ZERO)] * len(tree.bodies)
+    acting[tree.tip_body] = shift_wrench(tip_rotation, tip_position, wrench[:3], wrench[3:])
+    return passed_to_base(tree, frames, acting)

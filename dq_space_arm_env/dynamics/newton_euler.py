@@ -2,9 +2,10 @@
 
 Frames e_0 .. e_n sit at the centers of mass; e_{i+1} is parallel to joint frame i. The unknowns are the dual
 accelerations of all bodies and the reaction wrenches of all joints (20). Indices and frames follow the
-corrected equations: reaction wrench i is what body i exerts on body i+1, in the axes of joint frame i and
-about its origin. A dual vector has 8 slots: scalar and vector of the real part, scalar and vector of the dual
-part; velocities carry the angular part in the real slots, wrenches the force.
+corrected equations: reaction wrench i is what the parent of body i+1, in the paper body i, exerts on it, in
+the axes of joint frame i and about its origin; its columns and rows in (20) are those of these two bodies. A
+dual vector has 8 slots: scalar and vector of the real part, scalar and vector of the dual part; velocities
+carry the angular part in the real slots, wrenches the force.
 
 It is the reference for minimal coordinates (`forward`), which simulations use: 8 numbers per body against one
 per joint.
@@ -48,9 +49,9 @@ class NewtonEulerSystem:
 class JointFrames:
     """Relative poses around each joint."""
 
-    distal: Sequence[DualQuaternion]  # q_{i/e_i} = C_i exp(1/2 theta s), joint frame i in the body before it
+    distal: Sequence[DualQuaternion]  # q_{i/e_i} = C_i exp(1/2 theta s), joint frame i in its parent
     proximal: Sequence[DualQuaternion]  # q_{e_{i+1}/i} = D_i, body after the joint in joint frame i; constant
-    tip: DualQuaternion  # q_{G/e_n}
+    tip: DualQuaternion  # q_{G/e_n} in the body that carries the tip
 
 
 def _translation(position: Sequence[Scalar]) -> DualQuaternion:
@@ -62,19 +63,20 @@ def joint_frames(
 ) -> JointFrames:
     """Relative poses that (13)-(19) refer to."""
     distal, proximal = [], []
-    center: Sequence[float] = (0.0, 0.0, 0.0)
+    to_center = [_translation([-c for c in body.center_of_mass]) for body in tree.bodies]
     for link, angle in zip(tree.links, joint_angles, strict=True):
-        fixed = dq.multiply(_translation([-c for c in center]), link.joint.dual_quaternion)
+        fixed = dq.multiply(to_center[link.parent], link.joint.dual_quaternion)
         distal.append(dq.multiply(fixed, joint_motion(link.screw, angle)))
-        center = link.body.center_of_mass
-        proximal.append(_translation(center))
-    tip: DualQuaternion = _translation([-c for c in center])
+        proximal.append(_translation(link.body.center_of_mass))
+    tip: DualQuaternion = to_center[tree.tip_body]
     if tree.wrist is not None:
         tip = dq.multiply(dq.multiply(tip, tree.wrist.dual_quaternion), wrist_rotation(wrist_angles))
     return JointFrames(distal, proximal, dq.multiply(tip, tree.tip.dual_quaternion))
 
 
-def joint_velocity(frames: JointFrames, joint: int, velocities: Sequence[DualQuaternion]) -> DualQuaternion:
+def joint_velocity(
+    tree: KinematicTree, frames: JointFrames, joint: int, velocities: Sequence[DualQuaternion]
+) -> DualQuaternion:
     """Dual velocity of a joint in its own axes, omega^i_{i/e_i}.
 
     Entry 3, or 7 of a prismatic joint, is the joint rate (12). A screw's entry 7 is pitch times its rate; the
@@ -83,7 +85,8 @@ def joint_velocity(frames: JointFrames, joint: int, velocities: Sequence[DualQua
     after, before = frames.proximal[joint], frames.distal[joint]
     # (12): Ad(q_{e_{i+1}/i}) w_{i+1} - Ad(q_{i/e_i}*) w_i.
     return dq.subtract(
-        dq.adjoint(after, velocities[joint + 1]), dq.inverse_adjoint(before, velocities[joint])
+        dq.adjoint(after, velocities[joint + 1]),
+        dq.inverse_adjoint(before, velocities[tree.links[joint].parent]),
     )
 
 
@@ -92,7 +95,7 @@ def along_joints(
 ) -> list[Scalar]:
     """Joint rates (12) from the dual velocities of the bodies; likewise of their rates."""
     entries = [3 if link.screw.turn else 7 for link in tree.links]
-    return [joint_velocity(frames, j, velocities)[entry] for j, entry in enumerate(entries)]
+    return [joint_velocity(tree, frames, j, velocities)[entry] for j, entry in enumerate(entries)]
 
 
 def assemble(
@@ -107,12 +110,11 @@ def assemble(
     `velocities` holds omega^{e_i}_{e_i/I}, 8 per body; `joint_torques` include springs and dampers.
     """
     n = len(tree.links)
-    bodies = [tree.base, *(link.body for link in tree.links)]
     s11 = _zeros(8 * (n + 1), 8 * (n + 1))
     s12, s21 = _zeros(8 * (n + 1), 5 * n), _zeros(5 * n, 8 * (n + 1))
     b1: list[Scalar] = []
     b2: list[Scalar] = []
-    for i, (body, velocity) in enumerate(zip(bodies, velocities, strict=True)):
+    for i, (body, velocity) in enumerate(zip(tree.bodies, velocities, strict=True)):
         inertia = dual_matrices.dual_inertia_matrix(body.mass, body.inertia)
         _place(s11, 8 * i, 8 * i, dual_matrices.swap_columns(inertia))  # H(M_i) wdot_i = M_i wdot_i^s
         # (9): the gyroscopic term omega x (M omega^s) moves to the right.
@@ -121,14 +123,14 @@ def assemble(
     _accumulate(b1, 0, base_wrench)  # W_0 of (13)
     if tree.tip_wrench is not None:
         wrench = (0.0, *tree.tip_wrench[:3], 0.0, *tree.tip_wrench[3:])
-        _accumulate(b1, 8 * n, dq.adjoint(frames.tip, wrench))  # Ad(q_{G/e_n}) W_ext of (16)
-    for j in range(n):
+        _accumulate(b1, 8 * tree.tip_body, dq.adjoint(frames.tip, wrench))  # Ad(q_{G/e_n}) W_ext of (16)
+    for j, parent in enumerate(tree.parents):
         before, after = frames.distal[j], frames.proximal[j]
         # (13)-(16): +-Ad(.) E158' W~_{j+1/j} on the left, -+Ad(.) W_act,j+1 on the right.
         screw = tree.links[j].screw
         actuation = [0.0] * 8
         actuation[7 if screw.turn else 3] = joint_torques[j]
-        for body_index, pose, sign in ((j, before, 1.0), (j + 1, dq.conjugate(after), -1.0)):
+        for body_index, pose, sign in ((parent, before, 1.0), (j + 1, dq.conjugate(after), -1.0)):
             transfer = dual_matrices.adjoint_matrix(pose)
             columns = [[sign * entry for entry in _transmitted(screw, row)] for row in transfer]
             _place(s12, 8 * body_index, 5 * j, columns)
@@ -137,9 +139,9 @@ def assemble(
         # w^j_{j/e_j}).
         back = dual_matrices.adjoint_matrix(dq.conjugate(before))
         _place(s21, 5 * j, 8 * (j + 1), _forbidden(screw, dual_matrices.adjoint_matrix(after)))
-        _place(s21, 5 * j, 8 * j, [[-entry for entry in row] for row in _forbidden(screw, back)])
-        carried = dq.inverse_adjoint(before, velocities[j])
-        centripetal = dq.cross(carried, joint_velocity(frames, j, velocities))
+        _place(s21, 5 * j, 8 * parent, [[-entry for entry in row] for row in _forbidden(screw, back)])
+        carried = dq.inverse_adjoint(before, velocities[parent])
+        centripetal = dq.cross(carried, joint_velocity(tree, frames, j, velocities))
         b2 += [row[0] for row in _forbidden(screw, [[entry] for entry in centripetal])]
     return NewtonEulerSystem(s11, s12, s21, b1, b2)
 
@@ -169,7 +171,7 @@ class SchurComplement:
 
     def __init__(self, tree: KinematicTree, system: NewtonEulerSystem) -> None:
         self._system = system
-        self._bodies = [tree.base, *(link.body for link in tree.links)]
+        self._bodies = tree.bodies
         count = len(system.s21)
         # A force enforces a linear velocity, a torque an angular one: (vx, vy, vz, wx, wy) within each joint,
         # (vx, vy, wx, wy, wz) within a prismatic one.

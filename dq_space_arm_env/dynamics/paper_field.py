@@ -59,7 +59,7 @@ class PaperField:
             tree, frames, (*motion.angular, *motion.linear), motion.joint_rates
         )
         duals: list[Scalar] = []
-        for body, velocity in zip([tree.base, *(link.body for link in tree.links)], velocities, strict=True):
+        for body, velocity in zip(tree.bodies, velocities, strict=True):
             at_center = vectors.add(velocity.linear, vectors.cross(velocity.angular, body.center_of_mass))
             duals += [0.0, *velocity.angular, 0.0, *at_center]
         tip = kinematics.tip_pose(tree, pose, motion.joint_angles, motion.wrist_angles)

@@ -95,10 +95,10 @@ class Disturbances:
 
 
 def load_place(scene: Scene) -> str | None:
-    """Name the body whose mass differs: "payload", or the last link without one; None for a base alone."""
+    """Name the body whose mass differs: "payload", or without one the tip's link; None for a base alone."""
     if scene.payload is not None:
         return "payload"
-    return f"links.{len(scene.links) - 1}" if scene.links else None
+    return f"links.{scene.tip_body - 1}" if scene.tip_body else None
 
 
 def load_numbers(scene: Scene) -> list[Number]:

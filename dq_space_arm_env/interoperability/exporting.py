@@ -64,8 +64,8 @@ def joint_limits(scene: Scene) -> list[tuple[float, float, float]]:
     return [(lower, upper, rate) for lower, upper, rate in limits]
 
 
-def tip_from_last_link(scene: Scene) -> tuple[float, ...]:
-    """Pose of the tip in the last link's (or the base's) frame, with the wrist at its initial angles."""
+def tip_on_its_body(scene: Scene) -> tuple[float, ...]:
+    """Pose of the tip in the frame of the body that carries it, with the wrist at its initial angles."""
     if scene.wrist is None:
         return scene.tip.dual_quaternion
     turned = wrist_rotation(scene.initial_state.wrist_angles)

@@ -15,7 +15,7 @@ from dq_space_arm_env.interoperability.exporting import (
     free_name,
     joint_limits,
     refuse,
-    tip_from_last_link,
+    tip_on_its_body,
     words,
 )
 from dq_space_arm_env.scene import Base, Link, Payload, Scene, Shape, StateLayout
@@ -33,7 +33,7 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     Body `base` has the frame e0 and a free joint, called `base joint`; in a planar scene it slides along x
     and y and turns about z. Each link is a body with the frame of its joint, a hinge about z or a slide along
     it called by the link's name and " joint", with the scene's damping, spring and limits of the joint, and
-    no armature.
+    no armature. Where arms branch, MuJoCo's coordinates follow one arm after the other.
     MuJoCo pushes joints back from their limits, the scene's kernels do not, and it has no limits of rates.
     Site `tip` has the frame G, body `payload` is held at the tip.
 
@@ -69,13 +69,15 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     _add_inertial(base, scene.base, (0.0, 0.0, 0.0))
     _add_shapes(base, scene.base.geometry, COLORS["foil"])
     SubElement(base, "site", name="e0")
-    body = base
-    for link, (lower, upper, _) in zip(scene.links, joint_limits(scene), strict=True):
-        body = _add_body(body, link.name, link.joint.dual_quaternion)
+    bodies = [base]
+    limits = joint_limits(scene)
+    for link, parent, (lower, upper, _) in zip(scene.links, scene.parent_bodies, limits, strict=True):
+        body = _add_body(bodies[parent], link.name, link.joint.dual_quaternion)
+        bodies.append(body)
         _add_joint(body, link, lower, upper)
         _add_inertial(body, link, link.center_of_mass)
         _add_shapes(body, link.geometry, COLORS["white"])
-    tip = tip_from_last_link(scene)
+    tip, body = tip_on_its_body(scene), bodies[scene.tip_body]
     SubElement(body, "site", {"name": "tip", **_placed(tip)})
     if scene.payload is not None:
         payload = _add_body(body, free_name("payload", names), tip)
@@ -171,8 +173,18 @@ def _add_actuators(root: Element, scene: Scene) -> None:
             motor.set("ctrlrange", words([-limit, limit]))
 
 
+def _depth_first(scene: Scene) -> list[int]:
+    """Links in the order of MuJoCo's coordinates: each right before what it carries."""
+
+    def carried_by(body: int) -> list[int]:
+        links = [link for link, parent in enumerate(scene.parent_bodies) if parent == body]
+        return [each for link in links for each in (link, *carried_by(link + 1))]
+
+    return carried_by(0)
+
+
 def _add_start(root: Element, scene: Scene) -> None:
-    start = scene.initial_state
+    start, order = scene.initial_state, _depth_first(scene)
     rotation, position = poses.to_rotation_and_position(start.base_pose.dual_quaternion)
     angular, linear = start.base_velocity[:3], rotations.rotate(rotation, start.base_velocity[3:])
     if scene.base.motion == "planar":
@@ -184,6 +196,6 @@ def _add_start(root: Element, scene: Scene) -> None:
         SubElement(root, "keyframe"),
         "key",
         name="start",
-        qpos=words([*base, *start.joint_angles]),
-        qvel=words([*velocity, *start.joint_rates]),
+        qpos=words([*base, *(start.joint_angles[joint] for joint in order)]),
+        qvel=words([*velocity, *(start.joint_rates[joint] for joint in order)]),
     )

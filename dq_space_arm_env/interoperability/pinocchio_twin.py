@@ -12,7 +12,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Placement, RigidBody, Screw
-from dq_space_arm_env.interoperability.exporting import tip_from_last_link
+from dq_space_arm_env.interoperability.exporting import tip_on_its_body
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 
@@ -29,7 +29,7 @@ def pinocchio_model(scene: Scene) -> Any:
     accelerations), where (dw, dv) are the scene's base accelerations.
 
     Args:
-        scene: A validated scene; its nominal masses and inertias, the payload merged into the last link.
+        scene: A validated scene; its nominal masses and inertias, the payload part of the tip's link.
 
     Returns:
         The model; nv = 6 + n for n joints, 3 + n in a planar scene.
@@ -43,14 +43,15 @@ def pinocchio_model(scene: Scene) -> Any:
     model.name = scene.name
     model.gravity = pin.Motion.Zero()
     free = pin.JointModelPlanar() if tree.planar else pin.JointModelFreeFlyer()
-    joint = model.addJoint(0, free, pin.SE3.Identity(), "base")
-    model.appendBodyToJoint(joint, _inertia(pin, tree.base), pin.SE3.Identity())
+    joints = [model.addJoint(0, free, pin.SE3.Identity(), "base")]
+    model.appendBodyToJoint(joints[0], _inertia(pin, tree.base), pin.SE3.Identity())
     for link, name in zip(tree.links, [link.name for link in scene.links], strict=True):
-        joint = model.addJoint(joint, _joint(pin, link.screw), _placement(pin, link.joint), name)
-        model.appendBodyToJoint(joint, _inertia(pin, link.body), pin.SE3.Identity())
-    rotation, position = poses.to_matrix(tip_from_last_link(scene))
+        parent = joints[link.parent]
+        joints.append(model.addJoint(parent, _joint(pin, link.screw), _placement(pin, link.joint), name))
+        model.appendBodyToJoint(joints[-1], _inertia(pin, link.body), pin.SE3.Identity())
+    rotation, position = poses.to_matrix(tip_on_its_body(scene))
     tip = pin.SE3(np.array(rotation), np.array(position))
-    model.addFrame(pin.Frame("tip", joint, tip, pin.FrameType.OP_FRAME))
+    model.addFrame(pin.Frame("tip", joints[tree.tip_body], tip, pin.FrameType.OP_FRAME))
     return model
 
 

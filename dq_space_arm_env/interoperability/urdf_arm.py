@@ -1,7 +1,8 @@
-"""From the tree of a URDF to a free base with a chain of joints, as a scene has them.
+"""From the tree of a URDF to a free base with joints that branch from it, as a scene has them.
 
-The chain runs from the base link to the tip link. Bodies fixed to it are lumped into those that carry them.
-Joint frames are turned until z is the axis, and the base frame moves to the center of mass.
+A chain of joints runs from the base link to the tip link; others that move a mass branch from it, or are
+locked. Fixed bodies are lumped into those that carry them. Joint frames are turned until z is the axis, and
+the base frame moves to the center of mass.
 """
 
 from __future__ import annotations
@@ -26,22 +27,24 @@ _MANY = 60
 
 @dataclass(frozen=True, eq=False)
 class ArmJoint:
-    """A joint of the chain, and the body that it carries."""
+    """A joint, and the body that it carries."""
 
     joint: UrdfJoint
-    pose: Pose  # of the joint frame, z along the axis, in the frame before, 8 numbers, m
+    parent: int  # body that carries the joint: 0 for the base, i + 1 for that of joint i
+    pose: Pose  # of the joint frame, z along the axis, in the frame of that body, 8 numbers, m
     body: Body  # in the joint frame
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A free base with a chain of joints."""
+    """A free base with joints that branch from it."""
 
     base: Body  # in e0: origin at the center of mass, axes of the base link
     base_link: str
     base_center: Array  # origin of e0 in the base link's frame, shape (3,), m
-    joints: tuple[ArmJoint, ...]  # base to tip
-    tip: Pose  # of the tip link in the last joint frame, 8 numbers, m
+    joints: tuple[ArmJoint, ...]  # base to tip, then those of branches, each after its parent
+    way: int  # number of joints from base to tip
+    tip: Pose  # of the tip link in the frame of the last of these, 8 numbers, m
     flaws: tuple[str, ...]  # impossible inertias of links that fixed neighbors make up for
 
 
@@ -138,8 +141,46 @@ class UrdfTree:
                 )
         return chain
 
-    def carried(self, link: str, pose: Pose, chain: list[UrdfJoint], lock_branches: bool) -> dict[str, Pose]:
-        """Poses of all links that move as one with a link; the joints of the chain are not crossed."""
+    def branches(self, base: str, chain: list[UrdfJoint], locked: Collection[str]) -> list[UrdfJoint]:
+        """Other joints that move a mass, each after those that carry it, but for the locked ones."""
+        for name in locked:
+            known = [joint for joint in self.robot.joints if self.robot.joints[joint] not in chain]
+            if name not in known:
+                raise SceneError(
+                    f"lock_branches: {name!r} is not a joint beside the way from base to tip; "
+                    f"{did_you_mean(name, known)}these are {_some(known)}"
+                )
+        rank = {name: index for index, name in enumerate(self.robot.joints)}
+        found: list[UrdfJoint] = []
+        bodies = [base, *(joint.child for joint in chain)]
+        for body in bodies:  # it grows
+            at_body = self._hanging(body, [*chain, *found], locked)
+            for joint in sorted(at_body, key=lambda each: rank[each.name]):
+                self._check_branch(joint, at_body[joint])
+                found.append(joint)
+                bodies.append(joint.child)
+        return found
+
+    def _hanging(self, body: str, moving: list[UrdfJoint], locked: Collection[str]) -> dict[UrdfJoint, bool]:
+        """Other joints at a link and what is fixed to it that move a mass, each with whether it is below."""
+        found: dict[UrdfJoint, bool] = {}
+        reached, waiting = {body}, [body]
+        while waiting:
+            here = waiting.pop(0)
+            for joint in self._joints_at[here]:
+                down = joint.parent == here
+                there = joint.child if down else joint.parent
+                if there in reached or joint in moving:
+                    continue
+                if joint.type == "fixed" or joint.name in locked:
+                    reached.add(there)
+                    waiting.append(there)
+                elif self._has_mass_beyond(joint, here):
+                    found[joint] = down
+        return found
+
+    def carried(self, link: str, pose: Pose, moving: list[UrdfJoint]) -> dict[str, Pose]:
+        """Poses of all links that move as one with a link; the given joints are not crossed."""
         found = {link: pose}
         waiting = [link]
         while waiting:
@@ -147,12 +188,12 @@ class UrdfTree:
             for joint in self._joints_at[here]:
                 down = joint.parent == here
                 there = joint.child if down else joint.parent
-                if there in found or joint in chain:
+                if there in found or joint in moving:
                     continue
                 if joint.type != "fixed":
                     if not self._has_mass_beyond(joint, here):
                         continue
-                    self._check_branch(joint, chain, lock_branches)
+                    self._check_locked(joint, moving)
                 step = joint.origin if down else dual_quaternion.conjugate(joint.origin)
                 found[there] = dual_quaternion.multiply(found[here], step)
                 waiting.append(there)
@@ -171,25 +212,41 @@ class UrdfTree:
                 if other is not crossed:
                     waiting.append((other, other.child if other.parent == here else other.parent))
 
-    def _check_branch(self, joint: UrdfJoint, chain: list[UrdfJoint], lock_branches: bool) -> None:
-        if joint.mimics is not None and any(joint.mimics == other.name for other in chain):
+    def _check_branch(self, joint: UrdfJoint, down: bool) -> None:
+        """Refuse a joint beside the chain that a scene cannot have."""
+        reasons = {
+            f"mimics joint {joint.mimics!r}: in a scene every joint moves by itself": joint.mimics,
+            f"is {joint.type}: a scene has {', '.join(MOVABLE)} and fixed joints only": (
+                joint.type not in MOVABLE
+            ),
+            f"carries the base: choose link {joint.parent!r}, or one above it, as base": not down,
+        }
+        for reason, holds in reasons.items():
+            if holds:
+                raise SceneError(
+                    f"URDF: joint {joint.name!r}, which moves a mass beside the way from base to tip, "
+                    f"{reason}; lock_branches holds such joints at zero, those named or, if True, all"
+                )
+
+    def _check_locked(self, joint: UrdfJoint, moving: list[UrdfJoint]) -> None:
+        if joint.mimics is not None and any(joint.mimics == other.name for other in moving):
             raise SceneError(
                 f"URDF: joint {joint.name!r} mimics joint {joint.mimics!r} of the chain: in a scene every "
                 "joint moves by itself"
             )
-        if not lock_branches:
-            raise SceneError(
-                f"URDF: joint {joint.name!r} ({joint.type}) moves a mass beside the chain from base to tip; "
-                "a scene has no branches: lock_branches=True holds such joints at zero"
-            )
 
 
-def arm_of(robot: UrdfRobot, tip: str, base: str | None, lock_branches: bool, extra: Body | None) -> Arm:
-    """Cut the chain from base to tip out of a robot; `extra` is a body fixed to the base link."""
+def arm_of(
+    robot: UrdfRobot, tip: str, base: str | None, lock_branches: bool | Collection[str], extra: Body | None
+) -> Arm:
+    """Free a robot at its base link, to which `extra` is fixed; the chain from base to tip comes first."""
     tree = UrdfTree(robot)
     base = tree.root if base is None else base
     chain = tree.chain(tip, base)
-    placed = tree.carried(base, _HERE, chain, lock_branches)
+    moving = chain
+    if lock_branches is not True:
+        moving = [*chain, *tree.branches(base, chain, lock_branches or ())]
+    placed = tree.carried(base, _HERE, moving)
     bodies = [*_bodies(robot, placed), *([] if extra is None else [extra])]
     body = lumped(bodies)
     if body is None:
@@ -200,13 +257,17 @@ def arm_of(robot: UrdfRobot, tip: str, base: str | None, lock_branches: bool, ex
     flaws = _checked(robot, placed, body, base)
     center = body.center_of_mass
     to_center = poses.from_rotation_and_position((1.0, 0.0, 0.0, 0.0), tuple((-center).tolist()))
-    placed = {name: dual_quaternion.multiply(to_center, pose) for name, pose in placed.items()}
+    of_bodies: list[dict[str, Pose]] = [
+        {name: dual_quaternion.multiply(to_center, pose) for name, pose in placed.items()}
+    ]
     joints = []
-    for joint in chain:
+    for joint in moving:
         turned = _turned_to(joint.axis)
-        before = placed[joint.parent]
+        parent = next(index for index, links in enumerate(of_bodies) if joint.parent in links)
+        before = of_bodies[parent][joint.parent]
         pose = dual_quaternion.multiply(dual_quaternion.multiply(before, joint.origin), turned)
-        placed = tree.carried(joint.child, dual_quaternion.conjugate(turned), chain, lock_branches)
+        placed = tree.carried(joint.child, dual_quaternion.conjugate(turned), moving)
+        of_bodies.append(placed)
         moved = lumped(_bodies(robot, placed))
         if moved is None:
             raise SceneError(
@@ -214,9 +275,10 @@ def arm_of(robot: UrdfRobot, tip: str, base: str | None, lock_branches: bool, ex
                 "fixed to it: its accelerations would be infinite; give it a mass and an inertia"
             )
         flaws += _checked(robot, placed, moved, joint.child)
-        joints.append(ArmJoint(joint, pose, moved))
+        joints.append(ArmJoint(joint, parent, pose, moved))
     at_center = Body(body.mass, np.zeros(3), body.inertia)
-    return Arm(at_center, base, center, tuple(joints), placed[tip], tuple(flaws))
+    way = len(chain)
+    return Arm(at_center, base, center, tuple(joints), way, of_bodies[way][tip], tuple(flaws))
 
 
 def _checked(robot: UrdfRobot, placed: dict[str, Pose], body: Body, link: str) -> list[str]:

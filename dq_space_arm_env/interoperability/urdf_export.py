@@ -13,7 +13,7 @@ from dq_space_arm_env.interoperability.exporting import (
     free_name,
     joint_limits,
     refuse,
-    tip_from_last_link,
+    tip_on_its_body,
     words,
 )
 from dq_space_arm_env.interoperability.urdf_elements import UNLIMITED
@@ -50,17 +50,19 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     refuse(scene, "URDF", wrist, springs=True, planar=True)
     root = Element("robot", name=scene.name)
     names = [link.name for link in scene.links]
-    parent = free_name("base", names)
-    _add_link(root, parent, scene.base, (0.0, 0.0, 0.0))
-    for link, effort, limits in zip(scene.links, _efforts(scene), joint_limits(scene), strict=True):
+    bodies = [free_name("base", names), *names]
+    _add_link(root, bodies[0], scene.base, (0.0, 0.0, 0.0))
+    limits = joint_limits(scene)
+    for link, parent, effort, bounds in zip(
+        scene.links, scene.parent_bodies, _efforts(scene), limits, strict=True
+    ):
         _add_link(root, link.name, link, link.center_of_mass)
-        _add_joint(root, link, parent, effort, limits)
-        parent = link.name
+        _add_joint(root, link, bodies[parent], effort, bounds)
     tip = free_name("tip", names)
     payload = scene.payload
     _add_link(root, tip, payload, (0.0, 0.0, 0.0) if payload is None else payload.center_of_mass)
     joint = SubElement(root, "joint", name=f"{tip} joint", type="fixed")
-    _connect(joint, parent, tip, tip_from_last_link(scene))
+    _connect(joint, bodies[scene.tip_body], tip, tip_on_its_body(scene))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 

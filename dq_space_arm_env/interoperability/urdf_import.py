@@ -19,7 +19,7 @@ from dq_space_arm_env.interoperability.rigid_body import Body, lumped, tidied
 from dq_space_arm_env.interoperability.urdf_arm import Arm, ArmJoint, arm_of
 from dq_space_arm_env.interoperability.urdf_elements import Pose, UrdfJoint, read_robot
 from dq_space_arm_env.scene import Cost, Scene, SceneError
-from dq_space_arm_env.scene.bodies import Inertia
+from dq_space_arm_env.scene.bodies import BASE, Inertia
 from dq_space_arm_env.validation import Model, Positive, Vector3
 
 # Angle from the start of every joint at the default target, rad.
@@ -44,14 +44,14 @@ def scene_from_urdf(
     base_torque: float | Sequence[float] | None = 5.0,
     joint_torque: float | None = None,
     passive: Collection[str] = (),
-    lock_branches: bool = False,
+    lock_branches: bool | Collection[str] = False,
     target: Mapping[str, Any] | None = None,
 ) -> Scene:
-    """Make a scene of a robot's URDF: the arm from the base link to the tip link, free in space.
+    """Make a scene of a robot's URDF, free in space: the arm from base link to tip link, and its branches.
 
-    Revolute, continuous and fixed joints are supported. Bodies fixed to the chain are lumped into those that
+    Revolute, continuous, prismatic and fixed joints are supported. Fixed bodies are lumped into those that
     carry them; links without mass are mere frames. Each link of the scene is named after the link that its
-    joint carries.
+    joint carries; the links from base to tip come first, then those of the other branches.
 
     Frames: the scene's base frame e0 has the axes of the base link and its origin at the center of mass of
     the base and of all that is fixed to it; the scene's description says where that is in the base link. The
@@ -82,8 +82,9 @@ def scene_from_urdf(
             wheels.
         joint_torque: Limit of the joints for which the URDF gives no effort, or zero, N m (N of slides).
         passive: Names of the joints that have no motor.
-        lock_branches: Whether movable joints beside the chain, as those of a gripper, are held at zero;
-            otherwise they are an error if they move a mass.
+        lock_branches: Names of movable joints beside the way from base to tip, as those of a gripper or of
+            another arm, that are held at zero; True for all of them. Others that move a mass are joints of
+            the scene.
         target: Pose of the target as in a scene, {"position": ..., "rotation": ...} in m; by default the pose
             of the tip at the start but with every joint 0.3 rad further, or back where its limits ask for it.
 
@@ -96,6 +97,8 @@ def scene_from_urdf(
     """
     robot = read_robot(source)
     extra = None if spacecraft is None else _spacecraft(spacecraft)
+    if isinstance(lock_branches, str):
+        raise SceneError(f"lock_branches = {lock_branches!r}: must be a list of names of joints, or True")
     if joint_torque is not None and not (isinstance(joint_torque, int | float) and joint_torque > 0):
         raise SceneError(f"joint_torque = {joint_torque!r}: must be a number greater than 0, N m")
     arm = arm_of(robot, tip, base, lock_branches, extra)
@@ -107,7 +110,8 @@ def scene_from_urdf(
         "name": robot.name if name is None else name,
         "description": f"From the URDF of {robot.name}: base frame at ({center}) m in link {arm.base_link}.",
         "base": {"mass": arm.base.mass, "inertia": tidied(arm.base.inertia).tolist()},
-        "links": [_link(part, joint_torque, passive) for part in arm.joints],
+        "links": _links(arm, joint_torque, passive),
+        "tip_link": None if arm.way == len(arm.joints) else arm.joints[arm.way - 1].joint.child,
         "tip": _pose(arm.tip),
         "actuators": {
             "base_force": None if base_force is None else {"limit": base_force},
@@ -153,7 +157,7 @@ def _check_passive(arm: Arm, passive: Collection[str]) -> None:
     unknown = [name for name in passive if name not in joints]
     if unknown:
         raise SceneError(
-            f"passive: {unknown[0]!r} is not a joint between base and tip, which are {', '.join(joints)}"
+            f"passive: {unknown[0]!r} is not a joint that moves a mass; these are {', '.join(joints)}"
         )
 
 
@@ -193,21 +197,21 @@ def _torque_weight(arm: Arm, angles: Sequence[float]) -> float:
     without inertia its decay. Turned by theta, a tip at distance d costs a = w (1 + d^2) / 4, w the pose's
     weight; moved along a slide, a = w / 4.
     """
-    bodies: list[Body] = []
     tip, largest = arm.tip, (0.0, 0.0)
-    for part, angle in zip(reversed(arm.joints), reversed(angles), strict=True):
-        bodies.append(part.body)
-        moved = lumped(bodies)
+    carried: list[list[Body]] = [[] for _ in range(len(arm.joints) + 1)]
+    for index, (part, angle) in reversed([*enumerate(zip(arm.joints, angles, strict=True))]):
+        moved = lumped([*carried[index + 1], part.body])
         assert moved is not None
+        carried[part.parent].append(moved.seen_from(_displaced(part, angle)))
+        if index >= arm.way:
+            continue
         x, y, _ = moved.center_of_mass
         distance = math.dist(poses.to_rotation_and_position(tip)[1], (0.0, 0.0, 0.0))
         inertia, lever = float(moved.inertia[2, 2] + moved.mass * (x * x + y * y)), 1.0 + distance**2
         if part.joint.slides:
             inertia, lever = moved.mass, 1.0
         largest = max(largest, (math.hypot(inertia * _FREQUENCY, part.joint.damping), lever))
-        # On to the frame before, the joint at its start.
-        bodies = [moved.seen_from(pose := _displaced(part, angle))]
-        tip = tuple(dual_quaternion.multiply(pose, tip))
+        tip = tuple(dual_quaternion.multiply(_displaced(part, angle), tip))
     impedance, lever = largest  # N m s/rad or N s/m; 1 + d^2
     return float(f"{0.25 * Cost().pose[0] * lever / (impedance * _FREQUENCY) ** 2:.2g}")
 
@@ -252,6 +256,15 @@ def _joint_limits(arm: Arm) -> list[dict[str, Any]]:
     return [{"name": "joint limits", "kind": "joint_limits", **finite}] if finite else []
 
 
+def _links(arm: Arm, joint_torque: float | None, passive: Collection[str]) -> list[dict[str, Any]]:
+    """The scene's links; of those right after their parents nothing is said."""
+    names = [BASE, *(part.joint.child for part in arm.joints)]
+    return [
+        _link(part, joint_torque, passive) | ({} if part.parent == index else {"parent": names[part.parent]})
+        for index, part in enumerate(arm.joints)
+    ]
+
+
 def _link(part: ArmJoint, joint_torque: float | None, passive: Collection[str]) -> dict[str, Any]:
     joint = part.joint
     driven = joint.name not in passive
@@ -280,7 +293,7 @@ def _start(arm: Arm) -> list[float]:
     not tell which way to bend, and the solver creeps.
     """
     at_rest = [_at_rest(part.joint) for part in arm.joints]
-    bent = [_bent(part.joint) for part in arm.joints]
+    bent = [*(_bent(part.joint) for part in arm.joints[: arm.way]), *at_rest[arm.way :]]
     return bent if _dexterity(arm, at_rest) < _SINGULAR < _dexterity(arm, bent) else at_rest
 
 
@@ -313,8 +326,9 @@ def _dexterity(arm: Arm, angles: Sequence[float]) -> float:
     """
     frame: Pose = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     axes, origins = [], []
-    slides = np.array([part.joint.slides for part in arm.joints])
-    for part, angle in zip(arm.joints, angles, strict=True):
+    way = arm.joints[: arm.way]
+    slides = np.array([part.joint.slides for part in way])
+    for part, angle in zip(way, angles, strict=False):
         frame = tuple(dual_quaternion.multiply(frame, _displaced(part, angle)))
         rotation, position = poses.to_matrix(frame)
         axes.append([row[2] for row in rotation])

@@ -1,6 +1,6 @@
 """Bodies of a scene: base, links, wrist and payload, and the physics that constrains their numbers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -27,6 +27,7 @@ _TOLERANCE = 1e-9  # fractions of the largest moment
 _SINGULAR = 1e-12
 _ENTRIES = Range(0.0, INERTIAS.most)  # before anything is computed with them
 _FORMS = "3 numbers (diagonal) or 3x3"
+BASE = "base"  # its name among those of the bodies
 
 
 def _read_inertia(value: Any) -> Matrix3:
@@ -97,14 +98,20 @@ class Link(Model):
     """
 
     name: Name = Field(description="name of the link, unique in the scene")
+    parent: Name | None = Field(
+        default=None,
+        exclude_if=lambda parent: parent is None,
+        description="link before this one that carries it, or base; absent: the link right before (of the "
+        "first link: the base)",
+    )
     mass: Mass = Field(description="mass of the link, kg")
     inertia: Inertia = Field(
         description=f"inertia of the link about its center of mass, joint-frame axes, kg m^2: {_FORMS}"
     )
     center_of_mass: Position = Field(description="center of mass of the link in its joint frame, m")
     joint: Pose = Field(
-        description="pose of the joint frame at zero (angle or distance) in the parent's frame, m (first "
-        "link: base frame e0 at the center of mass; others: joint frame of the link before)"
+        description="pose of the joint frame at zero (angle or distance) in the parent's frame, m (base: "
+        "frame e0 at the center of mass; link: its joint frame)"
     )
     joint_type: JointType = Field(
         default="revolute",
@@ -150,6 +157,23 @@ class Link(Model):
             yield Problem(("pitch",), 0.0, "a screw joint needs one; without it the joint is revolute")
         if self.joint_type != "screw" and self.pitch != 0.0:
             yield Problem(("pitch",), self.pitch, f"a {self.joint_type} joint has none; a screw has one")
+
+
+def parent_bodies(links: Sequence[Link]) -> list[int | None]:
+    """Find what carries each link.
+
+    Args:
+        links: The links of a scene.
+
+    Returns:
+        One number per link: 0 for the base, i + 1 for link i; None where no link before it has the name.
+    """
+    found: list[int | None] = []
+    bodies = {BASE: 0}
+    for index, link in enumerate(links):
+        found.append(index if link.parent is None else bodies.get(link.parent))
+        bodies[link.name] = index + 1
+    return found
 
 
 class Wrist(Model):

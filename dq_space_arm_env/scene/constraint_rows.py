@@ -282,32 +282,43 @@ _MOVES_WITH_TARGET = ("target", "grasp")
 def _may_touch(scene: Scene, a: Volume, b: Volume) -> bool:
     if a.frame == b.frame or (a.frame in _MOVES_WITH_TARGET and b.frame in _MOVES_WITH_TARGET):
         return False
-    chain = ["base", *(link.name for link in scene.links), "tip"]
-    if a.frame not in chain or b.frame not in chain:
+    names = ["base", *(link.name for link in scene.links), "tip"]
+    if a.frame not in names or b.frame not in names:
         return True
-    if scene.wrist is None and {a.frame, b.frame} == set(chain[-2:]):
-        return False
-    near, far = sorted((a, b), key=lambda volume: chain.index(volume.frame))
-    between = scene.links[chain.index(near.frame) : chain.index(far.frame)]
-    if not all(link.joint_type == "revolute" for link in between):
+    near, far = sorted((a, b), key=lambda volume: names.index(volume.frame))
+    up, down = (_path_to(scene, names.index(volume.frame)) for volume in (near, far))
+    shared = sum(1 for one, other in zip(up, down, strict=False) if one == other)
+    up, down = up[shared:], down[shared:]  # frames below the body that carries both
+    moving = [scene.links[frame - 1] for frame in (*up, *down) if frame <= len(scene.links)]
+    if not moving and scene.wrist is None:
+        return False  # the tip is fixed in its body
+    if not all(link.joint_type == "revolute" for link in moving):
         return True  # one slides as far as it may
     # In the frame of the near volume, the far one is within its reach of the origin of the next frame.
-    first = chain.index(near.frame)
-    steps = [_offset(scene, index) for index in range(first, chain.index(far.frame))]
-    reach = sum(math.hypot(*step) for step in steps[1:])
-    if scene.wrist is not None and far.frame == "tip":
-        reach += math.hypot(*scene.tip.position)
+    lengths = [math.hypot(*_origin(scene, frame)) for frame in (*up[1:], *down[1:])]
+    first = _origin(scene, down[0])
+    if up:  # the next frame is the near one's own, at whose origin it turns
+        lengths.append(math.dist(_origin(scene, up[0]), first))
+        first = (0.0, 0.0, 0.0)
+    reach = sum(lengths) + (math.hypot(*scene.tip.position) if scene.wrist and far.frame == "tip" else 0.0)
     reach += max(math.hypot(*end) for end in far.ends) + near.radius + far.radius
-    return _distance_to_segment(steps[0], *near.ends) <= reach
+    return _distance_to_segment(first, *near.ends) <= reach
 
 
-def _offset(scene: Scene, index: int) -> tuple[float, ...]:
-    """Origin of the frame after that of a body, base or link, in its frame; of the tip after the last."""
-    if index < len(scene.links):
-        return tuple(scene.links[index].joint.position)
-    if scene.wrist is None:
-        return tuple(scene.tip.position)
-    return tuple(scene.wrist.frame.position)
+def _path_to(scene: Scene, frame: int) -> list[int]:
+    """Frames from the base, 0, to one of a link, i + 1, or of the tip, the last; without the base."""
+    path: list[int] = []
+    while frame:
+        path.insert(0, frame)
+        frame = scene.tip_body if frame > len(scene.links) else scene.parent_bodies[frame - 1]
+    return path
+
+
+def _origin(scene: Scene, frame: int) -> tuple[float, ...]:
+    """Origin of such a frame in the one before it; of the tip's that of the wrist, where there is one."""
+    if frame <= len(scene.links):
+        return tuple(scene.links[frame - 1].joint.position)
+    return tuple(scene.tip.position if scene.wrist is None else scene.wrist.frame.position)
 
 
 def _distance_to_segment(point: tuple[float, ...], start: tuple[float, ...], end: tuple[float, ...]) -> float:

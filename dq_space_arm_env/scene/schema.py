@@ -16,7 +16,7 @@ from pydantic import Field, StrictStr, ValidationError, ValidationInfo, field_va
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.common.suggestions import did_you_mean
-from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
+from dq_space_arm_env.scene.bodies import BASE, Base, Link, Payload, Wrist, parent_bodies
 from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.constraints import AnyConstraint, constraint_problems
 from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
@@ -49,14 +49,19 @@ class Scene(Model):
     name: Name = Field(description="name of the scene")
     description: StrictStr = Field(default="", description="purpose of the scene")
     base: Base = Field(description="the spacecraft")
-    links: tuple[Link, ...] = Field(default=(), description="links of the arm, base to tip")
+    links: tuple[Link, ...] = Field(default=(), description="links of arms and appendages, from the base out")
+    tip_link: Name | None = Field(
+        default=None,
+        exclude_if=lambda link: link is None,
+        description="link that carries wrist and tip, or base; absent: the last link",
+    )
     wrist: Wrist | None = Field(
-        default=None, description="massless spherical joint after the last link; absent: none"
+        default=None, description="massless spherical joint after that link; absent: none"
     )
     tip: Pose = Field(
         default_factory=Pose,
-        description="pose of the tip frame G in the wrist frame, m (without wrist: last link's joint frame; "
-        "without links too: base frame)",
+        description="pose of the tip frame G in the wrist frame, m (without wrist: in the joint frame of the "
+        "link that carries it, or the base frame)",
     )
     payload: Payload | None = Field(default=None, description="body held rigidly at the tip; absent: none")
     actuators: Actuators = Field(default_factory=Actuators, description="thrusters, wheels and motors")
@@ -95,6 +100,17 @@ class Scene(Model):
     )
 
     @property
+    def parent_bodies(self) -> tuple[int, ...]:
+        """What carries each link: 0 for the base, i + 1 for link i."""
+        return tuple(body or 0 for body in parent_bodies(self.links))
+
+    @property
+    def tip_body(self) -> int:
+        """What carries wrist and tip, likewise."""
+        names = [BASE, *(link.name for link in self.links)]
+        return len(self.links) if self.tip_link is None else names.index(self.tip_link)
+
+    @property
     def staged(self) -> StagedNumbers:
         """What the phases change."""
         return staged_numbers(self)
@@ -123,6 +139,9 @@ class Scene(Model):
         return start.model_copy(update=zeros)
 
     def _problems(self) -> Iterator[Problem]:
+        if tree := [*self._tree_problems()]:
+            yield from tree
+            return  # others look along the arms
         yield from self._actuator_problems()
         yield from self._part_problems()
         yield from self._tumbling_problems()
@@ -134,6 +153,24 @@ class Scene(Model):
         yield from found or self._previous_control_problems()
         if self.base.motion == "planar":
             yield from self._planar_problems()
+
+    def _tree_problems(self) -> Iterator[Problem]:
+        """Find links whose parents are not before them, names given twice, and a tip on nothing."""
+        names = [link.name for link in self.links]
+        for index, (link, parent) in enumerate(zip(self.links, parent_bodies(self.links), strict=True)):
+            if parent is None:
+                before = ", ".join([BASE, *names[:index]])
+                sentence = f"must be the base or a link before this one: {before}"
+                yield Problem(("links", index, "parent"), link.parent, sentence)
+            if link.name in names[:index]:
+                sentence = "another link has this name: each needs its own"
+                yield Problem(("links", index, "name"), link.name, sentence)
+            elif link.name == BASE and any(each.parent for each in self.links):
+                sentence = "is the spacecraft's, which links name as their parent: rename the link"
+                yield Problem(("links", index, "name"), link.name, sentence)
+        if self.tip_link is not None and self.tip_link not in (BASE, *names):
+            sentence = f"must be one of {', '.join([BASE, *names])}"
+            yield Problem(("tip_link",), self.tip_link, sentence)
 
     def _actuator_problems(self) -> Iterator[Problem]:
         """Find actuators without a part to act on, and limits without motors."""
@@ -160,11 +197,9 @@ class Scene(Model):
         if self.payload and self.wrist:
             sentence = "the wrist is massless and cannot carry a payload: remove the wrist or the payload"
             yield Problem(("payload",), self.payload, sentence)
-        names = [link.name for link in self.links]
-        for index, name in enumerate(names):
-            if name in names[:index]:
-                sentence = "another link has this name: each needs its own"
-                yield Problem(("links", index, "name"), name, sentence)
+        if self.payload and self.tip_body == 0:
+            sentence = "the tip is on the base: add the payload's mass and inertia to the base's"
+            yield Problem(("payload",), self.payload, sentence)
         spreads: dict[str, tuple[object, str]] = {
             "wrist_angles": (self.wrist, "wrist"),
             "joint_angles": (self.links, "links"),

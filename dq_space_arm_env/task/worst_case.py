@@ -35,7 +35,8 @@ class WorstCase:
     def __init__(self, equations: SceneEquations) -> None:
         self.equations, self.tree = equations, equations.tree
         self.inputs = equations.field.inputs(equations.control_limits)
-        self.bodies = [self.tree.base, *(link.body for link in self.tree.links)]
+        self.bodies = self.tree.bodies
+        self.last = self.bodies[self.tree.tip_body]  # it carries the tip
         self.mass = total([body.mass for body in self.bodies])
         # Of any point of the arm from the base's center of mass.
         places = [*(link.joint for link in self.tree.links), self.tree.wrist, self.tree.tip]
@@ -52,8 +53,8 @@ class WorstCase:
         sliding = total(_parts(self.tree, motion.joint_rates, 1))
         moving = norm(motion.linear) + reach * turning + sliding
         speed = self._root_energy(motion.joint_angles, moving, turning) + duration * self._growth()
-        if any(link.screw.slide for link in self.tree.links):  # bodies move apart: the last one by so much
-            fastest = total([speed / casadi.sqrt(body.mass) for body in (base, self.bodies[-1])])
+        if any(link.screw.slide for link in self.tree.links):  # bodies move apart: the tip's by so much
+            fastest = total([speed / casadi.sqrt(body.mass) for body in (base, self.last)])
             reach = reach + duration * fastest
         wrench = self.tree.tip_wrench or (0.0,) * 6
         drift = moving + duration * (norm(self.inputs.force) + norm(wrench[:3])) / self.mass
@@ -106,10 +107,10 @@ class WorstCase:
 
     def _relative_speeds(self, speed: Scalar, reach: Scalar, distance: Scalar) -> tuple[Scalar, Scalar]:
         """Bounds of angular velocity and velocity of the tip relative to a target at most so far away."""
-        hand, carried = self.bodies[-1], self._carried_speeds(distance)
+        carried = self._carried_speeds(distance)
         wrist = total([0.0, *(casadi.fabs(rate) for rate in self.inputs.wrist_rates)])
-        turning = _turned(hand, speed) + wrist
-        moving = speed / casadi.sqrt(hand.mass) + reach * turning
+        turning = _turned(self.last, speed) + wrist
+        moving = speed / casadi.sqrt(self.last.mass) + reach * turning
         return turning + carried[0], moving + carried[1]
 
     def _carried_speeds(self, distance: Scalar) -> tuple[Scalar, Scalar]:
@@ -156,23 +157,25 @@ class WorstCase:
         # Components of the torques as they act in I^-1/2, added as if all pointed the same way.
         torques = [_turned(self.tree.base, norm(inputs.torque)), *[0.0] * len(links)]
         for i, (link, limit) in enumerate(zip(links, inputs.joint_torques, strict=True)):
-            axis, effort = matrix_vector(link.joint.rotation, _Z), casadi.fabs(limit)
+            axis, effort, parent = matrix_vector(link.joint.rotation, _Z), casadi.fabs(limit), link.parent
             if link.screw.turn:
-                torques[i] = torques[i] + effort * casadi.sqrt(_inverse_moment(bodies[i], axis))
+                own = effort * casadi.sqrt(_inverse_moment(bodies[parent], axis))
+                torques[parent] = torques[parent] + own
                 torques[i + 1] = torques[i + 1] + effort * casadi.sqrt(_inverse_moment(bodies[i + 1], _Z))
                 continue
             # A force along the line of the joint, at a constant distance from both centers of mass.
             places = (link.joint.position, (0.0, 0.0, 0.0))
-            for body, place, direction in zip((i, i + 1), places, (axis, _Z), strict=True):
+            for body, place, direction in zip((parent, i + 1), places, (axis, _Z), strict=True):
                 arm = norm(cross(subtract(place, bodies[body].center_of_mass), direction))
                 forces[body] = forces[body] + effort
                 torques[body] = torques[body] + _turned(bodies[body], effort * arm)
         if self.tree.tip_wrench is not None:
             inner = (0.0, 0.0, 0.0) if self.tree.wrist is None else self.tree.wrist.position
-            arm = norm(subtract(inner, bodies[-1].center_of_mass)) + norm(self.tree.tip.position)
+            arm = norm(subtract(inner, self.last.center_of_mass)) + norm(self.tree.tip.position)
             force, torque = norm(self.tree.tip_wrench[:3]), norm(self.tree.tip_wrench[3:])
-            forces[-1] = forces[-1] + force
-            torques[-1] = torques[-1] + _turned(bodies[-1], torque + force * arm)
+            body = self.tree.tip_body
+            forces[body] = forces[body] + force
+            torques[body] = torques[body] + _turned(self.last, torque + force * arm)
         squares = [force * force / body.mass for force, body in zip(forces, bodies, strict=True)]
         return casadi.sqrt(total([*squares, *(torque * torque for torque in torques)]))
 

@@ -15,7 +15,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.viewing.rendering.body_shapes import shape_meshes
 from dq_space_arm_env.viewing.rendering.solids import Color, Mesh, ball, box, lathe
-from dq_space_arm_env.viewing.rendering.spacecraft import equivalent_box
+from dq_space_arm_env.viewing.rendering.spacecraft import equivalent_box, frames_before
 from experts.figures.style import BLUE, GREEN, PURPLE, VERMILION
 from experts.problems.shooting_problem import FloatArray
 
@@ -67,16 +67,15 @@ class Schematic:
     """The solids of a scene in their frames, lit from a direction, shape (3,)."""
 
     def __init__(self, scene: Scene, light: FloatArray) -> None:
-        offsets = [link.joint.position for link in scene.links]
-        if scene.wrist is not None:
-            offsets.append(scene.wrist.frame.position)
-        offsets.append(scene.tip.position)
+        before, offsets = frames_before(scene)
         size, _ = equivalent_box(scene.base.mass, scene.base.inertia)
         self.reach = max(float(np.linalg.norm(offsets, axis=1).sum()), float(size.max()))
         self._scene = scene
         self._light = light / np.linalg.norm(light)
         self._radius = 0.02 * self.reach
-        self._spacecraft = _divided(Mesh.joined([*self._bodies(), *self._arm(offsets)]), 0.06 * self.reach)
+        self._spacecraft = _divided(
+            Mesh.joined([*self._bodies(), *self._arm(before, offsets)]), 0.06 * self.reach
+        )
         target, target_body = shown_target(scene)
         ends = [each if each.ndim == 1 else each[-1] for each in (target, target_body) if each is not None]
         self._target_frames: FloatArray = np.array([ends[0], ends[-1]])
@@ -148,12 +147,12 @@ class Schematic:
                 return
             yield box(own, payload.center_of_mass, size, PAYLOAD_COLOR, axes)
 
-    def _arm(self, offsets: list[tuple[float, float, float]]) -> Iterable[Mesh]:
+    def _arm(self, before: list[int], offsets: FloatArray) -> Iterable[Mesh]:
         """Links from each frame to the next, joints along their axes, a ball for the wrist."""
         joints, radius = len(self._scene.links), self._radius
         shapes = {0: self._scene.base.geometry}
         shapes |= {frame: link.geometry for frame, link in enumerate(self._scene.links, 1)}
-        for frame, offset in enumerate(offsets):
+        for frame, offset in zip(before, offsets, strict=True):
             length = float(np.linalg.norm(offset))
             if length > 0.0 and not shapes.get(frame):
                 yield _rod(frame, offset, length, radius if frame else 1.5 * radius, LINK_COLOR)
@@ -161,6 +160,10 @@ class Schematic:
             if shapes[frame]:
                 yield from shape_meshes(frame, shapes[frame], LINK_COLOR)
                 continue
+            if frame not in before:  # the end of a branch
+                link = self._scene.links[frame - 1]
+                size, axes = equivalent_box(link.mass, link.inertia)
+                yield box(frame, link.center_of_mass, size, LINK_COLOR, axes)
             profile = [(-1.7, 0.0), (-1.7, 1.6), (1.7, 1.6), (1.7, 0.0)]
             scaled = [(radius * height, radius * ring) for height, ring in profile]
             yield lathe(frame, np.zeros(3), (0.0, 0.0, 1.0), scaled, JOINT_COLOR, _SIDES)

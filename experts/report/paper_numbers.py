@@ -111,7 +111,8 @@ def _collapsed(values: Sequence[float] | Any) -> Value:
 
 def _arm(scene: Scene) -> str:
     count = len(scene.links)
-    joints = f"{count} revolute joint{'' if count == 1 else 's'}"
+    kinds = {link.joint_type for link in scene.links} or {"revolute"}
+    joints = f"{count} {'/'.join(sorted(kinds))} joint{'' if count == 1 else 's'}"
     motion = ", base in the plane" if scene.base.motion == "planar" else ""
     return f"{joints}, {'spherical wrist' if scene.wrist else 'no wrist'}{motion}"
 

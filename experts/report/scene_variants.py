@@ -105,7 +105,12 @@ def without_wrist(scene: Scene) -> Scene:
 
 
 def with_links(scene: Scene, count: int) -> Scene | None:
-    """Keep the first links; wrist or tip move to where the next joint was. None: a payload needs a link."""
+    """Keep the first links; wrist or tip move to where the next joint was.
+
+    None where that is not a scene: a payload needs a link, and arms that branch have no first links.
+    """
+    if scene.parent_bodies != (*range(len(scene.links)),) or scene.tip_body != len(scene.links):
+        return None
     end = scene.links[count].joint
     start = scene.initial_state
     changes: dict[str, Any] = {

@@ -94,7 +94,7 @@ def test_warnings_and_the_options_that_help(here: Path, capsys: pytest.CaptureFi
     Path("gripper.urdf").write_text(text, encoding="utf-8")
     words = ["scenes", "import", "gripper.urdf", "--tip", "hand", *CARRIED]
     assert main(words) == UNUSABLE
-    assert "a scene has no branches: --lock-branches holds such joints" in capsys.readouterr().err
+    assert "no effort limit for joint elbow, f: give --joint-torque, N m, for all" in capsys.readouterr().err
     assert main([*words, "--lock-branches"]) == UNUSABLE
     assert "no effort limit for joint elbow: give --joint-torque, N m, for all" in capsys.readouterr().err
     assert main([*words, "--lock-branches", "--joint-torque", "1"]) == SUCCESS

@@ -41,14 +41,17 @@ def random_screw(rng: np.random.Generator) -> Screw:
     return kinds[rng.integers(len(kinds))]
 
 
-def random_tree(rng: np.random.Generator, joints: int, wrist: bool = True) -> KinematicTree:
+def random_tree(rng: np.random.Generator, joints: int, branches: bool, wrist: bool = True) -> KinematicTree:
+    """A robot whose links follow each other, or sit on any body before them, as the tip then does."""
+    parents = [int(rng.integers(i + 1)) if branches else i for i in range(joints)]
     links = tuple(
-        JointedLink(random_body(rng), random_placement(rng), random_screw(rng), 0.0, 0.0, 0.0)
-        for _ in range(joints)
+        JointedLink(random_body(rng), random_placement(rng), random_screw(rng), parent, 0.0, 0.0, 0.0)
+        for parent in parents
     )
     return KinematicTree(
         base=random_body(rng, at_origin=True),
         links=links,
+        tip_body=int(rng.integers(joints + 1)) if branches else joints,
         wrist=random_placement(rng) if wrist else None,
         tip=random_placement(rng),
         tip_wrench=None,
@@ -60,15 +63,15 @@ def pinocchio_model(tree: KinematicTree) -> Any:
     """The tree as a Pinocchio model without gravity."""
     model = pin.Model()
     model.gravity = pin.Motion.Zero()
-    parent = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
-    model.appendBodyToJoint(parent, _inertia(tree.base), pin.SE3.Identity())
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
+    model.appendBodyToJoint(1, _inertia(tree.base), pin.SE3.Identity())
     for index, link in enumerate(tree.links):
         placement = pin.SE3(np.array(link.joint.rotation), np.array(link.joint.position))
         turn, slide = link.screw
         joint = pin.JointModelHZ(slide) if slide else pin.JointModelRZ()
         joint = joint if turn else pin.JointModelPZ()
-        parent = model.addJoint(parent, joint, placement, f"joint {index}")
-        model.appendBodyToJoint(parent, _inertia(link.body), pin.SE3.Identity())
+        added = model.addJoint(1 + link.parent, joint, placement, f"joint {index}")
+        model.appendBodyToJoint(added, _inertia(link.body), pin.SE3.Identity())
     return model
 
 
@@ -88,8 +91,8 @@ def velocity(angular: Any, linear: Any, joint_rates: Any) -> np.ndarray:
     return np.array([*linear, *angular, *joint_rates])
 
 
-def tip_in_last_link(tree: KinematicTree, wrist_angles: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation matrix and position of the tip in the last link's frame, by matrices."""
+def tip_on_its_body(tree: KinematicTree, wrist_angles: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation matrix and position of the tip in the frame of the body that carries it, by matrices."""
     rotation, position = np.eye(3), np.zeros(3)
     if tree.wrist is not None:
         psi, theta, phi = wrist_angles

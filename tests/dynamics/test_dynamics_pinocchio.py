@@ -1,4 +1,4 @@
-"""Both formulations against Pinocchio on random chains: accelerations, reactions, kinematics, invariants."""
+"""Both formulations against Pinocchio on random trees: accelerations, reactions, kinematics, invariants."""
 
 from dataclasses import replace
 from functools import partial
@@ -27,8 +27,9 @@ def relative_error(actual, expected):
 
 
 def random_case(joints, seed, wrench=False):
+    """Robots of odd seeds branch."""
     rng = np.random.default_rng((joints, seed))
-    tree = twin.random_tree(rng, joints)
+    tree = twin.random_tree(rng, joints, branches=seed % 2 == 1)
     tip_wrench = tuple(rng.normal(size=6).tolist()) if wrench else None
     tree = replace(tree, tip_wrench=tip_wrench)
     model = twin.pinocchio_model(tree)
@@ -52,15 +53,15 @@ def random_case(joints, seed, wrench=False):
 
 
 def external_forces(case):
-    """Pinocchio's external forces: the tip's wrench on the last body, about the body frame's origin."""
+    """Pinocchio's external forces: the wrench on the body with the tip, about that body's origin."""
     forces = pin.StdVec_Force()
     for _ in range(case.model.njoints):
         forces.append(pin.Force.Zero())
     if case.tree.tip_wrench is not None:
-        rotation, position = twin.tip_in_last_link(case.tree, case.wrist)
+        rotation, position = twin.tip_on_its_body(case.tree, case.wrist)
         force = rotation @ case.tree.tip_wrench[:3]
         torque = rotation @ case.tree.tip_wrench[3:] + np.cross(position, force)
-        forces[case.model.njoints - 1] = pin.Force(force, torque)
+        forces[1 + case.tree.tip_body] = pin.Force(force, torque)
     return forces
 
 
@@ -76,8 +77,9 @@ def accelerations(case, inertia_at):
     frames = minimal.link_frames(tree, case.angles)
     acting = [(case.force, case.torque), *[(ZERO, ZERO)] * len(tree.links)]
     if tree.tip_wrench is not None:
-        tip, wrench = twin.tip_in_last_link(tree, case.wrist), tree.tip_wrench
-        acting[-1] = minimal.shift_wrench(*tip, wrench[:3], wrench[3:])
+        tip, wrench = twin.tip_on_its_body(tree, case.wrist), tree.tip_wrench
+        loaded = minimal.shift_wrench(*tip, wrench[:3], wrench[3:])
+        acting[tree.tip_body] = tuple(map(vectors.add, acting[tree.tip_body], loaded))
     inertia = inertia_at(tree, frames)
     solved = forward_dynamics(tree, inertia, frames, case.angular, case.rates, acting, case.motors)
     linear = vectors.subtract(solved.linear, vectors.cross(case.angular, case.linear))
@@ -88,7 +90,7 @@ def paper_state(case):
     """The case in the paper's coordinates: dual velocities of all bodies at their centers of mass."""
     frames = minimal.link_frames(case.tree, case.angles)
     velocities = kinematics.body_velocities(case.tree, frames, (*case.angular, *case.linear), case.rates)
-    bodies = [case.tree.base, *(link.body for link in case.tree.links)]
+    bodies = case.tree.bodies
     duals = [
         (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
         for body, v in zip(bodies, velocities, strict=True)
@@ -142,7 +144,7 @@ def test_reaction_wrenches_agree_with_pinocchio_21(joints):
 
 def test_schur_complement_solves_the_full_system_20():
     for joints in range(1, 6):
-        case = random_case(joints, 0, wrench=True)
+        case = random_case(joints, joints, wrench=True)
         state = paper_state(case)
         frames = newton_euler.joint_frames(case.tree, case.angles, case.wrist)
         wrench = (0.0, *case.force, 0.0, *case.torque)
@@ -157,12 +159,12 @@ def test_schur_complement_solves_the_full_system_20():
 
 def test_tip_pose_27_and_its_rate_30():
     for joints in range(5):
-        case = random_case(joints, 1)
+        case = random_case(joints, joints)
         twist, wrist_rates = (*case.angular, *case.linear), (0.3, -0.4, 0.5)
         arguments = (case.tree, case.base_pose, case.angles, case.wrist)
         pin.forwardKinematics(case.model, case.data, case.q)
-        last = case.data.oMi[joints + 1]
-        rotation, position = twin.tip_in_last_link(case.tree, case.wrist)
+        last = case.data.oMi[1 + case.tree.tip_body]
+        rotation, position = twin.tip_on_its_body(case.tree, case.wrist)
         matrix, origin = poses.to_matrix(kinematics.tip_pose(*arguments))
         np.testing.assert_allclose(matrix, last.rotation @ rotation, atol=1e-13)
         np.testing.assert_allclose(origin, last.translation + last.rotation @ position, atol=1e-12)
@@ -186,7 +188,7 @@ def test_tip_pose_27_and_its_rate_30():
 
 def test_momentum_and_energy_agree_with_pinocchio():
     for joints in range(8):
-        case = random_case(joints, 2)
+        case = random_case(joints, joints)
         frames = minimal.link_frames(case.tree, case.angles)
         twist = (*case.angular, *case.linear)
         velocities = kinematics.body_velocities(case.tree, frames, twist, case.rates)
@@ -203,7 +205,7 @@ def test_momentum_and_energy_agree_with_pinocchio():
 
 def test_inverse_dynamics_undoes_forward_dynamics():
     for joints in range(8):
-        case = random_case(joints, 3)
+        case = random_case(joints, joints)
         frames = minimal.link_frames(case.tree, case.angles)
         a = accelerations(case, MassMatrix)
         linear = vectors.add(tuple(a[3:6]), vectors.cross(case.angular, case.linear))

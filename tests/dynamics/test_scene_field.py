@@ -151,7 +151,7 @@ def test_momentum_changes_by_the_external_wrench_alone(name: str) -> None:
 
 
 def bodies(tree: KinematicTree) -> list[Any]:
-    return [tree.base, *(link.body for link in tree.links)]
+    return tree.bodies
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])

@@ -36,7 +36,7 @@ def slow_walk(kernels, u, steps, integrator, every=100):
 def center_of_mass(kernels, states):
     """Center of mass of base and links in inertial axes, from the poses of their frames."""
     tree = KinematicTree.from_scene(kernels.scene)
-    bodies = [tree.base, *(link.body for link in tree.links)]
+    bodies = tree.bodies
     poses = kernels.frame_poses(states)
     total = np.zeros((len(states), 3))
     for k, row in enumerate(poses):

@@ -20,6 +20,9 @@ FOLDERS = {
 KINOVA_TIP = "j2s6s200_end_effector"
 LOCKED = {"lock_branches": True}
 
+BAXTER_LOCKED = [f"{side}_gripper_{finger}_finger_joint" for side in "lr" for finger in "lr"]
+WITHOUT_EFFORT = {"joint_torque": 5.0}
+
 # Name: package, path of the URDF in its folder, tip link, and arguments besides.
 ROBOTS = {
     "ur3e": (AIRO, "ur3e/ur3e.urdf", "tool0", {}),
@@ -31,6 +34,27 @@ ROBOTS = {
     "xarm7": (EXAMPLES, "xarm_description/urdf/xarm7.urdf", "link_eef", {}),
     "talos-left-arm": (EXAMPLES, "talos_data/robots/talos_left_arm.urdf", "gripper_left_base_link", LOCKED),
     "anymal-kinova": (EXAMPLES, "anymal_b_simple_description/robots/anymal-kinova.urdf", KINOVA_TIP, LOCKED),
+    # Arms that branch: two arms, a head, four legs, sliding torsos and fingers.
+    "baxter": (
+        EXAMPLES,
+        "baxter_description/urdf/baxter.urdf",
+        "left_gripper",
+        {"lock_branches": BAXTER_LOCKED, **WITHOUT_EFFORT},
+    ),
+    "anymal-on-legs": (
+        EXAMPLES,
+        "anymal_b_simple_description/robots/anymal-kinova.urdf",
+        KINOVA_TIP,
+        WITHOUT_EFFORT,
+    ),
+    "centauro": (EXAMPLES, "centauro_description/urdf/centauro.urdf", "arm1_8", WITHOUT_EFFORT),
+    "g1": (EXAMPLES, "g1_description/urdf/g1_29dof_rev_1_0.urdf", "left_wrist_yaw_link", WITHOUT_EFFORT),
+    "tiago-dual": (
+        EXAMPLES,
+        "tiago_description/robots/tiago_dual.urdf",
+        "hand_left_grasping_frame",
+        WITHOUT_EFFORT,
+    ),
     "borinot": (EXAMPLES, "borinot_description/urdf/borinot_flying_arm_2.urdf", "flying_arm_2__ee", {}),
 }
 

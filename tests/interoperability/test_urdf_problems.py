@@ -80,8 +80,12 @@ MIMIC = '<mimic joint="j1"/>'
         (robot(*GOOD[:2], link("arm", "")), "link 'arm', moved by joint 'j1', has no mass"),
         (arm(content=""), "no effort limit for joint j1: give joint_torque"),
         (
-            robot(*GOOD, joint("j2", "base", "b"), B),
-            r"joint 'j2' \(revolute\) moves a mass beside the chain .* lock_branches=True holds such joints",
+            robot(*GOOD, joint("j2", "base", "b", "planar"), B),
+            r"joint 'j2', which .* beside the way .*, is planar: .* lock_branches holds such joints at zero",
+        ),
+        (
+            robot(*GOOD, joint("j2", "base", "b", content=MIMIC), B),
+            r"joint 'j2', which .* beside the way .*, mimics joint 'j1'.*; lock_branches holds",
         ),
         (robot(*GOOD[:2], link("arm", body(izz=3))), "moments 1, 1, 3 .* the two smaller must add up"),
         (robot(*GOOD[:2], link("arm", body(izz=0))), "principal moments .*, all must be greater than 0"),
@@ -113,7 +117,12 @@ def test_what_no_scene_can_be_made_of_is_refused(text, sentence):
         ({"tip": "base", "base": "arm"}, "joint 'j1' carries the base and not the tip; choose link 'base'"),
         ({"tip": "j1"}, "'j1' is not a link of 'r'; it is a joint, which carries link 'arm'; its links are"),
         ({"tip": "base"}, "tip: link 'base' is the base: choose a link that the joints move"),
-        ({"tip": "arm", "passive": ["j2"]}, "'j2' is not a joint between base and tip, which are j1"),
+        ({"tip": "arm", "passive": ["j2"]}, "'j2' is not a joint that moves a mass; these are j1"),
+        (
+            {"tip": "arm", "lock_branches": ["j1"]},
+            "lock_branches: 'j1' is not a joint beside the way from base to tip",
+        ),
+        ({"tip": "arm", "lock_branches": "j1"}, "lock_branches = 'j1': must be a list of names of joints"),
         ({"tip": "arm", "joint_torque": -1}, "joint_torque = -1: must be a number greater than 0, N m"),
         ({"tip": "arm", "spacecraft": 80}, "spacecraft = 80: must be a mapping"),
         (

@@ -79,14 +79,19 @@ ODD_ROBOT = """
 
 
 class Reference:
-    """A URDF as Pinocchio reads it: a free flyer at the root, joints beside the chain locked at zero."""
+    """A URDF as Pinocchio reads it: a free flyer at the root, joints that are not given locked at zero."""
 
     def __init__(self, text, joints, base=None, spacecraft=None):
         full = pin.buildModelFromXML(text, pin.JointModelFreeFlyer())
         locked = [i for i in range(2, full.njoints) if full.names[i] not in joints]
         self.model = pin.buildReducedModel(full, locked, pin.neutral(full))
         self.model.gravity = pin.Motion.Zero()
-        assert list(self.model.names)[2:] == joints
+        names = list(self.model.names)[2:]
+        assert sorted(names) == sorted(joints)
+        # Of the given joints in Pinocchio's order, and of Pinocchio's in the given order.
+        self.inward, self.outward = (
+            [a.index(name) for name in b] for a, b in ((joints, names), (names, joints))
+        )
         frames, root = self.model.frames, pin.SE3.Identity()
         turned = root if base is None else frames[self.model.getFrameId(base)].placement
         if spacecraft is not None:
@@ -97,7 +102,7 @@ class Reference:
     def configuration(self, pose, angles):
         rotation, position = (np.array(part) for part in poses.to_matrix(tuple(pose)))
         root = pin.SE3(rotation, position) * self.e0.inverse()
-        tangent = np.array([*np.zeros(6), *angles])
+        tangent = np.array([*np.zeros(6), *np.array(angles)[self.inward]])
         q = pin.integrate(self.model, pin.neutral(self.model), tangent)
         q[:7] = pin.SE3ToXYZQUAT(root)
         return q
@@ -107,11 +112,12 @@ class Reference:
         q = self.configuration(x[entries.pose], x[entries.joint_angles])
         rates, damping = x[entries.joint_rates], np.array([link.damping for link in scene.links])
         twist = pin.Motion(x[entries.linear_velocity], x[entries.angular_velocity])
-        v = np.array([*self.e0.act(twist).vector, *rates])
+        v = np.array([*self.e0.act(twist).vector, *rates[self.inward]])
         force = self.e0.act(pin.Force(u[:3], u[3:6])).vector
-        a = pin.aba(self.model, self.data, q, v, np.array([*force, *(u[6:] - damping * rates)]))
+        torques = (u[6:] - damping * rates)[self.inward]
+        a = pin.aba(self.model, self.data, q, v, np.array([*force, *torques]))
         base = self.e0.actInv(pin.Motion(a[:6]))
-        return np.array([*base.angular, *base.linear, *a[6:]])
+        return np.array([*base.angular, *base.linear, *a[6:][self.outward]])
 
     def tip(self, scene, x, name):
         entries = StateLayout.of(scene).state
@@ -132,7 +138,7 @@ def check(scene, reference, tip, samples=5):
 
 
 def movable_joints(text, scene):
-    """Names of the URDF's joints that carry the scene's links, base to tip."""
+    """Names of the URDF's joints that carry the scene's links."""
     model = pin.buildModelFromXML(text)
     children = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
     return [model.names[children[link.name]] for link in scene.links]
@@ -190,6 +196,23 @@ def odd_scene():
 
 def test_the_odd_robot_moves_as_pinocchio_says(odd_scene):
     check(odd_scene, Reference(ODD_ROBOT, ["shoulder", "elbow", "wrist"], "bus"), "grasp")
+
+
+def test_branches_of_the_odd_robot_move_unless_they_are_locked():
+    """Branches come after the links from base to tip, and survive the way out and in again."""
+    scene = scene_from_urdf(ODD_ROBOT, "grasp", "bus")
+    assert [link.name for link in scene.links] == ["upper", "fore", "hand", "camera"]
+    assert (scene.parent_bodies, scene.tip_link) == ((0, 1, 2, 1), "hand")
+    reference = Reference(ODD_ROBOT, ["shoulder", "elbow", "wrist", "bracket camera"], "bus")
+    check(scene, reference, "grasp")
+    locked = scene_from_urdf(ODD_ROBOT, "grasp", "bus", lock_branches=["bracket camera"])
+    assert locked == scene_from_urdf(ODD_ROBOT, "grasp", "bus", lock_branches=True)
+    text = scene_to_urdf(scene)
+    check(scene, Reference(text, [f"{link.name} joint" for link in scene.links]), "tip", samples=2)
+    again = scene_from_urdf(text, "tip")
+    assert (again.parent_bodies, again.tip_link) == (scene.parent_bodies, scene.tip_link)
+    x, u = drawn(scene, np.random.default_rng(1))
+    assert relative_error(accelerations(again, x, u), accelerations(scene, x, u)) < 1e-12
 
 
 def test_a_spacecraft_is_fixed_to_the_base_link():

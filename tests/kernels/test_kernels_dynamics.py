@@ -25,7 +25,7 @@ def paper_solution(kernels, x, u):
     link_frames = minimal.link_frames(tree, motion.joint_angles)
     twist = (*motion.angular, *motion.linear)
     velocities = kinematics.body_velocities(tree, link_frames, twist, motion.joint_rates)
-    bodies = [tree.base, *(link.body for link in tree.links)]
+    bodies = tree.bodies
     duals = [
         (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
         for body, v in zip(bodies, velocities, strict=True)

@@ -61,8 +61,11 @@ def moderate() -> str:
 
 def test_aliases_as_people_use_them(tmp_path: Path) -> None:
     file = tmp_path / "scene.yaml"
-    file.write_text(moderate().replace("[1, 1, 1]", "&i [1, 1, 1]") + "payload: {mass: 2, inertia: *i}\n")
-    assert load_scene(file).payload is not None
+    file.write_text(
+        moderate().replace("[1, 1, 1]", "&i [1, 1, 1]")
+        + "links: [{name: boom, mass: 2, inertia: *i, center_of_mass: [0, 0, 0], joint: {}}]\n"
+    )
+    assert load_scene(file).links[0].inertia == load_scene(file).base.inertia
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes here")

@@ -160,7 +160,7 @@ def test_a_bullet_stops_in_a_single_body() -> None:
     frame = KinematicTree.from_scene(load_scene("payload"))
     unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     tip = replace(frame.tip, position=(0.0,) * 3)
-    free = replace(frame, base=RigidBody(3.0, (0.0,) * 3, unit), links=(), tip=tip)
+    free = replace(frame, base=RigidBody(3.0, (0.0,) * 3, unit), links=(), tip_body=0, tip=tip)
     double = ((2.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 2.0))
     loaded = replace(free, base=RigidBody(4.0, (0.0,) * 3, double))
     bullet = RigidBody(1.0, (0.0,) * 3, unit)

@@ -97,9 +97,7 @@ def caught(kernels: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
 
 def center_of_mass(scene: Scene, x: np.ndarray, given: dict[str, float]) -> np.ndarray:
     tree, total, moment = KinematicTree.from_scene(scene, given), 0.0, np.zeros(3)
-    for body, pose in zip(
-        [tree.base, *(link.body for link in tree.links)], compile_scene(scene).frame_poses(x), strict=False
-    ):
+    for body, pose in zip(tree.bodies, compile_scene(scene).frame_poses(x), strict=False):
         rotation, position = poses.to_matrix(tuple(pose.tolist()))
         moment += body.mass * (np.array(position) + np.array(rotation) @ np.array(body.center_of_mass))
         total += body.mass

@@ -1,8 +1,8 @@
 """A scene as solids: spacecraft, arm, payload and target, and the region that they reach.
 
-A body with shapes of its own is drawn by these alone. For others a scene gives masses and frames: base and
-payload are drawn as the homogeneous boxes of their inertia; links join the origins of neighboring frames, in
-proportions taken from the length of the arm.
+A body with shapes of its own is drawn by these alone. For others a scene gives masses and frames: base,
+payload and links at the end of a branch are drawn as the homogeneous boxes of their inertia; other links join
+the origins of neighboring frames, in proportions taken from the length of the arm.
 """
 
 from __future__ import annotations
@@ -49,6 +49,25 @@ def equivalent_box(mass: float, inertia: ArrayLike) -> tuple[Array, Array]:
     return np.maximum(edges, _THINNEST * edges.max()), axes
 
 
+def frames_before(scene: Scene) -> tuple[list[int], Array]:
+    """Find where the frames of `Kernels.frame_poses` are placed: joints, wrist (if any), tip.
+
+    Args:
+        scene: A scene.
+
+    Returns:
+        Number of the frame that each is placed in, and its origin there with the joints at zero, shape
+        (frames - 1, 3), m.
+    """
+    before, offsets = [*scene.parent_bodies], [link.joint.position for link in scene.links]
+    last = scene.tip_body
+    if scene.wrist is not None:
+        before.append(last)
+        offsets.append(scene.wrist.frame.position)
+        last = len(before)
+    return [*before, last], np.array([*offsets, scene.tip.position])
+
+
 class SpacecraftModel:
     """The solids of a scene.
 
@@ -63,19 +82,22 @@ class SpacecraftModel:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        offsets = [link.joint.position for link in scene.links]
-        if scene.wrist is not None:
-            offsets.append(scene.wrist.frame.position)
-        # Origin of each frame but the base, in the frame before it.
-        self._offsets = np.array([*offsets, scene.tip.position])
+        self._before, self._offsets = frames_before(scene)
         self.frame_count = len(self._offsets) + 1
         self._body_size, self._body_axes = equivalent_box(scene.base.mass, scene.base.inertia)
         if scene.base.geometry:
             self._body_size, self._body_axes = np.ptp(corners_of(scene.base.geometry), axis=0), np.eye(3)
         lengths = np.linalg.norm(self._offsets, axis=1)
         # Without links or wrist the tip is part of the base.
-        self._arm_length = float(lengths[1:].sum())
+        self._arm_length = float(lengths[self._way_to_tip()[1:]].sum())
         self._thickness = max(0.025 * self._arm_length, 0.03 * float(self._body_size.mean()))
+
+    def _way_to_tip(self) -> list[int]:
+        """Offsets that lead from the base to the tip, by their numbers."""
+        way = [self.frame_count - 2]
+        while before := self._before[way[0]]:
+            way.insert(0, before - 1)
+        return way
 
     @cached_property
     def mesh(self) -> Mesh:
@@ -120,6 +142,7 @@ class SpacecraftModel:
             *(() if self.scene.base.geometry else body),
             (shoulder, 0.6 * reach),
             (frames[-1], 0.15 * reach + self._overhang()),
+            *((frames[end], 0.15 * reach) for end in self._branch_ends),
             *((np.array(poses.position(tuple(pose))), target) for pose in self._target_poses[0]),
             *self._shape_balls(poses_at_start),
         ]
@@ -243,15 +266,19 @@ class SpacecraftModel:
         return self._thickness * (1.15 - 0.4 * frame / self.frame_count)
 
     def _arm(self) -> Iterator[Mesh]:
-        last = len(self._offsets) - 1
         shapes = self._geometry
-        for frame, offset in enumerate(self._offsets):
+        ends = [*self._offsets[:-1], self._hand_start]
+        for frame, end in zip(self._before, ends, strict=True):
             if shapes[frame]:
                 continue
             radius, color = (self._radius(frame), LINK) if frame else (1.2 * self._radius(frame), METAL)
-            end = offset if frame < last else self._hand_start
             if np.linalg.norm(end) > 0.1 * radius:
                 yield cylinder(frame, (0.0, 0.0, 0.0), end, radius, color)
+        for frame in self._branch_ends:
+            link = self.scene.links[frame - 1]
+            if not shapes[frame]:
+                size, axes = equivalent_box(link.mass, link.inertia)
+                yield box(frame, link.center_of_mass, size, LINK, axes)
         for joint in range(1, len(self.scene.links) + 1):
             if shapes[joint]:
                 yield from shape_meshes(joint, shapes[joint], LINK)
@@ -279,9 +306,14 @@ class SpacecraftModel:
         return own if self.scene.wrist is None else [*own, ()]
 
     @property
+    def _branch_ends(self) -> list[int]:
+        """Frames of links that carry nothing."""
+        return [frame for frame in range(1, len(self.scene.links) + 1) if frame not in self._before]
+
+    @property
     def _has_hand(self) -> bool:
         """Whether a hand is drawn: as part of the body before the tip, if that has no shapes of its own."""
-        return not self._geometry[-1]
+        return not self._geometry[self._before[-1]]
 
     def _joint(self, frame: int) -> Iterator[Mesh]:
         """A beveled housing along the joint's z axis, and a mast as long as the joint slides."""
@@ -325,7 +357,7 @@ class SpacecraftModel:
 
     def _hand(self) -> Iterator[Mesh]:
         """A palm and two fingers."""
-        frame = len(self._offsets) - 1
+        frame = self._before[-1]
         radius, length, approach = 0.8 * self._thickness, self._hand_length, self._approach
         opening = np.cross(approach, np.eye(3)[np.abs(approach).argmin()])
         opening /= np.linalg.norm(opening)

@@ -69,11 +69,14 @@ def _check_same_robot(label: str, own: Scene, scene: Scene) -> None:
             f"flight {label!r} has time steps of {own.simulation.dt:g} s, the scene {scene.name!r} has "
             f"{scene.simulation.dt:g} s: show them on separate pages"
         )
-    mine, other = (
-        (item.base.motion, [link.joint for link in item.links], item.wrist, item.tip) for item in (own, scene)
-    )
-    if mine != other:
+    if _frames(own) != _frames(scene):
         raise ValueError(
             f"flight {label!r} is one of another robot ({own.name!r}) than that of the scene {scene.name!r}: "
             "show them on separate pages"
         )
+
+
+def _frames(scene: Scene) -> tuple[object, ...]:
+    """How the frames of a scene's robot are placed."""
+    joints = [link.joint for link in scene.links], scene.parent_bodies
+    return scene.base.motion, joints, scene.tip_body, scene.wrist, scene.tip

@@ -51,6 +51,7 @@ def obstacle(problem: ArmProblem) -> str | None:
     inputs = 6 + layout.n_joints + 3 * layout.has_wrist
     reasons = {
         "a planar base": tree.planar,
+        "arms that branch": tree.path_to(tree.tip_body) != [*range(len(tree.links))],
         "parts without an actuator": not tree.planar and layout.n_u < inputs,
         "springs or dampers": any(link.stiffness or link.damping for link in tree.links),
         "a wrench at the tip": tree.tip_wrench is not None,

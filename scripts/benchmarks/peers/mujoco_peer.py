@@ -201,12 +201,14 @@ def robot_xml(tree: KinematicTree, time_step: float, integrator: str) -> str:
     """Write a robot as an MJCF model, with nothing that it does not have."""
     slides = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>'
     freedom = slides + '<joint type="hinge" axis="0 0 1"/>' if tree.planar else "<freejoint/>"
-    links = "".join(
-        f'<body pos="{_numbers(link.joint.position)}" quat="{_numbers(link.joint.dual_quaternion[:4])}">'
-        f'<joint type="hinge" axis="0 0 1" damping="{link.damping!r}" stiffness="{link.stiffness!r}" '
-        f'springref="{link.rest_angle!r}"/>{_inertial(link.body)}'
-        for link in tree.links
-    )
+    carried = [""] * len(tree.bodies)
+    for index, link in reversed([*enumerate(tree.links)]):
+        carried[link.parent] = (
+            f'<body pos="{_numbers(link.joint.position)}" quat="{_numbers(link.joint.dual_quaternion[:4])}">'
+            f'<joint type="hinge" axis="0 0 1" damping="{link.damping!r}" stiffness="{link.stiffness!r}" '
+            f'springref="{link.rest_angle!r}"/>{_inertial(link.body)}{carried[index + 1]}</body>'
+            + carried[link.parent]
+        )
     unused = ["contact", "constraint", "gravity"]
     unused += ["spring"] * (not any(link.stiffness for link in tree.links))
     unused += ["damper"] * (not any(link.damping for link in tree.links))
@@ -214,8 +216,7 @@ def robot_xml(tree: KinematicTree, time_step: float, integrator: str) -> str:
     return (
         '<mujoco><compiler angle="radian"/>'
         f'<option timestep="{time_step!r}" integrator="{integrator}"><flag {flags}/></option>'
-        f"<worldbody><body>{freedom}{_inertial(tree.base)}{links}"
-        f"{'</body>' * (1 + len(tree.links))}</worldbody></mujoco>"
+        f"<worldbody><body>{freedom}{_inertial(tree.base)}{carried[0]}</body></worldbody></mujoco>"
     )
 
 

@@ -31,12 +31,13 @@ class PinocchioPeer:
         self.model = pinocchio.Model()
         self.model.gravity = pinocchio.Motion.Zero()
         base = pinocchio.JointModelPlanar() if tree.planar else pinocchio.JointModelFreeFlyer()
-        parent = self.model.addJoint(0, base, pinocchio.SE3.Identity(), "base")
-        self.model.appendBodyToJoint(parent, self._inertia(tree.base), pinocchio.SE3.Identity())
+        joints = [self.model.addJoint(0, base, pinocchio.SE3.Identity(), "base")]
+        self.model.appendBodyToJoint(joints[0], self._inertia(tree.base), pinocchio.SE3.Identity())
         for index, link in enumerate(tree.links):
             placement = pinocchio.SE3(np.array(link.joint.rotation), np.array(link.joint.position))
-            parent = self.model.addJoint(parent, pinocchio.JointModelRZ(), placement, f"joint {index}")
-            self.model.appendBodyToJoint(parent, self._inertia(link.body), pinocchio.SE3.Identity())
+            parent, revolute = joints[link.parent], pinocchio.JointModelRZ()
+            joints.append(self.model.addJoint(parent, revolute, placement, f"joint {index}"))
+            self.model.appendBodyToJoint(joints[-1], self._inertia(link.body), pinocchio.SE3.Identity())
         self._data = self.model.createData()
 
     def _inertia(self, body: RigidBody) -> Any:

@@ -41,8 +41,9 @@ class _Body:
 
 @dataclass
 class _Joint:
-    """A joint between a body and the one after it."""
+    """A joint between two bodies: its number is that of the other one, less 1."""
 
+    before: int  # body that carries it
     axes: Matrix  # of the joint frame, column by column
     origin: Vector
     rate: Any  # about the z axis, rad/s; 0 where nothing moves
@@ -87,15 +88,19 @@ def _cut_free(sample: Sample) -> tuple[list[_Body], list[_Joint]]:
         bodies[0].force[axis] = mpf(value)
     for axis, value in zip((2,) if planar else (0, 1, 2), motion.torque, strict=False):
         bodies[0].torque[axis] = mpf(value)
-    for index, link in enumerate(scene.links):
+    placed = [(axes, origin, omega)]
+    for index, (link, parent) in enumerate(zip(scene.links, scene.parent_bodies, strict=True)):
         angle, rate = mpf(motion.joint_angles[index]), mpf(motion.joint_rates[index])
+        axes, origin, omega = placed[parent]
         origin = origin + axes * column(link.joint.position)
         axes = axes * _rotation(link.joint.rotation) * turn(2, angle)
         omega = omega + axes[:, 2] * rate
         torque = mpf(actuated.get(index, 0.0)) - mpf(link.damping) * rate
         torque -= mpf(link.stiffness) * (angle - mpf(link.rest_angle))
-        joints.append(_Joint(axes, origin, rate, torque))
+        joints.append(_Joint(parent, axes, origin, rate, torque))
+        placed.append((axes, origin, omega))
         bodies.append(_body(link, axes, origin, omega))
+    axes, origin, omega = placed[scene.tip_body]
     if scene.wrist is not None:
         psi, theta, phi = sample.state[layout.state.wrist_angles]
         origin = origin + axes * column(scene.wrist.frame.position)
@@ -103,10 +108,11 @@ def _cut_free(sample: Sample) -> tuple[list[_Body], list[_Joint]]:
     origin, axes = origin + axes * column(scene.tip.position), axes * _rotation(scene.tip.rotation)
     if scene.tip_wrench is not None:
         force = axes * column(scene.tip_wrench.force)
-        bodies[-1].force += force
-        bodies[-1].torque += axes * column(scene.tip_wrench.torque) + skew(origin - bodies[-1].center) * force
+        body = bodies[scene.tip_body]
+        body.force += force
+        body.torque += axes * column(scene.tip_wrench.torque) + skew(origin - body.center) * force
     if scene.payload is not None:
-        joints.append(_Joint(axes, origin, mpf(0), None))
+        joints.append(_Joint(scene.tip_body, axes, origin, mpf(0), None))
         bodies.append(_body(scene.payload, axes, origin, omega))
     return bodies, joints
 
@@ -124,7 +130,7 @@ def _solved(sample: Sample, bodies: list[_Body], joints: list[_Joint]) -> Soluti
         _add(right, 6 * i + 3, 0, body.torque - skew(body.omega) * (body.inertia * body.omega))
     for i, joint in enumerate(joints):
         rows = starts[i]
-        for j, sign in ((i, -1), (i + 1, 1)):
+        for j, sign in ((joint.before, -1), (i + 1, 1)):
             body, lever = bodies[j], joint.origin - bodies[j].center
             # Forces at the joint's origin and torques, about its axes; the last torque is the motor's.
             wrenches = mpmath.zeros(6)
@@ -137,7 +143,7 @@ def _solved(sample: Sample, bodies: list[_Body], joints: list[_Joint]) -> Soluti
             _add(right, rows, 0, -sign * joint.axes.T * (skew(body.omega) * (skew(body.omega) * lever)))
             if joint.torque is not None:
                 _add(right, 6 * j, 0, sign * joint.torque * wrenches[:, 5])
-        turning = joint.axes.T * (skew(bodies[i].omega) * (joint.axes[:, 2] * joint.rate))
+        turning = joint.axes.T * (skew(bodies[joint.before].omega) * (joint.axes[:, 2] * joint.rate))
         _add(right, rows + 3, 0, turning[: sizes[i] - 3, 0])
     solution = mpmath.lu_solve(matrix, right)
     return _named(sample, bodies, joints, solution, starts)
@@ -160,8 +166,9 @@ def _named(
         if joint.torque is None:
             continue
         z = joint.axes[:, 2]
-        relative = solution[6 * i + 9 : 6 * i + 12, 0] - solution[6 * i + 3 : 6 * i + 6, 0]
-        found.append((z.T * (relative - skew(bodies[i].omega) * (z * joint.rate)))[0])
+        j, k = joint.before, i + 1
+        relative = solution[6 * k + 3 : 6 * k + 6, 0] - solution[6 * j + 3 : 6 * j + 6, 0]
+        found.append((z.T * (relative - skew(bodies[j].omega) * (z * joint.rate)))[0])
         reactions.append([*solution[starts[i] : starts[i] + 5, 0], joint.torque])
     as_floats = [[float(entry) for entry in row] for row in reactions]
     return Solution(np.array([float(entry) for entry in found]), np.array(as_floats).reshape(-1, 6))

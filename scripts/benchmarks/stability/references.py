@@ -92,13 +92,15 @@ def _linear_system(tree: KinematicTree, motion: Motion) -> LinearSystem:
     size = 6 + n
     omega, alpha, a = column(motion.angular), mpmath.zeros(3, 1), mpmath.zeros(3, 1)
     rotation, origin = mpmath.eye(3), mpmath.zeros(3, 1)
+    reached = [(omega, alpha, a, rotation, origin)]
     axes: list[Vector] = []
     origins: list[Vector] = []
     mass_matrix, bias, sizes = mpmath.zeros(size), mpmath.zeros(size, 1), mpmath.zeros(size, 1)
     for index in range(n + 1):
-        body = tree.base if index == 0 else tree.links[index - 1].body
+        body = tree.bodies[index]
         if index:
             link = tree.links[index - 1]
+            omega, alpha, a, rotation, origin = reached[link.parent]
             arm = rotation * column(link.joint.position)
             a = a + _cross(alpha, arm) + _cross(omega, _cross(omega, arm))
             origin = origin + arm
@@ -109,12 +111,13 @@ def _linear_system(tree: KinematicTree, motion: Motion) -> LinearSystem:
             omega = omega + axis * rate
             axes.append(axis)
             origins.append(origin)
+            reached.append((omega, alpha, a, rotation, origin))
         lever = rotation * column(body.center_of_mass)
         center = origin + lever
         turning, moving = mpmath.zeros(3, size), mpmath.zeros(3, size)
         turning[:, 0:3], moving[:, 0:3], moving[:, 3:6] = mpmath.eye(3), -skew(center), mpmath.eye(3)
-        for j, (axis, where) in enumerate(zip(axes, origins, strict=True)):
-            turning[:, 6 + j], moving[:, 6 + j] = axis, _cross(axis, center - where)
+        for j in tree.path_to(index):
+            turning[:, 6 + j], moving[:, 6 + j] = axes[j], _cross(axes[j], center - origins[j])
         mass = mpf(body.mass)
         inertia = rotation * _square(body.inertia) * rotation.T
         force = mass * (a + _cross(alpha, lever) + _cross(omega, _cross(omega, lever)))
@@ -223,7 +226,7 @@ def _system(sample: Sample) -> tuple[newton_euler.NewtonEulerSystem, newton_eule
     link_frames = minimal.link_frames(tree, angles)
     twist = (*motion.angular.tolist(), *motion.linear.tolist())
     velocities = kinematics.body_velocities(tree, link_frames, twist, rates)
-    bodies = [tree.base, *(link.body for link in tree.links)]
+    bodies = tree.bodies
     duals = [
         (0.0, *v.angular, 0.0, *add(v.linear, cross(v.angular, body.center_of_mass)))
         for body, v in zip(bodies, velocities, strict=True)
