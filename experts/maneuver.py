@@ -10,7 +10,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.viewing.payload_places import payload_path
-from dq_space_arm_env.viewing.replay.flights import frame_poses
+from dq_space_arm_env.viewing.replay.flights import frame_poses, target_during, tip_errors
 from experts.problems.shooting_problem import FloatArray
 
 _AT_LIMIT = 1.0 - 1e-9
@@ -58,7 +58,7 @@ class Maneuver:
 
     @cached_property
     def frames(self) -> FloatArray:
-        """Poses of base, joint frames, wrist frame (if any) and tip, shape (N + 1, frames, 8), m."""
+        """Poses as of `Kernels.frame_poses`, the tip's last, shape (N + 1, frames, 8), m."""
         return frame_poses(self.scene, StateLayout.of(self.scene), self.states)
 
     @cached_property
@@ -86,14 +86,18 @@ class Maneuver:
 
     @cached_property
     def distance(self) -> FloatArray:
-        """Length of the position error, shape (N + 1,), m."""
-        return np.asarray(np.linalg.norm(self.position_error, axis=1))
+        """Length of the position error, of the worst tip, shape (N + 1,), m."""
+        return self._errors[1]
 
     @cached_property
     def angle(self) -> FloatArray:
-        """Euler angle of the attitude error, shape (N + 1,), rad."""
-        tip = tuple(self.frames[:, -1].T)
-        return np.asarray(poses.error_angle(tip, self.target))
+        """Euler angle of the attitude error, of the worst tip, shape (N + 1,), rad."""
+        return self._errors[0]
+
+    @cached_property
+    def _errors(self) -> tuple[FloatArray, FloatArray]:
+        target, body = target_during(self.scene, len(self.states) - 1)
+        return tip_errors(self.scene, self.frames, target, body)
 
     @cached_property
     def actuators(self) -> tuple[ActuatorHistory, ...]:

@@ -87,6 +87,7 @@ class KinematicTree:
     tip_body: int  # body that carries wrist and tip
     wrist: Placement | None  # wrist frame at zero angles, in the frame of that body
     tip: Placement  # tip frame G in the wrist frame, or in that body's without a wrist
+    other_tips: tuple[tuple[int, Placement], ...]  # bodies that carry them, and their frames there
     tip_wrench: tuple[float, ...] | None  # force [N], torque [N m] at G, in G axes (16)
     planar: bool  # the base moves in its x-y plane only
     heaviest: int = 0  # body of greatest nominal mass: 0 is the base, i link i
@@ -132,6 +133,7 @@ class KinematicTree:
             tip_body=scene.tip_body,
             wrist=None if scene.wrist is None else _placement(scene.wrist.frame),
             tip=_placement(scene.tip),
+            other_tips=tuple((scene.body_named(tip.link), _placement(tip.frame)) for tip in scene.other_tips),
             tip_wrench=None if wrench is None else (*wrench.force, *wrench.torque),
             planar=scene.base.motion == "planar",
             heaviest=masses.index(max(masses)),
@@ -144,11 +146,13 @@ def _nominal_masses(scene: Scene) -> list[float]:
     masses = [scene.base.mass, *(link.mass for link in scene.links)]
     if scene.payload is not None:
         masses[scene.tip_body] += scene.payload.mass
+    for tip in scene.other_tips:
+        masses[scene.body_named(tip.link)] += 0.0 if tip.payload is None else tip.payload.mass
     return masses
 
 
 def _link_bodies(scene: Scene, given: Given) -> list[RigidBody]:
-    """Mass properties of the links in their joint frames; the one with the tip includes the payload."""
+    """Mass properties of the links in their joint frames, with the payloads that they hold."""
     bodies = [
         _rigid_body(link, f"links.{index}", link.center_of_mass, given)
         for index, link in enumerate(scene.links)
@@ -157,6 +161,11 @@ def _link_bodies(scene: Scene, given: Given) -> list[RigidBody]:
         payload = _rigid_body(scene.payload, "payload", scene.payload.center_of_mass, given)
         holding = scene.tip_body - 1
         bodies[holding] = _merged(bodies[holding], _moved(payload, scene.tip))
+    for tip in scene.other_tips:
+        if tip.payload is not None:
+            holding, place = scene.body_named(tip.link) - 1, ""  # a place of no parameters
+            payload = _rigid_body(tip.payload, place, tip.payload.center_of_mass, given)
+            bodies[holding] = _merged(bodies[holding], _moved(payload, tip.frame))
     return bodies
 
 

@@ -72,12 +72,13 @@ def frame_poses(
     joint_angles: Sequence[Scalar],
     wrist_angles: Sequence[Scalar],
 ) -> list[DualQuaternion]:
-    """Poses of base, joint frames, end effector (if any) and tip in the inertial frame: factors of (27)."""
+    """Poses of base, joint frames, other tips, end effector (if any) and tip in the inertial frame (27)."""
     poses = [base_pose]
     for link, angle in zip(tree.links, joint_angles, strict=True):
         joint = dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, angle))
         poses.append(dq.multiply(poses[link.parent], joint))
     last = poses[tree.tip_body]
+    poses += [dq.multiply(poses[body], frame.dual_quaternion) for body, frame in tree.other_tips]
     if tree.wrist is not None:
         wrist = dq.multiply(tree.wrist.dual_quaternion, wrist_rotation(wrist_angles))
         last = dq.multiply(last, wrist)
@@ -104,11 +105,18 @@ def arm_pose(
     if tree.wrist is not None:
         arm = dq.multiply(wrist_rotation(wrist_angles), arm)
         arm = dq.multiply(tree.wrist.dual_quaternion, arm)
-    for index in reversed(tree.path_to(tree.tip_body)):
+    return seen_from_base(tree, joint_angles, tree.tip_body, arm)
+
+
+def seen_from_base(
+    tree: KinematicTree, joint_angles: Sequence[Scalar], body: int, pose: DualQuaternion
+) -> DualQuaternion:
+    """Pose in the base frame of what has the given one in a body's frame."""
+    for index in reversed(tree.path_to(body)):
         link = tree.links[index]
-        moved = dq.multiply(joint_motion(link.screw, joint_angles[index]), arm)
-        arm = dq.multiply(link.joint.dual_quaternion, moved)
-    return arm
+        moved = dq.multiply(joint_motion(link.screw, joint_angles[index]), pose)
+        pose = dq.multiply(link.joint.dual_quaternion, moved)
+    return pose
 
 
 def tip_pose_rate(
@@ -180,13 +188,7 @@ def tip_twist(
 
     A fraction of the operations of `tip_jacobian`, half angles shared with the tip's pose.
     """
-    frames = link_frames(tree, joint_angles)
-    for index, (link, angle) in enumerate(zip(tree.links, joint_angles, strict=True)):
-        if link.screw.turn:
-            turned = matrix_product(link.joint.rotation, to_matrix(axis_rotation(2, angle))[0])
-            frames[index] = frames[index]._replace(rotation=turned)
-    last = body_velocities(tree, frames, base_twist, joint_rates)[tree.tip_body]
-    twist: Sequence[Scalar] = (*last.angular, *last.linear)
+    twist = _body_twists(tree, joint_angles, base_twist, joint_rates)[tree.tip_body]
     if tree.wrist is not None:
         twist = inverse_transform(tree.wrist.rotation, tree.wrist.position, twist)
         twist = inverse_transform(*to_matrix(wrist_rotation(wrist_angles)), twist)
@@ -194,6 +196,33 @@ def tip_twist(
             turning = matrix_vector(wrist_rate_matrix(wrist_angles), wrist_rates)
             twist = (*add(twist[:3], turning), *twist[3:])
     return inverse_transform(tree.tip.rotation, tree.tip.position, twist)
+
+
+def other_tip_twists(
+    tree: KinematicTree,
+    joint_angles: Sequence[Scalar],
+    base_twist: Sequence[Scalar],
+    joint_rates: Sequence[Scalar],
+) -> list[Sequence[Scalar]]:
+    """Twists of the other tips (angular, linear) in their axes, likewise."""
+    twists = _body_twists(tree, joint_angles, base_twist, joint_rates)
+    return [inverse_transform(at.rotation, at.position, twists[body]) for body, at in tree.other_tips]
+
+
+def _body_twists(
+    tree: KinematicTree,
+    joint_angles: Sequence[Scalar],
+    base_twist: Sequence[Scalar],
+    joint_rates: Sequence[Scalar],
+) -> list[Sequence[Scalar]]:
+    """Twists of base and links (angular, linear) in their frames, with half angles."""
+    frames = link_frames(tree, joint_angles)
+    for index, (link, angle) in enumerate(zip(tree.links, joint_angles, strict=True)):
+        if link.screw.turn:
+            turned = matrix_product(link.joint.rotation, to_matrix(axis_rotation(2, angle))[0])
+            frames[index] = frames[index]._replace(rotation=turned)
+    velocities = body_velocities(tree, frames, base_twist, joint_rates)
+    return [(*velocity.angular, *velocity.linear) for velocity in velocities]
 
 
 def _carried_to_tip(relative: DualQuaternion, angular: Vector3, linear: Vector3) -> list[Scalar]:

@@ -160,8 +160,8 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
 
         Raises:
             SceneError: If the scene cannot be loaded.
-            ValueError: If the reward type or the render mode is unknown, `DQSpaceArmEnv` refuses the scene, or a constraint
-                of it terminates episodes.
+            ValueError: If the reward type or the render mode is unknown, `DQSpaceArmEnv` refuses the scene, it has other tips,
+                or a constraint of it terminates episodes.
         """
         PicklesEpisodes.__init__(self, scene, reward_type, render_mode, width, height, default_camera_config)
         if reward_type not in get_args(RewardType):
@@ -169,6 +169,11 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
             raise ValueError(f"reward_type: {reward_type!r} is unknown; choose from {kinds}")
         self._env = DQSpaceArmEnv(scene, render_mode, width, height, default_camera_config)
         self.scene, self.kernels = self._env.scene, self._env.kernels
+        if self.scene.other_tips:
+            raise ValueError(
+                f"scene {self.scene.name!r} has tips besides the main one, and a goal is the pose of one tip: use "
+                "DQSpaceArm-v0, or leave other_tips out"
+            )
         if ending := [each.name for each in self.scene.constraints if each.terminates]:
             raise ValueError(
                 f"constraint {ending[0]!r} of scene {self.scene.name!r} terminates episodes; where every step "

@@ -146,7 +146,7 @@ class RobotKernels(KernelLibrary):
         return self.call("tip_pose", x=x, p=p)[0]
 
     def frame_poses(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Poses of base, joint frames, wrist frame (if any) and tip with respect to the inertial frame.
+        """Poses of base, joint frames, other tips, wrist frame (if any) and tip in the inertial frame.
 
         Args:
             x: States, shape (n_x,) or (B, n_x).

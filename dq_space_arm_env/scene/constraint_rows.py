@@ -111,7 +111,7 @@ def rows_of(scene: Scene, each: Constraint) -> list[Row]:
 
 
 def success_tolerances(scene: Scene) -> list[tuple[str, str, float]]:
-    """What success asks of the tip at the end.
+    """What success asks of each tip at the end.
 
     Args:
         scene: The scene.
@@ -165,7 +165,8 @@ def exact_rows(scene: Scene) -> tuple[Row, ...]:
 def _final_rows(scene: Scene) -> tuple[Row, ...]:
     """The rows that hold at the end besides those of the path."""
     rows = [
-        Row(f"success: {name}", unit, tolerance, margin=1e-3 * tolerance)
+        Row(f"success: {tip}{name}", unit, tolerance, margin=1e-3 * tolerance)
+        for tip in ("", *(f"{tip.name} " for tip in scene.other_tips))
         for name, unit, tolerance in success_tolerances(scene)
     ]
     for each in scene.constraints:

@@ -357,7 +357,7 @@ def _angle_problems(angle: float, most: float) -> Iterator[Problem]:
 def constraint_problems(scene: Scene) -> Iterator[Problem]:
     """Find constraints that do not fit the scene."""
     links = [link.name for link in scene.links]
-    known = (*FRAMES[:2], *links, *FRAMES[2:])
+    known = (*FRAMES[:2], *links, *(tip.name for tip in scene.other_tips), *FRAMES[2:])
     names_frames = any(True for constraint in scene.constraints for _ in constraint.frames())
     for name in links:
         if name in FRAMES and names_frames:

@@ -1,7 +1,10 @@
 """Maneuver of a scene: actuators and limits, target, cost, start, spread of starts, success."""
 
+from typing import Literal
+
 from pydantic import Field
 
+from dq_space_arm_env.scene.bodies import Payload
 from dq_space_arm_env.scene.motion import Motion
 from dq_space_arm_env.scene.pose import Pose
 from dq_space_arm_env.scene.shapes import Shape, geometry_field
@@ -16,6 +19,7 @@ from dq_space_arm_env.validation.fields import (
     Limits3,
     Load,
     Loads,
+    Name,
     Positive,
     Rates,
     RateSpread,
@@ -94,6 +98,34 @@ class Target(Model):
         "if fixed to it",
     )
     geometry: tuple[Shape, ...] = geometry_field("only axes and the ghost of a hand")
+
+
+class OtherTip(Model):
+    """A tip besides the main one: where it is, what it holds, and where it is to be at the end.
+
+    Its part of the cost is quadratic in the vector parts of its error pose q_{D/G}, which to first order are
+    half the angle and half the distance: the same whatever the signs of the quaternions. Success asks of it
+    what it asks of the main tip.
+    """
+
+    name: Name = Field(description="name of the tip, unlike those of links and other tips")
+    link: Name = Field(description="link that carries it, or base")
+    frame: Pose = Field(
+        default_factory=Pose, description="pose of its frame in that of the link (joint frame) or base, m"
+    )
+    payload: Payload | None = Field(default=None, description="body held rigidly at it; absent: none")
+    relative_to: Literal["target", "inertial"] = Field(
+        default="target",
+        description="'target': its goal is fixed to the target's body, and moves along; 'inertial': in space",
+    )
+    goal: Pose = Field(description="desired pose of the tip in that frame, m")
+    pose: StateWeights6 = Field(
+        default=(15.0,) * 6,
+        description="running weight on the vector parts of the error pose, rotation then position: one or 6",
+    )
+    terminal_pose: StateWeights6 = Field(
+        default=(150.0,) * 6, description="terminal weight on them: one number or 6"
+    )
 
 
 class Cost(Model):

@@ -19,7 +19,16 @@ from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.bodies import BASE, Base, Link, Payload, Wrist, parent_bodies
 from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.constraints import AnyConstraint, constraint_problems
-from dq_space_arm_env.scene.maneuver import Actuators, Cost, InitialState, Spread, Success, Target, TipWrench
+from dq_space_arm_env.scene.maneuver import (
+    Actuators,
+    Cost,
+    InitialState,
+    OtherTip,
+    Spread,
+    Success,
+    Target,
+    TipWrench,
+)
 from dq_space_arm_env.scene.motion import Motion, ScrewMotion, Tumbling, Waypoints
 from dq_space_arm_env.scene.parameters import control_numbers, is_part, numbers, parents
 from dq_space_arm_env.scene.phases import Phase, StagedNumbers, phase_problems, staged_numbers
@@ -40,6 +49,7 @@ _NOT_CONTENT: Any = {  # words and pictures, which change neither motion nor tas
     "description": True,
     **dict.fromkeys(("base", "payload", "target"), _GEOMETRY),
     "links": {"__all__": _GEOMETRY},
+    "other_tips": {"__all__": {"payload": _GEOMETRY}},
 }
 
 
@@ -64,6 +74,11 @@ class Scene(Model):
         "link that carries it, or the base frame)",
     )
     payload: Payload | None = Field(default=None, description="body held rigidly at the tip; absent: none")
+    other_tips: tuple[OtherTip, ...] = Field(
+        default=(),
+        exclude_if=lambda tips: not tips,
+        description="tips of other arms, each with a task of its own; absent: none",
+    )
     actuators: Actuators = Field(default_factory=Actuators, description="thrusters, wheels and motors")
     tip_wrench: TipWrench | None = Field(
         default=None, description="constant wrench at the tip, tip axes; absent: none"
@@ -107,8 +122,11 @@ class Scene(Model):
     @property
     def tip_body(self) -> int:
         """What carries wrist and tip, likewise."""
-        names = [BASE, *(link.name for link in self.links)]
-        return len(self.links) if self.tip_link is None else names.index(self.tip_link)
+        return len(self.links) if self.tip_link is None else self.body_named(self.tip_link)
+
+    def body_named(self, name: str) -> int:
+        """Number of a body by its name: 0 for the base, i + 1 for link i."""
+        return [BASE, *(link.name for link in self.links)].index(name)
 
     @property
     def staged(self) -> StagedNumbers:
@@ -171,6 +189,18 @@ class Scene(Model):
         if self.tip_link is not None and self.tip_link not in (BASE, *names):
             sentence = f"must be one of {', '.join([BASE, *names])}"
             yield Problem(("tip_link",), self.tip_link, sentence)
+        taken = [BASE, *names, "tip"]
+        for index, tip in enumerate(self.other_tips):
+            here: _Location = ("other_tips", index)
+            if tip.link not in (BASE, *names):
+                sentence = f"must be one of {', '.join([BASE, *names])}"
+                yield Problem((*here, "link"), tip.link, sentence)
+            elif tip.link == BASE and tip.payload is not None:
+                sentence = "the tip is on the base: add the payload's mass and inertia to the base's"
+                yield Problem((*here, "payload"), tip.payload, sentence)
+            if tip.name in taken:
+                yield Problem((*here, "name"), tip.name, "another tip, a link or the base has this name")
+            taken.append(tip.name)
 
     def _actuator_problems(self) -> Iterator[Problem]:
         """Find actuators without a part to act on, and limits without motors."""
@@ -286,9 +316,16 @@ class Scene(Model):
             yield from _height_problems((*here, "center_of_mass"), link.center_of_mass)
             yield from _inertia_problems((*here, "inertia"), link.inertia)
         yield from _pose_problems(("tip",), self.tip)
-        if self.payload is not None:
-            yield from _height_problems(("payload", "center_of_mass"), self.payload.center_of_mass)
-            yield from _inertia_problems(("payload", "inertia"), self.payload.inertia)
+        held: list[tuple[_Location, Payload | None]] = [(("payload",), self.payload)]
+        for index, tip in enumerate(self.other_tips):
+            here = ("other_tips", index)
+            yield from _pose_problems((*here, "frame"), tip.frame)
+            yield from _pose_problems((*here, "goal"), tip.goal)
+            held.append(((*here, "payload"), tip.payload))
+        for location, payload in held:
+            if payload is not None:
+                yield from _height_problems((*location, "center_of_mass"), payload.center_of_mass)
+                yield from _inertia_problems((*location, "inertia"), payload.inertia)
         if self.tip_wrench is not None:
             yield from _height_problems(("tip_wrench", "force"), self.tip_wrench.force)
             if any(self.tip_wrench.torque[:2]):

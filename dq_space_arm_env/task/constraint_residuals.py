@@ -72,7 +72,8 @@ class _Situation:
         self.u, self.inputs = u, equations.field.inputs(u)
         tree, motion = equations.tree, self.motion
         frames = kinematics.frame_poses(tree, dq.IDENTITY, motion.joint_angles, motion.wrist_angles)
-        names = ["base", *(link.name for link in self.scene.links)]
+        bodies = ["base", *(link.name for link in self.scene.links)]
+        names = [*bodies, *(tip.name for tip in self.scene.other_tips)]
         self._poses: dict[str, Scalars] = dict(zip(names, frames, strict=False))
         self._poses["tip"] = frames[-1]
         self._placements: dict[str, tuple[Any, Any]] = {}
@@ -152,8 +153,10 @@ def state_residuals(equations: SceneEquations, base: Scalars, y: Scalars) -> lis
     return [residual for residual, row in zip(residuals, rows, strict=True) if not row.has_input]
 
 
-def observed_margins(equations: SceneEquations, base: Scalars, y: Scalars) -> list[Scalar]:
-    """Entries tanh(-c / scale) of the observation.
+def observed_besides(equations: SceneEquations, base: Scalars, y: Scalars) -> list[Scalar]:
+    """What is observed besides state and target: errors of other tips, and margins tanh(-c / scale).
+
+    The error poses have a positive scalar: q and -q are the same.
 
     Args:
         equations: The scene's, with the parameters of the stage.
@@ -161,13 +164,17 @@ def observed_margins(equations: SceneEquations, base: Scalars, y: Scalars) -> li
         y: The state without the pose.
 
     Returns:
-        One scalar per row of `path_rows` that is observed.
+        The stored numbers of a pose per other tip, and one per row of `path_rows` that is observed.
     """
+    found: list[Scalar] = []
+    for error in equations.other_errors(base, y):
+        sign = select(error[0] < 0.0, -1.0, 1.0)
+        found += [sign * entry for entry in equations.field.pose.reduced(error)]
     rows = [row for row in path_rows(equations.scene) if not row.has_input]
     if all(row.observed is None for row in rows):
-        return []
+        return found
     residuals = zip(state_residuals(equations, base, y), rows, strict=True)
-    return [casadi.tanh(-c / row.observed) for c, row in residuals if row.observed is not None]
+    return found + [casadi.tanh(-c / row.observed) for c, row in residuals if row.observed is not None]
 
 
 def reported(
@@ -397,22 +404,33 @@ def _final_residuals(equations: SceneEquations, base: Scalars, y: Scalars) -> li
 
     A tolerance t of success is (e^2 / t - t) / 2 of an error e: smooth where e is zero, e - t near t.
     """
+    scene = equations.scene
     situation = _Situation(equations, base, y, [0.0] * equations.field.n_u)
     error = dq.multiply(dq.conjugate(situation.pose("grasp")), situation.pose("tip"))  # q_{G/D}
     twist = dual_vectors.subtract(equations.tip_twist(situation.motion), _target_twist(equations, error))
-    # |2 vec q_r| is 2 sin(angle / 2), the angle up to third order.
+    found = _success_residuals(scene, error, twist)
+    if scene.other_tips:
+        others = equations.other_errors(base, y), equations.other_twists(base, y)
+        for own in zip(*others, strict=True):
+            found += _success_residuals(scene, *own)
     halves = (scale(2.0, error[1:4]), poses.position(error))
-    squares = [dot(vector, vector) for vector in (*halves, twist[:3], twist[3:])]
-    names = ("attitude error", "position error", "angular velocity error", "velocity error")
-    by_name = dict(zip(names, squares, strict=True))
-    found = []
-    for name, _, tolerance in success_tolerances(equations.scene):
-        bound = 2.0 * math.sin(0.5 * tolerance) if name == names[0] else tolerance
-        found.append(0.5 * (by_name[name] / bound - bound))
-    for constraint in equations.scene.constraints:
+    for constraint in scene.constraints:
         for quantity in constraint.exact if isinstance(constraint, Terminal) else ():
             values = _exact(situation, quantity, [*halves[0], *halves[1]], twist)
-            found += [values[i] for i in directions(equations.scene, quantity)]
+            found += [values[i] for i in directions(scene, quantity)]
+    return found
+
+
+def _success_residuals(scene: Scene, error: Scalars, twist: Scalars) -> list[Scalar]:
+    """Those of a tip, by its error pose and its twist relative to its goal."""
+    # |2 vec q_r| is 2 sin(angle / 2), the angle up to third order.
+    vectors = (scale(2.0, error[1:4]), poses.position(error), twist[:3], twist[3:])
+    names = ("attitude error", "position error", "angular velocity error", "velocity error")
+    squares = {name: dot(vector, vector) for name, vector in zip(names, vectors, strict=True)}
+    found = []
+    for name, _, tolerance in success_tolerances(scene):
+        bound = 2.0 * math.sin(0.5 * tolerance) if name == names[0] else tolerance
+        found.append(0.5 * (squares[name] / bound - bound))
     return found
 
 

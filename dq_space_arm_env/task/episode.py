@@ -32,11 +32,12 @@ from dq_space_arm_env.scene.path import advanced
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import episode_start, parameter_values
 from dq_space_arm_env.task.catching import Catching, has_catch
-from dq_space_arm_env.task.constraint_residuals import charged, observed_margins, reported
+from dq_space_arm_env.task.constraint_residuals import charged, observed_besides, reported
 from dq_space_arm_env.task.equations import (
     SceneEquations,
     body_pose,
     body_velocity,
+    larger,
     total,
     weighted_square,
 )
@@ -151,10 +152,9 @@ def step(
 
 
 def seen(equations: SceneEquations, x: Scalars, time_left: Scalar) -> dict[str, list[Scalar]]:
-    """Observation, with the margins of constraints, and the tip's errors: angle in rad, distance in m."""
-    return equations.observe(
-        x, time_left, observed_margins(equations, equations.base_pose(x), equations.y(x))
-    )
+    """Observation, and the errors of the tips: angle in rad, distance in m."""
+    besides = observed_besides(equations, equations.base_pose(x), equations.y(x))
+    return equations.observe(x, time_left, besides)
 
 
 def compare_goals(scene: Scene, achieved: Scalars, desired: Scalars) -> Outputs:
@@ -269,7 +269,10 @@ def tip_errors(equations: SceneEquations, x: Scalars, errors: Scalars) -> list[S
     shown = [errors[0] * DEGREES, errors[1]]
     if has_twist_errors(equations.scene):
         twist = equations.relative_twist(x)
-        shown += [norm(twist[:3]) * DEGREES, norm(twist[3:])]
+        speeds = [norm(twist[:3]), norm(twist[3:])]
+        for own in equations.other_twists(equations.base_pose(x), equations.y(x)):
+            speeds = [larger(a, norm(b)) for a, b in zip(speeds, (own[:3], own[3:]), strict=True)]
+        shown += [speeds[0] * DEGREES, speeds[1]]
     return shown
 
 

@@ -13,6 +13,8 @@ Where a scene weighs it, the tip's twist relative to the target is a further ter
     w^G_{G/D} = w^G_{G/I} - q_{G/D}* w^D_{D/I} q_{G/D}.
 
 The wrist's Euler rates, which are inputs, are part of it in the stage cost; at the end the wrist is held.
+
+Other tips add squares of the vector parts of their error poses q_{D/G}, each with its own weights.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import casadi
 
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
+from dq_space_arm_env.algebra.scalars import select
 from dq_space_arm_env.algebra.vectors import norm
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.equations_of_motion import Motion
@@ -147,8 +150,42 @@ class SceneEquations:
             *poses.to_matrix(poses.error_pose(tip, self.target)), self.target_velocity
         )
 
+    def other_errors(self, base: Scalars, y: Scalars) -> list[Scalars]:
+        """Error poses q_{D/G} of the other tips, 8 numbers each, from the base's pose and the rest of x."""
+        angles, errors = self.field.motion(y).joint_angles, list[Scalars]()
+        for tip, (body, frame) in zip(self.scene.other_tips, self.tree.other_tips, strict=True):
+            seen = kinematics.seen_from_base(self.tree, angles, body, frame.dual_quaternion)
+            goal: Scalars = tip.goal.dual_quaternion
+            if tip.relative_to == "target":
+                goal = dq.multiply(body_pose(self.scene, self.given), goal)
+            errors.append(poses.error_pose(dq.multiply(base, seen), goal))
+        return errors
+
+    def other_twists(self, base: Scalars, y: Scalars) -> list[Scalars]:
+        """Twists of the other tips relative to their goals in tip axes, 6 each."""
+        motion = self.field.motion(y)
+        twists = kinematics.other_tip_twists(
+            self.tree, motion.joint_angles, (*motion.angular, *motion.linear), motion.joint_rates
+        )
+        carrying = body_velocity(self.scene, self.given)
+        for index, (tip, error) in enumerate(
+            zip(self.scene.other_tips, self.other_errors(base, y), strict=True)
+        ):
+            if tip.relative_to == "target" and self.scene.target.motion is not None:
+                goal = dual_vectors.inverse_transform(
+                    tip.goal.rotation_matrix, tip.goal.position, carrying
+                )  # in the goal's axes; Ad(q_{D/G}) brings it into the tip's
+                along = dual_vectors.transform(*poses.to_matrix(error), goal)
+                twists[index] = dual_vectors.subtract(twists[index], along)
+        return twists
+
     def _pose_cost(self, x: Scalars, field: str) -> Scalar:
-        return weighted_square(self.tip(x), self.target, self.state_weights(field))
+        cost = weighted_square(self.tip(x), self.target, self.state_weights(field))
+        for tip, error in zip(
+            self.scene.other_tips, self.other_errors(self.base_pose(x), self.y(x)), strict=True
+        ):
+            cost = cost + weighted_square(vector_parts(error), [0.0] * 6, getattr(tip, field))
+        return cost
 
     def _velocity_cost(self, x: Scalars, field: str) -> Scalar:
         motion = self.field.motion(self.y(x))
@@ -174,8 +211,8 @@ class SceneEquations:
         names, nominal = self.layout.control.limits, self.layout.control_limit.tolist()
         return [self.given.get(name, limit) for name, limit in zip(names, nominal, strict=True)]
 
-    def observe(self, x: Scalars, time_left: Scalar, margins: Scalars = ()) -> dict[str, list[Scalar]]:
-        """Observation, with the margins of constraints, and the tip's errors: angle in rad, distance in m."""
+    def observe(self, x: Scalars, time_left: Scalar, besides: Scalars = ()) -> dict[str, list[Scalar]]:
+        """Observation, with what is `besides`, and the errors of the tips: angle in rad, distance in m."""
         tip = self.tip(x)
         motion = self.field.motion(self.y(x))
         # Error pose q_{D/G} = q_{G/I}* q_{D/I}, eq. (31); in a planar scene four entries vanish identically.
@@ -193,14 +230,27 @@ class SceneEquations:
             *motion.joint_rates,
             *motion.previous_controls,
             *([self.given[PHASE]] if self.scene.phases else []),
-            *margins,
+            *besides,
             *twists,
             time_left,
         ]
         errors = [poses.error_angle(tip, self.target), poses.error_distance(tip, self.target)]
         if self.scene.target.motion is not None:  # the target's twist has the error's position computed
             errors[1] = norm(poses.position(poses.error_pose(tip, self.target)))
+        for other in self.other_errors(self.base_pose(x), self.y(x)):  # the worst tip counts
+            own = poses.error_angle(other, dq.IDENTITY), norm(poses.position(other))
+            errors = [larger(a, b) for a, b in zip(errors, own, strict=True)]
         return {"observation": observation, "errors": errors}
+
+
+def vector_parts(pose: Scalars) -> list[Scalar]:
+    """Vector parts of a dual quaternion, rotation then position, 6."""
+    return [*pose[1:4], *pose[5:8]]
+
+
+def larger(a: Scalar, b: Scalar) -> Scalar:
+    """The larger one of two numbers."""
+    return select(b > a, b, a)
 
 
 def body_pose(scene: Scene, given: Mapping[str, Scalar]) -> list[Scalar]:

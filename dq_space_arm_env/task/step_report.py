@@ -83,12 +83,13 @@ def cost_names(scene: Scene) -> tuple[str, ...]:
 
 
 def n_observations(scene: Scene) -> int:
-    """Count the entries of an observation: state, phase, margins, two twists where the target moves, time."""
+    """Count the entries: state, phase, other tips, margins, two twists where the target moves, time."""
     layout = StateLayout.of(scene)
     phase = 1 if scene.phases else 0
     twists = 2 * (3 if layout.planar else 6) if scene.target.motion is not None else 0
     margins = sum(row.observed is not None for row in path_rows(scene))
-    return layout.n_x + phase + margins + twists + 1
+    others = len(scene.other_tips) * (4 if layout.planar else 8)
+    return layout.n_x + phase + others + margins + twists + 1
 
 
 def memory_names(scene: Scene) -> tuple[str, ...]:

@@ -40,6 +40,7 @@ class WorstCase:
         self.mass = total([body.mass for body in self.bodies])
         # Of any point of the arm from the base's center of mass.
         places = [*(link.joint for link in self.tree.links), self.tree.wrist, self.tree.tip]
+        places += [frame for _, frame in self.tree.other_tips]
         lengths = [norm(place.position) for place in places if place is not None]
         self.reach = total([*lengths, *(norm(body.center_of_mass) for body in self.bodies)])
 
@@ -75,6 +76,9 @@ class WorstCase:
 
         def state_cost(pose: str, velocity: str, twist: str) -> Scalar:
             cost = self._weighted(pose, 4, gaps) + self._weighted(velocity, 3, speeds)
+            for tip in equations.scene.other_tips:  # the vector part of a unit quaternion is at most 1 long
+                away = gaps[1] + self._grasp_length() + norm(tip.goal.position)
+                cost = cost + _largest_square(getattr(tip, pose), 3, (1.0, away))
             if any(getattr(equations.scene.cost, twist)):
                 cost = cost + self._weighted(twist, 3, self._relative_speeds(speed, reach, 2.0 * gaps[1]))
             return cost
@@ -132,14 +136,7 @@ class WorstCase:
 
     def _weighted(self, field: str, size: int, lengths: Scalars) -> Scalar:
         """Cost of two vectors of these lengths; the largest weight counts for all entries of a vector."""
-        weights = self.equations.state_weights(field)
-        costs = []
-        for part, length in zip((weights[:size], weights[size:]), lengths, strict=True):
-            largest: Scalar = 0.0
-            for weight in part:
-                largest = casadi.fmax(largest, weight)
-            costs.append(largest * (length * length))
-        return total(costs)
+        return _largest_square(self.equations.state_weights(field), size, lengths)
 
     def _root_energy(self, joint_angles: Scalars, moving: Scalar, turning: Scalar) -> Scalar:
         """Bound of s if no body moves or turns faster."""
@@ -178,6 +175,17 @@ class WorstCase:
             torques[body] = torques[body] + _turned(self.last, torque + force * arm)
         squares = [force * force / body.mass for force, body in zip(forces, bodies, strict=True)]
         return casadi.sqrt(total([*squares, *(torque * torque for torque in torques)]))
+
+
+def _largest_square(weights: Scalars, size: int, lengths: Scalars) -> Scalar:
+    """Cost of two vectors of these lengths, of which the first has so many entries."""
+    costs = []
+    for part, length in zip((weights[:size], weights[size:]), lengths, strict=True):
+        largest: Scalar = 0.0
+        for weight in part:
+            largest = casadi.fmax(largest, weight)
+        costs.append(largest * (length * length))
+    return total(costs)
 
 
 def _parts(tree: KinematicTree, coordinates: Scalars, part: int) -> list[Scalar]:

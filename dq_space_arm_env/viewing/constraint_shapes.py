@@ -136,7 +136,7 @@ def _numbers_during(scene: Scene, count: int) -> list[Any]:
 
 def _frame_numbers(scene: Scene) -> dict[str, int]:
     """Numbers of the frames by their names in constraints."""
-    names = ["base", *(link.name for link in scene.links)]
+    names = ["base", *(link.name for link in scene.links), *(tip.name for tip in scene.other_tips)]
     tip = len(names) + (scene.wrist is not None)
     numbers = {name: number for number, name in enumerate(names)}
     return {**numbers, "tip": tip, "grasp": tip + 1, "target": tip + 2, "inertial": INERTIAL}

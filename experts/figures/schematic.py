@@ -141,7 +141,8 @@ class Schematic:
             yield box(0, np.zeros(3), size, BASE_COLOR, axes)
         if payload is not None:
             size, axes = equivalent_box(payload.mass, payload.inertia)
-            own = 2 + len(self._scene.links)  # after the tip's; a payload excludes a wrist
+            # After the tip's; a payload excludes a wrist.
+            own = 2 + len(self._scene.links) + len(self._scene.other_tips)
             if payload.geometry:
                 yield from shape_meshes(own, payload.geometry, PAYLOAD_COLOR)
                 return
@@ -168,7 +169,7 @@ class Schematic:
             scaled = [(radius * height, radius * ring) for height, ring in profile]
             yield lathe(frame, np.zeros(3), (0.0, 0.0, 1.0), scaled, JOINT_COLOR, _SIDES)
         if self._scene.wrist is not None:
-            yield ball(joints + 1, np.zeros(3), 1.6 * radius, JOINT_COLOR, _SIDES)
+            yield ball(len(before) - 1, np.zeros(3), 1.6 * radius, JOINT_COLOR, _SIDES)
 
     def _lit(self, solids: _Solids, rotations: FloatArray, positions: FloatArray) -> Faces:
         """Place and light solids, given rotation matrices and origins of the frames."""

@@ -71,10 +71,12 @@ def test_hashes_and_files_of_scenes_without_them_are_as_old_as_the_scenes() -> N
     assert with_shapes == [
         "approach-corridor",
         "capture-and-detumble",
+        "dual-arm",
         "plume",
         "release",
         "servicing",
         "sliding",
+        "solar-panels",
         "tracking",
         "tumbling-target",
     ]

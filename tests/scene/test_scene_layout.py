@@ -45,6 +45,8 @@ SIZES = {  # n_x, n_t, n_u
     "six-joint": (26, 24, 12),
     "tip-load": (23, 21, 12),
     "sliding": (22, 20, 10),
+    "dual-arm": (30, 28, 14),
+    "solar-panels": (31, 29, 12),
     "tracking": (23, 21, 12),
     "tumbling": (23, 21, 12),
     "tumbling-target": (23, 21, 12),

@@ -30,7 +30,7 @@ from dq_space_arm_env.kernels.programs.stage_programs import of_stage, stage_met
 from dq_space_arm_env.scene.constraint_rows import penalized_rows, terminal_rows
 from dq_space_arm_env.task.augmented_lagrangian import PenalizedEquations
 from dq_space_arm_env.task.constraint_residuals import penalized_residuals
-from dq_space_arm_env.task.equations import SceneEquations
+from dq_space_arm_env.task.equations import SceneEquations, vector_parts
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -101,8 +101,24 @@ class DerivativePrograms:
         self, x: Scalars, u: Scalars, field: str, *, exact: bool, emphasis: Scalar = 1.0
     ) -> tuple[Matrix, Matrix]:
         """Gradient and Hessian (exact or Gauss-Newton's) of a relative twist's cost by tangent state, u."""
-        residual, moved, values = self._twist_residual(x, u, field)
-        weights = casadi.diag(column(*(2.0 * emphasis * w for w in self.equations.state_weights(field))))
+        weights = [emphasis * weight for weight in self.equations.state_weights(field)]
+        return self._square_derivatives(*self._twist_residual(x, u, field), weights, exact=exact)
+
+    def _other_tip_derivatives(
+        self, x: Scalars, u: Scalars, index: int, weights: Scalars, *, exact: bool
+    ) -> tuple[Matrix, Matrix]:
+        """Likewise of another tip's cost."""
+        z, w = symbols("z", self.field.n_t), symbols("w", self.field.n_u)
+        error = self.equations.other_errors(*self.equations.moved(x, z))[index]
+        values = casadi.densify(column(*[0.0] * self.field.n_t, *u))
+        residual, moved = column(*vector_parts(error)), column(*z, *w)
+        return self._square_derivatives(residual, moved, values, weights, exact=exact)
+
+    def _square_derivatives(
+        self, residual: Matrix, moved: Matrix, values: Matrix, given: Scalars, *, exact: bool
+    ) -> tuple[Matrix, Matrix]:
+        """Gradient and Hessian of the weighted square of a residual, 6, at the values of what moves it."""
+        weights = casadi.diag(column(*(2.0 * weight for weight in given)))
         jacobian = casadi.jacobian(residual, moved)
         gradient = casadi.mtimes(jacobian.T, casadi.mtimes(weights, residual))
         hessian = casadi.mtimes(jacobian.T, casadi.mtimes(weights, jacobian))
@@ -140,6 +156,8 @@ class DerivativePrograms:
         """Gradients and Hessians by tangent state and input of what only some stage costs have."""
         for cost in self._twist_costs():
             yield self._twist_cost_derivatives(x, u, cost, exact=exact)
+        for index, tip in enumerate(self.scene.other_tips):
+            yield self._other_tip_derivatives(x, u, index, tip.pose, exact=exact)
         if isinstance(self.equations, PenalizedEquations) and penalized_rows(self.scene):
             yield self._penalty_derivatives(self.equations, x, u, exact=exact)
 
@@ -151,6 +169,10 @@ class DerivativePrograms:
         for cost in self._twist_costs("terminal_"):
             stressed = emphasis if cost == "terminal_tip_twist" else 1.0
             slope, curvature = self._twist_cost_derivatives(x, held, cost, exact=exact, emphasis=stressed)
+            yield slope[:n_t], curvature[:n_t, :n_t]
+        for index, tip in enumerate(self.scene.other_tips):
+            weights = [emphasis * weight for weight in tip.terminal_pose]
+            slope, curvature = self._other_tip_derivatives(x, held, index, weights, exact=exact)
             yield slope[:n_t], curvature[:n_t, :n_t]
         if isinstance(self.equations, PenalizedEquations):
             slope, curvature = self._penalty_derivatives(self.equations, x, None, exact=exact)

@@ -18,7 +18,7 @@ from dq_space_arm_env.compiler.program import Program
 from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 from dq_space_arm_env.dynamics.minimal import ZERO
-from dq_space_arm_env.task.constraint_residuals import observed_margins
+from dq_space_arm_env.task.constraint_residuals import observed_besides
 from dq_space_arm_env.task.episode import seen
 from dq_space_arm_env.task.equations import SceneEquations, total
 
@@ -111,24 +111,24 @@ class RobotPrograms:
             by_pose = zeros(len(rest), field.n_t - field.n_y)
             if self.equations.scene.target.motion is not None:
                 by_pose = self._twists_by_pose(x, base, len(rest))
-            by_pose = by_pose + self._margins_by_pose(x, len(rest))
+            by_pose = by_pose + self._besides_by_pose(x, len(rest))
             jacobian = casadi.vertcat(errors, casadi.horzcat(by_pose, by_y))
             return {"jacobian": casadi.densify(jacobian.T).nonzeros()}
 
         return self._program("observation_jacobian", outputs, x=field.n_x)
 
-    def _margins_by_pose(self, x: Scalars, count: int) -> Any:
-        """Derivative of the last entries by the base's pose: of the margins, before twists and time left."""
+    def _besides_by_pose(self, x: Scalars, count: int) -> Any:
+        """Derivative of the last entries by the base's pose: `besides`, before twists and time left."""
         n = len(self.field.pose.directions)
         z = symbols("z", n)
-        margins = observed_margins(
+        besides = observed_besides(
             self.equations, *self.equations.moved(x, [*z, *[0.0] * (self.field.n_t - n)])
         )
-        if not margins:
+        if not besides:
             return zeros(count, n)
         after = 1 + (2 * n if self.equations.scene.target.motion is not None else 0)
-        by_pose = casadi.substitute(casadi.jacobian(column(*margins), column(*z)), column(*z), [0.0] * n)
-        return casadi.vertcat(zeros(count - after - len(margins), n), by_pose, zeros(after, n))
+        by_pose = casadi.substitute(casadi.jacobian(column(*besides), column(*z)), column(*z), [0.0] * n)
+        return casadi.vertcat(zeros(count - after - len(besides), n), by_pose, zeros(after, n))
 
     def _twists_by_pose(self, x: Scalars, base: Columns, count: int) -> Any:
         """Derivative of the last entries but one by the base's pose: of relative and target's twist.

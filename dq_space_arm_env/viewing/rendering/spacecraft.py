@@ -50,7 +50,7 @@ def equivalent_box(mass: float, inertia: ArrayLike) -> tuple[Array, Array]:
 
 
 def frames_before(scene: Scene) -> tuple[list[int], Array]:
-    """Find where the frames of `Kernels.frame_poses` are placed: joints, wrist (if any), tip.
+    """Find where the frames of `Kernels.frame_poses` are placed: joints, other tips, wrist (if any), tip.
 
     Args:
         scene: A scene.
@@ -60,6 +60,9 @@ def frames_before(scene: Scene) -> tuple[list[int], Array]:
         (frames - 1, 3), m.
     """
     before, offsets = [*scene.parent_bodies], [link.joint.position for link in scene.links]
+    for tip in scene.other_tips:
+        before.append(scene.body_named(tip.link))
+        offsets.append(tip.frame.position)
     last = scene.tip_body
     if scene.wrist is not None:
         before.append(last)
@@ -83,6 +86,9 @@ class SpacecraftModel:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self._before, self._offsets = frames_before(scene)
+        # Frames of the tips, the main one last.
+        count = 1 + len(scene.links)
+        self._tips = [*range(count, count + len(scene.other_tips)), len(self._before)]
         self.frame_count = len(self._offsets) + 1
         self._body_size, self._body_axes = equivalent_box(scene.base.mass, scene.base.inertia)
         if scene.base.geometry:
@@ -102,7 +108,8 @@ class SpacecraftModel:
     @cached_property
     def mesh(self) -> Mesh:
         """All solids; the frames after the robot's are those of target, target's body and payload."""
-        hand = list(self._hand()) if self._has_hand else []
+        hand = list(self._hand(self._tips[-1])) if self._has_hand(self._tips[-1]) else []
+        others = [part for tip in self._tips[:-1] if self._has_hand(tip) for part in self._hand(tip)]
         # The ghost of the hand stands to the target as the hand to the tip.
         from_tip = np.array(self.scene.tip.rotation_matrix)
         likeness = [
@@ -110,7 +117,8 @@ class SpacecraftModel:
             for part in hand
         ]
         body = shape_meshes(self.frame_count + 1, self.scene.target.geometry, METAL)
-        parts = [*self._base(), *self._arm(), *hand, *self._payload(), *self._axes(), *likeness, *body]
+        parts = [*self._base(), *self._arm(), *hand, *others, *self._payloads(), *self._axes()]
+        parts += [*likeness, *body]
         return Mesh.joined(parts)
 
     @cached_property
@@ -267,10 +275,10 @@ class SpacecraftModel:
 
     def _arm(self) -> Iterator[Mesh]:
         shapes = self._geometry
-        ends = [*self._offsets[:-1], self._hand_start]
-        for frame, end in zip(self._before, ends, strict=True):
+        for index, frame in enumerate(self._before):
             if shapes[frame]:
                 continue
+            end = self._hand_start(index + 1) if index + 1 in self._tips else self._offsets[index]
             radius, color = (self._radius(frame), LINK) if frame else (1.2 * self._radius(frame), METAL)
             if np.linalg.norm(end) > 0.1 * radius:
                 yield cylinder(frame, (0.0, 0.0, 0.0), end, radius, color)
@@ -285,7 +293,7 @@ class SpacecraftModel:
             else:
                 yield from self._joint(joint)
         if self.scene.wrist is not None:
-            frame = len(self.scene.links) + 1
+            frame = len(self._before) - 1
             yield ball(frame, (0.0, 0.0, 0.0), 1.5 * self._radius(frame), JOINT)
 
     @cached_property
@@ -303,6 +311,7 @@ class SpacecraftModel:
     def _geometry(self) -> list[tuple[Shape, ...]]:
         """Given shapes of what is fixed in each frame but the tip's; a wrist has none."""
         own = [self.scene.base.geometry, *(link.geometry for link in self.scene.links)]
+        own += [()] * len(self.scene.other_tips)
         return own if self.scene.wrist is None else [*own, ()]
 
     @property
@@ -310,10 +319,9 @@ class SpacecraftModel:
         """Frames of links that carry nothing."""
         return [frame for frame in range(1, len(self.scene.links) + 1) if frame not in self._before]
 
-    @property
-    def _has_hand(self) -> bool:
-        """Whether a hand is drawn: as part of the body before the tip, if that has no shapes of its own."""
-        return not self._geometry[self._before[-1]]
+    def _has_hand(self, tip: int) -> bool:
+        """Whether a hand is drawn: as part of the body before a tip, if that has no shapes of its own."""
+        return not self._geometry[self._before[tip - 1]]
 
     def _joint(self, frame: int) -> Iterator[Mesh]:
         """A beveled housing along the joint's z axis, and a mast as long as the joint slides."""
@@ -329,20 +337,19 @@ class SpacecraftModel:
     def _hand_length(self) -> float:
         return 5.0 * self._thickness
 
-    @cached_property
-    def _approach(self) -> Array:
-        """Unit direction of the hand, in the frame before the tip's: that of the last link."""
-        direction = self._offsets[-1]
-        if not direction.any() and self.scene.wrist is not None:
+    def _approach(self, tip: int) -> Array:
+        """Unit direction of a tip's hand, in the frame before: that of the last link."""
+        direction = self._offsets[tip - 1]
+        if not direction.any() and self.scene.wrist is not None and tip == self._tips[-1]:
             direction = np.array(self.scene.wrist.frame.rotation_matrix).T @ self._offsets[-2]
         if not direction.any():
             direction = np.array([0.0, 0.0, 1.0])
         return np.asarray(direction / np.linalg.norm(direction))
 
-    @cached_property
-    def _hand_start(self) -> Array:
-        """Start of the hand, in the frame before the tip's, m: it ends at the tip if there is room."""
-        return self._approach * max(0.0, float(np.linalg.norm(self._offsets[-1])) - self._hand_length)
+    def _hand_start(self, tip: int) -> Array:
+        """Start of a tip's hand, in the frame before, m: it ends at the tip if there is room."""
+        room = float(np.linalg.norm(self._offsets[tip - 1])) - self._hand_length
+        return self._approach(tip) * max(0.0, room)
 
     def _overhang(self) -> float:
         """Reach of hand and payload beyond the tip, m."""
@@ -355,33 +362,41 @@ class SpacecraftModel:
             overhang = max(overhang, float(np.linalg.norm(payload.center_of_mass) + 0.5 * size.max()))
         return overhang
 
-    def _hand(self) -> Iterator[Mesh]:
+    def _hand(self, tip: int) -> Iterator[Mesh]:
         """A palm and two fingers."""
-        frame = self._before[-1]
-        radius, length, approach = 0.8 * self._thickness, self._hand_length, self._approach
+        frame, start = self._before[tip - 1], self._hand_start(tip)
+        radius, length, approach = 0.8 * self._thickness, self._hand_length, self._approach(tip)
         opening = np.cross(approach, np.eye(3)[np.abs(approach).argmin()])
         opening /= np.linalg.norm(opening)
         axes = np.column_stack([opening, np.cross(approach, opening), approach])
         profile = [(0.0, 0.0), (0.0, radius), (0.3, 1.3 * radius), (0.4, 1.3 * radius), (0.4, 0.0)]
         scaled = [(height * length, ring) for height, ring in profile]
-        yield lathe(frame, self._hand_start, approach, scaled, JOINT)
+        yield lathe(frame, start, approach, scaled, JOINT)
         for side in (-1.0, 1.0):
-            center = self._hand_start + 0.68 * length * approach + side * radius * opening
+            center = start + 0.68 * length * approach + side * radius * opening
             yield box(frame, center, (0.5 * radius, 1.2 * radius, 0.64 * length), DARK_METAL, axes)
 
-    def _payload(self) -> Iterator[Mesh]:
-        payload = self.scene.payload
-        if payload is not None and payload.geometry:
-            yield from shape_meshes(self.frame_count + 2, payload.geometry, GRASPED)
-        elif payload is not None:
-            size, axes = equivalent_box(payload.mass, payload.inertia)
-            yield box(self.frame_count + 2, payload.center_of_mass, size, GRASPED, axes)
+    def _payloads(self) -> Iterator[Mesh]:
+        held = [(self.frame_count + 2, self.scene.payload)]
+        held += [(tip, other.payload) for tip, other in zip(self._tips, self.scene.other_tips, strict=False)]
+        for frame, payload in held:
+            if payload is not None and payload.geometry:
+                yield from shape_meshes(frame, payload.geometry, GRASPED)
+            elif payload is not None:
+                size, axes = equivalent_box(payload.mass, payload.inertia)
+                yield box(frame, payload.center_of_mass, size, GRASPED, axes)
 
     def _axes(self) -> Iterator[Mesh]:
-        """Axes of the tip, and thicker and lighter ones at the target."""
+        """Axes of the tips, and thicker and lighter ones at the target."""
         thickness, length = self._thickness, self.axis_length
-        yield from _arrows(self.frame_count - 1, length, 0.26 * thickness, 0.0)
+        for tip in self._tips:
+            yield from _arrows(tip, length, 0.26 * thickness, 0.0)
         yield from _arrows(self.frame_count, length, 0.42 * thickness, 0.5)
+        for other in self.scene.other_tips:
+            if other.relative_to == "target":
+                rotation, place = np.array(other.goal.rotation_matrix), np.array(other.goal.position)
+                for arrow in _arrows(0, length, 0.42 * thickness, 0.5):
+                    yield arrow.moved(self.frame_count + 1, rotation, place)
 
 
 def _arrows(frame: int, length: float, radius: float, lightness: float) -> Iterator[Mesh]:

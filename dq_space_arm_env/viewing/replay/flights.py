@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.scene import Scene, StateLayout
@@ -97,9 +98,9 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
         payload = _target(f"{what}: payload", payload, steps, shown)
     elif (path := payload_path(flight.scene or scene, frames[:, -1], target)) is not None:
         payload = _target(f"{what}: payload", path, shown, shown)
-    tip, aim = tuple(frames[:, -1].T), tuple(target.T) if target.ndim == 2 else tuple(target.tolist())
     seconds = shown * scene.simulation.dt
     body = None if body is None else _target(f"{what}: target_body", body, steps, shown)
+    angle, distance = tip_errors(flight.scene or scene, frames, target, body)
     placed = flight.scene or scene, states[: shown + 1], controls[:shown], target if body is None else body
     return ShownFlight(
         label=flight.label,
@@ -109,8 +110,8 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
         target_body=body,
         payload=payload,
         frames=frames,
-        angle=np.degrees(poses.error_angle(tip, aim)),
-        distance=np.asarray(poses.error_distance(tip, aim)),
+        angle=np.degrees(angle),
+        distance=distance,
         note="" if shown == steps else f"diverges after {seconds:.4g} s",
         violated=violations(*placed) if scene.constraints else np.zeros((0, shown + 1), np.bool_),
     )
@@ -125,6 +126,33 @@ def frame_poses(scene: Scene, layout: StateLayout, states: FloatArray) -> FloatA
     joints, wrist = tuple(states[:, entries.joint_angles].T), tuple(states[:, entries.wrist_angles].T)
     frames = kinematics.frame_poses(KinematicTree.from_scene(scene), tuple(base), joints, wrist)
     return np.stack([np.stack(frame, axis=1) for frame in frames], axis=1)
+
+
+def tip_errors(
+    scene: Scene, frames: FloatArray, target: FloatArray, body: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Errors of the tips from their goals, of each instant the worst tip's.
+
+    Args:
+        scene: The scene.
+        frames: Poses of the robot's frames, shape (M, frames, 8), m.
+        target: q_{D/I}, shape (8,), or (M, 8) where it moves, m.
+        body: Pose of the target's body, likewise; None if it is the target's.
+
+    Returns:
+        Angles, rad, and distances, m, shape (M,) each.
+    """
+    first = 1 + len(scene.links)
+    aims = [(frames[:, -1], tuple(target.T))]
+    for index, tip in enumerate(scene.other_tips):
+        goal: tuple[Any, ...] = tip.goal.dual_quaternion
+        if tip.relative_to == "target":
+            goal = dual_quaternion.multiply(tuple((target if body is None else body).T), goal)
+        aims.append((frames[:, first + index], goal))
+    pairs = [(tuple(tip.T), goal) for tip, goal in aims]
+    angles = [np.asarray(poses.error_angle(*pair)) for pair in pairs]
+    distances = [np.asarray(poses.error_distance(*pair)) for pair in pairs]
+    return np.max(angles, axis=0), np.max(distances, axis=0)
 
 
 def target_during(scene: Scene, steps: int) -> tuple[FloatArray, FloatArray | None]:
