@@ -13,6 +13,7 @@ from dq_space_arm_env.common.tables import TextTable
 from dq_space_arm_env.scene import Pose, Scene, StateLayout
 from dq_space_arm_env.scene.constraint_rows import path_rows
 from dq_space_arm_env.scene.path import first_velocity
+from dq_space_arm_env.task.step_report import observation_entries
 
 _ACTUATORS = {
     "base_force": "thrusters: no force on the base",
@@ -30,6 +31,7 @@ def record(scene: Scene) -> dict[str, Any]:
         "description": scene.description,
         "content_hash": scene.content_hash(),
         "bodies": [dict(zip(("name", "mass_kg", "role"), body, strict=True)) for body in _bodies(scene)],
+        "observation": _entries(*zip(*observation_entries(scene), strict=True)),
         "states": _entries(layout.state.names, layout.state.units),
         "tangent": _entries(layout.tangent.names, layout.tangent.units),
         "inputs": [
@@ -83,6 +85,9 @@ def print_scene(console: Console, scene: Scene) -> None:
     ]
     heading = ("entry", "", "limit", "unit", "weight")
     _print(console, f"Inputs, {layout.n_u} numbers", heading, inputs, right=(2, 4))
+    observed = [(str(i), *entry) for i, entry in enumerate(observation_entries(scene))]
+    title = f"Observation, {len(observed)} numbers; actions are inputs over their limits, in [-1, 1]"
+    _print(console, title, ("entry", "", "unit"), observed)
     varies = layout.parameters
     if varies.names:
         rows = [
@@ -153,8 +158,11 @@ def _bodies(scene: Scene) -> Iterator[tuple[str, float, str]]:
         yield link.name, link.mass, f"{drive}{spring}{damper}"
     if scene.wrist is not None:
         yield "wrist", 0.0, "spherical joint, commanded by its Euler rates"
-    if scene.payload is not None:
-        yield "payload", scene.payload.mass, "held rigidly at the tip"
+    held = [("payload", "the tip", scene.payload)]
+    held += [(f"payload of {tip.name}", tip.name, tip.payload) for tip in scene.other_tips]
+    for name, tip_name, payload in held:
+        if payload is not None:
+            yield name, payload.mass, f"held rigidly at {tip_name}"
 
 
 def _state_parts(layout: StateLayout) -> list[tuple[str, slice, str]]:
@@ -181,6 +189,10 @@ def _task(scene: Scene) -> Iterator[tuple[str, str]]:
     if scene.target.grasp != Pose():
         position, rotation = scene.target.grasp.position, scene.target.grasp.rotation
         yield "grasp frame", f"{_vector(position)} m, rotation {_vector(rotation)}"
+    for tip in scene.other_tips:
+        position, rotation = tip.goal.position, tip.goal.rotation
+        where = "of the target" if tip.relative_to == "target" else "in space"
+        yield f"goal of {tip.name}", f"{_vector(position)} m, rotation {_vector(rotation)}, {where}"
     if scene.target.motion is not None:
         twist = first_velocity(scene)
         at_start = f"{_vector(twist[:3])} rad/s, {_vector(twist[3:])} m/s at the start, body axes"

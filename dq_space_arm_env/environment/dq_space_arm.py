@@ -92,7 +92,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     Where rates of controls are limited, the controls before, those of `layout.previous_controls`, stand after the
     joint rates, in N, N m, rad/s. In a scene with phases the number of the phase, from 0, is one more entry: before
-    the twists, or the time left.
+    the twists, or the time left. Where other tips have goals, their error dual quaternions follow, with a scalar part of at least 0.
+    `dq-space-arm scenes show SCENE` prints the tables of any scene.
 
     ## Rewards
 
@@ -116,7 +117,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | `cost_tip_twist`              | w' W w, w the relative twist with the wrist's rates    | the scene's `cost.tip_twist`         |
     | `terminal_cost_tip_twist`     | the same at the end, with the wrist held; 0 before     | `cost.terminal_tip_twist`: 1e5 in `tracking` |
 
-    `info` also holds the tip's `attitude_error` [deg] and `position_error` [m], `is_success` (both within the scene's tolerances, 3 deg and 0.1 m) and
+    `info` also holds the `attitude_error` [deg] and `position_error` [m] of the tip (of several the worst), `is_success` (both within the scene's tolerances, 3 deg and 0.1 m) and
     `diverged`; where the target moves, or success asks for it, the tip's `angular_velocity_error` [deg/s] and `velocity_error` [m/s] relative to the target with the
     wrist held. `reset` returns the same keys, with costs of zero.
 

@@ -82,14 +82,32 @@ def cost_names(scene: Scene) -> tuple[str, ...]:
     return tuple(name for name in report_names(scene) if name.startswith(("cost_", "terminal_cost_")))
 
 
-def n_observations(scene: Scene) -> int:
-    """Count the entries: state, phase, other tips, margins, two twists where the target moves, time."""
+def observation_entries(scene: Scene) -> list[tuple[str, str]]:
+    """Names and units of an observation's entries, in the order of `SceneEquations.observe`."""
     layout = StateLayout.of(scene)
-    phase = 1 if scene.phases else 0
-    twists = 2 * (3 if layout.planar else 6) if scene.target.motion is not None else 0
-    margins = sum(row.observed is not None for row in path_rows(scene))
-    others = len(scene.other_tips) * (4 if layout.planar else 8)
-    return layout.n_x + phase + others + margins + twists + 1
+    state = list(zip(layout.state.names, layout.state.units, strict=True))
+    where = layout.state
+    pose = [(name.removeprefix("base pose "), unit) for name, unit in state[where.pose]]
+    twist = [(name.removeprefix("base "), unit) for name, unit in state[where.base_velocity]]
+    moves, rows = scene.target.motion is not None, path_rows(scene)
+    return [
+        *((f"target from the tip {name}", unit) for name, unit in pose),
+        *state[where.base_velocity],
+        *state[where.joint_angles],
+        *state[where.wrist_angles],
+        *state[where.joint_rates.start :],
+        *([("phase", "1")] if scene.phases else []),
+        *((f"goal from {tip.name} {name}", unit) for tip in scene.other_tips for name, unit in pose),
+        *((f"margin of {row.name}", "1") for row in rows if row.observed is not None),
+        *((f"tip relative to the target {name}", unit) for name, unit in twist if moves),
+        *((f"target in tip axes {name}", unit) for name, unit in twist if moves),
+        ("time left", "s"),
+    ]
+
+
+def n_observations(scene: Scene) -> int:
+    """Count the entries of an observation."""
+    return len(observation_entries(scene))
 
 
 def memory_names(scene: Scene) -> tuple[str, ...]:

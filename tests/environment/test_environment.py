@@ -15,7 +15,7 @@ from short_scenes import diverging, short
 
 import dq_space_arm_env
 from dq_space_arm_env import list_scenes, load_scene
-from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.scene import Actuators
 from dq_space_arm_env.scene.constraint_rows import path_rows
 from dq_space_arm_env.validation.fields import MOST_STEPS
@@ -112,7 +112,9 @@ def test_observation_is_what_the_documentation_says(scene):
     kernels, x = env.unwrapped.kernels, env.unwrapped.state
     layout, target = kernels.layout.state, tuple(env.unwrapped.target)
     if env.unwrapped.scene.target.motion is None:
-        assert target == pytest.approx(env.unwrapped.episode_scene.target.pose.dual_quaternion, abs=1e-15)
+        own = env.unwrapped.episode_scene.target
+        desired = dual_quaternion.multiply(own.pose.dual_quaternion, own.grasp.dual_quaternion)
+        assert target == pytest.approx(desired, abs=1e-15)
     error = np.array(poses.error_pose(tuple(kernels.tip_pose(x)), target))  # (31)
     if kernels.layout.planar:
         np.testing.assert_allclose(error[[1, 2, 4, 7]], 0.0, atol=1e-15)
@@ -127,11 +129,21 @@ def test_observation_is_what_the_documentation_says(scene):
     phase = [info["phase"]] if env.unwrapped.scene.phases else []
     rows = [row for row in path_rows(env.unwrapped.scene) if row.observed is not None]
     margins = [np.tanh(-info["constraints"][row.name] / row.observed) for row in rows]
-    expected = np.concatenate([error, *(x[part] for part in parts), phase, margins, *twists, [19 * 0.015]])
+    tips, goals = [tuple(kernels.tip_pose(x))], [target]
+    body = tuple(kernels.layout.target_body_with(np.array(env.unwrapped.stage_parameters)).tolist())
+    others = kernels.frame_poses(x)[1 + len(env.unwrapped.scene.links) :]
+    for tip, pose in zip(env.unwrapped.scene.other_tips, others, strict=False):
+        tips.append(tuple(pose.tolist()))
+        goals.append(dual_quaternion.multiply(body, tip.goal.dual_quaternion))
+    errors = [np.array(poses.error_pose(*pair)) for pair in zip(tips, goals, strict=True)]
+    seen = [np.copysign(1.0, error[0]) * error for error in errors[1:]]
+    state = [x[part] for part in parts]
+    expected = np.concatenate([error, *state, phase, *seen, margins, *twists, [19 * 0.015]])
     np.testing.assert_allclose(observation, expected, atol=1e-14)
-    tip = tuple(kernels.tip_pose(x))
-    assert info["attitude_error"] == pytest.approx(np.degrees(poses.error_angle(tip, target)))
-    assert info["position_error"] == pytest.approx(poses.error_distance(tip, target))
+    angles = [poses.error_angle(*pair) for pair in zip(tips, goals, strict=True)]
+    distances = [poses.error_distance(*pair) for pair in zip(tips, goals, strict=True)]
+    assert info["attitude_error"] == pytest.approx(np.degrees(max(angles)))
+    assert info["position_error"] == pytest.approx(max(distances))
 
 
 def test_the_sign_of_the_error_is_fixed_at_reset_and_carried_along():

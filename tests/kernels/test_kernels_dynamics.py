@@ -87,7 +87,8 @@ def test_base_pose_and_velocity_do_not_change_the_motion(draw):
 def test_frame_poses_end_at_the_tip_27(scene, draw):
     kernels, states, _ = draw(scene, 10)
     frames, tips = kernels.frame_poses(states), kernels.tip_pose(states)
-    assert frames.shape == (10, 2 + len(kernels.scene.links) + (kernels.scene.wrist is not None), 8)
+    scene = kernels.scene
+    assert frames.shape == (10, 2 + len(scene.links) + len(scene.other_tips) + (scene.wrist is not None), 8)
     np.testing.assert_allclose(frames[:, -1], tips, atol=1e-13)
 
 

@@ -46,6 +46,7 @@ SIZES = {  # n_x, n_t, n_u
     "tip-load": (23, 21, 12),
     "sliding": (22, 20, 10),
     "dual-arm": (30, 28, 14),
+    "heavy-wrist": (26, 24, 12),
     "solar-panels": (31, 29, 12),
     "tracking": (23, 21, 12),
     "tumbling": (23, 21, 12),

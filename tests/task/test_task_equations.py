@@ -15,7 +15,7 @@ from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.scene.start import episode_scene, number_of_draws
 from dq_space_arm_env.task import episode
 from dq_space_arm_env.task.equations import SceneEquations
-from dq_space_arm_env.task.step_report import FLAGS, REPORT
+from dq_space_arm_env.task.step_report import FLAGS, REPORT, n_observations, observation_entries
 from dq_space_arm_env.task.worst_case import WorstCase
 
 interpreter = pytest.importorskip("graph_interpreter")
@@ -193,3 +193,22 @@ def test_parameters_are_what_the_episodes_scene_says(name: str) -> None:
     found = np.array(casadi.Function("f", [symbols], [expressions])(begun["parameters"])).ravel()
     expected = [*known.field.accelerations(y, u), *known.scene.target.pose.dual_quaternion]
     np.testing.assert_allclose(found, np.array(expected, dtype=float), atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["paper", "planar", "dual-arm", "servicing"])
+def test_names_of_an_observation_are_those_of_its_entries(name: str) -> None:
+    """What the state also has is where its names say; the rest is counted, the time left is last."""
+    equations = SceneEquations.of(load_scene(name))
+    given = SceneEquations.of(equations.scene, equations.layout.parameters.nominal.tolist())
+    x, entries = moving(equations), observation_entries(equations.scene)
+    found = run(lambda x: {"seen": episode.seen(given, x, 7.0)["observation"]}, x=x)["seen"]
+    assert len(entries) == len(found) == n_observations(equations.scene)
+    values = dict(zip(entries, found.tolist(), strict=True))
+    state = [*zip(equations.layout.state.names, equations.layout.state.units, strict=True)]
+    for entry, value in zip(state, x.tolist(), strict=True):
+        if not entry[0].startswith("base pose"):
+            assert values[entry] == value
+    assert values["time left", "s"] == 7.0
+    assert [unit for _, unit in entries[: len(x[equations.layout.state.pose])]] == [
+        unit for name, unit in state if name.startswith("base pose")
+    ]
