@@ -44,6 +44,8 @@ write_generated = import_module("write_generated")
 DIMENSIONLESS = {
     "Cost.pose",
     "Cost.terminal_pose",
+    "OtherTip.pose",
+    "OtherTip.terminal_pose",
     "Cost.base_velocity",
     "Cost.terminal_base_velocity",
     "Tumbling.inertia",
