@@ -96,7 +96,7 @@ def test_ipopt_says_when_iterations_or_time_are_used_up(short_scene: Scene) -> N
 def test_transcription_has_the_experts_steps_and_costs(integrator: str) -> None:
     problem = shortened("paper", 20, integrator)
     trajectory = roll_out(problem, problem.initial_state, random_controls(problem))
-    program = transcribe(problem.scene)
+    program = transcribe(problem)
     values = casadi.Function("values", [program.variables], [program.cost, program.gaps])
     cost, gaps = values(program.join(trajectory.states, trajectory.controls))
     assert float(cost) == pytest.approx(trajectory.cost, rel=1e-12)
@@ -104,12 +104,29 @@ def test_transcription_has_the_experts_steps_and_costs(integrator: str) -> None:
     assert float(casadi.norm_inf(gaps)) < (1e-9 if integrator == "rk4" else 1e-12)
 
 
+def test_transcription_has_the_parameters_of_the_stages() -> None:
+    """A target that tumbles, the twist relative to it in the cost, and rows that know where it is."""
+    problem = shortened("servicing", 20, "rk4")
+    trajectory = roll_out(problem, problem.initial_state, random_controls(problem))
+    program = transcribe(problem)
+    values = casadi.Function("values", [program.variables], [program.cost, program.gaps, program.rows])
+    cost, gaps, rows = values(program.join(trajectory.states, trajectory.controls))
+    assert float(cost) == pytest.approx(trajectory.cost, rel=1e-12)
+    assert float(casadi.norm_inf(gaps)) < 1e-9
+    assert problem.constraints is not None
+    expected = problem.constraints.find(trajectory.states, trajectory.controls)[1:-1]
+    of_stages = np.asarray(rows).ravel()[: 20 * (program.n_x + program.n_path)]
+    found = of_stages.reshape(20, -1)[1:, program.n_x :]
+    np.testing.assert_allclose(found, expected[:, : program.n_path], atol=1e-12)
+    assert np.ptp(found, axis=0).min() > 1e-4
+
+
 @pytest.mark.parametrize("integrator", COMPARED_INTEGRATORS)
 def test_transcription_has_the_derivatives_that_casadi_finds(short_scene: Scene, integrator: str) -> None:
     limits = {"kind": "joint_limits", "name": "limits", "lower": -1, "upper": 1, "rate": 0.5}
     short = {"dt": 0.05, "steps": 3, "integrator": integrator}
     scene = short_scene.replace(simulation=short, constraints=[limits])
-    program = transcribe(scene)
+    program = transcribe(ArmProblem(scene))
     rng = np.random.default_rng(0)
     values, pushed = rng.normal(size=program.variables.numel()), rng.normal(size=program.rows.numel())
     symbols = casadi.MX.sym("l", len(pushed))
@@ -267,15 +284,15 @@ def test_crocoddyl_is_left_out_with_a_sentence(name: str, reason: str) -> None:
     assert crocoddyl_maneuver.obstacle(ArmProblem("paper")) is None
 
 
-@pytest.mark.parametrize(
-    ("name", "more"), [("tracking", "a target that moves"), ("release", "phases or weights of the tip's")]
-)
-def test_what_knows_a_target_at_rest_only_refuses_more(name: str, more: str) -> None:
-    scene = load_scene(name)
-    with pytest.raises(ValueError, match=f"interior-point methods are left out: they are not given {more}"):
-        transcribe(scene)
+@pytest.mark.parametrize("name", ["tracking", "release"])
+def test_the_papers_formulation_refuses_more_than_a_target_at_rest(name: str) -> None:
     with pytest.raises(ValueError, match="formulation knows only a target at rest"):
-        PaperProblem(scene)
+        PaperProblem(load_scene(name))
+
+
+def test_interior_point_methods_refuse_phases() -> None:
+    with pytest.raises(ValueError, match="interior-point methods are left out: they are not given phases"):
+        transcribe(ArmProblem("release"))
 
 
 def test_the_papers_formulation_brings_the_tip_to_a_grasp_frame() -> None:

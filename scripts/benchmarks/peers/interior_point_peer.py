@@ -51,7 +51,7 @@ class InteriorPoint:
     ) -> None:
         """Build the program; `max_seconds` is IPOPT's only."""
         self._problem, self._solver_name = problem, solver
-        self._program = transcribe(problem.scene)
+        self._program = transcribe(problem)
         settings = {"max_iter": max_iterations, "mu_init": first_barrier, "tol": tolerance}
         self._watch = _Watch(self._program) if solver == IPOPT else None
         if self._watch is not None:
@@ -78,7 +78,7 @@ class InteriorPoint:
         controls = np.zeros((problem.horizon, problem.n_controls)) if u_init is None else u_init
         states = roll_out(problem, start, controls).states if x_init is None else x_init
         lower, upper = (
-            program.join(np.full_like(states, infinite), np.tile(bound, (problem.horizon, 1)))
+            program.join(np.full_like(states, infinite), np.broadcast_to(bound, controls.shape))
             for infinite, bound in ((-np.inf, problem.control_lower), (np.inf, problem.control_upper))
         )
         lower[: start.size] = upper[: start.size] = start

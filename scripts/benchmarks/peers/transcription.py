@@ -3,6 +3,8 @@
 Steps are those of the scene's integrator except for the pose: the classical Runge-Kutta method integrates its
 stored numbers, where the expert moves it by exponentials. The two independent ways are 1e-7 apart.
 
+What varies from stage to stage, such as the pose of a target that moves, enters as numbers of each stage.
+
 CasADi alone takes several seconds for the second derivatives of a thousand Runge-Kutta steps. The chain rule
 over the four stages, with derivatives of one stage from CasADi, takes a tenth of that.
 """
@@ -18,11 +20,10 @@ import numpy as np
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
-from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
 from dq_space_arm_env.task.constraint_residuals import path_residuals, terminal_residuals
 from dq_space_arm_env.task.equations import SceneEquations
-from experts.problems.paper_problem import beyond_the_paper
+from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 
 _OFFSETS = (0.0, 0.5, 0.5, 1.0)
@@ -69,29 +70,31 @@ class Transcription:
 
 
 class _Piece(NamedTuple):
-    """Functions of the state and input of a stage, or of the last state."""
+    """Functions of the state, input and parameters of a stage, or of the last state and parameters."""
 
     cost: Any
     rows: Any
-    jacobian: Any  # of the rows, by all arguments
+    jacobian: Any  # of the rows, by state and input
     hessian: Any  # of weight * cost + multipliers . rows, the two being further arguments
 
 
-def transcribe(scene: Scene) -> Transcription:
-    """Write a maneuver as a program over all its states and controls; ValueError if its target moves."""
-    if more := beyond_the_paper(scene.replace(constraints=())):
-        raise ValueError(f"interior-point methods are left out: they are not given {' or '.join(more)}.")
-    equations = SceneEquations.of(scene, StateLayout.of(scene).parameters.nominal.tolist())
+def transcribe(problem: ArmProblem) -> Transcription:
+    """Write a maneuver with its present parameters as a program; ValueError if it has phases."""
+    scene = problem.scene
+    if scene.phases:
+        raise ValueError("interior-point methods are left out: they are not given phases.")
+    equations = SceneEquations.of(scene)
     n_x, n_u, n = equations.layout.n_x, equations.layout.n_u, scene.simulation.steps
     stage, end = _stage(equations), _end(equations)
     n_rows = stage.rows.numel_out(0)
     variables = casadi.MX.sym("z", n * (n_x + n_u) + n_x)
     stages, last = casadi.reshape(variables[: n * (n_x + n_u)], n_x + n_u, n), variables[-n_x:]
     x, u = stages[:n_x, :], stages[n_x:, :]
-    following = casadi.horzcat(x[:, 1:], last)
-    cost = casadi.sum2(stage.cost.map(n)(x, u)) + end.cost(last)
-    rows = stage.rows.map(n)(x, u) + casadi.vertcat(following, casadi.MX(n_rows - n_x, n))
-    rows = casadi.vertcat(casadi.vec(rows), end.rows(last))
+    following, given = casadi.horzcat(x[:, 1:], last), problem.parameters.rows
+    p, p_end = casadi.DM(given[:-1].T), casadi.DM(given[-1])
+    cost = casadi.sum2(stage.cost.map(n)(x, u, p)) + end.cost(last, p_end)
+    rows = stage.rows.map(n)(x, u, p) + casadi.vertcat(following, casadi.MX(n_rows - n_x, n))
+    rows = casadi.vertcat(casadi.vec(rows), end.rows(last, p_end))
 
     def along_diagonal(of_stages: Any, of_end: Any) -> Any:
         return casadi.diagcat(*casadi.horzsplit(of_stages, n_x + n_u), of_end)
@@ -101,16 +104,16 @@ def transcribe(scene: Scene) -> Transcription:
     of_states = [(k + 1) * (n_x + n_u) + i for k, i in zip(stage_numbers, entries, strict=True)]
     shape = rows.numel(), variables.numel()
     shift = casadi.DM.triplet(of_gaps, of_states, casadi.DM.ones(n * n_x), *shape)
-    jacobian = along_diagonal(stage.jacobian.map(n)(x, u), end.jacobian(last)) + shift
+    jacobian = along_diagonal(stage.jacobian.map(n)(x, u, p), end.jacobian(last, p_end)) + shift
 
     parameters, weight = casadi.MX.sym("p", 0), casadi.MX.sym("lam_f")
     multipliers = casadi.MX.sym("lam_g", rows.numel())
     of_stages = casadi.reshape(multipliers[: n * n_rows], n_rows, n)
     hessian = along_diagonal(
-        stage.hessian.map(n)(x, u, casadi.repmat(weight, 1, n), of_stages),
-        end.hessian(last, weight, multipliers[n * n_rows :]),
+        stage.hessian.map(n)(x, u, p, casadi.repmat(weight, 1, n), of_stages),
+        end.hessian(last, p_end, weight, multipliers[n * n_rows :]),
     )
-    given = [variables, parameters]
+    arguments = [variables, parameters]
     return Transcription(
         steps=n,
         n_x=n_x,
@@ -120,8 +123,8 @@ def transcribe(scene: Scene) -> Transcription:
         cost=cost,
         rows=rows,
         row_bounds=_row_bounds(scene, n_x),
-        jacobian=casadi.Function("jac_g", given, [rows, jacobian]),
-        hessian=casadi.Function("hess_lag", [*given, weight, multipliers], [hessian]),
+        jacobian=casadi.Function("jac_g", arguments, [rows, jacobian]),
+        hessian=casadi.Function("hess_lag", [*arguments, weight, multipliers], [hessian]),
     )
 
 
@@ -149,8 +152,8 @@ def _stage(equations: SceneEquations) -> _Piece:
         path = casadi.vertcat(*path_residuals(equations, *place, casadi.vertsplit(u)))
         path += casadi.DM([row.margin for row in path_rows(equations.scene)])
     jacobian = casadi.vertcat(-by_both, casadi.jacobian(path, both))
-    cost, rows = _costs(equations)[0](x, u), casadi.vertcat(-x_next, path)
-    return _piece([x, u], cost, rows, jacobian, multiplier, twice)
+    cost, rows = _stage_cost(equations, x, u), casadi.vertcat(-x_next, path)
+    return _piece(equations, [x, u], cost, rows, jacobian, multiplier, twice)
 
 
 def _end(equations: SceneEquations) -> _Piece:
@@ -162,16 +165,23 @@ def _end(equations: SceneEquations) -> _Piece:
             *terminal_residuals(equations, equations.base_pose(entries), equations.y(entries))
         )
         rows += casadi.DM([row.margin for row in terminal_rows(equations.scene)])
-    cost, none = _costs(equations)[1](x), casadi.SX(x.numel(), x.numel())
-    return _piece([x], cost, rows, casadi.jacobian(rows, x), casadi.SX(0, 1), none)
+    cost, none = _terminal_cost(equations, x), casadi.SX(x.numel(), x.numel())
+    return _piece(equations, [x], cost, rows, casadi.jacobian(rows, x), casadi.SX(0, 1), none)
 
 
 def _piece(
-    arguments: Sequence[Any], cost: Any, rows: Any, jacobian: Any, multiplier: Any, twice: Any
+    equations: SceneEquations,
+    place: Sequence[Any],
+    cost: Any,
+    rows: Any,
+    jacobian: Any,
+    multiplier: Any,
+    twice: Any,
 ) -> _Piece:
-    """Functions of arguments; `twice` is the Hessian of the first rows weighted with their multiplier."""
+    """Functions of a place and the parameters; `twice` is the Hessian of the first rows weighted with their multiplier."""
     weight, others = casadi.SX.sym("w"), casadi.SX.sym("m", rows.numel() - multiplier.numel())
-    both, cse = casadi.vertcat(*arguments), {"cse": True}
+    both, cse = casadi.vertcat(*place), {"cse": True}
+    arguments = [*place, _parameters(equations)]
     lagrangian = weight * cost + casadi.dot(others, rows[multiplier.numel() :])
     hessian = twice + casadi.hessian(lagrangian, both)[0]
     given = [*arguments, weight, casadi.vertcat(multiplier, others)]
@@ -181,6 +191,11 @@ def _piece(
         casadi.Function("jacobian", arguments, [jacobian], cse),
         casadi.Function("hessian", given, [hessian], cse),
     )
+
+
+def _parameters(equations: SceneEquations) -> Any:
+    """The symbols for what varies, a column."""
+    return casadi.vertcat(casadi.SX(0, 1), *equations.field.parameters)
 
 
 def _step(equations: SceneEquations, x: Any, u: Any, multiplier: Any) -> tuple[Any, Any, Any]:
@@ -199,21 +214,21 @@ def _step(equations: SceneEquations, x: Any, u: Any, multiplier: Any) -> tuple[A
 def _motion_step(equations: SceneEquations, x: Any, u: Any, multiplier: Any) -> tuple[Any, Any, Any]:
     """The same of the motion alone."""
     if equations.scene.simulation.integrator == "rk4":
-        rates = _rates(equations)
-        return _runge_kutta_step(rates, x, u, multiplier, equations.scene.simulation.dt)
+        p, h = _parameters(equations), equations.scene.simulation.dt
+        return _runge_kutta_step(_rates(equations), x, u, p, multiplier, h)
     x_next, both = _euler_step(equations, x, u), casadi.vertcat(x, u)
     twice = casadi.hessian(casadi.dot(multiplier, x_next), both)[0]
     return x_next, casadi.jacobian(x_next, both), twice
 
 
 def _rates(equations: SceneEquations) -> Any:
-    """Time derivative of the stored motion, a function of (x, u)."""
+    """Time derivative of the stored motion, a function of (x, u, p)."""
     field = equations.field.of_motion
     x, u = casadi.SX.sym("x", field.n_x), casadi.SX.sym("u", field.n_u)
     stored = field.n_x - field.n_y
     others = field.rates(casadi.vertsplit(x[stored:]), casadi.vertsplit(u))
     rates = casadi.vertcat(_pose_rates(equations, x[:stored], x[stored:]), *others)
-    return casadi.Function("rates", [x, u], [rates], {"cse": True})
+    return casadi.Function("rates", [x, u, _parameters(equations)], [rates], {"cse": True})
 
 
 def _pose_rates(equations: SceneEquations, pose: Any, y: Any) -> Any:
@@ -250,18 +265,20 @@ def _stages(rates: Callable[[Any], Any], x: Any, h: float) -> tuple[list[Any], l
     return states, slopes
 
 
-def _runge_kutta_step(rates: Any, x: Any, u: Any, multiplier: Any, h: float) -> tuple[Any, Any, Any]:
+def _runge_kutta_step(
+    rates: Any, x: Any, u: Any, p: Any, multiplier: Any, h: float
+) -> tuple[Any, Any, Any]:
     """A step, its Jacobian by (x, u), and the Hessian of multiplier . step, by the chain rule over stages."""
     arguments = rates.sx_in()
     weight = casadi.SX.sym("w", x.numel())
-    slope, both = rates(*arguments), casadi.vertcat(*arguments)
+    slope, both = rates(*arguments), casadi.vertcat(*arguments[:2])
     jacobian = casadi.Function("jacobian", arguments, [casadi.jacobian(slope, both)], {"cse": True})
     twice = casadi.hessian(casadi.dot(weight, slope), both)[0]
     hessian = casadi.Function("hessian", [*arguments, weight], [twice], {"cse": True})
 
     n_x, n = x.numel(), both.numel()
-    states, slopes = _stages(lambda state: rates(state, u), x, h)
-    jacobians = [jacobian(state, u) for state in states]
+    states, slopes = _stages(lambda state: rates(state, u, p), x, h)
+    jacobians = [jacobian(state, u, p) for state in states]
     identity = casadi.SX.eye(n)
     changes: list[Any] = []  # of (state of the stage, u) by (x, u)
     slope_changes: list[Any] = []
@@ -278,7 +295,7 @@ def _runge_kutta_step(rates: Any, x: Any, u: Any, multiplier: Any, h: float) -> 
         multipliers.insert(0, h * (_WEIGHTS[i] * multiplier + _OFFSETS[i + 1] * following))
     total = casadi.SX(n, n)
     for state, change, costate in zip(states, changes, multipliers, strict=True):
-        total += casadi.mtimes(change.T, casadi.mtimes(hessian(state, u, costate), change))
+        total += casadi.mtimes(change.T, casadi.mtimes(hessian(state, u, p, costate), change))
     x_next = x + h * sum(weight * k for weight, k in zip(_WEIGHTS, slopes, strict=True))
     by_both = identity[:n_x, :] + h * sum(
         weight * k for weight, k in zip(_WEIGHTS, slope_changes, strict=True)
@@ -286,19 +303,31 @@ def _runge_kutta_step(rates: Any, x: Any, u: Any, multiplier: Any, h: float) -> 
     return x_next, by_both, total
 
 
-def _costs(equations: SceneEquations) -> tuple[Any, Any]:
-    """Stage cost and terminal cost."""
-    scene, layout = equations.scene, equations.layout
-    x, u = casadi.SX.sym("x", layout.n_x), casadi.SX.sym("u", layout.n_u)
-    entries = casadi.vertsplit(x)
+def _stage_cost(equations: SceneEquations, x: Any, u: Any) -> Any:
+    """Cost of a stage: of the state, the effort, and the tip's twist with the wrist's rates."""
+    effort = _weighted(equations.control_weights, u)
+    rates = equations.field.inputs(casadi.vertsplit(u)).wrist_rates
+    return _state_cost(equations, x, "", rates) + effort
+
+
+def _terminal_cost(equations: SceneEquations, x: Any) -> Any:
+    """Cost of the end, where the wrist is held."""
+    return _state_cost(equations, x, "terminal_", None)
+
+
+def _state_cost(equations: SceneEquations, x: Any, when: str, wrist_rates: Any) -> Any:
+    """Cost of a state by the weights of stages or of the end."""
+    entries, target = casadi.vertsplit(x), equations.scene.target
     motion = equations.field.motion(equations.y(entries))
-    pose = casadi.vertcat(*equations.tip(entries)) - casadi.DM([float(entry) for entry in equations.target])
-    twist = casadi.vertcat(*motion.angular, *motion.linear) - casadi.DM(scene.target.base_velocity)
+    pose = casadi.vertcat(*equations.tip(entries)) - casadi.vertcat(*equations.target)
+    twist = casadi.vertcat(*motion.angular, *motion.linear) - casadi.DM(target.base_velocity)
+    if target.base_velocity_relative:
+        twist -= casadi.vertcat(*equations.target_twist(equations.base_pose(entries)))
+    relative = casadi.vertcat(*equations.relative_twist(entries, wrist_rates))
+    errors = {"pose": pose, "base_velocity": twist, "tip_twist": relative}
+    return sum(_weighted(equations.state_weights(when + name), error) for name, error in errors.items())
 
-    def state_cost(pose_weights: Sequence[float], twist_weights: Sequence[float]) -> Any:
-        return casadi.dot(casadi.DM(pose_weights), pose**2) + casadi.dot(casadi.DM(twist_weights), twist**2)
 
-    cost = scene.cost
-    stage = state_cost(cost.pose, cost.base_velocity) + casadi.dot(casadi.DM(layout.control_weight), u**2)
-    terminal = state_cost(cost.terminal_pose, cost.terminal_base_velocity)
-    return casadi.Function("stage", [x, u], [stage]), casadi.Function("terminal", [x], [terminal])
+def _weighted(weights: Sequence[Any], errors: Any) -> Any:
+    """Sum of squares with weights."""
+    return casadi.dot(casadi.vertcat(*weights), errors**2)

@@ -200,7 +200,7 @@ def _ipopt(problem: ArmProblem, effort: Effort) -> tuple[list[Contender], list[s
         return [], ["IPOPT is left out: it is not installed."]
     if not effort.slow_peers:
         return [], ["IPOPT is left out: it takes minutes; --set slow_peers=true or --full have it."]
-    if more := beyond_the_paper(problem.scene):
-        return [], [f"IPOPT is left out: it is not given {' or '.join(more)}."]
+    if problem.scene.phases:
+        return [], ["IPOPT is left out: it is not given phases."]
     ipopt = interior_point_peer.InteriorPoint(problem)
     return [Contender(IPOPT, ipopt.solve, is_slow=True)], []

@@ -24,7 +24,7 @@ CONSTRAINED = [
 def test_ipopt_finds_nothing_better_near_the_experts_plan():
     problem = ArmProblem("paper")
     solution = BoxDDP(problem).solve()
-    program = transcribe(problem.scene)
+    program = transcribe(problem)
     # The two discretizations differ by 1e-7: the expert moves the pose by exponentials.
     plan = program.join(solution.states, solution.controls)
     replay = casadi.Function("replay", [program.variables], [program.cost, program.gaps])
