@@ -178,7 +178,7 @@ def _piece(
     multiplier: Any,
     twice: Any,
 ) -> _Piece:
-    """Functions of a place and the parameters; `twice` is the Hessian of the first rows weighted with their multiplier."""
+    """Functions of a place and the parameters; `twice`: Hessian of the first rows with their multiplier."""
     weight, others = casadi.SX.sym("w"), casadi.SX.sym("m", rows.numel() - multiplier.numel())
     both, cse = casadi.vertcat(*place), {"cse": True}
     arguments = [*place, _parameters(equations)]
@@ -265,9 +265,7 @@ def _stages(rates: Callable[[Any], Any], x: Any, h: float) -> tuple[list[Any], l
     return states, slopes
 
 
-def _runge_kutta_step(
-    rates: Any, x: Any, u: Any, p: Any, multiplier: Any, h: float
-) -> tuple[Any, Any, Any]:
+def _runge_kutta_step(rates: Any, x: Any, u: Any, p: Any, multiplier: Any, h: float) -> tuple[Any, Any, Any]:
     """A step, its Jacobian by (x, u), and the Hessian of multiplier . step, by the chain rule over stages."""
     arguments = rates.sx_in()
     weight = casadi.SX.sym("w", x.numel())
