@@ -290,9 +290,10 @@ def test_the_papers_formulation_refuses_more_than_a_target_at_rest(name: str) ->
         PaperProblem(load_scene(name))
 
 
-def test_interior_point_methods_refuse_phases() -> None:
-    with pytest.raises(ValueError, match="interior-point methods are left out: they are not given phases"):
-        transcribe(ArmProblem("release"))
+@pytest.mark.parametrize(("name", "more"), [("release", "phases"), ("dual-arm", "tips of other arms")])
+def test_interior_point_methods_refuse_phases_and_other_tips(name: str, more: str) -> None:
+    with pytest.raises(ValueError, match=f"interior-point methods are left out: they are not given {more}"):
+        transcribe(ArmProblem(name))
 
 
 def test_the_papers_formulation_brings_the_tip_to_a_grasp_frame() -> None:

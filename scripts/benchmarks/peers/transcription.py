@@ -78,11 +78,18 @@ class _Piece(NamedTuple):
     hessian: Any  # of weight * cost + multipliers . rows, the two being further arguments
 
 
-def transcribe(problem: ArmProblem) -> Transcription:
-    """Write a maneuver with its present parameters as a program; ValueError if it has phases."""
-    scene = problem.scene
+def not_given(scene: Scene) -> str | None:
+    """What a scene has that no program is written for; None for nothing."""
     if scene.phases:
-        raise ValueError("interior-point methods are left out: they are not given phases.")
+        return "phases"
+    return "tips of other arms" if scene.other_tips else None
+
+
+def transcribe(problem: ArmProblem) -> Transcription:
+    """Write a maneuver with its present parameters as a program; ValueError if there is none for it."""
+    scene = problem.scene
+    if more := not_given(scene):
+        raise ValueError(f"interior-point methods are left out: they are not given {more}.")
     equations = SceneEquations.of(scene)
     n_x, n_u, n = equations.layout.n_x, equations.layout.n_u, scene.simulation.steps
     stage, end = _stage(equations), _end(equations)

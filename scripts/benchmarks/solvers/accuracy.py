@@ -20,6 +20,7 @@ from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim, note
 from scripts.benchmarks.peers import crocoddyl_peer, interior_point_peer
 from scripts.benchmarks.peers.crocoddyl_maneuver import CrocoddylManeuver, obstacle
+from scripts.benchmarks.peers.transcription import not_given
 from scripts.benchmarks.solvers.runs import (
     GAPS,
     GUIDED,
@@ -200,7 +201,7 @@ def _ipopt(problem: ArmProblem, effort: Effort) -> tuple[list[Contender], list[s
         return [], ["IPOPT is left out: it is not installed."]
     if not effort.slow_peers:
         return [], ["IPOPT is left out: it takes minutes; --set slow_peers=true or --full have it."]
-    if problem.scene.phases:
-        return [], ["IPOPT is left out: it is not given phases."]
+    if more := not_given(problem.scene):
+        return [], [f"IPOPT is left out: it is not given {more}."]
     ipopt = interior_point_peer.InteriorPoint(problem)
     return [Contender(IPOPT, ipopt.solve, is_slow=True)], []
