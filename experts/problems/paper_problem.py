@@ -20,6 +20,7 @@ def beyond_the_paper(scene: Scene) -> list[str]:
     asked = {
         "a target that moves (target.motion)": scene.target.motion is not None,
         "phases": bool(scene.phases),
+        "tips of other arms (other_tips)": bool(scene.other_tips),
         "constraints": bool(scene.constraints),
         "weights of the tip's twist": any(cost.tip_twist) or any(cost.terminal_tip_twist),
     }
