@@ -8,6 +8,7 @@ import numpy as np
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.parameters import CONTROL_UNITS
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.viewing.payload_places import payload_path
 from dq_space_arm_env.viewing.replay.flights import frame_poses, target_during, tip_errors
@@ -104,7 +105,7 @@ class Maneuver:
         """The scene's actuators in the order of the controls."""
         layout = StateLayout.of(self.scene)
         histories = []
-        for name in ("base_force", "base_torque", "joint_torque", "wrist_rate"):
+        for name in CONTROL_UNITS:
             entries = getattr(layout.control, name)
             if entries.start == entries.stop:
                 continue

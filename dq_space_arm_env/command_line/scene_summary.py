@@ -117,6 +117,8 @@ def left_out(scene: Scene) -> Iterator[str]:
         yield "wrench at the tip"
     for name, meaning in _ACTUATORS.items():
         needs = {"joint_torque": bool(scene.links), "wrist_rate": scene.wrist is not None}
+        if name == "base_torque" and scene.actuators.wheels is not None:
+            continue
         if getattr(scene.actuators, name) is None and needs.get(name, True):
             yield meaning
     passive = [link.name for link in scene.links if not link.actuated]
@@ -175,6 +177,7 @@ def _state_parts(layout: StateLayout) -> list[tuple[str, slice, str]]:
         ("angular velocity of the base, base axes", state.angular_velocity, "rad/s"),
         ("linear velocity of the base, base axes", state.linear_velocity, "m/s"),
         ("joint rates", state.joint_rates, units[1]),
+        ("axial momenta of the wheels", state.wheel_momenta, "N m s"),
         ("previous controls", state.actuators, ", ".join(dict.fromkeys(state.units[state.actuators]))),
     ]
 

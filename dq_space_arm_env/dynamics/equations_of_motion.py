@@ -9,7 +9,7 @@ from typing import Any
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
-from dq_space_arm_env.dynamics import minimal
+from dq_space_arm_env.dynamics import minimal, reaction_wheels
 from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of, reaction_wrenches
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
@@ -34,16 +34,18 @@ class Motion:
     linear: Sequence[Scalar]  # of the base's center of mass, base axes, m/s
     joint_rates: Sequence[Scalar]  # n, rad/s
     previous_controls: Sequence[Scalar]  # those of the layout, N, N m, rad/s
+    wheel_momenta: Sequence[Scalar] = ()  # axial, N m s
 
 
 @dataclass(frozen=True)
 class Inputs:
     """Commanded forces and rates; zero where a scene has no actuator."""
 
-    force: Sequence[Scalar]  # on the base, base axes, N
-    torque: Sequence[Scalar]  # on the base, base axes, N m
+    force: Sequence[Scalar]  # on the base from outside, base axes, N
+    torque: Sequence[Scalar]  # on the base from outside, base axes, N m
     joint_torques: Sequence[Scalar]  # n, N m
     wrist_rates: Sequence[Scalar]  # psi, theta, phi rates, rad/s; empty without a wrist
+    wheel_torques: Sequence[Scalar] = ()  # of the motors on the wheels, N m
 
 
 class EquationsOfMotion:
@@ -96,6 +98,7 @@ class EquationsOfMotion:
             twist[3:],
             part(layout.state.joint_rates),
             part(layout.state.actuators),
+            part(layout.state.wheel_momenta),
         )
 
     def inputs(self, u: Sequence[Scalar]) -> Inputs:
@@ -113,6 +116,7 @@ class EquationsOfMotion:
             torque=spread(torque, (2,) if planar else (0, 1, 2), 3) if torque else ZERO,
             joint_torques=torques,
             wrist_rates=wrist,
+            wheel_torques=list(u[layout.control.wheel_torque]),
         )
 
     def _tip(self, motion: Motion) -> tuple[Any, Any]:
@@ -132,12 +136,19 @@ class EquationsOfMotion:
 
     def _acting(self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None) -> list[Any]:
         """External force and torque on base and links, in their frames."""
-        acting: list[Any] = [(inputs.force, inputs.torque), *[(ZERO, ZERO)] * len(self.tree.links)]
+        torque = inputs.torque
+        if self.tree.wheels:
+            torque = add(torque, self._wheel_torque(motion, inputs.wheel_torques))
+        acting: list[Any] = [(inputs.force, torque), *[(ZERO, ZERO)] * len(self.tree.links)]
         if wrench is not None:
             force, torque = minimal.shift_wrench(*self._tip(motion), wrench[:3], wrench[3:])
             body = self.tree.tip_body
             acting[body] = (add(acting[body][0], force), add(acting[body][1], torque))
         return acting
+
+    def _wheel_torque(self, motion: Motion, torques: Sequence[Scalar] = ()) -> Sequence[Scalar]:
+        """Torque of the wheels on the base, base axes."""
+        return reaction_wheels.torque_on_base(self.tree.wheels, torques, motion.wheel_momenta, motion.angular)
 
     def _inertia(self, motion: Motion, *, many: bool = False) -> Inertia:
         frames = minimal.link_frames(self.tree, motion.joint_angles)
@@ -190,13 +201,16 @@ class EquationsOfMotion:
         given = Accelerations(ZERO, cross(motion.angular, motion.linear), [0.0] * len(self.tree.links))
         needed = minimal.inverse_dynamics(self.tree, frames, motion.angular, motion.joint_rates, given)
         passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
-        dual = [*needed.torque, *needed.force]
+        torque = subtract(needed.torque, self._wheel_torque(motion)) if self.tree.wheels else needed.torque
+        dual = [*torque, *needed.force]
         joints = [bias - other for bias, other in zip(needed.joints, passive, strict=True)]
         return [*(dual[i] for i in self.pose.directions), *joints]
 
     def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
-        """Time derivative of y: rates of joints and wrist, base and joint accelerations."""
-        return [*self.motion(y).joint_rates, *self.inputs(u).wrist_rates, *self.accelerations(y, u)]
+        """Time derivative of y: joint and wrist rates, base and joint accelerations, torques on wheels."""
+        inputs = self.inputs(u)
+        accelerations = self.accelerations(y, u)
+        return [*self.motion(y).joint_rates, *inputs.wrist_rates, *accelerations, *inputs.wheel_torques]
 
     def reaction_wrenches(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
         """The paper's T (21): fx, fy, fz [N], tx, ty [N m] that each joint transmits, in joint axes, 5 n.

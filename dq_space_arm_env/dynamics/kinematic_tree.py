@@ -11,7 +11,7 @@ symbols where they are parameters of the scene.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dq_space_arm_env.algebra.vectors import (
@@ -23,6 +23,7 @@ from dq_space_arm_env.algebra.vectors import (
     subtract,
     transpose,
 )
+from dq_space_arm_env.dynamics.reaction_wheels import Wheel, free_inertia
 from dq_space_arm_env.scene.parameters import center_name, inertia_name
 
 if TYPE_CHECKING:
@@ -92,6 +93,7 @@ class KinematicTree:
     planar: bool  # the base moves in its x-y plane only
     heaviest: int = 0  # body of greatest nominal mass: 0 is the base, i link i
     heavy_base: bool = False  # its nominal mass is beyond 100 times that of all links
+    wheels: tuple[Wheel, ...] = ()  # free to turn: the base's inertia is without their axial ones
 
     @property
     def bodies(self) -> list[RigidBody]:
@@ -115,9 +117,10 @@ class KinematicTree:
     def from_scene(cls, scene: Scene, given: Given | None = None) -> KinematicTree:
         """Collect a scene's constants; numbers `given` by name (`scene.parameters`) replace its own."""
         wrench, given, masses = scene.tip_wrench, given or {}, _nominal_masses(scene)
-        bodies = _link_bodies(scene, given)
+        bodies, base = _link_bodies(scene, given), _rigid_body(scene.base, "base", (0.0, 0.0, 0.0), given)
+        wheels = tuple(Wheel(wheel.unit_axis, wheel.inertia) for wheel in scene.actuators.wheels or ())
         return cls(
-            base=_rigid_body(scene.base, "base", (0.0, 0.0, 0.0), given),
+            base=replace(base, inertia=free_inertia(base.inertia, wheels)) if wheels else base,
             links=tuple(
                 JointedLink(
                     body,
@@ -138,6 +141,7 @@ class KinematicTree:
             planar=scene.base.motion == "planar",
             heaviest=masses.index(max(masses)),
             heavy_base=masses[0] > 100.0 * sum(masses[1:]),
+            wheels=wheels,
         )
 
 

@@ -20,6 +20,7 @@ from dq_space_arm_env.algebra.vectors import (
     subtract,
     transposed_matrix_vector,
 )
+from dq_space_arm_env.dynamics import reaction_wheels
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Screw
 from dq_space_arm_env.dynamics.minimal import ZERO, LinkFrame, link_frames, shift_wrench
 
@@ -261,7 +262,10 @@ def body_velocities(
 
 
 def momentum(
-    tree: KinematicTree, frames: Sequence[LinkFrame], velocities: Sequence[BodyVelocity]
+    tree: KinematicTree,
+    frames: Sequence[LinkFrame],
+    velocities: Sequence[BodyVelocity],
+    wheel_momenta: Sequence[Scalar] = (),
 ) -> tuple[Vector3, Vector3, Vector3]:
     """Linear momentum, angular momentum about the center of mass, and center of mass, in the base frame."""
     linear: list[Vector3] = []
@@ -283,11 +287,17 @@ def momentum(
         moments[parent] = add(moments[parent], add(rotated, scale(masses[i + 1], position)))
         masses[parent] = masses[i + 1] + masses[parent]
     center = scale(1.0 / masses[0], moments[0])
-    return linear[0], subtract(angular[0], cross(center, linear[0])), center  # L_c = L_O - c x p
+    total = subtract(angular[0], cross(center, linear[0]))  # L_c = L_O - c x p
+    if tree.wheels:
+        total = add(total, reaction_wheels.along_axes(tree.wheels, wheel_momenta))
+    return linear[0], total, center
 
 
 def energy(
-    tree: KinematicTree, joint_angles: Sequence[Scalar], velocities: Sequence[BodyVelocity]
+    tree: KinematicTree,
+    joint_angles: Sequence[Scalar],
+    velocities: Sequence[BodyVelocity],
+    wheel_momenta: Sequence[Scalar] = (),
 ) -> tuple[Scalar, Scalar]:
     """Kinetic energy and potential energy of the joint springs, J."""
     kinetic: Scalar = 0.0
@@ -295,6 +305,8 @@ def energy(
         v = add(velocity.linear, cross(velocity.angular, body.center_of_mass))
         rotational = dot(velocity.angular, matrix_vector(body.inertia, velocity.angular))
         kinetic = kinetic + 0.5 * (body.mass * dot(v, v) + rotational)
+    if tree.wheels:
+        kinetic = kinetic + reaction_wheels.energy(tree.wheels, wheel_momenta)
     potential: Scalar = 0.0
     for link, angle in zip(tree.links, joint_angles, strict=True):
         stretch = angle - link.rest_angle

@@ -1,7 +1,7 @@
 """Momentum of a scene's whole system, and the external wrench that changes it, over CasADi symbols.
 
-Joint torques, springs, dampers and the motion of the arm are internal: only base actuators and a wrench at
-the tip act from outside.
+Joint torques, springs, dampers, wheels and the motion of the arm are internal: only base actuators and a
+wrench at the tip act from outside.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from dq_space_arm_env.algebra.vectors import add
-from dq_space_arm_env.dynamics import minimal
+from dq_space_arm_env.dynamics import minimal, reaction_wheels
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion, Motion
 from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 
@@ -33,10 +33,16 @@ class SpaceArmMomentum:
         """Linear momentum, angular momentum about the center of mass, and the latter in the base frame."""
         motion, mass_matrix = self._mass_matrix(y)
         linear, angular = mass_matrix.momentum(motion.angular, motion.linear, motion.joint_rates)
+        if self._tree.wheels:
+            angular = add(angular, self.of_wheels(y))
         return linear, angular, mass_matrix.center
 
+    def of_wheels(self, y: Scalars) -> Scalars:
+        """Angular momentum that the wheels have besides the bodies; zeros without any."""
+        return reaction_wheels.along_axes(self._tree.wheels, self._field.motion(y).wheel_momenta)
+
     def base_twist(self, y: Scalars, linear: Scalars, angular: Scalars) -> list[Scalar]:
-        """Twist of the base, angular then linear, that gives the system a momentum; y's own is not read."""
+        """Twist of the base, angular then linear, that gives the bodies a momentum; y's own is not read."""
         motion, mass_matrix = self._mass_matrix(y)
         turning, moving = mass_matrix.base_velocity(linear, angular, motion.joint_rates)
         return [*turning, *moving]

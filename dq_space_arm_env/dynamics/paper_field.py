@@ -14,7 +14,7 @@ import casadi
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import vectors
 from dq_space_arm_env.algebra.symbolic import column, matrix, symbols, zeros
-from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
+from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler, reaction_wheels
 from dq_space_arm_env.dynamics.equations_of_motion import Inputs
 from dq_space_arm_env.dynamics.newton_euler import PaperState, SchurComplement
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
@@ -28,7 +28,7 @@ class PaperField:
     """Vector field of the paper's state with the tip's pose appended.
 
     For three links and a wrist: base pose (8), joint angles (3), wrist angles (3), dual velocities of the
-    four bodies (32), q_{G/I} (8).
+    four bodies (32), q_{G/I} (8). Wheels, which the paper does not have, add their axial momenta.
     """
 
     name = "paper"
@@ -46,7 +46,7 @@ class PaperField:
             *range(self._positions + 1, self._positions + 4),
             *range(self._positions + 5, self._positions + 8),
         )
-        self.n_x = self.n_y = self.tip.stop
+        self.n_x = self.n_y = self.tip.stop + len(self.tree.wheels)
         self.rate_indices = tuple(range(self._positions, self.tip.start))
 
     def state_from_minimal(self, x: Sequence[Scalar]) -> list[Scalar]:
@@ -63,7 +63,7 @@ class PaperField:
             at_center = vectors.add(velocity.linear, vectors.cross(velocity.angular, body.center_of_mass))
             duals += [0.0, *velocity.angular, 0.0, *at_center]
         tip = kinematics.tip_pose(tree, pose, motion.joint_angles, motion.wrist_angles)
-        return [*pose, *motion.joint_angles, *motion.wrist_angles, *duals, *tip]
+        return [*pose, *motion.joint_angles, *motion.wrist_angles, *duals, *tip, *motion.wheel_momenta]
 
     def minimal_from_state(self, y: Sequence[Scalar]) -> list[Scalar]:
         """The motion in minimal coordinates.
@@ -81,13 +81,22 @@ class PaperField:
         x[layout.wrist_angles] = list(state.wrist_angles)
         x[layout.base_velocity] = [twist[i] for i in field.pose.directions]
         x[layout.joint_rates] = newton_euler.joint_speeds(self.tree, state)
+        x[layout.wheel_momenta] = list(y[self.tip.stop :])
         return x
 
     def system(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> newton_euler.NewtonEulerSystem:
         """The linear system (20) for dual accelerations and reaction wrenches."""
         state, inputs = self._parts(y, u)
-        base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
-        return newton_euler.system_of(self.tree, state, base_wrench, inputs.joint_torques)
+        wrench = self._base_wrench(y, state, inputs)
+        return newton_euler.system_of(self.tree, state, wrench, inputs.joint_torques)
+
+    def _base_wrench(self, y: Sequence[Scalar], state: PaperState, inputs: Inputs) -> Sequence[Scalar]:
+        """Dual wrench on the base from outside, and of its wheels."""
+        torque = inputs.torque
+        if self.tree.wheels:
+            given = inputs.wheel_torques, y[self.tip.stop :], state.velocities[0][1:4]
+            torque = vectors.add(torque, reaction_wheels.torque_on_base(self.tree.wheels, *given))
+        return (0.0, *inputs.force, 0.0, *torque)
 
     def free_accelerations(self, y: Sequence[Scalar], ydot: Sequence[Scalar]) -> list[Scalar]:
         """Accelerations of base (free directions) and joints among the dual accelerations of all bodies."""
@@ -105,11 +114,12 @@ class PaperField:
     def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
         """Time derivative of the state: (11), (12), (22), and (30) for the tip."""
         state, inputs = self._parts(y, u)
-        base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
+        wrench = self._base_wrench(y, state, inputs)
         rates, _ = newton_euler.paper_rates(
-            self.tree, state, base_wrench, inputs.joint_torques, inputs.wrist_rates
+            self.tree, state, wrench, inputs.joint_torques, inputs.wrist_rates
         )
-        return [*rates, *newton_euler.paper_tip_rate(self.tree, state, inputs.wrist_rates)]
+        tip = newton_euler.paper_tip_rate(self.tree, state, inputs.wrist_rates)
+        return [*rates, *tip, *inputs.wheel_torques]
 
     def linearized_rates(
         self, y: Sequence[Scalar], u: Sequence[Scalar]
@@ -137,11 +147,12 @@ class PaperField:
             responses.append(column(*response))
         positions = newton_euler.paper_position_rates(self.tree, state, inputs.wrist_rates)
         tip = newton_euler.paper_tip_rate(self.tree, state, inputs.wrist_rates)
-        rates = casadi.densify(column(*positions, *accelerations, *tip))
+        rates = casadi.densify(column(*positions, *accelerations, *tip, *inputs.wheel_torques))
         jacobian = casadi.vertcat(
             casadi.jacobian(column(*positions), variables),
             casadi.horzcat(*responses),
             casadi.jacobian(column(*tip), variables),
+            casadi.jacobian(column(*inputs.wheel_torques), variables),
         )
         rates, jacobian = casadi.substitute([rates, jacobian], [variables], [values])
         return casadi.vertsplit(casadi.densify(rates)), jacobian[:, : self.n_y], jacobian[:, self.n_y :]

@@ -13,7 +13,7 @@ import casadi
 
 from dq_space_arm_env.algebra.symbolic import column, columns, dense_entries, symbols, zeros
 from dq_space_arm_env.algebra.vectors import add, cross, scale, subtract
-from dq_space_arm_env.dynamics import minimal
+from dq_space_arm_env.dynamics import minimal, reaction_wheels
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.forward import Inertia
 from dq_space_arm_env.dynamics.minimal import ZERO, Accelerations
@@ -62,12 +62,13 @@ class SpaceArmField(EquationsOfMotion):
             self._response(inertia, [-e for e in dense_entries(by_y[:, i])]) for i in range(self.n_y)
         ]
         response = columns(*(column(*entries) for entries in responses), rows=len(self.rate_indices))
-        rates = [*motion.joint_rates, *inputs.wrist_rates, *self._dual(motion, solved)]
+        rates = [*motion.joint_rates, *inputs.wrist_rates, *self._dual(motion, solved), *inputs.wheel_torques]
         angles_by_y, angles_by_u, turning_by_y = self._simple_jacobians(y)
-        jacobian_y = casadi.vertcat(angles_by_y, response + turning_by_y)
+        wheels_by_y, wheels_by_u = self._wheel_jacobians()
+        jacobian_y = casadi.vertcat(angles_by_y, response + turning_by_y, wheels_by_y)
         inputs_one_by_one = (self._input_response(inertia, i) for i in range(self.n_u))
         by_u = columns(*inputs_one_by_one, rows=len(self.rate_indices))
-        return rates, jacobian_y, casadi.vertcat(angles_by_u, by_u)
+        return rates, jacobian_y, casadi.vertcat(angles_by_u, by_u, wheels_by_u)
 
     def _inertial(
         self, y: Sequence[Scalar], rates: Sequence[Scalar], by_y: Matrix, by_u: Matrix
@@ -134,6 +135,14 @@ class SpaceArmField(EquationsOfMotion):
         )
         return casadi.jacobian(angles, column(*free_y)), casadi.jacobian(angles, column(*free_u)), by_y
 
+    def _wheel_jacobians(self) -> tuple[Matrix, Matrix]:
+        """Jacobians of the torques on wheels by y and u."""
+        columns_of_u = self.layout.control.wheel_torque
+        by_u = zeros(len(self.tree.wheels), self.n_u)
+        for row, index in enumerate(range(columns_of_u.start, columns_of_u.stop)):
+            by_u[row, index] = 1.0
+        return zeros(len(self.tree.wheels), self.n_y), by_u
+
     def _body_residual_jacobian(self, y: Sequence[Scalar], solved: Accelerations) -> Matrix:
         """Jacobian by y of the body wrenches and joint torques that fixed accelerations need.
 
@@ -173,7 +182,10 @@ class SpaceArmField(EquationsOfMotion):
         joints = [
             bias - other - load for bias, other, load in zip(needed.joints, passive, tip.joints, strict=True)
         ]
-        forces = [*subtract(needed.force, tip.force), *subtract(needed.torque, tip.torque), *joints]
+        torque = subtract(needed.torque, tip.torque)
+        if self.tree.wheels:
+            torque = subtract(torque, self._wheel_torque(motion))
+        forces = [*subtract(needed.force, tip.force), *torque, *joints]
         free = (*self.pose.directions, *range(6, 6 + n))
         return Residual(column(*forces), y, acceleration, free)
 
@@ -193,5 +205,8 @@ class SpaceArmField(EquationsOfMotion):
 
     def _input_response(self, inertia: Inertia, index: int) -> Matrix:
         unit = self.inputs([1.0 if i == index else 0.0 for i in range(self.n_u)])
-        forces = [*unit.force, *unit.torque, *unit.joint_torques]
+        torque = unit.torque
+        if self.tree.wheels:
+            torque = subtract(torque, reaction_wheels.along_axes(self.tree.wheels, unit.wheel_torques))
+        forces = [*unit.force, *torque, *unit.joint_torques]
         return column(*self._response(inertia, self._on_base(forces)))

@@ -19,7 +19,6 @@ from typing import Any
 import casadi
 
 from dq_space_arm_env.algebra.symbolic import column, columns, dense_entries, symbols
-from dq_space_arm_env.algebra.vectors import transposed_matrix_vector
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.integrators.momentum_coordinates import (
     LocalState,
@@ -102,12 +101,12 @@ class CanonicalCoordinates:
 
     def _turning(self, state: LocalState) -> list[Scalar]:
         """The base's angular velocity for given joint rates, base axes."""
-        angular = transposed_matrix_vector(self.given.rotation_matrix(state.rotation), state.angular)
+        angular = self.given.angular_of_bodies(state)
         return self.given.twist(state.shape, (0.0, 0.0, 0.0), angular, state.joint_rates)[:3]
 
     def _velocities(self, state: LocalState) -> tuple[Scalars, Scalars]:
         """The base's angular velocity, base axes, and the joint rates for given canonical momenta."""
-        angular = transposed_matrix_vector(self.given.rotation_matrix(state.rotation), state.angular)
+        angular = self.given.angular_of_bodies(state)
         solved = self._mass_matrix(state.shape).velocities(angular, state.joint_rates)
         return solved.angular, solved.joints
 
@@ -116,11 +115,12 @@ class CanonicalCoordinates:
     ) -> list[Scalar]:
         given = self.given
         linear, angular = given.momentum_rates(state, u)
+        inputs = given.base.inputs(u)
         y = given.y(state.shape, [0.0] * 6, joint_rates)
         return given.joined(
             LocalState(
                 given.rotation_rate(state.rotation, omega),
-                [*joint_rates, *given.base.inputs(u).wrist_rates],
+                [*joint_rates, *inputs.wrist_rates, *inputs.wheel_torques],
                 [entry * (1.0 / self.balance.mass) for entry in state.linear],
                 linear,
                 angular,
@@ -148,5 +148,5 @@ class CanonicalCoordinates:
         gradient = casadi.substitute(casadi.densify(gradient), names, values)
         inertial = dense_entries(gradient)
         torques = self.balance.joint_torques(y, u)
-        # Joint angles come before wrist angles, which nothing depends on.
+        # Joint angles come before wrist angles and wheel momenta, which these do not depend on.
         return [a + b for a, b in zip(inertial[:n], torques, strict=True)]

@@ -2,8 +2,8 @@
 
 They are local to a step, seen from the base frame at its start ("start axes"):
 
-    rotation of the base (rotation vector), joint and wrist angles, displacement of the system's center of
-    mass, linear momentum, angular momentum about the center of mass, joint rates.
+    rotation of the base (rotation vector), joint and wrist angles, wheel momenta, displacement of the
+    system's center of mass, linear momentum, angular momentum about the center of mass, joint rates.
 
 The base's angular velocity follows from the angular momentum, the joint rates and the locked inertia, its
 position from the center of mass. Without an external wrench both momenta have time derivative zero: any
@@ -52,7 +52,7 @@ class LocalState:
     """The parts of a state in these coordinates; vectors have 3 entries in start axes."""
 
     rotation: Scalars  # rotation vector of the base, rad, or its coordinates in a subclass
-    shape: Scalars  # joint and wrist angles, rad
+    shape: Scalars  # joint and wrist angles, rad, and wheel momenta, N m s
     displacement: Scalars  # of the system's center of mass, m
     linear: Scalars  # momentum, kg m/s
     angular: Scalars  # momentum about the center of mass, kg m^2/s
@@ -141,12 +141,24 @@ class MomentumCoordinates:
         return result
 
     def twist(self, shape: Scalars, linear: Scalars, angular: Scalars, joint_rates: Scalars) -> list[Scalar]:
-        """The base's twist for a momentum in base axes."""
+        """The base's twist for a momentum of the bodies in base axes."""
         return self.balance.base_twist(self.y(shape, [0.0] * 6, joint_rates), linear, angular)
+
+    def angular_of_bodies(self, state: LocalState) -> Scalars:
+        """Angular momentum of the bodies, base axes: all but what wheels have besides them."""
+        return self._less_wheels(
+            state.shape, transposed_matrix_vector(self.rotation_matrix(state.rotation), state.angular)
+        )
+
+    def _less_wheels(self, shape: Scalars, angular: Scalars) -> Scalars:
+        if not self.base.tree.wheels:
+            return angular
+        still = [0.0] * len(self.joint_indices)
+        return subtract(angular, self.balance.of_wheels(self.y(shape, [0.0] * 6, still)))
 
     def _moving(self, state: LocalState) -> tuple[list[Scalar], list[Scalar]]:
         """The base's angular velocity, and y with it; no rate depends on the linear velocity."""
-        angular = transposed_matrix_vector(self.rotation_matrix(state.rotation), state.angular)
+        angular = self.angular_of_bodies(state)
         omega = self.twist(state.shape, (0.0, 0.0, 0.0), angular, state.joint_rates)[:3]
         return omega, self.y(state.shape, [*omega, 0.0, 0.0, 0.0], state.joint_rates)
 
@@ -282,7 +294,8 @@ class MomentumCoordinates:
         """
         back = quaternion.conjugate(self.quaternion(state.rotation))
         linear, angular = (rotations.rotate(back, part) for part in (state.linear, state.angular))
-        return linear, angular, self.twist(state.shape, linear, angular, state.joint_rates)
+        bodies = self._less_wheels(state.shape, angular)
+        return linear, angular, self.twist(state.shape, linear, bodies, state.joint_rates)
 
     def relative_pose(self, state: LocalState, before: Scalars, after: Scalars) -> Scalars:
         """Pose of the base seen from the start of the step, given the centers of mass in the base frame."""

@@ -45,6 +45,8 @@ def refuse(scene: Scene, language: str, wrist: str, *, springs: bool = False, pl
     screws = [link.name for link in scene.links if link.joint_type == "screw"]
     if screws:
         problems.append(f"it has no screw joints, and link {screws[0]!r} has one")
+    if scene.actuators.wheels is not None:
+        problems.append("it has no reaction wheels: leave them out with replace({'actuators.wheels': None})")
     if problems:
         raise SceneError("\n  - ".join([f"scene {scene.name!r} cannot be written as {language}:", *problems]))
 

@@ -56,8 +56,8 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
         The MJCF text, all numbers with 17 digits, in m, kg, s, rad.
 
     Raises:
-        SceneError: If the scene has a wrist that is not to be fixed, a constant wrench at the tip, or a screw
-            joint.
+        SceneError: If the scene has a wrist that is not to be fixed, a constant wrench at the tip, a screw
+            joint, or reaction wheels.
     """
     refuse(scene, "MJCF", wrist)
     root = Element("mujoco", model=scene.name)

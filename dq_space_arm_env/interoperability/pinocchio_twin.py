@@ -13,7 +13,7 @@ from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Placement, RigidBody, Screw
 from dq_space_arm_env.interoperability.exporting import tip_on_its_body
-from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene import Scene, SceneError, StateLayout
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 
 Array = NDArray[np.float64]
@@ -36,9 +36,10 @@ def pinocchio_model(scene: Scene) -> Any:
 
     Raises:
         ImportError: If Pinocchio is not installed.
+        SceneError: If the scene has reaction wheels, which are not part of this model.
     """
     pin = _pinocchio()
-    tree = KinematicTree.from_scene(scene)
+    tree = _equations(scene).tree
     model = pin.Model()
     model.name = scene.name
     model.gravity = pin.Motion.Zero()
@@ -75,7 +76,7 @@ def to_pinocchio(scene: Scene, x: ArrayLike) -> tuple[Array, Array]:
         v_x, v_y, omega_z, joint rates, (3 + n,)).
 
     Raises:
-        ValueError: If x has another shape.
+        ValueError: If x has another shape, or the scene reaction wheels (`SceneError`).
     """
     equations, entries = _equations(scene), StateLayout.of(scene).state
     values = _checked("x", x, equations.n_x)
@@ -163,6 +164,11 @@ def _pinocchio() -> Any:
 
 
 def _equations(scene: Scene) -> EquationsOfMotion:
+    if scene.actuators.wheels is not None:
+        raise SceneError(
+            f"scene {scene.name!r} cannot be written for Pinocchio: its reaction wheels have no place in the "
+            "model; leave them out with replace({'actuators.wheels': None})"
+        )
     return EquationsOfMotion(KinematicTree.from_scene(scene), StateLayout.of(scene))
 
 

@@ -34,8 +34,8 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     wheels, start, task or other constraints. Shapes become visuals.
 
     Features that URDF lacks and that change the motion are refused: joint springs, screw joints, a wrench at
-    the tip, a planar base. The massless wrist as three joints would have infinite accelerations; fixed at its
-    initial angles it changes no acceleration, but the tip cannot turn.
+    the tip, a planar base, reaction wheels. The massless wrist as three joints would have infinite
+    accelerations; fixed at its initial angles it changes no acceleration, but the tip cannot turn.
 
     Args:
         scene: A validated scene.

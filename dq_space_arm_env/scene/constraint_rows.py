@@ -17,10 +17,11 @@ from dq_space_arm_env.scene.constraints import (
     Plume,
     Terminal,
     Volume,
+    WheelLimits,
     WheelMomentum,
     per_link,
 )
-from dq_space_arm_env.scene.parameters import control_numbers
+from dq_space_arm_env.scene.parameters import control_numbers, wheel_names
 from dq_space_arm_env.scene.pose import PLANAR_TWIST
 
 Scene = Any  # `schema.Scene`
@@ -98,6 +99,13 @@ def rows_of(scene: Scene, each: Constraint) -> list[Row]:
         axes = AXES[2:] if scene.base.motion == "planar" else AXES
         names = [f"{each.name}: {sign}{axis}" for axis in axes for sign in "+-"]
         rows += [Row(name, "N m s", *common) for name in names]
+    elif isinstance(each, WheelLimits):
+        for which, wheel in zip(wheel_names(scene), scene.actuators.wheels, strict=True):
+            start = f"{each.name}: {which}"
+            if math.isfinite(wheel.speed):
+                rows += [Row(f"{start} speed {sign}", "rad/s", *common) for sign in "-+"]
+            if math.isfinite(wheel.power):
+                rows += [Row(f"{start} power {sign}", "W", *common, has_input=True) for sign in "-+"]
     elif isinstance(each, ControlRate):
         for limit in rate_limits(scene, each):
             names = [f"{each.name}: {limit.name} {word}" for word in ("falls", "rises")]
@@ -225,7 +233,7 @@ def rate_limits(scene: Scene, each: ControlRate) -> list[RateLimit]:
     # The name of a control's limit in the scene ends with its axis.
     found, index = [], 0
     for field, numbers in control_numbers(scene).items():
-        given = getattr(each, field)
+        given = getattr(each, field, None)
         for number in numbers:
             axis = number.limit.paths[0].rpartition(".")[2]
             rate = given[int(axis)] if isinstance(given, tuple) else given

@@ -270,6 +270,12 @@ class WheelMomentum(Constraint):
     capacity: Positive = Field(description="greatest momentum about each axis of the base, N m s")
 
 
+class WheelLimits(Constraint):
+    """Wheels stay below their largest speeds and powers; residuals in rad/s and W."""
+
+    kind: Literal["wheel_limits"] = Field(description="'wheel_limits'")
+
+
 class ControlRate(Constraint):
     """Greatest change of controls per second, from step to step; residuals in N, N m, rad/s.
 
@@ -318,6 +324,7 @@ _KINDS: dict[str, type[Constraint]] = {
     "plume": Plume,
     "momentum": Momentum,
     "wheel_momentum": WheelMomentum,
+    "wheel_limits": WheelLimits,
     "control_rate": ControlRate,
     "terminal": Terminal,
 }
@@ -343,6 +350,7 @@ AnyConstraint = Annotated[
     | Plume
     | Momentum
     | WheelMomentum
+    | WheelLimits
     | ControlRate
     | Terminal,
     BeforeValidator(_read_constraint),
@@ -377,6 +385,9 @@ def constraint_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem((*here, "kind"), constraint.kind, "the scene has no thrusters: remove it")
         elif isinstance(constraint, WheelMomentum):
             yield from _wheel_problems(scene, (*here, "kind"))
+        elif isinstance(constraint, WheelLimits) and not _has_wheel_limits(scene):
+            sentence = "the scene's wheels have no largest speed or power: remove it"
+            yield Problem((*here, "kind"), constraint.kind, sentence)
         elif isinstance(constraint, ControlRate):
             yield from _control_rate_problems(scene, here, constraint)
         if isinstance(constraint, Plume | ControlRate | Terminal) and constraint.observed is not None:
@@ -421,8 +432,16 @@ def _control_rate_problems(
             yield Problem((*here, field), rate, f"must be absent: the scene has no actuators.{field}")
 
 
+def _has_wheel_limits(scene: Scene) -> bool:
+    return any(math.isfinite(min(wheel.speed, wheel.power)) for wheel in scene.actuators.wheels or ())
+
+
 def _wheel_problems(scene: Scene, place: tuple[str | int, ...]) -> Iterator[Problem]:
     """Find what would change the total angular momentum, or have it differ from zero at the start."""
+    if scene.actuators.wheels is not None:
+        sentence = "is for the ideal actuators.base_torque: limit wheels by the kind wheel_limits"
+        yield Problem(place, "wheel_momentum", sentence)
+        return
     start, spread = scene.initial_state, scene.spread
     velocities = (*start.base_velocity, *start.joint_rates)
     velocities += (spread.base_angular_velocity, spread.base_linear_velocity, spread.joint_rates)

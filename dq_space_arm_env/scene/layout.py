@@ -1,10 +1,10 @@
 """Layout of the state, the tangent, the controls and the parameters of a scene.
 
-State: base pose, joint angles, wrist angles, base velocity, joint rates, and what actuators keep from step to
-step: the previous controls whose rates are limited. Tangent: the same, with a twist
-increment of the base in base axes (rotation, then translation) in place of the pose. Controls: base force,
-base torque, joint torques of the actuated joints, wrist rates. Parameters: target, bodies from base to
-payload, weights, limits. What a scene does not have is missing; the order stays.
+State: base pose, joint angles, wrist angles, base velocity, joint rates, axial momenta of wheels, and what
+actuators keep from step to step: the previous controls whose rates are limited. Tangent: the same, with a
+twist increment of the base in base axes (rotation, then translation) in place of the pose. Controls: base
+force, base torque, joint torques of the actuated joints, wrist rates, wheel torques. Parameters: target,
+bodies from base to payload, weights, limits. What a scene does not have is missing; the order stays.
 A planar base keeps only what is not zero by construction: q_r0, q_r3, q_d1, q_d2 of its pose, and omega_z,
 v_x, v_y.
 """
@@ -31,6 +31,7 @@ from dq_space_arm_env.scene.parameters import (
     is_part,
     moving_numbers,
     parameters,
+    wheel_names,
 )
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from dq_space_arm_env.scene.schema import Scene
@@ -58,6 +59,7 @@ class _MotionEntries(_Entries):
     angular_velocity: slice  # part of base_velocity
     linear_velocity: slice  # part of base_velocity
     joint_rates: slice  # base to tip
+    wheel_momenta: slice  # axial, inertial rate, in the order of the scene's wheels
     actuators: slice  # previous controls, those of `StateLayout.previous_controls`
 
 
@@ -84,6 +86,7 @@ class ControlEntries(_Entries):
     base_torque: slice  # base axes, 3 numbers (planar: z)
     joint_torque: slice  # actuated joints, base to tip
     wrist_rate: slice  # Euler rates psi, theta, phi
+    wheel_torque: slice  # of the motor on each wheel, about its axis
     limits: tuple[str, ...]  # name of each control's limit in the scene
     weights: tuple[str, ...]  # name of each control's weight in the cost
 
@@ -370,6 +373,7 @@ class _Collector:
             "angular_velocity": angular,
             "linear_velocity": linear,
             "joint_rates": joint_rates,
+            "wheel_momenta": self.add("N m s", [f"{name} momentum" for name in wheel_names(scene)]),
             "actuators": self.add_previous_controls(scene),
         }
 
@@ -416,6 +420,7 @@ def _lay_out_controls(controls: Mapping[str, Sequence[ControlNumbers]]) -> Contr
         base_torque=slices["base_torque"],
         joint_torque=slices["joint_torque"],
         wrist_rate=slices["wrist_rate"],
+        wheel_torque=slices["wheel_torque"],
         limits=tuple(each.limit.name for each in everything),
         weights=tuple(each.weight.name for each in everything),
         **entries.collected(),

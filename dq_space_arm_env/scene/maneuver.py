@@ -8,6 +8,7 @@ from dq_space_arm_env.scene.bodies import Payload
 from dq_space_arm_env.scene.motion import Motion
 from dq_space_arm_env.scene.pose import Pose
 from dq_space_arm_env.scene.shapes import Shape, geometry_field
+from dq_space_arm_env.scene.wheels import Wheels
 from dq_space_arm_env.validation.fields import (
     Angles,
     AngleSpread,
@@ -53,13 +54,18 @@ class Actuators(Model):
         default=None, description="thrusters: force on the base in base axes, N"
     )
     base_torque: AxisLimits | None = Field(
-        default=None, description="wheels: torque on the base in base axes, N m"
+        default=None, description="ideal wheels: torque on the base in base axes, N m"
     )
     joint_torque: JointLimit | None = Field(
         default=None, description="joint motors: torque about the joint axis, N m"
     )
     wrist_rate: AxisLimits | None = Field(
         default=None, description="wrist: Euler rates psi, theta, phi of the spherical joint, rad/s"
+    )
+    wheels: Wheels | None = Field(
+        default=None,
+        exclude_if=lambda wheels: wheels is None,
+        description="reaction wheels, one by one, or as a set: {set: orthogonal or pyramid, ...}",
     )
 
 
@@ -168,6 +174,11 @@ class Cost(Model):
     wrist_rate: ControlWeights3 = Field(
         default=(0.1,) * 3, description="weight on the wrist's Euler rates, (s/rad)^2: one number or 3"
     )
+    wheel_torque: ControlWeight = Field(
+        default=1.0,
+        exclude_if=lambda weight: weight == 1.0,
+        description="weight on the wheels' torques, 1/(N m)^2: one number",
+    )
 
 
 class InitialState(Model):
@@ -188,6 +199,11 @@ class InitialState(Model):
     )
     joint_rates: Rates = Field(
         default=(), description="joint rates, base to tip, one per link, rad/s; empty: zeros"
+    )
+    wheel_speeds: Rates = Field(
+        default=(),
+        exclude_if=lambda speeds: not speeds,
+        description="speeds of the wheels relative to the base, one per wheel, rad/s; empty: zeros",
     )
     previous_controls: Loads = Field(
         default=(),
@@ -217,6 +233,9 @@ class Spread(Model):
         default=0.0, description="linear velocity of the base, base axes, m/s"
     )
     joint_rates: RateSpread = Field(default=0.0, description="joint rates, rad/s")
+    wheel_speeds: RateSpread = Field(
+        default=0.0, exclude_if=lambda width: not width, description="speeds of the wheels, rad/s"
+    )
     target_rotation: AngleSpread = Field(
         default=0.0, description="rotation vector of the target in its own axes, rad"
     )

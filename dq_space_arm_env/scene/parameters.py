@@ -23,7 +23,16 @@ _EULER_ANGLES = ("psi", "theta", "phi")
 _LOWER_TRIANGLE = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
 _POSE = tuple(f"q_{part}{index}" for part in "rd" for index in range(4))
 _TWIST = tuple(f"{kind}_{axis}" for kind in ("omega", "v") for axis in _AXES)
-CONTROL_UNITS = {"base_force": "N", "base_torque": "N m", "joint_torque": "N m", "wrist_rate": "rad/s"}
+CONTROL_UNITS = {
+    "base_force": "N",
+    "base_torque": "N m",
+    "joint_torque": "N m",
+    "wrist_rate": "rad/s",
+    "wheel_torque": "N m",
+}
+"""Units of the controls, in their order."""
+ACTUATORS = {field: field for field in CONTROL_UNITS} | {"wheel_torque": "wheels"}
+"""Names in `actuators` of what the controls drive."""
 _STATE_WEIGHTS = {
     "pose": (_POSE, PLANAR_POSE),
     "terminal_pose": (_POSE, PLANAR_POSE),
@@ -245,11 +254,12 @@ def control_numbers(scene: Scene) -> dict[str, list[ControlNumbers]]:
     """The controls by actuator, in order; an absent one, or one without joints, has none."""
     planar = _is_planar(scene)
     axes = {"base_force": (0, 1), "base_torque": (2,)} if planar else {}
+    others = {"joint_torque": _joint_controls, "wheel_torque": _wheel_controls}
     return {
         field: [
             *(
-                _joint_controls(scene)
-                if field == "joint_torque"
+                others[field](scene)
+                if field in others
                 else _axis_controls(scene, field, axes.get(field, range(3)))
             )
         ]
@@ -280,6 +290,20 @@ def _joint_controls(scene: Scene) -> Iterator[ControlNumbers]:
         if link.torque_limit is not None:
             limit = _number(f"links.{index}.torque_limit", link.effort_unit, link.torque_limit)
         yield ControlNumbers(f"{link.name} {'torque' if link.turns else 'force'}", limit, weight)
+
+
+def _wheel_controls(scene: Scene) -> Iterator[ControlNumbers]:
+    for index, name in enumerate(wheel_names(scene)):
+        weight = _number("cost.wheel_torque", _per_square("wheel_torque"), scene.cost.wheel_torque)
+        torque = scene.actuators.wheels[index].torque
+        yield ControlNumbers(
+            f"{name} torque", _number(f"actuators.wheels.{index}.torque", "N m", torque), weight
+        )
+
+
+def wheel_names(scene: Scene) -> list[str]:
+    """Names of the wheels, in their order."""
+    return [f"wheel {index + 1}" for index in range(len(scene.actuators.wheels or ()))]
 
 
 def _per_square(field: str) -> str:

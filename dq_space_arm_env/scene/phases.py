@@ -11,7 +11,13 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import BeforeValidator, Field, PlainSerializer
 
 from dq_space_arm_env.scene.maneuver import Success
-from dq_space_arm_env.scene.parameters import drawn_factors, has_target_spread, numbers, target_numbers
+from dq_space_arm_env.scene.parameters import (
+    ACTUATORS,
+    drawn_factors,
+    has_target_spread,
+    numbers,
+    target_numbers,
+)
 from dq_space_arm_env.validation.fields import Name, Steps
 from dq_space_arm_env.validation.problems import Model, Problem, SceneError, problem
 
@@ -209,7 +215,7 @@ def _drawn_problems(scene: Scene) -> Iterator[Problem]:
         yield Problem(("phases",), both[0], "phases change it, so it can have no spread")
 
 
-_FIELDS = ("base_force", "base_torque", "joint_torque", "wrist_rate")
+_FIELDS = tuple(ACTUATORS.values())
 
 
 def _may_change(path: str, names: set[str]) -> bool:

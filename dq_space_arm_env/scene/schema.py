@@ -30,10 +30,11 @@ from dq_space_arm_env.scene.maneuver import (
     TipWrench,
 )
 from dq_space_arm_env.scene.motion import Motion, ScrewMotion, Tumbling, Waypoints
-from dq_space_arm_env.scene.parameters import control_numbers, is_part, numbers, parents
+from dq_space_arm_env.scene.parameters import ACTUATORS, control_numbers, is_part, numbers, parents
 from dq_space_arm_env.scene.phases import Phase, StagedNumbers, phase_problems, staged_numbers
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.scene.simulation import Simulation
+from dq_space_arm_env.scene.wheels import wheel_problems
 from dq_space_arm_env.validation.changes import ChangeError, merged, nested
 from dq_space_arm_env.validation.fields import Name
 from dq_space_arm_env.validation.problems import Model, Problem, SceneError, problem_list, raise_problems
@@ -163,6 +164,7 @@ class Scene(Model):
         yield from self._actuator_problems()
         yield from self._part_problems()
         yield from self._tumbling_problems()
+        yield from wheel_problems(self)
         yield from self._cost_problems()
         yield from self._parameter_problems()
         if self.phases:
@@ -268,19 +270,16 @@ class Scene(Model):
 
     def _cost_problems(self) -> Iterator[Problem]:
         """Find weights with which the reward of inputs at their limits would not be a number."""
-        for name in type(self.actuators).model_fields:
-            actuator, weight = getattr(self.actuators, name), getattr(self.cost, name)
-            if actuator is None:
-                continue
-            largest = [link.torque_limit or 0.0 for link in self.links] if name == "joint_torque" else []
-            largest += [*actuator.limit] if isinstance(actuator.limit, tuple) else [actuator.limit]
-            bound = max((limit for limit in largest if limit < math.inf), default=0.0)
-            heaviest = max(weight) if isinstance(weight, tuple) else weight
+        for name, controls in control_numbers(self).items():
+            limits = [each.limit.nominal for each in controls if each.limit.nominal < math.inf]
+            bound, weight = max(limits, default=0.0), getattr(self.cost, name)
+            heaviest = max((each.weight.nominal for each in controls), default=0.0)
             cost = heaviest * bound**2 * self.simulation.steps
             if cost > _LARGEST_COST:
                 sentence = (
                     f"with the limit {bound:g} and {self.simulation.steps} steps an episode may cost "
-                    f"{cost:.3g}, it must be at most {_LARGEST_COST:g}: lower it or actuators.{name}.limit"
+                    f"{cost:.3g}, it must be at most {_LARGEST_COST:g}: lower it or "
+                    f"actuators.{ACTUATORS[name]}"
                 )
                 yield Problem(("cost", name), weight, sentence)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.algebra.quaternion import multiply
 from dq_space_arm_env.algebra.scalars import select
-from dq_space_arm_env.algebra.vectors import matrix_vector, transposed_matrix_vector
+from dq_space_arm_env.algebra.vectors import dot, matrix_vector, transposed_matrix_vector
 from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.maneuver import Spread
 from dq_space_arm_env.scene.motion import ScrewMotion, Tumbling
@@ -30,6 +30,7 @@ from dq_space_arm_env.scene.parameters import (
     target_numbers,
     velocity_entries,
     velocity_numbers,
+    wheel_names,
 )
 from dq_space_arm_env.scene.path import first_velocity
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST, Pose
@@ -77,7 +78,8 @@ def number_of_draws(scene: Scene) -> int:
     base = len(turning) + len(moving)
     states = 2 * base + 2 * len(start.joint_angles) + len(start.wrist_angles)
     drawn = [has_target_spread(scene), has_velocity_spread(scene), has_grasp_spread(scene)]
-    return states + base * sum(drawn) + sum(1 for _ in drawn_factors(scene))
+    wheels = len(wheel_names(scene)) if scene.spread.wheel_speeds else 0
+    return states + base * sum(drawn) + sum(1 for _ in drawn_factors(scene)) + wheels
 
 
 def start_from_draws(scene: Scene, draws: Array) -> Array:
@@ -96,8 +98,8 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     wrist angles, angular and linear velocity of the base, joint rates; then, where there is a spread:
     rotation vector of the target (in its axes) and its position (in inertial axes), mass and inertia of the
     base, masses of the links, inertias of the links, mass and inertia of the payload, angular and linear
-    velocity of the target, rotation vector and position of the grasp frame. A planar base, and its target,
-    turn about z and move in x and y only.
+    velocity of the target, rotation vector and position of the grasp frame, speeds of the wheels. A planar
+    base, and its target, turn about z and move in x and y only.
     """
     start, spread = scene.initial_state, scene.spread
     turning, moving = free_axes(scene)
@@ -159,8 +161,14 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     if is_planar(scene):
         pose = [pose[index] for index in PLANAR_POSE]
         velocity = [velocity[index] for index in PLANAR_TWIST]
+    wheels, speeds = scene.actuators.wheels or (), list(start.wheel_speeds or [0.0] * len(wheel_names(scene)))
+    if spread.wheel_speeds:
+        speeds = spread_out(speeds, spread.wheel_speeds, range(len(wheels)))
+    momenta = [
+        w.inertia * (speed + dot(w.unit_axis, angular)) for w, speed in zip(wheels, speeds, strict=True)
+    ]
     previous = start.previous_controls or (0.0,) * len(previous_controls(scene))
-    state = [*pose, *joint_angles, *wrist_angles, *velocity, *joint_rates, *previous]
+    state = [*pose, *joint_angles, *wrist_angles, *velocity, *joint_rates, *momenta, *previous]
     return EpisodeStart(state, drawn)
 
 

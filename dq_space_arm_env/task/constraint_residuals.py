@@ -25,7 +25,7 @@ from dq_space_arm_env.algebra.vectors import (
     scale,
     subtract,
 )
-from dq_space_arm_env.dynamics import kinematics, minimal
+from dq_space_arm_env.dynamics import kinematics, minimal, reaction_wheels
 from dq_space_arm_env.scene.constraint_rows import (
     directions,
     exact_rows,
@@ -49,6 +49,7 @@ from dq_space_arm_env.scene.constraints import (
     Point,
     Terminal,
     Volume,
+    WheelLimits,
     WheelMomentum,
 )
 from dq_space_arm_env.scene.schema import Scene
@@ -113,8 +114,8 @@ class _Situation:
         frames = minimal.link_frames(tree, motion.joint_angles)
         twist = (*motion.angular, *motion.linear)
         velocities = kinematics.body_velocities(tree, frames, twist, motion.joint_rates)
-        linear, angular, _ = kinematics.momentum(tree, frames, velocities)
-        kinetic, potential = kinematics.energy(tree, motion.joint_angles, velocities)
+        linear, angular, _ = kinematics.momentum(tree, frames, velocities, motion.wheel_momenta)
+        kinetic, potential = kinematics.energy(tree, motion.joint_angles, velocities, motion.wheel_momenta)
         return linear, angular, kinetic + potential
 
 
@@ -362,6 +363,27 @@ def _wheel_momentum(situation: _Situation, constraint: WheelMomentum) -> Iterato
         yield angular[axis] - constraint.capacity
 
 
+def _wheel_limits(situation: _Situation, constraint: WheelLimits) -> Iterator[Scalar]:
+    """Speeds within +-Omega_max, torques within +-P / |Omega|.
+
+    The latter are seen at the corner P / u_max, the speed where the power takes over from the torque: nearly
+    linear in u and Omega, where u Omega is as curved as a saddle.
+    """
+    motion, tree = situation.motion, situation.equations.tree
+    found = reaction_wheels.speeds(tree.wheels, motion.wheel_momenta, motion.angular)
+    given = situation.scene.actuators.wheels or ()
+    for wheel, speed, torque in zip(given, found, situation.inputs.wheel_torques, strict=True):
+        if math.isfinite(wheel.speed):
+            yield -speed - wheel.speed
+            yield speed - wheel.speed
+        if math.isfinite(wheel.power):
+            corner = wheel.power / wheel.torque if math.isfinite(wheel.torque) else 1.0
+            size = casadi.fabs(speed)
+            most = wheel.power / select(size > 0.5 * corner, size, 0.5 * corner)
+            yield corner * (-torque - most)
+            yield corner * (torque - most)
+
+
 def _control_rate(situation: _Situation, constraint: ControlRate) -> Iterator[Scalar]:
     scene, layout = situation.scene, situation.equations.layout
     before = dict(zip(layout.previous_controls, situation.motion.previous_controls, strict=True))
@@ -381,6 +403,7 @@ _RESIDUALS: dict[type[Constraint], Callable[..., Iterator[Scalar]]] = {
     Plume: _plume,
     Momentum: _momentum,
     WheelMomentum: _wheel_momentum,
+    WheelLimits: _wheel_limits,
     ControlRate: _control_rate,
 }
 

@@ -31,6 +31,7 @@ from dq_space_arm_env.scene.parameters import parameters as all_parameters
 from dq_space_arm_env.scene.path import advanced
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import episode_start, parameter_values
+from dq_space_arm_env.task.actuator_limits import applied
 from dq_space_arm_env.task.catching import Catching, has_catch
 from dq_space_arm_env.task.constraint_residuals import charged, observed_besides, reported
 from dq_space_arm_env.task.equations import (
@@ -62,11 +63,12 @@ def start(scene: Scene, draws: Scalars) -> Outputs:
     return {**outputs, "parameters": parameters} if parameters else outputs
 
 
-def command(equations: SceneEquations, action: Scalars) -> Outputs:
-    """Inputs in N, N m, rad/s, from an action that is clipped to [-1, 1]."""
+def command(equations: SceneEquations, action: Scalars, x: Scalars = ()) -> Outputs:
+    """Inputs in N, N m, rad/s, from an action that is clipped to [-1, 1], as the actuators apply them."""
     # Ordered such that NaN passes: if two numbers do not compare, fmin and fmax take the second.
     clipped = [casadi.fmin(1.0, casadi.fmax(-1.0, value)) for value in action]
-    return {"u": [limit * value for limit, value in zip(equations.control_limits, clipped, strict=True)]}
+    asked = [limit * value for limit, value in zip(equations.control_limits, clipped, strict=True)]
+    return {"u": applied(equations, x, asked)}
 
 
 def observe(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:

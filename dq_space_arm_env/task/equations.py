@@ -228,6 +228,7 @@ class SceneEquations:
             *motion.joint_angles,
             *motion.wrist_angles,
             *motion.joint_rates,
+            *motion.wheel_momenta,
             *motion.previous_controls,
             *([self.given[PHASE]] if self.scene.phases else []),
             *besides,

@@ -35,6 +35,8 @@ class WorstCase:
     def __init__(self, equations: SceneEquations) -> None:
         self.equations, self.tree = equations, equations.tree
         self.inputs = equations.field.inputs(equations.control_limits)
+        # Against the wheels' motors; their gyroscopic torque does no work.
+        self.torque = total([norm(self.inputs.torque), *map(casadi.fabs, self.inputs.wheel_torques)])
         self.bodies = self.tree.bodies
         self.last = self.bodies[self.tree.tip_body]  # it carries the tip
         self.mass = total([body.mass for body in self.bodies])
@@ -152,7 +154,7 @@ class WorstCase:
         inputs, links, bodies = self.inputs, self.tree.links, self.bodies
         forces: list[Scalar] = [norm(inputs.force), *[0.0] * len(links)]
         # Components of the torques as they act in I^-1/2, added as if all pointed the same way.
-        torques = [_turned(self.tree.base, norm(inputs.torque)), *[0.0] * len(links)]
+        torques = [_turned(self.tree.base, self.torque), *[0.0] * len(links)]
         for i, (link, limit) in enumerate(zip(links, inputs.joint_torques, strict=True)):
             axis, effort, parent = matrix_vector(link.joint.rotation, _Z), casadi.fabs(limit), link.parent
             if link.screw.turn:

@@ -28,6 +28,7 @@ _TITLES = {
     "base_torque": ("Torque on the base", "torque"),
     "joint_torque": ("Joint torques", "torque"),
     "wrist_rate": ("Euler angle rates of the wrist", "rate"),
+    "wheel_torque": ("Torques on the wheels", "torque"),
 }
 _EULER_RATES = (r"$\dot{\psi}$", r"$\dot{\theta}$", r"$\dot{\phi}$")
 _SMALL = 0.1  # below this, inputs are shown in thousandths of their unit
@@ -85,8 +86,8 @@ def draw_distance(axes: Axes, maneuver: Maneuver, title: str) -> None:
 
 
 def figure_5(maneuver: Maneuver) -> Figure | None:
-    """Force and torque on the base; None without thrusters and wheels."""
-    return _inputs(maneuver, "base_force", "base_torque")
+    """Force and torque on the base, and torques on wheels; None without thrusters and wheels."""
+    return _inputs(maneuver, "base_force", "base_torque", "wheel_torque")
 
 
 def figure_6(maneuver: Maneuver) -> Figure | None:
@@ -131,6 +132,8 @@ def _symbols(maneuver: Maneuver, actuator: ActuatorHistory) -> list[str]:
         return [rf"$\tau_{joint + 1}$" for joint in StateLayout.of(maneuver.scene).actuated_joints]
     if actuator.name == "wrist_rate":
         return list(_EULER_RATES)
+    if actuator.name == "wheel_torque":
+        return [rf"$u_{name.split()[1]}$" for name in actuator.inputs]
     letter = "f" if actuator.name == "base_force" else r"\tau"
     return [rf"${letter}_{name[-1]}$" for name in actuator.inputs]
 

@@ -77,12 +77,18 @@ class FreeFloatingArm:
             wrist = turning[:, n + 1] @ rates
         return TipJacobian(base, joints, wrist)
 
+    def momentum_of_bodies(self, states: FloatArray) -> FloatArray:
+        """Momentum at states (B, n_x) without that of wheels, inertial axes, (B, 6), N s and N m s."""
+        states = states.copy()
+        states[:, self.kernels.layout.state.wheel_momenta] = 0.0
+        return self.kernels.momentum(states, p=self.parameters)
+
     def momentum_map(self, states: FloatArray) -> MomentumMap:
         """Momentum per unit velocity at states (B, n_x); their velocities do not matter."""
         moving = self.velocity_entries
         moved = np.repeat(states[:, None, :], len(moving), axis=1)
         moved[:, :, moving] = np.eye(len(moving))
-        momenta = self.kernels.momentum(moved.reshape(-1, states.shape[1]), p=self.parameters)
+        momenta = self.momentum_of_bodies(moved.reshape(-1, states.shape[1]))
         columns = momenta.reshape(len(states), len(moving), 6)[:, :, self.momentum_entries].transpose(0, 2, 1)
         n_base = len(self.twist_entries)
         return MomentumMap(columns[:, :, :n_base], columns[:, :, n_base:])
@@ -107,7 +113,7 @@ class FreeFloatingArm:
         control = self.kernels.layout.control
         acting = [
             i
-            for part in (control.base_force, control.base_torque, control.joint_torque)
+            for part in (control.base_force, control.base_torque, control.joint_torque, control.wheel_torque)
             for i in indices(part)
         ]
         inputs = np.zeros((len(states), 1 + len(acting), self.kernels.n_u))
@@ -118,9 +124,12 @@ class FreeFloatingArm:
         reached = reached.reshape(len(states), 1 + len(acting), -1)
         per_unit = reached[:, 1:] - reached[:, :1]
         missing = accelerations - reached[:, 0]
-        normal = per_unit @ per_unit.transpose(0, 2, 1)
+        normal, right = per_unit @ per_unit.transpose(0, 2, 1), per_unit @ missing[:, :, None]
         controls = np.zeros((len(states), self.kernels.n_u))
-        controls[:, acting] = np.linalg.solve(normal, per_unit @ missing[:, :, None])[:, :, 0]
+        if indices(control.wheel_torque):  # there may be more inputs than accelerations: the least ones
+            controls[:, acting] = (np.linalg.pinv(normal, hermitian=True) @ right)[:, :, 0]
+        else:
+            controls[:, acting] = np.linalg.solve(normal, right)[:, :, 0]
         return controls
 
 

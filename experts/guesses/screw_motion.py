@@ -161,12 +161,9 @@ class _ArmMotion:
         Linear momentum is conserved: only thrusters could change it. A torque on the base, where there is
         one, removes angular momentum, which would turn the arm away from the target.
         """
-        momenta = np.repeat(
-            self.kernels.momentum(start, p=self.arm.parameters)[None, self.arm.momentum_entries],
-            count,
-            axis=0,
-        )
-        if indices(self.layout.control.base_torque):
+        momentum = self.arm.momentum_of_bodies(start[None])[:, self.arm.momentum_entries]
+        momenta, control = np.repeat(momentum, count, axis=0), self.layout.control
+        if indices(control.base_torque) or indices(control.wheel_torque):
             angular = [i for i, entry in enumerate(self.arm.momentum_entries) if entry >= 3]
             momenta[:, angular] *= np.linspace(1.0, 0.0, count)[:, None] ** 2
         return momenta
@@ -230,6 +227,7 @@ class _ArmMotion:
         states[0] = knots.states[0]
         accelerations = np.diff(states[:, self.arm.velocity_entries], axis=0) / dt
         controls = self._within_bounds(controls + self.arm.controls(states[:-1], accelerations))
+        states[1:, entries.wheel_momenta] += dt * np.cumsum(controls[:, control.wheel_torque], axis=0)
         problem.keep_previous(states, controls)
         return ScrewMotion(states, controls)
 

@@ -18,6 +18,7 @@ ACTUATOR_TITLES = {
     "base_torque": "base torque",
     "joint_torque": "joint torques",
     "wrist_rate": "Euler rates",
+    "wheel_torque": "wheel torques",
 }
 
 

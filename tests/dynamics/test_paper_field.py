@@ -13,7 +13,7 @@ from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.scene.layout import StateLayout
 
-SCENES = ("paper", "no-wrist", "planar", "tip-load", "sliding")
+SCENES = ("paper", "no-wrist", "planar", "tip-load", "sliding", "wheels")
 
 
 def about(body: object, point: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

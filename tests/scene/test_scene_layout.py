@@ -52,6 +52,7 @@ SIZES = {  # n_x, n_t, n_u
     "tumbling": (23, 21, 12),
     "tumbling-target": (23, 21, 12),
     "wheel-saturation": (23, 21, 9),
+    "wheels": (27, 25, 10),
 }
 
 

@@ -22,6 +22,7 @@ from dq_space_arm_env.scene.path import PATH
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.start import number_of_draws
 from dq_space_arm_env.task import episode
+from dq_space_arm_env.task.actuator_limits import reads_state
 from dq_space_arm_env.task.equations import SceneEquations
 from dq_space_arm_env.task.step_report import MEMORY, memory_names
 
@@ -97,7 +98,8 @@ class EnvironmentPrograms:
         if self.scene.phases:
             self._append_stage(program, n_memory)
         command = partial(episode.command, equations)
-        program.call(trace("inputs_graph", {"action": n_u}, command, parameters=self._parameters))
+        asked = {"action": n_u} | ({"x": n_x} if reads_state(self.scene) else {})
+        program.call(trace("inputs_graph", asked, command, parameters=self._parameters))
         program.call(trace("time_step_graph", {}, lambda: {"h": [simulation.dt]}))
         method = checked_integrator_of(simulation, integrator)
         stepper = actuated(method or integrator_of(simulation, integrator), equations.field)

@@ -163,8 +163,8 @@ class ScenePrograms:
 
     def _momentum(self) -> Program:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
-            _, frames, velocities = self._velocities(x)
-            linear, angular, _ = kinematics.momentum(self.tree, frames, velocities)
+            motion, frames, velocities = self._velocities(x)
+            linear, angular, _ = kinematics.momentum(self.tree, frames, velocities, motion.wheel_momenta)
             attitude, _ = poses.to_matrix(self.equations.base_pose(x))
             return {"momentum": [*matrix_vector(attitude, linear), *matrix_vector(attitude, angular)]}
 
@@ -173,7 +173,8 @@ class ScenePrograms:
     def _energy(self) -> Program:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             motion, _, velocities = self._velocities(x)
-            kinetic, potential = kinematics.energy(self.tree, motion.joint_angles, velocities)
+            moving = velocities, motion.wheel_momenta
+            kinetic, potential = kinematics.energy(self.tree, motion.joint_angles, *moving)
             return {"energy": [kinetic + potential]}
 
         return self._program("energy", outputs, x=self.field.n_x)
@@ -256,7 +257,7 @@ class ScenePrograms:
         field, state = self.field, self.layout.state
         n_pose = len(field.pose.stored)
         angles = (state.joint_angles, state.wrist_angles)
-        parts = (state.base_velocity, *angles, state.joint_rates, state.actuators)
+        parts = (state.base_velocity, *angles, state.joint_rates, state.wheel_momenta, state.actuators)
 
         def outputs(observation: Scalars) -> Mapping[str, Scalars]:
             x: list[Scalar] = [0.0] * field.n_x

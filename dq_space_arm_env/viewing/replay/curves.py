@@ -15,6 +15,7 @@ _ACTUATORS = {
     "base_torque": "Torque on the base",
     "joint_torque": "Joint torques",
     "wrist_rate": "Wrist rates",
+    "wheel_torque": "Torques on the wheels",
 }
 _EULER_RATES = ("ψ̇", "θ̇", "φ̇")
 _SMALL = 0.1  # inputs below this are shown in thousandths of their unit
@@ -94,4 +95,6 @@ def _names(actuator: str, entries: slice, layout: StateLayout) -> tuple[str, ...
         return tuple(f"{joint + 1}" for joint in layout.actuated_joints)
     if actuator == "wrist_rate":
         return _EULER_RATES
+    if actuator == "wheel_torque":
+        return tuple(name.split()[1] for name in layout.control.names[entries])
     return tuple(name[-1] for name in layout.control.names[entries])

@@ -1,0 +1,55 @@
+"""What actuators do with their inputs: physics of the environment that no input overrides.
+
+Plans know these limits as bounds of the inputs and as constraints; kernels take inputs as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import casadi
+
+from dq_space_arm_env.dynamics import reaction_wheels
+from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.task.equations import SceneEquations
+
+Scalar = Any
+Scalars = Sequence[Scalar]
+
+_LEAST_SPEED = 1e-9  # rad/s, below which no power limits a wheel's torque
+
+
+def reads_state(scene: Scene) -> bool:
+    """Tell whether what actuators do depends on the state: wheels have a largest speed or power."""
+    return any(math.isfinite(min(wheel.speed, wheel.power)) for wheel in scene.actuators.wheels or ())
+
+
+def applied(equations: SceneEquations, x: Scalars, u: Scalars) -> list[Scalar]:
+    """Inputs that act, n_u, of those that are asked for; the state matters where `reads_state`."""
+    scene, result = equations.scene, list(u)
+    if reads_state(scene):
+        part = equations.layout.control.wheel_torque
+        result[part] = _wheel_torques(equations, x, result[part])
+    return result
+
+
+def _wheel_torques(equations: SceneEquations, x: Scalars, torques: Scalars) -> list[Scalar]:
+    """Torques held for a step that drive no wheel beyond its largest speed, and take no more than its power.
+
+    A wheel beyond its largest speed, as the base turns under it, may be braked.
+    """
+    motion, dt = equations.field.motion(equations.y(x)), equations.scene.simulation.dt
+    found = reaction_wheels.speeds(equations.tree.wheels, motion.wheel_momenta, motion.angular)
+    result = []
+    for wheel, speed, torque in zip(equations.scene.actuators.wheels or (), found, torques, strict=True):
+        if math.isfinite(wheel.speed):
+            # J (+-Omega_max - Omega) / h reaches the largest speed at the end of the step.
+            to_top, to_bottom = (wheel.inertia / dt * (end - speed) for end in (wheel.speed, -wheel.speed))
+            torque = casadi.fmin(casadi.fmax(torque, casadi.fmin(to_bottom, 0.0)), casadi.fmax(to_top, 0.0))
+        if math.isfinite(wheel.power):
+            most = wheel.power / casadi.fmax(casadi.fabs(speed), _LEAST_SPEED)
+            torque = casadi.fmin(casadi.fmax(torque, -most), most)
+        result.append(torque)
+    return result
