@@ -117,7 +117,8 @@ def left_out(scene: Scene) -> Iterator[str]:
         yield "wrench at the tip"
     for name, meaning in _ACTUATORS.items():
         needs = {"joint_torque": bool(scene.links), "wrist_rate": scene.wrist is not None}
-        if name == "base_torque" and scene.actuators.wheels is not None:
+        one_by_one = {"base_torque": scene.actuators.wheels, "base_force": scene.actuators.thrusters}
+        if one_by_one.get(name) is not None:
             continue
         if getattr(scene.actuators, name) is None and needs.get(name, True):
             yield meaning

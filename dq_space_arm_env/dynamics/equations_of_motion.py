@@ -11,6 +11,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
 from dq_space_arm_env.dynamics import minimal, reaction_wheels
 from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of, reaction_wrenches
+from dq_space_arm_env.dynamics.jets import net_wrench
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
 from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
@@ -111,9 +112,14 @@ class EquationsOfMotion:
         wrist = list(u[layout.control.wrist_rate])
         if not wrist and self.tree.wrist is not None:
             wrist = [0.0, 0.0, 0.0]
+        net_force: Sequence[Scalar] = spread(force, (0, 1) if planar else (0, 1, 2), 3) if force else ZERO
+        net_torque: Sequence[Scalar] = spread(torque, (2,) if planar else (0, 1, 2), 3) if torque else ZERO
+        if self.tree.jets:
+            by_jets = net_wrench(self.tree.jets, list(u[layout.control.thruster_force]))
+            net_force, net_torque = add(net_force, by_jets[0]), add(net_torque, by_jets[1])
         return Inputs(
-            force=spread(force, (0, 1) if planar else (0, 1, 2), 3) if force else ZERO,
-            torque=spread(torque, (2,) if planar else (0, 1, 2), 3) if torque else ZERO,
+            force=net_force,
+            torque=net_torque,
             joint_torques=torques,
             wrist_rates=wrist,
             wheel_torques=list(u[layout.control.wheel_torque]),

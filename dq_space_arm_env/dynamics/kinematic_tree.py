@@ -23,6 +23,7 @@ from dq_space_arm_env.algebra.vectors import (
     subtract,
     transpose,
 )
+from dq_space_arm_env.dynamics.jets import Jet
 from dq_space_arm_env.dynamics.reaction_wheels import Wheel, free_inertia
 from dq_space_arm_env.scene.parameters import center_name, inertia_name
 
@@ -93,6 +94,7 @@ class KinematicTree:
     planar: bool  # the base moves in its x-y plane only
     heaviest: int = 0  # body of greatest nominal mass: 0 is the base, i link i
     heavy_base: bool = False  # its nominal mass is beyond 100 times that of all links
+    jets: tuple[Jet, ...] = ()  # thrusters
     wheels: tuple[Wheel, ...] = ()  # free to turn: the base's inertia is without their axial ones
 
     @property
@@ -141,6 +143,7 @@ class KinematicTree:
             planar=scene.base.motion == "planar",
             heaviest=masses.index(max(masses)),
             heavy_base=masses[0] > 100.0 * sum(masses[1:]),
+            jets=tuple(Jet(each.unit_direction, each.moment) for each in scene.actuators.thrusters or ()),
             wheels=wheels,
         )
 

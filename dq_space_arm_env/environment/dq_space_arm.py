@@ -91,6 +91,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | 35    | time left in the episode                                              | 0    | T   | s     |
 
     Reaction wheels add their axial momenta after the joint rates, N m s, and their torques after the wrist's rates.
+    Thrusters add their forces at the end; an action below 0 is off, and a pulse shorter than the shortest does not fire.
     At its largest speed a wheel's torque stops, and a motor takes no more than its power: what then acts is less than the action asks for.
 
     Where rates of controls are limited, the controls before, those of `layout.previous_controls`, stand after the

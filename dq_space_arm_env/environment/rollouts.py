@@ -274,11 +274,12 @@ class _Log:
             self.controls[:, step] = self._layout.to_control(np.clip(actions, -1.0, 1.0))
         if noise is None:
             return actions
-        commanded = np.clip(actions.astype(np.float64), -1.0, 1.0)
-        disturbed = np.clip(commanded + noise, -1.0, 1.0)
+        least = self._layout.lower_limits(np.ones(self._layout.n_u))
+        commanded = np.clip(actions.astype(np.float64), least, 1.0)
+        disturbed = np.clip(commanded + noise, least, 1.0)
         if self.controls is not None:
             self.noise = np.zeros_like(self.controls) if self.noise is None else self.noise
-            self.noise[:, step] = self._layout.to_control(disturbed - commanded)
+            self.noise[:, step] = (disturbed - commanded) * self._layout.control_limit
         return disturbed
 
     def after_step(self, step: int, reward: FloatArray, terminated: Mask, info: dict[str, Any]) -> None:

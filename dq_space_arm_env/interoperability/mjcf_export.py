@@ -162,6 +162,8 @@ def _add_actuators(root: Element, scene: Scene) -> None:
     ):
         for index, gear in zip(range(part.start, part.stop), gears, strict=False):
             at[index] = {"site": "e0", "gear": gear}
+    for index, each in enumerate(scene.actuators.thrusters or (), control.thruster_force.start):
+        at[index] = {"site": "e0", "gear": words([*each.unit_direction, *each.moment])}
     torques = range(control.joint_torque.start, control.joint_torque.stop)
     for index, joint in zip(torques, layout.actuated_joints, strict=True):
         at[index] = {"joint": f"{scene.links[joint].name} joint"}
@@ -170,7 +172,7 @@ def _add_actuators(root: Element, scene: Scene) -> None:
         motor = SubElement(actuators, "motor", {"name": control.names[index], **transmission})
         limit = layout.control_limit[index]
         if math.isfinite(limit):
-            motor.set("ctrlrange", words([-limit, limit]))
+            motor.set("ctrlrange", words([layout.lower_limits(layout.control_limit)[index], limit]))
 
 
 def _depth_first(scene: Scene) -> list[int]:

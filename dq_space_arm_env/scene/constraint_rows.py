@@ -21,7 +21,7 @@ from dq_space_arm_env.scene.constraints import (
     WheelMomentum,
     per_link,
 )
-from dq_space_arm_env.scene.parameters import control_numbers, wheel_names
+from dq_space_arm_env.scene.parameters import control_numbers, thruster_names, wheel_names
 from dq_space_arm_env.scene.pose import PLANAR_TWIST
 
 Scene = Any  # `schema.Scene`
@@ -111,7 +111,9 @@ def rows_of(scene: Scene, each: Constraint) -> list[Row]:
             names = [f"{each.name}: {limit.name} {word}" for word in ("falls", "rises")]
             rows += [Row(name, limit.unit, *common, has_input=True, is_rate=True) for name in names]
     elif isinstance(each, Plume):
-        rows.append(Row(each.name, "N", *common, has_input=True))
+        names = [f"{each.name}: {thruster}" for thruster in thruster_names(scene)]
+        names = [each.name, *names] if scene.actuators.base_force is not None else names
+        rows += [Row(name, "N", *common, has_input=True) for name in names]
     elif not isinstance(each, Terminal):
         is_length = hasattr(each, "point")  # line of sight and corridor; the others compare cosines
         rows.append(Row(each.name, "m" if is_length else "1", *common))

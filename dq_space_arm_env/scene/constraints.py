@@ -221,11 +221,15 @@ class ApproachCorridor(Constraint):
 
 
 class Plume(Constraint):
-    """The gas of the thrusters, which leaves against their net force, misses a sphere; residual in N."""
+    """The gas of the thrusters, which leaves against their forces, misses a sphere; residual in N.
+
+    The gas of `actuators.base_force` leaves against the net force at one place, that of each of
+    `actuators.thrusters` at its own place and in its own direction.
+    """
 
     kind: Literal["plume"] = Field(description="'plume'")
     thruster: Position = Field(
-        default=(0.0, 0.0, 0.0), description="where the gas leaves, in the base frame, m"
+        default=(0.0, 0.0, 0.0), description="where the gas of base_force leaves, in the base frame, m"
     )
     angle_deg: Positive = Field(description="half angle of the plume, degrees, below 90")
     keeps_clear: Volume = Field(description="sphere that no gas may reach, outside of the thruster")
@@ -381,7 +385,7 @@ def constraint_problems(scene: Scene) -> Iterator[Problem]:
                 yield Problem((*here, *place), frame, f"must be one of {', '.join(known)}")
         if isinstance(constraint, JointLimits):
             yield from _joint_limit_problems(scene, here, constraint)
-        elif isinstance(constraint, Plume) and scene.actuators.base_force is None:
+        elif isinstance(constraint, Plume) and not _has_thrusters(scene):
             yield Problem((*here, "kind"), constraint.kind, "the scene has no thrusters: remove it")
         elif isinstance(constraint, WheelMomentum):
             yield from _wheel_problems(scene, (*here, "kind"))
@@ -432,6 +436,10 @@ def _control_rate_problems(
             yield Problem((*here, field), rate, f"must be absent: the scene has no actuators.{field}")
 
 
+def _has_thrusters(scene: Scene) -> bool:
+    return scene.actuators.base_force is not None or scene.actuators.thrusters is not None
+
+
 def _has_wheel_limits(scene: Scene) -> bool:
     return any(math.isfinite(min(wheel.speed, wheel.power)) for wheel in scene.actuators.wheels or ())
 
@@ -448,7 +456,7 @@ def _wheel_problems(scene: Scene, place: tuple[str | int, ...]) -> Iterator[Prob
     catches = any(phase.catch is not None for phase in scene.phases)
     reasons = {
         "the scene has no wheels": scene.actuators.base_torque is None,
-        "thrusters change the total momentum": scene.actuators.base_force is not None,
+        "thrusters change the total momentum": _has_thrusters(scene),
         "a wrench at the tip changes the total momentum": scene.tip_wrench is not None,
         "a catch changes the total momentum": catches,
         "the start is not at rest": any(velocities),

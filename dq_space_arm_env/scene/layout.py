@@ -3,8 +3,9 @@
 State: base pose, joint angles, wrist angles, base velocity, joint rates, axial momenta of wheels, and what
 actuators keep from step to step: the previous controls whose rates are limited. Tangent: the same, with a
 twist increment of the base in base axes (rotation, then translation) in place of the pose. Controls: base
-force, base torque, joint torques of the actuated joints, wrist rates, wheel torques. Parameters: target,
-bodies from base to payload, weights, limits. What a scene does not have is missing; the order stays.
+force, base torque, joint torques of the actuated joints, wrist rates, wheel torques, thruster forces.
+Parameters: target, bodies from base to payload, weights, limits. What a scene does not have is missing; the
+order stays.
 A planar base keeps only what is not zero by construction: q_r0, q_r3, q_d1, q_d2 of its pose, and omega_z,
 v_x, v_y.
 """
@@ -87,6 +88,7 @@ class ControlEntries(_Entries):
     joint_torque: slice  # actuated joints, base to tip
     wrist_rate: slice  # Euler rates psi, theta, phi
     wheel_torque: slice  # of the motor on each wheel, about its axis
+    thruster_force: slice  # of each thruster, zero or greater
     limits: tuple[str, ...]  # name of each control's limit in the scene
     weights: tuple[str, ...]  # name of each control's weight in the cost
 
@@ -288,16 +290,32 @@ class StateLayout:
                 limits[..., index] = parameters[..., self.parameters.names.index(name)]
         return limits
 
+    def lower_limits(self, limits: Array) -> Array:
+        """Least controls, where the greatest are given: zero for thrusters, the limits' negatives for others.
+
+        Args:
+            limits: Largest magnitudes, shape (..., n_u), N, N m, rad/s.
+
+        Returns:
+            Lower bounds, shape (..., n_u), N, N m, rad/s.
+        """
+        lower = -limits
+        lower[..., self.control.thruster_force] = 0.0
+        return lower
+
     def to_control(self, action: ArrayLike) -> Array:
         """Scale actions to controls.
 
         Args:
-            action: Fractions of the limits in [-1, 1], shape (..., n_u).
+            action: Fractions of the limits in [-1, 1], shape (..., n_u); below 0 a thruster is off.
 
         Returns:
             Controls, shape (..., n_u), N, N m, rad/s.
         """
-        return real_array("action", action, np.float64) * self.control_limit
+        controls = real_array("action", action, np.float64) * self.control_limit
+        jets = controls[..., self.control.thruster_force]
+        np.maximum(jets, 0.0, out=jets)
+        return controls
 
     def to_action(self, control: ArrayLike) -> Array:
         """Scale controls to actions, the inverse of `to_control`.
@@ -421,6 +439,7 @@ def _lay_out_controls(controls: Mapping[str, Sequence[ControlNumbers]]) -> Contr
         joint_torque=slices["joint_torque"],
         wrist_rate=slices["wrist_rate"],
         wheel_torque=slices["wheel_torque"],
+        thruster_force=slices["thruster_force"],
         limits=tuple(each.limit.name for each in everything),
         weights=tuple(each.weight.name for each in everything),
         **entries.collected(),

@@ -8,6 +8,7 @@ from dq_space_arm_env.scene.bodies import Payload
 from dq_space_arm_env.scene.motion import Motion
 from dq_space_arm_env.scene.pose import Pose
 from dq_space_arm_env.scene.shapes import Shape, geometry_field
+from dq_space_arm_env.scene.thrusters import Thrusters
 from dq_space_arm_env.scene.wheels import Wheels
 from dq_space_arm_env.validation.fields import (
     Angles,
@@ -51,7 +52,7 @@ class Actuators(Model):
     """The actuators; an absent one has no controls."""
 
     base_force: AxisLimits | None = Field(
-        default=None, description="thrusters: force on the base in base axes, N"
+        default=None, description="net force of thrusters on the base in base axes, N"
     )
     base_torque: AxisLimits | None = Field(
         default=None, description="ideal wheels: torque on the base in base axes, N m"
@@ -66,6 +67,11 @@ class Actuators(Model):
         default=None,
         exclude_if=lambda wheels: wheels is None,
         description="reaction wheels, one by one, or as a set: {set: orthogonal or pyramid, ...}",
+    )
+    thrusters: Thrusters | None = Field(
+        default=None,
+        exclude_if=lambda thrusters: thrusters is None,
+        description="thrusters, one by one: their forces are inputs, zero or greater",
     )
 
 
@@ -178,6 +184,11 @@ class Cost(Model):
         default=1.0,
         exclude_if=lambda weight: weight == 1.0,
         description="weight on the wheels' torques, 1/(N m)^2: one number",
+    )
+    thruster_force: ControlWeight = Field(
+        default=10.0,
+        exclude_if=lambda weight: weight == 10.0,
+        description="weight on the thrusters' forces, 1/N^2: one number",
     )
 
 

@@ -29,9 +29,13 @@ CONTROL_UNITS = {
     "joint_torque": "N m",
     "wrist_rate": "rad/s",
     "wheel_torque": "N m",
+    "thruster_force": "N",
 }
 """Units of the controls, in their order."""
-ACTUATORS = {field: field for field in CONTROL_UNITS} | {"wheel_torque": "wheels"}
+ACTUATORS = {field: field for field in CONTROL_UNITS} | {
+    "wheel_torque": "wheels",
+    "thruster_force": "thrusters",
+}
 """Names in `actuators` of what the controls drive."""
 _STATE_WEIGHTS = {
     "pose": (_POSE, PLANAR_POSE),
@@ -254,7 +258,11 @@ def control_numbers(scene: Scene) -> dict[str, list[ControlNumbers]]:
     """The controls by actuator, in order; an absent one, or one without joints, has none."""
     planar = _is_planar(scene)
     axes = {"base_force": (0, 1), "base_torque": (2,)} if planar else {}
-    others = {"joint_torque": _joint_controls, "wheel_torque": _wheel_controls}
+    others = {
+        "joint_torque": _joint_controls,
+        "wheel_torque": _wheel_controls,
+        "thruster_force": _thruster_controls,
+    }
     return {
         field: [
             *(
@@ -299,6 +307,21 @@ def _wheel_controls(scene: Scene) -> Iterator[ControlNumbers]:
         yield ControlNumbers(
             f"{name} torque", _number(f"actuators.wheels.{index}.torque", "N m", torque), weight
         )
+
+
+def _thruster_controls(scene: Scene) -> Iterator[ControlNumbers]:
+    for index, name in enumerate(thruster_names(scene)):
+        weight = _number("cost.thruster_force", _per_square("thruster_force"), scene.cost.thruster_force)
+        force = scene.actuators.thrusters[index].force
+        yield ControlNumbers(
+            f"{name} force", _number(f"actuators.thrusters.{index}.force", "N", force), weight
+        )
+
+
+def thruster_names(scene: Scene) -> list[str]:
+    """Names of the thrusters, in their order."""
+    thrusters = scene.actuators.thrusters or ()
+    return [each.name or f"thruster {index + 1}" for index, each in enumerate(thrusters)]
 
 
 def wheel_names(scene: Scene) -> list[str]:

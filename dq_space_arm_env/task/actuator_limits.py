@@ -32,6 +32,12 @@ def applied(equations: SceneEquations, x: Scalars, u: Scalars) -> list[Scalar]:
     if reads_state(scene):
         part = equations.layout.control.wheel_torque
         result[part] = _wheel_torques(equations, x, result[part])
+    first = equations.layout.control.thruster_force.start
+    for index, thruster in enumerate(scene.actuators.thrusters or (), first):
+        if thruster.impulse_bit:
+            # A pulse of the largest force with the impulse f h; one of the shortest is rounded into it.
+            least = (1.0 - 1e-12) * thruster.impulse_bit / scene.simulation.dt
+            result[index] = casadi.if_else(result[index] < least, 0.0, result[index])
     return result
 
 

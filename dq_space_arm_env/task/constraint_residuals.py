@@ -325,10 +325,31 @@ def _plume(situation: _Situation, constraint: Plume) -> Iterator[Scalar]:
     """How deep -f is in the cone in which gas meets the sphere; half angle al = plume + asin(R / |d|).
 
     Its distance from the surface is sin(al) (-f . n) - cos(al) |f x n| with n = d / |d| toward the sphere:
-    linear in f but for the turn about n.
+    linear in f but for the turn about n. A thruster only turns on: it is linear in its force.
     """
-    force, sphere = situation.inputs.force, constraint.keeps_clear
-    d = subtract(situation.point(sphere.frame, sphere.position), constraint.thruster)
+    scene, control = situation.scene, situation.equations.layout.control
+    given = scene.actuators.base_force
+    if given is not None:
+        strongest = max(given.limit)
+        rounded_off = 1e-3 * (strongest if math.isfinite(strongest) else 1.0)
+        sine, cosine, n = _cone_of_gas(situation, constraint, constraint.thruster)
+        part = situation.u[control.base_force]
+        force = [*part, 0.0] if situation.equations.tree.planar else part
+        aside = cross(force, n)
+        yield -sine * dot(force, n) - cosine * sqrt(dot(aside, aside) + rounded_off**2)
+    for thruster, size in zip(
+        scene.actuators.thrusters or (), situation.u[control.thruster_force], strict=True
+    ):
+        sine, cosine, n = _cone_of_gas(situation, constraint, thruster.position)
+        aside = cross(thruster.unit_direction, n)
+        along = dot(thruster.unit_direction, n)
+        yield size * (-sine * along - cosine * sqrt(dot(aside, aside) + 1e-12))
+
+
+def _cone_of_gas(situation: _Situation, constraint: Plume, place: Scalars) -> tuple[Scalar, Scalar, Scalars]:
+    """Sine and cosine of the half angle al, and direction n to the sphere, of gas that leaves at a place."""
+    sphere = constraint.keeps_clear
+    d = subtract(situation.point(sphere.frame, sphere.position), place)
     # Within the sphere its half angle stays that at the surface, 90 deg.
     square = dot(d, d) + SMALLEST_LENGTH**2
     nearest = select(square > sphere.radius**2, square, sphere.radius**2)
@@ -336,14 +357,7 @@ def _plume(situation: _Situation, constraint: Plume) -> Iterator[Scalar]:
     cosine = sqrt(1.0 - sine * sine + 1e-12)
     sine_of_both = math.sin(half) * cosine + math.cos(half) * sine
     cosine_of_both = math.cos(half) * cosine - math.sin(half) * sine
-    thrusters = situation.scene.actuators.base_force
-    assert thrusters is not None  # or the scene is refused
-    strongest = max(thrusters.limit)
-    rounded_off = 1e-3 * (strongest if math.isfinite(strongest) else 1.0)
-    n = scale(1.0 / sqrt(square), d)
-    aside = cross(force, n)
-    aside_length = sqrt(dot(aside, aside) + rounded_off**2)
-    yield -sine_of_both * dot(force, n) - cosine_of_both * aside_length
+    return sine_of_both, cosine_of_both, scale(1.0 / sqrt(square), d)
 
 
 def _momentum(situation: _Situation, constraint: Momentum) -> Iterator[Scalar]:

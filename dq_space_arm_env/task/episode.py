@@ -66,7 +66,9 @@ def start(scene: Scene, draws: Scalars) -> Outputs:
 def command(equations: SceneEquations, action: Scalars, x: Scalars = ()) -> Outputs:
     """Inputs in N, N m, rad/s, from an action that is clipped to [-1, 1], as the actuators apply them."""
     # Ordered such that NaN passes: if two numbers do not compare, fmin and fmax take the second.
-    clipped = [casadi.fmin(1.0, casadi.fmax(-1.0, value)) for value in action]
+    jets = equations.layout.control.thruster_force  # below 0 they are off
+    least = [0.0 if jets.start <= index < jets.stop else -1.0 for index in range(len(action))]
+    clipped = [casadi.fmin(1.0, casadi.fmax(low, value)) for low, value in zip(least, action, strict=True)]
     asked = [limit * value for limit, value in zip(equations.control_limits, clipped, strict=True)]
     return {"u": applied(equations, x, asked)}
 

@@ -9,6 +9,7 @@ that tumbles keeps its energy, so its rate grows at most by the root of the rati
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -35,8 +36,7 @@ class WorstCase:
     def __init__(self, equations: SceneEquations) -> None:
         self.equations, self.tree = equations, equations.tree
         self.inputs = equations.field.inputs(equations.control_limits)
-        # Against the wheels' motors; their gyroscopic torque does no work.
-        self.torque = total([norm(self.inputs.torque), *map(casadi.fabs, self.inputs.wheel_torques)])
+        self.force, self.torque = self._base_loads()
         self.bodies = self.tree.bodies
         self.last = self.bodies[self.tree.tip_body]  # it carries the tip
         self.mass = total([body.mass for body in self.bodies])
@@ -45,6 +45,18 @@ class WorstCase:
         places += [frame for _, frame in self.tree.other_tips]
         lengths = [norm(place.position) for place in places if place is not None]
         self.reach = total([*lengths, *(norm(body.center_of_mass) for body in self.bodies)])
+
+    def _base_loads(self) -> tuple[Scalar, Scalar]:
+        """Bounds of force and torque on the base."""
+        limits, jets = self.equations.control_limits, self.equations.layout.control.thruster_force
+        sizes = limits[jets]
+        limits[jets] = [0.0] * len(sizes)
+        inputs = self.equations.field.inputs(limits)
+        # Against the wheels' motors; their gyroscopic torque does no work.
+        torques = [norm(inputs.torque), *map(casadi.fabs, inputs.wheel_torques)]
+        pairs = [*zip(sizes, self.tree.jets, strict=True)]
+        torques += [casadi.fabs(size) * math.hypot(*jet.torque) for size, jet in pairs]
+        return total([norm(inputs.force), *map(casadi.fabs, sizes)]), total(torques)
 
     def cost(self, x: Scalars, steps: Scalar) -> Scalar:
         """Bound of the cost of a number of steps from a state, terminal cost included."""
@@ -60,7 +72,7 @@ class WorstCase:
             fastest = total([speed / casadi.sqrt(body.mass) for body in (base, self.last)])
             reach = reach + duration * fastest
         wrench = self.tree.tip_wrench or (0.0,) * 6
-        drift = moving + duration * (norm(self.inputs.force) + norm(wrench[:3])) / self.mass
+        drift = moving + duration * (self.force + norm(wrench[:3])) / self.mass
         # The dual part of a pose has half the length of its position; unit quaternions are at most 2 apart.
         start, target = (norm(poses.position(pose)) for pose in (equations.base_pose(x), equations.target))
         if equations.scene.target.motion is not None:  # its body is at |r| = 2 |q_d|
@@ -152,7 +164,7 @@ class WorstCase:
     def _growth(self) -> Scalar:
         """The bound c: root of the sum of f^2 / m + t' I^-1 t over the bodies' forces f and torques t."""
         inputs, links, bodies = self.inputs, self.tree.links, self.bodies
-        forces: list[Scalar] = [norm(inputs.force), *[0.0] * len(links)]
+        forces: list[Scalar] = [self.force, *[0.0] * len(links)]
         # Components of the torques as they act in I^-1/2, added as if all pointed the same way.
         torques = [_turned(self.tree.base, self.torque), *[0.0] * len(links)]
         for i, (link, limit) in enumerate(zip(links, inputs.joint_torques, strict=True)):

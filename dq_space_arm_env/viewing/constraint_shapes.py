@@ -190,9 +190,11 @@ def _approach_corridor(
 def _plume(
     scene: Scene, each: Plume, rows: Rows, numbers: Numbers, length: float
 ) -> Iterator[ConstraintShape]:
-    """The sphere, and the gas: a cone along -f."""
+    """The sphere, and the gas of the net force: a cone along -f."""
     frame = numbers[each.keeps_clear.frame]
     yield ConstraintShape(_capsule(each.keeps_clear), frame, frame, rows)
+    if scene.actuators.base_force is None:
+        return
     gas = _cone((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), each.angle_deg, length)
     yield ConstraintShape(gas, numbers["base"], GAS, rows, each.thruster)
 

@@ -29,6 +29,7 @@ _TITLES = {
     "joint_torque": ("Joint torques", "torque"),
     "wrist_rate": ("Euler angle rates of the wrist", "rate"),
     "wheel_torque": ("Torques on the wheels", "torque"),
+    "thruster_force": ("Forces of the thrusters", "force"),
 }
 _EULER_RATES = (r"$\dot{\psi}$", r"$\dot{\theta}$", r"$\dot{\phi}$")
 _SMALL = 0.1  # below this, inputs are shown in thousandths of their unit
@@ -86,8 +87,8 @@ def draw_distance(axes: Axes, maneuver: Maneuver, title: str) -> None:
 
 
 def figure_5(maneuver: Maneuver) -> Figure | None:
-    """Force and torque on the base, and torques on wheels; None without thrusters and wheels."""
-    return _inputs(maneuver, "base_force", "base_torque", "wheel_torque")
+    """Force and torque on the base, of wheels and thrusters; None without them."""
+    return _inputs(maneuver, "base_force", "base_torque", "wheel_torque", "thruster_force")
 
 
 def figure_6(maneuver: Maneuver) -> Figure | None:
@@ -111,7 +112,7 @@ def _draw_actuator(axes: Axes, maneuver: Maneuver, actuator: ActuatorHistory) ->
     draw_steps(axes, maneuver.time, scale * actuator.values, _symbols(maneuver, actuator))
     near = [limit for limit in sorted(set(actuator.limits.tolist())) if largest >= _NEAR * limit]
     for limit in near:
-        for side in (-limit, limit):
+        for side in (0.0 if actuator.name == "thruster_force" else -limit, limit):
             axes.axhline(scale * side, **LIMIT_STYLE)
     title, quantity = _TITLES[actuator.name]
     finish_panel(axes, f"{title} ({_limit_note(actuator, near)})", f"{quantity} [{prefix}{actuator.unit}]")
@@ -132,8 +133,9 @@ def _symbols(maneuver: Maneuver, actuator: ActuatorHistory) -> list[str]:
         return [rf"$\tau_{joint + 1}$" for joint in StateLayout.of(maneuver.scene).actuated_joints]
     if actuator.name == "wrist_rate":
         return list(_EULER_RATES)
-    if actuator.name == "wheel_torque":
-        return [rf"$u_{name.split()[1]}$" for name in actuator.inputs]
+    if actuator.name in ("wheel_torque", "thruster_force"):
+        letter = "u" if actuator.name == "wheel_torque" else "f"
+        return [f"${letter}_{{{i + 1}}}$" for i in range(len(actuator.inputs))]
     letter = "f" if actuator.name == "base_force" else r"\tau"
     return [rf"${letter}_{name[-1]}$" for name in actuator.inputs]
 

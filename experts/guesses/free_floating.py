@@ -18,6 +18,8 @@ from dq_space_arm_env.dynamics.kinematics import wrist_rate_matrix
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from experts.problems.shooting_problem import FloatArray
 
+PROJECTIONS = 30
+"""Rounds in which forces of thrusters become non-negative."""
 _PLANAR_MOMENTUM = (0, 1, 5)  # P_x, P_y, L_z
 _SKEW = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)  # cross-product matrices of e_x, e_y, e_z
 
@@ -113,7 +115,13 @@ class FreeFloatingArm:
         control = self.kernels.layout.control
         acting = [
             i
-            for part in (control.base_force, control.base_torque, control.joint_torque, control.wheel_torque)
+            for part in (
+                control.base_force,
+                control.base_torque,
+                control.joint_torque,
+                control.wheel_torque,
+                control.thruster_force,
+            )
             for i in indices(part)
         ]
         inputs = np.zeros((len(states), 1 + len(acting), self.kernels.n_u))
@@ -126,11 +134,29 @@ class FreeFloatingArm:
         missing = accelerations - reached[:, 0]
         normal, right = per_unit @ per_unit.transpose(0, 2, 1), per_unit @ missing[:, :, None]
         controls = np.zeros((len(states), self.kernels.n_u))
-        if indices(control.wheel_torque):  # there may be more inputs than accelerations: the least ones
+        if indices(control.wheel_torque) or indices(control.thruster_force):
+            # There may be more inputs than accelerations: the least ones.
             controls[:, acting] = (np.linalg.pinv(normal, hermitian=True) @ right)[:, :, 0]
+            jets = controls[:, control.thruster_force]
+            controls[:, control.thruster_force] = self._non_negative(jets)
         else:
             controls[:, acting] = np.linalg.solve(normal, right)[:, :, 0]
         return controls
+
+    def _non_negative(self, forces: FloatArray) -> FloatArray:
+        """Forces of thrusters, (B, k), with nearly the same net force and torque, of which none is negative.
+
+        Alternating projections on the two (Cheney & Goldstein, Proc. AMS 10, 1959).
+        """
+        thrusters = self.kernels.scene.actuators.thrusters
+        if not thrusters:
+            return forces
+        wrenches = np.array([[*each.unit_direction, *each.moment] for each in thrusters])
+        wanted, back = forces @ wrenches, np.linalg.pinv(wrenches)
+        for _ in range(PROJECTIONS):
+            forces = np.maximum(forces, 0.0)
+            forces = forces + (wanted - forces @ wrenches) @ back
+        return np.maximum(forces, 0.0)
 
 
 def indices(part: slice) -> range:

@@ -163,7 +163,7 @@ class _ArmMotion:
         """
         momentum = self.arm.momentum_of_bodies(start[None])[:, self.arm.momentum_entries]
         momenta, control = np.repeat(momentum, count, axis=0), self.layout.control
-        if indices(control.base_torque) or indices(control.wheel_torque):
+        if any(map(indices, (control.base_torque, control.wheel_torque, control.thruster_force))):
             angular = [i for i, entry in enumerate(self.arm.momentum_entries) if entry >= 3]
             momenta[:, angular] *= np.linspace(1.0, 0.0, count)[:, None] ** 2
         return momenta

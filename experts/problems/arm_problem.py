@@ -194,8 +194,8 @@ class ArmProblem:
 
     @property
     def control_lower(self) -> FloatArray:
-        """Lower bounds, the limits' negatives."""
-        return -self.control_upper
+        """Lower bounds, zero for thrusters."""
+        return self.kernels.layout.lower_limits(self.control_upper)
 
     def limits(self, parameters: StageParameters) -> FloatArray:
         """Limits of the inputs with given parameters of M stages, shape (n_u,) or (M, n_u)."""

@@ -59,7 +59,7 @@ class PaperProblem:
         self.horizon = self.scene.simulation.steps
         self.time_step = self.scene.simulation.dt
         self.parameters = StageParameters(self.horizon)
-        self.control_lower: FloatArray = -layout.control_limit
+        self.control_lower: FloatArray = layout.lower_limits(layout.control_limit)
         self.control_upper: FloatArray = layout.control_limit
 
     def from_minimal(self, x: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ ACTUATOR_TITLES = {
     "joint_torque": "joint torques",
     "wrist_rate": "Euler rates",
     "wheel_torque": "wheel torques",
+    "thruster_force": "thruster forces",
 }
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.algebra import vectors
-from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
+from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler, reaction_wheels
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
@@ -31,7 +31,9 @@ def paper_solution(kernels, x, u):
         for body, v in zip(bodies, velocities, strict=True)
     ]
     state = newton_euler.PaperState(field.pose.full(stored), motion.joint_angles, motion.wrist_angles, duals)
-    base_wrench = (0.0, *inputs.force, 0.0, *inputs.torque)
+    wheels = tree.wheels, inputs.wheel_torques, motion.wheel_momenta, motion.angular
+    torque = vectors.add(inputs.torque, reaction_wheels.torque_on_base(*wheels))
+    base_wrench = (0.0, *inputs.force, 0.0, *torque)
     given = (base_wrench, inputs.joint_torques, inputs.wrist_rates)
     rates, reactions = newton_euler.paper_rates(tree, state, *given)
     accelerations = [tuple(body) for body in np.reshape(rates[-8 * len(bodies) :], (-1, 8))]

@@ -48,6 +48,7 @@ SIZES = {  # n_x, n_t, n_u
     "dual-arm": (30, 28, 14),
     "heavy-wrist": (26, 24, 12),
     "solar-panels": (31, 29, 12),
+    "thrusters": (23, 21, 14),
     "tracking": (23, 21, 12),
     "tumbling": (23, 21, 12),
     "tumbling-target": (23, 21, 12),

@@ -16,6 +16,7 @@ _ACTUATORS = {
     "joint_torque": "Joint torques",
     "wrist_rate": "Wrist rates",
     "wheel_torque": "Torques on the wheels",
+    "thruster_force": "Forces of the thrusters",
 }
 _EULER_RATES = ("ψ̇", "θ̇", "φ̇")
 _SMALL = 0.1  # inputs below this are shown in thousandths of their unit
@@ -65,11 +66,12 @@ def _inputs(
     unit, limits = layout.control.units[entries.start], layout.control_limit[entries]
     largest = max(float(np.abs(flight.controls[:, entries]).max()) for flight in flights)
     scale, prefix = (1e3, "m") if 0.0 < largest < _SMALL else (1.0, "")
-    bounds = sorted({side * scale * limit for limit in limits[np.isfinite(limits)] for side in (-1.0, 1.0)})
+    sides = (0.0, 1.0) if actuator == "thruster_force" else (-1.0, 1.0)
+    bounds = sorted({side * scale * limit for limit in limits[np.isfinite(limits)] for side in sides})
     return Panel(
         title=title,
         unit=prefix + unit,
-        note=_limit_note(limits, f" {unit}" if prefix else ""),
+        note=_limit_note(limits, f" {unit}" if prefix else "", "" if sides[0] == 0.0 else "±"),
         names=_names(actuator, entries, layout),
         steps=True,
         bounds=tuple(bounds),
@@ -81,12 +83,14 @@ def _inputs(
     )
 
 
-def _limit_note(limits: FloatArray, unit: str) -> str:
+def _limit_note(limits: FloatArray, unit: str, sign: str) -> str:
     sizes = sorted(set(limits.tolist()))
     if np.isinf(sizes[-1]):
         return "no limit" if len(sizes) == 1 else "some without limit"
     smallest, largest = f"{sizes[0]:g}", f"{sizes[-1]:g}"
-    return f"limit ±{largest}{unit}" if len(sizes) == 1 else f"limits ±{smallest} to ±{largest}{unit}"
+    if len(sizes) == 1:
+        return f"limit {sign}{largest}{unit}"
+    return f"limits {sign}{smallest} to {sign}{largest}{unit}"
 
 
 def _names(actuator: str, entries: slice, layout: StateLayout) -> tuple[str, ...]:
@@ -95,6 +99,9 @@ def _names(actuator: str, entries: slice, layout: StateLayout) -> tuple[str, ...
         return tuple(f"{joint + 1}" for joint in layout.actuated_joints)
     if actuator == "wrist_rate":
         return _EULER_RATES
-    if actuator == "wheel_torque":
-        return tuple(name.split()[1] for name in layout.control.names[entries])
+    if actuator in ("wheel_torque", "thruster_force"):
+        return tuple(
+            name.rpartition(" ")[0].removeprefix("wheel ").removeprefix("thruster ")
+            for name in layout.control.names[entries]
+        )
     return tuple(name[-1] for name in layout.control.names[entries])

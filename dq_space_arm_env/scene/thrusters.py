@@ -1,0 +1,169 @@
+"""Thrusters of a scene, one by one; allocation of forces and torques to them."""
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BeforeValidator, Field
+
+from dq_space_arm_env.scene.constraints import Direction
+from dq_space_arm_env.validation.fields import Limit, Name, Position, Positive, Three
+from dq_space_arm_env.validation.problems import Model, Problem, problem
+
+Scene = Any  # `schema.Scene`
+Array = NDArray[np.float64]
+
+STANDARD_GRAVITY = 9.80665
+"""Acceleration by which specific impulse is given in seconds, m/s^2."""
+
+
+class Thruster(Model):
+    """A thruster fixed to the base, which only pushes: its gas leaves against its force."""
+
+    name: Name | None = Field(default=None, description="name of the thruster; absent: its number")
+    position: Position = Field(description="where the force acts, in the base frame, m")
+    direction: Direction = Field(
+        description="direction of the force on the base, base axes, of any length but zero"
+    )
+    force: Limit = Field(description="largest force, N; .inf: unlimited")
+    minimum_impulse: Positive | None = Field(
+        default=None,
+        description="impulse of the shortest pulse, N s: a step with less does not fire; absent: any",
+    )
+    minimum_on_time: Positive | None = Field(
+        default=None,
+        description="the same as the time of the largest force, s; absent: any",
+    )
+    specific_impulse: Positive | None = Field(
+        default=None, description="impulse per weight of fuel, s; absent: fuel is not counted"
+    )
+
+    @property
+    def unit_direction(self) -> Three:
+        """The direction as a unit vector."""
+        length = math.hypot(*self.direction)
+        x, y, z = (entry / length for entry in self.direction)
+        return x, y, z
+
+    @property
+    def moment(self) -> Three:
+        """Torque about the base's center of mass per unit of force, m."""
+        (a, b, c), (x, y, z) = self.position, self.unit_direction
+        return b * z - c * y, c * x - a * z, a * y - b * x
+
+    @property
+    def impulse_bit(self) -> float:
+        """Impulse of the shortest pulse, N s."""
+        if self.minimum_on_time is not None:
+            return self.minimum_on_time * self.force
+        return self.minimum_impulse or 0.0
+
+
+def _read_thrusters(value: Any) -> Any:
+    if not isinstance(value, list | tuple) or not value:
+        raise problem("must be a list of thrusters: [{position, direction, force}, ...]")
+    return value
+
+
+Thrusters = Annotated[tuple[Thruster, ...], BeforeValidator(_read_thrusters)]
+
+
+def thruster_problems(scene: Scene) -> Iterator[Problem]:
+    """Find thrusters that contradict themselves or others, or leave the plane of a planar base."""
+    names: list[str] = []
+    for index, thruster in enumerate(scene.actuators.thrusters or ()):
+        here = ("actuators", "thrusters", index)
+        if thruster.name in names:
+            yield Problem((*here, "name"), thruster.name, "another thruster has this name")
+        names += [] if thruster.name is None else [thruster.name]
+        if thruster.minimum_on_time is not None:
+            if thruster.minimum_impulse is not None:
+                sentence = "must be absent: minimum_on_time says the same"
+                yield Problem((*here, "minimum_impulse"), thruster.minimum_impulse, sentence)
+            if math.isinf(thruster.force):
+                sentence = "must be absent: the largest force is not finite"
+                yield Problem((*here, "minimum_on_time"), thruster.minimum_on_time, sentence)
+        if scene.base.motion == "planar":
+            for field in ("position", "direction"):
+                if (vector := getattr(thruster, field))[2]:
+                    sentence = 'base.motion is "planar": the z component must be 0'
+                    yield Problem((*here, field), vector, sentence)
+
+
+def allocate(scene: Scene, force: ArrayLike, torque: ArrayLike) -> Array:
+    """Find the forces of a scene's thrusters that give a net force and torque, by non-negative least squares.
+
+    Where the largest forces do not suffice, all are reduced in proportion: the net force keeps its direction.
+
+    Args:
+        scene: The scene, with thrusters.
+        force: On the base, base axes, shape (3,) or (B, 3), N.
+        torque: About the base's center of mass, base axes, shape (3,) or (B, 3), N m.
+
+    Returns:
+        One force per thruster, shape (n,) or (B, n), N; the nearest net force and torque where no
+        forces give the wanted ones.
+
+    Raises:
+        ValueError: If the scene has no thrusters, or a shape is wrong.
+    """
+    thrusters = scene.actuators.thrusters
+    if not thrusters:
+        raise ValueError(f"scene {scene.name!r} has no thrusters to allocate forces to")
+    wanted = np.concatenate(
+        np.broadcast_arrays(*(np.asarray(v, np.float64) for v in (force, torque))), axis=-1
+    )
+    if wanted.ndim > 2 or wanted.shape[-1] != 6:
+        raise ValueError(f"force, torque: shapes {np.shape(force)}, {np.shape(torque)}, must end in 3")
+    wrenches = np.array([[*each.unit_direction, *each.moment] for each in thrusters]).T
+    forces = np.array([_non_negative(wrenches, each) for each in np.atleast_2d(wanted)])
+    share = np.array([each.force for each in thrusters]) / np.maximum(forces, 1e-300)
+    forces *= np.minimum(share.min(axis=1, keepdims=True), 1.0)
+    return forces[0] if wanted.ndim == 1 else forces
+
+
+def _non_negative(matrix: Array, wanted: Array) -> Array:
+    """Least squares with x >= 0 (Lawson & Hanson, Solving Least Squares Problems, 1974, chapter 23)."""
+    count = matrix.shape[1]
+    x, active = np.zeros(count), np.zeros(count, bool)
+    tolerance = 1e-13 * float(np.linalg.norm(wanted))
+    for _ in range(10 * count):
+        slope = np.where(active, -np.inf, matrix.T @ (wanted - matrix @ x))
+        if active.all() or slope.max() <= tolerance:
+            break
+        active[slope.argmax()] = True
+        while True:
+            found = np.zeros(count)
+            found[active] = np.linalg.lstsq(matrix[:, active], wanted, rcond=None)[0]
+            below = active & (found <= 0.0)
+            if not below.any():
+                x = found
+                break
+            # As far as all stay positive; those that reach zero leave.
+            x = x + np.min(x[below] / (x[below] - found[below])) * (found - x)
+            active &= x > 1e-15 * max(float(x.max()), 1e-300)
+            x[~active] = 0.0
+    return x
+
+
+def fuel_used(scene: Scene, controls: ArrayLike) -> float:
+    """Fuel that the thrusters of a maneuver burn: sum f dt / (I_sp g0) over those with a specific impulse.
+
+    The masses of the scene do not change by it.
+
+    Args:
+        scene: The scene, with thrusters.
+        controls: Inputs of the stages, shape (N, n_u), of which the last are the thrusters' forces, N.
+
+    Returns:
+        The fuel, kg.
+    """
+    thrusters = scene.actuators.thrusters or ()
+    forces = np.asarray(controls, np.float64)[:, -len(thrusters) :].sum(axis=0) if thrusters else ()
+    used = 0.0
+    for each, total in zip(thrusters, forces, strict=True):
+        if each.specific_impulse is not None:
+            used += float(total) * scene.simulation.dt / (each.specific_impulse * STANDARD_GRAVITY)
+    return used
