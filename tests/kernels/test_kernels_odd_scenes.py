@@ -21,6 +21,10 @@ def only(**actuators):
 BASE_ONLY = only(base_force=1.0, base_torque=1.0)
 
 
+SKEW = [{"axis": axis, "inertia": 0.05, "torque": 1.0} for axis in ([1, 0, 0.5], [0, 1, -1])]
+JETS = [{"position": [0.5, -0.2, 0.1 * i], "direction": [1, i, 2], "force": 1.0} for i in range(2)]
+
+
 def scene(**changes):
     return PAPER.replace(**{"initial_state": InitialState(), "spread": Spread(), "target": HERE, **changes})
 
@@ -29,6 +33,11 @@ ODD = {
     "base": scene(links=[], wrist=None, actuators=BASE_ONLY),
     "wrist": scene(links=[], actuators=only(base_force=1.0, wrist_rate=0.5)),
     "one link": scene(links=LINKS[1:2], wrist=None, actuators=only(joint_torque=1.0)),
+    "wheels and jets": scene(
+        links=LINKS[1:2],
+        wrist=None,
+        actuators=Actuators(wheels=SKEW, thrusters=JETS, joint_torque={"limit": 1.0}),
+    ),
     "no actuator": scene(actuators=Actuators()),
     "wrist without motor": scene(actuators=BASE_ONLY),
     "passive middle joint": scene(links=[LINKS[0], LINKS[1] | {"actuated": False}, LINKS[2]]),
@@ -49,7 +58,7 @@ def test_dynamics_agree_with_the_papers_system(name, draw):
 
 def odd_scenes_and_integrators():
     """All pairs; methods that share their code with others are fast for small scenes only."""
-    for name in ("base", "wrist", "one link", "no actuator", "wrist without motor"):
+    for name in ("base", "wrist", "one link", "wheels and jets", "no actuator", "wrist without motor"):
         for integrator in INTEGRATORS:
             is_slow = not INTEGRATORS[integrator].has_curvature and name != "one link"
             yield pytest.param(name, integrator, marks=[pytest.mark.slow] if is_slow else [])
