@@ -24,19 +24,20 @@ def label_by_gains(demonstrations: Demonstrations, visits: Rollout) -> Correctio
     """
     assert visits.states is not None
     assert visits.observations is not None
-    parts = []
+    parts, layout = [], demonstrations.kernels.layout
+    least = layout.lower_limits(np.ones(layout.n_u))
     for i, demonstration in enumerate(demonstrations):
         steps = slice(int(visits.length[i]))
         states = visits.states[i, steps]
         gains = demonstration.feedback_gains[steps]
         deviations = demonstrations.tangent(demonstration.states[steps], states)
         wanted = demonstration.actions[steps] + np.einsum("kij,kj->ki", gains, deviations)
-        free = np.abs(wanted) < 1.0
+        free = (least < wanted) & (wanted < 1.0)
         parts.append(
             Corrections(
                 states,
                 visits.observations[i, steps],
-                np.clip(wanted, -1.0, 1.0),
+                np.clip(wanted, least, 1.0),
                 np.where(free[:, :, None], gains, np.float32(0.0)),
                 demonstrations.kernels.stage_parameters(demonstration.parameters)[steps],
             )
@@ -122,8 +123,10 @@ class Solver:
     ) -> FloatArray:
         """Actions of the demonstration's feedback policy, rolled out from a state."""
         actions = demonstration.actions[stage:].copy()
+        least = self._kernels.layout.lower_limits(np.ones_like(limits))
         for k in range(len(actions)):
             deviation = self._kernels.difference(demonstration.states[stage + k], state)
-            actions[k] = np.clip(actions[k] + demonstration.feedback_gains[stage + k] @ deviation, -1.0, 1.0)
+            wanted = actions[k] + demonstration.feedback_gains[stage + k] @ deviation
+            actions[k] = np.clip(wanted, least, 1.0)
             state = self._kernels.step(state, actions[k] * limits, p=rows[k])
         return actions

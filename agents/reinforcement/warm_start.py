@@ -167,12 +167,13 @@ def _mean_action(
     """
     kernels = data.kernels
     total, limits = np.zeros((len(chosen), kernels.n_u)), kernels.layout.limits_with(rows[:, 0])
+    least = kernels.layout.lower_limits(np.ones(kernels.n_u))
     stages = range(stage, min(stage + hold, data.scene.simulation.steps))
     for at in stages:
         deviation = data.tangent(np.array([each.states[at] for each in chosen]), states)
         gains = np.array([each.feedback_gains[at] for each in chosen])
         nominal = np.array([each.actions[at] for each in chosen])
-        actions = np.clip(nominal + np.einsum("bij,bj->bi", gains, deviation), -1.0, 1.0)
+        actions = np.clip(nominal + np.einsum("bij,bj->bi", gains, deviation), least, 1.0)
         states = kernels.step(states, actions * limits, p=rows[:, at])
         total += actions
     mean: SingleArray = (total / len(stages)).astype(np.float32)
