@@ -105,7 +105,8 @@ def rows_of(scene: Scene, each: Constraint) -> list[Row]:
             if math.isfinite(wheel.speed):
                 rows += [Row(f"{start} speed {sign}", "rad/s", *common) for sign in "-+"]
             if math.isfinite(wheel.power):
-                rows += [Row(f"{start} power {sign}", "W", *common, has_input=True) for sign in "-+"]
+                unseen = *common[:3], None
+                rows += [Row(f"{start} power {sign}", "W", *unseen, has_input=True) for sign in "-+"]
     elif isinstance(each, ControlRate):
         for limit in rate_limits(scene, each):
             names = [f"{each.name}: {limit.name} {word}" for word in ("falls", "rises")]

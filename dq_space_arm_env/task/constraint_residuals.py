@@ -392,7 +392,7 @@ def _wheel_limits(situation: _Situation, constraint: WheelLimits) -> Iterator[Sc
             yield speed - wheel.speed
         if math.isfinite(wheel.power):
             corner = wheel.power / wheel.torque if math.isfinite(wheel.torque) else 1.0
-            size = casadi.fabs(speed)
+            size = select(speed > 0.0, speed, -speed)
             most = wheel.power / select(size > 0.5 * corner, size, 0.5 * corner)
             yield corner * (-torque - most)
             yield corner * (torque - most)

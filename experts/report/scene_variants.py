@@ -6,6 +6,7 @@ from typing import Any
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.scene import Pose
+from dq_space_arm_env.scene.constraints import WheelLimits
 
 _TIP_WRENCH = {"force": [0.2, 0.0, -0.1], "torque": [0.05, 0.0, 0.02]}
 _SPRING = {"stiffness": 10.0, "damping": 1.0}  # N m/rad, N m s/rad
@@ -16,6 +17,8 @@ _ACTUATORS = {
     "base_torque": "base torque",
     "joint_torque": "joint torques",
     "wrist_rate": "wrist inputs",
+    "wheels": "wheels",
+    "thrusters": "thrusters",
 }
 
 
@@ -89,7 +92,12 @@ def without_actuators(scene: Scene, *names: str) -> Scene:
     links = scene.links
     if "joint_torque" in names:
         links = tuple(link.model_copy(update={"torque_limit": None}) for link in links)
-    return scene.replace(actuators=dict.fromkeys(names), links=links)
+    changes: dict[str, Any] = {"actuators": dict.fromkeys(names), "links": links}
+    if "wheels" in names:
+        limits = [each for each in scene.constraints if isinstance(each, WheelLimits)]
+        changes["constraints"] = [each for each in scene.constraints if each not in limits]
+        changes |= {"initial_state": {"wheel_speeds": ()}, "spread": {"wheel_speeds": 0.0}}
+    return scene.replace(**changes)
 
 
 def without_wrist(scene: Scene) -> Scene:
@@ -134,8 +142,10 @@ def with_links(scene: Scene, count: int) -> Scene | None:
 
 
 def in_the_plane(scene: Scene) -> Scene:
-    """The robot in the plane: no wrist, all axes along z, offsets along z turned to x."""
+    """The robot in the plane: no wrist, wheels and jets, all axes along z, offsets along z turned to x."""
     flat = without_wrist(scene) if scene.wrist else scene
+    out_of_plane = [name for name in ("wheels", "thrusters") if getattr(flat.actuators, name)]
+    flat = without_actuators(flat, *out_of_plane) if out_of_plane else flat
     wrench, start = flat.tip_wrench, flat.initial_state
     base_pose, velocity = _flat_pose(start.base_pose), _flat_twist(start.base_velocity)
     changes: dict[str, Any] = {
