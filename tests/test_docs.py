@@ -56,6 +56,8 @@ DIMENSIONLESS = {
     "Spread.payload_mass",
     "Spread.payload_inertia",
     "Axis.direction",
+    "Thruster.direction",
+    "Wheel.axis",
     "LineOfSight.boresight",
     "ApproachCorridor.direction",
     "AxisLimits.limit",
