@@ -131,6 +131,7 @@ def best_gradient_step(scene, solution):
     rows = solution.parameters  # of the stages, (N + 1, n_p)
     limits = kernels.layout.limits_with(rows[:-1]) if kernels.n_p else kernels.layout.control_limit
     limits, here = np.broadcast_to(limits, controls.shape), {"x": states[:-1], "u": controls, "p": rows[:-1]}
+    least = kernels.layout.lower_limits(limits)
     n_t, path, end = kernels.n_t, *multipliers_of(solution, kernels)
     a, b = kernels.linearize(**here)
     lx, lu, _, luu = kernels.call("cost_derivatives", **here)
@@ -149,7 +150,7 @@ def best_gradient_step(scene, solution):
     x = np.tile(states[0], (len(lengths), 1))
     value = np.zeros(len(lengths))
     for k in range(len(controls)):
-        u = np.clip(controls[k] - lengths[:, None] * direction[k], -limits[k], limits[k])
+        u = np.clip(controls[k] - lengths[:, None] * direction[k], least[k], limits[k])
         value += kernels.cost(x, u, p=rows[k])
         if path.size:
             value += kernels.constraints(x, u, p=rows[k]) @ path[k]
