@@ -211,15 +211,19 @@ class EquationsOfMotion:
         ]
         return [entry for five in transmitted for entry in five]
 
-    def _missing_wrenches(self, motion: Motion, given: Accelerations) -> list[Any]:
-        """Force and torque on base and links that given accelerations need besides the tip's wrench."""
+    def _missing_wrenches(self, motion: Motion, given: Accelerations) -> tuple[list[Any], list[Scalar]]:
+        """Force and torque on base and links that given accelerations need besides the tip's wrench.
+
+        Besides, the torques that the joints' rotors need.
+        """
         frames = minimal.link_frames(self.tree, motion.joint_angles)
-        needed = minimal.body_wrenches(self.tree, frames, motion.angular, motion.joint_rates, given)
+        needed, rotors = minimal.body_wrenches(self.tree, frames, motion.angular, motion.joint_rates, given)
         acting = self._acting(motion, Inputs(ZERO, ZERO, [], []), self.tree.tip_wrench)
-        return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(needed, acting, strict=True)]
+        pairs = zip(needed, acting, strict=True)
+        return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in pairs], rotors
 
     def _reactions(self, motion: Motion, solved: Accelerations) -> Sequence[Any]:
         """Force and torque that each joint transmits to its link, in joint axes."""
         frames = minimal.link_frames(self.tree, motion.joint_angles)
-        missing = self._missing_wrenches(motion, solved)
+        missing, _ = self._missing_wrenches(motion, solved)
         return minimal.passed_to_base(self.tree, frames, missing).reactions

@@ -27,6 +27,7 @@ from dq_space_arm_env.scene.parameters import center_name, inertia_name
 
 if TYPE_CHECKING:
     from dq_space_arm_env.scene import Base, Link, Payload, Pose, Scene
+    from dq_space_arm_env.scene.drives import Motor
 
 Scalar = Any
 Given = Mapping[str, Scalar]
@@ -59,6 +60,26 @@ class Screw(NamedTuple):
     slide: float  # 0 for a revolute joint, 1 for a prismatic one, or the pitch, m/rad
 
 
+class Rotor(NamedTuple):
+    """A motor's rotor on the body before a joint, which a gear turns about the joint's z axis."""
+
+    inertia: Scalar  # J_r, about its axis, kg m^2; the body before the joint has the rest of its inertia
+    gear: float  # N, turns of the rotor per coordinate of the joint, 1 or rad/m
+    exact: bool  # energy J_r (a . omega + N rate)^2 / 2 with the body's omega, or J_r (N rate)^2 / 2
+
+    @property
+    def reflected(self) -> Scalar:
+        """Inertia about the joint, N^2 J_r."""
+        return self.inertia * (self.gear * self.gear)
+
+
+class Friction(NamedTuple):
+    """Coulomb friction of a joint, torque tanh(rate / speed)."""
+
+    torque: Scalar  # N m
+    speed: float  # rad/s
+
+
 SCREWS = {"revolute": Screw(1.0, 0.0), "prismatic": Screw(0.0, 1.0)}
 
 
@@ -76,6 +97,8 @@ class JointedLink:
     stiffness: Scalar  # N m/rad
     rest_angle: float  # of the spring, rad
     damping: Scalar  # N m s/rad
+    rotor: Rotor | None = None
+    friction: Friction | None = None
 
 
 @dataclass(frozen=True)
@@ -127,6 +150,7 @@ class KinematicTree:
                     given.get(f"links.{index}.stiffness", link.stiffness),
                     link.rest_angle,
                     given.get(f"links.{index}.damping", link.damping),
+                    *_drive(link.motor, f"links.{index}.motor", given),
                 )
                 for index, (body, link) in enumerate(zip(bodies, scene.links, strict=True))
             ),
@@ -178,6 +202,18 @@ def _rigid_body(body: Base | Link | Payload, place: str, center_of_mass: Vector,
             tuple(given.get(inertia_name(place, i, j), entry) for j, entry in enumerate(row))
             for i, row in enumerate(body.inertia)
         ),
+    )
+
+
+def _drive(motor: Motor | None, place: str, given: Given) -> tuple[Rotor | None, Friction | None]:
+    """Rotor and friction of a joint's motor, as far as it has them."""
+    if motor is None:
+        return None, None
+    inertia = given.get(f"{place}.inertia", motor.inertia)
+    torque = given.get(f"{place}.friction", motor.friction)
+    return (
+        Rotor(inertia, motor.gear, motor.coupling == "exact") if motor.inertia else None,
+        Friction(torque, motor.friction_speed) if motor.friction else None,
     )
 
 

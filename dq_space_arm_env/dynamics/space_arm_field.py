@@ -146,8 +146,10 @@ class SpaceArmField(EquationsOfMotion):
         motion = self.motion(free)
         given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
         passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
-        missing = [entry for pair in self._missing_wrenches(motion, given) for part in pair for entry in part]
-        by_y = casadi.jacobian(column(*missing, *(-torque for torque in passive)), column(*free))
+        wrenches, rotors = self._missing_wrenches(motion, given)
+        missing = [entry for pair in wrenches for part in pair for entry in part]
+        missing += [rotor - torque for rotor, torque in zip(rotors, passive, strict=True)]
+        by_y = casadi.jacobian(column(*missing), column(*free))
         values = casadi.densify(column(*y, *solved.angular, *solved.linear, *solved.joints))
         by_y = casadi.substitute(by_y, column(*free, *acceleration), values)
         angles = self._in_y(self.layout.state.joint_angles)

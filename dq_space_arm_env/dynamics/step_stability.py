@@ -21,7 +21,7 @@ class JointMotion(NamedTuple):
     """The fastest motions of the joints about their springs, at the start of a scene."""
 
     frequency: float  # of the stiffest swing, rad/s
-    decay: float  # of the fastest relaxation in the dampers, 1/s
+    decay: float  # of the fastest relaxation in dampers and friction, 1/s
 
 
 def joint_motion(scene: Scene) -> JointMotion:
@@ -34,7 +34,11 @@ def joint_motion(scene: Scene) -> JointMotion:
         Square root of the largest eigenvalue of the first, and largest of the second; zeros without any.
     """
     tree, links = KinematicTree.from_scene(scene), scene.links
-    if not any(link.stiffness or link.damping for link in links):
+    slopes = [
+        link.damping + (0.0 if link.friction is None else link.friction.torque / link.friction.speed)
+        for link in tree.links
+    ]
+    if not any(link.stiffness or slope for link, slope in zip(links, slopes, strict=True)):
         return JointMotion(0.0, 0.0)
     whole = np.array(mass_matrix(tree, link_frames(tree, scene.initial_state.joint_angles)), dtype=float)
     free = [2, 3, 4, *range(6, len(whole))] if tree.planar else range(len(whole))
@@ -46,7 +50,7 @@ def joint_motion(scene: Scene) -> JointMotion:
         return max(0.0, float(np.linalg.eigvalsh(root[:, None] * inverse * root)[-1]))
 
     frequency = sqrt(largest([link.stiffness for link in links]))
-    return JointMotion(frequency, largest([link.damping for link in links]))
+    return JointMotion(frequency, largest(slopes))
 
 
 def _used(scene: Scene) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
@@ -25,8 +25,30 @@ def free_name(wanted: str, taken: Collection[str]) -> str:
     return wanted
 
 
-def refuse(scene: Scene, language: str, wrist: str, *, springs: bool = False, planar: bool = False) -> None:
-    """Refuse a scene that the format cannot represent without changing its motion."""
+def coupled_rotors(scene: Scene) -> Iterator[str]:
+    """Say of the first rotor that turns with the body before its joint that others lack the like."""
+    for link in scene.links:
+        if link.motor is not None and link.motor.inertia and link.motor.coupling == "exact":
+            yield (
+                "it has no rotors that turn with the body before the joint, and "
+                f"link {link.name!r} has one: set its motor's coupling to armature"
+            )
+            return
+
+
+def refuse(
+    scene: Scene,
+    language: str,
+    wrist: str,
+    *,
+    springs: bool = False,
+    planar: bool = False,
+    rotors: bool = False,
+) -> None:
+    """Refuse a scene that the format cannot represent without changing its motion.
+
+    `springs`, `planar`, `rotors`: formats without joint springs, planar bases, and rotors of any kind.
+    """
     if wrist not in ("refuse", "fixed"):
         raise ValueError(f"wrist: {wrist!r}, it must be 'refuse' or 'fixed'")
     problems = []
@@ -45,6 +67,11 @@ def refuse(scene: Scene, language: str, wrist: str, *, springs: bool = False, pl
     screws = [link.name for link in scene.links if link.joint_type == "screw"]
     if screws:
         problems.append(f"it has no screw joints, and link {screws[0]!r} has one")
+    geared = [link.name for link in scene.links if link.motor is not None and link.motor.inertia]
+    if rotors and geared:
+        problems.append(f"it has no rotors, and link {geared[0]!r} has one: set its motor's inertia to 0")
+    elif geared:
+        problems += coupled_rotors(scene)
     if problems:
         raise SceneError("\n  - ".join([f"scene {scene.name!r} cannot be written as {language}:", *problems]))
 

@@ -40,6 +40,7 @@ ANGLES = Range(0.0, 1e6)  # rad: up to where the code reduces angles with full p
 RATES = Range(0.0, 1e9)  # rad/s, m/s
 MASSES = Range(1e-12, 1e12)  # kg: from a speck of dust to a mountain
 INERTIAS = Range(1e-18, 1e18)  # kg m^2
+GEARS = Range(1e-6, 1e6)  # 1, rad/m
 FORCES = Range(1e-12, 1e12)  # N, N m, of limits
 LOADS = Range(0.0, FORCES.most)
 STATE_WEIGHTS = Range(0.0, 1e15)
@@ -178,6 +179,9 @@ Count = Annotated[int, count_up_to(_MOST_COUNT)]
 Vector3 = Annotated[Three, _vector(3)]
 
 Mass = Annotated[float, positive(MASSES)]
+MomentOfInertia = Annotated[float, non_negative(INERTIAS)]
+Gear = Annotated[float, _number(lambda n: n != 0 and math.isfinite(n), "a finite number other than 0", GEARS)]
+Speed = Annotated[float, positive(Range(1e-9, RATES.most))]
 Position = Annotated[Three, _vector(3, LENGTHS)]
 Twist = Annotated[Six, _vector(6, RATES)]
 Load = Annotated[Three, _vector(3, LOADS)]
