@@ -80,6 +80,15 @@ class Friction(NamedTuple):
     speed: float  # rad/s
 
 
+class Elasticity(NamedTuple):
+    """An elastic gear between rotor and joint; on the joint's side."""
+
+    inertia: Scalar  # of the rotor, B = N^2 J_r, kg m^2
+    stiffness: Scalar  # N m/rad
+    damping: Scalar  # N m s/rad
+    friction: Friction | None  # of the rotor
+
+
 SCREWS = {"revolute": Screw(1.0, 0.0), "prismatic": Screw(0.0, 1.0)}
 
 
@@ -99,6 +108,7 @@ class JointedLink:
     damping: Scalar  # N m s/rad
     rotor: Rotor | None = None
     friction: Friction | None = None
+    elastic: Elasticity | None = None  # in place of rotor and friction
 
 
 @dataclass(frozen=True)
@@ -205,16 +215,19 @@ def _rigid_body(body: Base | Link | Payload, place: str, center_of_mass: Vector,
     )
 
 
-def _drive(motor: Motor | None, place: str, given: Given) -> tuple[Rotor | None, Friction | None]:
-    """Rotor and friction of a joint's motor, as far as it has them."""
+def _drive(
+    motor: Motor | None, place: str, given: Given
+) -> tuple[Rotor | None, Friction | None, Elasticity | None]:
+    """Rotor, friction and elasticity of a joint's motor, as far as it has them."""
     if motor is None:
-        return None, None
-    inertia = given.get(f"{place}.inertia", motor.inertia)
-    torque = given.get(f"{place}.friction", motor.friction)
-    return (
-        Rotor(inertia, motor.gear, motor.coupling == "exact") if motor.inertia else None,
-        Friction(torque, motor.friction_speed) if motor.friction else None,
-    )
+        return None, None, None
+    values = {name: given.get(f"{place}.{name}", getattr(motor, name)) for name in motor.varying}
+    rotor = Rotor(values["inertia"], motor.gear, motor.coupling == "exact") if motor.inertia else None
+    friction = Friction(values["friction"], motor.friction_speed) if motor.friction else None
+    if motor.stiffness is None or rotor is None:
+        return rotor, friction, None
+    damping = values.get("damping", 0.0)
+    return None, None, Elasticity(rotor.reflected, values["stiffness"], damping, friction)
 
 
 def _placement(pose: Pose) -> Placement:

@@ -148,5 +148,5 @@ class CanonicalCoordinates:
         gradient = casadi.substitute(casadi.densify(gradient), names, values)
         inertial = dense_entries(gradient)
         torques = self.balance.joint_torques(y, u)
-        # Joint angles come before wrist angles, which nothing depends on.
+        # Angles of joints and motors come before wrist angles, which nothing depends on.
         return [a + b for a, b in zip(inertial[:n], torques, strict=True)]

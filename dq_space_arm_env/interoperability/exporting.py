@@ -26,7 +26,10 @@ def free_name(wanted: str, taken: Collection[str]) -> str:
 
 
 def coupled_rotors(scene: Scene) -> Iterator[str]:
-    """Say of the first rotor that turns with the body before its joint that others lack the like."""
+    """Say of elastic gears, and of rotors that turn with the body before their joint, that it has none."""
+    elastic = [link.name for link in scene.links if link.is_elastic]
+    if elastic:
+        yield f"it has no elastic gears, and link {elastic[0]!r} has one: remove its motor's stiffness"
     for link in scene.links:
         if link.motor is not None and link.motor.inertia and link.motor.coupling == "exact":
             yield (
@@ -68,7 +71,7 @@ def refuse(
     if screws:
         problems.append(f"it has no screw joints, and link {screws[0]!r} has one")
     geared = [link.name for link in scene.links if link.motor is not None and link.motor.inertia]
-    if rotors and geared:
+    if rotors and geared and not any(link.is_elastic for link in scene.links):
         problems.append(f"it has no rotors, and link {geared[0]!r} has one: set its motor's inertia to 0")
     elif geared:
         problems += coupled_rotors(scene)

@@ -149,6 +149,11 @@ class Link(Model):
         return self.joint_type != "prismatic"
 
     @property
+    def is_elastic(self) -> bool:
+        """Whether the gear of the joint's motor is a spring."""
+        return self.motor is not None and self.motor.is_elastic
+
+    @property
     def unit(self) -> str:
         """Unit of the joint's coordinate."""
         return "rad" if self.turns else "m"

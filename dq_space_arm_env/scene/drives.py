@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dq_space_arm_env.validation.fields import Gear, MomentOfInertia, NonNegative, Speed
+from dq_space_arm_env.validation.fields import Gear, MomentOfInertia, NonNegative, Positive, Speed
 from dq_space_arm_env.validation.problems import Model, Problem
 
 
@@ -28,7 +28,9 @@ class Motor(Model):
         "to the inertia of the joint alone, as MuJoCo and Pinocchio have it",
     )
     friction: NonNegative = Field(
-        default=0.0, description="Coulomb friction of the joint, N m (N); it is smooth: tanh(rate / speed)"
+        default=0.0,
+        description="Coulomb friction on the joint's side, N m (N), of the motor if the gear is elastic; it "
+        "is smooth: tanh(rate / speed)",
     )
     friction_speed: Speed = Field(
         default=0.01, description="speed in it, at which it reaches 76 %, rad/s (m/s)"
@@ -39,6 +41,40 @@ class Motor(Model):
         """N^2 J_r, the rotor's inertia about the joint, kg m^2 (kg)."""
         return self.gear * self.gear * self.inertia
 
+    stiffness: Positive | None = Field(
+        default=None,
+        exclude_if=lambda stiffness: stiffness is None,
+        description="stiffness of the gear between rotor and link, N m/rad (N/m): angle and rate of the "
+        "motor are states then, on the joint's side; absent: rigid",
+    )
+    damping: NonNegative = Field(
+        default=0.0,
+        exclude_if=lambda damping: not damping,
+        description="viscous damping of an elastic gear, N m s/rad (N s/m)",
+    )
+
+    @property
+    def is_elastic(self) -> bool:
+        """Whether the gear is a spring."""
+        return self.stiffness is not None
+
+    @property
+    def varying(self) -> list[str]:
+        """The numbers that may be parameters, those that are not 0: others are not in the machine code."""
+        return [name for name in ("inertia", "friction", "stiffness", "damping") if getattr(self, name)]
+
     def _problems(self) -> Iterator[Problem]:
         if not (self.inertia or self.friction):
             yield Problem(("inertia",), self.inertia, "a motor needs an inertia or friction: remove it")
+        elif self.is_elastic and not self.inertia:
+            sentence = "the rotor behind an elastic gear needs an inertia: give it, or remove stiffness"
+            yield Problem(("inertia",), self.inertia, sentence)
+        if self.is_elastic and self.coupling != "armature":
+            sentence = (
+                "the rotor behind an elastic gear moves relative to its carrier alone (Spong's reduced "
+                "model): set it to armature"
+            )
+            yield Problem(("coupling",), self.coupling, sentence)
+        if self.damping and not self.is_elastic:
+            sentence = "a rigid gear has none: give a stiffness too, or damping of the link"
+            yield Problem(("damping",), self.damping, sentence)

@@ -1,6 +1,7 @@
 """Layout of the state, the tangent, the controls and the parameters of a scene.
 
-State: base pose, joint angles, wrist angles, base velocity, joint rates, and what actuators keep from step to
+State: base pose, joint angles, wrist angles, base velocity, joint rates, angles and rates of
+motors behind elastic gears, and what actuators keep from step to
 step: the previous controls whose rates are limited. Tangent: the same, with a twist
 increment of the base in base axes (rotation, then translation) in place of the pose. Controls: base force,
 base torque, joint torques of the actuated joints, wrist rates. Parameters: target, bodies from base to
@@ -58,6 +59,8 @@ class _MotionEntries(_Entries):
     angular_velocity: slice  # part of base_velocity
     linear_velocity: slice  # part of base_velocity
     joint_rates: slice  # base to tip
+    motor_angles: slice  # of elastic joints, on the joints' side
+    motor_rates: slice  # likewise
     actuators: slice  # previous controls, those of `StateLayout.previous_controls`
 
 
@@ -370,7 +373,19 @@ class _Collector:
             "angular_velocity": angular,
             "linear_velocity": linear,
             "joint_rates": joint_rates,
+            **self.add_motors(scene),
             "actuators": self.add_previous_controls(scene),
+        }
+
+    def add_motors(self, scene: Scene) -> dict[str, slice]:
+        """Append angles and rates of the motors of elastic joints."""
+        links = [link for link in scene.links if link.is_elastic]
+        kinds = ("displacement", "angle")
+        angles = [f"{link.name} motor {kinds[link.turns]}" for link in links]
+        rates = [f"{link.name} motor rate" for link in links]
+        return {
+            "motor_angles": self.add_each([link.unit for link in links], angles),
+            "motor_rates": self.add_each([f"{link.unit}/s" for link in links], rates),
         }
 
     def add_previous_controls(self, scene: Scene) -> slice:

@@ -106,12 +106,15 @@ def numbers(scene: Scene) -> Iterator[Number]:
 
 
 def _motor_numbers(place: str, link: Link) -> Iterator[Number]:
-    """The numbers of a joint's motor, those that are not 0: what a scene does not have is not in its code."""
-    if link.motor is not None:
-        numbers = {"inertia": "kg m^2", "friction": link.effort_unit}
-        for name, unit in numbers.items():
-            if getattr(link.motor, name):
-                yield _number(f"{place}.{name}", unit, getattr(link.motor, name))
+    """The numbers of a joint's motor that may vary."""
+    units = {
+        "inertia": "kg m^2",
+        "friction": link.effort_unit,
+        "stiffness": f"{link.effort_unit}/{link.unit}",
+        "damping": f"{link.effort_unit} s/{link.unit}",
+    }
+    for name in link.motor.varying if link.motor is not None else ():
+        yield _number(f"{place}.{name}", units[name], getattr(link.motor, name))
 
 
 def catch_numbers(scene: Scene) -> Iterator[Number]:

@@ -160,7 +160,10 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
         pose = [pose[index] for index in PLANAR_POSE]
         velocity = [velocity[index] for index in PLANAR_TWIST]
     previous = start.previous_controls or (0.0,) * len(previous_controls(scene))
-    state = [*pose, *joint_angles, *wrist_angles, *velocity, *joint_rates, *previous]
+    elastic = [index for index, link in enumerate(scene.links) if link.is_elastic]
+    # Elastic gears start unstrained: their motors stand and move as the joints do.
+    motors = [part[index] for part in (joint_angles, joint_rates) for index in elastic]
+    state = [*pose, *joint_angles, *wrist_angles, *velocity, *joint_rates, *motors, *previous]
     return EpisodeStart(state, drawn)
 
 

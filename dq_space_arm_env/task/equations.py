@@ -228,6 +228,8 @@ class SceneEquations:
             *motion.joint_angles,
             *motion.wrist_angles,
             *motion.joint_rates,
+            *motion.motor_angles,
+            *motion.motor_rates,
             *motion.previous_controls,
             *([self.given[PHASE]] if self.scene.phases else []),
             *besides,

@@ -14,7 +14,7 @@ from dq_space_arm_env.algebra import poses, screw
 from dq_space_arm_env.algebra.vectors import matrix_vector
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
-from dq_space_arm_env.dynamics import kinematics, minimal
+from dq_space_arm_env.dynamics import drives, kinematics, minimal
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators import checked_integrator_of
 from dq_space_arm_env.integrators.actuated import append_measured_step
@@ -174,7 +174,9 @@ class ScenePrograms:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             motion, _, velocities = self._velocities(x)
             kinetic, potential = kinematics.energy(self.tree, motion.joint_angles, velocities)
-            return {"energy": [kinetic + potential]}
+            motors = (motion.motor_angles, motion.motor_rates)
+            driving = drives.drive_energy(self.tree, motion.joint_angles, *motors)
+            return {"energy": [kinetic + potential + driving]}
 
         return self._program("energy", outputs, x=self.field.n_x)
 
@@ -256,7 +258,8 @@ class ScenePrograms:
         field, state = self.field, self.layout.state
         n_pose = len(field.pose.stored)
         angles = (state.joint_angles, state.wrist_angles)
-        parts = (state.base_velocity, *angles, state.joint_rates, state.actuators)
+        motors = (state.motor_angles, state.motor_rates)
+        parts = (state.base_velocity, *angles, state.joint_rates, *motors, state.actuators)
 
         def outputs(observation: Scalars) -> Mapping[str, Scalars]:
             x: list[Scalar] = [0.0] * field.n_x
