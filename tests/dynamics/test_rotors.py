@@ -33,9 +33,9 @@ def random_rotor(rng, exact):
 class Case:
     """A random robot whose joints have rotors (but one in four), and a motion of it."""
 
-    def __init__(self, joints, seed, exact=True):
+    def __init__(self, joints, seed, exact=True, branches=False):
         self.rng = rng = np.random.default_rng((joints, seed))
-        tree = twin.random_tree(rng, joints, wrist=False)
+        tree = twin.random_tree(rng, joints, branches, wrist=False)
         rotors = [random_rotor(rng, exact) if rng.uniform() < 0.75 else None for _ in range(joints)]
         links = [replace(link, rotor=rotor) for link, rotor in zip(tree.links, rotors, strict=True)]
         self.tree = replace(tree, links=tuple(links), heaviest=int(rng.integers(joints + 1)))
@@ -155,3 +155,17 @@ def test_the_reaction_of_a_rotor_is_what_armature_leaves_out():
         np.array(minimal.inverse_dynamics(tree, frames, ZERO, [0.0], rest).torque) for tree in (still, plain)
     ]
     np.testing.assert_allclose(torques[0] - torques[1], 1e-4 * 100.0 * axis, atol=1e-14)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_rotors_of_arms_that_branch_are_alike_in_every_formulation(exact):
+    for seed in range(8):
+        case = Case(5, seed, exact, branches=True)
+        expected = case.accelerations(MassMatrix)
+        for root in range(6):
+            found = case.accelerations(partial(ArticulatedBodies, root=root))
+            assert relative_error(found, expected) < 1e-11
+        moving = vectors.add(expected[:3], vectors.cross(case.angular, case.linear))
+        given = Accelerations(expected[3:6], moving, expected[6:])
+        needed = minimal.inverse_dynamics(case.tree, case.frames, case.angular, case.rates, given)
+        assert relative_error([*needed.force, *needed.torque, *needed.joints], case.tau) < 1e-11
