@@ -36,6 +36,8 @@ class Motion:
     motor_angles: Sequence[Scalar]  # of elastic joints, rad
     motor_rates: Sequence[Scalar]  # of elastic joints, rad/s
     previous_controls: Sequence[Scalar]  # those of the layout, N, N m, rad/s
+    drives: Sequence[Scalar]  # commands on their way and outputs, those of the layout's chains
+    wrist_rates: Sequence[Scalar]  # psi, theta, phi, rad/s, where they are states; else empty
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,24 @@ class EquationsOfMotion:
             part(layout.state.motor_angles),
             part(layout.state.motor_rates),
             part(layout.state.actuators),
+            part(layout.state.drives),
+            self._wrist_rates(part(layout.state.drives)),
         )
+
+    def acting(self, drives: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
+        """What acts at the start of a step: outputs of lagging actuators, commands that have waited, or u."""
+        acting, start = list(u), 0
+        for chain in self.layout.chains:
+            output = start if chain.time_constant is None else start + chain.delay
+            acting[chain.control] = drives[output]
+            start += len(chain.names)
+        return acting
+
+    def _wrist_rates(self, drives: Sequence[Scalar]) -> list[Scalar]:
+        where = self.layout.control.wrist_rate
+        if not any(where.start <= chain.control < where.stop for chain in self.layout.chains):
+            return []
+        return self.acting(drives, [0.0] * self.n_u)[where]
 
     def inputs(self, u: Sequence[Scalar]) -> Inputs:
         """Name the parts of u, with zeros for absent actuators."""

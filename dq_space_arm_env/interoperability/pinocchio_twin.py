@@ -110,7 +110,7 @@ def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: Array
 
     Returns:
         State, shape (n_x,), units of the state; the sign of q_{e0/I} is that of q, in a planar scene the one
-        with a scalar part of at least 0. Previous controls, where the state has some, are zero.
+        with a scalar part of at least 0. What else the state has, as previous controls, is zero.
 
     Raises:
         ValueError: If a shape is wrong.
@@ -130,7 +130,7 @@ def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: Array
         position, (i, j, k, w), angles = configuration[:3], configuration[3:7], configuration[7:]
         base = list(poses.from_rotation_and_position((w, i, j, k), tuple(position)))
         twist, rates = [*velocity[3:6], *velocity[:3]], velocity[6:]
-    previous = np.zeros(len(layout.previous_controls))
+    previous = np.zeros(layout.n_x - layout.state.joint_rates.stop)
     return np.array([*base, *angles, *wrist, *twist, *rates, *previous], dtype=np.float64)
 
 

@@ -235,6 +235,25 @@ def rate_limits(scene: Scene, each: ControlRate) -> list[RateLimit]:
     return found
 
 
+def slew_limits(scene: Scene) -> list[RateLimit]:
+    """How fast actuators follow at most, which environments see to.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        The controls with a limit, in their order.
+    """
+    found, index = [], 0
+    for field, numbers in control_numbers(scene).items():
+        for number in numbers:
+            rate = getattr(scene.actuators, field).slew_limit
+            if rate is not None:
+                found.append(RateLimit(index, number.name, number.limit.unit, rate))
+            index += 1
+    return found
+
+
 def previous_controls(scene: Scene) -> tuple[int, ...]:
     """Indices of the controls that the state keeps for a step: those whose rates are limited.
 
@@ -256,7 +275,7 @@ def rates_of(scene: Scene) -> tuple[RateLimit, ...]:
     Returns:
         The strictest limit of each.
     """
-    found: dict[int, RateLimit] = {}
+    found = {limit.control: limit for limit in slew_limits(scene)}
     for each in scene.constraints:
         for limit in rate_limits(scene, each) if isinstance(each, ControlRate) else ():
             kept = limit._replace(rate=max(limit.rate - each.margin / scene.simulation.dt, 0.0))

@@ -26,6 +26,7 @@ from dq_space_arm_env.algebra.vectors import (
     subtract,
 )
 from dq_space_arm_env.dynamics import kinematics, minimal
+from dq_space_arm_env.dynamics.drives import drive_energy
 from dq_space_arm_env.scene.constraint_rows import (
     directions,
     exact_rows,
@@ -115,7 +116,8 @@ class _Situation:
         velocities = kinematics.body_velocities(tree, frames, twist, motion.joint_rates)
         linear, angular, _ = kinematics.momentum(tree, frames, velocities)
         kinetic, potential = kinematics.energy(tree, motion.joint_angles, velocities)
-        return linear, angular, kinetic + potential
+        motors = (motion.motor_angles, motion.motor_rates)
+        return linear, angular, kinetic + potential + drive_energy(tree, motion.joint_angles, *motors)
 
 
 def path_residuals(equations: SceneEquations, base: Scalars, y: Scalars, u: Scalars) -> list[Scalar]:

@@ -17,6 +17,7 @@ import casadi
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import norm
+from dq_space_arm_env.scene.constraint_rows import slew_limits
 from dq_space_arm_env.scene.maneuver import Success
 from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.parameters import (
@@ -62,11 +63,26 @@ def start(scene: Scene, draws: Scalars) -> Outputs:
     return {**outputs, "parameters": parameters} if parameters else outputs
 
 
-def command(equations: SceneEquations, action: Scalars) -> Outputs:
-    """Inputs in N, N m, rad/s, from an action that is clipped to [-1, 1]."""
+def command(equations: SceneEquations, action: Scalars, x: Scalars = ()) -> Outputs:
+    """Inputs in N, N m, rad/s, from an action that is clipped to [-1, 1].
+
+    The state `x` counts where actuators take no command as it is (`is_limited_by_state`).
+    """
     # Ordered such that NaN passes: if two numbers do not compare, fmin and fmax take the second.
     clipped = [casadi.fmin(1.0, casadi.fmax(-1.0, value)) for value in action]
-    return {"u": [limit * value for limit, value in zip(equations.control_limits, clipped, strict=True)]}
+    u = [limit * value for limit, value in zip(equations.control_limits, clipped, strict=True)]
+    if is_limited_by_state(equations.scene):
+        previous, dt = x[equations.layout.state.actuators], equations.scene.simulation.dt
+        for limit in slew_limits(equations.scene):
+            before = previous[equations.layout.previous_controls.index(limit.control)]
+            highest, lowest = before + limit.rate * dt, before - limit.rate * dt
+            u[limit.control] = casadi.fmin(highest, casadi.fmax(lowest, u[limit.control]))
+    return {"u": u}
+
+
+def is_limited_by_state(scene: Scene) -> bool:
+    """Whether the inputs that actions lead to depend on the state."""
+    return bool(slew_limits(scene))
 
 
 def observe(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:

@@ -12,7 +12,8 @@ Where a scene weighs it, the tip's twist relative to the target is a further ter
 
     w^G_{G/D} = w^G_{G/I} - q_{G/D}* w^D_{D/I} q_{G/D}.
 
-The wrist's Euler rates, which are inputs, are part of it in the stage cost; at the end the wrist is held.
+The wrist's Euler rates, which are inputs, are part of it in the stage cost; at the end the wrist is held. If
+they lag behind their commands they are states, and part of it at the end too.
 
 Other tips add squares of the vector parts of their error poses q_{D/G}, each with its own weights.
 """
@@ -139,7 +140,8 @@ class SceneEquations:
         return dual_vectors.subtract(self.tip_twist(moving, wrist_rates), self.target_twist(tip))
 
     def tip_twist(self, motion: Motion, wrist_rates: Scalars | None = None) -> Scalars:
-        """Twist of the tip in its axes, 6."""
+        """Twist of the tip in its axes, 6; of a wrist whose rates are states, with these."""
+        wrist_rates = motion.wrist_rates or wrist_rates
         base = (*motion.angular, *motion.linear)
         angles = motion.joint_angles, motion.wrist_angles
         return kinematics.tip_twist(self.tree, *angles, base, motion.joint_rates, wrist_rates)
@@ -231,6 +233,7 @@ class SceneEquations:
             *motion.motor_angles,
             *motion.motor_rates,
             *motion.previous_controls,
+            *motion.drives,
             *([self.given[PHASE]] if self.scene.phases else []),
             *besides,
             *twists,

@@ -97,7 +97,8 @@ class EnvironmentPrograms:
         if self.scene.phases:
             self._append_stage(program, n_memory)
         command = partial(episode.command, equations)
-        program.call(trace("inputs_graph", {"action": n_u}, command, parameters=self._parameters))
+        given = {"action": n_u} | ({"x": n_x} if episode.is_limited_by_state(self.scene) else {})
+        program.call(trace("inputs_graph", given, command, parameters=self._parameters))
         program.call(trace("time_step_graph", {}, lambda: {"h": [simulation.dt]}))
         method = checked_integrator_of(simulation, integrator)
         stepper = actuated(method or integrator_of(simulation, integrator), equations.field)

@@ -259,7 +259,7 @@ class ScenePrograms:
         n_pose = len(field.pose.stored)
         angles = (state.joint_angles, state.wrist_angles)
         motors = (state.motor_angles, state.motor_rates)
-        parts = (state.base_velocity, *angles, state.joint_rates, *motors, state.actuators)
+        parts = (state.base_velocity, *angles, state.joint_rates, *motors, state.actuators, state.drives)
 
         def outputs(observation: Scalars) -> Mapping[str, Scalars]:
             x: list[Scalar] = [0.0] * field.n_x
