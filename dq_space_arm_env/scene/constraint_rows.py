@@ -16,8 +16,10 @@ from dq_space_arm_env.scene.constraints import (
     Momentum,
     Plume,
     Terminal,
+    TorqueSpeed,
     Volume,
     WheelMomentum,
+    limited_motors,
     per_link,
 )
 from dq_space_arm_env.scene.parameters import control_numbers
@@ -102,6 +104,12 @@ def rows_of(scene: Scene, each: Constraint) -> list[Row]:
         for limit in rate_limits(scene, each):
             names = [f"{each.name}: {limit.name} {word}" for word in ("falls", "rises")]
             rows += [Row(name, limit.unit, *common, has_input=True, is_rate=True) for name in names]
+    elif isinstance(each, TorqueSpeed):
+        for _, link in limited_motors(scene):
+            for words in ("backward", "forward"):
+                rows.append(
+                    Row(f"{each.name}: {link.name} {words}", link.effort_unit, *common, has_input=True)
+                )
     elif isinstance(each, Plume):
         rows.append(Row(each.name, "N", *common, has_input=True))
     elif not isinstance(each, Terminal):

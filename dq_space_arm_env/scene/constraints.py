@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, StrictBool
 
+from dq_space_arm_env.scene.bodies import Link
 from dq_space_arm_env.validation.fields import (
     ANGLES,
     LENGTHS,
@@ -291,6 +292,15 @@ class ControlRate(Constraint):
     )
 
 
+class TorqueSpeed(Constraint):
+    """What full voltage leaves of the torque of motors with a `stall_torque`; residuals in N m (N).
+
+    Environments clip torques to it, with or without this constraint, by which the expert knows it.
+    """
+
+    kind: Literal["torque_speed"] = Field(description="'torque_speed'")
+
+
 class Terminal(Constraint):
     """Quantities that are exact at the end: equalities in rad, m, rad/s, m/s, N s, N m s."""
 
@@ -319,6 +329,7 @@ _KINDS: dict[str, type[Constraint]] = {
     "momentum": Momentum,
     "wheel_momentum": WheelMomentum,
     "control_rate": ControlRate,
+    "torque_speed": TorqueSpeed,
     "terminal": Terminal,
 }
 
@@ -344,6 +355,7 @@ AnyConstraint = Annotated[
     | Momentum
     | WheelMomentum
     | ControlRate
+    | TorqueSpeed
     | Terminal,
     BeforeValidator(_read_constraint),
 ]
@@ -379,7 +391,13 @@ def constraint_problems(scene: Scene) -> Iterator[Problem]:
             yield from _wheel_problems(scene, (*here, "kind"))
         elif isinstance(constraint, ControlRate):
             yield from _control_rate_problems(scene, here, constraint)
-        if isinstance(constraint, Plume | ControlRate | Terminal) and constraint.observed is not None:
+        elif isinstance(constraint, TorqueSpeed) and not limited_motors(scene):
+            sentence = "no motor that drives a joint has a stall_torque: remove it"
+            yield Problem((*here, "kind"), constraint.kind, sentence)
+        if (
+            isinstance(constraint, Plume | ControlRate | TorqueSpeed | Terminal)
+            and constraint.observed is not None
+        ):
             sentence = "must be absent: a residual with the input, or of the end, is not observed"
             yield Problem((*here, "observed"), constraint.observed, sentence)
         if isinstance(constraint, Terminal) and constraint.terminates:
@@ -419,6 +437,19 @@ def _control_rate_problems(
     for field, rate in given.items():
         if getattr(scene.actuators, field) is None:
             yield Problem((*here, field), rate, f"must be absent: the scene has no actuators.{field}")
+
+
+def limited_motors(scene: Scene) -> list[tuple[int, Link]]:
+    """The driven links whose motors have a torque that falls with their speed.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        Index among the driven links, and link.
+    """
+    driven = [link for link in scene.links if link.actuated] if scene.actuators.joint_torque else []
+    return [(index, link) for index, link in enumerate(driven) if link.motor and link.motor.stall_torque]
 
 
 def _wheel_problems(scene: Scene, place: tuple[str | int, ...]) -> Iterator[Problem]:

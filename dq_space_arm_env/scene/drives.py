@@ -1,7 +1,7 @@
-"""Drives of the joints: motors with rotor, gear and friction."""
+"""Drives of the joints: motors with rotor, gear, friction, and the torque that full voltage leaves."""
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -53,6 +53,34 @@ class Motor(Model):
         description="viscous damping of an elastic gear, N m s/rad (N s/m)",
     )
 
+    stall_torque: Positive | None = Field(
+        default=None,
+        exclude_if=lambda torque: torque is None,
+        description="torque at full voltage of the motor at rest, on the joint's side, N m (N): it falls "
+        "with the speed by the back EMF; absent: at any speed the limit of the torque, which stands for that "
+        "of the current",
+    )
+    no_load_speed: Speed | None = Field(
+        default=None,
+        exclude_if=lambda speed: speed is None,
+        description="speed at full voltage at which no torque is left, on the joint's side, rad/s (m/s)",
+    )
+
+    def envelope(self, rate: Any) -> tuple[Any, Any] | None:
+        """Least and greatest torque at a speed.
+
+        Args:
+            rate: Of the motor, on the joint's side, a scalar, rad/s (m/s).
+
+        Returns:
+            Both, N m (N); None where they do not depend on the speed.
+        """
+        if self.stall_torque is None or self.no_load_speed is None:
+            return None
+        # tau = N k (+-V - N k rate) / R: back EMF N k rate, resistance R, stall torque N k V / R.
+        fallen = (self.stall_torque / self.no_load_speed) * rate
+        return -self.stall_torque - fallen, self.stall_torque - fallen
+
     @property
     def is_elastic(self) -> bool:
         """Whether the gear is a spring."""
@@ -64,8 +92,9 @@ class Motor(Model):
         return [name for name in ("inertia", "friction", "stiffness", "damping") if getattr(self, name)]
 
     def _problems(self) -> Iterator[Problem]:
-        if not (self.inertia or self.friction):
-            yield Problem(("inertia",), self.inertia, "a motor needs an inertia or friction: remove it")
+        if not (self.inertia or self.friction or self.stall_torque):
+            sentence = "a motor needs an inertia, friction or stall_torque: remove it"
+            yield Problem(("inertia",), self.inertia, sentence)
         elif self.is_elastic and not self.inertia:
             sentence = "the rotor behind an elastic gear needs an inertia: give it, or remove stiffness"
             yield Problem(("inertia",), self.inertia, sentence)
@@ -75,6 +104,9 @@ class Motor(Model):
                 "model): set it to armature"
             )
             yield Problem(("coupling",), self.coupling, sentence)
+        if (self.stall_torque is None) != (self.no_load_speed is None):
+            sentence = "stall_torque and no_load_speed need each other"
+            yield Problem(("no_load_speed",), self.no_load_speed, sentence)
         if self.damping and not self.is_elastic:
             sentence = "a rigid gear has none: give a stiffness too, or damping of the link"
             yield Problem(("damping",), self.damping, sentence)

@@ -49,11 +49,12 @@ from dq_space_arm_env.scene.constraints import (
     Plume,
     Point,
     Terminal,
+    TorqueSpeed,
     Volume,
     WheelMomentum,
 )
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.task.equations import SceneEquations, body_pose
+from dq_space_arm_env.task.equations import SceneEquations, body_pose, torque_ranges
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -373,6 +374,12 @@ def _control_rate(situation: _Situation, constraint: ControlRate) -> Iterator[Sc
         yield change - most
 
 
+def _torque_speed(situation: _Situation, constraint: TorqueSpeed) -> Iterator[Scalar]:
+    for torque, least, greatest in torque_ranges(situation.equations, situation.motion, situation.u):
+        yield least - torque
+        yield torque - greatest
+
+
 _RESIDUALS: dict[type[Constraint], Callable[..., Iterator[Scalar]]] = {
     JointLimits: _joint_limits,
     Distance: _distance,
@@ -384,6 +391,7 @@ _RESIDUALS: dict[type[Constraint], Callable[..., Iterator[Scalar]]] = {
     Momentum: _momentum,
     WheelMomentum: _wheel_momentum,
     ControlRate: _control_rate,
+    TorqueSpeed: _torque_speed,
 }
 
 

@@ -18,6 +18,7 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import norm
 from dq_space_arm_env.scene.constraint_rows import slew_limits
+from dq_space_arm_env.scene.constraints import limited_motors
 from dq_space_arm_env.scene.maneuver import Success
 from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.parameters import (
@@ -39,6 +40,7 @@ from dq_space_arm_env.task.equations import (
     body_pose,
     body_velocity,
     larger,
+    torque_ranges,
     total,
     weighted_square,
 )
@@ -77,12 +79,18 @@ def command(equations: SceneEquations, action: Scalars, x: Scalars = ()) -> Outp
             before = previous[equations.layout.previous_controls.index(limit.control)]
             highest, lowest = before + limit.rate * dt, before - limit.rate * dt
             u[limit.control] = casadi.fmin(highest, casadi.fmax(lowest, u[limit.control]))
+        motion, first = equations.field.motion(equations.y(x)), equations.layout.control.joint_torque.start
+        ranges = torque_ranges(equations, motion, u)
+        for (index, _), (torque, least, greatest) in zip(
+            limited_motors(equations.scene), ranges, strict=True
+        ):
+            u[first + index] = casadi.fmin(greatest, casadi.fmax(least, torque))
     return {"u": u}
 
 
 def is_limited_by_state(scene: Scene) -> bool:
     """Whether the inputs that actions lead to depend on the state."""
-    return bool(slew_limits(scene))
+    return bool(slew_limits(scene) or limited_motors(scene))
 
 
 def observe(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:

@@ -35,6 +35,7 @@ from dq_space_arm_env.dynamics.equations_of_motion import Motion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
+from dq_space_arm_env.scene.constraints import limited_motors
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.parameters import (
     PHASE,
@@ -256,6 +257,19 @@ def vector_parts(pose: Scalars) -> list[Scalar]:
 def larger(a: Scalar, b: Scalar) -> Scalar:
     """The larger one of two numbers."""
     return select(b > a, b, a)
+
+
+def torque_ranges(equations: SceneEquations, motion: Motion, u: Scalars) -> list[tuple[Scalar, ...]]:
+    """Torque, and the least and the greatest that full voltage leaves, of motors with a stall torque."""
+    links, layout, found = equations.scene.links, equations.layout, []
+    elastic = [index for index, link in enumerate(links) if link.is_elastic]
+    for index, link in limited_motors(equations.scene):
+        joint = layout.actuated_joints[index]
+        rate = motion.motor_rates[elastic.index(joint)] if link.is_elastic else motion.joint_rates[joint]
+        torque = u[layout.control.joint_torque.start + index]
+        assert link.motor is not None
+        found.append((torque, *(link.motor.envelope(rate) or ())))
+    return found
 
 
 def body_pose(scene: Scene, given: Mapping[str, Scalar]) -> list[Scalar]:

@@ -167,3 +167,31 @@ def test_impossible_dynamics_are_refused(change):
     (name, value), *_ = change.items()
     with pytest.raises(SceneError, match=f"actuators.base_force.{name}"):
         PLAIN.replace({f"actuators.base_force.{name}": value})
+
+
+def test_voltage_leaves_less_torque_the_faster_a_motor_turns():
+    """The environment clips, the constraint measures, and the kernels take what they are given."""
+    motor = {"stall_torque": 1.0, "no_load_speed": 0.5}
+    charged = [{"kind": "torque_speed", "name": "voltage", "tolerance": 0.1}]
+    scene = PLAIN.replace({"links.1.motor": motor, "constraints": charged})
+    env, plain, kernels = DQSpaceArmEnv(scene), compile_scene(PLAIN), compile_scene(scene)
+    env.reset(seed=0)
+    layout, rng = kernels.layout, np.random.default_rng(0)
+    torque, rate = layout.control.joint_torque.start + 1, layout.state.joint_rates.start + 1
+    clipped = 0
+    for action in rng.choice([-1.0, 1.0], (20, layout.n_u)):
+        x, u = env.state.copy(), layout.to_control(action)
+        fallen = motor["stall_torque"] * x[rate] / motor["no_load_speed"]
+        rows = kernels.constraints(x, u)
+        expected = [-1.0 - fallen - u[torque], u[torque] - 1.0 + fallen]
+        np.testing.assert_allclose(rows, expected, atol=1e-14)
+        _, _, _, _, info = env.step(action)
+        given, u[torque] = u[torque], np.clip(u[torque], -1.0 - fallen, 1.0 - fallen)
+        clipped += given != u[torque]
+        np.testing.assert_allclose(env.state, plain.step(x, u), atol=1e-13)
+        assert info["cost"] < 1e-12
+    assert clipped > 5
+    with pytest.raises(SceneError, match="need each other"):
+        PLAIN.replace({"links.1.motor": {"stall_torque": 1.0}})
+    with pytest.raises(SceneError, match="no motor that drives a joint"):
+        PLAIN.replace(constraints=charged)

@@ -27,8 +27,16 @@ class PaperPrograms:
     """Builds the programs of one scene in the paper's formulation."""
 
     def __init__(self, scene: Scene) -> None:
+        """Lay out the equations; ValueError for drives that the system (20) has no rows for."""
         self.scene = scene
         self.layout = StateLayout.of(scene)
+        missing = {
+            "rotors": any(link.motor and link.motor.inertia for link in scene.links),
+            "actuators that lag or delay": bool(self.layout.chains),
+        }
+        for what, present in missing.items():
+            if present:
+                raise ValueError(f"the paper's formulation has no {what}, and scene {scene.name!r} has some")
         nominal = SceneEquations.of(scene, self.layout.parameters.nominal.tolist())
         self.field, self.target = PaperField(nominal.field), nominal.target
 
