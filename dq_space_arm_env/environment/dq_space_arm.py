@@ -90,6 +90,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | 32-34 | velocity of the target, as if it reached to the tip                   | -1e12 | 1e12 | m/s  |
     | 35    | time left in the episode                                              | 0    | T   | s     |
 
+    Angles and rates of motors behind elastic gears, rad and rad/s, stand after the joint rates, commands on their way
+    and outputs of actuators that lag, `layout.state.drives`, in N, N m, rad/s, after those and the controls before.
     Where rates of controls are limited, the controls before, those of `layout.previous_controls`, stand after the
     joint rates, in N, N m, rad/s. In a scene with phases the number of the phase, from 0, is one more entry: before
     the twists, or the time left. Where other tips have goals, their error dual quaternions follow, with a scalar part of at least 0.
