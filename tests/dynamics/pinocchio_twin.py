@@ -54,6 +54,7 @@ def random_tree(rng: np.random.Generator, joints: int, branches: bool, wrist: bo
         tip_body=int(rng.integers(joints + 1)) if branches else joints,
         wrist=random_placement(rng) if wrist else None,
         tip=random_placement(rng),
+        other_tips=(),
         tip_wrench=None,
         planar=False,
     )

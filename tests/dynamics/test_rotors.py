@@ -8,7 +8,7 @@ import pinocchio_twin as twin
 import pytest
 
 from dq_space_arm_env.algebra import poses, vectors
-from dq_space_arm_env.dynamics import kinematics, minimal
+from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler
 from dq_space_arm_env.dynamics.articulated_body import ArticulatedBodies
 from dq_space_arm_env.dynamics.forward import forward_dynamics, reaction_wrenches
 from dq_space_arm_env.dynamics.kinematic_tree import Rotor
@@ -169,3 +169,29 @@ def test_rotors_of_arms_that_branch_are_alike_in_every_formulation(exact):
         given = Accelerations(expected[3:6], moving, expected[6:])
         needed = minimal.inverse_dynamics(case.tree, case.frames, case.angular, case.rates, given)
         assert relative_error([*needed.force, *needed.torque, *needed.joints], case.tau) < 1e-11
+
+
+@pytest.mark.parametrize("branches", [False, True])
+@pytest.mark.parametrize("exact", [True, False])
+def test_the_papers_system_20_has_a_row_for_each_rotor(exact, branches):
+    """Accelerations and reaction wrenches of the dual-quaternion Newton-Euler equations."""
+    for seed in range(6):
+        case = Case(4, seed, exact, branches)
+        tree, twist = case.tree, (*case.angular, *case.linear)
+        velocities = kinematics.body_velocities(tree, case.frames, twist, case.rates)
+        duals = [
+            (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
+            for body, v in zip(tree.bodies, velocities, strict=True)
+        ]
+        state = newton_euler.PaperState(case.pose, case.angles, [], duals)
+        wrench = (0.0, *case.force, 0.0, *case.torque)
+        rates, found = newton_euler.paper_rates(tree, state, wrench, case.motors, [])
+        bodies = [tuple(body) for body in np.reshape(rates[-8 * 5 :], (-1, 8))]
+        frames = newton_euler.joint_frames(tree, case.angles, [])
+        joints = newton_euler.along_joints(tree, frames, bodies)
+        accelerations = [*bodies[0][5:8], *bodies[0][1:4], *joints]
+        assert relative_error(accelerations, case.accelerations(MassMatrix)) < 1e-11
+        expected = []
+        for link, (force, torque) in zip(tree.links, reaction_wrenches(tree, *case.motion), strict=True):
+            expected += [*force, *torque[:2]] if link.screw.turn else [*force[:2], *torque]
+        assert relative_error(found, expected) < 1e-11

@@ -31,7 +31,7 @@ class PaperPrograms:
         self.scene = scene
         self.layout = StateLayout.of(scene)
         missing = {
-            "rotors": any(link.motor and link.motor.inertia for link in scene.links),
+            "elastic gears": any(link.is_elastic for link in scene.links),
             "actuators that lag or delay": bool(self.layout.chains),
         }
         for what, present in missing.items():
@@ -105,7 +105,10 @@ class PaperPrograms:
         def outputs(x: Scalars, u: Scalars) -> dict[str, Scalars]:
             system = self.field.system(x, u)
             upper = [[*left, *right] for left, right in zip(system.s11, system.s12, strict=True)]
-            lower = [[*row, *(0.0 for _ in system.b2)] for row in system.s21]
+            lower = [
+                [*row, *(own if i == j else 0.0 for j in range(len(system.s22)))]
+                for i, (row, own) in enumerate(zip(system.s21, system.s22, strict=True))
+            ]
             matrix = [entry for row in (*upper, *lower) for entry in row]
             return {"matrix": matrix, "right": [*system.b1, *system.b2]}
 
