@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
 from dq_space_arm_env.scene import Scene, SceneError
+from dq_space_arm_env.scene.actuator_chains import chains
 from dq_space_arm_env.scene.constraint_rows import sides
 from dq_space_arm_env.scene.constraints import JointLimits
 
@@ -47,10 +48,12 @@ def refuse(
     springs: bool = False,
     planar: bool = False,
     rotors: bool = False,
+    at_once: bool = False,
 ) -> None:
     """Refuse a scene that the format cannot represent without changing its motion.
 
-    `springs`, `planar`, `rotors`: formats without joint springs, planar bases, and rotors of any kind.
+    `springs`, `planar`, `rotors`: formats without joint springs, planar bases, and rotors of any kind;
+    `at_once`: with actuators that neither lag nor delay.
     """
     if wrist not in ("refuse", "fixed"):
         raise ValueError(f"wrist: {wrist!r}, it must be 'refuse' or 'fixed'")
@@ -75,6 +78,11 @@ def refuse(
         problems.append(f"it has no rotors, and link {geared[0]!r} has one: set its motor's inertia to 0")
     elif geared:
         problems += coupled_rotors(scene)
+    late = [chain.name for chain in chains(scene)]
+    if at_once and late:
+        problems.append(
+            f"its actuators act at once, and {late[0]} lags or delays: remove time_constant and delay"
+        )
     if problems:
         raise SceneError("\n  - ".join([f"scene {scene.name!r} cannot be written as {language}:", *problems]))
 

@@ -58,9 +58,10 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
 
     Raises:
         SceneError: If the scene has a wrist that is not to be fixed, a constant wrench at the tip, a screw
-            joint, or a rotor that turns with the body before its joint.
+            joint, an elastic gear, a rotor that turns with the body before its joint, or an actuator that
+            lags or delays.
     """
-    refuse(scene, "MJCF", wrist)
+    refuse(scene, "MJCF", wrist, at_once=True)
     root = Element("mujoco", model=scene.name)
     SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     SubElement(root, "option", gravity="0 0 0", timestep=words([scene.simulation.dt]), integrator="RK4")

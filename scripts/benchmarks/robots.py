@@ -54,7 +54,11 @@ def robot(scene: Scene) -> str:
     which masses are parameters; not limits, weights, target, start, time step and number of steps.
     """
     content = scene.model_dump(include=set(_PARTS), exclude=_OF_THE_TASK)
-    content["actuators"] = sorted(scene.actuators.model_dump(exclude_none=True))
+    actuators = scene.actuators.model_dump(exclude_none=True)
+    content["actuators"] = [
+        (name, {key: value for key, value in actuators[name].items() if key != "limit"})
+        for name in sorted(actuators)
+    ]
     names = StateLayout.of(scene).parameters.names
     content["parameters"] = [
         name

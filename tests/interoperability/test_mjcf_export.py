@@ -103,6 +103,8 @@ def test_rotors_are_armatures_and_what_mujoco_lacks_is_refused():
         scene_to_mjcf(geared.replace({"links.2.motor.coupling": "exact"}))
     with pytest.raises(SceneError, match="it has no elastic gears, and link 'elbow' has one"):
         scene_to_mjcf(geared.replace({"links.2.motor.stiffness": 100.0}))
+    with pytest.raises(SceneError, match="act at once, and base torque x lags or delays"):
+        scene_to_mjcf(geared.replace({"actuators.base_torque.delay": 1}))
     with pytest.raises(SceneError, match="it has no rotors, and link 'shoulder' has one"):
         scene_to_urdf(geared)
     rubbing = scene.replace({"links.1.motor": {"friction": 0.3}, "links.1.damping": 0.2})
