@@ -133,7 +133,7 @@ def test_the_numbers_of_motors_may_be_parameters(draw):
 @pytest.mark.parametrize(
     ("motor", "sentence"),
     [
-        ({"gear": 10}, "needs an inertia or friction"),
+        ({"gear": 10}, "needs an inertia, friction or stall_torque"),
         ({"inertia": 1e-4, "gear": 0}, "other than 0"),
         ({"inertia": 1e-4, "stiffness": 10.0}, "set it to armature"),
         ({"friction": 1.0, "stiffness": 10.0, "coupling": "armature"}, "needs an inertia: give it"),
