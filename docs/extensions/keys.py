@@ -13,8 +13,8 @@ from pydantic_core import PydanticUndefined
 
 UNITS = (
     "1/(N m)^2", "(s/rad)^2", "N m s/rad", "kg m^2", "N m/rad", "rad/s^2", "1/N^2", "deg/s", "rad/s", "N m/s",
-    "m/rad", "N s/m", "N s", "N/m", "m/s", "N m", "N/s", "degrees", "deg", "pixels", "rad", "kg", "m", "s",
-    "N", "W",
+    "m/rad", "rad/m", "N s/m", "N s", "N/m", "m/s", "N m", "N/s", "degrees", "deg", "pixels", "rad", "kg",
+    "m", "s", "N", "W",
 )  # fmt: skip
 """Units as descriptions write them, longer ones before their parts."""
 _UNIT = re.compile(r"(?<![\w/^])(" + "|".join(re.escape(unit) for unit in UNITS) + r")(?![\w/^])")

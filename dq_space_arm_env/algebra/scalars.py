@@ -13,7 +13,7 @@ import numpy as np
 
 from dq_space_arm_env.algebra._types import Scalar
 
-__all__ = ["arctan2", "cos", "maximum", "safe_sqrt", "select", "sin", "sqrt"]
+__all__ = ["arctan2", "cos", "maximum", "safe_sqrt", "select", "sin", "sqrt", "tanh"]
 
 
 def _casadi(value: Any, function: str) -> Any:
@@ -46,6 +46,15 @@ def cos(x: Scalar) -> Scalar:
     if isinstance(x, (np.ndarray, np.generic)):
         return np.cos(x)
     return _casadi(x, "cos").cos(x)
+
+
+def tanh(x: Scalar) -> Scalar:
+    """Return the hyperbolic tangent."""
+    if isinstance(x, (float, int)):
+        return math.tanh(x)
+    if isinstance(x, (np.ndarray, np.generic)):
+        return np.tanh(x)
+    return _casadi(x, "tanh").tanh(x)
 
 
 def sqrt(x: Scalar) -> Scalar:

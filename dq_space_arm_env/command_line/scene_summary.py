@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from dq_space_arm_env.common.tables import TextTable
-from dq_space_arm_env.scene import Pose, Scene, StateLayout
+from dq_space_arm_env.scene import Link, Pose, Scene, StateLayout
 from dq_space_arm_env.scene.constraint_rows import path_rows
 from dq_space_arm_env.scene.path import first_velocity
 from dq_space_arm_env.task.step_report import observation_entries
@@ -127,6 +127,8 @@ def left_out(scene: Scene) -> Iterator[str]:
         yield f"motors of {', '.join(passive)}"
     if scene.links and not any(link.stiffness or link.damping for link in scene.links):
         yield "springs and dampers of the joints"
+    if scene.links and not any(link.motor for link in scene.links):
+        yield "rotors, friction and elastic gears of the joints"
     spread = scene.spread.model_dump()
     fixed = {
         "start": not any(spread[name] for name in _START),
@@ -158,7 +160,7 @@ def _bodies(scene: Scene) -> Iterator[tuple[str, float, str]]:
         drive = drive if link.joint_type == "revolute" else f"{link.joint_type}, {drive}"
         spring = f", spring of {link.stiffness:g} {link.effort_unit}/{link.unit}" if link.stiffness else ""
         damper = f", damper of {link.damping:g} {link.effort_unit} s/{link.unit}" if link.damping else ""
-        yield link.name, link.mass, f"{drive}{spring}{damper}"
+        yield link.name, link.mass, f"{drive}{spring}{damper}{_motor(link)}"
     if scene.wrist is not None:
         yield "wrist", 0.0, "spherical joint, commanded by its Euler rates"
     held = [("payload", "the tip", scene.payload)]
@@ -168,9 +170,20 @@ def _bodies(scene: Scene) -> Iterator[tuple[str, float, str]]:
             yield name, payload.mass, f"held rigidly at {tip_name}"
 
 
+def _motor(link: Link) -> str:
+    motor, words = link.motor, ""
+    if motor is not None and motor.inertia:
+        words += f", rotor of {motor.reflected_inertia:g} {'kg m^2' if link.turns else 'kg'} at the joint"
+    if motor is not None and motor.stiffness is not None:
+        words += f" behind a gear of {motor.stiffness:g} {link.effort_unit}/{link.unit}"
+    if motor is not None and motor.friction:
+        words += f", friction of {motor.friction:g} {link.effort_unit}"
+    return words
+
+
 def _state_parts(layout: StateLayout) -> list[tuple[str, slice, str]]:
     state = layout.state
-    units = [", ".join(dict.fromkeys(state.units[part])) for part in (state.joint_angles, state.joint_rates)]
+    units = [_units(state.units[part]) for part in (state.joint_angles, state.joint_rates)]
     return [
         ("pose of the base q_{e0/I}", state.pose, "1, m"),
         ("joint angles", state.joint_angles, units[0]),
@@ -178,9 +191,16 @@ def _state_parts(layout: StateLayout) -> list[tuple[str, slice, str]]:
         ("angular velocity of the base, base axes", state.angular_velocity, "rad/s"),
         ("linear velocity of the base, base axes", state.linear_velocity, "m/s"),
         ("joint rates", state.joint_rates, units[1]),
+        ("motor angles of elastic joints", state.motor_angles, _units(state.units[state.motor_angles])),
+        ("motor rates of elastic joints", state.motor_rates, _units(state.units[state.motor_rates])),
         ("axial momenta of the wheels", state.wheel_momenta, "N m s"),
-        ("previous controls", state.actuators, ", ".join(dict.fromkeys(state.units[state.actuators]))),
+        ("previous controls", state.actuators, _units(state.units[state.actuators])),
+        ("commands on their way and outputs", state.drives, _units(state.units[state.drives])),
     ]
+
+
+def _units(units: Sequence[str]) -> str:
+    return ", ".join(dict.fromkeys(units))
 
 
 def _task(scene: Scene) -> Iterator[tuple[str, str]]:

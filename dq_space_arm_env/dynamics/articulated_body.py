@@ -35,7 +35,7 @@ from dq_space_arm_env.algebra.vectors import (
     transpose,
     transposed_matrix_vector,
 )
-from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody, Screw
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody, Rotor, Screw
 from dq_space_arm_env.dynamics.linear import factorize_ldl, solve_ldl
 from dq_space_arm_env.dynamics.minimal import ZERO, Accelerations, LinkFrame, along, shift_wrench
 
@@ -101,11 +101,12 @@ class _Joint:
     force: Vector3  # per acceleration, kg m
     torque: Vector3  # per acceleration, kg m^2
     inverse: Scalar  # of the inertia along the screw, 1/(kg m^2)
-    remainder: ArticulatedInertia  # of the body across the joint, none along the screw
+    remainder: ArticulatedInertia  # of the body across the joint, none along the screw but for a rotor
+    rotor: Rotor | None
 
     @classmethod
-    def eliminated(cls, body: ArticulatedInertia, screw: Screw) -> _Joint:
-        """Free a body along a screw about its z axis."""
+    def eliminated(cls, body: ArticulatedInertia, screw: Screw, rotor: Rotor | None = None) -> _Joint:
+        """Free a body along a screw about its z axis, with the rotor that turns as it does."""
         # I^a = I - U D^-1 U' with U = I s, D = s' I s and the screw s (Featherstone, table 7.1).
         turn, slide = screw
         force: Vector3 = body.coupling[2]
@@ -114,13 +115,22 @@ class _Joint:
             lever = [row[2] for row in body.coupling]
             force = add(scale(turn, force), scale(slide, [row[2] for row in body.mass]))
             torque = add(scale(turn, torque), scale(slide, lever))
-        inverse = 1.0 / along(screw, force, torque)
+        own = along(screw, force, torque)
+        inertia: Rows = body.inertia
+        if rotor is not None:
+            own = own + rotor.reflected
+        if rotor is not None and rotor.exact:
+            # Its energy J_r (a'_z + N qdd)^2 / 2 adds J_r z z' to I, N J_r z to U and N^2 J_r to D.
+            torque = (*torque[:2], torque[2] + rotor.inertia * rotor.gear)
+            inertia = [*inertia[:2], (*inertia[2][:2], inertia[2][2] + rotor.inertia)]
+        inverse = 1.0 / own
         by_force, by_torque = scale(inverse, force), scale(inverse, torque)
         mass = _symmetric(lambda i, j: body.mass[i][j] - force[i] * by_force[j])
         coupling = [[body.coupling[i][j] - by_torque[i] * force[j] for j in range(3)] for i in range(3)]
-        inertia = _symmetric(lambda i, j: body.inertia[i][j] - torque[i] * by_torque[j])
-        _clear(screw, mass, coupling, inertia)
-        return cls(screw, force, torque, inverse, ArticulatedInertia(mass, coupling, inertia))
+        left = _symmetric(lambda i, j: inertia[i][j] - torque[i] * by_torque[j])
+        if rotor is None:
+            _clear(screw, mass, coupling, left)
+        return cls(screw, force, torque, inverse, ArticulatedInertia(mass, coupling, left), rotor)
 
     def passed(self, force: Vector3, torque: Vector3, own: Scalar) -> Wrench:
         """Share of a wrench on the body that crosses the joint.
@@ -156,13 +166,14 @@ class ArticulatedBodies:
         bodies = [ArticulatedInertia.of_body(body) for body in tree.bodies]
         self._joints: dict[int, _Joint] = {}
         for i in self._inward:
-            (rotation, position), parent, screw = frames[i], self._parents[i], tree.links[i].screw
+            (rotation, position), parent = frames[i], self._parents[i]
+            screw, rotor = tree.links[i].screw, tree.links[i].rotor
             if i in self._inverted:  # the parent is carried by the joint, which moves backward
                 body = bodies[parent].shifted(scale(-1.0, position)).rotated(transpose(rotation))
-                self._joints[i] = _Joint.eliminated(body, screw)
+                self._joints[i] = _Joint.eliminated(body, screw, _backward(rotor, screw))
                 bodies[i + 1] = bodies[i + 1].plus(self._joints[i].remainder)
             else:
-                self._joints[i] = _Joint.eliminated(bodies[i + 1], screw)
+                self._joints[i] = _Joint.eliminated(bodies[i + 1], screw, rotor)
                 body = self._joints[i].remainder.rotated(rotation).shifted(position)
                 bodies[parent] = bodies[parent].plus(body)
         self._factor = factorize_ldl(_root_block(bodies[self._root], self._free))
@@ -178,13 +189,18 @@ class ArticulatedBodies:
 
     def reactions(self, wrenches: Sequence[Wrench], joints: Sequence[Scalar]) -> list[Wrench]:
         """Wrench that each joint transmits to its link, in joint axes, under the same as `accelerations`."""
-        _, passed, reached = self._motion(wrenches, joints)
+        solved, passed, reached = self._motion(wrenches, joints)
         reactions: list[Wrench] = []
         for i, (given, acceleration) in enumerate(zip(passed, reached, strict=True)):
             # The body beyond the joint is given I^a a' + p^a, where -p^a is passed on (Featherstone, 7.3).
             needed = self._joints[i].remainder.wrench(*acceleration)
             plus, minus = (given, needed) if i in self._inverted else (needed, given)
-            reactions.append((subtract(plus[0], minus[0]), subtract(plus[1], minus[1])))
+            force, torque = subtract(plus[0], minus[0]), subtract(plus[1], minus[1])
+            rotor = self._joints[i].rotor
+            if rotor is not None and rotor.exact and i not in self._inverted:  # of what carries it
+                spinning = rotor.inertia * (acceleration[1][2] + rotor.gear * solved.joints[i])
+                torque = (*torque[:2], torque[2] - spinning)
+            reactions.append((force, torque))
         return reactions
 
     def _motion(
@@ -256,6 +272,14 @@ def _inward(tree: KinematicTree, root: int) -> list[int]:
     others = [i for i in range(len(tree.links)) if i not in inverted]
     aside = [i for i in others if i + 1 not in beyond]
     return [*reversed(aside), *inverted, *reversed([i for i in others if i + 1 in beyond])]
+
+
+def _backward(rotor: Rotor | None, screw: Screw) -> Rotor | None:
+    """The rotor per coordinate of a joint that turns its carrier backward instead of the link."""
+    if rotor is None or not rotor.exact:
+        return rotor
+    # omega_z + N rate, with the link's omega_z less turn * rate in place of the carrier's.
+    return rotor._replace(gear=screw.turn - rotor.gear)
 
 
 def _clear(

@@ -9,7 +9,7 @@ from typing import Any
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
-from dq_space_arm_env.dynamics import minimal, reaction_wheels
+from dq_space_arm_env.dynamics import drives, minimal, reaction_wheels
 from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of, reaction_wrenches
 from dq_space_arm_env.dynamics.jets import net_wrench
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
@@ -34,8 +34,12 @@ class Motion:
     angular: Sequence[Scalar]  # of the base, base axes, rad/s
     linear: Sequence[Scalar]  # of the base's center of mass, base axes, m/s
     joint_rates: Sequence[Scalar]  # n, rad/s
+    motor_angles: Sequence[Scalar]  # of elastic joints, rad
+    motor_rates: Sequence[Scalar]  # of elastic joints, rad/s
     previous_controls: Sequence[Scalar]  # those of the layout, N, N m, rad/s
-    wheel_momenta: Sequence[Scalar] = ()  # axial, N m s
+    wheel_momenta: Sequence[Scalar]  # axial, N m s
+    drives: Sequence[Scalar]  # commands on their way and outputs, those of the layout's chains
+    wrist_rates: Sequence[Scalar]  # psi, theta, phi, rad/s, where they are states; else empty
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,12 @@ class EquationsOfMotion:
         self.n_t = layout.n_t
         self.n_y = self.n_x - layout.state.pose.stop
         twist = self._in_y(layout.state.base_velocity)
-        self.rate_indices = (*twist, *self._in_y(layout.state.joint_rates))
+        self.body_rate_indices = (*twist, *self._in_y(layout.state.joint_rates))
+        self.rate_indices = (*self.body_rate_indices, *self._in_y(layout.state.motor_rates))
+        # Angles in the order of their rates, then what has no acceleration.
+        state = layout.state
+        others = (state.joint_angles, state.motor_angles, state.wrist_angles, state.wheel_momenta)
+        self.shape_indices = tuple(index for part in others for index in self._in_y(part))
         self.pose = PoseCoordinates(
             stored=PLANAR_POSE if tree.planar else tuple(range(8)),
             directions=PLANAR_TWIST if tree.planar else tuple(range(6)),
@@ -98,9 +107,28 @@ class EquationsOfMotion:
             twist[:3],
             twist[3:],
             part(layout.state.joint_rates),
+            part(layout.state.motor_angles),
+            part(layout.state.motor_rates),
             part(layout.state.actuators),
             part(layout.state.wheel_momenta),
+            part(layout.state.drives),
+            self._wrist_rates(part(layout.state.drives)),
         )
+
+    def acting(self, drives: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
+        """What acts at the start of a step: outputs of lagging actuators, commands that have waited, or u."""
+        acting, start = list(u), 0
+        for chain in self.layout.chains:
+            output = start if chain.time_constant is None else start + chain.delay
+            acting[chain.control] = drives[output]
+            start += len(chain.names)
+        return acting
+
+    def _wrist_rates(self, drives: Sequence[Scalar]) -> list[Scalar]:
+        where = self.layout.control.wrist_rate
+        if not any(where.start <= chain.control < where.stop for chain in self.layout.chains):
+            return []
+        return self.acting(drives, [0.0] * self.n_u)[where]
 
     def inputs(self, u: Sequence[Scalar]) -> Inputs:
         """Name the parts of u, with zeros for absent actuators."""
@@ -168,9 +196,28 @@ class EquationsOfMotion:
     def _driven(self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None) -> tuple[Any, ...]:
         """Rotations of the joints, angular velocity, joint rates, external wrenches and joint torques."""
         frames = minimal.link_frames(self.tree, motion.joint_angles)
-        passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
-        torques = [motor + other for motor, other in zip(inputs.joint_torques, passive, strict=True)]
+        pairs = zip(self._on_links(inputs.joint_torques), self.passive_torques(motion), strict=True)
+        torques = [motor + other for motor, other in pairs]
         return frames, motion.angular, motion.joint_rates, self._acting(motion, inputs, wrench), torques
+
+    def passive_torques(self, motion: Motion) -> list[Scalar]:
+        """Torques on the links that no motor commands, n: of springs, dampers, friction and elastic gears."""
+        passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
+        return [own + gear for own, gear in zip(passive, self._transmitted(motion), strict=True)]
+
+    def motor_torques(self, motion: Motion, joint_torques: Sequence[Scalar]) -> list[Scalar]:
+        """Torques on the rotors of elastic joints, on the joints' side, N m."""
+        transmitted = self._transmitted(motion)
+        return drives.motor_torques(self.tree, transmitted, motion.motor_rates, joint_torques)
+
+    def _transmitted(self, motion: Motion) -> list[Scalar]:
+        joints, motors = (motion.joint_angles, motion.joint_rates), (motion.motor_angles, motion.motor_rates)
+        return drives.transmitted_torques(self.tree, *joints, *motors)
+
+    def _on_links(self, joint_torques: Sequence[Scalar]) -> list[Scalar]:
+        """Motor torques that act on links directly: through rigid gears."""
+        pairs = zip(self.tree.links, joint_torques, strict=True)
+        return [0.0 if link.elastic is not None else torque for link, torque in pairs]
 
     def accelerations(
         self, y: Sequence[Scalar], u: Sequence[Scalar], wrench: Sequence[Scalar] | None = None
@@ -206,17 +253,23 @@ class EquationsOfMotion:
         frames = minimal.link_frames(self.tree, motion.joint_angles)
         given = Accelerations(ZERO, cross(motion.angular, motion.linear), [0.0] * len(self.tree.links))
         needed = minimal.inverse_dynamics(self.tree, frames, motion.angular, motion.joint_rates, given)
-        passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
+        passive = self.passive_torques(motion)
         torque = subtract(needed.torque, self._wheel_torque(motion)) if self.tree.wheels else needed.torque
         dual = [*torque, *needed.force]
         joints = [bias - other for bias, other in zip(needed.joints, passive, strict=True)]
         return [*(dual[i] for i in self.pose.directions), *joints]
 
     def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
-        """Time derivative of y: joint and wrist rates, base and joint accelerations, torques on wheels."""
-        inputs = self.inputs(u)
-        accelerations = self.accelerations(y, u)
-        return [*self.motion(y).joint_rates, *inputs.wrist_rates, *accelerations, *inputs.wheel_torques]
+        """Time derivative of y: rates of joints and wrist, accelerations, motors' both, torques on wheels."""
+        motion, inputs = self.motion(y), self.inputs(u)
+        bodies = [*motion.joint_rates, *inputs.wrist_rates, *self.accelerations(y, u)]
+        return [*bodies, *self.motor_motion(motion, inputs), *inputs.wheel_torques]
+
+    def motor_motion(self, motion: Motion, inputs: Inputs) -> list[Scalar]:
+        """Time derivative of angles and rates of the motors of elastic joints."""
+        torques = self.motor_torques(motion, inputs.joint_torques)
+        pairs = zip(torques, drives.elastic_joints(self.tree), strict=True)
+        return [*motion.motor_rates, *(torque / gear.inertia for torque, (_, gear) in pairs)]
 
     def reaction_wrenches(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
         """The paper's T (21): fx, fy, fz [N], tx, ty [N m] that each joint transmits, in joint axes, 5 n.
@@ -231,15 +284,19 @@ class EquationsOfMotion:
         ]
         return [entry for five in transmitted for entry in five]
 
-    def _missing_wrenches(self, motion: Motion, given: Accelerations) -> list[Any]:
-        """Force and torque on base and links that given accelerations need besides the tip's wrench."""
+    def _missing_wrenches(self, motion: Motion, given: Accelerations) -> tuple[list[Any], list[Scalar]]:
+        """Force and torque on base and links that given accelerations need besides the tip's wrench.
+
+        Besides, the torques that the joints' rotors need.
+        """
         frames = minimal.link_frames(self.tree, motion.joint_angles)
-        needed = minimal.body_wrenches(self.tree, frames, motion.angular, motion.joint_rates, given)
+        needed, rotors = minimal.body_wrenches(self.tree, frames, motion.angular, motion.joint_rates, given)
         acting = self._acting(motion, Inputs(ZERO, ZERO, [], []), self.tree.tip_wrench)
-        return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(needed, acting, strict=True)]
+        pairs = zip(needed, acting, strict=True)
+        return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in pairs], rotors
 
     def _reactions(self, motion: Motion, solved: Accelerations) -> Sequence[Any]:
         """Force and torque that each joint transmits to its link, in joint axes."""
         frames = minimal.link_frames(self.tree, motion.joint_angles)
-        missing = self._missing_wrenches(motion, solved)
+        missing, _ = self._missing_wrenches(motion, solved)
         return minimal.passed_to_base(self.tree, frames, missing).reactions

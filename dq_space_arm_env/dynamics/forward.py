@@ -62,8 +62,7 @@ def forward_dynamics(
     joints: Sequence[Scalar],
 ) -> Accelerations:
     """Accelerations of a motion under external wrenches (as in `Inertia.accelerations`) and joint torques."""
-    left = _left(tree, frames, angular_velocity, joint_rates, acting)
-    return inertia.accelerations(left, joints)
+    return inertia.accelerations(*_left(tree, frames, angular_velocity, joint_rates, acting, joints))
 
 
 def reaction_wrenches(
@@ -79,8 +78,8 @@ def reaction_wrenches(
     Rooted at the heaviest body, whatever the masses: a light base may accelerate a million times faster than
     the link that drives it, and the link's acceleration would be their difference.
     """
-    left = _left(tree, frames, angular_velocity, joint_rates, acting)
-    return ArticulatedBodies(tree, frames, tree.heaviest).reactions(left, joints)
+    left = _left(tree, frames, angular_velocity, joint_rates, acting, joints)
+    return ArticulatedBodies(tree, frames, tree.heaviest).reactions(*left)
 
 
 def _left(
@@ -89,12 +88,16 @@ def _left(
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
     acting: Sequence[Wrench],
-) -> list[Wrench]:
-    """External wrenches, less those that the motion needs at zero acceleration.
+    joints: Sequence[Scalar],
+) -> tuple[list[Wrench], list[Scalar]]:
+    """External wrenches and joint torques, less those that the motion needs at zero acceleration.
 
-    They are subtracted body by body: summed over the tree, what acts on a light body would drown in what a
-    heavy one needs.
+    Wrenches are subtracted body by body: summed over the tree, what acts on a light body would drown in what
+    a heavy one needs.
     """
     rest = Accelerations(ZERO, ZERO, [0.0] * len(tree.links))
-    needed = body_wrenches(tree, frames, angular_velocity, joint_rates, rest)
-    return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(acting, needed, strict=True)]
+    needed, rotors = body_wrenches(tree, frames, angular_velocity, joint_rates, rest)
+    return (
+        [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in zip(acting, needed, strict=True)],
+        [torque - rotor for torque, rotor in zip(joints, rotors, strict=True)],
+    )

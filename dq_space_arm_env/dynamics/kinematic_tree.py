@@ -29,6 +29,7 @@ from dq_space_arm_env.scene.parameters import center_name, inertia_name
 
 if TYPE_CHECKING:
     from dq_space_arm_env.scene import Base, Link, Payload, Pose, Scene
+    from dq_space_arm_env.scene.drives import Motor
 
 Scalar = Any
 Given = Mapping[str, Scalar]
@@ -61,6 +62,35 @@ class Screw(NamedTuple):
     slide: float  # 0 for a revolute joint, 1 for a prismatic one, or the pitch, m/rad
 
 
+class Rotor(NamedTuple):
+    """A motor's rotor on the body before a joint, which a gear turns about the joint's z axis."""
+
+    inertia: Scalar  # J_r, about its axis, kg m^2; the body before the joint has the rest of its inertia
+    gear: float  # N, turns of the rotor per coordinate of the joint, 1 or rad/m
+    exact: bool  # energy J_r (a . omega + N rate)^2 / 2 with the body's omega, or J_r (N rate)^2 / 2
+
+    @property
+    def reflected(self) -> Scalar:
+        """Inertia about the joint, N^2 J_r."""
+        return self.inertia * (self.gear * self.gear)
+
+
+class Friction(NamedTuple):
+    """Coulomb friction of a joint, torque tanh(rate / speed)."""
+
+    torque: Scalar  # N m
+    speed: float  # rad/s
+
+
+class Elasticity(NamedTuple):
+    """An elastic gear between rotor and joint; on the joint's side."""
+
+    inertia: Scalar  # of the rotor, B = N^2 J_r, kg m^2
+    stiffness: Scalar  # N m/rad
+    damping: Scalar  # N m s/rad
+    friction: Friction | None  # of the rotor
+
+
 SCREWS = {"revolute": Screw(1.0, 0.0), "prismatic": Screw(0.0, 1.0)}
 
 
@@ -78,6 +108,9 @@ class JointedLink:
     stiffness: Scalar  # N m/rad
     rest_angle: float  # of the spring, rad
     damping: Scalar  # N m s/rad
+    rotor: Rotor | None = None
+    friction: Friction | None = None
+    elastic: Elasticity | None = None  # in place of rotor and friction
 
 
 @dataclass(frozen=True)
@@ -132,6 +165,7 @@ class KinematicTree:
                     given.get(f"links.{index}.stiffness", link.stiffness),
                     link.rest_angle,
                     given.get(f"links.{index}.damping", link.damping),
+                    *_drive(link.motor, f"links.{index}.motor", given),
                 )
                 for index, (body, link) in enumerate(zip(bodies, scene.links, strict=True))
             ),
@@ -186,6 +220,21 @@ def _rigid_body(body: Base | Link | Payload, place: str, center_of_mass: Vector,
             for i, row in enumerate(body.inertia)
         ),
     )
+
+
+def _drive(
+    motor: Motor | None, place: str, given: Given
+) -> tuple[Rotor | None, Friction | None, Elasticity | None]:
+    """Rotor, friction and elasticity of a joint's motor, as far as it has them."""
+    if motor is None:
+        return None, None, None
+    values = {name: given.get(f"{place}.{name}", getattr(motor, name)) for name in motor.varying}
+    rotor = Rotor(values["inertia"], motor.gear, motor.coupling == "exact") if motor.inertia else None
+    friction = Friction(values["friction"], motor.friction_speed) if motor.friction else None
+    if motor.stiffness is None or rotor is None:
+        return rotor, friction, None
+    damping = values.get("damping", 0.0)
+    return None, None, Elasticity(rotor.reflected, values["stiffness"], damping, friction)
 
 
 def _placement(pose: Pose) -> Placement:

@@ -239,6 +239,9 @@ class BodyVelocity:
 
     angular: Vector3  # rad/s
     linear: Vector3  # of the frame's origin, m/s
+    # Of the rotor that drives it, about the joint's axis: relative to inertial space, or without its coupling
+    # to the body before the joint; rad/s.
+    rotor: Scalar = 0.0
 
 
 def body_velocities(
@@ -253,11 +256,14 @@ def body_velocities(
         parent, (turn, slide) = velocities[link.parent], link.screw
         linear = transposed_matrix_vector(rotation, add(parent.linear, cross(parent.angular, position)))
         angular = transposed_matrix_vector(rotation, parent.angular)
+        rotor: Scalar = 0.0
+        if link.rotor is not None:
+            rotor = link.rotor.gear * rate + (angular[2] if link.rotor.exact else 0.0)
         if turn:
             angular = (angular[0], angular[1], angular[2] + rate)
         if slide:
             linear = (linear[0], linear[1], linear[2] + slide * rate)
-        velocities.append(BodyVelocity(angular, linear))
+        velocities.append(BodyVelocity(angular, linear, rotor))
     return velocities
 
 
@@ -283,6 +289,10 @@ def momentum(
         linear_at_parent, angular_at_parent = shift_wrench(rotation, position, linear[i + 1], angular[i + 1])
         linear[parent] = add(linear[parent], linear_at_parent)
         angular[parent] = add(angular[parent], angular_at_parent)
+        rotor = tree.links[i].rotor
+        if rotor is not None and rotor.exact:
+            spin = rotor.inertia * velocities[i + 1].rotor
+            angular[parent] = add(angular[parent], scale(spin, [row[2] for row in rotation]))
         rotated = matrix_vector(rotation, moments[i + 1])
         moments[parent] = add(moments[parent], add(rotated, scale(masses[i + 1], position)))
         masses[parent] = masses[i + 1] + masses[parent]
@@ -307,6 +317,9 @@ def energy(
         kinetic = kinetic + 0.5 * (body.mass * dot(v, v) + rotational)
     if tree.wheels:
         kinetic = kinetic + reaction_wheels.energy(tree.wheels, wheel_momenta)
+    for link, velocity in zip(tree.links, velocities[1:], strict=True):
+        if link.rotor is not None:
+            kinetic = kinetic + 0.5 * (link.rotor.inertia * (velocity.rotor * velocity.rotor))
     potential: Scalar = 0.0
     for link, angle in zip(tree.links, joint_angles, strict=True):
         stretch = angle - link.rest_angle

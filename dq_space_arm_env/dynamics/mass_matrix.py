@@ -220,6 +220,13 @@ def _composite_bodies(
         mass, moment, inertia = composite[i + 1]
         column = _wrench_along(tree.links[i].screw, mass, moment, inertia)
         block[i][i] = along(tree.links[i].screw, *column)
+        rotor = tree.links[i].rotor
+        if rotor is not None:
+            block[i][i] = block[i][i] + rotor.reflected
+        if rotor is not None and rotor.exact:  # carried by the body before the joint, about the joint's axis
+            force, torque = column
+            column = force, (*torque[:2], torque[2] + rotor.inertia * rotor.gear)
+            inertia = [*inertia[:2], (*inertia[2][:2], inertia[2][2] + rotor.inertia)]
         carried = i
         for ancestor in reversed(tree.path_to(parent)):
             column = shift_wrench(*frames[carried], *column)

@@ -11,12 +11,12 @@ dual acceleration follows as v' = a - omega x v.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from dq_space_arm_env.algebra.scalars import cos, sin
+from dq_space_arm_env.algebra.scalars import cos, sin, tanh
 from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale, transposed_matrix_vector
-from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody, Screw
+from dq_space_arm_env.dynamics.kinematic_tree import Friction, KinematicTree, RigidBody, Rotor, Screw
 
 Scalar = Any
 Vector3 = Sequence[Scalar]
@@ -80,11 +80,13 @@ def body_wrenches(
     angular_velocity: Vector3,
     joint_rates: Sequence[Scalar],
     acceleration: Accelerations,
-) -> list[tuple[Vector3, Vector3]]:
+) -> tuple[list[tuple[Vector3, Vector3]], list[Scalar]]:
     """Force [N] and torque [N m] that each body needs for given accelerations, of base and links.
 
     They act about the origin of each body's frame, in its axes, n + 1 pairs: the outward pass of the RNEA.
+    Besides, the torques [N m] that the rotors of the joints need, n.
     """
+    rotors: list[Scalar] = []
     motions = [(angular_velocity, acceleration.angular, acceleration.linear)]
     wrenches = [_newton_euler(tree.base, *motions[0])]
     for link, (rotation, p), rate, rate_change in zip(
@@ -95,6 +97,11 @@ def body_wrenches(
         a = transposed_matrix_vector(rotation, add(a, add(cross(alpha, p), cross(omega, cross(omega, p)))))
         omega = transposed_matrix_vector(rotation, omega)
         alpha = transposed_matrix_vector(rotation, alpha)
+        about_rotor, about_joint = rotor_torques(link.rotor, omega, alpha, rate, rate_change)
+        rotors.append(about_joint)
+        if about_rotor is not None:  # its bearings are on the body before the joint
+            force, torque = wrenches[link.parent]
+            wrenches[link.parent] = force, add(torque, matrix_vector(rotation, about_rotor))
         across = (omega[1] * rate, -omega[0] * rate)  # omega x (rate z)
         turn, slide = link.screw
         if slide:  # the origin moves along z: 2 omega x (rate z) and (rate change) z more
@@ -105,7 +112,25 @@ def body_wrenches(
             omega = (omega[0], omega[1], omega[2] + rate)
         motions.append((omega, alpha, a))
         wrenches.append(_newton_euler(link.body, omega, alpha, a))
-    return wrenches
+    return wrenches, rotors
+
+
+def rotor_torques(
+    rotor: Rotor | None, omega: Vector3, alpha: Vector3, rate: Scalar, rate_change: Scalar
+) -> tuple[Vector3 | None, Scalar]:
+    """Torque that a rotor needs from the body before its joint, joint axes, and from the joint's motor, N m.
+
+    `omega` and `alpha` are that body's. Lagrange's equations of J_r (omega_z + N rate)^2 / 2, the rotor's
+    energy; without its coupling the body does not enter, and needs no torque.
+    """
+    if rotor is None:
+        return None, 0.0
+    if not rotor.exact:
+        return None, rotor.reflected * rate_change
+    # The spin s = J_r (omega_z + N rate) about z: s' z + omega x s z.
+    spin = rotor.inertia * (omega[2] + rotor.gear * rate)
+    change = rotor.inertia * (alpha[2] + rotor.gear * rate_change)
+    return (omega[1] * spin, -omega[0] * spin, change), rotor.gear * change
 
 
 def inverse_dynamics(
@@ -116,8 +141,9 @@ def inverse_dynamics(
     acceleration: Accelerations,
 ) -> Wrenches:
     """Generalized forces for given accelerations (RNEA), without springs, dampers and tip wrench."""
-    wrenches = body_wrenches(tree, frames, angular_velocity, joint_rates, acceleration)
-    return passed_to_base(tree, frames, wrenches)
+    wrenches, rotors = body_wrenches(tree, frames, angular_velocity, joint_rates, acceleration)
+    passed = passed_to_base(tree, frames, wrenches)
+    return replace(passed, joints=[own + rotor for own, rotor in zip(passed.joints, rotors, strict=True)])
 
 
 def passed_to_base(
@@ -157,11 +183,16 @@ def shift_wrench(
 def passive_torques(
     tree: KinematicTree, joint_angles: Sequence[Scalar], joint_rates: Sequence[Scalar]
 ) -> list[Scalar]:
-    """Torques (or forces) of the joints' springs and dampers on the links, n, N m (N)."""
+    """Torques (or forces) of the joints' springs, dampers and friction on the links, n, N m (N)."""
     return [
-        -link.stiffness * (angle - link.rest_angle) - link.damping * rate
+        -link.stiffness * (angle - link.rest_angle) - link.damping * rate - rubbing(link.friction, rate)
         for link, angle, rate in zip(tree.links, joint_angles, joint_rates, strict=True)
     ]
+
+
+def rubbing(friction: Friction | None, rate: Scalar) -> Scalar:
+    """Torque of Coulomb friction against a rate, N m."""
+    return 0.0 if friction is None else friction.torque * tanh(rate * (1.0 / friction.speed))
 
 
 def tip_wrench_forces(

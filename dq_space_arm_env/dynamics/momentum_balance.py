@@ -11,6 +11,7 @@ from typing import Any
 
 from dq_space_arm_env.algebra.vectors import add
 from dq_space_arm_env.dynamics import minimal, reaction_wheels
+from dq_space_arm_env.dynamics.drives import DrivenMassMatrix
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion, Motion
 from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 
@@ -55,20 +56,21 @@ class SpaceArmMomentum:
         return add(inputs.force, tip.force), add(inputs.torque, tip.torque)
 
     def joint_torques(self, y: Scalars, u: Scalars) -> list[Scalar]:
-        """Torques of motors, springs and dampers on the joints, and what a wrench at the tip adds, n."""
-        motion = self._field.motion(y)
+        """Torques on joints, and on motors behind elastic gears, with what a wrench at the tip adds."""
+        motion, motors = self._field.motion(y), self._field.inputs(u).joint_torques
         frames = minimal.link_frames(self._tree, motion.joint_angles)
         parts = (
-            self._field.inputs(u).joint_torques,
-            self.passive_torques(y),
+            [0.0 if link.elastic else torque for link, torque in zip(self._tree.links, motors, strict=True)],
+            self._field.passive_torques(motion),
             self._field.tip_forces(motion, frames, self._tree.tip_wrench).joints,
         )
-        return [sum(torques) for torques in zip(*parts, strict=True)]
+        on_joints = [sum(torques) for torques in zip(*parts, strict=True)]
+        return [*on_joints, *self._field.motor_torques(motion, motors)]
 
     def passive_torques(self, y: Scalars) -> list[Scalar]:
-        """Torques of springs and dampers on the joints, n."""
-        motion = self._field.motion(y)
-        return minimal.passive_torques(self._tree, motion.joint_angles, motion.joint_rates)
+        """Torques on joints, and on motors behind elastic gears, that no motor commands."""
+        motion, still = self._field.motion(y), [0.0] * len(self._tree.links)
+        return [*self._field.passive_torques(motion), *self._field.motor_torques(motion, still)]
 
     def mass_matrix(self, y: Scalars) -> MassMatrix:
         """The mass matrix at the joint angles."""
@@ -76,4 +78,5 @@ class SpaceArmMomentum:
 
     def _mass_matrix(self, y: Scalars) -> tuple[Motion, MassMatrix]:
         motion = self._field.motion(y)
-        return motion, MassMatrix(self._tree, minimal.link_frames(self._tree, motion.joint_angles))
+        frames = minimal.link_frames(self._tree, motion.joint_angles)
+        return motion, DrivenMassMatrix(self._tree, frames)

@@ -19,7 +19,7 @@ from typing import Any
 
 from dq_space_arm_env.algebra import dual_matrices
 from dq_space_arm_env.algebra import dual_quaternion as dq
-from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Screw
+from dq_space_arm_env.dynamics.kinematic_tree import JointedLink, KinematicTree, Screw
 from dq_space_arm_env.dynamics.kinematics import joint_motion, tip_pose_rate, wrist_rotation
 from dq_space_arm_env.dynamics.linear import factorize_ldl, solve_ldl
 from dq_space_arm_env.dynamics.minimal import passive_torques
@@ -43,6 +43,9 @@ class NewtonEulerSystem:
     s21: Matrix  # joint constraints on the dual accelerations, (5 n, 8 (n+1))
     b1: list[Scalar]  # wrenches, 8 (n+1)
     b2: list[Scalar]  # centripetal terms of the constraints, 5 n
+    # Rotors add an unknown to T each, the negative of what their spin changes by per second, with the row
+    # that says so: S21 ydot + S22 T = B2.
+    s22: list[Scalar]  # diagonal of S22: 0 for constraints, 1 / J_r for rotors
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,8 @@ def assemble(
     """
     n = len(tree.links)
     s11 = _zeros(8 * (n + 1), 8 * (n + 1))
-    s12, s21 = _zeros(8 * (n + 1), 5 * n), _zeros(5 * n, 8 * (n + 1))
+    rotors = sum(link.rotor is not None for link in tree.links)
+    s12, s21 = _zeros(8 * (n + 1), 5 * n + rotors), _zeros(5 * n, 8 * (n + 1))
     b1: list[Scalar] = []
     b2: list[Scalar] = []
     for i, (body, velocity) in enumerate(zip(tree.bodies, velocities, strict=True)):
@@ -143,7 +147,47 @@ def assemble(
         carried = dq.inverse_adjoint(before, velocities[parent])
         centripetal = dq.cross(carried, joint_velocity(tree, frames, j, velocities))
         b2 += [row[0] for row in _forbidden(screw, [[entry] for entry in centripetal])]
-    return NewtonEulerSystem(s11, s12, s21, b1, b2)
+    s22: list[Scalar] = [0.0] * len(b2)
+    for j, link in enumerate(tree.links):
+        if link.rotor is not None:
+            row = _rotor_row(link, frames, j)
+            for body_index, entries in row.items():
+                _place(s12, 8 * body_index, len(s22), [[-entry] for entry in dq.swap(entries)])
+            s21.append([0.0] * len(s11))
+            for body_index, entries in row.items():
+                _place(s21, len(s22), 8 * body_index, [entries])
+            s22.append(1.0 / link.rotor.inertia)
+            b2.append(0.0)
+            gyroscopic = _gyroscopic(link, frames, j, velocities)
+            _accumulate(b1, 8 * link.parent, dq.scale(-1.0, dq.adjoint(frames.distal[j], gyroscopic)))
+    return NewtonEulerSystem(s11, s12, s21, b1, b2, s22)
+
+
+def _rotor_row(link: JointedLink, frames: JointFrames, joint: int) -> dict[int, list[Scalar]]:
+    """The rate of a rotor per dual velocity of the bodies before and after its joint, 8 each."""
+    assert link.rotor is not None
+    along = 3 if link.screw.turn else 7
+    after = dual_matrices.adjoint_matrix(frames.proximal[joint])
+    before = dual_matrices.adjoint_matrix(dq.conjugate(frames.distal[joint]))
+    own = [link.rotor.gear * entry for entry in after[along]]
+    carrier = [-link.rotor.gear * entry for entry in before[along]]
+    if link.rotor.exact:
+        carrier = [entry + turning for entry, turning in zip(carrier, before[3], strict=True)]
+    return {link.parent: carrier, joint + 1: own}
+
+
+def _gyroscopic(
+    link: JointedLink, frames: JointFrames, joint: int, velocities: Sequence[DualQuaternion]
+) -> DualQuaternion:
+    """Wrench that a rotor's spin needs as the body that carries it turns, joint axes: omega x s z."""
+    assert link.rotor is not None
+    if not link.rotor.exact:
+        return [0.0] * 8
+    carried = dq.inverse_adjoint(frames.distal[joint], velocities[link.parent])
+    parents = {link.parent: velocities[link.parent], joint + 1: velocities[joint + 1]}
+    row = _rotor_row(link, frames, joint)
+    spin = link.rotor.inertia * sum(_product(row[body], parents[body]) for body in parents)
+    return [0.0, 0.0, 0.0, 0.0, 0.0, carried[2] * spin, -carried[1] * spin, 0.0]
 
 
 def _transmitted(screw: Screw, row: Sequence[Scalar]) -> list[Scalar]:
@@ -177,17 +221,23 @@ class SchurComplement:
         # (vx, vy, wx, wy, wz) within a prismatic one.
         turning, sliding = (2, 3, 4, 0, 1), (3, 4, 0, 1, 2)
         orders = [turning if link.screw.turn else sliding for link in tree.links]
-        order = [5 * (k // 5) + orders[k // 5][k % 5] for k in range(count)]
+        joints = 5 * len(tree.links)
+        order = [5 * (k // 5) + orders[k // 5][k % 5] for k in range(joints)]
+        order += range(joints, count)  # rotors pair with their own rows
         self._order = order
         self._constraints = [system.s21[row] for row in order]
         columns = [[row[c] for row in system.s12] for c in range(count)]
         self._weighted = [_solve_inertia(self._bodies, column) for column in columns]
-        self._factor = factorize_ldl(
-            [[-_product(row, column) for column in self._weighted] for row in self._constraints]
-        )
+        complement = [[-_product(row, column) for column in self._weighted] for row in self._constraints]
+        for k in range(joints, count):
+            complement[k][k] = complement[k][k] + system.s22[k]
+        self._factor = factorize_ldl(complement)
 
     def solve(self, b1: Sequence[Scalar], b2: Sequence[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
-        """Dual accelerations (22), 8 (n+1), and reaction wrenches (21), 5 n, of right-hand sides b1, b2."""
+        """Dual accelerations (22), 8 (n+1), and reaction wrenches (21), 5 n, of right-hand sides b1, b2.
+
+        Those of rotors come after the reaction wrenches.
+        """
         accelerations = _solve_inertia(self._bodies, b1)  # S11^-1 B1
         # (21): (-S21 S11^-1 S12) T = B2 - S21 S11^-1 B1.
         right = [
@@ -215,7 +265,10 @@ class SchurComplement:
             value - _product(own, accelerations) - _product(others, reactions)
             for value, own, others in zip(b1, left.s11, left.s12, strict=True)
         ]
-        violated = [value - _product(row, accelerations) for value, row in zip(b2, left.s21, strict=True)]
+        violated = [
+            value - _product(row, accelerations) - own * reaction
+            for value, row, own, reaction in zip(b2, left.s21, left.s22, reactions, strict=True)
+        ]
         corrections = self.solve(unbalanced, violated)
         return (
             [a + b for a, b in zip(accelerations, corrections[0], strict=True)],
@@ -294,7 +347,7 @@ def paper_rates(
     """Time derivative of the paper's state (11), (12), (22), and the reaction wrenches (21)."""
     system = system_of(tree, state, base_wrench, joint_torques)
     accelerations, reactions = solve_schur(tree, system)
-    return [*paper_position_rates(tree, state, wrist_rates), *accelerations], reactions
+    return [*paper_position_rates(tree, state, wrist_rates), *accelerations], reactions[: 5 * len(tree.links)]
 
 
 def system_of(

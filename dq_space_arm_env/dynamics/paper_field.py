@@ -168,4 +168,6 @@ def _residual(system: newton_euler.NewtonEulerSystem) -> tuple[Matrix, Matrix]:
         return bodies, unknowns
     bodies += casadi.mtimes(matrix(system.s12), reactions)
     constraints = casadi.mtimes(matrix(system.s21), ydot) - column(*system.b2)
+    if any(system.s22):
+        constraints += column(*system.s22) * reactions
     return casadi.vertcat(bodies, constraints), unknowns

@@ -7,7 +7,7 @@ never its solution, which only solves for more right-hand sides.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi
 
@@ -22,6 +22,16 @@ from dq_space_arm_env.dynamics.residual import Residual
 
 Scalar = Any
 Matrix = Any
+
+
+class _SimpleJacobians(NamedTuple):
+    """Jacobians of what is written in closed form."""
+
+    angles_by_y: Matrix  # rates of joint and wrist angles, constant
+    angles_by_u: Matrix
+    turning_by_y: Matrix  # -omega x v, rows of the accelerations of base and joints
+    motors_by_y: Matrix  # rates and accelerations of the motors of elastic joints
+    motors_by_u: Matrix
 
 
 class SpaceArmField(EquationsOfMotion):
@@ -61,25 +71,27 @@ class SpaceArmField(EquationsOfMotion):
         responses = [
             self._response(inertia, [-e for e in dense_entries(by_y[:, i])]) for i in range(self.n_y)
         ]
-        response = columns(*(column(*entries) for entries in responses), rows=len(self.rate_indices))
-        rates = [*motion.joint_rates, *inputs.wrist_rates, *self._dual(motion, solved), *inputs.wheel_torques]
-        angles_by_y, angles_by_u, turning_by_y = self._simple_jacobians(y)
-        wheels_by_y, wheels_by_u = self._wheel_jacobians()
-        jacobian_y = casadi.vertcat(angles_by_y, response + turning_by_y, wheels_by_y)
+        response = columns(*(column(*entries) for entries in responses), rows=len(self.body_rate_indices))
+        rates = [*motion.joint_rates, *inputs.wrist_rates, *self._dual(motion, solved)]
+        rates += [*self.motor_motion(motion, inputs), *inputs.wheel_torques]
+        simple, wheels = self._simple_jacobians(y), self._wheel_jacobians()
+        jacobian_y = casadi.vertcat(
+            simple.angles_by_y, response + simple.turning_by_y, simple.motors_by_y, wheels[0]
+        )
         inputs_one_by_one = (self._input_response(inertia, i) for i in range(self.n_u))
-        by_u = columns(*inputs_one_by_one, rows=len(self.rate_indices))
-        return rates, jacobian_y, casadi.vertcat(angles_by_u, by_u, wheels_by_u)
+        by_u = columns(*inputs_one_by_one, rows=len(self.body_rate_indices))
+        return rates, jacobian_y, casadi.vertcat(simple.angles_by_u, by_u, simple.motors_by_u, wheels[1])
 
     def _inertial(
         self, y: Sequence[Scalar], rates: Sequence[Scalar], by_y: Matrix, by_u: Matrix
     ) -> tuple[list[Scalar], Matrix]:
         """Accelerations seen by an inertial observer, and their Jacobian with respect to (y, u)."""
-        rows = list(self.rate_indices)
+        rows = list(self.body_rate_indices)
         motion = self.motion(y)
         dual = self.pose.full_twist([rates[i] for i in self.pose.twist_indices])
         turning = cross(motion.angular, motion.linear)
         joints = [rates[i] for i in rows[len(self.pose.directions) :]]
-        by_state = casadi.horzcat(by_y[rows, :] - self._simple_jacobians(y)[2], by_u[rows, :])
+        by_state = casadi.horzcat(by_y[rows, :] - self._simple_jacobians(y).turning_by_y, by_u[rows, :])
         # As seen by an inertial observer moving along, the velocity of the base changes no acceleration.
         linear = [
             i for i, axis in zip(self.pose.twist_indices, self.pose.directions, strict=True) if axis > 2
@@ -101,7 +113,7 @@ class SpaceArmField(EquationsOfMotion):
         With w = M^-1 multiplier, differentiating w . (M a + ID(y, 0) - f) = 0 twice gives multiplier . a_zz =
         -[(w . ID)_zz + G' a_z + (G' a_z)'], G = d(M w)/dy: the factorization of M is not differentiated.
         """
-        rows = list(self.rate_indices)
+        rows = list(self.body_rate_indices)
         acceleration, by_state = self._inertial(y, rates, by_y, by_u)
         # w = M^-1 multiplier: M is symmetric.
         weights = self.pose.full_twist([multiplier[i] for i in self.pose.twist_indices])
@@ -119,21 +131,32 @@ class SpaceArmField(EquationsOfMotion):
         moving = self.motion(free)
         bilinear = casadi.dot(column(*weights[3:]), column(*cross(moving.angular, moving.linear)))
         curvature = curvature + casadi.jacobian(casadi.gradient(bilinear, column(*free)), column(*free))
+        # Friction is all that bends in the equations of motors behind elastic gears.
+        motors = column(*self.motor_motion(moving, self.inputs([0.0] * n_u)))
+        last = column(*multiplier[n_y - motors.shape[0] :])
+        bent = casadi.hessian(casadi.dot(last, motors), column(*free))[0]
+        curvature = curvature - casadi.substitute(bent, column(*free), casadi.densify(column(*y)))
         curvature = casadi.diagcat(curvature, zeros(n_u, n_u))
         return casadi.sparsify(-(curvature + coupling + coupling.T))
 
-    def _simple_jacobians(self, y: Sequence[Scalar]) -> tuple[Matrix, Matrix, Matrix]:
-        """Constant Jacobians of the angles' rates by y and u, and the Jacobian of -omega x v by y."""
+    def _simple_jacobians(self, y: Sequence[Scalar]) -> _SimpleJacobians:
+        """Jacobians of all but the accelerations of base and joints, and of -omega x v."""
         free_y = symbols("f", self.n_y)
         free_u = symbols("g", self.n_u)
-        motion = self.motion(free_y)
-        angles = column(*motion.joint_rates, *self.inputs(free_u).wrist_rates)
+        motion, inputs = self.motion(free_y), self.inputs(free_u)
+        angles = column(*motion.joint_rates, *inputs.wrist_rates)
+        motors = column(*self.motor_motion(motion, inputs))
         turning = [*ZERO, *(-entry for entry in cross(motion.angular, motion.linear))]
         kept = column(*(turning[i] for i in self.pose.directions), *[0.0] * len(self.tree.links))
-        by_y = casadi.substitute(
-            casadi.jacobian(kept, column(*free_y)), column(*free_y), casadi.densify(column(*y))
+        by_y = [casadi.jacobian(each, column(*free_y)) for each in (kept, motors)]
+        turning_by_y, motors_by_y = casadi.substitute(by_y, [column(*free_y)], [casadi.densify(column(*y))])
+        return _SimpleJacobians(
+            casadi.jacobian(angles, column(*free_y)),
+            casadi.jacobian(angles, column(*free_u)),
+            turning_by_y,
+            motors_by_y,
+            casadi.jacobian(motors, column(*free_u)),
         )
-        return casadi.jacobian(angles, column(*free_y)), casadi.jacobian(angles, column(*free_u)), by_y
 
     def _wheel_jacobians(self) -> tuple[Matrix, Matrix]:
         """Jacobians of the torques on wheels by y and u."""
@@ -154,9 +177,11 @@ class SpaceArmField(EquationsOfMotion):
         free, acceleration = symbols("v", self.n_y), symbols("a", 6 + n)
         motion = self.motion(free)
         given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
-        passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
-        missing = [entry for pair in self._missing_wrenches(motion, given) for part in pair for entry in part]
-        by_y = casadi.jacobian(column(*missing, *(-torque for torque in passive)), column(*free))
+        passive = self.passive_torques(motion)
+        wrenches, rotors = self._missing_wrenches(motion, given)
+        missing = [entry for pair in wrenches for part in pair for entry in part]
+        missing += [rotor - torque for rotor, torque in zip(rotors, passive, strict=True)]
+        by_y = casadi.jacobian(column(*missing), column(*free))
         values = casadi.densify(column(*y, *solved.angular, *solved.linear, *solved.joints))
         by_y = casadi.substitute(by_y, column(*free, *acceleration), values)
         angles = self._in_y(self.layout.state.joint_angles)
@@ -178,7 +203,7 @@ class SpaceArmField(EquationsOfMotion):
         given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
         needed = minimal.inverse_dynamics(self.tree, frames, motion.angular, motion.joint_rates, given)
         tip = self.tip_forces(motion, frames, self.tree.tip_wrench)
-        passive = minimal.passive_torques(self.tree, motion.joint_angles, motion.joint_rates)
+        passive = self.passive_torques(motion)
         joints = [
             bias - other - load for bias, other, load in zip(needed.joints, passive, tip.joints, strict=True)
         ]
@@ -208,5 +233,5 @@ class SpaceArmField(EquationsOfMotion):
         torque = unit.torque
         if self.tree.wheels:
             torque = subtract(torque, reaction_wheels.along_axes(self.tree.wheels, unit.wheel_torques))
-        forces = [*unit.force, *torque, *unit.joint_torques]
+        forces = [*unit.force, *torque, *self._on_links(unit.joint_torques)]
         return column(*self._response(inertia, self._on_base(forces)))

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
+from dq_space_arm_env.dynamics.drives import elastic_joints
+from dq_space_arm_env.dynamics.kinematic_tree import Friction, KinematicTree
 from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
 from dq_space_arm_env.dynamics.minimal import link_frames
 from dq_space_arm_env.scene import INTEGRATORS, Scene
@@ -21,7 +22,7 @@ class JointMotion(NamedTuple):
     """The fastest motions of the joints about their springs, at the start of a scene."""
 
     frequency: float  # of the stiffest swing, rad/s
-    decay: float  # of the fastest relaxation in the dampers, 1/s
+    decay: float  # of the fastest relaxation in dampers and friction, 1/s
 
 
 def joint_motion(scene: Scene) -> JointMotion:
@@ -34,19 +35,33 @@ def joint_motion(scene: Scene) -> JointMotion:
         Square root of the largest eigenvalue of the first, and largest of the second; zeros without any.
     """
     tree, links = KinematicTree.from_scene(scene), scene.links
-    if not any(link.stiffness or link.damping for link in links):
+    slopes = [link.damping + _slope(link.friction) for link in tree.links]
+    if not any(link.stiffness or slope or link.is_elastic for link, slope in zip(links, slopes, strict=True)):
         return JointMotion(0.0, 0.0)
     whole = np.array(mass_matrix(tree, link_frames(tree, scene.initial_state.joint_angles)), dtype=float)
     free = [2, 3, 4, *range(6, len(whole))] if tree.planar else range(len(whole))
-    inverse = np.linalg.inv(whole[np.ix_(free, free)])[-len(links) :, -len(links) :]
+    gears, n = elastic_joints(tree), len(links)
+    inverse = np.zeros((n + len(gears),) * 2)  # of joints, and of the motors behind elastic gears
+    inverse[:n, :n] = np.linalg.inv(whole[np.ix_(free, free)])[-n:, -n:]
+    for motor, (_, gear) in enumerate(gears, n):
+        inverse[motor, motor] = 1.0 / gear.inertia
 
-    def largest(diagonal: list[float]) -> float:
-        # M^-1 D is similar to the symmetric D^1/2 M^-1 D^1/2.
-        root = np.sqrt(diagonal)
-        return max(0.0, float(np.linalg.eigvalsh(root[:, None] * inverse * root)[-1]))
+    def largest(of_joints: list[float], of_gears: list[float], of_motors: list[float]) -> float:
+        slopes = np.diag([*of_joints, *of_motors])
+        for motor, ((joint, _), slope) in enumerate(zip(gears, of_gears, strict=True), n):
+            slopes[np.ix_([joint, motor], [joint, motor])] += slope * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        # M^-1 D has the eigenvalues of the symmetric L' D L with M^-1 = L L'.
+        root = np.linalg.cholesky(inverse)
+        return max(0.0, float(np.linalg.eigvalsh(root.T @ slopes @ root)[-1]))
 
-    frequency = sqrt(largest([link.stiffness for link in links]))
-    return JointMotion(frequency, largest([link.damping for link in links]))
+    springs = [link.stiffness for link in links], [gear.stiffness for _, gear in gears], [0.0] * len(gears)
+    dampers = slopes, [gear.damping for _, gear in gears], [_slope(gear.friction) for _, gear in gears]
+    return JointMotion(sqrt(largest(*springs)), largest(*dampers))
+
+
+def _slope(friction: Friction | None) -> float:
+    """Damping by friction at rest, N m s/rad."""
+    return 0.0 if friction is None else float(friction.torque / friction.speed)
 
 
 def _used(scene: Scene) -> float:

@@ -94,6 +94,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     Thrusters add their forces at the end; an action below 0 is off, and a pulse shorter than the shortest does not fire.
     At its largest speed a wheel's torque stops, and a motor takes no more than its power: what then acts is less than the action asks for.
 
+    Angles and rates of motors behind elastic gears, rad and rad/s, stand after the joint rates, commands on their way
+    and outputs of actuators that lag, `layout.state.drives`, in N, N m, rad/s, after those and the controls before.
     Where rates of controls are limited, the controls before, those of `layout.previous_controls`, stand after the
     joint rates, in N, N m, rad/s. In a scene with phases the number of the phase, from 0, is one more entry: before
     the twists, or the time left. Where other tips have goals, their error dual quaternions follow, with a scalar part of at least 0.

@@ -148,5 +148,5 @@ class CanonicalCoordinates:
         gradient = casadi.substitute(casadi.densify(gradient), names, values)
         inertial = dense_entries(gradient)
         torques = self.balance.joint_torques(y, u)
-        # Joint angles come before wrist angles and wheel momenta, which these do not depend on.
+        # Angles of joints and motors come first; nothing here depends on wrist angles and wheel momenta.
         return [a + b for a, b in zip(inertial[:n], torques, strict=True)]

@@ -52,11 +52,12 @@ class LocalState:
     """The parts of a state in these coordinates; vectors have 3 entries in start axes."""
 
     rotation: Scalars  # rotation vector of the base, rad, or its coordinates in a subclass
-    shape: Scalars  # joint and wrist angles, rad, and wheel momenta, N m s
+    # Angles of joints, of motors behind elastic gears, and of the wrist, rad, and wheel momenta, N m s.
+    shape: Scalars
     displacement: Scalars  # of the system's center of mass, m
     linear: Scalars  # momentum, kg m/s
     angular: Scalars  # momentum about the center of mass, kg m^2/s
-    joint_rates: Scalars  # rad/s
+    joint_rates: Scalars  # of joints, and of motors behind elastic gears, rad/s
 
 
 class MomentumCoordinates:
@@ -72,7 +73,7 @@ class MomentumCoordinates:
         self.rotating = self._rotating()
         self.moving = [axis - 3 for axis in field.pose.directions if axis >= 3]
         twist = field.pose.twist_indices
-        self.shape_indices = [i for i in range(field.n_y) if i not in field.rate_indices]
+        self.shape_indices = list(field.shape_indices)
         self.joint_indices = [i for i in field.rate_indices if i not in twist]
         sizes = [len(self.rotating), len(self.shape_indices), len(self.moving), len(self.moving)]
         sizes += [len(self.turning), len(self.joint_indices)]

@@ -103,8 +103,15 @@ def _state_derivative(programs: ScenePrograms) -> Program:
         motion = field.motion(y)
         twist = (*motion.angular, *motion.linear)
         pose = field.pose.reduced(dual_quaternion.derivative(equations.base_pose(x), twist))
-        kept = [0.0] * len(motion.previous_controls)
-        return {"xdot": [*pose, *field.rates(y, u), *kept]}
+        kept = [0.0] * (len(motion.previous_controls) + len(motion.drives))
+        start = 0
+        for chain in programs.layout.chains:
+            output = len(motion.previous_controls) + start + chain.delay
+            if chain.time_constant is not None:
+                followed = motion.drives[start] if chain.delay else u[chain.control]
+                kept[output] = (followed - motion.drives[start + chain.delay]) / chain.time_constant
+            start += len(chain.names)
+        return {"xdot": [*pose, *field.rates(y, field.acting(motion.drives, u)), *kept]}
 
     inputs = program_inputs(field, Buffer("x", field.n_x), Buffer("u", field.n_u))
     program = Program("xdot", inputs, [Buffer("xdot", field.n_x)])

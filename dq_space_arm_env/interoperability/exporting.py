@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
 from dq_space_arm_env.scene import Scene, SceneError
+from dq_space_arm_env.scene.actuator_chains import chains
 from dq_space_arm_env.scene.constraint_rows import sides
 from dq_space_arm_env.scene.constraints import JointLimits
 
@@ -25,8 +26,35 @@ def free_name(wanted: str, taken: Collection[str]) -> str:
     return wanted
 
 
-def refuse(scene: Scene, language: str, wrist: str, *, springs: bool = False, planar: bool = False) -> None:
-    """Refuse a scene that the format cannot represent without changing its motion."""
+def coupled_rotors(scene: Scene) -> Iterator[str]:
+    """Say of elastic gears, and of rotors that turn with the body before their joint, that it has none."""
+    elastic = [link.name for link in scene.links if link.is_elastic]
+    if elastic:
+        yield f"it has no elastic gears, and link {elastic[0]!r} has one: remove its motor's stiffness"
+    for link in scene.links:
+        if link.motor is not None and link.motor.inertia and link.motor.coupling == "exact":
+            yield (
+                "it has no rotors that turn with the body before the joint, and "
+                f"link {link.name!r} has one: set its motor's coupling to armature"
+            )
+            return
+
+
+def refuse(
+    scene: Scene,
+    language: str,
+    wrist: str,
+    *,
+    springs: bool = False,
+    planar: bool = False,
+    rotors: bool = False,
+    at_once: bool = False,
+) -> None:
+    """Refuse a scene that the format cannot represent without changing its motion.
+
+    `springs`, `planar`, `rotors`: formats without joint springs, planar bases, and rotors of any kind;
+    `at_once`: with actuators that neither lag nor delay.
+    """
     if wrist not in ("refuse", "fixed"):
         raise ValueError(f"wrist: {wrist!r}, it must be 'refuse' or 'fixed'")
     problems = []
@@ -47,6 +75,16 @@ def refuse(scene: Scene, language: str, wrist: str, *, springs: bool = False, pl
         problems.append(f"it has no screw joints, and link {screws[0]!r} has one")
     if scene.actuators.wheels is not None:
         problems.append("it has no reaction wheels: leave them out with replace({'actuators.wheels': None})")
+    geared = [link.name for link in scene.links if link.motor is not None and link.motor.inertia]
+    if rotors and geared and not any(link.is_elastic for link in scene.links):
+        problems.append(f"it has no rotors, and link {geared[0]!r} has one: set its motor's inertia to 0")
+    elif geared:
+        problems += coupled_rotors(scene)
+    late = [chain.name for chain in chains(scene)]
+    if at_once and late:
+        problems.append(
+            f"its actuators act at once, and {late[0]} lags or delays: remove time_constant and delay"
+        )
     if problems:
         raise SceneError("\n  - ".join([f"scene {scene.name!r} cannot be written as {language}:", *problems]))
 

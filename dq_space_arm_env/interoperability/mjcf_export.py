@@ -32,8 +32,9 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     There is no gravity, and nothing collides: the scene's shapes, if it gives any, are there to be seen.
     Body `base` has the frame e0 and a free joint, called `base joint`; in a planar scene it slides along x
     and y and turns about z. Each link is a body with the frame of its joint, a hinge about z or a slide along
-    it called by the link's name and " joint", with the scene's damping, spring and limits of the joint, and
-    no armature. Where arms branch, MuJoCo's coordinates follow one arm after the other.
+    it called by the link's name and " joint", with the scene's damping, spring and limits of the joint. Where
+    arms branch, MuJoCo's coordinates follow one arm after the other.
+    A rotor is an armature, Coulomb friction a friction loss, which MuJoCo has without the smoothing speed.
     MuJoCo pushes joints back from their limits, the scene's kernels do not, and it has no limits of rates.
     Site `tip` has the frame G, body `payload` is held at the tip.
 
@@ -57,9 +58,10 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
 
     Raises:
         SceneError: If the scene has a wrist that is not to be fixed, a constant wrench at the tip, a screw
-            joint, or reaction wheels.
+            joint, reaction wheels, an elastic gear, a rotor that turns with the body before its joint, or an
+            actuator that lags or delays.
     """
-    refuse(scene, "MJCF", wrist)
+    refuse(scene, "MJCF", wrist, at_once=True)
     root = Element("mujoco", model=scene.name)
     SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     SubElement(root, "option", gravity="0 0 0", timestep=words([scene.simulation.dt]), integrator="RK4")
@@ -149,6 +151,10 @@ def _add_joint(body: Element, link: Link, lower: float, upper: float) -> None:
     if link.stiffness:
         joint.set("stiffness", words([link.stiffness]))
         joint.set("springref", words([link.rest_angle]))
+    if link.motor is not None and link.motor.inertia:
+        joint.set("armature", words([link.motor.reflected_inertia]))
+    if link.motor is not None and link.motor.friction:
+        joint.set("frictionloss", words([link.motor.friction]))
 
 
 def _add_actuators(root: Element, scene: Scene) -> None:

@@ -12,7 +12,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Placement, RigidBody, Screw
-from dq_space_arm_env.interoperability.exporting import tip_on_its_body
+from dq_space_arm_env.interoperability.exporting import coupled_rotors, tip_on_its_body
 from dq_space_arm_env.scene import Scene, SceneError, StateLayout
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 
@@ -23,10 +23,10 @@ def pinocchio_model(scene: Scene) -> Any:
     """Build a scene's robot as a `pinocchio.Model`.
 
     Joint `base` is a free flyer (planar scenes: a planar joint) with the frame e0, at the center of mass;
-    each link has a joint about or along z, called by its name. There is no gravity; limits are not set. Frame
-    `tip` is G, with the wrist at its initial angles. `to_pinocchio` and `generalized_forces` give the
-    arguments of Pinocchio's algorithms: `pinocchio.aba(model, data, q, v, tau)` is (dv, dw, joint
-    accelerations), where (dw, dv) are the scene's base accelerations.
+    each link has a joint about or along z, called by its name. There is no gravity; limits are not set.
+    Rotors are its `armature`. Frame `tip` is G, with the wrist at its initial angles. `to_pinocchio` and
+    `generalized_forces` give the arguments of Pinocchio's algorithms: `pinocchio.aba(model, data, q, v, tau)`
+    is (dv, dw, joint accelerations), where (dw, dv) are the scene's base accelerations.
 
     Args:
         scene: A validated scene; its nominal masses and inertias, the payload part of the tip's link.
@@ -36,10 +36,13 @@ def pinocchio_model(scene: Scene) -> Any:
 
     Raises:
         ImportError: If Pinocchio is not installed.
-        SceneError: If the scene has reaction wheels, which are not part of this model.
+        SceneError: If the scene has reaction wheels, or a rotor is coupled to the body that carries it.
     """
     pin = _pinocchio()
     tree = _equations(scene).tree
+    problems = [*coupled_rotors(scene)]
+    if problems:
+        raise SceneError("\n  - ".join([f"scene {scene.name!r} cannot be a Pinocchio model:", *problems]))
     model = pin.Model()
     model.name = scene.name
     model.gravity = pin.Motion.Zero()
@@ -50,6 +53,11 @@ def pinocchio_model(scene: Scene) -> Any:
         parent = joints[link.parent]
         joints.append(model.addJoint(parent, _joint(pin, link.screw), _placement(pin, link.joint), name))
         model.appendBodyToJoint(joints[-1], _inertia(pin, link.body), pin.SE3.Identity())
+    if any(link.rotor is not None for link in tree.links):
+        armature = np.zeros(model.nv)
+        for joint, link in zip(joints[1:], tree.links, strict=True):
+            armature[model.joints[joint].idx_v] = link.rotor.reflected if link.rotor else 0.0
+        model.armature = armature
     rotation, position = poses.to_matrix(tip_on_its_body(scene))
     tip = pin.SE3(np.array(rotation), np.array(position))
     model.addFrame(pin.Frame("tip", joints[tree.tip_body], tip, pin.FrameType.OP_FRAME))
@@ -102,7 +110,7 @@ def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: Array
 
     Returns:
         State, shape (n_x,), units of the state; the sign of q_{e0/I} is that of q, in a planar scene the one
-        with a scalar part of at least 0. Previous controls, where the state has some, are zero.
+        with a scalar part of at least 0. What else the state has, as previous controls, is zero.
 
     Raises:
         ValueError: If a shape is wrong.
@@ -122,7 +130,7 @@ def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: Array
         position, (i, j, k, w), angles = configuration[:3], configuration[3:7], configuration[7:]
         base = list(poses.from_rotation_and_position((w, i, j, k), tuple(position)))
         twist, rates = [*velocity[3:6], *velocity[:3]], velocity[6:]
-    previous = np.zeros(len(layout.previous_controls))
+    previous = np.zeros(layout.n_x - layout.state.joint_rates.stop)
     return np.array([*base, *angles, *wrist, *twist, *rates, *previous], dtype=np.float64)
 
 

@@ -33,8 +33,8 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     continuous; 1e4 rad (m) and rad/s (m/s) stand for none where URDF asks for a number. It has no thrusters,
     wheels, start, task or other constraints. Shapes become visuals.
 
-    Features that URDF lacks and that change the motion are refused: joint springs, screw joints, a wrench at
-    the tip, a planar base, reaction wheels. The massless wrist as three joints would have infinite
+    Features that URDF lacks and that change the motion are refused: joint springs, rotors, screw joints, a
+    wrench at the tip, a planar base, reaction wheels. The massless wrist as three joints would have infinite
     accelerations; fixed at its initial angles it changes no acceleration, but the tip cannot turn.
 
     Args:
@@ -47,7 +47,7 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     Raises:
         SceneError: If URDF lacks a feature of the scene.
     """
-    refuse(scene, "URDF", wrist, springs=True, planar=True)
+    refuse(scene, "URDF", wrist, springs=True, planar=True, rotors=True)
     root = Element("robot", name=scene.name)
     names = [link.name for link in scene.links]
     bodies = [free_name("base", names), *names]
@@ -124,8 +124,9 @@ def _add_joint(
         if has_range:
             limit.set("lower", words([max(lower, -UNLIMITED)]))
             limit.set("upper", words([min(upper, UNLIMITED)]))
-    if link.damping:
-        SubElement(joint, "dynamics", damping=words([link.damping]))
+    rubbing = {"damping": link.damping, "friction": link.motor.friction if link.motor else 0.0}
+    if any(rubbing.values()):
+        SubElement(joint, "dynamics", {key: words([value]) for key, value in rubbing.items() if value})
 
 
 def _connect(joint: Element, parent: str, child: str, pose: Sequence[float]) -> None:

@@ -179,7 +179,7 @@ def _warn(arm: Arm) -> None:
     rubbing = [part.joint.name for part in arm.joints if part.joint.friction]
     if rubbing:
         warnings.warn(
-            f"URDF: Coulomb friction of {', '.join(rubbing)} is left out: a scene has viscous damping only",
+            f"URDF: Coulomb friction of {', '.join(rubbing)} is left out: `motor.friction` of a link adds it",
             stacklevel=3,
         )
     for flaw in arm.flaws:

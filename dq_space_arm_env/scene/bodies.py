@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictBool
 
+from dq_space_arm_env.scene.drives import Motor
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.scene.shapes import Shape, geometry_field
 from dq_space_arm_env.validation.fields import (
@@ -135,12 +136,22 @@ class Link(Model):
     stiffness: NonNegative = Field(default=0.0, description="stiffness of the joint spring, N m/rad (N/m)")
     rest_angle: Angle = Field(default=0.0, description="joint angle at which the spring is at rest, rad (m)")
     damping: NonNegative = Field(default=0.0, description="viscous damping of the joint, N m s/rad (N s/m)")
+    motor: Motor | None = Field(
+        default=None,
+        exclude_if=lambda motor: motor is None,
+        description="rotor, gear and friction of the joint's motor; absent: an ideal torque",
+    )
     geometry: tuple[Shape, ...] = geometry_field("a joint, and a rod to the next one")
 
     @property
     def turns(self) -> bool:
         """Whether the joint's coordinate is an angle."""
         return self.joint_type != "prismatic"
+
+    @property
+    def is_elastic(self) -> bool:
+        """Whether the gear of the joint's motor is a spring."""
+        return self.motor is not None and self.motor.is_elastic
 
     @property
     def unit(self) -> str:

@@ -16,9 +16,11 @@ from dq_space_arm_env.scene.constraints import (
     Momentum,
     Plume,
     Terminal,
+    TorqueSpeed,
     Volume,
     WheelLimits,
     WheelMomentum,
+    limited_motors,
     per_link,
 )
 from dq_space_arm_env.scene.parameters import control_numbers, thruster_names, wheel_names
@@ -111,6 +113,12 @@ def rows_of(scene: Scene, each: Constraint) -> list[Row]:
         for limit in rate_limits(scene, each):
             names = [f"{each.name}: {limit.name} {word}" for word in ("falls", "rises")]
             rows += [Row(name, limit.unit, *common, has_input=True, is_rate=True) for name in names]
+    elif isinstance(each, TorqueSpeed):
+        for _, link in limited_motors(scene):
+            for words in ("backward", "forward"):
+                rows.append(
+                    Row(f"{each.name}: {link.name} {words}", link.effort_unit, *common, has_input=True)
+                )
     elif isinstance(each, Plume):
         names = [f"{each.name}: {thruster}" for thruster in thruster_names(scene)]
         names = [each.name, *names] if scene.actuators.base_force is not None else names
@@ -246,6 +254,25 @@ def rate_limits(scene: Scene, each: ControlRate) -> list[RateLimit]:
     return found
 
 
+def slew_limits(scene: Scene) -> list[RateLimit]:
+    """How fast actuators follow at most, which environments see to.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        The controls with a limit, in their order.
+    """
+    found, index = [], 0
+    for field, numbers in control_numbers(scene).items():
+        for number in numbers:
+            rate = getattr(getattr(scene.actuators, field, None), "slew_limit", None)
+            if rate is not None:
+                found.append(RateLimit(index, number.name, number.limit.unit, rate))
+            index += 1
+    return found
+
+
 def previous_controls(scene: Scene) -> tuple[int, ...]:
     """Indices of the controls that the state keeps for a step: those whose rates are limited.
 
@@ -267,7 +294,7 @@ def rates_of(scene: Scene) -> tuple[RateLimit, ...]:
     Returns:
         The strictest limit of each.
     """
-    found: dict[int, RateLimit] = {}
+    found = {limit.control: limit for limit in slew_limits(scene)}
     for each in scene.constraints:
         for limit in rate_limits(scene, each) if isinstance(each, ControlRate) else ():
             kept = limit._replace(rate=max(limit.rate - each.margin / scene.simulation.dt, 0.0))

@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, StrictBool
 
+from dq_space_arm_env.scene.bodies import Link
 from dq_space_arm_env.validation.fields import (
     ANGLES,
     LENGTHS,
@@ -301,6 +302,15 @@ class ControlRate(Constraint):
     )
 
 
+class TorqueSpeed(Constraint):
+    """What full voltage leaves of the torque of motors with a `stall_torque`; residuals in N m (N).
+
+    Environments clip torques to it, with or without this constraint, by which the expert knows it.
+    """
+
+    kind: Literal["torque_speed"] = Field(description="'torque_speed'")
+
+
 class Terminal(Constraint):
     """Quantities that are exact at the end: equalities in rad, m, rad/s, m/s, N s, N m s."""
 
@@ -330,6 +340,7 @@ _KINDS: dict[str, type[Constraint]] = {
     "wheel_momentum": WheelMomentum,
     "wheel_limits": WheelLimits,
     "control_rate": ControlRate,
+    "torque_speed": TorqueSpeed,
     "terminal": Terminal,
 }
 
@@ -356,6 +367,7 @@ AnyConstraint = Annotated[
     | WheelMomentum
     | WheelLimits
     | ControlRate
+    | TorqueSpeed
     | Terminal,
     BeforeValidator(_read_constraint),
 ]
@@ -394,7 +406,13 @@ def constraint_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem((*here, "kind"), constraint.kind, sentence)
         elif isinstance(constraint, ControlRate):
             yield from _control_rate_problems(scene, here, constraint)
-        if isinstance(constraint, Plume | ControlRate | Terminal) and constraint.observed is not None:
+        elif isinstance(constraint, TorqueSpeed) and not limited_motors(scene):
+            sentence = "no motor that drives a joint has a stall_torque: remove it"
+            yield Problem((*here, "kind"), constraint.kind, sentence)
+        if (
+            isinstance(constraint, Plume | ControlRate | TorqueSpeed | Terminal)
+            and constraint.observed is not None
+        ):
             sentence = "must be absent: a residual with the input, or of the end, is not observed"
             yield Problem((*here, "observed"), constraint.observed, sentence)
         if isinstance(constraint, Terminal) and constraint.terminates:
@@ -442,6 +460,19 @@ def _has_thrusters(scene: Scene) -> bool:
 
 def _has_wheel_limits(scene: Scene) -> bool:
     return any(math.isfinite(min(wheel.speed, wheel.power)) for wheel in scene.actuators.wheels or ())
+
+
+def limited_motors(scene: Scene) -> list[tuple[int, Link]]:
+    """The driven links whose motors have a torque that falls with their speed.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        Index among the driven links, and link.
+    """
+    driven = [link for link in scene.links if link.actuated] if scene.actuators.joint_torque else []
+    return [(index, link) for index, link in enumerate(driven) if link.motor and link.motor.stall_torque]
 
 
 def _wheel_problems(scene: Scene, place: tuple[str | int, ...]) -> Iterator[Problem]:

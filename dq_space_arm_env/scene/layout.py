@@ -1,11 +1,11 @@
 """Layout of the state, the tangent, the controls and the parameters of a scene.
 
-State: base pose, joint angles, wrist angles, base velocity, joint rates, axial momenta of wheels, and what
-actuators keep from step to step: the previous controls whose rates are limited. Tangent: the same, with a
-twist increment of the base in base axes (rotation, then translation) in place of the pose. Controls: base
-force, base torque, joint torques of the actuated joints, wrist rates, wheel torques, thruster forces.
-Parameters: target, bodies from base to payload, weights, limits. What a scene does not have is missing; the
-order stays.
+State: base pose, joint angles, wrist angles, base velocity, joint rates, angles and rates of motors behind
+elastic gears, axial momenta of wheels, and what actuators keep from step to step: the previous controls whose
+rates are limited, then commands on their way and outputs. Tangent: the same, with a twist increment of the
+base in base axes (rotation, then translation) in place of the pose. Controls: base force, base torque, joint
+torques of the actuated joints, wrist rates, wheel torques, thruster forces. Parameters: target, bodies from
+base to payload, weights, limits. What a scene does not have is missing; the order stays.
 A planar base keeps only what is not zero by construction: q_r0, q_r3, q_d1, q_d2 of its pose, and omega_z,
 v_x, v_y.
 """
@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.scene.actuator_chains import Chain, chains
 from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.parameters import (
     GRASP,
@@ -60,8 +61,11 @@ class _MotionEntries(_Entries):
     angular_velocity: slice  # part of base_velocity
     linear_velocity: slice  # part of base_velocity
     joint_rates: slice  # base to tip
+    motor_angles: slice  # of elastic joints, on the joints' side
+    motor_rates: slice  # likewise
     wheel_momenta: slice  # axial, inertial rate, in the order of the scene's wheels
     actuators: slice  # previous controls, those of `StateLayout.previous_controls`
+    drives: slice  # commands on their way and outputs, those of `StateLayout.chains`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +141,7 @@ class StateLayout:
         tangent: Entries of the tangent of the state.
         control: Entries of the controls u.
         previous_controls: Indices of the controls that the state keeps for a step: their rates are limited.
+        chains: Controls that act later than they are commanded: with a delay or a lag.
         parameters: Entries of the parameters p.
         target: The nominal pose of the target's body at the start, shape (8,), real part dimensionless, dual
             part m; without a grasp frame the target q_{D/I}.
@@ -154,6 +159,7 @@ class StateLayout:
     tangent: TangentEntries
     control: ControlEntries
     previous_controls: tuple[int, ...]
+    chains: tuple[Chain, ...]
     parameters: ParameterEntries
     target: Array
     grasp: Array
@@ -184,11 +190,12 @@ class StateLayout:
     @property
     def of_motion(self) -> "StateLayout":
         """The layout without what actuators keep: of the state that the equations of motion advance."""
-        if not self.previous_controls:
+        if not self.previous_controls and not self.chains:
             return self
         state, tangent = _without_actuators(self.state), _without_actuators(self.tangent)
         start = self.initial_state[: self.state.actuators.start]
-        return replace(self, state=state, tangent=tangent, previous_controls=(), initial_state=start)
+        nothing: dict[str, Any] = {"previous_controls": (), "chains": ()}
+        return replace(self, state=state, tangent=tangent, initial_state=start, **nothing)
 
     def target_with(self, parameters: Array) -> Array:
         """Target where it may be a parameter.
@@ -342,6 +349,7 @@ class StateLayout:
             tangent=_lay_out_tangent(scene),
             control=_lay_out_controls(controls),
             previous_controls=previous_controls(scene),
+            chains=chains(scene),
             parameters=_lay_out_parameters(scene),
             target=_constant(scene.target.pose.dual_quaternion),
             grasp=_constant(scene.target.grasp.dual_quaternion),
@@ -391,8 +399,21 @@ class _Collector:
             "angular_velocity": angular,
             "linear_velocity": linear,
             "joint_rates": joint_rates,
+            **self.add_motors(scene),
             "wheel_momenta": self.add("N m s", [f"{name} momentum" for name in wheel_names(scene)]),
             "actuators": self.add_previous_controls(scene),
+            "drives": self.add_chains(scene),
+        }
+
+    def add_motors(self, scene: Scene) -> dict[str, slice]:
+        """Append angles and rates of the motors of elastic joints."""
+        links = [link for link in scene.links if link.is_elastic]
+        kinds = ("displacement", "angle")
+        angles = [f"{link.name} motor {kinds[link.turns]}" for link in links]
+        rates = [f"{link.name} motor rate" for link in links]
+        return {
+            "motor_angles": self.add_each([link.unit for link in links], angles),
+            "motor_rates": self.add_each([f"{link.unit}/s" for link in links], rates),
         }
 
     def add_previous_controls(self, scene: Scene) -> slice:
@@ -400,6 +421,11 @@ class _Collector:
         controls = [number for numbers in control_numbers(scene).values() for number in numbers]
         kept = [controls[index] for index in previous_controls(scene)]
         return self.add_each([each.limit.unit for each in kept], [f"previous {each.name}" for each in kept])
+
+    def add_chains(self, scene: Scene) -> slice:
+        """Append what is on its way from commands to outputs, each with its unit."""
+        found = [(name, chain.unit) for chain in chains(scene) for name in chain.names]
+        return self.add_each([unit for _, unit in found], [name for name, _ in found])
 
 
 def _lay_out_state(scene: Scene) -> StateEntries:
@@ -414,7 +440,9 @@ def _lay_out_state(scene: Scene) -> StateEntries:
 def _without_actuators(entries: _Part) -> _Part:
     """Entries of the motion alone."""
     end = entries.actuators.start
-    return replace(entries, names=entries.names[:end], units=entries.units[:end], actuators=slice(end, end))
+    none = slice(end, end)
+    names, units = entries.names[:end], entries.units[:end]
+    return replace(entries, names=names, units=units, actuators=none, drives=none)
 
 
 def _lay_out_tangent(scene: Scene) -> TangentEntries:

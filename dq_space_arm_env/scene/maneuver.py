@@ -15,6 +15,7 @@ from dq_space_arm_env.validation.fields import (
     AngleSpread,
     ControlWeight,
     ControlWeights3,
+    Delay,
     Fraction,
     LengthSpread,
     Limit,
@@ -34,7 +35,28 @@ from dq_space_arm_env.validation.problems import Model
 _ZERO_TWIST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class AxisLimits(Model):
+class Dynamics(Model):
+    """How the output of an actuator follows its commands; what is on the way is part of the state."""
+
+    time_constant: Positive | None = Field(
+        default=None,
+        exclude_if=lambda constant: constant is None,
+        description="time constant of a first-order lag of the output, s; absent: it is the command",
+    )
+    delay: Delay = Field(
+        default=0,
+        exclude_if=lambda steps: not steps,
+        description="whole time steps by which commands act later",
+    )
+    slew_limit: Positive | None = Field(
+        default=None,
+        exclude_if=lambda rate: rate is None,
+        description="greatest change of the commands that the actuator takes, of each axis or joint, N/s, "
+        "N m/s, rad/s^2; absent: any",
+    )
+
+
+class AxisLimits(Dynamics):
     """An actuator with three axes, each limited to [-limit, limit]."""
 
     limit: Limits3 = Field(
@@ -42,7 +64,7 @@ class AxisLimits(Model):
     )
 
 
-class JointLimit(Model):
+class JointLimit(Dynamics):
     """The joint motors, each limited to [-limit, limit]; a link may set its own torque_limit."""
 
     limit: Limit = Field(description="largest magnitude of a joint torque, one number, N m; .inf: unlimited")

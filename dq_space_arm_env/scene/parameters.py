@@ -101,6 +101,7 @@ def numbers(scene: Scene) -> Iterator[Number]:
         yield from body_numbers(scene, place)
         yield _number(f"{place}.stiffness", f"{link.effort_unit}/{link.unit}", link.stiffness)
         yield _number(f"{place}.damping", f"{link.effort_unit} s/{link.unit}", link.damping)
+        yield from _motor_numbers(f"{place}.motor", link)
     if scene.payload is not None:
         yield from body_numbers(scene, "payload")
     for field, (entries, planar) in _STATE_WEIGHTS.items():
@@ -115,6 +116,18 @@ def numbers(scene: Scene) -> Iterator[Number]:
     controls = [each for numbers in control_numbers(scene).values() for each in numbers]
     yield from dict.fromkeys(control.weight for control in controls)
     yield from dict.fromkeys(control.limit for control in controls)
+
+
+def _motor_numbers(place: str, link: Link) -> Iterator[Number]:
+    """The numbers of a joint's motor that may vary."""
+    units = {
+        "inertia": "kg m^2",
+        "friction": link.effort_unit,
+        "stiffness": f"{link.effort_unit}/{link.unit}",
+        "damping": f"{link.effort_unit} s/{link.unit}",
+    }
+    for name in link.motor.varying if link.motor is not None else ():
+        yield _number(f"{place}.{name}", units[name], getattr(link.motor, name))
 
 
 def catch_numbers(scene: Scene) -> Iterator[Number]:

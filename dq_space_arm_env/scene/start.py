@@ -11,6 +11,7 @@ from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.algebra.quaternion import multiply
 from dq_space_arm_env.algebra.scalars import select
 from dq_space_arm_env.algebra.vectors import dot, matrix_vector, transposed_matrix_vector
+from dq_space_arm_env.scene.actuator_chains import chains
 from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.maneuver import Spread
 from dq_space_arm_env.scene.motion import ScrewMotion, Tumbling
@@ -168,7 +169,12 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
         w.inertia * (speed + dot(w.unit_axis, angular)) for w, speed in zip(wheels, speeds, strict=True)
     ]
     previous = start.previous_controls or (0.0,) * len(previous_controls(scene))
-    state = [*pose, *joint_angles, *wrist_angles, *velocity, *joint_rates, *momenta, *previous]
+    elastic = [index for index, link in enumerate(scene.links) if link.is_elastic]
+    # Elastic gears start unstrained: their motors stand and move as the joints do.
+    motors = [part[index] for part in (joint_angles, joint_rates) for index in elastic]
+    on_the_way = [0.0 for chain in chains(scene) for _ in chain.names]
+    rates = [*velocity, *joint_rates, *motors, *momenta]
+    state = [*pose, *joint_angles, *wrist_angles, *rates, *previous, *on_the_way]
     return EpisodeStart(state, drawn)
 
 

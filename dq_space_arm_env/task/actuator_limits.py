@@ -12,8 +12,10 @@ from typing import Any
 import casadi
 
 from dq_space_arm_env.dynamics import reaction_wheels
+from dq_space_arm_env.scene.constraint_rows import slew_limits
+from dq_space_arm_env.scene.constraints import limited_motors
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.task.equations import SceneEquations
+from dq_space_arm_env.task.equations import SceneEquations, torque_ranges
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -22,14 +24,17 @@ _LEAST_SPEED = 1e-9  # rad/s, below which no power limits a wheel's torque
 
 
 def reads_state(scene: Scene) -> bool:
-    """Tell whether what actuators do depends on the state: wheels have a largest speed or power."""
-    return any(math.isfinite(min(wheel.speed, wheel.power)) for wheel in scene.actuators.wheels or ())
+    """Tell whether what actuators do depends on the state: they slew, or speed leaves motors less torque."""
+    limited = (math.isfinite(min(wheel.speed, wheel.power)) for wheel in scene.actuators.wheels or ())
+    return bool(any(limited) or slew_limits(scene) or limited_motors(scene))
 
 
 def applied(equations: SceneEquations, x: Scalars, u: Scalars) -> list[Scalar]:
     """Inputs that act, n_u, of those that are asked for; the state matters where `reads_state`."""
     scene, result = equations.scene, list(u)
     if reads_state(scene):
+        _follow(equations, x, result)
+        _drive(equations, x, result)
         part = equations.layout.control.wheel_torque
         result[part] = _wheel_torques(equations, x, result[part])
     first = equations.layout.control.thruster_force.start
@@ -39,6 +44,23 @@ def applied(equations: SceneEquations, x: Scalars, u: Scalars) -> list[Scalar]:
             least = (1.0 - 1e-12) * thruster.impulse_bit / scene.simulation.dt
             result[index] = casadi.if_else(result[index] < least, 0.0, result[index])
     return result
+
+
+def _follow(equations: SceneEquations, x: Scalars, u: list[Scalar]) -> None:
+    """Let inputs change no faster than the actuators slew, from those before."""
+    layout, dt = equations.layout, equations.scene.simulation.dt
+    for limit in slew_limits(equations.scene):
+        before = x[layout.state.actuators][layout.previous_controls.index(limit.control)]
+        highest, lowest = before + limit.rate * dt, before - limit.rate * dt
+        u[limit.control] = casadi.fmin(highest, casadi.fmax(lowest, u[limit.control]))
+
+
+def _drive(equations: SceneEquations, x: Scalars, u: list[Scalar]) -> None:
+    """Keep the joints' motors within what their voltage leaves at their speed."""
+    motion, first = equations.field.motion(equations.y(x)), equations.layout.control.joint_torque.start
+    ranges = torque_ranges(equations, motion, u)
+    for (index, _), (torque, least, greatest) in zip(limited_motors(equations.scene), ranges, strict=True):
+        u[first + index] = casadi.fmin(greatest, casadi.fmax(least, torque))
 
 
 def _wheel_torques(equations: SceneEquations, x: Scalars, torques: Scalars) -> list[Scalar]:

@@ -26,6 +26,7 @@ from dq_space_arm_env.algebra.vectors import (
     subtract,
 )
 from dq_space_arm_env.dynamics import kinematics, minimal, reaction_wheels
+from dq_space_arm_env.dynamics.drives import drive_energy
 from dq_space_arm_env.scene.constraint_rows import (
     directions,
     exact_rows,
@@ -48,12 +49,13 @@ from dq_space_arm_env.scene.constraints import (
     Plume,
     Point,
     Terminal,
+    TorqueSpeed,
     Volume,
     WheelLimits,
     WheelMomentum,
 )
 from dq_space_arm_env.scene.schema import Scene
-from dq_space_arm_env.task.equations import SceneEquations, body_pose
+from dq_space_arm_env.task.equations import SceneEquations, body_pose, torque_ranges
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -116,7 +118,8 @@ class _Situation:
         velocities = kinematics.body_velocities(tree, frames, twist, motion.joint_rates)
         linear, angular, _ = kinematics.momentum(tree, frames, velocities, motion.wheel_momenta)
         kinetic, potential = kinematics.energy(tree, motion.joint_angles, velocities, motion.wheel_momenta)
-        return linear, angular, kinetic + potential
+        motors = (motion.motor_angles, motion.motor_rates)
+        return linear, angular, kinetic + potential + drive_energy(tree, motion.joint_angles, *motors)
 
 
 def path_residuals(equations: SceneEquations, base: Scalars, y: Scalars, u: Scalars) -> list[Scalar]:
@@ -407,6 +410,12 @@ def _control_rate(situation: _Situation, constraint: ControlRate) -> Iterator[Sc
         yield change - most
 
 
+def _torque_speed(situation: _Situation, constraint: TorqueSpeed) -> Iterator[Scalar]:
+    for torque, least, greatest in torque_ranges(situation.equations, situation.motion, situation.u):
+        yield least - torque
+        yield torque - greatest
+
+
 _RESIDUALS: dict[type[Constraint], Callable[..., Iterator[Scalar]]] = {
     JointLimits: _joint_limits,
     Distance: _distance,
@@ -419,6 +428,7 @@ _RESIDUALS: dict[type[Constraint], Callable[..., Iterator[Scalar]]] = {
     WheelMomentum: _wheel_momentum,
     WheelLimits: _wheel_limits,
     ControlRate: _control_rate,
+    TorqueSpeed: _torque_speed,
 }
 
 

@@ -12,7 +12,8 @@ Where a scene weighs it, the tip's twist relative to the target is a further ter
 
     w^G_{G/D} = w^G_{G/I} - q_{G/D}* w^D_{D/I} q_{G/D}.
 
-The wrist's Euler rates, which are inputs, are part of it in the stage cost; at the end the wrist is held.
+The wrist's Euler rates, which are inputs, are part of it in the stage cost; at the end the wrist is held. If
+they lag behind their commands they are states, and part of it at the end too.
 
 Other tips add squares of the vector parts of their error poses q_{D/G}, each with its own weights.
 """
@@ -34,6 +35,7 @@ from dq_space_arm_env.dynamics.equations_of_motion import Motion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
+from dq_space_arm_env.scene.constraints import limited_motors
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.parameters import (
     PHASE,
@@ -139,7 +141,8 @@ class SceneEquations:
         return dual_vectors.subtract(self.tip_twist(moving, wrist_rates), self.target_twist(tip))
 
     def tip_twist(self, motion: Motion, wrist_rates: Scalars | None = None) -> Scalars:
-        """Twist of the tip in its axes, 6."""
+        """Twist of the tip in its axes, 6; of a wrist whose rates are states, with these."""
+        wrist_rates = motion.wrist_rates or wrist_rates
         base = (*motion.angular, *motion.linear)
         angles = motion.joint_angles, motion.wrist_angles
         return kinematics.tip_twist(self.tree, *angles, base, motion.joint_rates, wrist_rates)
@@ -228,8 +231,11 @@ class SceneEquations:
             *motion.joint_angles,
             *motion.wrist_angles,
             *motion.joint_rates,
+            *motion.motor_angles,
+            *motion.motor_rates,
             *motion.wheel_momenta,
             *motion.previous_controls,
+            *motion.drives,
             *([self.given[PHASE]] if self.scene.phases else []),
             *besides,
             *twists,
@@ -252,6 +258,19 @@ def vector_parts(pose: Scalars) -> list[Scalar]:
 def larger(a: Scalar, b: Scalar) -> Scalar:
     """The larger one of two numbers."""
     return select(b > a, b, a)
+
+
+def torque_ranges(equations: SceneEquations, motion: Motion, u: Scalars) -> list[tuple[Scalar, ...]]:
+    """Torque, and the least and the greatest that full voltage leaves, of motors with a stall torque."""
+    links, layout, found = equations.scene.links, equations.layout, []
+    elastic = [index for index, link in enumerate(links) if link.is_elastic]
+    for index, link in limited_motors(equations.scene):
+        joint = layout.actuated_joints[index]
+        rate = motion.motor_rates[elastic.index(joint)] if link.is_elastic else motion.joint_rates[joint]
+        torque = u[layout.control.joint_torque.start + index]
+        assert link.motor is not None
+        found.append((torque, *(link.motor.envelope(rate) or ())))
+    return found
 
 
 def body_pose(scene: Scene, given: Mapping[str, Scalar]) -> list[Scalar]:

@@ -1,9 +1,9 @@
 """The most that the rest of an episode can cost, whatever its actions: what a diverged simulation is charged.
 
-With s = sqrt(2 E), E the kinetic energy and that of the springs, the twist of every body is bounded by s and
+With s = sqrt(2 E), E the energy of bodies, rotors and springs, the twist of every body is bounded by s and
 its inertia, so the power of the actuators, and of a wrench at the tip, is at most c s: s' = E' / s <= c.
-Dampers only take energy away. The center of mass gains no more speed than the forces give, and the arm
-reaches no farther from it than when it is stretched out. A target on a screw keeps its speed; one
+Dampers and friction only take energy away. The center of mass gains no more speed than the forces give, and
+the arm reaches no farther from it than when it is stretched out. A target on a screw keeps its speed; one
 that tumbles keeps its energy, so its rate grows at most by the root of the ratio of its moments of inertia.
 """
 
@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import poses, quaternion
 from dq_space_arm_env.algebra.vectors import cross, dot, matrix_vector, norm, subtract
+from dq_space_arm_env.dynamics.drives import elastic_joints
+from dq_space_arm_env.dynamics.equations_of_motion import Motion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from dq_space_arm_env.scene.motion import Tumbling, Waypoints
 from dq_space_arm_env.scene.path import given_path
@@ -67,7 +69,8 @@ class WorstCase:
         reach = self.reach + total(_parts(self.tree, motion.joint_angles, 1))
         sliding = total(_parts(self.tree, motion.joint_rates, 1))
         moving = norm(motion.linear) + reach * turning + sliding
-        speed = self._root_energy(motion.joint_angles, moving, turning) + duration * self._growth()
+        speed = self._root_energy(motion, moving, turning)
+        speed = speed + duration * self._growth()
         if any(link.screw.slide for link in self.tree.links):  # bodies move apart: the tip's by so much
             fastest = total([speed / casadi.sqrt(body.mass) for body in (base, self.last)])
             reach = reach + duration * fastest
@@ -152,14 +155,23 @@ class WorstCase:
         """Cost of two vectors of these lengths; the largest weight counts for all entries of a vector."""
         return _largest_square(self.equations.state_weights(field), size, lengths)
 
-    def _root_energy(self, joint_angles: Scalars, moving: Scalar, turning: Scalar) -> Scalar:
+    def _root_energy(self, motion: Motion, moving: Scalar, turning: Scalar) -> Scalar:
         """Bound of s if no body moves or turns faster."""
         moments = total([body.inertia[i][i] for body in self.bodies for i in range(3)])
+        rotors = [
+            casadi.sqrt(link.rotor.inertia) * (turning + abs(link.rotor.gear) * casadi.fabs(rate))
+            for link, rate in zip(self.tree.links, motion.joint_rates, strict=True)
+            if link.rotor is not None
+        ]
+        motors = zip(elastic_joints(self.tree), motion.motor_angles, motion.motor_rates, strict=True)
+        for (index, gear), angle, rate in motors:
+            rotors.append(casadi.sqrt(gear.inertia) * casadi.fabs(rate))
+            rotors.append(casadi.sqrt(gear.stiffness) * casadi.fabs(angle - motion.joint_angles[index]))
         springs = [
             casadi.sqrt(link.stiffness) * casadi.fabs(angle - link.rest_angle)
-            for link, angle in zip(self.tree.links, joint_angles, strict=True)
+            for link, angle in zip(self.tree.links, motion.joint_angles, strict=True)
         ]
-        return casadi.sqrt(self.mass) * moving + casadi.sqrt(moments) * turning + total(springs)
+        return casadi.sqrt(self.mass) * moving + casadi.sqrt(moments) * turning + total([*springs, *rotors])
 
     def _growth(self) -> Scalar:
         """The bound c: root of the sum of f^2 / m + t' I^-1 t over the bodies' forces f and torques t."""
@@ -167,8 +179,12 @@ class WorstCase:
         forces: list[Scalar] = [self.force, *[0.0] * len(links)]
         # Components of the torques as they act in I^-1/2, added as if all pointed the same way.
         torques = [_turned(self.tree.base, self.torque), *[0.0] * len(links)]
+        rotors: list[Scalar] = []
         for i, (link, limit) in enumerate(zip(links, inputs.joint_torques, strict=True)):
             axis, effort, parent = matrix_vector(link.joint.rotation, _Z), casadi.fabs(limit), link.parent
+            if link.elastic is not None:  # it turns the rotor alone
+                rotors.append(effort / casadi.sqrt(link.elastic.inertia))
+                continue
             if link.screw.turn:
                 own = effort * casadi.sqrt(_inverse_moment(bodies[parent], axis))
                 torques[parent] = torques[parent] + own
@@ -188,7 +204,7 @@ class WorstCase:
             forces[body] = forces[body] + force
             torques[body] = torques[body] + _turned(self.last, torque + force * arm)
         squares = [force * force / body.mass for force, body in zip(forces, bodies, strict=True)]
-        return casadi.sqrt(total([*squares, *(torque * torque for torque in torques)]))
+        return casadi.sqrt(total([*squares, *(torque * torque for torque in (*torques, *rotors))]))
 
 
 def _largest_square(weights: Scalars, size: int, lengths: Scalars) -> Scalar:

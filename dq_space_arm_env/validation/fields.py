@@ -40,6 +40,7 @@ ANGLES = Range(0.0, 1e6)  # rad: up to where the code reduces angles with full p
 RATES = Range(0.0, 1e9)  # rad/s, m/s
 MASSES = Range(1e-12, 1e12)  # kg: from a speck of dust to a mountain
 INERTIAS = Range(1e-18, 1e18)  # kg m^2
+GEARS = Range(1e-6, 1e6)  # 1, rad/m
 FORCES = Range(1e-12, 1e12)  # N, N m, of limits
 LOADS = Range(0.0, FORCES.most)
 STATE_WEIGHTS = Range(0.0, 1e15)
@@ -53,6 +54,7 @@ Below 2^24, up to which single precision counts the steps of an episode exactly.
 MOST_WAYPOINTS = 100_000
 _MOST_COUNT = 10**12
 _LONGEST_NAME = 200  # characters
+_LONGEST_DELAY = 20  # steps: each command on its way is a state
 
 
 def read_numbers(value: Any, count: int | None = None, span: Range | None = None) -> tuple[float, ...]:
@@ -160,6 +162,14 @@ def _name(text: str) -> str:
     return text
 
 
+def _delay(value: Any) -> int:
+    """Accept a number of steps whose commands a state may hold."""
+    steps = -1 if isinstance(value, bool) or not isinstance(value, Integral) else int(value)
+    if not 0 <= steps <= _LONGEST_DELAY:
+        raise problem(f"must be a whole number from 0 to {_LONGEST_DELAY}")
+    return steps
+
+
 _Rule = tuple[Callable[[float], bool], str, Range]
 _STATE_WEIGHT: _Rule = (lambda number: 0 <= number < math.inf, "finite and 0 or greater", STATE_WEIGHTS)
 _CONTROL_WEIGHT: _Rule = (lambda number: 0 < number < math.inf, "finite and greater than 0", CONTROL_WEIGHTS)
@@ -178,6 +188,9 @@ Count = Annotated[int, count_up_to(_MOST_COUNT)]
 Vector3 = Annotated[Three, _vector(3)]
 
 Mass = Annotated[float, positive(MASSES)]
+MomentOfInertia = Annotated[float, non_negative(INERTIAS)]
+Gear = Annotated[float, _number(lambda n: n != 0 and math.isfinite(n), "a finite number other than 0", GEARS)]
+Speed = Annotated[float, positive(Range(1e-9, RATES.most))]
 Position = Annotated[Three, _vector(3, LENGTHS)]
 Twist = Annotated[Six, _vector(6, RATES)]
 Load = Annotated[Three, _vector(3, LOADS)]
@@ -200,3 +213,4 @@ ControlWeight = Annotated[float, positive(CONTROL_WEIGHTS)]
 ControlWeights3 = Annotated[Three, _per_component(3, *_CONTROL_WEIGHT)]
 TimeStep = Annotated[float, positive(TIME_STEPS)]
 Steps = Annotated[int, count_up_to(MOST_STEPS)]
+Delay = Annotated[int, BeforeValidator(_delay)]

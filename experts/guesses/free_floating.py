@@ -6,7 +6,7 @@ that. All maps are exact and come from the scene's compiled functions: momentum 
 and accelerations are linear in the forces, so unit vectors give the matrices.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,6 +39,17 @@ class MomentumMap(NamedTuple):
     joints: FloatArray  # per joint rate, shape (B, n_b, n)
 
 
+class ElasticGear(NamedTuple):
+    """An elastic gear, its numbers the scene's nominal ones."""
+
+    link: int
+    control: int | None  # of its motor; None if it has none
+    angle: int  # of the motor, among the states
+    rate: int  # likewise
+    inertia: float  # of the rotor on the joint's side, kg m^2
+    stiffness: float  # N m/rad
+
+
 class FreeFloatingArm:
     """Linear maps of a scene's robot.
 
@@ -57,6 +68,7 @@ class FreeFloatingArm:
         self.twist_entries = list(PLANAR_TWIST if planar else range(6))
         self.momentum_entries = list(_PLANAR_MOMENTUM if planar else range(6))
         self.velocity_entries = [*indices(entries.base_velocity), *indices(entries.joint_rates)]
+        self.elastic_gears = list(_elastic_gears(kernels))
 
     def tip_jacobian(self, states: FloatArray, frames: FloatArray) -> TipJacobian:
         """Geometric Jacobian of the tip: columns Ad(q_{X/G}) of the axes in their frames X, (B, f, 8)."""
@@ -126,8 +138,11 @@ class FreeFloatingArm:
         ]
         inputs = np.zeros((len(states), 1 + len(acting), self.kernels.n_u))
         inputs[:, range(1, 1 + len(acting)), acting] = 1.0
-        repeated = np.repeat(states, 1 + len(acting), axis=0)
-        forces = inputs.reshape(len(repeated), -1)
+        repeated = np.repeat(states[:, None], 1 + len(acting), axis=1)
+        for gear in self.elastic_gears:  # a motor acts through the twist of its gear
+            if gear.control is not None:
+                repeated[:, 1 + acting.index(gear.control), gear.angle] += 1.0 / gear.stiffness
+        repeated, forces = repeated.reshape(-1, states.shape[1]), inputs.reshape(-1, self.kernels.n_u)
         reached = self.kernels.forward_dynamics(repeated, forces, p=self.parameters)
         reached = reached.reshape(len(states), 1 + len(acting), -1)
         per_unit = reached[:, 1:] - reached[:, :1]
@@ -141,6 +156,10 @@ class FreeFloatingArm:
             controls[:, control.thruster_force] = self._non_negative(jets)
         else:
             controls[:, acting] = np.linalg.solve(normal, right)[:, :, 0]
+        for gear in self.elastic_gears:
+            if gear.control is not None:  # the rotor is to follow the joint
+                turning = accelerations[:, len(self.twist_entries) + gear.link]
+                controls[:, gear.control] += gear.inertia * turning
         return controls
 
     def _non_negative(self, forces: FloatArray) -> FloatArray:
@@ -157,6 +176,24 @@ class FreeFloatingArm:
             forces = np.maximum(forces, 0.0)
             forces = forces + (wanted - forces @ wrenches) @ back
         return np.maximum(forces, 0.0)
+
+    def drive_along(self, states: FloatArray) -> None:
+        """Let the motors behind elastic gears move as their joints do, in states (B, n_x), in place."""
+        entries = self.kernels.layout.state
+        for gear in self.elastic_gears:
+            states[:, gear.angle] = states[:, entries.joint_angles.start + gear.link]
+            states[:, gear.rate] = states[:, entries.joint_rates.start + gear.link]
+
+
+def _elastic_gears(kernels: Kernels) -> Iterator[ElasticGear]:
+    layout, motors = kernels.layout, 0
+    torques = dict(zip(layout.actuated_joints, indices(layout.control.joint_torque), strict=True))
+    for link, part in enumerate(kernels.scene.links):
+        if part.motor is not None and part.motor.stiffness is not None:
+            angle, rate = layout.state.motor_angles.start + motors, layout.state.motor_rates.start + motors
+            inertia, stiffness = part.motor.reflected_inertia, part.motor.stiffness
+            yield ElasticGear(link, torques.get(link), angle, rate, inertia, stiffness)
+            motors += 1
 
 
 def indices(part: slice) -> range:

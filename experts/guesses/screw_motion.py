@@ -224,6 +224,7 @@ class _ArmMotion:
             controls = self._within_bounds(controls)
             states[1:, entries.wrist_angles] += dt * np.cumsum(controls[:, control.wrist_rate], axis=0)
         self._add_base_motion(states, knots, place)
+        self.arm.drive_along(states)
         states[0] = knots.states[0]
         accelerations = np.diff(states[:, self.arm.velocity_entries], axis=0) / dt
         controls = self._within_bounds(controls + self.arm.controls(states[:-1], accelerations))

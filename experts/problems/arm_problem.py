@@ -112,6 +112,23 @@ class ArmProblem:
         """Set the previous controls in states, (N + 1, n_x), to those of a guess, (N, n_u), in place."""
         layout = self.kernels.layout
         states[1:, layout.state.actuators] = controls[:, layout.previous_controls]
+        self._keep_chains(states, controls)
+
+    def _keep_chains(self, states: FloatArray, controls: FloatArray) -> None:
+        """Likewise what is on its way from commands to outputs."""
+        layout, h = self.kernels.layout, self.time_step
+        start = layout.state.drives.start
+        for chain in layout.chains:
+            n, waiting = chain.delay, states[:, start : start + chain.delay]
+            for step, u in enumerate(controls[:, chain.control]):
+                followed = u
+                if n:
+                    followed = waiting[step, 0]
+                    waiting[step + 1] = [*waiting[step, 1:], u]
+                if chain.time_constant is not None:
+                    e = math.exp(-h / chain.time_constant)
+                    states[step + 1, start + n] = e * states[step, start + n] + (1.0 - e) * followed
+            start += len(chain.names)
 
     def constraints_of(self, parameters: StageParameters) -> StageConstraints | None:
         """Constraints of stages with given parameters, whose further numbers are their multipliers."""

@@ -28,7 +28,7 @@ PREFERRED = (
 OTHER_MOTIONS = ("tumbling",)
 """Scenes whose robots others have, but not the kind of motion: this one spins, with wide limits."""
 
-_PARTS = ("base", "links", "wrist", "tip", "payload", "tip_wrench", "simulation")
+_PARTS = ("base", "links", "tip_link", "wrist", "tip", "payload", "other_tips", "tip_wrench", "simulation")
 _OF_THE_TASK: dict[str, Any] = {"links": {"__all__": {"name", "torque_limit"}}, "simulation": {"dt", "steps"}}
 
 
@@ -54,7 +54,13 @@ def robot(scene: Scene) -> str:
     which masses are parameters; not limits, weights, target, start, time step and number of steps.
     """
     content = scene.model_dump(include=set(_PARTS), exclude=_OF_THE_TASK)
-    content["actuators"] = sorted(scene.actuators.model_dump(exclude_none=True))
+    actuators = scene.actuators.model_dump(exclude_none=True)
+    content["actuators"] = [
+        (name, {key: value for key, value in actuators[name].items() if key != "limit"})
+        if isinstance(actuators[name], dict)
+        else (name, actuators[name])  # wheels and thrusters, one by one
+        for name in sorted(actuators)
+    ]
     names = StateLayout.of(scene).parameters.names
     content["parameters"] = [
         name

@@ -67,13 +67,19 @@ def pinocchio_model(tree: KinematicTree) -> Any:
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
     model.appendBodyToJoint(1, _inertia(tree.base), pin.SE3.Identity())
     for index, link in enumerate(tree.links):
-        placement = pin.SE3(np.array(link.joint.rotation), np.array(link.joint.position))
-        turn, slide = link.screw
-        joint = pin.JointModelHZ(slide) if slide else pin.JointModelRZ()
-        joint = joint if turn else pin.JointModelPZ()
-        added = model.addJoint(1 + link.parent, joint, placement, f"joint {index}")
-        model.appendBodyToJoint(added, _inertia(link.body), pin.SE3.Identity())
+        add_link(model, 1 + link.parent, link, f"joint {index}")
     return model
+
+
+def add_link(model: Any, parent: int, link: JointedLink, name: str) -> int:
+    """Add a link to Pinocchio's model, and give the number of its joint."""
+    placement = pin.SE3(np.array(link.joint.rotation), np.array(link.joint.position))
+    turn, slide = link.screw
+    joint = pin.JointModelHZ(slide) if slide else pin.JointModelRZ()
+    joint = joint if turn else pin.JointModelPZ()
+    number: int = model.addJoint(parent, joint, placement, name)
+    model.appendBodyToJoint(number, _inertia(link.body), pin.SE3.Identity())
+    return number
 
 
 def _inertia(body: RigidBody) -> Any:

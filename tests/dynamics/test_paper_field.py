@@ -11,6 +11,7 @@ from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.paper_field import PaperField
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
+from dq_space_arm_env.kernels.programs.paper_programs import PaperPrograms
 from dq_space_arm_env.scene.layout import StateLayout
 
 SCENES = ("paper", "no-wrist", "planar", "tip-load", "sliding", "wheels")
@@ -101,3 +102,28 @@ def test_both_states_describe_the_same_motion(name: str) -> None:
     np.testing.assert_allclose(y[field.tip], np.array(at).ravel(), atol=1e-13)
     np.testing.assert_allclose(rates[field.tip], np.array(rate).ravel(), atol=1e-12)
     np.testing.assert_allclose(rates[: 8 + count + wrist], moving, atol=1e-12)
+
+
+def test_the_papers_form_has_rotors_and_refuses_what_it_has_no_rows_for() -> None:
+    motor = {"inertia": 2e-4, "gear": -30.0, "friction": 0.2, "friction_speed": 0.3}
+    scene = load_scene("no-wrist").replace({f"links.{i}.motor": motor for i in (0, 2)})
+    layout = StateLayout.of(scene)
+    minimal = SpaceArmField(KinematicTree.from_scene(scene), layout)
+    field, rng = PaperField(minimal), np.random.default_rng(0)
+    x, u = layout.initial_state.copy(), rng.normal(size=minimal.n_u)
+    x[layout.state.pose.stop :] = rng.uniform(-1.0, 1.0, minimal.n_y)
+    y = field.state_from_minimal(x.tolist())
+    rates = field.rates(y, u.tolist())
+    bodies = slice(field.rate_indices[0], field.rate_indices[-1] + 1)
+    expected = minimal.accelerations(split_state(minimal, x.tolist())[1], u.tolist())
+    np.testing.assert_allclose(field.free_accelerations(y, rates[bodies]), expected, atol=1e-10)
+    symbols, inputs = casadi.SX.sym("y", field.n_y), casadi.SX.sym("u", field.n_u)
+    found = field.linearized_rates(casadi.vertsplit(symbols), casadi.vertsplit(inputs))
+    expected = casadi.vertcat(*field.rates(casadi.vertsplit(symbols), casadi.vertsplit(inputs)))
+    jacobians = [*found[1:], casadi.jacobian(expected, symbols), casadi.jacobian(expected, inputs)]
+    values = casadi.Function("values", [symbols, inputs], jacobians)(casadi.DM(list(y)), u)
+    for own, other in zip(values[:2], values[2:], strict=True):
+        np.testing.assert_allclose(np.array(own), np.array(other), atol=1e-9)
+    for name in ("elastic-joints", "motors"):
+        with pytest.raises(ValueError, match=f"and scene {name!r} has some"):
+            PaperPrograms(load_scene(name))

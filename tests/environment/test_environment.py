@@ -120,7 +120,8 @@ def test_observation_is_what_the_documentation_says(scene):
         np.testing.assert_allclose(error[[1, 2, 4, 7]], 0.0, atol=1e-15)
         error = error[[0, 3, 5, 6]]
     parts = (layout.base_velocity, layout.joint_angles, layout.wrist_angles, layout.joint_rates)
-    parts = (*parts, layout.wheel_momenta)
+    parts += (layout.motor_angles, layout.motor_rates, layout.wheel_momenta)
+    parts += (layout.actuators, layout.drives)
     twists = []
     if env.unwrapped.scene.target.motion is not None:
         relative = kernels.relative_twist(x, p=env.unwrapped.stage_parameters)

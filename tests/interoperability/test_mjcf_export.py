@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from foreign_robots import ROBOTS, accelerations, drawn, foreign_scene, relative_error, tip_pose
 
-from dq_space_arm_env import SceneError, load_scene, scene_to_mjcf
+from dq_space_arm_env import SceneError, load_scene, scene_to_mjcf, scene_to_urdf
 from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.scene import StateLayout
 
@@ -92,6 +92,25 @@ def test_slides_are_the_same_and_screws_are_refused():
         scene_to_mjcf(scene)
     parts = {"joint_type": "prismatic", "pitch": 0.0, "stiffness": 20.0, "rest_angle": 0.1, "damping": 0.7}
     check_accelerations(scene.replace({f"links.3.{name}": part for name, part in parts.items()}))
+
+
+def test_rotors_are_armatures_and_what_mujoco_lacks_is_refused():
+    scene = load_scene("six-joint")
+    motor = {"inertia": 2e-5, "gear": -80.0, "coupling": "armature"}
+    geared = scene.replace({f"links.{i}.motor": motor for i in range(0, 6, 2)})
+    check_accelerations(geared)
+    with pytest.raises(SceneError, match="set its motor's coupling to armature"):
+        scene_to_mjcf(geared.replace({"links.2.motor.coupling": "exact"}))
+    with pytest.raises(SceneError, match="it has no elastic gears, and link 'elbow' has one"):
+        scene_to_mjcf(geared.replace({"links.2.motor.stiffness": 100.0}))
+    with pytest.raises(SceneError, match="act at once, and base torque x lags or delays"):
+        scene_to_mjcf(geared.replace({"actuators.base_torque.delay": 1}))
+    with pytest.raises(SceneError, match="it has no rotors, and link 'shoulder' has one"):
+        scene_to_urdf(geared)
+    rubbing = scene.replace({"links.1.motor": {"friction": 0.3}, "links.1.damping": 0.2})
+    assert '<dynamics damping="0.2" friction="0.3" />' in scene_to_urdf(rubbing)
+    model = mujoco.MjModel.from_xml_string(scene_to_mjcf(rubbing))
+    assert model.dof_frictionloss.tolist() == [0.0] * 7 + [0.3] + [0.0] * 4
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -25,11 +25,13 @@ Change = Callable[..., dict[str, Any]]
 SIZES = {  # n_x, n_t, n_u
     "approach-corridor": (23, 21, 12),
     "capture-and-detumble": (20, 18, 9),
+    "elastic-joints": (26, 24, 9),
     "far": (23, 21, 12),
     "free-floating": (23, 21, 6),
     "joint-limits": (23, 21, 12),
     "keep-out": (23, 21, 12),
     "line-of-sight": (23, 21, 12),
+    "motors": (29, 27, 12),
     "no-wrist": (20, 18, 9),
     "paper": (23, 21, 12),
     "payload": (20, 18, 9),

@@ -27,8 +27,16 @@ class PaperPrograms:
     """Builds the programs of one scene in the paper's formulation."""
 
     def __init__(self, scene: Scene) -> None:
+        """Lay out the equations; ValueError for drives that the system (20) has no rows for."""
         self.scene = scene
         self.layout = StateLayout.of(scene)
+        missing = {
+            "elastic gears": any(link.is_elastic for link in scene.links),
+            "actuators that lag or delay": bool(self.layout.chains),
+        }
+        for what, present in missing.items():
+            if present:
+                raise ValueError(f"the paper's formulation has no {what}, and scene {scene.name!r} has some")
         nominal = SceneEquations.of(scene, self.layout.parameters.nominal.tolist())
         self.field, self.target = PaperField(nominal.field), nominal.target
 
@@ -97,7 +105,10 @@ class PaperPrograms:
         def outputs(x: Scalars, u: Scalars) -> dict[str, Scalars]:
             system = self.field.system(x, u)
             upper = [[*left, *right] for left, right in zip(system.s11, system.s12, strict=True)]
-            lower = [[*row, *(0.0 for _ in system.b2)] for row in system.s21]
+            lower = [
+                [*row, *(own if i == j else 0.0 for j in range(len(system.s22)))]
+                for i, (row, own) in enumerate(zip(system.s21, system.s22, strict=True))
+            ]
             matrix = [entry for row in (*upper, *lower) for entry in row]
             return {"matrix": matrix, "right": [*system.b1, *system.b2]}
 

@@ -14,7 +14,7 @@ from dq_space_arm_env.algebra import poses, screw
 from dq_space_arm_env.algebra.vectors import matrix_vector
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
-from dq_space_arm_env.dynamics import kinematics, minimal
+from dq_space_arm_env.dynamics import drives, kinematics, minimal
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators import checked_integrator_of
 from dq_space_arm_env.integrators.actuated import append_measured_step
@@ -175,7 +175,9 @@ class ScenePrograms:
             motion, _, velocities = self._velocities(x)
             moving = velocities, motion.wheel_momenta
             kinetic, potential = kinematics.energy(self.tree, motion.joint_angles, *moving)
-            return {"energy": [kinetic + potential]}
+            motors = (motion.motor_angles, motion.motor_rates)
+            driving = drives.drive_energy(self.tree, motion.joint_angles, *motors)
+            return {"energy": [kinetic + potential + driving]}
 
         return self._program("energy", outputs, x=self.field.n_x)
 
@@ -257,7 +259,9 @@ class ScenePrograms:
         field, state = self.field, self.layout.state
         n_pose = len(field.pose.stored)
         angles = (state.joint_angles, state.wrist_angles)
-        parts = (state.base_velocity, *angles, state.joint_rates, state.wheel_momenta, state.actuators)
+        motors = (state.motor_angles, state.motor_rates)
+        kept = (state.wheel_momenta, state.actuators, state.drives)
+        parts = (state.base_velocity, *angles, state.joint_rates, *motors, *kept)
 
         def outputs(observation: Scalars) -> Mapping[str, Scalars]:
             x: list[Scalar] = [0.0] * field.n_x
