@@ -13,8 +13,18 @@ from experts.problems.paper_problem import PaperProblem
 from scripts.benchmarks.stability.expert import at_target
 
 COMPILED_ANYWAY = ("no-wrist", "paper", "planar")
+OF_A_KIND = ("dual-arm", "elastic-joints", "free-floating", "motors", "servicing", "six-joint", "sliding")
+OF_A_KIND += ("thrusters", "tumbling", "wheels")
 EVERY_SCENE = [
-    pytest.param(name, marks=() if name in COMPILED_ANYWAY else pytest.mark.slow) for name in list_scenes()
+    pytest.param(
+        name,
+        marks=()
+        if name in COMPILED_ANYWAY
+        else pytest.mark.slow
+        if name in OF_A_KIND
+        else pytest.mark.endurance,
+    )
+    for name in list_scenes()
 ]
 """The derivatives of each scene take seconds to compile: other tests need those of the first three."""
 

@@ -10,14 +10,16 @@ from scripts.benchmarks.peers.interior_point_peer import InteriorPoint
 from scripts.benchmarks.peers.transcription import transcribe
 from scripts.benchmarks.solvers.runs import FATROP
 
-MINUTES = ("approach-corridor", "line-of-sight", "wheel-saturation")  # that IPOPT takes
 IN_LONG_STEPS = ("approach-corridor", "line-of-sight", "plume", "servicing")
-CONSTRAINED = [
+# For which IPOPT takes minutes each.
+CONSTRAINED = (
+    "approach-corridor",
     "joint-limits",
     "keep-out",
+    "line-of-sight",
     "pointing",
-    *(pytest.param(name, marks=pytest.mark.endurance) for name in MINUTES),
-]
+    "wheel-saturation",
+)
 
 
 @pytest.mark.slow
@@ -37,7 +39,7 @@ def test_ipopt_finds_nothing_better_near_the_experts_plan():
     assert solution.cost <= (1.0 + 1e-4) * run.replayed_cost
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_ipopt_finds_the_experts_plan_from_zero_controls():
     problem = ArmProblem("paper")
     run = InteriorPoint(problem).solve()
@@ -45,7 +47,7 @@ def test_ipopt_finds_the_experts_plan_from_zero_controls():
     assert run.replayed_cost == pytest.approx(BoxDDP(problem).solve().cost, rel=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_ipopt_finds_the_experts_plan_under_constraints(name):
     """From the plan's neighborhood an interior-point method arrives at the same cost."""
