@@ -5,7 +5,7 @@ import pytest
 
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.algebra import vectors
-from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler, reaction_wheels
+from dq_space_arm_env.dynamics import drives, kinematics, minimal, newton_euler, reaction_wheels
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
@@ -34,7 +34,12 @@ def paper_solution(kernels, x, u):
     wheels = tree.wheels, inputs.wheel_torques, motion.wheel_momenta, motion.angular
     torque = vectors.add(inputs.torque, reaction_wheels.torque_on_base(*wheels))
     base_wrench = (0.0, *inputs.force, 0.0, *torque)
-    given = (base_wrench, inputs.joint_torques, inputs.wrist_rates)
+    # Behind an elastic gear the motor turns its rotor alone, and the gear the link.
+    moving = motion.joint_angles, motion.joint_rates, motion.motor_angles, motion.motor_rates
+    torques = drives.transmitted_torques(tree, *moving)
+    for joint, (link, torque) in enumerate(zip(tree.links, inputs.joint_torques, strict=True)):
+        torques[joint] += torque if link.elastic is None else 0.0
+    given = (base_wrench, torques, inputs.wrist_rates)
     rates, reactions = newton_euler.paper_rates(tree, state, *given)
     accelerations = [tuple(body) for body in np.reshape(rates[-8 * len(bodies) :], (-1, 8))]
     frames = newton_euler.joint_frames(tree, motion.joint_angles, motion.wrist_angles)
