@@ -6,7 +6,7 @@ from typing import Any
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.scene import Pose
-from dq_space_arm_env.scene.constraints import WheelLimits
+from dq_space_arm_env.scene.constraints import TorqueSpeed, WheelLimits
 
 _TIP_WRENCH = {"force": [0.2, 0.0, -0.1], "torque": [0.05, 0.0, 0.02]}
 _SPRING = {"stiffness": 10.0, "damping": 1.0}  # N m/rad, N m s/rad
@@ -20,6 +20,8 @@ _ACTUATORS = {
     "wheels": "wheels",
     "thrusters": "thrusters",
 }
+
+_CONSTRAINTS = {"wheels": WheelLimits, "joint_torque": TorqueSpeed}  # of actuators that are there
 
 
 def feature_variants(scene: Scene) -> dict[str, Scene]:
@@ -37,6 +39,8 @@ def feature_variants(scene: Scene) -> dict[str, Scene]:
     if scene.actuators.base_force and scene.actuators.base_torque:
         both = without_actuators(scene, "base_force", "base_torque")
         variants["without base force and torque"] = both
+    if scene.other_tips:
+        variants["without other tips"] = scene.replace(other_tips=())
     if scene.tip_wrench:
         variants["without tip wrench"] = scene.replace(tip_wrench=None)
     elif scene.base.motion == "spatial":
@@ -93,9 +97,9 @@ def without_actuators(scene: Scene, *names: str) -> Scene:
     if "joint_torque" in names:
         links = tuple(link.model_copy(update={"torque_limit": None}) for link in links)
     changes: dict[str, Any] = {"actuators": dict.fromkeys(names), "links": links}
+    theirs = tuple(kind for name, kind in _CONSTRAINTS.items() if name in names)
+    changes["constraints"] = [each for each in scene.constraints if not isinstance(each, theirs)]
     if "wheels" in names:
-        limits = [each for each in scene.constraints if isinstance(each, WheelLimits)]
-        changes["constraints"] = [each for each in scene.constraints if each not in limits]
         changes |= {"initial_state": {"wheel_speeds": ()}, "spread": {"wheel_speeds": 0.0}}
     return scene.replace(**changes)
 
@@ -136,13 +140,14 @@ def with_links(scene: Scene, count: int) -> Scene | None:
         if scene.payload:
             return None
         changes["actuators"] = {"joint_torque": None}
+        changes["constraints"] = [each for each in scene.constraints if not isinstance(each, TorqueSpeed)]
         none = ("joint_angles", "joint_rates", "link_masses", "link_inertias")
         changes["spread"] = dict.fromkeys(none, 0.0)
     return scene.replace(**changes)
 
 
 def in_the_plane(scene: Scene) -> Scene:
-    """The robot in the plane: no wrist, wheels and jets, all axes along z, offsets along z turned to x."""
+    """The robot in the plane: no wrist, wheels, jets, other tips; axes along z, offsets along z turned to x."""
     flat = without_wrist(scene) if scene.wrist else scene
     out_of_plane = [name for name in ("wheels", "thrusters") if getattr(flat.actuators, name)]
     flat = without_actuators(flat, *out_of_plane) if out_of_plane else flat
@@ -161,8 +166,10 @@ def in_the_plane(scene: Scene) -> Scene:
             for link in flat.links
         ],
         "tip": _flat_pose(flat.tip),
+        "other_tips": (),
         "target": {
             "pose": _flat_pose(flat.target.pose),
+            "grasp": _flat_pose(flat.target.grasp),
             "base_velocity": _flat_twist(flat.target.base_velocity),
         },
         "initial_state": {"base_pose": base_pose, "base_velocity": velocity},
