@@ -147,7 +147,7 @@ def with_links(scene: Scene, count: int) -> Scene | None:
 
 
 def in_the_plane(scene: Scene) -> Scene:
-    """The robot in the plane: no wrist, wheels, jets, other tips; axes along z, offsets along z turned to x."""
+    """The robot in the plane: no wrist, wheels, jets, other tips; axes along z, offsets turned to x."""
     flat = without_wrist(scene) if scene.wrist else scene
     out_of_plane = [name for name in ("wheels", "thrusters") if getattr(flat.actuators, name)]
     flat = without_actuators(flat, *out_of_plane) if out_of_plane else flat
