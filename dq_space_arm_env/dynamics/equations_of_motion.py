@@ -9,7 +9,7 @@ from typing import Any
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
-from dq_space_arm_env.dynamics import drives, minimal, reaction_wheels
+from dq_space_arm_env.dynamics import elastic_gears, minimal, reaction_wheels
 from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of, reaction_wrenches
 from dq_space_arm_env.dynamics.jets import net_wrench
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
@@ -208,11 +208,11 @@ class EquationsOfMotion:
     def motor_torques(self, motion: Motion, joint_torques: Sequence[Scalar]) -> list[Scalar]:
         """Torques on the rotors of elastic joints, on the joints' side, N m."""
         transmitted = self._transmitted(motion)
-        return drives.motor_torques(self.tree, transmitted, motion.motor_rates, joint_torques)
+        return elastic_gears.motor_torques(self.tree, transmitted, motion.motor_rates, joint_torques)
 
     def _transmitted(self, motion: Motion) -> list[Scalar]:
         joints, motors = (motion.joint_angles, motion.joint_rates), (motion.motor_angles, motion.motor_rates)
-        return drives.transmitted_torques(self.tree, *joints, *motors)
+        return elastic_gears.transmitted_torques(self.tree, *joints, *motors)
 
     def _on_links(self, joint_torques: Sequence[Scalar]) -> list[Scalar]:
         """Motor torques that act on links directly: through rigid gears."""
@@ -268,7 +268,7 @@ class EquationsOfMotion:
     def motor_motion(self, motion: Motion, inputs: Inputs) -> list[Scalar]:
         """Time derivative of angles and rates of the motors of elastic joints."""
         torques = self.motor_torques(motion, inputs.joint_torques)
-        pairs = zip(torques, drives.elastic_joints(self.tree), strict=True)
+        pairs = zip(torques, elastic_gears.elastic_joints(self.tree), strict=True)
         return [*motion.motor_rates, *(torque / gear.inertia for torque, (_, gear) in pairs)]
 
     def reaction_wrenches(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from dq_space_arm_env.algebra.vectors import add
 from dq_space_arm_env.dynamics import minimal, reaction_wheels
-from dq_space_arm_env.dynamics.drives import DrivenMassMatrix
+from dq_space_arm_env.dynamics.elastic_gears import DrivenMassMatrix
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion, Motion
 from dq_space_arm_env.dynamics.mass_matrix import MassMatrix
 

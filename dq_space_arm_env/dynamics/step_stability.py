@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dq_space_arm_env.dynamics.drives import elastic_joints
+from dq_space_arm_env.dynamics.elastic_gears import elastic_joints
 from dq_space_arm_env.dynamics.kinematic_tree import Friction, KinematicTree
 from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
 from dq_space_arm_env.dynamics.minimal import link_frames

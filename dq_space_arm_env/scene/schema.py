@@ -127,7 +127,14 @@ class Scene(Model):
         return len(self.links) if self.tip_link is None else self.body_named(self.tip_link)
 
     def body_named(self, name: str) -> int:
-        """Number of a body by its name: 0 for the base, i + 1 for link i."""
+        """Find a body by its name.
+
+        Args:
+            name: Of a link, or "base".
+
+        Returns:
+            0 for the base, i + 1 for link i.
+        """
         return [BASE, *(link.name for link in self.links)].index(name)
 
     @property

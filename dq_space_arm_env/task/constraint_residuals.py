@@ -26,7 +26,7 @@ from dq_space_arm_env.algebra.vectors import (
     subtract,
 )
 from dq_space_arm_env.dynamics import kinematics, minimal, reaction_wheels
-from dq_space_arm_env.dynamics.drives import drive_energy
+from dq_space_arm_env.dynamics.elastic_gears import drive_energy
 from dq_space_arm_env.scene.constraint_rows import (
     directions,
     exact_rows,

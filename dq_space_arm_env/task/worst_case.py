@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import poses, quaternion
 from dq_space_arm_env.algebra.vectors import cross, dot, matrix_vector, norm, subtract
-from dq_space_arm_env.dynamics.drives import elastic_joints
+from dq_space_arm_env.dynamics.elastic_gears import elastic_joints
 from dq_space_arm_env.dynamics.equations_of_motion import Motion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from dq_space_arm_env.scene.motion import Tumbling, Waypoints

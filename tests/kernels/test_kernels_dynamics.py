@@ -5,7 +5,7 @@ import pytest
 
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.algebra import vectors
-from dq_space_arm_env.dynamics import drives, kinematics, minimal, newton_euler, reaction_wheels
+from dq_space_arm_env.dynamics import elastic_gears, kinematics, minimal, newton_euler, reaction_wheels
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
@@ -36,7 +36,7 @@ def paper_solution(kernels, x, u):
     base_wrench = (0.0, *inputs.force, 0.0, *torque)
     # Behind an elastic gear the motor turns its rotor alone, and the gear the link.
     moving = motion.joint_angles, motion.joint_rates, motion.motor_angles, motion.motor_rates
-    torques = drives.transmitted_torques(tree, *moving)
+    torques = elastic_gears.transmitted_torques(tree, *moving)
     for joint, (link, torque) in enumerate(zip(tree.links, inputs.joint_torques, strict=True)):
         torques[joint] += torque if link.elastic is None else 0.0
     given = (base_wrench, torques, inputs.wrist_rates)

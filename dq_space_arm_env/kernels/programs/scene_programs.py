@@ -14,7 +14,7 @@ from dq_space_arm_env.algebra import poses, screw
 from dq_space_arm_env.algebra.vectors import matrix_vector
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
-from dq_space_arm_env.dynamics import drives, kinematics, minimal
+from dq_space_arm_env.dynamics import elastic_gears, kinematics, minimal
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators import checked_integrator_of
 from dq_space_arm_env.integrators.actuated import append_measured_step
@@ -176,7 +176,7 @@ class ScenePrograms:
             moving = velocities, motion.wheel_momenta
             kinetic, potential = kinematics.energy(self.tree, motion.joint_angles, *moving)
             motors = (motion.motor_angles, motion.motor_rates)
-            driving = drives.drive_energy(self.tree, motion.joint_angles, *motors)
+            driving = elastic_gears.drive_energy(self.tree, motion.joint_angles, *motors)
             return {"energy": [kinetic + potential + driving]}
 
         return self._program("energy", outputs, x=self.field.n_x)
