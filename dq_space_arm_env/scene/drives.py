@@ -35,12 +35,6 @@ class Motor(Model):
     friction_speed: Speed = Field(
         default=0.01, description="speed in it, at which it reaches 76 %, rad/s (m/s)"
     )
-
-    @property
-    def reflected_inertia(self) -> float:
-        """N^2 J_r, the rotor's inertia about the joint, kg m^2 (kg)."""
-        return self.gear * self.gear * self.inertia
-
     stiffness: Positive | None = Field(
         default=None,
         exclude_if=lambda stiffness: stiffness is None,
@@ -52,7 +46,6 @@ class Motor(Model):
         exclude_if=lambda damping: not damping,
         description="viscous damping of an elastic gear, N m s/rad (N s/m)",
     )
-
     stall_torque: Positive | None = Field(
         default=None,
         exclude_if=lambda torque: torque is None,
@@ -65,6 +58,11 @@ class Motor(Model):
         exclude_if=lambda speed: speed is None,
         description="speed at full voltage at which no torque is left, on the joint's side, rad/s (m/s)",
     )
+
+    @property
+    def reflected_inertia(self) -> float:
+        """N^2 J_r, the rotor's inertia about the joint, kg m^2 (kg)."""
+        return self.gear * self.gear * self.inertia
 
     def envelope(self, rate: Any) -> tuple[Any, Any] | None:
         """Least and greatest torque at a speed.

@@ -270,22 +270,15 @@ def _drawn(scene: Scene) -> set[str]:
 def control_numbers(scene: Scene) -> dict[str, list[ControlNumbers]]:
     """The controls by actuator, in order; an absent one, or one without joints, has none."""
     planar = _is_planar(scene)
-    axes = {"base_force": (0, 1), "base_torque": (2,)} if planar else {}
-    others = {
-        "joint_torque": _joint_controls,
-        "wheel_torque": _wheel_controls,
-        "thruster_force": _thruster_controls,
+    found = {
+        "base_force": _axis_controls(scene, "base_force", (0, 1) if planar else range(3)),
+        "base_torque": _axis_controls(scene, "base_torque", (2,) if planar else range(3)),
+        "joint_torque": _joint_controls(scene),
+        "wrist_rate": _axis_controls(scene, "wrist_rate", range(3)),
+        "wheel_torque": _one_by_one(scene, "wheel_torque", "wheels", "torque", wheel_names(scene)),
+        "thruster_force": _one_by_one(scene, "thruster_force", "thrusters", "force", thruster_names(scene)),
     }
-    return {
-        field: [
-            *(
-                others[field](scene)
-                if field in others
-                else _axis_controls(scene, field, axes.get(field, range(3)))
-            )
-        ]
-        for field in CONTROL_UNITS
-    }
+    return {field: [*controls] for field, controls in found.items()}
 
 
 def _axis_controls(scene: Scene, field: str, axes: Sequence[int]) -> Iterator[ControlNumbers]:
@@ -313,22 +306,15 @@ def _joint_controls(scene: Scene) -> Iterator[ControlNumbers]:
         yield ControlNumbers(f"{link.name} {'torque' if link.turns else 'force'}", limit, weight)
 
 
-def _wheel_controls(scene: Scene) -> Iterator[ControlNumbers]:
-    for index, name in enumerate(wheel_names(scene)):
-        weight = _number("cost.wheel_torque", _per_square("wheel_torque"), scene.cost.wheel_torque)
-        torque = scene.actuators.wheels[index].torque
-        yield ControlNumbers(
-            f"{name} torque", _number(f"actuators.wheels.{index}.torque", "N m", torque), weight
-        )
-
-
-def _thruster_controls(scene: Scene) -> Iterator[ControlNumbers]:
-    for index, name in enumerate(thruster_names(scene)):
-        weight = _number("cost.thruster_force", _per_square("thruster_force"), scene.cost.thruster_force)
-        force = scene.actuators.thrusters[index].force
-        yield ControlNumbers(
-            f"{name} force", _number(f"actuators.thrusters.{index}.force", "N", force), weight
-        )
+def _one_by_one(
+    scene: Scene, field: str, part: str, limit: str, names: Sequence[str]
+) -> Iterator[ControlNumbers]:
+    """Controls of wheels or of thrusters, each with a limit of its own."""
+    weight = _number(f"cost.{field}", _per_square(field), getattr(scene.cost, field))
+    for index, name in enumerate(names):
+        largest = getattr(getattr(scene.actuators, part)[index], limit)
+        number = _number(f"actuators.{part}.{index}.{limit}", CONTROL_UNITS[field], largest)
+        yield ControlNumbers(f"{name} {limit}", number, weight)
 
 
 def thruster_names(scene: Scene) -> list[str]:
