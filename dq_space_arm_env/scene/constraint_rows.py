@@ -241,17 +241,26 @@ def sides(scene: Scene, limits: JointLimits) -> Iterator[Side]:
 
 def rate_limits(scene: Scene, each: ControlRate) -> list[RateLimit]:
     """The controls whose rates a constraint limits, in their order."""
-    # The name of a control's limit in the scene ends with its axis.
     found, index = [], 0
     for field, numbers in control_numbers(scene).items():
-        given = getattr(each, field, None)
-        for number in numbers:
-            axis = number.limit.paths[0].rpartition(".")[2]
-            rate = given[int(axis)] if isinstance(given, tuple) else given
-            if rate is not None and math.isfinite(rate):
+        for number, rate in zip(numbers, _rates(scene, each, field, len(numbers)), strict=True):
+            if math.isfinite(rate):
                 found.append(RateLimit(index, number.name, number.limit.unit, rate))
             index += 1
     return found
+
+
+def _rates(scene: Scene, each: ControlRate, field: str, count: int) -> list[float]:
+    """Greatest rates of the controls of an actuator."""
+    given = getattr(each, {"wheel_torque": "wheels", "thruster_force": "thrusters"}.get(field, field))
+    if given is None:
+        return [math.inf] * count
+    if field == "joint_torque":
+        rates = per_link(given, len(scene.links))
+        return [rate for rate, link in zip(rates, scene.links, strict=True) if link.actuated]
+    if scene.base.motion == "planar" and field in ("base_force", "base_torque"):
+        given = given[:2] if field == "base_force" else given[2:]
+    return list(per_link(given, count))
 
 
 def slew_limits(scene: Scene) -> list[RateLimit]:

@@ -14,7 +14,7 @@ from dq_space_arm_env.scene.bodies import Link
 from dq_space_arm_env.validation.fields import (
     ANGLES,
     LENGTHS,
-    Limit,
+    Limits,
     Limits3,
     Name,
     NonNegative,
@@ -34,6 +34,7 @@ FRAMES = ("inertial", "base", "tip", "target", "grasp")
 _FRAME = "inertial, base, a link, tip, target or grasp"
 _PER_LINK = "one number for all links, or one per link"
 _PER_AXIS = "one number for all three axes, or three; .inf or absent: any"
+_ONE_BY_ONE = "one number for all, or one for each; .inf or absent: any"
 
 
 def _read_bounds(value: Any) -> tuple[float, ...]:
@@ -294,11 +295,17 @@ class ControlRate(Constraint):
     base_torque: Limits3 | None = Field(
         default=None, description=f"greatest rate of the base torque, N m/s: {_PER_AXIS}"
     )
-    joint_torque: Limit | None = Field(
-        default=None, description="greatest rate of each joint torque, one number, N m/s; absent: any"
+    joint_torque: Limits | None = Field(
+        default=None, description=f"greatest rate of joint torques, N m/s: {_PER_LINK}; .inf or absent: any"
     )
     wrist_rate: Limits3 | None = Field(
         default=None, description=f"greatest rate of the wrist's rates, rad/s^2: {_PER_AXIS}"
+    )
+    wheels: Limits | None = Field(
+        default=None, description=f"greatest rate of the torques of wheels, N m/s: {_ONE_BY_ONE}"
+    )
+    thrusters: Limits | None = Field(
+        default=None, description=f"greatest rate of the forces of thrusters, N/s: {_ONE_BY_ONE}"
     )
 
 
@@ -444,14 +451,24 @@ def _joint_limit_problems(
 def _control_rate_problems(
     scene: Scene, here: tuple[str | int, ...], constraint: ControlRate
 ) -> Iterator[Problem]:
-    fields = ("base_force", "base_torque", "joint_torque", "wrist_rate")
-    given = {field: getattr(constraint, field) for field in fields if getattr(constraint, field) is not None}
-    rates = [rate for each in given.values() for rate in (each if isinstance(each, tuple) else [each])]
-    if not any(math.isfinite(rate) for rate in rates):
-        yield Problem(here, constraint, f"must limit at least one of {', '.join(fields)}")
-    for field, rate in given.items():
-        if getattr(scene.actuators, field) is None:
-            yield Problem((*here, field), rate, f"must be absent: the scene has no actuators.{field}")
+    actuators = scene.actuators
+    counts = {
+        "base_force": 3,
+        "base_torque": 3,
+        "joint_torque": len(scene.links),
+        "wrist_rate": 3,
+        "wheels": len(actuators.wheels or ()),
+        "thrusters": len(actuators.thrusters or ()),
+    }
+    given = {field: getattr(constraint, field) for field in counts if getattr(constraint, field) is not None}
+    if not any(math.isfinite(rate) for rates in given.values() for rate in rates):
+        yield Problem(here, constraint, f"must limit at least one of {', '.join(counts)}")
+    for field, rates in given.items():
+        if getattr(actuators, field) is None:
+            yield Problem((*here, field), rates, f"must be absent: the scene has no actuators.{field}")
+        elif len(rates) not in (1, counts[field]):
+            sentence = f"must be one number, or {counts[field]}: one for each"
+            yield Problem((*here, field), rates, sentence)
 
 
 def _has_thrusters(scene: Scene) -> bool:

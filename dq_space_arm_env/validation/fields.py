@@ -137,16 +137,18 @@ def _vector(count: int | None, span: Range | None = None) -> BeforeValidator:
     return BeforeValidator(lambda value: read_numbers(value, count, span))
 
 
-def _per_component(count: int, good: Callable[[float], bool], wanted: str, span: Range) -> BeforeValidator:
-    """Read one number for all components, or one for each."""
+def _per_component(
+    count: int | None, good: Callable[[float], bool], wanted: str, span: Range
+) -> BeforeValidator:
+    """Read one number for all components, or one for each; a count of None leaves open how many there are."""
 
     def read(value: Any) -> tuple[float, ...]:
         if isinstance(value, np.ndarray):
             value = value.tolist()
-        items: Sequence[Any] = value if isinstance(value, list | tuple) else (value,) * count
+        items: Sequence[Any] = value if isinstance(value, list | tuple) else (value,) * (count or 1)
         numbers = tuple(_real(item) for item in items)
-        if len(numbers) != count or not all(good(number) for number in numbers):
-            raise problem(f"must be one number or {count} numbers, each {wanted}")
+        if len(numbers) != (count or max(len(numbers), 1)) or not all(good(number) for number in numbers):
+            raise problem(f"must be one number or {count or 'several'} numbers, each {wanted}")
         span.check(*numbers)
         return numbers
 
@@ -173,6 +175,7 @@ def _delay(value: Any) -> int:
 _Rule = tuple[Callable[[float], bool], str, Range]
 _STATE_WEIGHT: _Rule = (lambda number: 0 <= number < math.inf, "finite and 0 or greater", STATE_WEIGHTS)
 _CONTROL_WEIGHT: _Rule = (lambda number: 0 < number < math.inf, "finite and greater than 0", CONTROL_WEIGHTS)
+_LIMIT: _Rule = (lambda number: number > 0, "greater than 0, or .inf for no limit", FORCES)
 
 Three = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
@@ -204,9 +207,8 @@ LengthSpread = Annotated[float, non_negative(LENGTHS)]
 AngleSpread = Annotated[float, non_negative(ANGLES)]
 RateSpread = Annotated[float, non_negative(RATES)]
 Limit = Annotated[float, _number(lambda n: n > 0, "a number greater than 0, or .inf for no limit", FORCES)]
-Limits3 = Annotated[
-    Three, _per_component(3, lambda number: number > 0, "greater than 0, or .inf for no limit", FORCES)
-]
+Limits3 = Annotated[Three, _per_component(3, *_LIMIT)]
+Limits = Annotated[tuple[float, ...], _per_component(None, *_LIMIT)]
 StateWeights8 = Annotated[Eight, _per_component(8, *_STATE_WEIGHT)]
 StateWeights6 = Annotated[Six, _per_component(6, *_STATE_WEIGHT)]
 ControlWeight = Annotated[float, positive(CONTROL_WEIGHTS)]

@@ -1,5 +1,7 @@
 """Limits of rates of controls: the controls before are part of the state, and changes are charged."""
 
+import math
+
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -14,6 +16,8 @@ from dq_space_arm_env import (
 )
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
+from dq_space_arm_env.scene.constraint_rows import rates_of
+from dq_space_arm_env.scene.parameters import thruster_names
 
 PLAIN = load_scene("planar").replace(simulation={"steps": 30})
 RATES = {"kind": "control_rate", "name": "slew", "base_torque": 4.0, "joint_torque": 2.0, "tolerance": 0.1}
@@ -138,3 +142,23 @@ def test_the_control_before_the_episode_is_given():
         LIMITED.replace(initial_state={"previous_controls": [1.0]})
     with pytest.raises(SceneError, match="limit no control's rate"):
         PLAIN.replace(initial_state={"previous_controls": [1.0]})
+
+
+def test_each_joint_wheel_and_thruster_may_have_a_rate_of_its_own():
+    rates = {"kind": "control_rate", "name": "slew"}
+    links = [5.0, math.inf, 1.0]
+    few = load_scene("planar").replace(
+        constraints=[{**rates, "joint_torque": links, "base_force": [1, 2, 3]}]
+    )
+    names, most = zip(*((limit.name, limit.rate) for limit in rates_of(few)), strict=True)
+    first, _, last = (link.name for link in few.links)
+    assert names == ("base force x", "base force y", f"{first} torque", f"{last} torque")
+    assert most == (1.0, 2.0, 5.0, 1.0)
+    wheels = load_scene("wheels").replace(constraints=[{**rates, "wheels": [1, 2, 3, 4]}])
+    assert [limit.rate for limit in rates_of(wheels)] == [1.0, 2.0, 3.0, 4.0]
+    jets = load_scene("thrusters").replace(constraints=[{**rates, "thrusters": 2.0}])
+    assert [limit.name for limit in rates_of(jets)] == [f"{name} force" for name in thruster_names(jets)]
+    with pytest.raises(SceneError, match=r"joint_torque = .*: must be one number, or 3: one for each"):
+        few.replace(constraints=[{**rates, "joint_torque": [1.0, 2.0]}])
+    with pytest.raises(SceneError, match="must be one number or several numbers, each greater than 0"):
+        few.replace(constraints=[{**rates, "joint_torque": []}])

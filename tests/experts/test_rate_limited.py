@@ -82,3 +82,16 @@ def test_receding_horizon_keeps_to_the_rates():
         charge += info["cost"]
     assert info["is_success"]
     assert charge <= 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "rates"), [("wheels", {"wheels": 0.02}), ("thrusters", {"thrusters": 2.0})])
+def test_wheels_and_thrusters_keep_to_their_rates(name, rates):
+    limited = load_scene(name)
+    slew = {"kind": "control_rate", "name": "slew", **rates}
+    limited = limited.replace(constraints=[*limited.constraints, slew])
+    solver = GuidedDDP(limited)
+    solution = solver.solve()
+    assert solution.converged
+    assert changes(solution, solver.problem).max() == pytest.approx(1.0, abs=1e-12)
+    assert solution.controls[:, solver.problem.kernels.layout.control.thruster_force].min(initial=0.0) >= 0.0
