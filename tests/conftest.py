@@ -2,6 +2,7 @@
 
 import signal
 import sys
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,20 @@ sys.path.append(str(Path(__file__).parent / "compiler"))
 # A shell that runs the tests in the background lets all its processes ignore Ctrl-C, which some tests press.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)  # before slow ones are left out
+def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
+    """Of the cases of a test with the mark `sampled`, all but one are slow."""
+    families: dict[str, list[pytest.Function]] = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("sampled"):
+            families[item.nodeid.partition("[")[0]].append(item)
+    for cases in families.values():
+        sample = next((case for case in cases if "paper" in case.name.partition("[")[2]), cases[0])
+        for case in cases:
+            if case is not sample:
+                case.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session")

@@ -32,8 +32,6 @@ WITH_README = TEXTS | {"README": (ROOT / "README.md").read_text(encoding="utf-8"
 SECTIONS = dict(re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", TEXTS["extending"], re.MULTILINE | re.DOTALL))
 RECIPES = {title: text for title, text in SECTIONS.items() if "```diff" in text}
 PACKAGES = ("agents", "configs", "dq_space_arm_env", "experts")
-SLOW = {("expert", 0), ("expert", 1), ("expert", 2), ("demonstrations", 0)}
-"""Blocks that solve something; the README has the like among the quick tests."""
 
 sys.path.insert(0, str(DOCS))
 commands = import_module("extensions.commands")
@@ -74,16 +72,16 @@ def code_of(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
 
 
-def blocks() -> list[object]:
-    found = []
-    for page, text in WITH_README.items():
-        for number, code in enumerate(code_of(text, "python")):
-            if page != "extending" and not code.startswith(">>>"):  # docstrings' examples: see test_readme.py
-                marks = [pytest.mark.slow] if (page, number) in SLOW else []
-                found.append(pytest.param(page, number, marks=marks))
-    return found
+def blocks() -> list[tuple[str, int]]:
+    return [
+        (page, number)
+        for page, text in WITH_README.items()
+        for number, code in enumerate(code_of(text, "python"))
+        if page != "extending" and not code.startswith(">>>")  # docstrings' examples: see test_readme.py
+    ]
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(("page", "number"), blocks())
 def test_code_in_the_documentation_runs(page, number, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)  # results of older code would be refused

@@ -99,6 +99,7 @@ def test_stumpff_functions():
             assert error([value], [series], size) <= bounds[k], (k, s)
 
 
+@pytest.mark.slow
 def test_exponential():
     """Real and dual part to 4 units; of small angles, the vector part relative to itself."""
     for twist in twists(ANGLES):
@@ -123,6 +124,7 @@ def test_exponential_minus_identity():
             assert q[0] == 0.0
 
 
+@pytest.mark.slow
 def test_logarithm():
     """Rotation and translation each relative to itself, from 1e-307 rad up to and including pi."""
     for twist in twists(SHORT_ANGLES):
@@ -151,6 +153,7 @@ def test_beyond_half_a_turn():
         np.testing.assert_allclose(twist[:3], expected, rtol=0.0, atol=8.0 * EPSILON)
 
 
+@pytest.mark.slow
 def test_right_jacobian():
     for twist in twists(ANGLES[::2], TRANSLATIONS[::2]):
         actual, (real, dual) = screw.exponential_right_jacobian(twist), exact_right_jacobian(twist)

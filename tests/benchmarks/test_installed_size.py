@@ -71,6 +71,7 @@ def test_without_installation_the_sources_say_what_is_required(folder: Path) -> 
     assert "stable-baselines3" in extras[0]["missing"]
 
 
+@pytest.mark.slow
 def test_this_environment_has_all_that_the_base_requires() -> None:
     base, *_ = list(installation_rows())
     assert base["missing"] == ""

@@ -271,6 +271,7 @@ def test_an_undisturbed_episode_costs_what_the_plan_says(problem: ArmProblem) ->
     assert cost(solution.policy(), noise) != undisturbed
 
 
+@pytest.mark.slow
 def test_flights_have_every_horizon_and_disturbance(problem: ArmProblem) -> None:
     rows = list(measure_flights(problem, replace(SHORT, horizons=(10, 500, 900), episodes=2)))
     flights = select(rows, table="flights")
@@ -285,6 +286,7 @@ def test_flights_have_every_horizon_and_disturbance(problem: ArmProblem) -> None
     assert shortcomings(rows) == []
 
 
+@pytest.mark.slow
 def test_the_tip_follows_a_target_that_the_papers_formulation_cannot() -> None:
     rows = list(measure_tracking())
     assert [row["status"] for row in rows if row["table"] == "claims"] == ["handled", "handled"]

@@ -255,6 +255,7 @@ def test_ctrl_c_says_what_is_kept() -> None:
     assert result.stderr.strip() == "Interrupted: the first part remains."
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_finalizer_interrupts_all_the_same() -> None:
     code = (
         "import os, signal, sys, time\n"

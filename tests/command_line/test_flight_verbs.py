@@ -121,6 +121,7 @@ def test_solutions_fly_as_planned(solved: Path, scene_file: str, capsys: pytest.
         assert documents(capsys)["cost"] == pytest.approx(cost, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_noise_is_recorded_and_feedback_makes_up_for_it(scene: Scene) -> None:
     def flight(policy: str) -> Trajectory:
         start = begin(scene, 3)
@@ -173,6 +174,7 @@ def test_a_start_is_that_of_the_environment_with_its_drawn_target(scene: Scene) 
     assert env.episode_scene.target != scene.target
 
 
+@pytest.mark.slow
 def test_drawn_targets_and_masses_are_compiled_once(
     scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

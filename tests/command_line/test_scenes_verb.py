@@ -41,6 +41,7 @@ def test_list_has_every_scene(capsys: pytest.CaptureFixture[str]) -> None:
         assert load_scene(row["file"]) == load_scene(row["name"])
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", list_scenes())
 def test_show_has_states_and_inputs(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     layout = StateLayout.of(load_scene(name))

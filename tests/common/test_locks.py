@@ -117,6 +117,7 @@ print(failed)
 """
 
 
+@pytest.mark.slow
 def test_every_module_imports_without_the_modules_of_posix() -> None:
     root = Path(__file__).parents[2]
     command = [sys.executable, "-c", WITHOUT_POSIX, str(root)]

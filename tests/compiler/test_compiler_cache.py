@@ -243,12 +243,14 @@ def run_process(cache, code=SECOND_PROCESS):
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
 
 
+@pytest.mark.slow
 def test_a_second_process_neither_traces_nor_compiles(cache):
     first, second = (run_process(cache).stdout.split("\n") for _ in range(2))
     assert first[0] == second[0]
     assert (first[1], second[1]) == ("True", "False")
 
 
+@pytest.mark.slow
 def test_a_first_use_says_that_it_compiles_and_where_the_result_is(cache):
     code = SECOND_PROCESS + "kernels.linearize(kernels.layout.initial_state, [0.0] * kernels.n_u)\n"
     first, second = (run_process(cache, code).stderr for _ in range(2))
@@ -257,6 +259,7 @@ def test_a_first_use_says_that_it_compiles_and_where_the_result_is(cache):
     assert second == ""
 
 
+@pytest.mark.slow
 def test_two_processes_at_once_agree(cache):
     with ThreadPoolExecutor() as pool:
         outputs = pool.map(run_process, [cache] * 3)

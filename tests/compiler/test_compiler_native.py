@@ -192,6 +192,7 @@ def test_all_rows_read_a_shared_input_and_scatter_into_runs_of_every_length(lane
     np.testing.assert_array_equal(y, expected)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(("lanes", "precision"), EVERY_CODE)
 @pytest.mark.parametrize("dtype", ["", "float64", "float32", "bool"])
 def test_rows_of_every_size_and_type_pass_through_registers(lanes, precision, dtype):

@@ -18,6 +18,7 @@ from experts.demonstrations.settings import Settings
 from experts.problems.arm_problem import ArmProblem
 
 
+@pytest.mark.slow
 def test_each_is_an_episode_of_the_environment_bit_for_bit(whole: Demonstrations):
     env = gymnasium.make("DQSpaceArm-v0", scene=whole.scene)
     for demonstration in (whole[0], whole[7], whole[-1]):

@@ -24,6 +24,7 @@ def go_on(scene: Scene, folder: Path, executor=None, **changes) -> Demonstration
     return generate_demonstrations(scene, out=folder, **arguments)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_resumed_to_the_same_bytes(
     whole: Demonstrations, quick_scene: Scene, tmp_path: Path
 ):
@@ -134,6 +135,7 @@ def test_a_lock_ends_with_its_process(quick_scene: Scene, folder: Path):
     go_on(quick_scene, folder)
 
 
+@pytest.mark.slow
 def test_parts_share_a_folder_and_the_last_one_completes_it(
     whole: Demonstrations, quick_scene: Scene, tmp_path: Path
 ):
@@ -147,6 +149,7 @@ def test_parts_share_a_folder_and_the_last_one_completes_it(
     assert contents(tmp_path) == contents(whole.path)
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_with_a_sentence_and_a_folder_to_go_on_with(
     whole: Demonstrations, quick_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

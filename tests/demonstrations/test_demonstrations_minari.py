@@ -51,6 +51,7 @@ def metadata_of(dataset: Any) -> list[dict[str, Any]]:
     return list(dataset.storage.get_episode_metadata(dataset.episode_indices))
 
 
+@pytest.mark.slow
 def test_every_episode_fits_the_spaces(exported: Any, whole: Demonstrations):
     assert (exported.total_episodes, exported.total_steps) == (len(whole), len(whole) * 150)
     assert exported.observation_space == recovered(exported).observation_space
@@ -115,6 +116,7 @@ def test_the_data_set_says_where_it_comes_from(exported: Any, whole: Demonstrati
     assert list(minari.list_local_datasets()) == [ID]
 
 
+@pytest.mark.slow
 def test_some_demonstrations_without_gains_and_with_an_author(whole: Demonstrations, root: Path):
     dataset = export_to_minari(
         whole.select([7, 2]),
@@ -132,6 +134,7 @@ def test_some_demonstrations_without_gains_and_with_an_author(whole: Demonstrati
     assert (root / "quick-v3" / "README.md").read_text() == "# Card"
 
 
+@pytest.mark.slow
 def test_an_existing_data_set_is_only_replaced_when_asked(whole: Demonstrations, root: Path):
     export_to_minari(whole[:2], ID)
     with pytest.raises(DemonstrationsError, match=f"the Minari data set {ID} exists"):
@@ -142,6 +145,7 @@ def test_an_existing_data_set_is_only_replaced_when_asked(whole: Demonstrations,
     assert list(minari.list_local_datasets()) == [ID]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dataset_id", [ID, "other-v0"])
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_what_stops_half_way_leaves_nothing(
@@ -164,6 +168,7 @@ def test_what_stops_half_way_leaves_nothing(
     assert os.environ["MINARI_DATASETS_PATH"] == str(root)
 
 
+@pytest.mark.slow
 def test_what_a_killed_process_left_is_cleared_away(whole: Demonstrations, root: Path):
     (root / STAGING / "space-arm" / "quick").mkdir(parents=True)
     assert minari.list_local_datasets() == {}
@@ -171,6 +176,7 @@ def test_what_a_killed_process_left_is_cleared_away(whole: Demonstrations, root:
     assert not (root / STAGING).exists()
 
 
+@pytest.mark.slow
 def test_a_data_set_is_not_lost_between_two_renames(whole: Demonstrations, root: Path):
     place = export_to_minari(whole[:2], ID).storage.data_path.parent
     (root / STAGING).mkdir()
@@ -184,6 +190,7 @@ def _stop(done: int) -> None:
     raise RuntimeError("stop")
 
 
+@pytest.mark.slow
 def test_a_namespace_is_not_overwritten(whole: Demonstrations, root: Path):
     export_to_minari(whole[:1], "space-v0/quick-v0")
     with pytest.raises(DemonstrationsError, match="exists"):
@@ -237,6 +244,7 @@ def run(arguments: Sequence[str]) -> int:
     return main(["demonstrations", "export", *arguments])
 
 
+@pytest.mark.slow
 def test_the_verb_exports_with_a_data_card(
     whole: Demonstrations, root: Path, capsys: pytest.CaptureFixture[str]
 ):

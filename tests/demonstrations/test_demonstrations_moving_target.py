@@ -41,6 +41,7 @@ def made(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Demonstratio
     return load_demonstrations(folder, verify=True)
 
 
+@pytest.mark.slow
 def test_observations_are_those_of_states_and_stages(made: Demonstrations) -> None:
     kernels, steps = made.kernels, made.scene.simulation.steps
     assert len(made) == COUNT
@@ -71,6 +72,7 @@ def test_a_demonstration_is_shown_with_the_path_of_its_target(made: Demonstratio
     np.testing.assert_array_equal(flight.target_body, layout.target_body_with(rows))
 
 
+@pytest.mark.slow
 def test_minari_holds_the_stages_and_gives_the_demonstrations_back(
     made: Demonstrations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

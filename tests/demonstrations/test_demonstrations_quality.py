@@ -37,6 +37,7 @@ def spoil(expert: Expert, outcome: Outcome) -> Outcome:
     return Outcome(outcome.index, outcome.seed, outcome.start, solution, "zero controls", reason)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("position", "is_demonstration", "excess"), [(1, True, 0.002), (5, False, 2.0)], ids=["poor", "failed"]
 )
@@ -56,6 +57,7 @@ def test_a_poor_minimum_is_found_out_by_its_neighbors_and_solved_again(
     assert outcomes[position].solution.cost == pytest.approx(cost, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_second_solve_never_makes_anything_worse(solved: tuple[Expert, list[Outcome]]):
     expert, outcomes = solved
     before = list(outcomes)
@@ -77,6 +79,7 @@ def hard(quick_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Demons
     return made
 
 
+@pytest.mark.slow
 def test_failures_are_recorded_and_never_mixed_in(hard: Demonstrations):
     failures = hard.failures()
     assert len(hard) + len(failures["index"]) == 8

@@ -270,7 +270,7 @@ def test_tasks_that_miss_the_order_to_end_get_it_again(tasks: list[Task]):
 
 
 @pytest.mark.ray
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_few_tasks_are_under_way_and_they_end_with_the_generator(cluster: LocalCluster, quick_scene: Scene):
     import ray
 

@@ -85,12 +85,14 @@ def test_the_log_counts_each_shard_once(folder: Path):
     assert found.seconds["solves"] == pytest.approx(8.0 + rest)
 
 
+@pytest.mark.slow
 def test_without_a_log_times_are_not_known(folder: Path):
     shutil.rmtree(folder / "log")
     solves = sections(gather(load_demonstrations(folder)))[1]
     assert solves.notes == ["Times are unknown: the folder has no log."]
 
 
+@pytest.mark.slow
 def test_the_page_holds_numbers_and_pictures(folder: Path):
     pytest.importorskip("matplotlib")
     files = write_summary(load_demonstrations(folder))
@@ -117,6 +119,7 @@ def test_the_page_holds_numbers_and_pictures(folder: Path):
     assert len(load_demonstrations(folder, verify=True)) == 18
 
 
+@pytest.mark.slow
 def test_failures_are_shown_with_their_reasons(failing: Demonstrations):
     count = len(failing.failures()["index"])
     facts = gather(failing)
@@ -190,6 +193,7 @@ def run(arguments: Sequence[str]) -> int:
     return main(["demonstrations", "generate", *arguments])
 
 
+@pytest.mark.slow
 def test_the_script_writes_it_unless_told_not_to(quick_scene: Scene, tmp_path: Path):
     quick_scene.to_yaml(tmp_path / "quick.yaml")
     arguments = [

@@ -39,6 +39,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.slow
 def test_it_generates_says_so_and_resumes(scene_file: str, tmp_path: Path, capsys):
     arguments = ["--scene", scene_file, "-n", "6", "--shard-size", "2", "--workers", "1"]
     arguments += ["--out", str(tmp_path / "data")]
@@ -107,9 +108,13 @@ def shards(out: Path) -> int:
     return len([path for path in (out / "shards").glob("*") if not path.name.startswith(".")])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("workers", "spread"), [(1, {}), (2, {}), (2, {"target_position": 0.15, "base_mass": 0.1})]
+    ("workers", "spread"),
+    [
+        pytest.param(1, {}, marks=pytest.mark.slow),
+        pytest.param(2, {}, marks=pytest.mark.endurance),
+        pytest.param(2, {"target_position": 0.15, "base_mass": 0.1}, marks=pytest.mark.endurance),
+    ],
 )
 def test_killed_at_random_moments_it_ends_with_the_same_bytes(
     scene_file: str, workers: int, spread: dict[str, float], tmp_path: Path

@@ -43,6 +43,7 @@ def change_metadata(data: Path, change: Callable[[dict[str, Any]], None]) -> Non
     (data / "metadata.json").write_text(json.dumps(metadata))
 
 
+@pytest.mark.slow
 def test_it_comes_back(data: Path, whole: Demonstrations, tmp_path: Path) -> None:
     found = read_from_minari(ID, tmp_path / "copy")
     assert len(found) == 3
@@ -54,6 +55,7 @@ def test_it_comes_back(data: Path, whole: Demonstrations, tmp_path: Path) -> Non
     assert [each.cost for each in again] == [each.cost for each in found]
 
 
+@pytest.mark.slow
 def test_nothing_that_it_names_is_called(data: Path, tmp_path: Path) -> None:
     """Without its spaces, Minari makes the environment of a data set: any function of any module."""
 
@@ -125,6 +127,7 @@ def have_text(file: Any) -> None:
     file["episode_1"].attrs["cost"] = "x"
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -148,6 +151,7 @@ def abort(*arguments: object) -> None:
     os.abort()
 
 
+@pytest.mark.slow
 def test_a_crash_of_hdf5_is_a_sentence(
     data: Path, whole: Demonstrations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -112,6 +112,7 @@ def newton_euler_accelerations(case):
     return np.array([*bodies[0][1:4], *bodies[0][5:8], *joints], dtype=float)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("wrench", [False, True])
 @pytest.mark.parametrize("joints", range(8))
 def test_all_formulations_agree_with_pinocchio_13_to_22(joints, wrench):

@@ -104,6 +104,7 @@ def test_both_states_describe_the_same_motion(name: str) -> None:
     np.testing.assert_allclose(rates[: 8 + count + wrist], moving, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_papers_form_has_rotors_and_refuses_what_it_has_no_rows_for() -> None:
     motor = {"inertia": 2e-4, "gear": -30.0, "friction": 0.2, "friction_speed": 0.3}
     scene = load_scene("no-wrist").replace({f"links.{i}.motor": motor for i in (0, 2)})

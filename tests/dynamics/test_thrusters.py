@@ -79,6 +79,7 @@ def test_a_jet_is_off_below_zero_and_fires_no_pulse_shorter_than_its_shortest() 
     np.testing.assert_array_equal(layout.lower_limits(layout.control_limit), np.zeros(4))
 
 
+@pytest.mark.slow
 def test_the_expert_only_pushes_and_the_environment_flies_its_plan() -> None:
     from experts import GuidedDDP
 

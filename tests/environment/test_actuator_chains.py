@@ -46,6 +46,7 @@ def test_the_state_ends_with_what_is_on_its_way():
     np.testing.assert_allclose(new[5::2], decay[1] * old[5::2] + (1 - decay[1]) * old[4::2], atol=1e-15)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_the_motion_sees_the_mean_of_the_outputs(integrator):
     kernels, x, u = point(CHAINED)
@@ -75,6 +76,7 @@ def differences(function, size, step=1e-3):
     return np.array(rows).T
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_derivatives_agree_with_differences(integrator):
     kernels, x, u = point(CHAINED)
@@ -90,6 +92,7 @@ def test_derivatives_agree_with_differences(integrator):
     )
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_those_of_the_motion_seen_through_the_chains():
     kernels, x, u = point(CHAINED)
     multiplier = np.random.default_rng(1).standard_normal(kernels.n_t)

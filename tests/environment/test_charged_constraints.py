@@ -55,6 +55,7 @@ def test_costs_are_violations_over_tolerances():
     assert charged > 0.0
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("mode", list(AutoresetMode)[:2])
 def test_vector_environments_charge_the_same_to_the_bit(mode):
     single = [DQSpaceArmEnv(CONSTRAINED) for _ in range(3)]
@@ -84,6 +85,7 @@ def test_margins_are_observed():
     np.testing.assert_array_equal(np.delete(seen, -2), without)
 
 
+@pytest.mark.slow
 def test_a_violation_may_end_the_episode_and_never_pays():
     """The end is charged with at least what the rest of the episode would have cost."""
     ending = scene({**LIMITS, "terminates": True})

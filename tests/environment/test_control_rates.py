@@ -30,6 +30,7 @@ def rates_and_point(seed=0):
     return kernels, compile_scene(PLAIN), x, rng.uniform(-1.0, 1.0, kernels.n_u)
 
 
+@pytest.mark.slow
 def test_the_state_ends_with_the_controls_before():
     kernels, plain, x, u = rates_and_point()
     layout = kernels.layout
@@ -43,6 +44,7 @@ def test_the_state_ends_with_the_controls_before():
         np.testing.assert_allclose(after[:n], plain.step(x[:n], u, integrator=integrator), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_step_are_those_of_the_motion_and_ones():
     kernels, plain, x, u = rates_and_point()
     n_x, n_t, kept = plain.n_x, plain.n_t, list(kernels.layout.previous_controls)
@@ -67,6 +69,7 @@ def hessian(kernels: Kernels, x, u, multiplier):
     return np.block([[xx, ux.T], [ux, uu]])
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_those_of_the_motion():
     kernels, plain, x, u = rates_and_point()
     n_t = plain.n_t

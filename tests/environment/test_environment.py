@@ -45,6 +45,7 @@ assert not heavy & set(sys.modules)
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", list_scenes())
 def test_check_env_has_no_complaint(scene):
     with warnings.catch_warnings():
@@ -104,6 +105,7 @@ def test_reward_is_the_papers_formula_step_by_step():
         assert charged == pytest.approx(terms, rel=1e-12)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", list_scenes())
 def test_observation_is_what_the_documentation_says(scene):
     env = make(short(scene, steps=20))

@@ -99,6 +99,7 @@ def test_an_info_that_says_nothing_of_a_divergence_reports_none():
     assert lost[1] < sound[1]
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     "scene",

@@ -135,6 +135,7 @@ def test_pushes_change_velocities_and_noise_only_what_is_measured(scene):
     np.testing.assert_allclose(others, 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_masses_differ_from_the_scene(scene):
     start = np.tile(compile_scene(scene).layout.initial_state, (3, 1))
     factors = [1.3, 1.0, 1.3]

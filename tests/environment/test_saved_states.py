@@ -65,6 +65,7 @@ def check(env, other, *, seed):
         assert_same(fly(again, 2 * LENGTH), expected)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", list_scenes())
 def test_a_single_environment_goes_on(name):
     check(*(gymnasium.make("DQSpaceArm-v0", scene=short(name, LENGTH)) for _ in range(2)), seed=3)
@@ -74,6 +75,7 @@ def test_a_goal_environment_goes_on():
     check(*(gymnasium.make("DQSpaceArmGoal-v0", scene=DRAWN) for _ in range(2)), seed=3)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("name", list_scenes())
 def test_a_vector_environment_goes_on(name, mode):

@@ -48,6 +48,7 @@ CASES += [("paper", "float64", copies, mode) for copies in (1, 3, 11) for mode i
 CASES += [(name, "float32", 19, mode) for name in ("paper", "random-masses", "planar") for mode in MODES]
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(("scene", "precision", "copies", "mode"), CASES)
 def test_bits_are_those_of_single_environments_over_several_episodes(scene, precision, copies, mode):
     native, sync = twins(short(scene, 5, precision), copies, mode)

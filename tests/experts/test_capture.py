@@ -10,7 +10,10 @@ from experts import GuidedDDP
 
 @pytest.mark.parametrize(
     "name",
-    ["capture-and-detumble", *(pytest.param(n, marks=pytest.mark.slow) for n in ("release", "refuelling"))],
+    [
+        pytest.param("capture-and-detumble", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.endurance) for name in ("release", "refuelling")),
+    ],
 )
 def test_plans_across_phases_succeed_in_the_environment(name: str) -> None:
     """From drawn starts: the plan's cost is the episode's, and the payload is caught and brought to rest."""

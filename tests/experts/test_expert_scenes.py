@@ -73,6 +73,7 @@ NOT_THERE = (*MOVING, *TWO_TARGETS, *TWO_TIPS, *VIOLATED_THERE)
 AT_REST = [case for case in EVERY_SCENE if case.values[0] not in NOT_THERE]
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("solver", [BoxDDP, GuidedDDP])
 @pytest.mark.parametrize("scene", AT_REST)
 def test_a_start_at_the_target_has_converged(scene, solver):

@@ -42,6 +42,7 @@ def fly(expert, p, measure=lambda x, k: x):
     return cost + kernels.terminal_cost(x, p=p), maneuver.misses(x), np.array(actions)
 
 
+@pytest.mark.slow
 def test_with_unknown_springs_only_who_estimates_them_reaches_the_target(experts):
     expert = experts[True]
     p = world(expert.maneuver.kernels, SPRINGS, {})

@@ -28,6 +28,7 @@ def replay(env: DQSpaceArmEnv, solution: Solution) -> tuple[float, dict[str, Any
     return total, info
 
 
+@pytest.mark.slow
 def test_the_tip_follows_a_target_along_a_screw() -> None:
     """Within a millimeter from the fourth second on, where the file says so."""
     solution = GuidedDDP("tracking").solve()

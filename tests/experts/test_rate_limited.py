@@ -24,6 +24,7 @@ def changes(solution, problem):
     return change.max(axis=0) / problem.rate_limits.change
 
 
+@pytest.mark.slow
 def test_maneuver_keeps_to_the_rates():
     plain, solver = BoxDDP(PLAIN).solve(), BoxDDP(LIMITED)
     problem = solver.problem
@@ -41,6 +42,7 @@ def test_maneuver_keeps_to_the_rates():
     assert changes(solver.solve(u_init=plain.controls), problem).max() <= 1.0 + 1e-12
 
 
+@pytest.mark.slow
 def test_interior_point_method_finds_the_same_maneuver():
     scene = LIMITED.replace(simulation={"steps": 50, "dt": 0.3})
     problem = ArmProblem(scene)

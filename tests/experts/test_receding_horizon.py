@@ -66,6 +66,7 @@ def fly(truth, control, noise=0.0, push=0.0, seed=0):
     return cost + truth.terminal_cost(x), np.degrees(angle), distance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 def test_undisturbed_it_costs_no_more_than_the_full_horizon(scene, plans, experts):
     """The model of what remains beyond the horizon is exact along the plan."""
@@ -76,6 +77,7 @@ def test_undisturbed_it_costs_no_more_than_the_full_horizon(scene, plans, expert
     assert experts[scene].fallbacks == 0
 
 
+@pytest.mark.slow
 def test_noise_on_the_state_hardly_costs_anything(plans, experts):
     """Noise of 0.01 rad, m, rad/s, m/s; controls that answer noise cost effort, so a little is lost."""
     cost, angle, distance = fly(compile_scene("paper"), closed_loop(experts["paper"]), noise=0.01)

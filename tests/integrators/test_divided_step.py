@@ -32,6 +32,7 @@ def test_an_accurate_step_is_the_whole_step_to_the_bit(scene, name):
     np.testing.assert_array_equal(end, kernels.step(x, u, integrator=name))
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", EMBEDDED)
 @pytest.mark.parametrize("tolerance", [1e-5, 1e-8])
 def test_a_fast_step_is_as_accurate_as_asked(scene, name, tolerance):

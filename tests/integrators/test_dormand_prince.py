@@ -101,6 +101,7 @@ def test_the_environment_simulates_with_it_and_reports_a_failure():
     assert np.isfinite(observation).all()
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", ["paper", "planar"])
 def test_derivatives_over_many_shares_agree_with_differences(scene):
     """Shares are held fixed in the derivatives: what differences see of their changes is of the tolerance."""

@@ -23,6 +23,7 @@ STEPS = {"dormand_prince": (12, 24), "rk6": (8, 16), "rk8": (6, 10)}
 STEPS_OF_SIX_JOINTS = {"dormand_prince": (180, 360), "rk6": (40, 80), "rk8": (30, 50)}
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", ["paper", "planar", "tip-load", "six-joint"])
 @pytest.mark.parametrize("name", HIGHER)
 def test_errors_fall_with_the_order_of_the_method(name, scene):
@@ -123,6 +124,7 @@ def test_a_body_spun_about_its_middle_axis_flips_after_half_an_analytic_period()
     np.testing.assert_allclose(np.diff(crossings), flip, rtol=1e-7)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", HIGHER)
 @pytest.mark.parametrize("scene", ["paper", "planar"])
 def test_single_precision_keeps_its_digits_and_batches_the_bits_of_single_states(name, scene):

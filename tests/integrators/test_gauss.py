@@ -23,6 +23,7 @@ def test_coefficients_are_those_of_collocation_at_gauss_points():
         np.testing.assert_allclose((b * c ** (k - 1)) @ a, b * (1.0 - c**k) / k, atol=1e-16)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(
     ("scene", "first"), [("paper", 4), ("planar", 4), ("tip-load", 4), ("six-joint", 32)]
 )
@@ -90,6 +91,7 @@ def symplectic_form(kernels, x):
     return form
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [0.0, 100.0])
 def test_a_step_is_symplectic(stiffness):
     """A' form(x+) A = form(x), whatever the step; the methods beside it are off by their errors."""

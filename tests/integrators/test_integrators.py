@@ -37,6 +37,7 @@ def test_agrees_with_dop853_on_the_vector_field_of_8_and_22(name, refinement, to
     np.testing.assert_allclose(final, exact_motion(kernels, x, u, 3.0), atol=tolerance)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_the_pose_stays_a_unit_dual_quaternion(name):
     kernels = compile_scene("tumbling")
@@ -47,6 +48,7 @@ def test_the_pose_stays_a_unit_dual_quaternion(name):
     assert (np.abs((real * dual).sum(axis=1)) / (1.0 + np.linalg.norm(dual, axis=1))).max() < 1e-15
 
 
+@pytest.mark.slow
 def test_a_screw_motion_is_exact_whatever_the_step():
     """A single body spinning about a principal axis moves along a screw: no error (8).
 
@@ -83,6 +85,7 @@ def test_free_motion_of_1500_s_keeps_momentum_and_energy():
         assert np.ptp(states[:, kernels.layout.state.joint_angles], axis=0).min() > 1.0
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", ["momentum_rk4", "rodas4", "gauss6"])
 def test_an_environment_steps_by_the_method_that_its_scene_names(name):
     scene = load_scene("planar").replace(simulation={"dt": 0.015, "steps": 20, "integrator": name})

@@ -78,6 +78,7 @@ def exact(programs: ScenePrograms, x: np.ndarray, u: np.ndarray, h: float) -> np
     return solve_ivp(rates, (0.0, h), x, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_a_step_errs_by_the_power_of_its_order(name: str, programs: ScenePrograms) -> None:
     entry = INTEGRATORS[name]
@@ -91,6 +92,7 @@ def test_a_step_errs_by_the_power_of_its_order(name: str, programs: SceneProgram
     assert errors[0] / errors[1] > 0.65 * 2.0 ** (entry.order + 1) or errors[1] < 1e-14
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_derivatives_of_a_step_are_its_complex_steps(name: str, programs: ScenePrograms) -> None:
     layout, h = programs.layout, 0.05

@@ -47,6 +47,7 @@ def center_of_mass(kernels, states):
     return total / sum(body.mass for body in bodies)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", ["paper", "free-floating", "planar", "six-joint", "payload"])
 @pytest.mark.parametrize("name", METHODS)
 def test_internal_torques_keep_the_momentum_to_rounding(name, scene):
@@ -159,6 +160,7 @@ def test_single_precision_follows_double_precision(name):
     assert drift(single, states) < 1e-5
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", METHODS)
 def test_masses_drawn_for_each_episode_reach_the_method(name):
     """With masses as parameters of the machine code, the method agrees with RK4 up to their errors."""

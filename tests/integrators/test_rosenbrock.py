@@ -45,6 +45,7 @@ def test_tableaus_are_consistent_and_l_stable(name):
     assert np.log2(errors[1] / errors[0]) > tableau.order + 0.8
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(
     ("scene", "stiffness"), [("paper", 0.0), ("paper", 30.0), ("no-wrist", 5.0), ("tip-load", 0.0)]
 )
@@ -64,6 +65,7 @@ def test_errors_against_dop853_fall_with_the_order_of_the_method(name, scene, st
     assert orders == pytest.approx(TABLEAUS[name].order, abs=0.3)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     ("stiffness", "damping", "bound"), [(1e2, 20.0, 2e-9), (1e4, 200.0, 2e-9), (1e6, 2000.0, 4e-9)]
@@ -78,6 +80,7 @@ def test_stiff_damped_joints_agree_with_radau(name, stiffness, damping, bound):
     assert np.linalg.norm(kernels.difference(exact, final)) < bound
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("scene", ["paper", "planar"])
 @pytest.mark.parametrize("stiffness", [1e2, 1e4, 1e6, 1e8])
@@ -97,6 +100,7 @@ def test_stiff_springs_never_gain_energy_where_rk4_explodes(stiffness, scene, na
         assert not exploded[-1] < 10.0 * energy[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_soft_and_stiff_joints_get_along(name):
     scene = sprung()
@@ -112,6 +116,7 @@ def test_soft_and_stiff_joints_get_along(name):
     assert np.ptp(angles[:, 2]) < 4e-6
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("stiffness", [0.0, 1e6])
 def test_dampers_of_a_million_stop_the_joints_and_nothing_else(stiffness, name):
@@ -125,6 +130,7 @@ def test_dampers_of_a_million_stop_the_joints_and_nothing_else(stiffness, name):
     assert np.abs(momentum - momentum[0]).max() < 1e-12 * np.linalg.norm(momentum[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_infinite_stiffness_is_a_locked_arm(name):
     """The base then moves as a rigid body with the arm's mass does: Euler's equations about its center."""
@@ -151,6 +157,7 @@ def test_infinite_stiffness_is_a_locked_arm(name):
     assert np.divide(errors[:-1], errors[1:]) == pytest.approx(100.0, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_linearization_of_stiff_steps_agrees_with_differences(name):
     """Of undivided steps: the derivatives of others hold the lengths of their substeps fixed."""
@@ -275,6 +282,7 @@ CELLS = [  # stiffness, damping, deflection, rate, joints
 ]
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     ("scene", "stiffness", "damping", "deflection", "rate", "joints"),
@@ -305,6 +313,7 @@ def test_steps_of_15_ms_are_right_at_finite_deflections(
         assert kernels.momentum(end) == pytest.approx(kernels.momentum(x), abs=1e-12)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("damping", [1e6, 1e8])
 @pytest.mark.parametrize("rate", [0.1, 1.0])
@@ -327,6 +336,7 @@ def test_a_moving_joint_that_meets_a_damper_stops_plastically(rate, damping, nam
     np.testing.assert_allclose(turned, after, atol=5.0 * dt * rate + 20.0 / damping)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_vibration_beyond_the_budget_is_told(name):
     """Energy of 5e5 J: nothing is hidden, whether a state is found or not."""
@@ -339,6 +349,7 @@ def test_a_vibration_beyond_the_budget_is_told(name):
         kernels.checked_step(x, np.zeros(kernels.n_u), integrator="symplectic_euler")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_smaller_tolerance_gives_a_smaller_error(name):
     x, ends = None, []

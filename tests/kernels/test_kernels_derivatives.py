@@ -75,6 +75,7 @@ def scenes_and_integrators():
                 yield pytest.param(scene, integrator, marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scene", "integrator"), list(scenes_and_integrators()))
 def test_linearization_agrees_with_complex_steps(scene, integrator, draw):
     kernels, states, inputs = draw(scene, 3)
@@ -86,6 +87,7 @@ def test_linearization_agrees_with_complex_steps(scene, integrator, draw):
         np.testing.assert_allclose(b[k], expected_b, atol=2e-13)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", robots())
 def test_machine_code_agrees_with_the_interpreted_graph(scene, draw):
     kernels, states, inputs = draw(scene, 2)
@@ -97,6 +99,7 @@ def test_machine_code_agrees_with_the_interpreted_graph(scene, draw):
         np.testing.assert_allclose(found, expected.astype(float), rtol=1e-13, atol=1e-14 * max(10.0, largest))
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", list_scenes())
 def test_cost_derivatives_agree_with_complex_steps(scene, draw):
     kernels, states, inputs = draw(scene, 3)

@@ -33,6 +33,7 @@ def with_stiffness(stiffness, **others):
     return PLANAR.replace({f"links.{i}.motor": motor for i in range(len(PLANAR.links))})
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(
     "integrator",
     [
@@ -56,6 +57,7 @@ def test_derivatives_of_a_step_with_motors_agree_with_complex_steps(integrator, 
         np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_second_derivatives_with_motors_agree_with_differences(draw):
     kernels, states, inputs = draw(DRIVEN, 1)
     check_lagrangian(kernels, "rk4", states[0], inputs[0], 0)

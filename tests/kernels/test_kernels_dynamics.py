@@ -48,6 +48,7 @@ def paper_solution(kernels, x, u):
     return np.array([*base[list(field.pose.directions)], *joints]), np.array(reactions)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", robots())
 def test_minimal_coordinates_and_the_papers_system_agree_to_1e_12(scene, draw):
     kernels, states, inputs = draw(scene, 30)

@@ -29,6 +29,7 @@ def both(draw, scene, count):
     return [kernels, compile_scene(by(scene, "minimal_coordinates"))], states, inputs
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", SCENES)
 def test_accelerations_and_reactions_agree_to_1e_12(name, draw):
     kernels, states, inputs = both(draw, SCENES[name], 10)
@@ -38,6 +39,7 @@ def test_accelerations_and_reactions_agree_to_1e_12(name, draw):
             assert_close(row, right)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(
     "name", [s if s in DIFFERENTIATED else pytest.param(s, marks=pytest.mark.slow) for s in robots()]
 )
@@ -48,6 +50,7 @@ def test_derivatives_of_a_step_agree_to_1e_12(name, draw):
         assert_close(ours, right)
 
 
+@pytest.mark.slow
 def test_second_derivatives_agree(draw):
     kernels, states, inputs = both(draw, load_scene("planar"), 1)
     multiplier, h = np.ones(kernels[0].n_t), np.array([0.1])
@@ -57,6 +60,7 @@ def test_second_derivatives_agree(draw):
         assert_close(ours, right, 1e-11)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(
     ("integrator", "other"),
     [
@@ -74,6 +78,7 @@ def test_steps_of_other_methods_agree_to_1e_12(integrator, other, draw):
     assert_close(found, expected)
 
 
+@pytest.mark.slow
 def test_environments_that_draw_masses_agree():
     scenes = [by(load_scene("random-masses"), each) for each in (DEFAULT, "minimal_coordinates")]
     environments = [DQSpaceArmEnv(scene) for scene in scenes]
@@ -89,6 +94,7 @@ def operations(scene, program, integrator="", **changes):
     return ScenePrograms(scene).build(program, integrator).operation_count
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", ["paper", "planar", "six-joint"])
 def test_without_a_choice_it_is_the_one_with_fewer_operations(name):
     scene = load_scene(name)

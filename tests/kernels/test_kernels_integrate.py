@@ -28,6 +28,7 @@ def followed(kernels, x, u, times, step=1e-3):
     return np.array(states)[np.rint(np.asarray(times) / step).astype(int)]
 
 
+@pytest.mark.slow
 def test_errors_follow_the_tolerance_at_the_ends_of_steps_and_between(arm):
     kernels, x = arm
     u, times = np.zeros(kernels.n_u), np.linspace(0.0, 1.0, 201)
@@ -46,6 +47,7 @@ def test_errors_follow_the_tolerance_at_the_ends_of_steps_and_between(arm):
     assert 1.8 < steps[2] / steps[1] < 3.2
 
 
+@pytest.mark.slow
 def test_the_curve_is_of_order_4_inside_a_step(arm):
     kernels, x = arm
     u, errors = np.zeros(kernels.n_u), []

@@ -11,6 +11,7 @@ from dq_space_arm_env.kernels.bound import KernelCall
 from scripts.benchmarks.robots import robots
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", robots())
 def test_batches_give_the_bits_of_single_states(scene, draw):
     kernels, states, inputs = draw(scene, 11)
@@ -103,6 +104,7 @@ def size_of(scene):
     return {"states": kernels.n_x, "inputs": kernels.n_u, "dynamics": dynamics, "step": step}
 
 
+@pytest.mark.slow
 def test_what_a_scene_does_not_need_is_not_there():
     sizes = {scene: size_of(scene) for scene in list_scenes()}
     paper = sizes["paper"]

@@ -45,6 +45,7 @@ def square(kernels: Kernels, entries: Any, rows: int) -> Any:
     return entries.reshape(rows, -1)
 
 
+@pytest.mark.slow
 def test_gradients_agree_with_differences_of_the_costs(drawn: Any) -> None:
     kernels, states, inputs = drawn
     n_t = kernels.n_t
@@ -66,6 +67,7 @@ def test_gradients_agree_with_differences_of_the_costs(drawn: Any) -> None:
         np.testing.assert_allclose(final, expected, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.sampled
 def test_hessians_of_the_twist_are_gauss_newtons(drawn: Any) -> None:
     """2 J' W J by the twist's exact differences, on top of the Hessian without the twist's weights."""
     kernels, states, inputs = drawn
@@ -105,12 +107,14 @@ def test_hessians_of_the_twist_are_gauss_newtons(drawn: Any) -> None:
         np.testing.assert_allclose(hessian, expected, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_lagrangian_hessian_agrees_with_differences_of_the_gradient(drawn: Any) -> None:
     kernels, states, inputs = drawn
     for seed, (x, u) in enumerate(zip(states, inputs, strict=True)):
         check_lagrangian(kernels, "rk4", x, u, seed)
 
 
+@pytest.mark.sampled
 def test_terminal_cost_hessian_agrees_with_differences_of_the_gradient(drawn: Any) -> None:
     kernels, states, _ = drawn
     for x in states:
@@ -125,6 +129,7 @@ def test_terminal_cost_hessian_agrees_with_differences_of_the_gradient(drawn: An
         np.testing.assert_allclose(hessian, expected, atol=1e-8 * np.abs(expected).max())
 
 
+@pytest.mark.sampled
 def test_the_observation_changes_as_its_jacobian_says(drawn: Any) -> None:
     kernels, states, _ = drawn
     for x in states:

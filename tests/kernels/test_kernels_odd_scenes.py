@@ -85,6 +85,7 @@ def test_everything_else_can_be_asked_for(name, draw):
     np.testing.assert_allclose(kernels.retract(states, np.zeros((3, kernels.n_t))), states, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["base", "wrist"])
 def test_the_expert_solves_scenes_without_joints(name):
     from experts import BoxDDP

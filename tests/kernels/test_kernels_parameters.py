@@ -134,6 +134,7 @@ def cases():
         yield pytest.param(*case, marks=() if case in DEFAULT else pytest.mark.slow)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(("name", "integrator"), list(cases()))
 def test_a_step_is_differentiated_by_parameters(name, integrator):
     scene = scene_of(name)
@@ -177,6 +178,7 @@ def test_costs_are_differentiated_by_parameters(name):
         assert len(actual) == n
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("lanes", [1, native.host_machine().lanes])
 def test_machine_code_agrees_with_the_interpreter(lanes):
     scene = scene_of("planar+")

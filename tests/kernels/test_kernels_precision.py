@@ -12,6 +12,7 @@ def in_single_precision(scene):
     return scene.replace(simulation={"precision": "float32"})
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", robots())
 def test_results_are_single_and_near_those_in_double_precision(scene, draw):
     kernels, states, inputs = draw(scene, 40)

@@ -27,6 +27,7 @@ def make(scene):
     return gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", ["paper", "payload", "planar", "tip-load", "no-wrist"])
 def test_an_episode_is_that_of_a_scene_with_the_drawn_numbers(name):
     """The machine code with parameters against that of a scene in which they are constants."""

@@ -70,6 +70,7 @@ def check_lagrangian(kernels, integrator, x, u, seed, p=None):
     np.testing.assert_allclose(hessian, expected, atol=1e-8 * np.abs(expected).max())
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("integrator", CURVED)
 @pytest.mark.parametrize("scene", SCENES)
 def test_lagrangian_hessian_agrees_with_differences_of_the_gradient(scene, integrator, draw):
@@ -78,6 +79,7 @@ def test_lagrangian_hessian_agrees_with_differences_of_the_gradient(scene, integ
         check_lagrangian(kernels, integrator, x, u, seed)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("integrator", CURVED)
 @pytest.mark.parametrize("scene", ODD_SCENES)
 def test_lagrangian_hessian_of_odd_scenes(scene, integrator, draw):
@@ -85,6 +87,7 @@ def test_lagrangian_hessian_of_odd_scenes(scene, integrator, draw):
     check_lagrangian(kernels, integrator, states[0], inputs[0], 0)
 
 
+@pytest.mark.slow
 def test_lagrangian_hessian_across_a_catch(draw):
     kernels, states, inputs = draw("capture-and-detumble", 2)
     rows, (start,) = kernels.stage_parameters(), np.flatnonzero(kernels.scene.staged.catches)

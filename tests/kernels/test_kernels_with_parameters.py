@@ -63,6 +63,7 @@ FUNCTIONS = {
 }
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_parameters_are_the_numbers_of_the_scene(twins, name):
     kernels, p, constant = twins

@@ -39,6 +39,7 @@ def check(name: str, seeds: range, folder: Path) -> None:
     assert outcome.refused
 
 
+@pytest.mark.sampled
 @pytest.mark.agents
 @pytest.mark.parametrize("name", ALL)
 def test_a_few_mutations(name: str, tmp_path: Path) -> None:

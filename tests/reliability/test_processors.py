@@ -52,6 +52,7 @@ def cases():
                 yield pytest.param(scene, processor, True, marks=pytest.mark.endurance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scene", "processor", "whole"), list(cases()))
 def test_results_are_those_of_this_processor_to_rounding(scene, processor, whole, tmp_path: Path):
     found, expected = results_of(tmp_path, scene, processor, whole), results_of(tmp_path, scene, None, whole)

@@ -169,6 +169,7 @@ def test_grid_lies_below_everything_at_round_numbers() -> None:
         assert len(lines) <= 9
 
 
+@pytest.mark.slow
 def test_files_are_pictures_and_stale_ones_go(short_run: ManeuverRun, tmp_path: Path) -> None:
     settings = dict(matplotlib.rcParams)
     files = write_figures(short_run.maneuver, tmp_path)
@@ -193,6 +194,7 @@ def test_readme_picture_has_its_size(short_run: ManeuverRun, tmp_path: Path) -> 
     assert file.stat().st_size < 250_000
 
 
+@pytest.mark.slow
 def test_only_the_figures_import_matplotlib_and_never_pyplot() -> None:
     code = (
         "import sys, experts.report; assert 'matplotlib' not in sys.modules;"

@@ -125,6 +125,7 @@ def test_shipped_scenes(name: str, tmp_path: Path) -> None:
     assert load_scene(json.loads(json.dumps(scene.model_dump(mode="json", exclude_none=True)))) == scene
 
 
+@pytest.mark.slow
 @settings(derandomize=True, max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=scenes())
 def test_random_scenes(data: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -35,6 +35,7 @@ def test_first_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert is_picture(tmp_path / "first_steps.png")
 
 
+@pytest.mark.slow
 def test_feedback_under_disturbance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--scene", "planar", "--pushes", "0", "0.01", "--out", str(tmp_path)]
     run("feedback_under_disturbance", *options)
@@ -77,6 +78,7 @@ def test_own_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert is_picture(tmp_path / "own_scene.png")
 
 
+@pytest.mark.slow
 @pytest.mark.agents
 def test_train_ppo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("stable_baselines3")

@@ -50,6 +50,7 @@ def test_free_bodies_agree_with_kanes_equations():
         np.testing.assert_allclose(free_bodies(sample).accelerations, right, rtol=1e-14)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("ratio", RATIOS)
 @pytest.mark.parametrize("joints", [1, 3])
 def test_wrenches_and_accelerations_keep_their_digits_at_any_mass_of_the_base(joints, ratio):

@@ -31,6 +31,7 @@ def starts(kernels, count):
     return x
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", [n for n in list_scenes() if n != "six-joint"])
 def test_no_motion_costs_more(name):
     """Accurate motions under inputs at their limits: constant, switching, and along the velocities."""

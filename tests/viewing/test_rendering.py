@@ -50,6 +50,7 @@ LINKLESS = [
 ]
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", [*list_scenes(), *LINKLESS], ids=str)
 @pytest.mark.parametrize(("width", "height"), [(320, 240), (97, 301), (1, 1)])
 def test_scenes_are_drawn_in_view_and_in_any_size(scene, width, height):

@@ -70,6 +70,7 @@ def rays_one_by_one(corners, camera):
     return nearest
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("seed", range(4))
 def test_depth_buffer_agrees_with_rays_cast_one_by_one(seed):
     rng = np.random.default_rng(seed)
@@ -86,6 +87,7 @@ def test_depth_buffer_agrees_with_rays_cast_one_by_one(seed):
     np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("seed", range(4))
 def test_bodies_that_reach_behind_the_camera_are_seen_as_far_as_they_are_before_it(seed):
     """Against rays cast one by one; without cuts at the camera's plane the long faces would be missing."""

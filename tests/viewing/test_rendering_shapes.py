@@ -40,6 +40,7 @@ def bounds(camera, corners):
     return seen.min(axis=0), seen.max(axis=0)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", [n for n in list_scenes() if "geometry:" not in load_scene(n).to_yaml()])
 def test_scenes_without_shapes_look_as_before(name):
     """No shapes, or an empty list of them, leave base, arm, payload and target as they are, to the pixel."""

@@ -11,6 +11,7 @@ from dq_space_arm_env.viewing.replay.flights import prepare
 from dq_space_arm_env.viewing.replay.geometry import direction, smooth_normals, solids_of, view_of
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", list_scenes())
 def test_triangles_enclose_the_volume_of_the_mesh(name):
     """By the divergence theorem; a triangle the wrong way around would take its part away."""
@@ -37,6 +38,7 @@ def test_a_ball_is_shaded_round_and_a_box_is_not():
     np.testing.assert_array_equal(smooth_normals(cube), np.repeat(cube.normals[:, None], 4, axis=1))
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", list_scenes())
 def test_the_points_to_be_seen_surround_every_corner(name, make_flight):
     scene = load_scene(name)

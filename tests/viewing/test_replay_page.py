@@ -26,6 +26,7 @@ def data_of(page):
     return json.loads(DATA.search(page)[1])
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", list_scenes())
 def test_every_scene_has_a_page_without_a_reference_to_anything(name, make_flight):
     scene = load_scene(name)

@@ -12,6 +12,7 @@ from experts.demonstrations import SerialExecutor
 pytestmark = pytest.mark.agents
 
 
+@pytest.mark.slow
 def test_controllers_fly_to_the_target_of_each_flight(drawn):
     found = fly_plans(drawn.scene, [OPEN_LOOP, FEEDBACK], ["training"], 5, SerialExecutor())
     receding = fly_receding(drawn.scene, "training", 5)

@@ -87,6 +87,7 @@ def test_evaluation_seeds_are_fixed_and_their_own():
             evaluation_seeds(PAPER, n)
 
 
+@pytest.mark.slow
 def test_optimal_costs_are_those_of_demonstrations(cache, tmp_path, quick):
     costs = optimal_costs(quick, 30, executor=SerialExecutor())
     from agents.configuration.schema import RESERVED_SEED
@@ -102,6 +103,7 @@ def test_optimal_costs_are_those_of_demonstrations(cache, tmp_path, quick):
     assert (costs.seconds > 0.0).all()
 
 
+@pytest.mark.slow
 def test_optimal_costs_are_computed_once_and_go_on_where_they_were(cache, counting, quick):
     executor = counting(limit=1)
     with pytest.raises(KeyboardInterrupt):

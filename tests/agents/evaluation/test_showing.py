@@ -65,6 +65,7 @@ def test_a_flight_is_that_of_an_evaluation(exported, quick):
     json.dumps(pair.record(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_the_expert_knows_what_an_episode_draws(quick):
     """Target and masses are inputs of the machine code: they are given to a solve."""
     scene = quick.replace(spread={"target_position": 0.2, "link_masses": 0.3})
@@ -93,6 +94,7 @@ def test_the_verb_writes_numbers_and_pictures(exported, tmp_path, capsys):
     assert "-n: 0, should be at least 1" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_verb_draws_the_flight(exported, tmp_path):
     image = pytest.importorskip("PIL.Image")
     options = ["--no-picture", "--out", str(tmp_path), "--gif", str(tmp_path / "flight.gif")]

@@ -104,6 +104,7 @@ def test_new_plans_begin_where_the_flight_went_and_are_optimal(some):
         np.testing.assert_allclose(again.actions[begin:end], rest, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_plans_know_the_target_and_the_masses_of_each_stage(staged):
     plans_know_the_target_and_the_masses(staged)
 

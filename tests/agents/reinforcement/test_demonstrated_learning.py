@@ -122,6 +122,7 @@ def test_critics_are_layer_normalized_and_optimized(trained):
     assert len(list(critic.parameters())) == 2 * (3 * 2 + 2 * 2)
 
 
+@pytest.mark.slow
 def test_the_actor_is_drawn_to_what_was_demonstrated(demonstrations, small_file, flown, tmp_path):
     errors = []
     for weight in (0.0, 100.0):

@@ -39,6 +39,7 @@ def one_thread():
     torch.set_num_threads(threads)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("reward_type", ["sparse", "dense"])
 def test_sampled_rewards_are_those_of_the_sampled_goals(reward_type):
     """Tolerances are so tight that relabelled goals, a few steps away, give both rewards."""

@@ -109,6 +109,7 @@ def trained(scene_file, tmp_path_factory):
     return get
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_training_learns_for_as_many_steps_as_it_was_asked_for(algorithm, trained, scene_file):
     run = trained(algorithm)
@@ -136,6 +137,7 @@ def test_saved_and_exported_policies_act_like_the_model(algorithm, trained):
     assert exported.metadata["observation"] == ("goal" if algorithm == "HER" else "plain")
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_run_resumes_with_optimizer_and_buffer(algorithm, trained, scene_file, tmp_path):
     """Killed after its first checkpoint: what a new process reads there is what was written.

@@ -158,6 +158,7 @@ def row_of(comparison, condition, name):
     return row
 
 
+@pytest.mark.slow
 def test_controllers_are_compared_start_by_start(comparison, demonstrations):
     gains = row_of(comparison, "as-planned", FEEDBACK).evaluation
     assert gains.median_cost_gap.value == pytest.approx(0.0, abs=1e-9)
@@ -306,6 +307,7 @@ def test_corrections_see_the_target_of_each_plan(drawing):
     np.testing.assert_allclose(seen[:, : kernels.n_x + 1], expected, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_receding_horizon_plans_with_what_it_is_told(drawing):
     scene, drawn = drawing
     expert = RecedingHorizon(scene, 20)

@@ -163,6 +163,7 @@ def test_warm_start_from_the_solution_needs_no_iteration(pendulum):
     np.testing.assert_array_equal(again.feedback_gains, solution.feedback_gains)
 
 
+@pytest.mark.slow
 def test_solver_can_be_used_again(unicycle):
     solver = BoxDDP(unicycle)
     first = solver.solve()
@@ -202,6 +203,7 @@ def test_idle_iterations_are_a_plateau_not_convergence(pendulum):
     assert solution.optimality > 0.1
 
 
+@pytest.mark.slow
 def test_a_regularized_step_with_no_predicted_reduction_is_not_convergence(pendulum):
     solution = BoxDDP(pendulum, initial_regularization=1e9).solve()
     assert solution.converged

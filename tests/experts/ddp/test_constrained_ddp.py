@@ -189,8 +189,15 @@ def test_multipliers_of_another_problem_are_refused():
         BoxDDP(scene).solve(multipliers=np.zeros((1001, 99)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CONSTRAINED)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(
+            name, marks=pytest.mark.slow if name in ("joint-limits", "plume") else pytest.mark.endurance
+        )
+        for name in CONSTRAINED
+    ],
+)
 def test_random_starts_keep_to_the_constraints(name):
     solver, kernels = GuidedDDP(name), compile_scene(name)
     env = DQSpaceArmEnv(name)

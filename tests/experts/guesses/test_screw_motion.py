@@ -162,6 +162,7 @@ def test_the_path_begins_with_the_velocity_of_the_tip(scene):
 # The arm ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", robots())
 @pytest.mark.parametrize("seed", [None, 0])
 def test_every_robot_gets_a_finite_guess_within_its_limits(scene, seed):

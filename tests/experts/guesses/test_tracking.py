@@ -14,6 +14,7 @@ def test_what_obeys_the_dynamics_is_repeated(unicycle):
     assert cost == pytest.approx(solution.cost, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_the_gains_are_those_of_the_regulator(double_integrator):
     """Around rest at the origin they steer a deviation as the optimal controls do.
 

@@ -132,6 +132,7 @@ def optimum_of_ipopt(problem, example, solution, p=()):
     return found.value(cost), np.reshape(found.value(u), (problem.n_controls, -1)).T
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(
     ("second_order", "tolerance", "gap"),
     [("gauss_newton", 1e-7, 1e-5), ("hybrid", 1e-12, 1e-7)],
