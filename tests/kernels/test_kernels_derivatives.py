@@ -75,7 +75,7 @@ def scenes_and_integrators():
                 yield pytest.param(scene, integrator, marks=pytest.mark.slow)
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize(("scene", "integrator"), list(scenes_and_integrators()))
 def test_linearization_agrees_with_complex_steps(scene, integrator, draw):
     kernels, states, inputs = draw(scene, 3)
