@@ -306,12 +306,19 @@ class Scene(Model):
 
     def _previous_control_problems(self) -> Iterator[Problem]:
         """Find controls before the episode that are not those whose rates are limited."""
-        given, limited = self.initial_state.previous_controls, previous_controls(self)
+        given, place = self.initial_state.previous_controls, ("initial_state", "previous_controls")
+        controls = [each for numbers in control_numbers(self).values() for each in numbers]
+        limited = [controls[index] for index in previous_controls(self)]
         if given and len(given) != len(limited):
-            controls = [each.name for numbers in control_numbers(self).values() for each in numbers]
-            names = ", ".join(controls[index] for index in limited) or "constraints limit no control's rate"
+            names = ", ".join(each.name for each in limited) or "constraints limit no control's rate"
             sentence = f"must be {len(limited)} numbers ({names}); it has {len(given)}"
-            yield Problem(("initial_state", "previous_controls"), given, sentence)
+            yield Problem(place, given, sentence)
+            return
+        for index, value in enumerate(given):
+            control = limited[index]
+            if abs(value) > control.limit.nominal:
+                sentence = f"must be within the limit of {control.name}, {control.limit.nominal:g}"
+                yield Problem((*place, index), value, sentence)
 
     def _planar_problems(self) -> Iterator[Problem]:
         """Find what leaves the x-y plane or turns about another axis than z."""

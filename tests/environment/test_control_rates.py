@@ -137,14 +137,16 @@ def test_vector_and_goal_environments_see_the_same():
 
 def test_the_control_before_the_episode_is_given():
     count = len(compile_scene(LIMITED).layout.previous_controls)
-    given = LIMITED.replace(initial_state={"previous_controls": np.arange(1.0, count + 1.0).tolist()})
+    given = LIMITED.replace(initial_state={"previous_controls": np.linspace(0.5, 1.5, count).tolist()})
     env = DQSpaceArmEnv(given)
     env.reset(seed=1)
-    np.testing.assert_array_equal(env.state[-count:], np.arange(1.0, count + 1.0))
+    np.testing.assert_array_equal(env.state[-count:], np.linspace(0.5, 1.5, count))
     with pytest.raises(SceneError, match=rf"must be {count} numbers \(base torque z, "):
         LIMITED.replace(initial_state={"previous_controls": [1.0]})
     with pytest.raises(SceneError, match="limit no control's rate"):
         PLAIN.replace(initial_state={"previous_controls": [1.0]})
+    with pytest.raises(SceneError, match=r"previous_controls\[0\] = 99.0: must be within the limit of base"):
+        LIMITED.replace(initial_state={"previous_controls": [99.0] * count})
 
 
 def test_each_joint_wheel_and_thruster_may_have_a_rate_of_its_own():
