@@ -1,13 +1,15 @@
 # make paper   solve and replay the paper's maneuver: figures and table in results/paper
 # make docs    bring generated parts of the pages up to date, build the documentation in results/docs
-# make test    lint, import contracts, types, tests; with CI set also the slow tests, the quick benchmarks, and the
-#              tests of the extras agents and ray (skipped otherwise: PyTorch is a download of gigabytes)
+# make test    lint, import contracts, types, tests; with CI set also the slow tests, the quick benchmarks (but
+#              stability, whose cases are slow tests), and the tests of the extras agents and ray (skipped
+#              otherwise: PyTorch is a download of gigabytes)
 # make clean   remove the virtual environment and the results
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 COMMA := ,
+BENCHMARKS := work-precision scene-cost solvers throughput rendering
 TEST := test$(if $(CI),$(COMMA)agents$(COMMA)ray)
 
 .PHONY: paper docs test lint lock clean
@@ -21,7 +23,7 @@ docs: $(VENV)/installed-docs
 
 test: $(VENV)/installed-$(TEST) lint
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal $(if $(CI),-m "not endurance")
-	$(if $(CI),$(BIN)/python -m scripts.benchmarks --quick)
+	$(if $(CI),$(BIN)/python -m scripts.benchmarks --quick $(BENCHMARKS))
 
 lint: $(VENV)/installed-$(TEST)
 	$(BIN)/ruff check .
