@@ -58,8 +58,9 @@ def test_derivatives_of_a_step_with_motors_agree_with_complex_steps(integrator, 
 
 
 @pytest.mark.slow
-def test_second_derivatives_with_motors_agree_with_differences(draw):
-    kernels, states, inputs = draw(DRIVEN, 1)
+def test_second_derivatives_with_motors_and_a_wheel_agree_with_differences(draw):
+    wheel = {"axis": [0, 0, 1], "inertia": 0.01, "torque": 1.0}
+    kernels, states, inputs = draw(DRIVEN.replace({"actuators.wheels": [wheel]}), 1)
     check_lagrangian(kernels, "rk4", states[0], inputs[0], 0)
 
 
