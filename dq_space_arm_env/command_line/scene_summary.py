@@ -194,6 +194,7 @@ def _state_parts(layout: StateLayout) -> list[tuple[str, slice, str]]:
         ("motor angles of elastic joints", state.motor_angles, _units(state.units[state.motor_angles])),
         ("motor rates of elastic joints", state.motor_rates, _units(state.units[state.motor_rates])),
         ("axial momenta of the wheels", state.wheel_momenta, "N m s"),
+        ("mass of the propellant", state.propellant, "kg"),
         ("previous controls", state.actuators, _units(state.units[state.actuators])),
         ("commands on their way and outputs", state.drives, _units(state.units[state.drives])),
     ]

@@ -11,7 +11,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
 from dq_space_arm_env.dynamics import elastic_gears, minimal, reaction_wheels
 from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of, reaction_wrenches
-from dq_space_arm_env.dynamics.jets import net_wrench
+from dq_space_arm_env.dynamics.jets import burnt, net_wrench
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
 from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
@@ -38,6 +38,7 @@ class Motion:
     motor_rates: Sequence[Scalar]  # of elastic joints, rad/s
     previous_controls: Sequence[Scalar]  # those of the layout, N, N m, rad/s
     wheel_momenta: Sequence[Scalar]  # axial, N m s
+    propellant: Sequence[Scalar]  # mass left in the tank, kg; empty without one
     drives: Sequence[Scalar]  # commands on their way and outputs, those of the layout's chains
     wrist_rates: Sequence[Scalar]  # psi, theta, phi, rad/s, where they are states; else empty
 
@@ -51,6 +52,7 @@ class Inputs:
     joint_torques: Sequence[Scalar]  # n, N m
     wrist_rates: Sequence[Scalar]  # psi, theta, phi rates, rad/s; empty without a wrist
     wheel_torques: Sequence[Scalar] = ()  # of the motors on the wheels, N m
+    propellant_rates: Sequence[Scalar] = ()  # change of what is left in the tank, kg/s
 
 
 class EquationsOfMotion:
@@ -111,6 +113,7 @@ class EquationsOfMotion:
             part(layout.state.motor_rates),
             part(layout.state.actuators),
             part(layout.state.wheel_momenta),
+            part(layout.state.propellant),
             part(layout.state.drives),
             self._wrist_rates(part(layout.state.drives)),
         )
@@ -142,8 +145,9 @@ class EquationsOfMotion:
             wrist = [0.0, 0.0, 0.0]
         net_force: Sequence[Scalar] = spread(force, (0, 1) if planar else (0, 1, 2), 3) if force else ZERO
         net_torque: Sequence[Scalar] = spread(torque, (2,) if planar else (0, 1, 2), 3) if torque else ZERO
+        jets = list(u[layout.control.thruster_force])
         if self.tree.jets:
-            by_jets = net_wrench(self.tree.jets, list(u[layout.control.thruster_force]))
+            by_jets = net_wrench(self.tree.jets, jets)
             net_force, net_torque = add(net_force, by_jets[0]), add(net_torque, by_jets[1])
         return Inputs(
             force=net_force,
@@ -151,7 +155,12 @@ class EquationsOfMotion:
             joint_torques=torques,
             wrist_rates=wrist,
             wheel_torques=list(u[layout.control.wheel_torque]),
+            propellant_rates=[] if self.tree.tank is None else [-burnt(self.tree.jets, jets)],
         )
+
+    def loaded(self, motion: Motion) -> KinematicTree:
+        """The tree with what is left of the propellant in its base."""
+        return self.tree.with_propellant(motion.propellant)
 
     def _tip(self, motion: Motion) -> tuple[Any, Any]:
         """Rotation and position of the tip in the frame of the body that carries it."""
@@ -186,12 +195,12 @@ class EquationsOfMotion:
 
     def _inertia(self, motion: Motion, *, many: bool = False) -> Inertia:
         frames = minimal.link_frames(self.tree, motion.joint_angles)
-        return inertia_of(self._formulation, self.tree, frames, many=many)
+        return inertia_of(self._formulation, self.loaded(motion), frames, many=many)
 
     def _solve(
         self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None, inertia: Inertia
     ) -> Accelerations:
-        return forward_dynamics(self.tree, inertia, *self._driven(motion, inputs, wrench))
+        return forward_dynamics(self.loaded(motion), inertia, *self._driven(motion, inputs, wrench))
 
     def _driven(self, motion: Motion, inputs: Inputs, wrench: Sequence[Scalar] | None) -> tuple[Any, ...]:
         """Rotations of the joints, angular velocity, joint rates, external wrenches and joint torques."""
@@ -239,9 +248,10 @@ class EquationsOfMotion:
 
     def mass_matrix(self, y: Sequence[Scalar]) -> list[list[Scalar]]:
         """Mass matrix by the accelerations (free directions, joints), symmetric."""
-        frames = minimal.link_frames(self.tree, self.motion(y).joint_angles)
+        motion = self.motion(y)
+        frames = minimal.link_frames(self.tree, motion.joint_angles)
         free = (*self.pose.directions, *range(6, 6 + len(self.tree.links)))
-        whole = mass_matrix(self.tree, frames)
+        whole = mass_matrix(self.loaded(motion), frames)
         return [[whole[i][j] for j in free] for i in free]
 
     def bias_forces(self, y: Sequence[Scalar]) -> list[Scalar]:
@@ -252,7 +262,8 @@ class EquationsOfMotion:
         motion = self.motion(y)
         frames = minimal.link_frames(self.tree, motion.joint_angles)
         given = Accelerations(ZERO, cross(motion.angular, motion.linear), [0.0] * len(self.tree.links))
-        needed = minimal.inverse_dynamics(self.tree, frames, motion.angular, motion.joint_rates, given)
+        rates = motion.angular, motion.joint_rates
+        needed = minimal.inverse_dynamics(self.loaded(motion), frames, *rates, given)
         passive = self.passive_torques(motion)
         torque = subtract(needed.torque, self._wheel_torque(motion)) if self.tree.wheels else needed.torque
         dual = [*torque, *needed.force]
@@ -260,10 +271,11 @@ class EquationsOfMotion:
         return [*(dual[i] for i in self.pose.directions), *joints]
 
     def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
-        """Time derivative of y: rates of joints and wrist, accelerations, motors' both, torques on wheels."""
+        """Time derivative of y: rates of joints and wrist, accelerations, motors', wheels', the tank's."""
         motion, inputs = self.motion(y), self.inputs(u)
         bodies = [*motion.joint_rates, *inputs.wrist_rates, *self.accelerations(y, u)]
-        return [*bodies, *self.motor_motion(motion, inputs), *inputs.wheel_torques]
+        motors = self.motor_motion(motion, inputs)
+        return [*bodies, *motors, *inputs.wheel_torques, *inputs.propellant_rates]
 
     def motor_motion(self, motion: Motion, inputs: Inputs) -> list[Scalar]:
         """Time derivative of angles and rates of the motors of elastic joints."""
@@ -276,8 +288,9 @@ class EquationsOfMotion:
 
         A prismatic joint transmits fx, fy [N], tx, ty, tz [N m].
         """
-        driven = self._driven(self.motion(y), self.inputs(u), self.tree.tip_wrench)
-        reactions = reaction_wrenches(self.tree, *driven)
+        motion = self.motion(y)
+        driven = self._driven(motion, self.inputs(u), self.tree.tip_wrench)
+        reactions = reaction_wrenches(self.loaded(motion), *driven)
         transmitted = [
             (*force, *torque[:2]) if link.screw.turn else (*force[:2], *torque)
             for link, (force, torque) in zip(self.tree.links, reactions, strict=True)
@@ -290,7 +303,8 @@ class EquationsOfMotion:
         Besides, the torques that the joints' rotors need.
         """
         frames = minimal.link_frames(self.tree, motion.joint_angles)
-        needed, rotors = minimal.body_wrenches(self.tree, frames, motion.angular, motion.joint_rates, given)
+        rates = motion.angular, motion.joint_rates
+        needed, rotors = minimal.body_wrenches(self.loaded(motion), frames, *rates, given)
         acting = self._acting(motion, Inputs(ZERO, ZERO, [], []), self.tree.tip_wrench)
         pairs = zip(needed, acting, strict=True)
         return [(subtract(a[0], b[0]), subtract(a[1], b[1])) for a, b in pairs], rotors

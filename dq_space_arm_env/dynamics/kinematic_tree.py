@@ -129,6 +129,7 @@ class KinematicTree:
     heavy_base: bool = False  # its nominal mass is beyond 100 times that of all links
     jets: tuple[Jet, ...] = ()  # thrusters
     wheels: tuple[Wheel, ...] = ()  # free to turn: the base's inertia is without their axial ones
+    tank: Vector | None = None  # where propellant is that the base does not contain, in its frame, m
 
     @property
     def bodies(self) -> list[RigidBody]:
@@ -139,6 +140,17 @@ class KinematicTree:
     def parents(self) -> list[int]:
         """Bodies that carry the links, n."""
         return [link.parent for link in self.links]
+
+    def with_propellant(self, masses: Sequence[Scalar]) -> KinematicTree:
+        """The tree whose base contains what is left in its tank, if it has one; masses in kg.
+
+        The frame of the base stays where it is, off the center of mass.
+        """
+        if self.tank is None:
+            return self
+        (mass,) = masses
+        propellant = RigidBody(mass, self.tank, ((0.0,) * 3,) * 3)
+        return replace(self, base=_merged(self.base, propellant), tank=None)
 
     def path_to(self, body: int) -> list[int]:
         """Indices of the links from the base to a body."""
@@ -154,6 +166,7 @@ class KinematicTree:
         wrench, given, masses = scene.tip_wrench, given or {}, _nominal_masses(scene)
         bodies, base = _link_bodies(scene, given), _rigid_body(scene.base, "base", (0.0, 0.0, 0.0), given)
         wheels = tuple(Wheel(wheel.unit_axis, wheel.inertia) for wheel in scene.actuators.wheels or ())
+        tank = scene.actuators.tank
         return cls(
             base=replace(base, inertia=free_inertia(base.inertia, wheels)) if wheels else base,
             links=tuple(
@@ -177,14 +190,20 @@ class KinematicTree:
             planar=scene.base.motion == "planar",
             heaviest=masses.index(max(masses)),
             heavy_base=masses[0] > 100.0 * sum(masses[1:]),
-            jets=tuple(Jet(each.unit_direction, each.moment) for each in scene.actuators.thrusters or ()),
+            jets=tuple(
+                Jet(each.unit_direction, each.moment, 0.0 if tank is None else each.mass_flow)
+                for each in scene.actuators.thrusters or ()
+            ),
             wheels=wheels,
+            tank=None if tank is None else tank.position,
         )
 
 
 def _nominal_masses(scene: Scene) -> list[float]:
-    """Masses of base and links, with the payload where the tip is, kg."""
+    """Masses of base and links, with propellant, and the payload where the tip is, kg."""
     masses = [scene.base.mass, *(link.mass for link in scene.links)]
+    if scene.actuators.tank is not None:
+        masses[0] += scene.actuators.tank.propellant
     if scene.payload is not None:
         masses[scene.tip_body] += scene.payload.mass
     for tip in scene.other_tips:

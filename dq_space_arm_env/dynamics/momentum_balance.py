@@ -79,4 +79,4 @@ class SpaceArmMomentum:
     def _mass_matrix(self, y: Scalars) -> tuple[Motion, MassMatrix]:
         motion = self._field.motion(y)
         frames = minimal.link_frames(self._tree, motion.joint_angles)
-        return motion, DrivenMassMatrix(self._tree, frames)
+        return motion, DrivenMassMatrix(self._field.loaded(motion), frames)

@@ -73,14 +73,14 @@ class SpaceArmField(EquationsOfMotion):
         ]
         response = columns(*(column(*entries) for entries in responses), rows=len(self.body_rate_indices))
         rates = [*motion.joint_rates, *inputs.wrist_rates, *self._dual(motion, solved)]
-        rates += [*self.motor_motion(motion, inputs), *inputs.wheel_torques]
-        simple, wheels = self._simple_jacobians(y), self._wheel_jacobians()
+        rates += [*self.motor_motion(motion, inputs), *inputs.wheel_torques, *inputs.propellant_rates]
+        simple, stored = self._simple_jacobians(y), self._store_jacobians()
         jacobian_y = casadi.vertcat(
-            simple.angles_by_y, response + simple.turning_by_y, simple.motors_by_y, wheels[0]
+            simple.angles_by_y, response + simple.turning_by_y, simple.motors_by_y, stored[0]
         )
         inputs_one_by_one = (self._input_response(inertia, i) for i in range(self.n_u))
         by_u = columns(*inputs_one_by_one, rows=len(self.body_rate_indices))
-        return rates, jacobian_y, casadi.vertcat(simple.angles_by_u, by_u, simple.motors_by_u, wheels[1])
+        return rates, jacobian_y, casadi.vertcat(simple.angles_by_u, by_u, simple.motors_by_u, stored[1])
 
     def _inertial(
         self, y: Sequence[Scalar], rates: Sequence[Scalar], by_y: Matrix, by_u: Matrix
@@ -133,8 +133,10 @@ class SpaceArmField(EquationsOfMotion):
         curvature = curvature + casadi.jacobian(casadi.gradient(bilinear, column(*free)), column(*free))
         # Friction is all that bends in the equations of motors behind elastic gears.
         motors = column(*self.motor_motion(moving, self.inputs([0.0] * n_u)))
-        last = column(*multiplier[n_y - motors.shape[0] :])
-        bent = casadi.hessian(casadi.dot(last, motors), column(*free))[0]
+        state = self.layout.state
+        moved = [*self._in_y(state.motor_angles), *self._in_y(state.motor_rates)]
+        theirs = column(*(multiplier[i] for i in moved))
+        bent = casadi.hessian(casadi.dot(theirs, motors), column(*free))[0]
         curvature = curvature - casadi.substitute(bent, column(*free), casadi.densify(column(*y)))
         curvature = casadi.diagcat(curvature, zeros(n_u, n_u))
         return casadi.sparsify(-(curvature + coupling + coupling.T))
@@ -158,13 +160,17 @@ class SpaceArmField(EquationsOfMotion):
             casadi.jacobian(motors, column(*free_u)),
         )
 
-    def _wheel_jacobians(self) -> tuple[Matrix, Matrix]:
-        """Jacobians of the torques on wheels by y and u."""
-        columns_of_u = self.layout.control.wheel_torque
-        by_u = zeros(len(self.tree.wheels), self.n_u)
-        for row, index in enumerate(range(columns_of_u.start, columns_of_u.stop)):
+    def _store_jacobians(self) -> tuple[Matrix, Matrix]:
+        """Jacobians by y and u of what the inputs alone change: momenta of wheels, mass of propellant."""
+        control, count = self.layout.control, len(self.tree.wheels)
+        rows = count + (0 if self.tree.tank is None else 1)
+        by_u = zeros(rows, self.n_u)
+        for row, index in enumerate(range(control.wheel_torque.start, control.wheel_torque.stop)):
             by_u[row, index] = 1.0
-        return zeros(len(self.tree.wheels), self.n_y), by_u
+        if self.tree.tank is not None:
+            for index, jet in enumerate(self.tree.jets, control.thruster_force.start):
+                by_u[count, index] = -jet.mass_flow
+        return zeros(rows, self.n_y), by_u
 
     def _body_residual_jacobian(self, y: Sequence[Scalar], solved: Accelerations) -> Matrix:
         """Jacobian by y of the body wrenches and joint torques that fixed accelerations need.
@@ -201,7 +207,8 @@ class SpaceArmField(EquationsOfMotion):
         motion = self.motion(y)
         frames = minimal.link_frames(self.tree, motion.joint_angles)
         given = Accelerations(acceleration[:3], acceleration[3:6], acceleration[6:])
-        needed = minimal.inverse_dynamics(self.tree, frames, motion.angular, motion.joint_rates, given)
+        rates = motion.angular, motion.joint_rates
+        needed = minimal.inverse_dynamics(self.loaded(motion), frames, *rates, given)
         tip = self.tip_forces(motion, frames, self.tree.tip_wrench)
         passive = self.passive_torques(motion)
         joints = [

@@ -34,7 +34,8 @@ def joint_motion(scene: Scene) -> JointMotion:
     Returns:
         Square root of the largest eigenvalue of the first, and largest of the second; zeros without any.
     """
-    tree, links = KinematicTree.from_scene(scene), scene.links
+    tank, links = scene.actuators.tank, scene.links
+    tree = KinematicTree.from_scene(scene).with_propellant(() if tank is None else (tank.propellant,))
     slopes = [link.damping + _slope(link.friction) for link in tree.links]
     if not any(link.stiffness or slope or link.is_elastic for link, slope in zip(links, slopes, strict=True)):
         return JointMotion(0.0, 0.0)

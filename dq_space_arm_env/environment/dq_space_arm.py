@@ -92,6 +92,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     Reaction wheels add their axial momenta after the joint rates, N m s, and their torques after the wrist's rates.
     Thrusters add their forces at the end; an action below 0 is off, and a pulse shorter than the shortest does not fire.
+    A tank adds the mass of its propellant after the momenta of wheels, kg; when it is empty the thrusters stop.
     At its largest speed a wheel's torque stops, and a motor takes no more than its power: what then acts is less than the action asks for.
 
     Angles and rates of motors behind elastic gears, rad and rad/s, stand after the joint rates, commands on their way

@@ -75,6 +75,8 @@ def refuse(
         problems.append(f"it has no screw joints, and link {screws[0]!r} has one")
     if scene.actuators.wheels is not None:
         problems.append("it has no reaction wheels: leave them out with replace({'actuators.wheels': None})")
+    if scene.actuators.tank is not None:
+        problems.append("it has no tank that empties: leave it out with replace({'actuators.tank': None})")
     geared = [link.name for link in scene.links if link.motor is not None and link.motor.inertia]
     if rotors and geared and not any(link.is_elastic for link in scene.links):
         problems.append(f"it has no rotors, and link {geared[0]!r} has one: set its motor's inertia to 0")

@@ -172,11 +172,12 @@ def _pinocchio() -> Any:
 
 
 def _equations(scene: Scene) -> EquationsOfMotion:
-    if scene.actuators.wheels is not None:
-        raise SceneError(
-            f"scene {scene.name!r} cannot be written for Pinocchio: its reaction wheels have no place in the "
-            "model; leave them out with replace({'actuators.wheels': None})"
-        )
+    for part, words in (("wheels", "reaction wheels have"), ("tank", "tank, which empties, has")):
+        if getattr(scene.actuators, part) is not None:
+            raise SceneError(
+                f"scene {scene.name!r} cannot be written for Pinocchio: its {words} no place in the model; "
+                f"leave out what is there with replace({{'actuators.{part}': None}})"
+            )
     return EquationsOfMotion(KinematicTree.from_scene(scene), StateLayout.of(scene))
 
 

@@ -15,6 +15,7 @@ from dq_space_arm_env.scene.constraints import (
     JointLimits,
     Momentum,
     Plume,
+    Propellant,
     Terminal,
     TorqueSpeed,
     Volume,
@@ -109,6 +110,8 @@ def rows_of(scene: Scene, each: Constraint) -> list[Row]:
             if math.isfinite(wheel.power):
                 unseen = *common[:3], None
                 rows += [Row(f"{start} power {sign}", "W", *unseen, has_input=True) for sign in "-+"]
+    elif isinstance(each, Propellant):
+        rows.append(Row(each.name, "kg", *common, has_input=True))
     elif isinstance(each, ControlRate):
         for limit in rate_limits(scene, each):
             names = [f"{each.name}: {limit.name} {word}" for word in ("falls", "rises")]

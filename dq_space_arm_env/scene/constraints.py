@@ -282,6 +282,13 @@ class WheelLimits(Constraint):
     kind: Literal["wheel_limits"] = Field(description="'wheel_limits'")
 
 
+class Propellant(Constraint):
+    """Something is left in the tank at the end of each step; residual in kg."""
+
+    kind: Literal["propellant"] = Field(description="'propellant'")
+    reserve: NonNegative = Field(default=0.0, description="least mass of the propellant that is left, kg")
+
+
 class ControlRate(Constraint):
     """Greatest change of controls per second, from step to step; residuals in N, N m, rad/s.
 
@@ -346,6 +353,7 @@ _KINDS: dict[str, type[Constraint]] = {
     "momentum": Momentum,
     "wheel_momentum": WheelMomentum,
     "wheel_limits": WheelLimits,
+    "propellant": Propellant,
     "control_rate": ControlRate,
     "torque_speed": TorqueSpeed,
     "terminal": Terminal,
@@ -373,6 +381,7 @@ AnyConstraint = Annotated[
     | Momentum
     | WheelMomentum
     | WheelLimits
+    | Propellant
     | ControlRate
     | TorqueSpeed
     | Terminal,
@@ -411,13 +420,15 @@ def constraint_problems(scene: Scene) -> Iterator[Problem]:
         elif isinstance(constraint, WheelLimits) and not _has_wheel_limits(scene):
             sentence = "the scene's wheels have no largest speed or power: remove it"
             yield Problem((*here, "kind"), constraint.kind, sentence)
+        elif isinstance(constraint, Propellant):
+            yield from _propellant_problems(scene, here, constraint)
         elif isinstance(constraint, ControlRate):
             yield from _control_rate_problems(scene, here, constraint)
         elif isinstance(constraint, TorqueSpeed) and not limited_motors(scene):
             sentence = "no motor that drives a joint has a stall_torque: remove it"
             yield Problem((*here, "kind"), constraint.kind, sentence)
         if (
-            isinstance(constraint, Plume | ControlRate | TorqueSpeed | Terminal)
+            isinstance(constraint, Plume | Propellant | ControlRate | TorqueSpeed | Terminal)
             and constraint.observed is not None
         ):
             sentence = "must be absent: a residual with the input, or of the end, is not observed"
@@ -446,6 +457,17 @@ def _joint_limit_problems(
             yield Problem((*here, "upper"), upper[index], sentence)
         if not rate[index] > 0.0:
             yield Problem((*here, "rate"), rate[index], "must be greater than 0")
+
+
+def _propellant_problems(
+    scene: Scene, here: tuple[str | int, ...], constraint: Propellant
+) -> Iterator[Problem]:
+    tank = scene.actuators.tank
+    if tank is None:
+        yield Problem((*here, "kind"), constraint.kind, "the scene has no actuators.tank: remove it")
+    elif constraint.reserve >= tank.propellant:
+        sentence = f"must be below the propellant at the start, {tank.propellant:g} kg"
+        yield Problem((*here, "reserve"), constraint.reserve, sentence)
 
 
 def _control_rate_problems(

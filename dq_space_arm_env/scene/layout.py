@@ -1,11 +1,12 @@
 """Layout of the state, the tangent, the controls and the parameters of a scene.
 
 State: base pose, joint angles, wrist angles, base velocity, joint rates, angles and rates of motors behind
-elastic gears, axial momenta of wheels, and what actuators keep from step to step: the previous controls whose
-rates are limited, then commands on their way and outputs. Tangent: the same, with a twist increment of the
-base in base axes (rotation, then translation) in place of the pose. Controls: base force, base torque, joint
-torques of the actuated joints, wrist rates, wheel torques, thruster forces. Parameters: target, bodies from
-base to payload, weights, limits. What a scene does not have is missing; the order stays.
+elastic gears, axial momenta of wheels, mass of the propellant in a tank, and what actuators keep from step to
+step: the previous controls whose rates are limited, then commands on their way and outputs. Tangent: the
+same, with a twist increment of the base in base axes (rotation, then translation) in place of the pose.
+Controls: base force, base torque, joint torques of the actuated joints, wrist rates, wheel torques, thruster
+forces. Parameters: target, bodies from base to payload, weights, limits. What a scene does not have is
+missing; the order stays.
 A planar base keeps only what is not zero by construction: q_r0, q_r3, q_d1, q_d2 of its pose, and omega_z,
 v_x, v_y.
 """
@@ -64,6 +65,7 @@ class _MotionEntries(_Entries):
     motor_angles: slice  # of elastic joints, on the joints' side
     motor_rates: slice  # likewise
     wheel_momenta: slice  # axial, inertial rate, in the order of the scene's wheels
+    propellant: slice  # mass left in the tank
     actuators: slice  # previous controls, those of `StateLayout.previous_controls`
     drives: slice  # commands on their way and outputs, those of `StateLayout.chains`
 
@@ -401,6 +403,7 @@ class _Collector:
             "joint_rates": joint_rates,
             **self.add_motors(scene),
             "wheel_momenta": self.add("N m s", [f"{name} momentum" for name in wheel_names(scene)]),
+            "propellant": self.add("kg", ["propellant mass"] if scene.actuators.tank else []),
             "actuators": self.add_previous_controls(scene),
             "drives": self.add_chains(scene),
         }

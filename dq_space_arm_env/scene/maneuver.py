@@ -8,7 +8,7 @@ from dq_space_arm_env.scene.bodies import Payload
 from dq_space_arm_env.scene.motion import Motion
 from dq_space_arm_env.scene.pose import Pose
 from dq_space_arm_env.scene.shapes import Shape, geometry_field
-from dq_space_arm_env.scene.thrusters import Thrusters
+from dq_space_arm_env.scene.thrusters import Tank, Thrusters
 from dq_space_arm_env.scene.wheels import Wheels
 from dq_space_arm_env.validation.fields import (
     Angles,
@@ -94,6 +94,11 @@ class Actuators(Model):
         default=None,
         exclude_if=lambda thrusters: thrusters is None,
         description="thrusters, one by one: their forces are inputs, zero or greater",
+    )
+    tank: Tank | None = Field(
+        default=None,
+        exclude_if=lambda tank: tank is None,
+        description="tank of the thrusters, whose propellant's mass is a state; absent: masses stay",
     )
 
 

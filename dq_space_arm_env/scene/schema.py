@@ -34,7 +34,7 @@ from dq_space_arm_env.scene.parameters import ACTUATORS, control_numbers, is_par
 from dq_space_arm_env.scene.phases import Phase, StagedNumbers, phase_problems, staged_numbers
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.scene.simulation import Simulation
-from dq_space_arm_env.scene.thrusters import thruster_problems
+from dq_space_arm_env.scene.thrusters import tank_problems, thruster_problems
 from dq_space_arm_env.scene.wheels import wheel_problems
 from dq_space_arm_env.validation.changes import ChangeError, merged, nested
 from dq_space_arm_env.validation.fields import Name
@@ -174,6 +174,7 @@ class Scene(Model):
         yield from self._tumbling_problems()
         yield from wheel_problems(self)
         yield from thruster_problems(self)
+        yield from tank_problems(self)
         yield from self._cost_problems()
         yield from self._parameter_problems()
         if self.phases:

@@ -173,7 +173,8 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     # Elastic gears start unstrained: their motors stand and move as the joints do.
     motors = [part[index] for part in (joint_angles, joint_rates) for index in elastic]
     on_the_way = [0.0 for chain in chains(scene) for _ in chain.names]
-    rates = [*velocity, *joint_rates, *motors, *momenta]
+    propellant = [] if scene.actuators.tank is None else [scene.actuators.tank.propellant]
+    rates = [*velocity, *joint_rates, *motors, *momenta, *propellant]
     state = [*pose, *joint_angles, *wrist_angles, *rates, *previous, *on_the_way]
     return EpisodeStart(state, drawn)
 

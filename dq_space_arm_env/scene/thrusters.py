@@ -1,4 +1,4 @@
-"""Thrusters of a scene, one by one; allocation of forces and torques to them."""
+"""Thrusters of a scene, one by one, and their tank; allocation of forces and torques to them."""
 
 import math
 from collections.abc import Iterator
@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field
 
 from dq_space_arm_env.scene.constraints import Direction
+from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
 from dq_space_arm_env.validation.fields import Limit, Name, Position, Positive, Three
 from dq_space_arm_env.validation.problems import Model, Problem, problem
 
@@ -54,6 +55,11 @@ class Thruster(Model):
         return b * z - c * y, c * x - a * z, a * y - b * x
 
     @property
+    def mass_flow(self) -> float:
+        """Propellant that leaves per force and time, 1 / (I_sp g0), s/m; 0 where it is not counted."""
+        return 0.0 if self.specific_impulse is None else 1.0 / (self.specific_impulse * STANDARD_GRAVITY)
+
+    @property
     def impulse_bit(self) -> float:
         """Impulse of the shortest pulse, N s."""
         if self.minimum_on_time is not None:
@@ -68,6 +74,45 @@ def _read_thrusters(value: Any) -> Any:
 
 
 Thrusters = Annotated[tuple[Thruster, ...], BeforeValidator(_read_thrusters)]
+
+
+class Tank(Model):
+    """A tank in the base that feeds all thrusters; the base gets lighter as they burn its propellant.
+
+    The propellant is a point mass; mass, inertia and frame of the base are those without it.
+    """
+
+    propellant: Positive = Field(description="mass of the propellant at the start, kg")
+    position: Position = Field(
+        default=(0.0, 0.0, 0.0), description="where the propellant is, in the base frame, m"
+    )
+
+
+def tank_problems(scene: Scene) -> Iterator[Problem]:
+    """Find a tank that feeds nothing or leaves the plane, thrusters that burn it at an unknown rate."""
+    tank, here = scene.actuators.tank, ("actuators", "tank")
+    if tank is None:
+        return
+    thrusters = scene.actuators.thrusters or ()
+    if not thrusters:
+        yield Problem(here, tank, "feeds nothing: remove it or add actuators.thrusters")
+    for index, thruster in enumerate(thrusters):
+        if thruster.specific_impulse is None:
+            sentence = "must be given: the tank feeds this thruster"
+            yield Problem(("actuators", "thrusters", index, "specific_impulse"), None, sentence)
+    if scene.base.motion == "planar" and tank.position[2]:
+        sentence = 'base.motion is "planar": the z component must be 0'
+        yield Problem((*here, "position"), tank.position, sentence)
+    if (refusal := burning_refusal(scene.simulation.integrator)) is not None:
+        yield Problem(("simulation", "integrator"), scene.simulation.integrator, refusal)
+
+
+def burning_refusal(integrator: str) -> str | None:
+    """Say why a method cannot integrate a robot that burns propellant; None if it can."""
+    if not INTEGRATORS[integrator].keeps_momentum:
+        return None
+    others = ", ".join(name for name, entry in INTEGRATORS.items() if not entry.keeps_momentum)
+    return f"keeps the momentum, of which burnt propellant takes some along: with actuators.tank use {others}"
 
 
 def thruster_problems(scene: Scene) -> Iterator[Problem]:
@@ -151,7 +196,7 @@ def _non_negative(matrix: Array, wanted: Array) -> Array:
 def fuel_used(scene: Scene, controls: ArrayLike) -> float:
     """Fuel that the thrusters of a maneuver burn: sum f dt / (I_sp g0) over those with a specific impulse.
 
-    The masses of the scene do not change by it.
+    The masses of a scene change by it where `actuators.tank` feeds the thrusters.
 
     Args:
         scene: The scene, with thrusters.
@@ -164,6 +209,5 @@ def fuel_used(scene: Scene, controls: ArrayLike) -> float:
     forces = np.asarray(controls, np.float64)[:, -len(thrusters) :].sum(axis=0) if thrusters else ()
     used = 0.0
     for each, total in zip(thrusters, forces, strict=True):
-        if each.specific_impulse is not None:
-            used += float(total) * scene.simulation.dt / (each.specific_impulse * STANDARD_GRAVITY)
+        used += float(total) * scene.simulation.dt * each.mass_flow
     return used

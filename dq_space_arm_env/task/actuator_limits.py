@@ -12,6 +12,7 @@ from typing import Any
 import casadi
 
 from dq_space_arm_env.dynamics import reaction_wheels
+from dq_space_arm_env.dynamics.jets import burnt
 from dq_space_arm_env.scene.constraint_rows import slew_limits
 from dq_space_arm_env.scene.constraints import limited_motors
 from dq_space_arm_env.scene.schema import Scene
@@ -20,13 +21,14 @@ from dq_space_arm_env.task.equations import SceneEquations, torque_ranges
 Scalar = Any
 Scalars = Sequence[Scalar]
 
+_LEAST_BURN = 1e-30  # kg, below which nothing burns
 _LEAST_SPEED = 1e-9  # rad/s, below which no power limits a wheel's torque
 
 
 def reads_state(scene: Scene) -> bool:
-    """Tell whether what actuators do depends on the state: they slew, or speed leaves motors less torque."""
+    """Tell whether what actuators do depends on the state: they slew, slow down, or burn propellant."""
     limited = (math.isfinite(min(wheel.speed, wheel.power)) for wheel in scene.actuators.wheels or ())
-    return bool(any(limited) or slew_limits(scene) or limited_motors(scene))
+    return bool(any(limited) or scene.actuators.tank or slew_limits(scene) or limited_motors(scene))
 
 
 def applied(equations: SceneEquations, x: Scalars, u: Scalars) -> list[Scalar]:
@@ -43,6 +45,8 @@ def applied(equations: SceneEquations, x: Scalars, u: Scalars) -> list[Scalar]:
             # A pulse of the largest force with the impulse f h; one of the shortest is rounded into it.
             least = (1.0 - 1e-12) * thruster.impulse_bit / scene.simulation.dt
             result[index] = casadi.if_else(result[index] < least, 0.0, result[index])
+    if scene.actuators.tank is not None:
+        _burn(equations, x, result)
     return result
 
 
@@ -53,6 +57,15 @@ def _follow(equations: SceneEquations, x: Scalars, u: list[Scalar]) -> None:
         before = x[layout.state.actuators][layout.previous_controls.index(limit.control)]
         highest, lowest = before + limit.rate * dt, before - limit.rate * dt
         u[limit.control] = casadi.fmin(highest, casadi.fmax(lowest, u[limit.control]))
+
+
+def _burn(equations: SceneEquations, x: Scalars, u: list[Scalar]) -> None:
+    """Keep the thrusters within what is left in the tank: the last of it is shared in proportion."""
+    (left,) = equations.field.motion(equations.y(x)).propellant
+    jets, part = equations.tree.jets, equations.layout.control.thruster_force
+    asked = burnt(jets, u[part]) * equations.scene.simulation.dt
+    share = casadi.fmin(1.0, casadi.fmax(left, 0.0) / casadi.fmax(asked, _LEAST_BURN))
+    u[part] = [share * force for force in u[part]]
 
 
 def _drive(equations: SceneEquations, x: Scalars, u: list[Scalar]) -> None:

@@ -39,7 +39,8 @@ class Catching:
         field, state = self.equations.field, self.equations.layout.state
         motion = field.motion(self.equations.y(x))
         velocities = Velocities(motion.angular, motion.linear, motion.joint_rates)
-        after = capture(self._free, self._loaded, self._payload, motion.joint_angles, velocities, twist)
+        free, loaded = (tree.with_propellant(motion.propellant) for tree in (self._free, self._loaded))
+        after = capture(free, loaded, self._payload, motion.joint_angles, velocities, twist)
         moving = [*after.angular, *after.linear]
         caught = list(x)
         caught[state.base_velocity] = [moving[i] for i in field.pose.directions]

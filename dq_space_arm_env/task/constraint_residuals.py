@@ -48,6 +48,7 @@ from dq_space_arm_env.scene.constraints import (
     Momentum,
     Plume,
     Point,
+    Propellant,
     Terminal,
     TorqueSpeed,
     Volume,
@@ -112,7 +113,8 @@ class _Situation:
 
     def momentum(self) -> tuple[Scalars, Scalars, Scalar]:
         """Linear momentum, angular momentum about the center of mass, base axes; energy."""
-        tree, motion = self.equations.tree, self.motion
+        motion = self.motion
+        tree = self.equations.field.loaded(motion)
         frames = minimal.link_frames(tree, motion.joint_angles)
         twist = (*motion.angular, *motion.linear)
         velocities = kinematics.body_velocities(tree, frames, twist, motion.joint_rates)
@@ -401,6 +403,11 @@ def _wheel_limits(situation: _Situation, constraint: WheelLimits) -> Iterator[Sc
             yield corner * (torque - most)
 
 
+def _propellant(situation: _Situation, constraint: Propellant) -> Iterator[Scalar]:
+    (left,), (rate,) = situation.motion.propellant, situation.inputs.propellant_rates
+    yield constraint.reserve - (left + rate * situation.scene.simulation.dt)
+
+
 def _control_rate(situation: _Situation, constraint: ControlRate) -> Iterator[Scalar]:
     scene, layout = situation.scene, situation.equations.layout
     before = dict(zip(layout.previous_controls, situation.motion.previous_controls, strict=True))
@@ -427,6 +434,7 @@ _RESIDUALS: dict[type[Constraint], Callable[..., Iterator[Scalar]]] = {
     Momentum: _momentum,
     WheelMomentum: _wheel_momentum,
     WheelLimits: _wheel_limits,
+    Propellant: _propellant,
     ControlRate: _control_rate,
     TorqueSpeed: _torque_speed,
 }

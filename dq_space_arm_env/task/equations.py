@@ -234,6 +234,7 @@ class SceneEquations:
             *motion.motor_angles,
             *motion.motor_rates,
             *motion.wheel_momenta,
+            *motion.propellant,
             *motion.previous_controls,
             *motion.drives,
             *([self.given[PHASE]] if self.scene.phases else []),

@@ -2,9 +2,10 @@
 
 With s = sqrt(2 E), E the energy of bodies, rotors and springs, the twist of every body is bounded by s and
 its inertia, so the power of the actuators, and of a wrench at the tip, is at most c s: s' = E' / s <= c.
-Dampers and friction only take energy away. The center of mass gains no more speed than the forces give, and
-the arm reaches no farther from it than when it is stretched out. A target on a screw keeps its speed; one
-that tumbles keeps its energy, so its rate grows at most by the root of the ratio of its moments of inertia.
+Dampers, friction and burnt propellant only take energy away. The center of mass gains no more speed than the
+forces give, and the arm reaches no farther from it than when it is stretched out; a tank that empties moves
+that center, and there the base is as fast as its energy allows. A target on a screw keeps its speed; one that
+tumbles keeps its energy, so its rate grows at most by the root of the ratio of its moments of inertia.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ class WorstCase:
         places = [*(link.joint for link in self.tree.links), self.tree.wrist, self.tree.tip]
         places += [frame for _, frame in self.tree.other_tips]
         lengths = [norm(place.position) for place in places if place is not None]
+        lengths += [] if self.tree.tank is None else [norm(self.tree.tank)]
         self.reach = total([*lengths, *(norm(body.center_of_mass) for body in self.bodies)])
 
     def _base_loads(self) -> tuple[Scalar, Scalar]:
@@ -76,6 +78,8 @@ class WorstCase:
             reach = reach + duration * fastest
         wrench = self.tree.tip_wrench or (0.0,) * 6
         drift = moving + duration * (self.force + norm(wrench[:3])) / self.mass
+        if self.tree.tank is not None:
+            drift = speed / casadi.sqrt(base.mass)
         # The dual part of a pose has half the length of its position; unit quaternions are at most 2 apart.
         start, target = (norm(poses.position(pose)) for pose in (equations.base_pose(x), equations.target))
         if equations.scene.target.motion is not None:  # its body is at |r| = 2 |q_d|
@@ -171,7 +175,8 @@ class WorstCase:
             casadi.sqrt(link.stiffness) * casadi.fabs(angle - link.rest_angle)
             for link, angle in zip(self.tree.links, motion.joint_angles, strict=True)
         ]
-        return casadi.sqrt(self.mass) * moving + casadi.sqrt(moments) * turning + total([*springs, *rotors])
+        mass = total([self.mass, *motion.propellant])
+        return casadi.sqrt(mass) * moving + casadi.sqrt(moments) * turning + total([*springs, *rotors])
 
     def _growth(self) -> Scalar:
         """The bound c: root of the sum of f^2 / m + t' I^-1 t over the bodies' forces f and torques t."""

@@ -229,6 +229,9 @@ class _ArmMotion:
         accelerations = np.diff(states[:, self.arm.velocity_entries], axis=0) / dt
         controls = self._within_bounds(controls + self.arm.controls(states[:-1], accelerations))
         states[1:, entries.wheel_momenta] += dt * np.cumsum(controls[:, control.wheel_torque], axis=0)
+        flows = [each.mass_flow for each in self.kernels.scene.actuators.thrusters or ()]
+        burnt = dt * np.cumsum(controls[:, control.thruster_force] @ np.array(flows))
+        states[1:, entries.propellant] -= burnt[:, None]
         problem.keep_previous(states, controls)
         return ScrewMotion(states, controls)
 

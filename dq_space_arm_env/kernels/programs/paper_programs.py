@@ -33,6 +33,7 @@ class PaperPrograms:
         missing = {
             "elastic gears": any(link.is_elastic for link in scene.links),
             "actuators that lag or delay": bool(self.layout.chains),
+            "tanks": scene.actuators.tank is not None,
         }
         for what, present in missing.items():
             if present:

@@ -66,8 +66,9 @@ class RobotPrograms:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             base, arm = self._tip_columns(x)
             n = len(self.tree.links)
-            angles = self.field.motion(self.equations.y(x)).joint_angles
-            system = MassMatrix(self.tree, minimal.link_frames(self.tree, angles))
+            motion = self.field.motion(self.equations.y(x))
+            frames = minimal.link_frames(self.tree, motion.joint_angles)
+            system = MassMatrix(self.field.loaded(motion), frames)
             for joint in range(n):
                 rates = [1.0 if i == joint else 0.0 for i in range(n)]
                 # -H_b^-1 H_bm: the base moves such that the momentum stays zero.

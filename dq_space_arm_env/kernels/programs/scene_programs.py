@@ -27,6 +27,7 @@ from dq_space_arm_env.kernels.programs.robot_programs import RobotPrograms
 from dq_space_arm_env.kernels.programs.stage_programs import of_stage, stage_method
 from dq_space_arm_env.scene.parameters import moving_numbers
 from dq_space_arm_env.scene.schema import Scene
+from dq_space_arm_env.scene.thrusters import burning_refusal
 from dq_space_arm_env.task.augmented_lagrangian import PenalizedEquations
 from dq_space_arm_env.task.episode import next_target, seen, with_target
 from dq_space_arm_env.task.equations import SceneEquations, total
@@ -83,6 +84,8 @@ class ScenePrograms:
 
     def build(self, name: str, integrator: str = "") -> Program:
         """Trace a program by name, with an integrator if it takes a step; KeyError if either is unknown."""
+        if integrator and self.tree.tank is not None and (why := burning_refusal(integrator)):
+            raise ValueError(f"integrator: {integrator!r} {why}")
         if name in ("step", "step_with_cost", "checked_step"):
             return self._step(name, integrator)
         if name == "walk":
@@ -164,7 +167,8 @@ class ScenePrograms:
     def _momentum(self) -> Program:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             motion, frames, velocities = self._velocities(x)
-            linear, angular, _ = kinematics.momentum(self.tree, frames, velocities, motion.wheel_momenta)
+            tree = self.field.loaded(motion)
+            linear, angular, _ = kinematics.momentum(tree, frames, velocities, motion.wheel_momenta)
             attitude, _ = poses.to_matrix(self.equations.base_pose(x))
             return {"momentum": [*matrix_vector(attitude, linear), *matrix_vector(attitude, angular)]}
 
@@ -174,7 +178,7 @@ class ScenePrograms:
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             motion, _, velocities = self._velocities(x)
             moving = velocities, motion.wheel_momenta
-            kinetic, potential = kinematics.energy(self.tree, motion.joint_angles, *moving)
+            kinetic, potential = kinematics.energy(self.field.loaded(motion), motion.joint_angles, *moving)
             motors = (motion.motor_angles, motion.motor_rates)
             driving = elastic_gears.drive_energy(self.tree, motion.joint_angles, *motors)
             return {"energy": [kinetic + potential + driving]}
@@ -260,7 +264,7 @@ class ScenePrograms:
         n_pose = len(field.pose.stored)
         angles = (state.joint_angles, state.wrist_angles)
         motors = (state.motor_angles, state.motor_rates)
-        kept = (state.wheel_momenta, state.actuators, state.drives)
+        kept = (state.wheel_momenta, state.propellant, state.actuators, state.drives)
         parts = (state.base_velocity, *angles, state.joint_rates, *motors, *kept)
 
         def outputs(observation: Scalars) -> Mapping[str, Scalars]:
