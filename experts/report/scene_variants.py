@@ -6,7 +6,7 @@ from typing import Any
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.scene import Pose
-from dq_space_arm_env.scene.constraints import TorqueSpeed, WheelLimits
+from dq_space_arm_env.scene.constraints import Propellant, TorqueSpeed, WheelLimits
 
 _TIP_WRENCH = {"force": [0.2, 0.0, -0.1], "torque": [0.05, 0.0, 0.02]}
 _SPRING = {"stiffness": 10.0, "damping": 1.0}  # N m/rad, N m s/rad
@@ -19,9 +19,13 @@ _ACTUATORS = {
     "wrist_rate": "wrist inputs",
     "wheels": "wheels",
     "thrusters": "thrusters",
+    "tank": "tank",
 }
-
-_CONSTRAINTS = {"wheels": WheelLimits, "joint_torque": TorqueSpeed}  # of actuators that are there
+_CONSTRAINTS = {
+    "wheels": WheelLimits,
+    "joint_torque": TorqueSpeed,
+    "tank": Propellant,
+}  # of actuators that are there
 
 
 def feature_variants(scene: Scene) -> dict[str, Scene]:
@@ -39,6 +43,11 @@ def feature_variants(scene: Scene) -> dict[str, Scene]:
     if scene.actuators.base_force and scene.actuators.base_torque:
         both = without_actuators(scene, "base_force", "base_torque")
         variants["without base force and torque"] = both
+    if any(link.motor for link in scene.links):
+        rest = [each for each in scene.constraints if not isinstance(each, TorqueSpeed)]
+        variants["without motors"] = _with_link_fields(scene.replace(constraints=rest), motor=None)
+    if late := _with_actuator_fields(scene, time_constant=None, delay=0, slew_limit=None):
+        variants["without lags, delays and slew limits"] = late
     if scene.other_tips:
         variants["without other tips"] = scene.replace(other_tips=())
     if scene.tip_wrench:
@@ -67,6 +76,17 @@ def _with_link_fields(scene: Scene, **fields: Any) -> Scene:
     return scene.replace(links=[link.model_copy(update=fields) for link in scene.links])
 
 
+def _with_actuator_fields(scene: Scene, **fields: Any) -> Scene | None:
+    """The scene with other dynamics of its actuators; None where they have these."""
+    changes = {
+        f"actuators.{name}": actuator.model_copy(update=fields)
+        for name in ("base_force", "base_torque", "joint_torque", "wrist_rate")
+        if (actuator := getattr(scene.actuators, name)) is not None
+        and any(getattr(actuator, field) != value for field, value in fields.items())
+    }
+    return scene.replace(changes) if changes else None
+
+
 def _spread_variants(scene: Scene) -> dict[str, Scene]:
     """Without the starts, target and masses that episodes draw; with those that they do not."""
     drawn = {name: width for name, width in scene.spread.model_dump().items() if width}
@@ -92,7 +112,8 @@ def _with_spread(scene: Scene, **widths: float) -> Scene:
 
 
 def without_actuators(scene: Scene, *names: str) -> Scene:
-    """Remove actuators, by their names in the scene's `actuators`."""
+    """Remove actuators, by their names in the scene's `actuators`; thrusters take their tank along."""
+    names = (*names, *(["tank"] if "thrusters" in names and scene.actuators.tank else []))
     links = scene.links
     if "joint_torque" in names:
         links = tuple(link.model_copy(update={"torque_limit": None}) for link in links)

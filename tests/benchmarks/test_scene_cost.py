@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +14,7 @@ from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
 from experts.report.scene_variants import feature_variants
 from scripts.benchmarks.effort import QUICK, Sampling
 from scripts.benchmarks.harness import Row, select, shortcomings
+from scripts.benchmarks.scene_cost.mechanisms import mechanism_rows
 from scripts.benchmarks.scene_cost.processes import IMPORT, MAKE, STEP, WRENCHES, process_rows
 from scripts.benchmarks.scene_cost.sizes import BATCH, OUTPUTS, output_rows, program_row, scene_rows, size_row
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
@@ -63,6 +65,19 @@ def test_random_starts_change_no_step_targets_that_of_the_environment_and_masses
     assert whole["environment"] < changed["environment"] < 1.02 * whole["environment"]
     for program, count in operations(variants["with random masses"]).items():
         assert whole[program] < count < 1.1 * whole[program], program
+
+
+def test_mechanisms_cost_what_the_page_says_and_never_less_than_nothing() -> None:
+    page = (Path(__file__).parents[2] / "docs/report.md").read_text(encoding="utf-8")
+    whole, *others = rows = list(mechanism_rows(load_scene("paper")))
+    for row in rows:
+        counts = [f"{row[key]:,}" for key in ("dynamics", "step", "derivatives", "environment")]
+        counts.insert(2, f"{row['step_ratio']:.2f}")
+        cells = (row["title"], f"{row['states']}, {row['inputs']}", *counts)
+        assert f"| {' | '.join(cells)} |\n" in page
+    for row in others:
+        assert all(row[key] >= whole[key] for key in ("states", "inputs", "dynamics", "step", "derivatives"))
+        assert row["environment"] > whole["environment"]
 
 
 # States, tangent states, inputs, entries of an observation; the pose has 8 numbers and 6 directions.

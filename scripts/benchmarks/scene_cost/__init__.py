@@ -14,6 +14,7 @@ from experts.report.scene_variants import feature_variants
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, time_column
 from scripts.benchmarks.scene_cost.installation import installation_rows
+from scripts.benchmarks.scene_cost.mechanisms import mechanism_rows
 from scripts.benchmarks.scene_cost.processes import process_rows
 from scripts.benchmarks.scene_cost.sizes import BATCH, output_rows, program_row, scene_rows
 
@@ -29,6 +30,7 @@ def measure(effort: Effort) -> Iterator[Row]:
     scenes = {name: load_scene(name) for name in dict.fromkeys((REFERENCE, *names))}
     yield from scene_rows("scenes", scenes, effort, vector=True)
     yield from scene_rows("parts", feature_variants(first), effort, vector=False)
+    yield from mechanism_rows(paper)
     yield from output_rows(first, effort.compilations)
     yield from process_rows(effort.processes, derivatives=effort.slow_cases)
     yield from installation_rows()
@@ -93,6 +95,20 @@ BENCHMARK = Benchmark(
     tables=(
         *_tables("scenes", "Scenes"),
         *_tables("parts", "Parts of a scene, one at a time"),
+        Table(
+            "mechanisms",
+            "Actuators and mechanisms, one more at a time: operations",
+            (
+                "title",
+                Column("states", "n_x"),
+                Column("inputs", "n_u"),
+                Column("dynamics", "dynamics"),
+                Column("step", "RK4 step"),
+                Column("step_ratio", "ratio", ".2f"),
+                Column("derivatives", "its\nderivatives"),
+                Column("environment", "env. step"),
+            ),
+        ),
         Table(
             "outputs",
             "Outputs of scene {scene}: what each costs those who ask for it",
