@@ -1,9 +1,9 @@
-"""Constraints as shapes in frames for pictures: cones, volumes, directions; and where flights violate any."""
+"""Constraints, and thrusters, as shapes in frames for pictures; and where flights violate any."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -33,10 +33,14 @@ VISIBLE = 0.01
 INERTIAL = -1
 """Number of the inertial frame; the others are numbered as in `SpacecraftModel`."""
 GAS = -2
-"""Number of the axes of which z is where the gas of the thrusters goes."""
+"""Number of the axes of which z is where the gas of the net force goes; of thruster i it is GAS - 1 - i."""
 
 _COLOR: Color = (1.0, 1.0, 1.0)  # the page tints them
 _SIDES = 32
+_JET = (
+    0.3,
+    15.0,
+)  # of a thruster that misses nothing in particular: share of the length, half angle, degrees
 _NEEDLE = 0.012  # radius of a direction over its length
 _POINT = 0.02  # radius of what a camera sees over the length of its cone
 
@@ -71,23 +75,48 @@ def constraint_shapes(scene: Scene, length: float) -> list[list[ConstraintShape]
     return found
 
 
+def thruster_shapes(scene: Scene, length: float) -> list[ConstraintShape]:
+    """The gas of single thrusters where no constraint draws it: a cone each, which grows with the force.
+
+    Args:
+        scene: The scene.
+        length: How far cones of constraints are drawn, m.
+
+    Returns:
+        One shape per thruster, or none.
+    """
+    if any(isinstance(each, Plume) for each in scene.constraints):
+        return []
+    share, angle = _JET
+    return [*_jets(scene, angle, share * length, [()] * len(scene.actuators.thrusters or ()))]
+
+
 def gas_of(scene: Scene, controls: FloatArray) -> FloatArray:
     """Find where the gas of the thrusters goes.
 
     Args:
-        scene: The scene, with thrusters.
+        scene: The scene.
         controls: Shape (M, n_u), N, N m, rad/s; none acts in the last state.
 
     Returns:
-        Vectors along -f in base axes, shape (M + 1, 3); of length 1 for the largest force along an axis.
+        Vectors along -f in base axes, shape (M + 1, 1 + thrusters, 3), of the net force and of each thruster;
+        of length 1 for the largest force, along an axis or of the thruster.
     """
-    layout, thrusters = StateLayout.of(scene), scene.actuators.base_force
-    assert thrusters is not None  # or there is no plume
+    layout, thrusters = StateLayout.of(scene), scene.actuators.thrusters or ()
+    gas = np.zeros((len(controls) + 1, 1 + len(thrusters), 3))
     given = controls[:, layout.control.base_force]
-    force = np.zeros((len(controls) + 1, 3))
-    force[:-1, : given.shape[1]] = given  # planar: x and y
-    limits = [limit for limit in thrusters.limit if math.isfinite(limit) and limit > 0.0]
-    return -force / max(limits, default=max(float(np.abs(force).max()), 1.0))
+    gas[:-1, 0, : given.shape[1]] = -given / _largest(scene.actuators.base_force, given)  # planar: x and y
+    for index, each in enumerate(thrusters):
+        force = np.maximum(controls[:, layout.control.thruster_force.start + index, None], 0.0)
+        largest = each.force if math.isfinite(each.force) else max(float(force.max(initial=0.0)), 1.0)
+        gas[:-1, 1 + index] = -force / largest * np.array(each.unit_direction)
+    return gas
+
+
+def _largest(actuator: Any, given: FloatArray) -> float:
+    """The largest limit of an actuator's axes; where none is finite, the largest force that is given."""
+    limits = [limit for limit in actuator.limit if math.isfinite(limit) and limit > 0.0] if actuator else []
+    return float(max(limits, default=max(float(np.abs(given).max(initial=0.0)), 1.0)))
 
 
 def violations(scene: Scene, states: FloatArray, controls: FloatArray, body: FloatArray) -> NDArray[np.bool_]:
@@ -190,13 +219,21 @@ def _approach_corridor(
 def _plume(
     scene: Scene, each: Plume, rows: Rows, numbers: Numbers, length: float
 ) -> Iterator[ConstraintShape]:
-    """The sphere, and the gas of the net force: a cone along -f."""
+    """The sphere, and the gas: a cone along -f, of the net force and of each thruster."""
     frame = numbers[each.keeps_clear.frame]
     yield ConstraintShape(_capsule(each.keeps_clear), frame, frame, rows)
-    if scene.actuators.base_force is None:
-        return
-    gas = _cone((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), each.angle_deg, length)
-    yield ConstraintShape(gas, numbers["base"], GAS, rows, each.thruster)
+    if scene.actuators.base_force is not None:
+        gas = _cone((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), each.angle_deg, length)
+        yield ConstraintShape(gas, numbers["base"], GAS, rows[:1], each.thruster)
+    own = rows[len(rows) - len(scene.actuators.thrusters or ()) :]
+    yield from _jets(scene, each.angle_deg, length, [(row,) for row in own])
+
+
+def _jets(scene: Scene, angle_deg: float, length: float, rows: Sequence[Rows]) -> Iterator[ConstraintShape]:
+    """Cones of the gas of single thrusters, with the rows that each shows."""
+    gas = _cone((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), angle_deg, length)
+    for index, (thruster, own) in enumerate(zip(scene.actuators.thrusters or (), rows, strict=True)):
+        yield ConstraintShape(gas, 0, GAS - 1 - index, own, thruster.position)
 
 
 _SHAPES: dict[type[Constraint], Callable[..., Iterator[ConstraintShape]]] = {

@@ -19,6 +19,8 @@ from dq_space_arm_env.viewing.constraint_shapes import (
     violations,
 )
 from dq_space_arm_env.viewing.replay import replay_page
+from dq_space_arm_env.viewing.replay.flights import prepare
+from dq_space_arm_env.viewing.replay.geometry import constraints_of
 
 CAPSULE = {"frame": "link 2", "position": [0.1, 0, 0], "to": [0.1, 0.6, 0], "radius": 0.05}
 KINDS = [
@@ -99,7 +101,27 @@ def test_shapes_have_the_sizes_and_frames_of_the_constraints(constrained):
 def test_gas_leaves_against_the_force(paper):
     controls = np.zeros((2, 12))
     controls[:, :3] = [[10, 0, 0], [0, -5, 2.5]]
-    np.testing.assert_array_equal(gas_of(paper, controls), [[-1, 0, 0], [0, 0.5, -0.25], [0, 0, 0]])
+    found = gas_of(paper, controls)
+    np.testing.assert_array_equal(found, [[[-1, 0, 0]], [[0, 0.5, -0.25]], [[0, 0, 0]]])
+
+
+def test_each_thruster_blows_at_its_place_as_it_fires(make_flight):
+    scene = load_scene("thrusters")
+    flight, jets = make_flight(scene), scene.actuators.thrusters
+    drawn = constraints_of(scene, prepare([flight], scene))
+    assert (drawn.names, drawn.frames) == (("thrusters",), tuple((0, GAS - 1 - i) for i in range(8)))
+    assert drawn.nozzles == tuple(jet.position for jet in jets)
+    fired = np.maximum(flight.controls[:, -8:], 0.0) / 5.0
+    expected = -fired[:, :, None] * np.array([jet.unit_direction for jet in jets])
+    np.testing.assert_allclose(drawn.gas[0][:-1, 1:], expected, atol=1e-15)
+    assert not drawn.gas[0][-1].any()
+    assert not drawn.violated[0].any()
+    sphere = {"frame": "tip", "radius": 0.3}
+    clear = {"kind": "plume", "name": "gas", "angle_deg": 20, "keeps_clear": sphere}
+    careful = scene.replace(constraints=[clear])
+    around, *cones = constraint_shapes(careful, 2.0)[0]
+    assert [shape.rows for shape in (around, *cones)] == [tuple(range(8)), *((i,) for i in range(8))]
+    assert constraints_of(careful, prepare([flight], careful)).names == ("gas",)
 
 
 def test_what_is_red_is_what_the_compiled_residuals_call_violated(constrained, make_flight):
@@ -146,7 +168,8 @@ def test_the_page_knows_shapes_and_violations(constrained, make_flight, paper):
     assert drawn["owners"] == [0, 0, 1, 1, 2, 2, 3, 5, 5]
     assert drawn["frames"][-1] == [0, GAS]
     np.testing.assert_array_equal(
-        table(drawn["gas"][0], len(flight.states)), gas_of(constrained, flight.controls).astype(np.float32)
+        table(drawn["gas"][0], len(flight.states)),
+        gas_of(constrained, flight.controls)[:, 0].astype(np.float32),
     )
     assert drawn["frames"][:3] == [[2, 2], [-1, -1], [0, 0]]
     shapes, broken = table(drawn["violated"][0], 9), table(drawn["broken"][0], 6)

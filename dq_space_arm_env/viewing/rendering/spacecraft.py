@@ -211,6 +211,9 @@ class SpacecraftModel:
         yield from self._wing(-1.0)
         if self.scene.actuators.base_force is not None:
             yield from self._thrusters()
+        for thruster in self.scene.actuators.thrusters or ():
+            outward = tuple(-entry for entry in thruster.unit_direction)
+            yield self._nozzle(thruster.position, outward)
 
     def _rims(self) -> Iterator[Mesh]:
         """Decks at the two ends of the body, and rails along the edges between them."""
@@ -256,18 +259,23 @@ class SpacecraftModel:
 
     def _thrusters(self) -> Iterator[Mesh]:
         """Nozzles at the edges of the body; for a planar base, in the plane."""
-        axes, size, mean = self._body_axes, self._body_size, float(self._body_size.mean())
+        axes, size = self._body_axes, self._body_size
         along, across, normal = self._wing_axes
         levels = (0.0,) if self.scene.base.motion == "planar" else (-0.38, 0.38)
-        bell = [(0.0, 0.0), (0.0, 0.022), (0.03, 0.022), (0.095, 0.05), (0.095, 0.042), (0.05, 0.0)]
-        profile = [(height * mean, radius * mean) for height, radius in bell]
-        colors = [METAL, METAL, METAL, METAL, DARK_METAL]
         for level in levels:
             for first in (-1.0, 1.0):
                 for second in (-1.0, 1.0):
                     corner = np.zeros(3)
                     corner[[along, across, normal]] = first * 0.36, second * 0.5, level
-                    yield lathe(0, axes @ (corner * size), second * axes[:, across], profile, colors, 16)
+                    yield self._nozzle(axes @ (corner * size), second * axes[:, across])
+
+    def _nozzle(self, place: Sequence[float] | Array, outward: Sequence[float] | Array) -> Mesh:
+        """The nozzle of a thruster, at a place of the base."""
+        bell = [(0.0, 0.0), (0.0, 0.022), (0.03, 0.022), (0.095, 0.05), (0.095, 0.042), (0.05, 0.0)]
+        mean, colors = float(self._body_size.mean()), [METAL, METAL, METAL, METAL, DARK_METAL]
+        return lathe(
+            0, place, outward, [(height * mean, radius * mean) for height, radius in bell], colors, 16
+        )
 
     def _radius(self, frame: int) -> float:
         """Radius of the link in a frame: the arm tapers toward the tip, m."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.constraint_rows import rows_of
-from dq_space_arm_env.viewing.constraint_shapes import GAS, constraint_shapes, gas_of
+from dq_space_arm_env.viewing.constraint_shapes import GAS, constraint_shapes, gas_of, thruster_shapes
 from dq_space_arm_env.viewing.rendering.solids import Mesh
 from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
 from dq_space_arm_env.viewing.replay.flights import FloatArray, ShownFlight, poses_at
@@ -70,12 +70,14 @@ def solids_of(scene: Scene) -> Triangles:
 
 
 def constraints_of(scene: Scene, flights: Sequence[ShownFlight]) -> ConstraintDrawing | None:
-    """Shapes of the constraints along the path, and where flights violate them; None without any."""
+    """Shapes of the constraints along the path, where flights violate them, and jets; None without any."""
     listed = [each for each in scene.constraints if rows_of(scene, each)]
-    if not listed:
+    length = _CONES * SpacecraftModel(scene).axis_length
+    groups, jets = constraint_shapes(scene, length), thruster_shapes(scene, length)
+    if not listed and not jets:
         return None
-    groups = constraint_shapes(scene, _CONES * SpacecraftModel(scene).axis_length)
     along = [group for each, group in zip(scene.constraints, groups, strict=True) if each in listed]
+    along += [jets] if jets else []
     shapes = [(number, shape) for number, group in enumerate(along) for shape in group]
     frames = [(shape.place, shape.axes) for _, shape in shapes]
     meshes = [shape.mesh.moved(index, np.eye(3), np.zeros(3)) for index, (_, shape) in enumerate(shapes)]
@@ -85,13 +87,15 @@ def constraints_of(scene: Scene, flights: Sequence[ShownFlight]) -> ConstraintDr
     violated, broken = [], []
     for flight in flights:
         rows = flight.violated
-        violated.append(np.array([rows[list(shape.rows)].any(axis=0) for _, shape in shapes]))
+        violated.append(np.array([rows[list(shape.rows), :].any(axis=0) for _, shape in shapes]))
         spans = [rows[end - len(part) : end].any(axis=0) for part, end in zip(parts, ends, strict=True)]
+        spans += [np.zeros_like(flight.distance, np.bool_)] if jets else []
         broken.append(np.array(spans))
     nozzles = tuple(shape.nozzle for _, shape in shapes)
-    has_gas = any(shape.axes == GAS for _, shape in shapes)
+    has_gas = any(shape.axes <= GAS for _, shape in shapes)
     gas = tuple(gas_of(scene, flight.controls) for flight in flights) if has_gas else ()
-    names, owners = tuple(each.name for each in listed), tuple(number for number, _ in shapes)
+    names = (*(each.name for each in listed), *(["thrusters"] if jets else []))
+    owners = tuple(number for number, _ in shapes)
     return ConstraintDrawing(
         names, triangles, tuple(frames), nozzles, gas, owners, tuple(violated), tuple(broken)
     )

@@ -71,10 +71,11 @@ export class Flight {
     return Array.from({ length: table.length / size }, (_, row) => table[row * size + instant] === 1);
   }
 
-  /** Of the rows of a table of vectors, one for each instant: that at a time, in s. */
-  vectorAt(table, time) {
+  /** Of the rows of a table, one for each instant: that at a time, in s. */
+  rowAt(table, time) {
+    const width = table.length / (this.steps + 1);
     const instant = Math.min(Math.floor(Math.max(time / this.dt, 0) + 1e-6), this.steps);
-    return table.subarray(3 * instant, 3 * instant + 3);
+    return table.subarray(width * instant, width * (instant + 1));
   }
 
   /** Position of the tip at an instant. */

@@ -8,7 +8,7 @@ const STARS = 1200; // over the whole sky, of which a picture shows a few percen
 const RIBBON_WIDTH = 3.2; // CSS pixels
 const GHOST_OPACITY = 0.5;
 const CONSTRAINT_OPACITY = 0.5; // at the rim of a shape
-const GAS = -2; // axes of which z is where the gas of the thrusters goes
+const GAS = -2; // axes of which z is where gas goes: that of the net force, and below it that of each thruster
 const GHOST_TINT = 0.75;
 const GHOST_GLOW = 0.25; // so that a ghost is seen against a dark sky
 
@@ -218,7 +218,8 @@ export class Renderer {
     for (const { frame, axes = frame, point, start, count } of parts) {
       if (count === 0) continue;
       const { poses } = flight;
-      const place = axes === GAS ? turnedMatrix(poses, frame, point, gas) : placedMatrix(poses, frame, axes);
+      const blown = axes <= GAS ? gas.subarray(3 * (GAS - axes), 3 * (GAS - axes) + 3) : null;
+      const place = blown ? turnedMatrix(poses, frame, point, blown) : placedMatrix(poses, frame, axes);
       const matrix = multiply(this.matrices.view, place);
       gl.uniformMatrix4fv(uniforms.u_frame, false, matrix);
       gl.drawElements(gl.TRIANGLES, 3 * count, gl.UNSIGNED_SHORT, 6 * start);
@@ -229,7 +230,7 @@ export class Renderer {
   drawConstraints(flight, { solid, time, shown }) {
     const { gl, look } = this;
     const { violated, owners, gas } = this.recording.constraints;
-    const blown = gas.length ? flight.vectorAt(gas[solid], time) : null;
+    const blown = gas.length ? flight.rowAt(gas[solid], time) : null;
     const broken = flight.setAt(violated[solid], time);
     gl.disable(gl.CULL_FACE); // cones are open
     for (const state of [false, true]) {
