@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dq_space_arm_env.environment.disturbances import load_numbers
+from dq_space_arm_env.scene.bodies import freedoms
 from experts.ddp.shooting import ShootingWorkspace
 from experts.ddp.solution import Solution
 from experts.problems.arm_problem import ArmProblem
@@ -69,8 +70,8 @@ def doubtful_numbers(maneuver: ArmProblem) -> list[Doubtful]:
     scene, layout, found = maneuver.scene, maneuver.kernels.layout, []
     limits = layout.control_limit[layout.control.joint_torque]
     torques = dict(zip(layout.actuated_joints, map(float, limits), strict=True))
-    for index in range(layout.n_joints):
-        torque = torques.get(index, 1.0)
+    largest = {link: torques.get(joint, 1.0) for joint, (link, _) in enumerate(freedoms(scene.links))}
+    for index, torque in largest.items():
         found.append(Doubtful(f"links.{index}.stiffness", torque, -np.inf))
         found.append(Doubtful(f"links.{index}.damping", 0.1 * torque, -np.inf))
     for number in load_numbers(scene):

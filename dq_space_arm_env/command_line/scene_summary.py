@@ -122,7 +122,7 @@ def left_out(scene: Scene) -> Iterator[str]:
             continue
         if getattr(scene.actuators, name) is None and needs.get(name, True):
             yield meaning
-    passive = [link.name for link in scene.links if not link.actuated]
+    passive = [link.name for link in scene.links if not (link.actuated or link.is_fixed)]
     if passive:
         yield f"motors of {', '.join(passive)}"
     if scene.links and not any(link.stiffness or link.damping for link in scene.links):
@@ -158,6 +158,7 @@ def _bodies(scene: Scene) -> Iterator[tuple[str, float, str]]:
     for link in scene.links:
         drive = "driven joint" if link.actuated and scene.actuators.joint_torque else "passive joint"
         drive = drive if link.joint_type == "revolute" else f"{link.joint_type}, {drive}"
+        drive = "fixed" if link.is_fixed else drive
         spring = f", spring of {link.stiffness:g} {link.effort_unit}/{link.unit}" if link.stiffness else ""
         damper = f", damper of {link.damping:g} {link.effort_unit} s/{link.unit}" if link.damping else ""
         yield link.name, link.mass, f"{drive}{spring}{damper}{_motor(link)}"

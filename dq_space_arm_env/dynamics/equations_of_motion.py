@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dq_space_arm_env.algebra import dual_quaternion as dq
-from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra import poses, quaternion
 from dq_space_arm_env.algebra.vectors import add, cross, subtract
 from dq_space_arm_env.dynamics import elastic_gears, minimal, reaction_wheels
 from dq_space_arm_env.dynamics.forward import Inertia, forward_dynamics, inertia_of, reaction_wrenches
@@ -29,7 +29,7 @@ ZERO = (0.0, 0.0, 0.0)
 class Motion:
     """The state without the pose."""
 
-    joint_angles: Sequence[Scalar]  # n, rad
+    joint_angles: Sequence[Any]  # n, rad; of spherical joints see `KinematicTree.coordinates`
     wrist_angles: Sequence[Scalar]  # psi, theta, phi, rad; empty without a wrist
     angular: Sequence[Scalar]  # of the base, base axes, rad/s
     linear: Sequence[Scalar]  # of the base's center of mass, base axes, m/s
@@ -104,7 +104,7 @@ class EquationsOfMotion:
 
         twist = self.pose.full_twist(part(layout.state.base_velocity))
         return Motion(
-            part(layout.state.joint_angles),
+            self.tree.coordinates(part(layout.state.joint_angles)),
             part(layout.state.wrist_angles),
             twist[:3],
             twist[3:],
@@ -273,9 +273,23 @@ class EquationsOfMotion:
     def rates(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
         """Time derivative of y: rates of joints and wrist, accelerations, motors', wheels', the tank's."""
         motion, inputs = self.motion(y), self.inputs(u)
-        bodies = [*motion.joint_rates, *inputs.wrist_rates, *self.accelerations(y, u)]
+        bodies = [*self.angle_rates(motion), *inputs.wrist_rates, *self.accelerations(y, u)]
         motors = self.motor_motion(motion, inputs)
         return [*bodies, *motors, *inputs.wheel_torques, *inputs.propellant_rates]
+
+    def angle_rates(self, motion: Motion) -> list[Scalar]:
+        """Time derivative of the joints' coordinates."""
+        return minimal.angle_rates(self.tree, motion.joint_angles, motion.joint_rates)
+
+    def with_unit_quaternions(self, x: Sequence[Scalar]) -> list[Scalar]:
+        """A state whose spherical joints have quaternions of unit length, which rounding and steps change."""
+        where, unit = self.layout.state.joint_angles, list[Scalar]()
+        for link, angle in zip(self.tree.links, self.tree.coordinates(x[where]), strict=True):
+            if link.spherical is None:
+                unit.append(angle)
+            elif link.spherical == 0:
+                unit += quaternion.normalize(angle)
+        return [*x[: where.start], *unit, *x[where.stop :]]
 
     def motor_motion(self, motion: Motion, inputs: Inputs) -> list[Scalar]:
         """Time derivative of angles and rates of the motors of elastic joints."""
@@ -286,16 +300,18 @@ class EquationsOfMotion:
     def reaction_wrenches(self, y: Sequence[Scalar], u: Sequence[Scalar]) -> list[Scalar]:
         """The paper's T (21): fx, fy, fz [N], tx, ty [N m] that each joint transmits, in joint axes, 5 n.
 
-        A prismatic joint transmits fx, fy [N], tx, ty, tz [N m].
+        A prismatic joint transmits fx, fy [N], tx, ty, tz [N m], a spherical one fx, fy, fz.
         """
         motion = self.motion(y)
         driven = self._driven(motion, self.inputs(u), self.tree.tip_wrench)
         reactions = reaction_wrenches(self.loaded(motion), *driven)
-        transmitted = [
-            (*force, *torque[:2]) if link.screw.turn else (*force[:2], *torque)
-            for link, (force, torque) in zip(self.tree.links, reactions, strict=True)
-        ]
-        return [entry for five in transmitted for entry in five]
+        transmitted: list[Scalar] = []
+        for link, (force, torque) in zip(self.tree.links, reactions, strict=True):
+            if link.spherical is None:
+                transmitted += (*force, *torque[:2]) if link.screw.turn else (*force[:2], *torque)
+            elif link.spherical == 2:  # whose frame is the link's
+                transmitted += force
+        return transmitted
 
     def _missing_wrenches(self, motion: Motion, given: Accelerations) -> tuple[list[Any], list[Scalar]]:
         """Force and torque on base and links that given accelerations need besides the tip's wrench.

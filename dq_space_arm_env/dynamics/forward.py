@@ -46,7 +46,8 @@ def inertia_of(
             f"formulation: {formulation!r} is unknown; it must be articulated_body or minimal_coordinates"
         )
     root = tree.heaviest
-    if root == 0 and tree.links and (tree.planar or not many) and not tree.heavy_base:
+    first = tree.links[0].spherical is None if tree.links else False
+    if root == 0 and first and (tree.planar or not many) and not tree.heavy_base:
         # The first link is as good a root, and a faster one but for many right-hand sides in space.
         root = 1
     return ArticulatedBodies(tree, frames, root)

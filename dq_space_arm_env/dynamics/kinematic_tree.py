@@ -4,16 +4,23 @@ A `KinematicTree` is a base, links that branch from it, an optional massless wri
 the base, body i+1 link i, and a parent comes before what it carries. Link frames are the joint frames of the
 paper: frame i is fixed in the distal body i+1, with its z axis along the joint axis. Every joint is a screw
 about and along that axis.
-A payload is merged into the body that holds it. Masses, inertias, stiffness and damping are numbers, or
-symbols where they are parameters of the scene.
+
+A spherical joint is three of them with the axes x, y and z of the link that it carries: the first takes the
+joint's quaternion as its coordinate, the other two stand at zero, and the bodies between have no mass. Each
+has its rate, the component of the link's angular velocity relative to its parent, in the link's axes. Only
+the accelerations that these rates cause differ from those of three joints one after another.
+
+A payload is merged into the body that holds it, and so is a link whose joint is fixed. Masses, inertias,
+stiffness and damping are numbers, or symbols where they are parameters of the scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra.vectors import (
     add,
     dot,
@@ -54,6 +61,17 @@ class Placement:
     rotation: Matrix  # from inner to outer axes; entries of 0 and +-1 are exact
     dual_quaternion: tuple[float, ...]  # q_{inner/outer}
 
+    def within(self, outer: Placement | None) -> Placement:
+        """The same seen from the frame in which the outer one is placed; None for the outer frame itself."""
+        if outer is None:
+            return self
+        x, y, z = add(outer.position, matrix_vector(outer.rotation, self.position))
+        first, second, third = (
+            (row[0], row[1], row[2]) for row in matrix_product(outer.rotation, self.rotation)
+        )
+        pose = dq.multiply(outer.dual_quaternion, self.dual_quaternion)
+        return Placement((x, y, z), (first, second, third), tuple(pose))
+
 
 class Screw(NamedTuple):
     """Motion of a link about and along the z axis of its frame, per unit of its joint's coordinate."""
@@ -91,7 +109,14 @@ class Elasticity(NamedTuple):
     friction: Friction | None  # of the rotor
 
 
-SCREWS = {"revolute": Screw(1.0, 0.0), "prismatic": Screw(0.0, 1.0)}
+SCREWS = {"revolute": Screw(1.0, 0.0), "prismatic": Screw(0.0, 1.0), "spherical": Screw(1.0, 0.0)}
+
+# From the axes of each body of a spherical joint to those of the one before, or of the link to those of the
+# first: z of one is x of the other, so that the z axes are x, y and z of the link.
+TURNED_AXES = Placement(
+    (0.0, 0.0, 0.0), ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), (0.5,) * 4 + (0.0,) * 4
+)
+_MASSLESS = RigidBody(0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0),) * 3)
 
 
 @dataclass(frozen=True)
@@ -111,6 +136,7 @@ class JointedLink:
     rotor: Rotor | None = None
     friction: Friction | None = None
     elastic: Elasticity | None = None  # in place of rotor and friction
+    spherical: int | None = None  # of a spherical joint: axis of its link, x, y or z, that is this one's z
 
 
 @dataclass(frozen=True)
@@ -130,6 +156,8 @@ class KinematicTree:
     jets: tuple[Jet, ...] = ()  # thrusters
     wheels: tuple[Wheel, ...] = ()  # free to turn: the base's inertia is without their axial ones
     tank: Vector | None = None  # where propellant is that the base does not contain, in its frame, m
+    # Where base and links of the scene are: the body that each is, or is fixed to, and its frame there.
+    places: tuple[tuple[int, Placement | None], ...] = ()
 
     @property
     def bodies(self) -> list[RigidBody]:
@@ -152,6 +180,22 @@ class KinematicTree:
         propellant = RigidBody(mass, self.tank, ((0.0,) * 3,) * 3)
         return replace(self, base=_merged(self.base, propellant), tank=None)
 
+    @property
+    def has_spherical(self) -> bool:
+        """Whether a joint is spherical."""
+        return any(link.spherical is not None for link in self.links)
+
+    def coordinates(self, values: Sequence[Scalar]) -> list[Any]:
+        """One coordinate per link from those of a state: of spherical joints a quaternion, and two zeros."""
+        given = iter(values)
+        found: list[Any] = []
+        for link in self.links:
+            if link.spherical is None:
+                found.append(next(given))
+            else:
+                found.append(0.0 if link.spherical else tuple(next(given) for _ in range(4)))
+        return found
+
     def path_to(self, body: int) -> list[int]:
         """Indices of the links from the base to a body."""
         path: list[int] = []
@@ -163,29 +207,21 @@ class KinematicTree:
     @classmethod
     def from_scene(cls, scene: Scene, given: Given | None = None) -> KinematicTree:
         """Collect a scene's constants; numbers `given` by name (`scene.parameters`) replace its own."""
-        wrench, given, masses = scene.tip_wrench, given or {}, _nominal_masses(scene)
-        bodies, base = _link_bodies(scene, given), _rigid_body(scene.base, "base", (0.0, 0.0, 0.0), given)
+        wrench, given = scene.tip_wrench, given or {}
+        places, bodies, masses = _bodies(scene, given)
         wheels = tuple(Wheel(wheel.unit_axis, wheel.inertia) for wheel in scene.actuators.wheels or ())
         tank = scene.actuators.tank
+        tip_body, at = places[scene.tip_body]
+        wrist = None if scene.wrist is None else _placement(scene.wrist.frame).within(at)
+        tip = _placement(scene.tip)
+        others = [(places[scene.body_named(each.link)], _placement(each.frame)) for each in scene.other_tips]
         return cls(
-            base=replace(base, inertia=free_inertia(base.inertia, wheels)) if wheels else base,
-            links=tuple(
-                JointedLink(
-                    body,
-                    _placement(link.joint),
-                    SCREWS.get(link.joint_type) or Screw(1.0, link.pitch),
-                    scene.parent_bodies[index],
-                    given.get(f"links.{index}.stiffness", link.stiffness),
-                    link.rest_angle,
-                    given.get(f"links.{index}.damping", link.damping),
-                    *_drive(link.motor, f"links.{index}.motor", given),
-                )
-                for index, (body, link) in enumerate(zip(bodies, scene.links, strict=True))
-            ),
-            tip_body=scene.tip_body,
-            wrist=None if scene.wrist is None else _placement(scene.wrist.frame),
-            tip=_placement(scene.tip),
-            other_tips=tuple((scene.body_named(tip.link), _placement(tip.frame)) for tip in scene.other_tips),
+            base=replace(bodies[0], inertia=free_inertia(bodies[0].inertia, wheels)) if wheels else bodies[0],
+            links=tuple(_links(scene, given, places, bodies)),
+            tip_body=tip_body,
+            wrist=wrist,
+            tip=tip if wrist is not None else tip.within(at),
+            other_tips=tuple((body, frame.within(place)) for (body, place), frame in others),
             tip_wrench=None if wrench is None else (*wrench.force, *wrench.torque),
             planar=scene.base.motion == "planar",
             heaviest=masses.index(max(masses)),
@@ -196,37 +232,65 @@ class KinematicTree:
             ),
             wheels=wheels,
             tank=None if tank is None else tank.position,
+            places=tuple(places),
         )
 
 
-def _nominal_masses(scene: Scene) -> list[float]:
-    """Masses of base and links, with propellant, and the payload where the tip is, kg."""
-    masses = [scene.base.mass, *(link.mass for link in scene.links)]
+Places = list[tuple[int, Placement | None]]
+
+
+def _bodies(scene: Scene, given: Given) -> tuple[Places, list[RigidBody], list[float]]:
+    """Places of base and links; bodies with payloads and what is fixed to them; their nominal masses, kg."""
+    places: Places = [(0, None)]
+    bodies, masses = [_rigid_body(scene.base, "base", (0.0, 0.0, 0.0), given)], [scene.base.mass]
     if scene.actuators.tank is not None:
         masses[0] += scene.actuators.tank.propellant
-    if scene.payload is not None:
-        masses[scene.tip_body] += scene.payload.mass
-    for tip in scene.other_tips:
-        masses[scene.body_named(tip.link)] += 0.0 if tip.payload is None else tip.payload.mass
-    return masses
+
+    def add_to(body: int, nominal: float, part: RigidBody) -> None:
+        bodies[body] = _merged(bodies[body], part)
+        masses[body] += nominal
+
+    for index, link in enumerate(scene.links):
+        own = _rigid_body(link, f"links.{index}", link.center_of_mass, given)
+        if link.is_fixed:
+            parent, at = places[scene.parent_bodies[index]]
+            place = _placement(link.joint).within(at)
+            places.append((parent, place))
+            add_to(parent, link.mass, _moved(own, place))
+            continue
+        bodies += [*[_MASSLESS] * (link.freedoms - 1), own]
+        masses += [*[0.0] * (link.freedoms - 1), link.mass]
+        places.append((len(bodies) - 1, None))
+    held = [(scene.tip_body, scene.payload, scene.tip, "payload")]
+    for tip in scene.other_tips:  # a place of no parameters
+        held.append((scene.body_named(tip.link), tip.payload, tip.frame, ""))
+    for carrier, payload, frame, name in held:
+        if payload is not None:
+            body, at = places[carrier]
+            own = _rigid_body(payload, name, payload.center_of_mass, given)
+            add_to(body, payload.mass, _moved(own, _placement(frame).within(at)))
+    return places, bodies, masses
 
 
-def _link_bodies(scene: Scene, given: Given) -> list[RigidBody]:
-    """Mass properties of the links in their joint frames, with the payloads that they hold."""
-    bodies = [
-        _rigid_body(link, f"links.{index}", link.center_of_mass, given)
-        for index, link in enumerate(scene.links)
-    ]
-    if scene.payload is not None:
-        payload = _rigid_body(scene.payload, "payload", scene.payload.center_of_mass, given)
-        holding = scene.tip_body - 1
-        bodies[holding] = _merged(bodies[holding], _moved(payload, scene.tip))
-    for tip in scene.other_tips:
-        if tip.payload is not None:
-            holding, place = scene.body_named(tip.link) - 1, ""  # a place of no parameters
-            payload = _rigid_body(tip.payload, place, tip.payload.center_of_mass, given)
-            bodies[holding] = _merged(bodies[holding], _moved(payload, tip.frame))
-    return bodies
+def _links(scene: Scene, given: Given, places: Places, bodies: Sequence[RigidBody]) -> Iterator[JointedLink]:
+    """The joints that move, with the bodies that they carry."""
+    body = 0
+    for index, link in enumerate(scene.links):
+        parent, at = places[scene.parent_bodies[index]]
+        joint = _placement(link.joint).within(at)
+        passive = (
+            given.get(f"links.{index}.stiffness", link.stiffness),
+            link.rest_angle,
+            given.get(f"links.{index}.damping", link.damping),
+        )
+        drive = _drive(link.motor, f"links.{index}.motor", given)
+        screw = SCREWS.get(link.joint_type) or Screw(1.0, link.pitch)
+        for axis in range(link.freedoms):
+            body += 1
+            if axis:
+                parent, joint = body - 1, TURNED_AXES
+            spherical = axis if link.is_spherical else None
+            yield JointedLink(bodies[body], joint, screw, parent, *passive, *drive, spherical)
 
 
 def _rigid_body(body: Base | Link | Payload, place: str, center_of_mass: Vector, given: Given) -> RigidBody:
@@ -260,11 +324,11 @@ def _placement(pose: Pose) -> Placement:
     return Placement(pose.position, pose.rotation_matrix, pose.dual_quaternion)
 
 
-def _moved(body: RigidBody, pose: Pose) -> RigidBody:
-    """Mass properties in the frame in which the body's own frame has the given pose."""
-    rotation = pose.rotation_matrix
+def _moved(body: RigidBody, place: Placement) -> RigidBody:
+    """Mass properties in the frame in which the body's own frame is placed."""
+    rotation = place.rotation
     inertia = matrix_product(matrix_product(rotation, body.inertia), transpose(rotation))
-    return RigidBody(body.mass, add(pose.position, matrix_vector(rotation, body.center_of_mass)), inertia)
+    return RigidBody(body.mass, add(place.position, matrix_vector(rotation, body.center_of_mass)), inertia)
 
 
 def _merged(a: RigidBody, b: RigidBody) -> RigidBody:

@@ -21,8 +21,8 @@ from dq_space_arm_env.algebra.vectors import (
     transposed_matrix_vector,
 )
 from dq_space_arm_env.dynamics import reaction_wheels
-from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Screw
-from dq_space_arm_env.dynamics.minimal import ZERO, LinkFrame, link_frames, shift_wrench
+from dq_space_arm_env.dynamics.kinematic_tree import JointedLink, KinematicTree, Screw
+from dq_space_arm_env.dynamics.minimal import ZERO, LinkFrame, deflections, link_frames, shift_wrench
 
 Scalar = Any
 DualQuaternion = Sequence[Scalar]
@@ -36,9 +36,11 @@ def axis_rotation(axis: int, angle: Scalar) -> DualQuaternion:
     return result
 
 
-def joint_motion(screw: Screw, coordinate: Scalar) -> DualQuaternion:
-    """Unit dual quaternion of a screw about and along the z axis, exp(1/2 coordinate s)."""
+def joint_motion(screw: Screw, coordinate: Any) -> DualQuaternion:
+    """Unit dual quaternion of a screw about and along z, exp(1/2 coordinate s), or of a quaternion."""
     turn, slide = screw
+    if isinstance(coordinate, tuple):
+        return (*coordinate, 0.0, 0.0, 0.0, 0.0)
     if not slide:
         return axis_rotation(2, coordinate)
     half = 0.5 * slide * coordinate
@@ -74,18 +76,45 @@ def frame_poses(
     wrist_angles: Sequence[Scalar],
 ) -> list[DualQuaternion]:
     """Poses of base, joint frames, other tips, end effector (if any) and tip in the inertial frame (27)."""
-    poses = [base_pose]
-    for link, angle in zip(tree.links, joint_angles, strict=True):
-        joint = dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, angle))
-        poses.append(dq.multiply(poses[link.parent], joint))
-    last = poses[tree.tip_body]
-    poses += [dq.multiply(poses[body], frame.dual_quaternion) for body, frame in tree.other_tips]
+    bodies = _body_poses(tree, base_pose, joint_angles)
+    poses = [
+        bodies[body] if place is None else dq.multiply(bodies[body], place.dual_quaternion)
+        for body, place in tree.places or [(body, None) for body in range(len(bodies))]
+    ]
+    last = bodies[tree.tip_body]
+    poses += [dq.multiply(bodies[body], frame.dual_quaternion) for body, frame in tree.other_tips]
     if tree.wrist is not None:
         wrist = dq.multiply(tree.wrist.dual_quaternion, wrist_rotation(wrist_angles))
         last = dq.multiply(last, wrist)
         poses.append(last)
     poses.append(dq.multiply(last, tree.tip.dual_quaternion))
     return poses
+
+
+def _body_poses(
+    tree: KinematicTree, base_pose: DualQuaternion, joint_angles: Sequence[Any]
+) -> list[DualQuaternion]:
+    """Poses of base and links; the massless bodies of a spherical joint have that of its link here."""
+    poses = [base_pose]
+    for link, angle in zip(tree.links, joint_angles, strict=True):
+        poses.append(
+            poses[link.parent]
+            if link.spherical
+            else dq.multiply(poses[link.parent], _joint_pose(link, angle))
+        )
+    return poses
+
+
+def _joint_pose(link: JointedLink, coordinate: Any) -> DualQuaternion:
+    """Pose of a link's frame in its parent's, of the first body of a spherical joint that of its link."""
+    return dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, coordinate))
+
+
+def _axis(link: JointedLink) -> Vector3:
+    """Axis of a joint in the frames of `_body_poses`."""
+    axis = [0.0, 0.0, 0.0]
+    axis[2 if link.spherical is None else link.spherical] = 1.0
+    return axis
 
 
 def tip_pose(
@@ -115,8 +144,9 @@ def seen_from_base(
     """Pose in the base frame of what has the given one in a body's frame."""
     for index in reversed(tree.path_to(body)):
         link = tree.links[index]
-        moved = dq.multiply(joint_motion(link.screw, joint_angles[index]), pose)
-        pose = dq.multiply(link.joint.dual_quaternion, moved)
+        if not link.spherical:
+            moved = dq.multiply(joint_motion(link.screw, joint_angles[index]), pose)
+            pose = dq.multiply(link.joint.dual_quaternion, moved)
     return pose
 
 
@@ -130,8 +160,8 @@ def tip_pose_rate(
     wrist_rates: Sequence[Scalar],
 ) -> DualQuaternion:
     """Time derivative of q_{G/I}, eq. (30); its last factor is q_{G/e3}, where the paper prints q_{G/3}."""
-    poses = frame_poses(tree, base_pose, joint_angles, wrist_angles)
-    tip = poses[-1]
+    poses = _body_poses(tree, base_pose, joint_angles)
+    *_, hand, tip = (base_pose, *frame_poses(tree, base_pose, joint_angles, wrist_angles))
 
     def contribution(frame: DualQuaternion, twist: Sequence[Scalar]) -> DualQuaternion:
         """1/2 q_{X/I} omega^X q_{G/X}."""
@@ -143,10 +173,11 @@ def tip_pose_rate(
     rate = contribution(base_pose, base_twist)
     for index in tree.path_to(tree.tip_body):
         turn, slide = (part * joint_rates[index] for part in tree.links[index].screw)
-        rate = dq.add(rate, contribution(poses[index + 1], (0.0, 0.0, turn, 0.0, 0.0, slide)))
+        axis = _axis(tree.links[index])
+        rate = dq.add(rate, contribution(poses[index + 1], (*scale(turn, axis), *scale(slide, axis))))
     if tree.wrist is not None:
         turning = matrix_vector(wrist_rate_matrix(wrist_angles), wrist_rates)
-        rate = dq.add(rate, contribution(poses[-2], (*turning, 0.0, 0.0, 0.0)))
+        rate = dq.add(rate, contribution(hand, (*turning, 0.0, 0.0, 0.0)))
     return rate
 
 
@@ -168,9 +199,10 @@ def tip_jacobian(
     for index in reversed(tree.path_to(tree.tip_body)):
         link = tree.links[index]
         turn, slide = link.screw
-        columns[index] = _carried_to_tip(relative, (0.0, 0.0, turn), (0.0, 0.0, slide))
-        joint = dq.multiply(link.joint.dual_quaternion, joint_motion(link.screw, joint_angles[index]))
-        relative = dq.multiply(joint, relative)
+        axis = _axis(link)
+        columns[index] = _carried_to_tip(relative, scale(turn, axis), scale(slide, axis))
+        if not link.spherical:
+            relative = dq.multiply(_joint_pose(link, joint_angles[index]), relative)
     axes = [[1.0 if j == i else 0.0 for j in range(3)] for i in range(3)]
     turning = [_carried_to_tip(relative, axis, ZERO) for axis in axes]
     moving = [_carried_to_tip(relative, ZERO, axis) for axis in axes]
@@ -219,7 +251,7 @@ def _body_twists(
     """Twists of base and links (angular, linear) in their frames, with half angles."""
     frames = link_frames(tree, joint_angles)
     for index, (link, angle) in enumerate(zip(tree.links, joint_angles, strict=True)):
-        if link.screw.turn:
+        if link.screw.turn and link.spherical is None:
             turned = matrix_product(link.joint.rotation, to_matrix(axis_rotation(2, angle))[0])
             frames[index] = frames[index]._replace(rotation=turned)
     velocities = body_velocities(tree, frames, base_twist, joint_rates)
@@ -321,7 +353,6 @@ def energy(
         if link.rotor is not None:
             kinetic = kinetic + 0.5 * (link.rotor.inertia * (velocity.rotor * velocity.rotor))
     potential: Scalar = 0.0
-    for link, angle in zip(tree.links, joint_angles, strict=True):
-        stretch = angle - link.rest_angle
+    for link, stretch in zip(tree.links, deflections(tree, joint_angles), strict=True):
         potential = potential + 0.5 * link.stiffness * (stretch * stretch)
     return kinetic, potential

@@ -14,9 +14,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+from dq_space_arm_env.algebra import quaternion, rotations
 from dq_space_arm_env.algebra.scalars import cos, sin, tanh
-from dq_space_arm_env.algebra.vectors import add, cross, matrix_vector, scale, transposed_matrix_vector
-from dq_space_arm_env.dynamics.kinematic_tree import Friction, KinematicTree, RigidBody, Rotor, Screw
+from dq_space_arm_env.algebra.vectors import (
+    add,
+    cross,
+    matrix_product,
+    matrix_vector,
+    scale,
+    transposed_matrix_vector,
+)
+from dq_space_arm_env.dynamics.kinematic_tree import (
+    TURNED_AXES,
+    Friction,
+    KinematicTree,
+    RigidBody,
+    Rotor,
+    Screw,
+)
 
 Scalar = Any
 Vector3 = Sequence[Scalar]
@@ -51,20 +66,69 @@ class LinkFrame(NamedTuple):
     position: Vector3  # of the origin, m
 
 
-def link_frames(tree: KinematicTree, joint_angles: Sequence[Scalar]) -> list[LinkFrame]:
-    """Frames of the links, n, from their joints' coordinates: screws about their z axes."""
+def link_frames(tree: KinematicTree, joint_angles: Sequence[Any]) -> list[LinkFrame]:
+    """Frames of the links, n, from their joints' coordinates: screws about their z axes, or quaternions."""
     frames: list[LinkFrame] = []
     for link, angle in zip(tree.links, joint_angles, strict=True):
         rotation: Sequence[Vector3] = link.joint.rotation
         position: Vector3 = link.joint.position
         axis = [row[2] for row in rotation]  # z, which a turn leaves where it is
-        if link.screw.turn:
+        if link.spherical is not None:
+            if link.spherical == 0:
+                turned = matrix_product(rotation, quaternion_rotation(angle))
+                rotation = matrix_product(turned, TURNED_AXES.rotation)
+        elif link.screw.turn:
             c, s = cos(angle), sin(angle)
             rotation = tuple((row[0] * c + row[1] * s, row[1] * c - row[0] * s, row[2]) for row in rotation)
         if link.screw.slide:
             position = add(position, scale(link.screw.slide * angle, axis))
         frames.append(LinkFrame(rotation, position))
     return frames
+
+
+def quaternion_rotation(q: Sequence[Scalar]) -> Sequence[Vector3]:
+    """Rotation matrix of a quaternion that need not have unit length, as within the stages of a step."""
+    w, x, y, z = q
+    twice = 2.0 / (w * w + x * x + y * y + z * z)
+    xx, yy, zz = twice * x * x, twice * y * y, twice * z * z
+    xy, yz, zx = twice * x * y, twice * y * z, twice * z * x
+    wx, wy, wz = twice * w * x, twice * w * y, twice * w * z
+    return (
+        (1.0 - (yy + zz), xy - wz, zx + wy),
+        (xy + wz, 1.0 - (zz + xx), yz - wx),
+        (zx - wy, yz + wx, 1.0 - (xx + yy)),
+    )
+
+
+def turn_by_quaternion(q: Sequence[Scalar]) -> list[list[Scalar]]:
+    """Rotation in a link's axes, rad, per change of its quaternion of any length, 3x4: 2 q* dq / |q|^2."""
+    w, x, y, z = quaternion.scale(2.0 / quaternion.dot(q, q)[0], q)
+    return [[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]]
+
+
+def angle_rates(
+    tree: KinematicTree, joint_angles: Sequence[Any], joint_rates: Sequence[Scalar]
+) -> list[Scalar]:
+    """Time derivative of the joints' coordinates as a state has them: the rates, or q' = q omega / 2 (2)."""
+    rates: list[Scalar] = []
+    for index, link in enumerate(tree.links):
+        if link.spherical is None:
+            rates.append(joint_rates[index])
+        elif link.spherical == 0:
+            omega = (0.0, *joint_rates[index : index + 3])
+            rates += quaternion.scale(0.5, quaternion.multiply(joint_angles[index], omega))
+    return rates
+
+
+def deflections(tree: KinematicTree, joint_angles: Sequence[Any]) -> list[Scalar]:
+    """Joints' coordinates less those at which springs rest, rad (m): of spherical ones rotation vectors."""
+    found: list[Scalar] = []
+    for index, link in enumerate(tree.links):
+        if link.spherical is None:
+            found.append(joint_angles[index] - link.rest_angle)
+        elif link.spherical == 0:
+            found += rotations.logarithm(quaternion.normalize(joint_angles[index]))
+    return found
 
 
 def along(screw: Screw, force: Vector3, torque: Vector3) -> Scalar:
@@ -87,6 +151,7 @@ def body_wrenches(
     Besides, the torques [N m] that the rotors of the joints need, n.
     """
     rotors: list[Scalar] = []
+    carried: Vector3 = ZERO  # angular velocity of what carries a spherical joint
     motions = [(angular_velocity, acceleration.angular, acceleration.linear)]
     wrenches = [_newton_euler(tree.base, *motions[0])]
     for link, (rotation, p), rate, rate_change in zip(
@@ -103,6 +168,9 @@ def body_wrenches(
             force, torque = wrenches[link.parent]
             wrenches[link.parent] = force, add(torque, matrix_vector(rotation, about_rotor))
         across = (omega[1] * rate, -omega[0] * rate)  # omega x (rate z)
+        if link.spherical is not None:  # rates about axes of one body: no rate turns another's axis
+            carried = transposed_matrix_vector(rotation, carried) if link.spherical else omega
+            across = (carried[1] * rate, -carried[0] * rate)
         turn, slide = link.screw
         if slide:  # the origin moves along z: 2 omega x (rate z) and (rate change) z more
             a = add(a, scale(slide, (2.0 * across[0], 2.0 * across[1], rate_change)))
@@ -185,8 +253,8 @@ def passive_torques(
 ) -> list[Scalar]:
     """Torques (or forces) of the joints' springs, dampers and friction on the links, n, N m (N)."""
     return [
-        -link.stiffness * (angle - link.rest_angle) - link.damping * rate - rubbing(link.friction, rate)
-        for link, angle, rate in zip(tree.links, joint_angles, joint_rates, strict=True)
+        -link.stiffness * away - link.damping * rate - rubbing(link.friction, rate)
+        for link, away, rate in zip(tree.links, deflections(tree, joint_angles), joint_rates, strict=True)
     ]
 
 

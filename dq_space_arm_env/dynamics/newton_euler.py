@@ -19,19 +19,25 @@ from typing import Any
 
 from dq_space_arm_env.algebra import dual_matrices
 from dq_space_arm_env.algebra import dual_quaternion as dq
-from dq_space_arm_env.dynamics.kinematic_tree import JointedLink, KinematicTree, Screw
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.kinematics import joint_motion, tip_pose_rate, wrist_rotation
 from dq_space_arm_env.dynamics.linear import factorize_ldl, solve_ldl
-from dq_space_arm_env.dynamics.minimal import passive_torques
+from dq_space_arm_env.dynamics.minimal import angle_rates, passive_torques
+from dq_space_arm_env.dynamics.paper_joints import (
+    FORBIDDEN,
+    PRISMATIC_FORBIDDEN,
+    Joint,
+    bodies_of,
+    count_of_coordinates,
+    forbidden,
+    joints_of,
+    tip_body_of,
+    transmitted,
+)
 
 Scalar = Any
 DualQuaternion = Sequence[Scalar]
 Matrix = list[list[Scalar]]
-
-# E_158 keeps what a revolute joint can transmit, E_145 the velocities that it forbids (counted from zero).
-TRANSMITTED, FORBIDDEN = (1, 2, 3, 5, 6), (1, 2, 5, 6, 7)
-# A prismatic joint transmits a torque about its axis, and no force along it.
-PRISMATIC_TRANSMITTED, PRISMATIC_FORBIDDEN = (1, 2, 5, 6, 7), (1, 2, 3, 5, 6)
 
 
 @dataclass(frozen=True)
@@ -66,12 +72,12 @@ def joint_frames(
 ) -> JointFrames:
     """Relative poses that (13)-(19) refer to."""
     distal, proximal = [], []
-    to_center = [_translation([-c for c in body.center_of_mass]) for body in tree.bodies]
-    for link, angle in zip(tree.links, joint_angles, strict=True):
-        fixed = dq.multiply(to_center[link.parent], link.joint.dual_quaternion)
-        distal.append(dq.multiply(fixed, joint_motion(link.screw, angle)))
-        proximal.append(_translation(link.body.center_of_mass))
-    tip: DualQuaternion = to_center[tree.tip_body]
+    to_center = [_translation([-c for c in body.center_of_mass]) for body in bodies_of(tree)]
+    for joint in joints_of(tree):
+        fixed = dq.multiply(to_center[joint.parent], joint.link.joint.dual_quaternion)
+        distal.append(dq.multiply(fixed, joint_motion(joint.link.screw, joint_angles[joint.first])))
+        proximal.append(_translation(joint.body.center_of_mass))
+    tip: DualQuaternion = to_center[tip_body_of(tree)]
     if tree.wrist is not None:
         tip = dq.multiply(dq.multiply(tip, tree.wrist.dual_quaternion), wrist_rotation(wrist_angles))
     return JointFrames(distal, proximal, dq.multiply(tip, tree.tip.dual_quaternion))
@@ -82,23 +88,53 @@ def joint_velocity(
 ) -> DualQuaternion:
     """Dual velocity of a joint in its own axes, omega^i_{i/e_i}.
 
-    Entry 3, or 7 of a prismatic joint, is the joint rate (12). A screw's entry 7 is pitch times its rate; the
-    others vanish when the bodies obey the joint.
+    Entry 3, or 7 of a prismatic joint, is the joint rate (12), entries 1 to 3 those of a spherical one. A
+    screw's entry 7 is pitch times its rate; the others vanish when the bodies obey the joint.
     """
     after, before = frames.proximal[joint], frames.distal[joint]
     # (12): Ad(q_{e_{i+1}/i}) w_{i+1} - Ad(q_{i/e_i}*) w_i.
     return dq.subtract(
         dq.adjoint(after, velocities[joint + 1]),
-        dq.inverse_adjoint(before, velocities[tree.links[joint].parent]),
+        dq.inverse_adjoint(before, velocities[joints_of(tree)[joint].parent]),
     )
 
 
 def along_joints(
     tree: KinematicTree, frames: JointFrames, velocities: Sequence[DualQuaternion]
 ) -> list[Scalar]:
-    """Joint rates (12) from the dual velocities of the bodies; likewise of their rates."""
-    entries = [3 if link.screw.turn else 7 for link in tree.links]
-    return [joint_velocity(tree, frames, j, velocities)[entry] for j, entry in enumerate(entries)]
+    """Joint rates (12) from the dual velocities of the bodies."""
+    rates: list[Scalar] = []
+    for j, joint in enumerate(joints_of(tree)):
+        velocity = joint_velocity(tree, frames, j, velocities)
+        rates += [velocity[entry] for entry in joint.free]
+    return rates
+
+
+def joint_accelerations(
+    tree: KinematicTree,
+    frames: JointFrames,
+    velocities: Sequence[DualQuaternion],
+    accelerations: Sequence[DualQuaternion],
+) -> list[Scalar]:
+    """Accelerations of the joints from the dual velocities and accelerations of the bodies, by (19).
+
+    The turning of a single axis has no component along it: there (12) holds for accelerations too.
+    """
+    changes = along_joints(tree, frames, accelerations)
+    for j, joint in enumerate(joints_of(tree)):
+        if joint.link.spherical is not None:
+            turned = _centripetal(tree, frames, j, velocities)
+            for degree, entry in enumerate(joint.free):
+                changes[joint.first + degree] = changes[joint.first + degree] - turned[entry]
+    return changes
+
+
+def _centripetal(
+    tree: KinematicTree, frames: JointFrames, joint: int, velocities: Sequence[DualQuaternion]
+) -> DualQuaternion:
+    """The right-hand side of (19), w^j_{e_j/I} x w^j_{j/e_j}."""
+    carried = dq.inverse_adjoint(frames.distal[joint], velocities[joints_of(tree)[joint].parent])
+    return dq.cross(carried, joint_velocity(tree, frames, joint, velocities))
 
 
 def assemble(
@@ -112,13 +148,14 @@ def assemble(
 
     `velocities` holds omega^{e_i}_{e_i/I}, 8 per body; `joint_torques` include springs and dampers.
     """
-    n = len(tree.links)
-    s11 = _zeros(8 * (n + 1), 8 * (n + 1))
+    joints, bodies = joints_of(tree), bodies_of(tree)
+    count = sum(len(joint.forbidden) for joint in joints)
+    s11 = _zeros(8 * len(bodies), 8 * len(bodies))
     rotors = sum(link.rotor is not None for link in tree.links)
-    s12, s21 = _zeros(8 * (n + 1), 5 * n + rotors), _zeros(5 * n, 8 * (n + 1))
+    s12, s21 = _zeros(8 * len(bodies), count + rotors), _zeros(count, 8 * len(bodies))
     b1: list[Scalar] = []
     b2: list[Scalar] = []
-    for i, (body, velocity) in enumerate(zip(tree.bodies, velocities, strict=True)):
+    for i, (body, velocity) in enumerate(zip(bodies, velocities, strict=True)):
         inertia = dual_matrices.dual_inertia_matrix(body.mass, body.inertia)
         _place(s11, 8 * i, 8 * i, dual_matrices.swap_columns(inertia))  # H(M_i) wdot_i = M_i wdot_i^s
         # (9): the gyroscopic term omega x (M omega^s) moves to the right.
@@ -127,30 +164,30 @@ def assemble(
     _accumulate(b1, 0, base_wrench)  # W_0 of (13)
     if tree.tip_wrench is not None:
         wrench = (0.0, *tree.tip_wrench[:3], 0.0, *tree.tip_wrench[3:])
-        _accumulate(b1, 8 * tree.tip_body, dq.adjoint(frames.tip, wrench))  # Ad(q_{G/e_n}) W_ext of (16)
-    for j, parent in enumerate(tree.parents):
-        before, after = frames.distal[j], frames.proximal[j]
+        _accumulate(b1, 8 * tip_body_of(tree), dq.adjoint(frames.tip, wrench))  # Ad(q_{G/e_n}) W_ext of (16)
+    for j, joint in enumerate(joints):
+        before, after, parent = frames.distal[j], frames.proximal[j], joint.parent
         # (13)-(16): +-Ad(.) E158' W~_{j+1/j} on the left, -+Ad(.) W_act,j+1 on the right.
-        screw = tree.links[j].screw
         actuation = [0.0] * 8
-        actuation[7 if screw.turn else 3] = joint_torques[j]
+        for degree, entry in enumerate(joint.free):  # a torque turns, a force slides
+            actuation[(entry + 4) % 8] = joint_torques[joint.first + degree]
         for body_index, pose, sign in ((parent, before, 1.0), (j + 1, dq.conjugate(after), -1.0)):
             transfer = dual_matrices.adjoint_matrix(pose)
-            columns = [[sign * entry for entry in _transmitted(screw, row)] for row in transfer]
-            _place(s12, 8 * body_index, 5 * j, columns)
+            columns = [[sign * entry for entry in transmitted(joint, row)] for row in transfer]
+            _place(s12, 8 * body_index, joint.row, columns)
             _accumulate(b1, 8 * body_index, dq.scale(-sign, dq.adjoint(pose, actuation)))
         # (19): E145 Ad(q_{e_{j+1}/j}) wdot_{j+1} - E145 Ad(q_{j/e_j}*) wdot_j = E145 (w^j_{e_j/I} x
         # w^j_{j/e_j}).
         back = dual_matrices.adjoint_matrix(dq.conjugate(before))
-        _place(s21, 5 * j, 8 * (j + 1), _forbidden(screw, dual_matrices.adjoint_matrix(after)))
-        _place(s21, 5 * j, 8 * parent, [[-entry for entry in row] for row in _forbidden(screw, back)])
-        carried = dq.inverse_adjoint(before, velocities[parent])
-        centripetal = dq.cross(carried, joint_velocity(tree, frames, j, velocities))
-        b2 += [row[0] for row in _forbidden(screw, [[entry] for entry in centripetal])]
+        _place(s21, joint.row, 8 * (j + 1), forbidden(joint, dual_matrices.adjoint_matrix(after)))
+        _place(s21, joint.row, 8 * parent, [[-entry for entry in row] for row in forbidden(joint, back)])
+        centripetal = _centripetal(tree, frames, j, velocities)
+        b2 += [row[0] for row in forbidden(joint, [[entry] for entry in centripetal])]
     s22: list[Scalar] = [0.0] * len(b2)
-    for j, link in enumerate(tree.links):
+    for j, joint in enumerate(joints):
+        link = joint.link
         if link.rotor is not None:
-            row = _rotor_row(link, frames, j)
+            row = _rotor_row(joint, frames, j)
             for body_index, entries in row.items():
                 _place(s12, 8 * body_index, len(s22), [[-entry] for entry in dq.swap(entries)])
             s21.append([0.0] * len(s11))
@@ -158,13 +195,14 @@ def assemble(
                 _place(s21, len(s22), 8 * body_index, [entries])
             s22.append(1.0 / link.rotor.inertia)
             b2.append(0.0)
-            gyroscopic = _gyroscopic(link, frames, j, velocities)
-            _accumulate(b1, 8 * link.parent, dq.scale(-1.0, dq.adjoint(frames.distal[j], gyroscopic)))
+            gyroscopic = _gyroscopic(joint, frames, j, velocities)
+            _accumulate(b1, 8 * joint.parent, dq.scale(-1.0, dq.adjoint(frames.distal[j], gyroscopic)))
     return NewtonEulerSystem(s11, s12, s21, b1, b2, s22)
 
 
-def _rotor_row(link: JointedLink, frames: JointFrames, joint: int) -> dict[int, list[Scalar]]:
+def _rotor_row(whole: Joint, frames: JointFrames, joint: int) -> dict[int, list[Scalar]]:
     """The rate of a rotor per dual velocity of the bodies before and after its joint, 8 each."""
+    link = whole.link
     assert link.rotor is not None
     along = 3 if link.screw.turn else 7
     after = dual_matrices.adjoint_matrix(frames.proximal[joint])
@@ -173,37 +211,22 @@ def _rotor_row(link: JointedLink, frames: JointFrames, joint: int) -> dict[int, 
     carrier = [-link.rotor.gear * entry for entry in before[along]]
     if link.rotor.exact:
         carrier = [entry + turning for entry, turning in zip(carrier, before[3], strict=True)]
-    return {link.parent: carrier, joint + 1: own}
+    return {whole.parent: carrier, joint + 1: own}
 
 
 def _gyroscopic(
-    link: JointedLink, frames: JointFrames, joint: int, velocities: Sequence[DualQuaternion]
+    whole: Joint, frames: JointFrames, joint: int, velocities: Sequence[DualQuaternion]
 ) -> DualQuaternion:
     """Wrench that a rotor's spin needs as the body that carries it turns, joint axes: omega x s z."""
+    link, parent = whole.link, whole.parent
     assert link.rotor is not None
     if not link.rotor.exact:
         return [0.0] * 8
-    carried = dq.inverse_adjoint(frames.distal[joint], velocities[link.parent])
-    parents = {link.parent: velocities[link.parent], joint + 1: velocities[joint + 1]}
-    row = _rotor_row(link, frames, joint)
+    carried = dq.inverse_adjoint(frames.distal[joint], velocities[parent])
+    parents = {parent: velocities[parent], joint + 1: velocities[joint + 1]}
+    row = _rotor_row(whole, frames, joint)
     spin = link.rotor.inertia * sum(_product(row[body], parents[body]) for body in parents)
     return [0.0, 0.0, 0.0, 0.0, 0.0, carried[2] * spin, -carried[1] * spin, 0.0]
-
-
-def _transmitted(screw: Screw, row: Sequence[Scalar]) -> list[Scalar]:
-    """Combine a row's columns into those of the five wrenches that a joint transmits."""
-    kept = [row[column] for column in (TRANSMITTED if screw.turn else PRISMATIC_TRANSMITTED)]
-    if screw.turn and screw.slide:  # a force along the axis comes with a torque: no work along the screw
-        kept[2] = kept[2] - screw.slide * row[7]
-    return kept
-
-
-def _forbidden(screw: Screw, rows: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
-    """Combine the rows of a dual velocity into those of the five velocities that a joint forbids."""
-    kept = [list(rows[row]) for row in (FORBIDDEN if screw.turn else PRISMATIC_FORBIDDEN)]
-    if screw.turn and screw.slide:
-        kept[4] = [along - screw.slide * about for along, about in zip(rows[7], rows[3], strict=True)]
-    return kept
 
 
 class SchurComplement:
@@ -215,14 +238,16 @@ class SchurComplement:
 
     def __init__(self, tree: KinematicTree, system: NewtonEulerSystem) -> None:
         self._system = system
-        self._bodies = tree.bodies
+        self._bodies = bodies_of(tree)
         count = len(system.s21)
         # A force enforces a linear velocity, a torque an angular one: (vx, vy, vz, wx, wy) within each joint,
-        # (vx, vy, wx, wy, wz) within a prismatic one.
-        turning, sliding = (2, 3, 4, 0, 1), (3, 4, 0, 1, 2)
-        orders = [turning if link.screw.turn else sliding for link in tree.links]
-        joints = 5 * len(tree.links)
-        order = [5 * (k // 5) + orders[k // 5][k % 5] for k in range(joints)]
+        # (vx, vy, wx, wy, wz) within a prismatic one, (vx, vy, vz) within a spherical one.
+        pairing: dict[tuple[int, ...], tuple[int, ...]] = {
+            FORBIDDEN: (2, 3, 4, 0, 1),
+            PRISMATIC_FORBIDDEN: (3, 4, 0, 1, 2),
+        }
+        order = [joint.row + k for joint in joints_of(tree) for k in pairing.get(joint.forbidden, (0, 1, 2))]
+        joints = len(order)
         order += range(joints, count)  # rotors pair with their own rows
         self._order = order
         self._constraints = [system.s21[row] for row in order]
@@ -324,17 +349,17 @@ class PaperState:
     """The paper's state: 46 numbers for three links and a wrist."""
 
     base_pose: DualQuaternion  # q_{e0/I}, 8
-    joint_angles: Sequence[Scalar]  # n, rad
+    joint_angles: Sequence[Any]  # n, rad; of spherical joints see `KinematicTree.coordinates`
     wrist_angles: Sequence[Scalar]  # psi, theta, phi, rad; empty without a wrist
     velocities: Sequence[DualQuaternion]  # dual velocities omega^{e_i}_{e_i/I} of all bodies
 
     @classmethod
     def from_vector(cls, tree: KinematicTree, x: Sequence[Scalar]) -> PaperState:
-        """Split a state vector of 8 + n + (3) + 8 (n + 1) numbers."""
-        n, wrist = len(tree.links), 0 if tree.wrist is None else 3
-        start = 8 + n + wrist
-        velocities = [x[start + 8 * i : start + 8 * i + 8] for i in range(n + 1)]
-        return cls(x[:8], x[8 : 8 + n], x[8 + n : start], velocities)
+        """Split a state vector of 8 + n + (3) + 8 (n + 1) numbers, one more for each spherical joint."""
+        n, wrist = count_of_coordinates(tree), 0 if tree.wrist is None else 3
+        start, bodies = 8 + n + wrist, range(len(joints_of(tree)) + 1)
+        velocities = [x[start + 8 * i : start + 8 * i + 8] for i in bodies]
+        return cls(x[:8], tree.coordinates(x[8 : 8 + n]), x[8 + n : start], velocities)
 
 
 def paper_rates(
@@ -347,7 +372,8 @@ def paper_rates(
     """Time derivative of the paper's state (11), (12), (22), and the reaction wrenches (21)."""
     system = system_of(tree, state, base_wrench, joint_torques)
     accelerations, reactions = solve_schur(tree, system)
-    return [*paper_position_rates(tree, state, wrist_rates), *accelerations], reactions[: 5 * len(tree.links)]
+    count = sum(len(joint.forbidden) for joint in joints_of(tree))
+    return [*paper_position_rates(tree, state, wrist_rates), *accelerations], reactions[:count]
 
 
 def system_of(
@@ -371,7 +397,8 @@ def paper_position_rates(
 ) -> list[Scalar]:
     """Rates of base pose (11), joint angles (12) and wrist angles."""
     pose_rate = dq.scale(0.5, dq.multiply(state.base_pose, state.velocities[0]))  # (8), (11)
-    return [*pose_rate, *joint_speeds(tree, state), *wrist_rates]
+    angles = angle_rates(tree, state.joint_angles, joint_speeds(tree, state))
+    return [*pose_rate, *angles, *wrist_rates]
 
 
 def paper_tip_rate(tree: KinematicTree, state: PaperState, wrist_rates: Sequence[Scalar]) -> DualQuaternion:

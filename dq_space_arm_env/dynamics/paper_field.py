@@ -17,6 +17,7 @@ from dq_space_arm_env.algebra.symbolic import column, matrix, symbols, zeros
 from dq_space_arm_env.dynamics import kinematics, minimal, newton_euler, reaction_wheels
 from dq_space_arm_env.dynamics.equations_of_motion import Inputs
 from dq_space_arm_env.dynamics.newton_euler import PaperState, SchurComplement
+from dq_space_arm_env.dynamics.paper_joints import count_of_coordinates, joints_of
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
 
@@ -39,8 +40,9 @@ class PaperField:
         self.parameters = minimal_field.parameters
         self.tree = minimal_field.tree
         self.n_u = minimal_field.n_u
-        n = len(self.tree.links)
-        self._positions = 8 + n + (0 if self.tree.wrist is None else 3)
+        n = len(joints_of(self.tree))
+        coordinates = count_of_coordinates(self.tree)
+        self._positions = 8 + coordinates + (0 if self.tree.wrist is None else 3)
         self.tip = slice(self._positions + 8 * (n + 1), self._positions + 8 * (n + 2))
         self.base_twist = (
             *range(self._positions + 1, self._positions + 4),
@@ -60,10 +62,13 @@ class PaperField:
         )
         duals: list[Scalar] = []
         for body, velocity in zip(tree.bodies, velocities, strict=True):
+            if not body.mass:  # of a spherical joint
+                continue
             at_center = vectors.add(velocity.linear, vectors.cross(velocity.angular, body.center_of_mass))
             duals += [0.0, *velocity.angular, 0.0, *at_center]
         tip = kinematics.tip_pose(tree, pose, motion.joint_angles, motion.wrist_angles)
-        return [*pose, *motion.joint_angles, *motion.wrist_angles, *duals, *tip, *motion.wheel_momenta]
+        angles = y[: count_of_coordinates(tree)]
+        return [*pose, *angles, *motion.wrist_angles, *duals, *tip, *motion.wheel_momenta]
 
     def minimal_from_state(self, y: Sequence[Scalar]) -> list[Scalar]:
         """The motion in minimal coordinates.
@@ -77,7 +82,8 @@ class PaperField:
         twist = (*base[1:4], *base[5:8])
         x: list[Scalar] = [0.0] * field.n_x
         x[layout.pose] = field.pose.reduced(dq.normalize(state.base_pose))
-        x[layout.joint_angles] = list(state.joint_angles)
+        x[layout.joint_angles] = list(y[8 : 8 + count_of_coordinates(self.tree)])
+        x = field.with_unit_quaternions(x)
         x[layout.wrist_angles] = list(state.wrist_angles)
         x[layout.base_velocity] = [twist[i] for i in field.pose.directions]
         x[layout.joint_rates] = newton_euler.joint_speeds(self.tree, state)
@@ -101,10 +107,9 @@ class PaperField:
     def free_accelerations(self, y: Sequence[Scalar], ydot: Sequence[Scalar]) -> list[Scalar]:
         """Accelerations of base (free directions) and joints among the dual accelerations of all bodies."""
         state = PaperState.from_vector(self.tree, y[: self.tip.start])
-        # The turning of the joint's axes has no component along them: (12) holds for accelerations too.
-        bodies = [ydot[8 * i : 8 * i + 8] for i in range(len(self.tree.links) + 1)]
+        bodies = [ydot[8 * i : 8 * i + 8] for i in range(len(ydot) // 8)]
         frames = newton_euler.joint_frames(self.tree, state.joint_angles, state.wrist_angles)
-        joints = newton_euler.along_joints(self.tree, frames, bodies)
+        joints = newton_euler.joint_accelerations(self.tree, frames, state.velocities, bodies)
         base = (*ydot[1:4], *ydot[5:8])
         return [*(base[i] for i in self.minimal.pose.directions), *joints]
 

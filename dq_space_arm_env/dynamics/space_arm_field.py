@@ -27,7 +27,7 @@ Matrix = Any
 class _SimpleJacobians(NamedTuple):
     """Jacobians of what is written in closed form."""
 
-    angles_by_y: Matrix  # rates of joint and wrist angles, constant
+    angles_by_y: Matrix  # rates of joint and wrist angles, constant but for quaternions
     angles_by_u: Matrix
     turning_by_y: Matrix  # -omega x v, rows of the accelerations of base and joints
     motors_by_y: Matrix  # rates and accelerations of the motors of elastic joints
@@ -72,7 +72,7 @@ class SpaceArmField(EquationsOfMotion):
             self._response(inertia, [-e for e in dense_entries(by_y[:, i])]) for i in range(self.n_y)
         ]
         response = columns(*(column(*entries) for entries in responses), rows=len(self.body_rate_indices))
-        rates = [*motion.joint_rates, *inputs.wrist_rates, *self._dual(motion, solved)]
+        rates = [*self.angle_rates(motion), *inputs.wrist_rates, *self._dual(motion, solved)]
         rates += [*self.motor_motion(motion, inputs), *inputs.wheel_torques, *inputs.propellant_rates]
         simple, stored = self._simple_jacobians(y), self._store_jacobians()
         jacobian_y = casadi.vertcat(
@@ -137,6 +137,10 @@ class SpaceArmField(EquationsOfMotion):
         moved = [*self._in_y(state.motor_angles), *self._in_y(state.motor_rates)]
         theirs = column(*(multiplier[i] for i in moved))
         bent = casadi.hessian(casadi.dot(theirs, motors), column(*free))[0]
+        if self.tree.has_spherical:  # q' = q omega / 2
+            angles = self._in_y(state.joint_angles)
+            turned = casadi.dot(column(*(multiplier[i] for i in angles)), column(*self.angle_rates(moving)))
+            bent = bent + casadi.hessian(turned, column(*free))[0]
         curvature = curvature - casadi.substitute(bent, column(*free), casadi.densify(column(*y)))
         curvature = casadi.diagcat(curvature, zeros(n_u, n_u))
         return casadi.sparsify(-(curvature + coupling + coupling.T))
@@ -146,14 +150,15 @@ class SpaceArmField(EquationsOfMotion):
         free_y = symbols("f", self.n_y)
         free_u = symbols("g", self.n_u)
         motion, inputs = self.motion(free_y), self.inputs(free_u)
-        angles = column(*motion.joint_rates, *inputs.wrist_rates)
+        angles = column(*self.angle_rates(motion), *inputs.wrist_rates)
         motors = column(*self.motor_motion(motion, inputs))
         turning = [*ZERO, *(-entry for entry in cross(motion.angular, motion.linear))]
         kept = column(*(turning[i] for i in self.pose.directions), *[0.0] * len(self.tree.links))
-        by_y = [casadi.jacobian(each, column(*free_y)) for each in (kept, motors)]
-        turning_by_y, motors_by_y = casadi.substitute(by_y, [column(*free_y)], [casadi.densify(column(*y))])
+        by_y = [casadi.jacobian(each, column(*free_y)) for each in (angles, kept, motors)]
+        values = casadi.densify(column(*y))
+        angles_by_y, turning_by_y, motors_by_y = casadi.substitute(by_y, [column(*free_y)], [values])
         return _SimpleJacobians(
-            casadi.jacobian(angles, column(*free_y)),
+            angles_by_y,
             casadi.jacobian(angles, column(*free_u)),
             turning_by_y,
             motors_by_y,
@@ -190,14 +195,25 @@ class SpaceArmField(EquationsOfMotion):
         by_y = casadi.jacobian(column(*missing), column(*free))
         values = casadi.densify(column(*y, *solved.angular, *solved.linear, *solved.joints))
         by_y = casadi.substitute(by_y, column(*free, *acceleration), values)
-        angles = self._in_y(self.layout.state.joint_angles)
-        for j, (force, torque) in enumerate(self._reactions(self.motion(y), solved)):
-            turn, slide = self.tree.links[j].screw
-            across = (-force[1], force[0], 0.0)  # z x force
-            moved = add(scale(turn, (-torque[1], torque[0], 0.0)), scale(slide, across))
-            change = column(*scale(turn, across), *moved)
-            rows = list(range(6 * (j + 1), 6 * (j + 2)))
-            by_y[rows, angles[j]] = by_y[rows, angles[j]] + change
+        angles = iter(self._in_y(self.layout.state.joint_angles))
+        moving = self.motion(y)
+        for j, (force, torque) in enumerate(self._reactions(moving, solved)):
+            link, rows = self.tree.links[j], list(range(6 * (j + 1), 6 * (j + 2)))
+            changes: list[Matrix] = []
+            if link.spherical is None:
+                turn, slide = link.screw
+                across = (-force[1], force[0], 0.0)  # z x force
+                moved = add(scale(turn, (-torque[1], torque[0], 0.0)), scale(slide, across))
+                changes.append(column(*scale(turn, across), *moved))
+            elif link.spherical == 0:  # it takes the whole rotation, whose x is this frame's z
+                for x, *others in zip(*minimal.turn_by_quaternion(moving.joint_angles[j]), strict=True):
+                    turned = (*others, x)
+                    changes.append(column(*cross(turned, force), *cross(turned, torque)))
+            for change in changes:
+                angle = next(angles)
+                by_y[rows, angle] = by_y[rows, angle] + change
+                if link.spherical is not None:  # the torque about z of this frame, which turns along, stays
+                    by_y[6 * (n + 1) + j, angle] = by_y[6 * (n + 1) + j, angle] - change[5]
         return casadi.sparsify(by_y)
 
     def _residual(self, y: Sequence[Scalar]) -> Residual:

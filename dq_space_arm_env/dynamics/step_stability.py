@@ -11,7 +11,7 @@ from dq_space_arm_env.dynamics.elastic_gears import elastic_joints
 from dq_space_arm_env.dynamics.kinematic_tree import Friction, KinematicTree
 from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
 from dq_space_arm_env.dynamics.minimal import link_frames
-from dq_space_arm_env.scene import INTEGRATORS, Scene
+from dq_space_arm_env.scene import INTEGRATORS, Scene, StateLayout
 
 STIFF = "rodas4"
 """The integrator for joints that are too stiff for explicit ones."""
@@ -34,14 +34,17 @@ def joint_motion(scene: Scene) -> JointMotion:
     Returns:
         Square root of the largest eigenvalue of the first, and largest of the second; zeros without any.
     """
-    tank, links = scene.actuators.tank, scene.links
+    tank = scene.actuators.tank
     tree = KinematicTree.from_scene(scene).with_propellant(() if tank is None else (tank.propellant,))
-    slopes = [link.damping + _slope(link.friction) for link in tree.links]
-    if not any(link.stiffness or slope or link.is_elastic for link, slope in zip(links, slopes, strict=True)):
+    links, gears = tree.links, elastic_joints(tree)
+    slopes = [link.damping + _slope(link.friction) for link in links]
+    if not gears and not any(link.stiffness or slope for link, slope in zip(links, slopes, strict=True)):
         return JointMotion(0.0, 0.0)
-    whole = np.array(mass_matrix(tree, link_frames(tree, scene.initial_state.joint_angles)), dtype=float)
+    layout = StateLayout.of(scene)
+    start = tree.coordinates(layout.initial_state[layout.state.joint_angles].tolist())
+    whole = np.array(mass_matrix(tree, link_frames(tree, start)), dtype=float)
     free = [2, 3, 4, *range(6, len(whole))] if tree.planar else range(len(whole))
-    gears, n = elastic_joints(tree), len(links)
+    n = len(links)
     inverse = np.zeros((n + len(gears),) * 2)  # of joints, and of the motors behind elastic gears
     inverse[:n, :n] = np.linalg.inv(whole[np.ix_(free, free)])[-n:, -n:]
     for motor, (_, gear) in enumerate(gears, n):
@@ -80,7 +83,8 @@ def stable(scene: Scene) -> Scene:
     Returns:
         The scene itself, or one with integrator `rodas4`.
     """
-    return scene.replace(simulation={"integrator": STIFF}) if _used(scene) > _MARGIN else scene
+    unstable = _used(scene) > _MARGIN and _may_be_stiff(scene)
+    return scene.replace(simulation={"integrator": STIFF}) if unstable else scene
 
 
 def advice(scene: Scene) -> str | None:
@@ -104,8 +108,13 @@ def advice(scene: Scene) -> str | None:
         )
         if rate > 0.0
     ]
+    stiff = f"integrator to {STIFF}, or " if _may_be_stiff(scene) else ""
     return (
         f"joints {' and '.join(parts)}, where {simulation.integrator} is unstable in steps of "
-        f"{simulation.dt:g} s: set simulation.integrator to {STIFF}, or dt to "
-        f"{_MARGIN * simulation.dt / used:.2g}"
+        f"{simulation.dt:g} s: set simulation.{stiff}dt to {_MARGIN * simulation.dt / used:.2g}"
     )
+
+
+def _may_be_stiff(scene: Scene) -> bool:
+    """Whether the integrator for stiff joints takes the scene's."""
+    return INTEGRATORS[STIFF].turns_quaternions or not any(link.is_spherical for link in scene.links)

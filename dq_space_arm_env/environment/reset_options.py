@@ -13,6 +13,7 @@ from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.layout import unit_quaternions
 from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.parameters import TARGET, target_entries
 from dq_space_arm_env.scene.path import given_path
@@ -85,13 +86,21 @@ def given_start(kernels: Kernels, options: dict[str, Any]) -> GivenStart:
 
 
 def _checked_state(kernels: Kernels, state: Any) -> Array:
-    """A state with the rounding errors of its base pose removed."""
+    """A state with the rounding errors of its base pose, and of spherical joints' quaternions, removed."""
     x = _finite("initial_state", state, kernels.n_x)
     where = kernels.layout.state.pose
     stored = list(PLANAR_POSE) if kernels.layout.planar else list(range(8))
     pose = np.zeros(8)
     pose[stored] = x[where]
     x[where] = _unit_pose("initial_state has a base pose", pose)[stored]
+    for where in unit_quaternions(kernels.scene):
+        length = math.hypot(*x[where])
+        if abs(length - 1.0) > 1e-6:
+            raise ValueError(
+                f"options: initial_state has a spherical joint with |q| = {length:.9g} (entries "
+                f"{where.start} to {where.stop - 1}); a unit quaternion has 1"
+            )
+        x[where] /= length
     check_size("options: initial_state", x)
     return x
 

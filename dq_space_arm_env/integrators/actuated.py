@@ -19,6 +19,7 @@ from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.integrators import dormand_prince
 from dq_space_arm_env.integrators.actuator_maps import ActuatorMaps
+from dq_space_arm_env.integrators.after_jump import StepAndJump, rename
 from dq_space_arm_env.integrators.method import Integrator, TwiceDifferentiableIntegrator, program_inputs
 
 Scalar = Any
@@ -93,8 +94,13 @@ class ActuatedStep:
 
 
 def actuated(method: Any, field: SpaceArmField) -> Any:
-    """Let the actuators' step go along with a method's, where they keep anything."""
+    """Let the actuators' step go along with a method's, where they keep anything.
+
+    Quaternions of spherical joints get their unit length back after each step of the method.
+    """
     layout = field.layout
+    if field.tree.has_spherical:
+        method = StepAndJump(method, field.of_motion.with_unit_quaternions, before="unscaled")
     if not layout.previous_controls and not layout.chains:
         return method
     return ActuatedStep(method, layout.previous_controls)
@@ -103,9 +109,9 @@ def actuated(method: Any, field: SpaceArmField) -> Any:
 def append_measured_step(program: Program, field: SpaceArmField) -> None:
     """Append a step with its error and dense output, in which what is kept changes evenly."""
     if not field.layout.previous_controls and not field.layout.chains:
-        dormand_prince.append_measured_step(program, field)
+        _append_measured_motion(program, field)
         return
-    _append_motion(program, field, dormand_prince.append_measured_step)
+    _append_motion(program, field, _append_measured_motion)
     n, x = field.of_motion.n_t, symbols("x", field.n_x)
     dense, landed = symbols("dense", 4 * n), symbols("motion_next", field.of_motion.n_x)
     given, kept = _kept(field, x)
@@ -118,6 +124,17 @@ def append_measured_step(program: Program, field: SpaceArmField) -> None:
     given |= {"x": x, "motion_next": landed, "dense_of_motion": dense}
     outputs = {"x_next": [*landed, *kept], "dense": whole}
     program.call(graph_of(f"{field.name}_actuated_measured", given, outputs))
+
+
+def _append_measured_motion(program: Program, field: SpaceArmField) -> None:
+    """Append such a step of the motion alone."""
+    begin = len(program.calls)
+    dormand_prince.append_measured_step(program, field)
+    if field.tree.has_spherical:
+        rename(program, begin, {"x_next": "x_unscaled"})
+        x = symbols("x", field.n_x)
+        outputs = {"x_next": field.with_unit_quaternions(x)}
+        program.call(graph_of(f"{field.name}_scaled", {"x_unscaled": x}, outputs))
 
 
 def _maps(field: SpaceArmField, h: Scalar) -> ActuatorMaps:

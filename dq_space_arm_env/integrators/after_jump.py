@@ -23,14 +23,24 @@ class StepAndJump:
 
     method: Integrator
     jump: Callable[[Sequence[Scalar]], Sequence[Scalar]]  # from the state after the step to that after both
+    before: str = "before"  # in names of what is before the jump: each jump after a step has its own
+
+    @property
+    def _x(self) -> str:
+        return f"x_{self.before}"
+
+    def _prefix(self, field: VectorField) -> str:
+        return f"{field.name}_{self.before}_jump"
 
     def append_step(self, program: Program, field: VectorField) -> None:
         """See `Integrator.append_step`."""
         begin = len(program.calls)
         self.method.append_step(program, field)
-        _rename(program, begin, {"x_next": _BEFORE})
+        rename(program, begin, {"x_next": self._x})
         x = symbols("x", field.n_x)
-        graph = graph_of(f"{field.name}_jump", graph_inputs(field, **{_BEFORE: x}), {"x_next": self.jump(x)})
+        graph = graph_of(
+            f"{field.name}_{self.before}_jump", graph_inputs(field, **{self._x: x}), {"x_next": self.jump(x)}
+        )
         program.call(graph)
 
     def append_linearization(self, program: Program, field: VectorField) -> tuple[Any, Any]:
@@ -41,14 +51,14 @@ class StepAndJump:
         by_y = casadi.jacobian(column(*after), column(*y))
         pose = patterns["A"].size1() - field.n_y
         jump = casadi.diagcat(casadi.SX.eye(pose), by_y)
-        given, outputs, sparsity = {_BEFORE: x}, {}, []
+        given, outputs, sparsity = {self._x: x}, {}, []
         for name, pattern in patterns.items():
             matrix = casadi.SX.sym(name, pattern)
             product = casadi.sparsify(casadi.mtimes(jump, matrix))
-            given[f"{name}_before"] = matrix.nonzeros()
+            given[f"{name}_{self.before}"] = matrix.nonzeros()
             outputs[name] = product.nonzeros()
             sparsity.append(product.sparsity())
-        program.call(graph_of(f"{field.name}_jump_derivatives", graph_inputs(field, **given), outputs))
+        program.call(graph_of(f"{self._prefix(field)}_derivatives", graph_inputs(field, **given), outputs))
         return sparsity[0], sparsity[1]
 
     def append_curvature(self, program: Program, field: TwiceDifferentiableField) -> Any:
@@ -64,14 +74,18 @@ class StepAndJump:
         weighted = casadi.dot(column(*multiplier[pose:]), column(*after))
         twice, slope = casadi.hessian(weighted, column(*y))
         outputs = {
-            "multiplier_before": [*multiplier[:pose], *casadi.densify(slope).nonzeros()],
-            "bend": casadi.triu(twice).nonzeros(),
+            f"multiplier_{self.before}": [*multiplier[:pose], *casadi.densify(slope).nonzeros()],
+            f"bend_{self.before}": casadi.triu(twice).nonzeros(),
         }
-        given = graph_inputs(field, **{_BEFORE: x}, multiplier=multiplier)
-        program.call(graph_of(f"{field.name}_jump_curvature", given, outputs))
+        given = graph_inputs(field, **{self._x: x}, multiplier=multiplier)
+        program.call(graph_of(f"{self._prefix(field)}_curvature", given, outputs))
         begin = len(program.calls)
         before = self.method.append_curvature(program, field)
-        _rename(program, begin, {"multiplier": "multiplier_before", "curvature": "curvature_before"})
+        rename(
+            program,
+            begin,
+            {"multiplier": f"multiplier_{self.before}", "curvature": f"curvature_{self.before}"},
+        )
         bend = casadi.SX.sym("bend", casadi.triu(twice).sparsity())
         curvature, a, b = (
             casadi.SX.sym(name, pattern)
@@ -80,26 +94,23 @@ class StepAndJump:
         change = casadi.horzcat(a, b)[pose:, :]
         moved = casadi.mtimes(change.T, casadi.mtimes(casadi.triu2symm(bend), change))
         total = casadi.sparsify(curvature + casadi.triu(moved))
-        matrices = {"curvature_before": curvature, "bend": bend, "A_before": a, "B_before": b}
-        inputs = {name: matrix.nonzeros() for name, matrix in matrices.items()}
-        program.call(graph_of(f"{field.name}_jump_sum", inputs, {"curvature": total.nonzeros()}))
+        matrices = {"curvature": curvature, "bend": bend, "A": a, "B": b}
+        inputs = {f"{name}_{self.before}": matrix.nonzeros() for name, matrix in matrices.items()}
+        program.call(graph_of(f"{self._prefix(field)}_sum", inputs, {"curvature": total.nonzeros()}))
         return total.sparsity()
 
     def _append_linearization_before(self, program: Program, field: VectorField) -> dict[str, Any]:
         """Append the method's step and linearization, with results of other names; their patterns."""
         begin = len(program.calls)
         self.method.append_step(program, field)
-        _rename(program, begin, {"x_next": _BEFORE})
+        rename(program, begin, {"x_next": self._x})
         begin = len(program.calls)
         patterns = dict(zip("AB", self.method.append_linearization(program, field), strict=True))
-        _rename(program, begin, {"A": "A_before", "B": "B_before"})
+        rename(program, begin, {name: f"{name}_{self.before}" for name in "AB"})
         return patterns
 
 
-_BEFORE = "x_before"
-
-
-def _rename(program: Program, begin: int, names: dict[str, str]) -> None:
+def rename(program: Program, begin: int, names: dict[str, str]) -> None:
     """Bind buffers to other names in the calls from some number on."""
     for number in range(begin, len(program.calls)):
         graph, bindings = program.calls[number].graph, program.calls[number].bindings

@@ -48,12 +48,13 @@ def refuse(
     springs: bool = False,
     planar: bool = False,
     rotors: bool = False,
+    spherical: bool = False,
     at_once: bool = False,
 ) -> None:
     """Refuse a scene that the format cannot represent without changing its motion.
 
-    `springs`, `planar`, `rotors`: formats without joint springs, planar bases, and rotors of any kind;
-    `at_once`: with actuators that neither lag nor delay.
+    `springs`, `planar`, `rotors`, `spherical`: formats without joint springs, planar bases, rotors of any
+    kind, and spherical joints; `at_once`: with actuators that neither lag nor delay.
     """
     if wrist not in ("refuse", "fixed"):
         raise ValueError(f"wrist: {wrist!r}, it must be 'refuse' or 'fixed'")
@@ -73,6 +74,9 @@ def refuse(
     screws = [link.name for link in scene.links if link.joint_type == "screw"]
     if screws:
         problems.append(f"it has no screw joints, and link {screws[0]!r} has one")
+    balls = [link.name for link in scene.links if link.is_spherical]
+    if spherical and balls:
+        problems.append(f"it has no spherical joints, and link {balls[0]!r} has one")
     if scene.actuators.wheels is not None:
         problems.append("it has no reaction wheels: leave them out with replace({'actuators.wheels': None})")
     if scene.actuators.tank is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import islice
 from typing import Literal
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -19,6 +20,7 @@ from dq_space_arm_env.interoperability.exporting import (
     words,
 )
 from dq_space_arm_env.scene import Base, Link, Payload, Scene, Shape, StateLayout
+from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.shapes import COLORS, color_of
 from dq_space_arm_env.validation.fields import Three
 
@@ -32,8 +34,8 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     There is no gravity, and nothing collides: the scene's shapes, if it gives any, are there to be seen.
     Body `base` has the frame e0 and a free joint, called `base joint`; in a planar scene it slides along x
     and y and turns about z. Each link is a body with the frame of its joint, a hinge about z or a slide along
-    it called by the link's name and " joint", with the scene's damping, spring and limits of the joint. Where
-    arms branch, MuJoCo's coordinates follow one arm after the other.
+    it or a ball, called by the link's name and " joint", with the scene's damping, spring and limits of the
+    joint; fixed links have none. Where arms branch, MuJoCo's coordinates follow one arm after the other.
     A rotor is an armature, Coulomb friction a friction loss, which MuJoCo has without the smoothing speed.
     MuJoCo pushes joints back from their limits, the scene's kernels do not, and it has no limits of rates.
     Site `tip` has the frame G, body `payload` is held at the tip.
@@ -76,7 +78,8 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     for link, parent, (lower, upper, _) in zip(scene.links, scene.parent_bodies, limits, strict=True):
         body = _add_body(bodies[parent], link.name, link.joint.dual_quaternion)
         bodies.append(body)
-        _add_joint(body, link, lower, upper)
+        if not link.is_fixed:
+            _add_joint(body, link, lower, upper)
         _add_inertial(body, link, link.center_of_mass)
         _add_shapes(body, link.geometry, COLORS["white"])
     tip, body = tip_on_its_body(scene), bodies[scene.tip_body]
@@ -143,14 +146,17 @@ def _add_shapes(body: Element, shapes: Sequence[Shape], color: Three) -> None:
 
 def _add_joint(body: Element, link: Link, lower: float, upper: float) -> None:
     kind = "hinge" if link.turns else "slide"
-    joint = SubElement(body, "joint", name=f"{link.name} joint", type=kind, axis="0 0 1")
+    joint = SubElement(body, "joint", name=f"{link.name} joint", type="ball" if link.is_spherical else kind)
+    if not link.is_spherical:
+        joint.set("axis", "0 0 1")
     if math.isfinite(lower) or math.isfinite(upper):
         joint.set("range", words([lower, upper]))
     if link.damping:
         joint.set("damping", words([link.damping]))
     if link.stiffness:
         joint.set("stiffness", words([link.stiffness]))
-        joint.set("springref", words([link.rest_angle]))
+        if not link.is_spherical:
+            joint.set("springref", words([link.rest_angle]))
     if link.motor is not None and link.motor.inertia:
         joint.set("armature", words([link.motor.reflected_inertia]))
     if link.motor is not None and link.motor.friction:
@@ -171,8 +177,11 @@ def _add_actuators(root: Element, scene: Scene) -> None:
     for index, each in enumerate(scene.actuators.thrusters or (), control.thruster_force.start):
         at[index] = {"site": "e0", "gear": words([*each.unit_direction, *each.moment])}
     torques = range(control.joint_torque.start, control.joint_torque.stop)
+    about = {" x": "1 0 0", " y": "0 1 0", " z": "0 0 1"}
+    moving = freedoms(scene.links)
     for index, joint in zip(torques, layout.actuated_joints, strict=True):
-        at[index] = {"joint": f"{scene.links[joint].name} joint"}
+        link, axis = moving[joint]
+        at[index] = {"joint": f"{scene.links[link].name} joint"} | ({"gear": about[axis]} if axis else {})
     actuators = SubElement(root, "actuator")
     for index, transmission in sorted(at.items()):
         motor = SubElement(actuators, "motor", {"name": control.names[index], **transmission})
@@ -192,7 +201,14 @@ def _depth_first(scene: Scene) -> list[int]:
 
 
 def _add_start(root: Element, scene: Scene) -> None:
-    start, order = scene.initial_state, _depth_first(scene)
+    start, layout = scene.initial_state, StateLayout.of(scene)
+    parts = (layout.state.joint_angles, layout.state.joint_rates)
+    angles, rates = (iter(layout.initial_state[part].tolist()) for part in parts)
+    joints = [
+        ([*islice(angles, link.freedoms + link.is_spherical)], [*islice(rates, link.freedoms)])
+        for link in scene.links
+    ]
+    order = [joints[link] for link in _depth_first(scene)]
     rotation, position = poses.to_rotation_and_position(start.base_pose.dual_quaternion)
     angular, linear = start.base_velocity[:3], rotations.rotate(rotation, start.base_velocity[3:])
     if scene.base.motion == "planar":
@@ -204,6 +220,6 @@ def _add_start(root: Element, scene: Scene) -> None:
         SubElement(root, "keyframe"),
         "key",
         name="start",
-        qpos=words([*base, *(start.joint_angles[joint] for joint in order)]),
-        qvel=words([*velocity, *(start.joint_rates[joint] for joint in order)]),
+        qpos=words([*base, *(angle for joint, _ in order for angle in joint)]),
+        qvel=words([*velocity, *(rate for _, joint in order for rate in joint)]),
     )

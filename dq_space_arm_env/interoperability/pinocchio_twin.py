@@ -14,6 +14,8 @@ from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Placement, RigidBody, Screw
 from dq_space_arm_env.interoperability.exporting import coupled_rotors, tip_on_its_body
 from dq_space_arm_env.scene import Scene, SceneError, StateLayout
+from dq_space_arm_env.scene.bodies import freedoms
+from dq_space_arm_env.scene.layout import unit_quaternions
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 
 Array = NDArray[np.float64]
@@ -23,16 +25,17 @@ def pinocchio_model(scene: Scene) -> Any:
     """Build a scene's robot as a `pinocchio.Model`.
 
     Joint `base` is a free flyer (planar scenes: a planar joint) with the frame e0, at the center of mass;
-    each link has a joint about or along z, called by its name. There is no gravity; limits are not set.
-    Rotors are its `armature`. Frame `tip` is G, with the wrist at its initial angles. `to_pinocchio` and
-    `generalized_forces` give the arguments of Pinocchio's algorithms: `pinocchio.aba(model, data, q, v, tau)`
-    is (dv, dw, joint accelerations), where (dw, dv) are the scene's base accelerations.
+    each link has a joint about or along z, called by its name, or a spherical one; a link that is fixed is
+    part of what carries it. There is no gravity; limits are not set. Rotors are its `armature`. Frame `tip`
+    is G, with the wrist at its initial angles. `to_pinocchio` and `generalized_forces` give the arguments of
+    Pinocchio's algorithms: `pinocchio.aba(model, data, q, v, tau)` is (dv, dw, joint accelerations), where
+    (dw, dv) are the scene's base accelerations.
 
     Args:
         scene: A validated scene; its nominal masses and inertias, the payload part of the tip's link.
 
     Returns:
-        The model; nv = 6 + n for n joints, 3 + n in a planar scene.
+        The model; nv = 6 + n for n degrees of freedom of joints, 3 + n in a planar scene.
 
     Raises:
         ImportError: If Pinocchio is not installed.
@@ -49,17 +52,26 @@ def pinocchio_model(scene: Scene) -> Any:
     free = pin.JointModelPlanar() if tree.planar else pin.JointModelFreeFlyer()
     joints = [model.addJoint(0, free, pin.SE3.Identity(), "base")]
     model.appendBodyToJoint(joints[0], _inertia(pin, tree.base), pin.SE3.Identity())
-    for link, name in zip(tree.links, [link.name for link in scene.links], strict=True):
+    for link, (index, _) in zip(tree.links, freedoms(scene.links), strict=True):
         parent = joints[link.parent]
-        joints.append(model.addJoint(parent, _joint(pin, link.screw), _placement(pin, link.joint), name))
-        model.appendBodyToJoint(joints[-1], _inertia(pin, link.body), pin.SE3.Identity())
+        if link.spherical:  # Pinocchio has one joint for all three
+            joints.append(parent)
+        else:
+            kind = pin.JointModelSpherical() if link.spherical == 0 else _joint(pin, link.screw)
+            joints.append(model.addJoint(parent, kind, _placement(pin, link.joint), scene.links[index].name))
+        if link.body.mass:
+            model.appendBodyToJoint(joints[-1], _inertia(pin, link.body), pin.SE3.Identity())
     if any(link.rotor is not None for link in tree.links):
         armature = np.zeros(model.nv)
         for joint, link in zip(joints[1:], tree.links, strict=True):
-            armature[model.joints[joint].idx_v] = link.rotor.reflected if link.rotor else 0.0
+            if link.rotor is not None:
+                armature[model.joints[joint].idx_v] = link.rotor.reflected
         model.armature = armature
     rotation, position = poses.to_matrix(tip_on_its_body(scene))
     tip = pin.SE3(np.array(rotation), np.array(position))
+    place = tree.places[scene.tip_body][1]
+    if place is not None:
+        tip = _placement(pin, place) * tip
     model.addFrame(pin.Frame("tip", joints[tree.tip_body], tip, pin.FrameType.OP_FRAME))
     return model
 
@@ -78,8 +90,9 @@ def to_pinocchio(scene: Scene, x: ArrayLike) -> tuple[Array, Array]:
         x: State, shape (n_x,), units of the state; the wrist's angles are not part of the model.
 
     Returns:
-        q: position of e0 in inertial axes, m, quaternion with the scalar last, joint angles, rad, shape
-        (7 + n,) (planar: x, y, cosine and sine of the angle, joint angles, (4 + n,)); v: linear velocity of
+        q: position of e0 in inertial axes, m, quaternion with the scalar last, joint angles, rad, or
+        quaternions likewise, shape (7 + n,), 1 more for each spherical joint (planar: x, y, cosine and sine
+        of the angle, joint angles, (4 + n,)); v: linear velocity of
         e0, m/s, angular velocity, rad/s, both in base axes, joint rates, rad/s, shape (6 + n,) (planar:
         v_x, v_y, omega_z, joint rates, (3 + n,)).
 
@@ -96,7 +109,10 @@ def to_pinocchio(scene: Scene, x: ArrayLike) -> tuple[Array, Array]:
         velocity = [*motion.linear[:2], motion.angular[2]]
     else:
         base, velocity = [*position, i, j, k, w], [*motion.linear, *motion.angular]
-    return np.array([*base, *motion.joint_angles]), np.array([*velocity, *motion.joint_rates])
+    values = values.copy()
+    for where in unit_quaternions(scene):
+        values[where] = np.roll(values[where], -1)
+    return np.array([*base, *values[entries.joint_angles]]), np.array([*velocity, *motion.joint_rates])
 
 
 def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: ArrayLike = ()) -> Array:
@@ -104,7 +120,7 @@ def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: Array
 
     Args:
         scene: A validated scene.
-        q: Configuration, shape (7 + n,), or (4 + n,) in a planar scene, m and rad.
+        q: Configuration as of `to_pinocchio`, m and rad.
         v: Velocity, shape (6 + n,), or (3 + n,) in a planar scene, m/s and rad/s.
         wrist_angles: psi, theta, phi, shape (3,), rad; shape (0,) without a wrist.
 
@@ -117,7 +133,8 @@ def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: Array
     """
     layout = StateLayout.of(scene)
     n, planar = layout.n_joints, layout.planar
-    configuration = _checked("q", q, n + (4 if planar else 7))
+    quaternions = unit_quaternions(scene)
+    configuration = _checked("q", q, n + len(quaternions) + (4 if planar else 7))
     velocity = _checked("v", v, n + (3 if planar else 6))
     wrist = _checked("wrist_angles", wrist_angles, 3 if layout.has_wrist else 0)
     if planar:
@@ -131,7 +148,10 @@ def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: Array
         base = list(poses.from_rotation_and_position((w, i, j, k), tuple(position)))
         twist, rates = [*velocity[3:6], *velocity[:3]], velocity[6:]
     previous = np.zeros(layout.n_x - layout.state.joint_rates.stop)
-    return np.array([*base, *angles, *wrist, *twist, *rates, *previous], dtype=np.float64)
+    x = np.array([*base, *angles, *wrist, *twist, *rates, *previous], dtype=np.float64)
+    for where in quaternions:
+        x[where] = np.roll(x[where], 1)
+    return x
 
 
 def generalized_forces(scene: Scene, x: ArrayLike, u: ArrayLike) -> Array:

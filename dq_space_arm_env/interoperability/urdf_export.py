@@ -33,9 +33,10 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     continuous; 1e4 rad (m) and rad/s (m/s) stand for none where URDF asks for a number. It has no thrusters,
     wheels, start, task or other constraints. Shapes become visuals.
 
-    Features that URDF lacks and that change the motion are refused: joint springs, rotors, screw joints, a
-    wrench at the tip, a planar base, reaction wheels. The massless wrist as three joints would have infinite
-    accelerations; fixed at its initial angles it changes no acceleration, but the tip cannot turn.
+    Features that URDF lacks and that change the motion are refused: joint springs, rotors, screw and
+    spherical joints, a wrench at the tip, a planar base, reaction wheels. The massless wrist as three joints
+    would have infinite accelerations; fixed at its initial angles it changes no acceleration, but the tip
+    cannot turn.
 
     Args:
         scene: A validated scene.
@@ -47,7 +48,7 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     Raises:
         SceneError: If URDF lacks a feature of the scene.
     """
-    refuse(scene, "URDF", wrist, springs=True, planar=True, rotors=True)
+    refuse(scene, "URDF", wrist, springs=True, planar=True, rotors=True, spherical=True)
     root = Element("robot", name=scene.name)
     names = [link.name for link in scene.links]
     bodies = [free_name("base", names), *names]
@@ -110,6 +111,10 @@ def _add_visual(link: Element, shape: Shape, default: Three, material: str) -> N
 def _add_joint(
     root: Element, link: Link, parent: str, effort: float, limits: tuple[float, float, float]
 ) -> None:
+    if link.is_fixed:
+        fixed = SubElement(root, "joint", name=f"{link.name} joint", type="fixed")
+        _connect(fixed, parent, link.name, link.joint.dual_quaternion)
+        return
     lower, upper, rate = limits
     has_range = math.isfinite(lower) or math.isfinite(upper)
     kind = ("revolute" if has_range else "continuous") if link.turns else "prismatic"

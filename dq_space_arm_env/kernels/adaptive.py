@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.kernels.library import KernelLibrary
+from dq_space_arm_env.scene.layout import unit_quaternions
 
 Array = NDArray[Any]
 
@@ -64,7 +65,10 @@ class MotionCurve:
         change = np.zeros(())
         for power in reversed(range(4)):
             change = theta * (self._coefficients[step, power] + change)
-        return self._kernels.call("retract", x=self._states[step], dx=change)[0]
+        x = self._kernels.call("retract", x=self._states[step], dx=change)[0]
+        for where in unit_quaternions(self._kernels.scene):
+            x[..., where] /= np.linalg.norm(x[..., where], axis=-1, keepdims=True)
+        return x
 
     def difference(self, reference: Array, x: Array) -> Array:
         """Tangent coordinates of states seen from others, shape (k, n_t)."""

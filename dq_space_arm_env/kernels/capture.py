@@ -55,11 +55,12 @@ def catch_payload(free: Kernels, loaded: Kernels, x: ArrayLike, payload_twist: A
     layout, where = free.layout, free.layout.state
     directions = PLANAR_TWIST if layout.planar else tuple(range(6))
     base = spread(state[where.base_velocity].tolist(), directions, 6)
+    tree = KinematicTree.from_scene(free.scene)
     after = capture(
-        KinematicTree.from_scene(free.scene),
+        tree,
         KinematicTree.from_scene(loaded.scene),
         RigidBody(payload.mass, payload.center_of_mass, payload.inertia),
-        state[where.joint_angles].tolist(),
+        tree.coordinates(state[where.joint_angles].tolist()),
         Velocities(base[:3], base[3:], state[where.joint_rates].tolist()),
         twist.tolist(),
     )

@@ -88,14 +88,16 @@ class Base(Model):
     geometry: tuple[Shape, ...] = geometry_field("the box of its inertia, with wings")
 
 
-JointType = Literal["revolute", "prismatic", "screw"]
+JointType = Literal["revolute", "prismatic", "screw", "spherical", "fixed"]
 
 
 class Link(Model):
     """A link and the joint that carries it; the joint moves about and along the z axis of its own frame.
 
     Its coordinate is an angle, rad, and its effort a torque, N m; those of a prismatic joint are a distance,
-    m, and a force, N.
+    m, and a force, N. A spherical joint turns about all axes of its frame: its coordinates are a quaternion,
+    its rates and torques have three components in the link's axes, and its spring pulls along the rotation
+    vector. A fixed one makes link and parent one body.
     """
 
     name: Name = Field(description="name of the link, unique in the scene")
@@ -118,7 +120,7 @@ class Link(Model):
         default="revolute",
         exclude_if=lambda joint_type: joint_type == "revolute",
         description="'revolute': the joint turns about z; 'prismatic': it slides along z; 'screw': both, by "
-        "its pitch",
+        "its pitch; 'spherical': it turns about any axis; 'fixed': it holds the link",
     )
     pitch: Finite = Field(
         default=0.0,
@@ -149,6 +151,21 @@ class Link(Model):
         return self.joint_type != "prismatic"
 
     @property
+    def is_fixed(self) -> bool:
+        """Whether the link is one body with what carries it."""
+        return self.joint_type == "fixed"
+
+    @property
+    def is_spherical(self) -> bool:
+        """Whether the joint turns about all axes."""
+        return self.joint_type == "spherical"
+
+    @property
+    def freedoms(self) -> int:
+        """Degrees of freedom of the joint."""
+        return {"spherical": 3, "fixed": 0}.get(self.joint_type, 1)
+
+    @property
     def is_elastic(self) -> bool:
         """Whether the gear of the joint's motor is a spring."""
         return self.motor is not None and self.motor.is_elastic
@@ -168,6 +185,27 @@ class Link(Model):
             yield Problem(("pitch",), 0.0, "a screw joint needs one; without it the joint is revolute")
         if self.joint_type != "screw" and self.pitch != 0.0:
             yield Problem(("pitch",), self.pitch, f"a {self.joint_type} joint has none; a screw has one")
+        without: tuple[str, ...] = ()
+        if self.is_spherical:
+            without = ("rest_angle", "motor")
+        elif self.is_fixed:
+            without = ("torque_limit", "stiffness", "rest_angle", "damping", "motor")
+        for name in without:
+            if getattr(self, name):
+                yield Problem((name,), getattr(self, name), f"a {self.joint_type} joint has none: remove it")
+
+
+def freedoms(links: Sequence[Link]) -> list[tuple[int, str]]:
+    """List the degrees of freedom of links, base to tip.
+
+    Args:
+        links: The links of a scene.
+
+    Returns:
+        Index of its link, and " x", " y" or " z" where it is one of a spherical joint's three.
+    """
+    axes = {0: (), 1: ("",), 3: (" x", " y", " z")}
+    return [(index, axis) for index, link in enumerate(links) for axis in axes[link.freedoms]]
 
 
 def parent_bodies(links: Sequence[Link]) -> list[int | None]:

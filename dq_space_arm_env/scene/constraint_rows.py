@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.constraints import (
     Constraint,
     ControlRate,
@@ -58,6 +59,7 @@ class Side(NamedTuple):
     """A bound of a joint's angle or rate: sign * value - bound <= 0."""
 
     link: int
+    joint: int  # among the degrees of freedom
     is_rate: bool
     sign: float
     bound: float
@@ -231,7 +233,9 @@ def sides(scene: Scene, limits: JointLimits) -> Iterator[Side]:
     """The finite bounds of joints."""
     count = len(scene.links)
     lower, upper, rate = (per_link(each, count) for each in (limits.lower, limits.upper, limits.rate))
-    for link in range(count):
+    for joint, (link, _) in enumerate(freedoms(scene.links)):
+        if scene.links[link].is_spherical:
+            continue
         for is_rate, sign, bound in (
             (False, -1.0, -lower[link]),
             (False, 1.0, upper[link]),
@@ -239,7 +243,7 @@ def sides(scene: Scene, limits: JointLimits) -> Iterator[Side]:
             (True, 1.0, rate[link]),
         ):
             if math.isfinite(bound):
-                yield Side(link, is_rate, sign, bound)
+                yield Side(link, joint, is_rate, sign, bound)
 
 
 def rate_limits(scene: Scene, each: ControlRate) -> list[RateLimit]:
@@ -341,9 +345,9 @@ def _may_touch(scene: Scene, a: Volume, b: Volume) -> bool:
     shared = sum(1 for one, other in zip(up, down, strict=False) if one == other)
     up, down = up[shared:], down[shared:]  # frames below the body that carries both
     moving = [scene.links[frame - 1] for frame in (*up, *down) if frame <= len(scene.links)]
-    if not moving and scene.wrist is None:
-        return False  # the tip is fixed in its body
-    if not all(link.joint_type == "revolute" for link in moving):
+    if all(link.is_fixed for link in moving) and (scene.wrist is None or far.frame != "tip"):
+        return False  # one is fixed in the other's body
+    if not all(link.joint_type in ("revolute", "spherical", "fixed") for link in moving):
         return True  # one slides as far as it may
     # In the frame of the near volume, the far one is within its reach of the origin of the next frame.
     lengths = [math.hypot(*_origin(scene, frame)) for frame in (*up[1:], *down[1:])]

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, StrictBool
 
-from dq_space_arm_env.scene.bodies import Link
+from dq_space_arm_env.scene.bodies import Link, freedoms
 from dq_space_arm_env.validation.fields import (
     ANGLES,
     LENGTHS,
@@ -446,6 +446,12 @@ def _joint_limit_problems(
         if len(given) not in (1, count):
             yield Problem((*here, field), given, f"must be {_PER_LINK}: the scene has {count} links")
             return
+    for field in ("lower", "upper", "rate"):
+        given = getattr(limits, field)
+        for link, bound in zip(scene.links, given if len(given) == count else (), strict=False):
+            if link.freedoms != 1 and count > 1 and math.isfinite(bound):
+                sentence = f"link {link.name!r} must have none, its joint is {link.joint_type}: .inf"
+                yield Problem((*here, field), given, sentence)
     lower, upper, rate = (per_link(getattr(limits, field), count) for field in ("lower", "upper", "rate"))
     if not any(math.isfinite(bound) for bound in (*lower, *upper, *rate)):
         yield Problem(
@@ -508,9 +514,10 @@ def limited_motors(scene: Scene) -> list[tuple[int, Link]]:
         scene: The scene.
 
     Returns:
-        Index among the driven links, and link.
+        Index among the driven degrees of freedom, and link.
     """
-    driven = [link for link in scene.links if link.actuated] if scene.actuators.joint_torque else []
+    moving = [scene.links[index] for index, _ in freedoms(scene.links)]
+    driven = [link for link in moving if link.actuated] if scene.actuators.joint_torque else []
     return [(index, link) for index, link in enumerate(driven) if link.motor and link.motor.stall_torque]
 
 

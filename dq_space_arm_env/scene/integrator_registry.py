@@ -34,6 +34,8 @@ class IntegratorEntry:
     # Whether a step is a canonical map where nothing dissipates: the energy does not drift. Such a method is
     # not L-stable: motion in a very stiff damper alternates, and dies slowly.
     symplectic: bool = False
+    # Whether angles may have other rates than those of the joints, as the quaternions of spherical joints do.
+    turns_quaternions: bool = False
 
     @property
     def is_adaptive(self) -> bool:
@@ -79,6 +81,7 @@ INTEGRATORS: Mapping[str, IntegratorEntry] = {
             real_interval=2.785,
             curvature="rk4",
             is_embedded=True,
+            turns_quaternions=True,
         ),
         IntegratorEntry(
             "rk6",
@@ -88,6 +91,7 @@ INTEGRATORS: Mapping[str, IntegratorEntry] = {
             real_interval=4.463,
             curvature="rk4",
             is_embedded=True,
+            turns_quaternions=True,
         ),
         IntegratorEntry(
             "rk8",
@@ -97,12 +101,14 @@ INTEGRATORS: Mapping[str, IntegratorEntry] = {
             real_interval=6.393,
             curvature="rk4",
             is_embedded=True,
+            turns_quaternions=True,
         ),
         IntegratorEntry(
             "dormand_prince",
             order=5,
             implementation=("dormand_prince.DormandPrince",),
             tolerances=("rtol", "atol"),
+            turns_quaternions=True,
         ),
         IntegratorEntry(
             "rodas4",

@@ -1,12 +1,12 @@
 """Layout of the state, the tangent, the controls and the parameters of a scene.
 
-State: base pose, joint angles, wrist angles, base velocity, joint rates, angles and rates of motors behind
-elastic gears, axial momenta of wheels, mass of the propellant in a tank, and what actuators keep from step to
-step: the previous controls whose rates are limited, then commands on their way and outputs. Tangent: the
-same, with a twist increment of the base in base axes (rotation, then translation) in place of the pose.
-Controls: base force, base torque, joint torques of the actuated joints, wrist rates, wheel torques, thruster
-forces. Parameters: target, bodies from base to payload, weights, limits. What a scene does not have is
-missing; the order stays.
+State: base pose, joint angles (quaternions of spherical joints), wrist angles, base velocity, joint rates,
+angles and rates of motors behind elastic gears, axial momenta of wheels, mass of the propellant in a tank,
+and what actuators keep from step to step: the previous controls whose rates are limited, then commands on their
+way and outputs. Tangent: the same, with a twist increment of the base in base axes (rotation, then
+translation) in place of the pose. Controls: base force, base torque, joint torques of the actuated joints,
+wrist rates, wheel torques, thruster forces. Parameters: target, bodies from base to payload, weights, limits.
+What a scene does not have is missing; the order stays.
 A planar base keeps only what is not zero by construction: q_r0, q_r3, q_d1, q_d2 of its pose, and omega_z,
 v_x, v_y.
 """
@@ -22,6 +22,7 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.actuator_chains import Chain, chains
+from dq_space_arm_env.scene.bodies import Link, freedoms
 from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.parameters import (
     GRASP,
@@ -56,12 +57,12 @@ class _Entries:
 class _MotionEntries(_Entries):
     """Slices that state and tangent have in common; empty for what the scene does not have."""
 
-    joint_angles: slice  # base to tip
+    joint_angles: slice  # base to tip, of spherical joints w, x, y, z of a unit quaternion
     wrist_angles: slice  # psi, theta, phi
     base_velocity: slice  # base axes, 6 numbers (planar: omega_z, v_x, v_y)
     angular_velocity: slice  # part of base_velocity
     linear_velocity: slice  # part of base_velocity
-    joint_rates: slice  # base to tip
+    joint_rates: slice  # base to tip, of spherical joints x, y, z of the angular velocity in the link's axes
     motor_angles: slice  # of elastic joints, on the joints' side
     motor_rates: slice  # likewise
     wheel_momenta: slice  # axial, inertial rate, in the order of the scene's wheels
@@ -136,8 +137,8 @@ class StateLayout:
 
     Attributes:
         planar: Whether the base moves in its x-y plane only.
-        n_joints: Number of joints.
-        actuated_joints: Indices of the joints with a motor, base to tip.
+        n_joints: Number of degrees of freedom of all joints: of joint rates.
+        actuated_joints: Indices of those that motors drive among them, base to tip.
         has_wrist: Whether the scene has a wrist.
         state: Entries of the state x.
         tangent: Entries of the tangent of the state.
@@ -344,7 +345,7 @@ class StateLayout:
         every_control = [each for numbers in controls.values() for each in numbers]
         return cls(
             planar=is_planar(scene),
-            n_joints=len(scene.links),
+            n_joints=len(freedoms(scene.links)),
             actuated_joints=_actuated_joints(scene),
             has_wrist=scene.wrist is not None,
             state=_lay_out_state(scene),
@@ -386,13 +387,14 @@ class _Collector:
         """Append what state and tangent have in common."""
         turning, moving = free_axes(scene)
         wrist = _EULER_ANGLES if scene.wrist else ()
-        units, kinds = ([link.unit for link in scene.links], ("displacement", "angle"))
-        joint_angles = self.add_each(units, [f"{link.name} {kinds[link.turns]}" for link in scene.links])
+        angles = [(f"{link.name} {name}", unit) for link in scene.links for name, unit in _coordinates(link)]
+        joint_angles = self.add_each([unit for _, unit in angles], [name for name, _ in angles])
+        freely = [(scene.links[index], axis) for index, axis in freedoms(scene.links)]
         wrist_angles = self.add("rad", [f"wrist {angle}" for angle in wrist])
         angular = self.add("rad/s", [f"base omega_{_AXES[axis]}" for axis in turning])
         linear = self.add("m/s", [f"base v_{_AXES[axis]}" for axis in moving])
         joint_rates = self.add_each(
-            [f"{unit}/s" for unit in units], [f"{link.name} rate" for link in scene.links]
+            [f"{link.unit}/s" for link, _ in freely], [f"{link.name} rate{axis}" for link, axis in freely]
         )
         return {
             "joint_angles": joint_angles,
@@ -492,7 +494,32 @@ def _lay_out_parameters(scene: Scene) -> ParameterEntries:
 def _actuated_joints(scene: Scene) -> tuple[int, ...]:
     if scene.actuators.joint_torque is None:
         return ()
-    return tuple(index for index, link in enumerate(scene.links) if link.actuated)
+    driven = (scene.links[index].actuated for index, _ in freedoms(scene.links))
+    return tuple(number for number, actuated in enumerate(driven) if actuated)
+
+
+def unit_quaternions(scene: Scene) -> list[slice]:
+    """Find where the quaternions of spherical joints are.
+
+    Args:
+        scene: A scene.
+
+    Returns:
+        Slices of its state, of 4 numbers each.
+    """
+    start, found = (len(PLANAR_POSE) if is_planar(scene) else 8), list[slice]()
+    for link in scene.links:
+        if link.is_spherical:
+            found.append(slice(start, start + 4))
+        start += len(_coordinates(link))
+    return found
+
+
+def _coordinates(link: Link) -> list[tuple[str, str]]:
+    """Names and units of a joint's coordinates."""
+    if link.is_spherical:
+        return [(f"q_{index}", "1") for index in range(4)]
+    return [("angle" if link.turns else "displacement", link.unit)] * link.freedoms
 
 
 def _entries(vectors: Array) -> tuple[Array, ...]:

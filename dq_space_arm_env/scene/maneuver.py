@@ -226,7 +226,9 @@ class InitialState(Model):
         default_factory=Pose, description="pose q_{e0/I} of the base in the inertial frame, m"
     )
     joint_angles: Angles = Field(
-        default=(), description="joint angles, base to tip, one per link, rad; empty: zeros"
+        default=(),
+        description="joint angles, base to tip, one per link, rad (a fixed joint has none, a spherical one "
+        "three, a rotation vector in the axes of its frame); empty: zeros",
     )
     wrist_angles: Angles = Field(
         default=(), description="wrist angles psi, theta, phi, rad; empty: zeros, or no wrist"
@@ -236,7 +238,9 @@ class InitialState(Model):
         description="velocity of the base in base axes: angular (3) rad/s, linear (3) m/s",
     )
     joint_rates: Rates = Field(
-        default=(), description="joint rates, base to tip, one per link, rad/s; empty: zeros"
+        default=(),
+        description="joint rates, base to tip, one per link, rad/s (a fixed joint has none, a spherical one "
+        "three, in the link's axes); empty: zeros",
     )
     wheel_speeds: Rates = Field(
         default=(),

@@ -7,7 +7,7 @@ Whatever varies is known by its path in the scene: "links.0.mass", "base.inertia
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from dq_space_arm_env.scene.bodies import Base, Link, Payload
+from dq_space_arm_env.scene.bodies import Base, Link, Payload, freedoms
 from dq_space_arm_env.scene.path import first_velocity
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST, Pose
 
@@ -99,6 +99,8 @@ def numbers(scene: Scene) -> Iterator[Number]:
     for index, link in enumerate(scene.links):
         place = f"links.{index}"
         yield from body_numbers(scene, place)
+        if link.is_fixed:
+            continue
         yield _number(f"{place}.stiffness", f"{link.effort_unit}/{link.unit}", link.stiffness)
         yield _number(f"{place}.damping", f"{link.effort_unit} s/{link.unit}", link.damping)
         yield from _motor_numbers(f"{place}.motor", link)
@@ -296,14 +298,15 @@ def _axis_controls(scene: Scene, field: str, axes: Sequence[int]) -> Iterator[Co
 
 def _joint_controls(scene: Scene) -> Iterator[ControlNumbers]:
     motors = scene.actuators.joint_torque
-    for index, link in enumerate(scene.links):
+    for index, axis in freedoms(scene.links):
+        link = scene.links[index]
         if motors is None or not link.actuated:
             continue
         weight = _number("cost.joint_torque", f"({link.effort_unit})^-2", scene.cost.joint_torque)
         limit = _number("actuators.joint_torque.limit", link.effort_unit, motors.limit)
         if link.torque_limit is not None:
             limit = _number(f"links.{index}.torque_limit", link.effort_unit, link.torque_limit)
-        yield ControlNumbers(f"{link.name} {'torque' if link.turns else 'force'}", limit, weight)
+        yield ControlNumbers(f"{link.name} {'torque' if link.turns else 'force'}{axis}", limit, weight)
 
 
 def _one_by_one(

@@ -16,9 +16,10 @@ from pydantic import Field, StrictStr, ValidationError, ValidationInfo, field_va
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.common.suggestions import did_you_mean
-from dq_space_arm_env.scene.bodies import BASE, Base, Link, Payload, Wrist, parent_bodies
+from dq_space_arm_env.scene.bodies import BASE, Base, Link, Payload, Wrist, freedoms, parent_bodies
 from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.constraints import AnyConstraint, constraint_problems
+from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
 from dq_space_arm_env.scene.maneuver import (
     Actuators,
     Cost,
@@ -148,9 +149,13 @@ class Scene(Model):
         """Fill in zeros, and check that there is one number per joint."""
         if "links" not in info.data or "wrist" not in info.data:
             return start  # they have problems of their own, which are reported
+        links = info.data["links"]
+        per_link = "one per link"
+        if any(link.freedoms != 1 for link in links):
+            per_link += "; none of a fixed joint; of a spherical one three, x, y, z"
         lengths = {
-            "joint_angles": (len(info.data["links"]), "one per link"),
-            "joint_rates": (len(info.data["links"]), "one per link"),
+            "joint_angles": (len(freedoms(links)), per_link),
+            "joint_rates": (len(freedoms(links)), per_link),
             "wrist_angles": (3, "psi, theta, phi") if info.data["wrist"] else (0, "the scene has no wrist"),
         }
         problems, zeros = [], {}
@@ -171,6 +176,7 @@ class Scene(Model):
             return  # others look along the arms
         yield from self._actuator_problems()
         yield from self._part_problems()
+        yield from self._integrator_problems()
         yield from self._tumbling_problems()
         yield from wheel_problems(self)
         yield from thruster_problems(self)
@@ -264,6 +270,14 @@ class Scene(Model):
                 sentence = "must be 0: the target is on no screw and does not tumble"
                 yield Problem(("spread", field), half_width, sentence)
 
+    def _integrator_problems(self) -> Iterator[Problem]:
+        """Find an integrator that does not know quaternions among its angles."""
+        name = self.simulation.integrator
+        if any(link.is_spherical for link in self.links) and not INTEGRATORS[name].turns_quaternions:
+            able = ", ".join(each for each, entry in INTEGRATORS.items() if entry.turns_quaternions)
+            sentence = f"has no quaternions among its angles, as spherical joints have: take {able}"
+            yield Problem(("simulation", "integrator"), name, sentence)
+
     def _tumbling_problems(self) -> Iterator[Problem]:
         """Find a tumble too fast for the time step, of which the target takes one step each."""
         motion = self.target.motion
@@ -328,6 +342,9 @@ class Scene(Model):
         yield from _inertia_problems(("base", "inertia"), self.base.inertia)
         for index, link in enumerate(self.links):
             here: _Location = ("links", index)
+            if link.is_spherical:
+                sentence = f"{_PLANAR}: a spherical joint turns out of the plane"
+                yield Problem((*here, "joint_type"), link.joint_type, sentence)
             yield from _pose_problems((*here, "joint"), link.joint)
             yield from _height_problems((*here, "center_of_mass"), link.center_of_mass)
             yield from _inertia_problems((*here, "inertia"), link.inertia)

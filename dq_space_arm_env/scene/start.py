@@ -12,6 +12,7 @@ from dq_space_arm_env.algebra.quaternion import multiply
 from dq_space_arm_env.algebra.scalars import select
 from dq_space_arm_env.algebra.vectors import dot, matrix_vector, transposed_matrix_vector
 from dq_space_arm_env.scene.actuator_chains import chains
+from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.maneuver import Spread
 from dq_space_arm_env.scene.motion import ScrewMotion, Tumbling
@@ -95,12 +96,13 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     """Turn draws in [-1, 1] into state and drawn parameters.
 
     The draws come in this order, components in the order of the state, also where the spread is zero: base
-    rotation vector (in base axes: q_{e0/I} = nominal * exp), base position (in inertial axes), joint angles,
-    wrist angles, angular and linear velocity of the base, joint rates; then, where there is a spread:
-    rotation vector of the target (in its axes) and its position (in inertial axes), mass and inertia of the
-    base, masses of the links, inertias of the links, mass and inertia of the payload, angular and linear
-    velocity of the target, rotation vector and position of the grasp frame, speeds of the wheels. A planar
-    base, and its target, turn about z and move in x and y only.
+    rotation vector (in base axes: q_{e0/I} = nominal * exp), base position (in inertial axes), joint angles
+    (of spherical joints rotation vectors in the link's axes, likewise), wrist angles, angular and linear
+    velocity of the base, joint rates; then, where there is a spread: rotation vector of the target (in its
+    axes) and its position (in inertial axes), mass and inertia of the base, masses of the links, inertias of
+    the links, mass and inertia of the payload, angular and linear velocity of the target, rotation vector and
+    position of the grasp frame, speeds of the wheels. A planar base, and its target, turn about z and move in
+    x and y only.
     """
     start, spread = scene.initial_state, scene.spread
     turning, moving = free_axes(scene)
@@ -116,7 +118,8 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     rotation_vector = spread_out((0.0, 0.0, 0.0), spread.base_rotation, turning)
     rotation = multiply(start.base_pose.rotation, rotations.exponential(rotation_vector))
     position = spread_out(start.base_pose.position, spread.base_position, moving)
-    joint_angles = spread_out(start.joint_angles, spread.joint_angles, joints)
+    turns = spread_out([0.0] * len(joints), spread.joint_angles, joints)
+    joint_angles = _coordinates(scene, start.joint_angles, turns)
     wrist_angles = spread_out(start.wrist_angles, spread.wrist_angles, angles)
     angular = spread_out(start.base_velocity[:3], spread.base_angular_velocity, turning)
     linear = spread_out(start.base_velocity[3:], spread.base_linear_velocity, moving)
@@ -169,13 +172,16 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
         w.inertia * (speed + dot(w.unit_axis, angular)) for w, speed in zip(wheels, speeds, strict=True)
     ]
     previous = start.previous_controls or (0.0,) * len(previous_controls(scene))
-    elastic = [index for index, link in enumerate(scene.links) if link.is_elastic]
     # Elastic gears start unstrained: their motors stand and move as the joints do.
-    motors = [part[index] for part in (joint_angles, joint_rates) for index in elastic]
+    turned = [scene.links[index] for index, _ in freedoms(scene.links)]
+    as_joints = [angle for angle, link in zip(joint_angles, scene.links, strict=True) if link.is_elastic]
+    motors = [angle for (angle,) in as_joints]
+    motors += [rate for rate, link in zip(joint_rates, turned, strict=True) if link.is_elastic]
     on_the_way = [0.0 for chain in chains(scene) for _ in chain.names]
     propellant = [] if scene.actuators.tank is None else [scene.actuators.tank.propellant]
     rates = [*velocity, *joint_rates, *motors, *momenta, *propellant]
-    state = [*pose, *joint_angles, *wrist_angles, *rates, *previous, *on_the_way]
+    coordinates = [entry for joint in joint_angles for entry in joint]
+    state = [*pose, *coordinates, *wrist_angles, *rates, *previous, *on_the_way]
     return EpisodeStart(state, drawn)
 
 
@@ -237,13 +243,35 @@ def _indexed_velocity(scene: Scene) -> Iterator[tuple[Number, int]]:
     return zip(velocity_numbers(scene), velocity_entries(scene) if moves else (), strict=True)
 
 
-def _tip_rotation(scene: Scene, joint_angles: Sequence[Any], wrist_angles: Sequence[Any]) -> Sequence[Any]:
+def _coordinates(scene: Scene, nominal: Sequence[float], turns: Sequence[Scalar]) -> list[list[Scalar]]:
+    """Coordinates of each joint from its nominal ones and how far it is from there, degree by degree.
+
+    Of a spherical joint both are rotation vectors; of q and -q, one rotation, it gets the one with q_0 >= 0.
+    """
+    given, found = iter(zip(nominal, turns, strict=True)), list[list[Scalar]]()
+    for link in scene.links:
+        own = [next(given) for _ in range(link.freedoms)]
+        if link.is_spherical:
+            start, turned = (rotations.exponential(vector) for vector in zip(*own, strict=True))
+            rotation = multiply(start, turned)
+            sign = select(rotation[0] < 0.0, -1.0, 1.0)
+            found.append([sign * entry for entry in rotation])
+        else:
+            found.append([value + turn for value, turn in own])
+    return found
+
+
+def _tip_rotation(
+    scene: Scene, joint_angles: Sequence[Sequence[Any]], wrist_angles: Sequence[Any]
+) -> Sequence[Any]:
     """Rotation of q_{G/e0}: real parts of eq. (27), without the base."""
     q: Sequence[Any] = (1.0, 0.0, 0.0, 0.0)
-    for link, angle in zip(scene.links, joint_angles, strict=True):
+    for link, coordinates in zip(scene.links, joint_angles, strict=True):
         q = multiply(q, link.joint.rotation)
-        if link.turns:
-            q = multiply(q, rotations.from_axis_angle(_Z, angle))
+        if link.is_spherical:
+            q = multiply(q, coordinates)
+        elif link.turns and not link.is_fixed:
+            q = multiply(q, rotations.from_axis_angle(_Z, coordinates[0]))
     if scene.wrist:
         psi, theta, phi = wrist_angles
         q = multiply(multiply(q, scene.wrist.frame.rotation), rotations.from_euler_321(psi, theta, phi))

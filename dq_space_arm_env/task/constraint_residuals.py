@@ -230,7 +230,7 @@ def charged(scene: Scene, residuals: Scalars, at_end: Scalar) -> tuple[Scalar, S
 def _joint_limits(situation: _Situation, limits: JointLimits) -> Iterator[Scalar]:
     for side in sides(situation.scene, limits):
         values = situation.motion.joint_rates if side.is_rate else situation.motion.joint_angles
-        yield side.sign * values[side.link] - side.bound
+        yield side.sign * values[side.joint] - side.bound
 
 
 def _distance(situation: _Situation, constraint: Distance) -> Iterator[Scalar]:

@@ -35,6 +35,7 @@ from dq_space_arm_env.dynamics.equations_of_motion import Motion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
+from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.constraints import limited_motors
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.parameters import (
@@ -228,7 +229,7 @@ class SceneEquations:
         observation = [
             *error,
             *x[self.layout.state.base_velocity],
-            *motion.joint_angles,
+            *x[self.layout.state.joint_angles],
             *motion.wrist_angles,
             *motion.joint_rates,
             *motion.motor_angles,
@@ -264,7 +265,7 @@ def larger(a: Scalar, b: Scalar) -> Scalar:
 def torque_ranges(equations: SceneEquations, motion: Motion, u: Scalars) -> list[tuple[Scalar, ...]]:
     """Torque, and the least and the greatest that full voltage leaves, of motors with a stall torque."""
     links, layout, found = equations.scene.links, equations.layout, []
-    elastic = [index for index, link in enumerate(links) if link.is_elastic]
+    elastic = [joint for joint, (link, _) in enumerate(freedoms(links)) if links[link].is_elastic]
     for index, link in limited_motors(equations.scene):
         joint = layout.actuated_joints[index]
         rate = motion.motor_rates[elastic.index(joint)] if link.is_elastic else motion.joint_rates[joint]

@@ -23,6 +23,7 @@ from dq_space_arm_env.algebra.vectors import cross, dot, matrix_vector, norm, su
 from dq_space_arm_env.dynamics.elastic_gears import elastic_joints
 from dq_space_arm_env.dynamics.equations_of_motion import Motion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
+from dq_space_arm_env.dynamics.minimal import deflections
 from dq_space_arm_env.scene.motion import Tumbling, Waypoints
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.task.equations import SceneEquations, body_pose, body_velocity, grasp_pose, total
@@ -60,6 +61,8 @@ class WorstCase:
         torques = [norm(inputs.torque), *map(casadi.fabs, inputs.wheel_torques)]
         pairs = [*zip(sizes, self.tree.jets, strict=True)]
         torques += [casadi.fabs(size) * math.hypot(*jet.torque) for size, jet in pairs]
+        if fixed := norm(self.tree.base.center_of_mass):  # of what is fixed to the base
+            torques.append(fixed * total([norm(inputs.force), *map(casadi.fabs, sizes)]))
         return total([norm(inputs.force), *map(casadi.fabs, sizes)]), total(torques)
 
     def cost(self, x: Scalars, steps: Scalar) -> Scalar:
@@ -172,8 +175,8 @@ class WorstCase:
             rotors.append(casadi.sqrt(gear.inertia) * casadi.fabs(rate))
             rotors.append(casadi.sqrt(gear.stiffness) * casadi.fabs(angle - motion.joint_angles[index]))
         springs = [
-            casadi.sqrt(link.stiffness) * casadi.fabs(angle - link.rest_angle)
-            for link, angle in zip(self.tree.links, motion.joint_angles, strict=True)
+            casadi.sqrt(link.stiffness) * casadi.fabs(away)
+            for link, away in zip(self.tree.links, deflections(self.tree, motion.joint_angles), strict=True)
         ]
         mass = total([self.mass, *motion.propellant])
         return casadi.sqrt(mass) * moving + casadi.sqrt(moments) * turning + total([*springs, *rotors])
@@ -187,6 +190,11 @@ class WorstCase:
         rotors: list[Scalar] = []
         for i, (link, limit) in enumerate(zip(links, inputs.joint_torques, strict=True)):
             axis, effort, parent = matrix_vector(link.joint.rotation, _Z), casadi.fabs(limit), link.parent
+            if link.spherical is not None:  # about any axis of the body before, across those without mass
+                before, after = links[i - link.spherical].parent, i + 3 - link.spherical
+                torques[before] = torques[before] + _turned(bodies[before], effort)
+                torques[after] = torques[after] + _turned(bodies[after], effort)
+                continue
             if link.elastic is not None:  # it turns the rotor alone
                 rotors.append(effort / casadi.sqrt(link.elastic.inertia))
                 continue
@@ -208,7 +216,9 @@ class WorstCase:
             body = self.tree.tip_body
             forces[body] = forces[body] + force
             torques[body] = torques[body] + _turned(self.last, torque + force * arm)
-        squares = [force * force / body.mass for force, body in zip(forces, bodies, strict=True)]
+        massive = [link.spherical in (None, 2) for link in links]
+        loaded = zip(forces, bodies, [True, *massive], strict=True)
+        squares = [force * force / body.mass for force, body, has_mass in loaded if has_mass]
         return casadi.sqrt(total([*squares, *(torque * torque for torque in (*torques, *rotors))]))
 
 

@@ -14,7 +14,11 @@ import numpy as np
 from dq_space_arm_env import Kernels
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.kinematics import wrist_rate_matrix
+from dq_space_arm_env.dynamics.minimal import angle_rates, turn_by_quaternion
+from dq_space_arm_env.scene.bodies import freedoms
+from dq_space_arm_env.scene.layout import unit_quaternions
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
 from experts.problems.shooting_problem import FloatArray
 
@@ -42,7 +46,8 @@ class MomentumMap(NamedTuple):
 class ElasticGear(NamedTuple):
     """An elastic gear, its numbers the scene's nominal ones."""
 
-    link: int
+    joint: int  # among the joint rates
+    coordinate: int  # of the joint, among the states
     control: int | None  # of its motor; None if it has none
     angle: int  # of the motor, among the states
     rate: int  # likewise
@@ -69,6 +74,10 @@ class FreeFloatingArm:
         self.momentum_entries = list(_PLANAR_MOMENTUM if planar else range(6))
         self.velocity_entries = [*indices(entries.base_velocity), *indices(entries.joint_rates)]
         self.elastic_gears = list(_elastic_gears(kernels))
+        self._tree = KinematicTree.from_scene(kernels.scene)
+        # Of each joint rate, the frame that it turns about one of its axes, z but for spherical joints.
+        axes = {"": 2, " x": 0, " y": 1, " z": 2}
+        self._turning = [(1 + link, axes[axis]) for link, axis in freedoms(kernels.scene.links)]
 
     def tip_jacobian(self, states: FloatArray, frames: FloatArray) -> TipJacobian:
         """Geometric Jacobian of the tip: columns Ad(q_{X/G}) of the axes in their frames X, (B, f, 8)."""
@@ -83,12 +92,13 @@ class FreeFloatingArm:
         turning = np.concatenate([axes, swept], axis=-2)
         moving = np.concatenate([np.zeros_like(axes[:, 0]), axes[:, 0]], axis=-2)
         base = np.concatenate([turning[:, 0], moving], axis=-1)[:, :, self.twist_entries]
-        n = layout.n_joints
-        joints = turning[:, 1 : n + 1, :, 2].transpose(0, 2, 1)
+        joints = np.zeros((len(states), 6, len(self._turning)))
+        for joint, (frame, axis) in enumerate(self._turning):
+            joints[:, :, joint] = turning[:, frame, :, axis]
         wrist = np.zeros((len(states), 6, 0))
         if layout.has_wrist:
             rates = matrix_of(wrist_rate_matrix(list(states[:, layout.state.wrist_angles].T)))
-            wrist = turning[:, n + 1] @ rates
+            wrist = turning[:, -2] @ rates
         return TipJacobian(base, joints, wrist)
 
     def momentum_of_bodies(self, states: FloatArray) -> FloatArray:
@@ -158,7 +168,7 @@ class FreeFloatingArm:
             controls[:, acting] = np.linalg.solve(normal, right)[:, :, 0]
         for gear in self.elastic_gears:
             if gear.control is not None:  # the rotor is to follow the joint
-                turning = accelerations[:, len(self.twist_entries) + gear.link]
+                turning = accelerations[:, len(self.twist_entries) + gear.joint]
                 controls[:, gear.control] += gear.inertia * turning
         return controls
 
@@ -177,22 +187,49 @@ class FreeFloatingArm:
             forces = forces + (wanted - forces @ wrenches) @ back
         return np.maximum(forces, 0.0)
 
+    def angle_rates(self, angles: FloatArray, rates: FloatArray) -> FloatArray:
+        """Rates of the joint angles of states, (..., n_a), at joint rates (..., n)."""
+        coordinates = self._tree.coordinates(list(np.moveaxis(angles, -1, 0)))
+        changes = angle_rates(self._tree, coordinates, list(np.moveaxis(rates, -1, 0)))
+        return np.stack(changes, axis=-1) if changes else np.zeros(angles.shape)
+
+    def joint_rates(self, angles: FloatArray, changes: FloatArray) -> FloatArray:
+        """Joint rates, (B, n), with which joint angles, (B, n_a), change so fast, the other way round."""
+        coordinates = zip(*(self._tree.coordinates(list(each.T)) for each in (angles, changes)), strict=True)
+        found: list[FloatArray] = []
+        for link, (angle, change) in zip(self._tree.links, coordinates, strict=True):
+            if link.spherical is None:
+                found.append(change)
+            elif link.spherical == 0:
+                turns = turn_by_quaternion(angle)
+                found += [sum(a * b for a, b in zip(row, change, strict=True)) for row in turns]
+        return np.stack(found, axis=-1) if found else np.zeros((len(angles), 0))
+
+    def scale_quaternions(self, states: FloatArray) -> None:
+        """Give the quaternions of spherical joints unit length, in states (..., n_x), in place."""
+        for where in unit_quaternions(self.kernels.scene):
+            states[..., where] /= np.linalg.norm(states[..., where], axis=-1, keepdims=True)
+
     def drive_along(self, states: FloatArray) -> None:
         """Let the motors behind elastic gears move as their joints do, in states (B, n_x), in place."""
         entries = self.kernels.layout.state
         for gear in self.elastic_gears:
-            states[:, gear.angle] = states[:, entries.joint_angles.start + gear.link]
-            states[:, gear.rate] = states[:, entries.joint_rates.start + gear.link]
+            states[:, gear.angle] = states[:, gear.coordinate]
+            states[:, gear.rate] = states[:, entries.joint_rates.start + gear.joint]
 
 
 def _elastic_gears(kernels: Kernels) -> Iterator[ElasticGear]:
     layout, motors = kernels.layout, 0
     torques = dict(zip(layout.actuated_joints, indices(layout.control.joint_torque), strict=True))
-    for link, part in enumerate(kernels.scene.links):
+    tree = KinematicTree.from_scene(kernels.scene)
+    coordinates = tree.coordinates(indices(layout.state.joint_angles))
+    for joint, (link, _) in enumerate(freedoms(kernels.scene.links)):
+        part = kernels.scene.links[link]
         if part.motor is not None and part.motor.stiffness is not None:
             angle, rate = layout.state.motor_angles.start + motors, layout.state.motor_rates.start + motors
             inertia, stiffness = part.motor.reflected_inertia, part.motor.stiffness
-            yield ElasticGear(link, torques.get(link), angle, rate, inertia, stiffness)
+            driven = torques.get(joint)
+            yield ElasticGear(joint, coordinates[joint], driven, angle, rate, inertia, stiffness)
             motors += 1
 
 

@@ -148,12 +148,22 @@ class _ArmMotion:
         before = None
         for k in range(len(states) - 1):
             rates, load = self._rates(states[k], momenta[k], path.poses[k], path.velocities[k], step)
-            change[configuration] = step * (rates if before is None else 1.5 * rates - 0.5 * before)
+            change[configuration] = step * self._changes(
+                states[k], rates if before is None else 1.5 * rates - 0.5 * before
+            )
             states[k + 1] = self.kernels.retract(states[k], change)
+            self.arm.scale_quaternions(states[k + 1])
             gained += step * load
             momenta[k + 1] += gained
             before = rates
         return _Knots(states, momenta)
+
+    def _changes(self, state: FloatArray, rates: FloatArray) -> FloatArray:
+        """Rates of base, joint and wrist angles in tangent coordinates."""
+        base, n = len(self.arm.twist_entries), self.layout.n_joints
+        angles = state[self.layout.state.joint_angles]
+        joints = self.arm.angle_rates(angles, rates[base : base + n])
+        return np.concatenate([rates[:base], joints, rates[base + n :]])
 
     def _kept_momentum(self, start: FloatArray, count: int) -> FloatArray:
         """Remaining share of the initial momentum at the knots, shape (K + 1, n_b).
@@ -214,10 +224,12 @@ class _ArmMotion:
         step = n * dt / (len(knots.states) - 1)
         states = np.repeat(knots.states[:1], n + 1, axis=0)
         controls = np.zeros((n, problem.n_controls))
-        angles, rates = _spline(
-            knots.states[:, entries.joint_angles], step * states[0, entries.joint_rates], place
-        )
-        states[:, entries.joint_angles], states[:, entries.joint_rates] = angles, rates / step
+        given = knots.states[:, entries.joint_angles]
+        first = self.arm.angle_rates(given[0], states[0, entries.joint_rates])
+        angles, rates = _spline(given, step * first, place)
+        states[:, entries.joint_angles] = angles
+        states[:, entries.joint_rates] = self.arm.joint_rates(angles, rates / step)
+        self.arm.scale_quaternions(states)
         if indices(control.wrist_rate):
             angles, _ = _spline(knots.states[:, entries.wrist_angles], np.zeros(3), place)
             controls[:, control.wrist_rate] = np.diff(angles, axis=0) / dt

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.scene import Pose
+from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.constraints import Propellant, TorqueSpeed, WheelLimits
 
 _TIP_WRENCH = {"force": [0.2, 0.0, -0.1], "torque": [0.05, 0.0, 0.02]}
@@ -149,8 +151,8 @@ def with_links(scene: Scene, count: int) -> Scene | None:
     changes: dict[str, Any] = {
         "links": scene.links[:count],
         "initial_state": {
-            "joint_angles": start.joint_angles[:count],
-            "joint_rates": start.joint_rates[:count],
+            "joint_angles": start.joint_angles[: len(freedoms(scene.links[:count]))],
+            "joint_rates": start.joint_rates[: len(freedoms(scene.links[:count]))],
         },
     }
     if scene.wrist:
@@ -168,7 +170,10 @@ def with_links(scene: Scene, count: int) -> Scene | None:
 
 
 def in_the_plane(scene: Scene) -> Scene:
-    """The robot in the plane: no wrist, wheels, jets, other tips; axes along z, offsets turned to x."""
+    """The robot in the plane: no wrist, wheels, jets, other tips; axes along z, offsets turned to x.
+
+    Spherical joints turn about z.
+    """
     flat = without_wrist(scene) if scene.wrist else scene
     out_of_plane = [name for name in ("wheels", "thrusters") if getattr(flat.actuators, name)]
     flat = without_actuators(flat, *out_of_plane) if out_of_plane else flat
@@ -179,6 +184,7 @@ def in_the_plane(scene: Scene) -> Scene:
         "links": [
             link.model_copy(
                 update={
+                    "joint_type": "revolute" if link.is_spherical else link.joint_type,
                     "inertia": _flat_inertia(link.inertia),
                     "center_of_mass": _flat_vector(link.center_of_mass),
                     "joint": _flat_pose(link.joint),
@@ -193,7 +199,12 @@ def in_the_plane(scene: Scene) -> Scene:
             "grasp": _flat_pose(flat.target.grasp),
             "base_velocity": _flat_twist(flat.target.base_velocity),
         },
-        "initial_state": {"base_pose": base_pose, "base_velocity": velocity},
+        "initial_state": {
+            "base_pose": base_pose,
+            "base_velocity": velocity,
+            "joint_angles": _flat_joints(scene, start.joint_angles),
+            "joint_rates": _flat_joints(scene, start.joint_rates),
+        },
     }
     if flat.payload:
         changes["payload"] = {
@@ -203,6 +214,13 @@ def in_the_plane(scene: Scene) -> Scene:
     if wrench:
         changes["tip_wrench"] = {"force": _flat_vector(wrench.force), "torque": (0.0, 0.0, wrench.torque[2])}
     return flat.replace(**changes)
+
+
+def _flat_joints(scene: Scene, values: Sequence[float]) -> list[float]:
+    """Values of joints, of spherical ones about z."""
+    return [
+        value for value, (_, axis) in zip(values, freedoms(scene.links), strict=True) if axis in ("", " z")
+    ]
 
 
 def _flat_vector(vector: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -5,6 +5,7 @@ import pytest
 
 from dq_space_arm_env import compile_scene
 from dq_space_arm_env.algebra import screw
+from dq_space_arm_env.scene.layout import unit_quaternions
 
 
 def random_states(kernels, count, seed=0, scale=1.0):
@@ -18,6 +19,8 @@ def random_states(kernels, count, seed=0, scale=1.0):
             twist[[0, 1, 5]] = 0.0
         pose = np.array(screw.exponential(tuple(twist.tolist())))
         row[layout.state.pose] = pose[[0, 3, 5, 6]] if layout.planar else pose
+    for where in unit_quaternions(kernels.scene):
+        x[:, where] /= np.linalg.norm(x[:, where], axis=1, keepdims=True)
     return x
 
 

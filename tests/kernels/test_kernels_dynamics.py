@@ -7,6 +7,7 @@ from dq_space_arm_env import load_scene
 from dq_space_arm_env.algebra import vectors
 from dq_space_arm_env.dynamics import elastic_gears, kinematics, minimal, newton_euler, reaction_wheels
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
+from dq_space_arm_env.dynamics.paper_joints import bodies_of
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.dynamics.vector_field import split_state
 from scripts.benchmarks.robots import robots
@@ -25,10 +26,11 @@ def paper_solution(kernels, x, u):
     link_frames = minimal.link_frames(tree, motion.joint_angles)
     twist = (*motion.angular, *motion.linear)
     velocities = kinematics.body_velocities(tree, link_frames, twist, motion.joint_rates)
-    bodies = tree.bodies
+    bodies = bodies_of(tree)
     duals = [
         (0.0, *v.angular, 0.0, *vectors.add(v.linear, vectors.cross(v.angular, body.center_of_mass)))
-        for body, v in zip(bodies, velocities, strict=True)
+        for body, v in zip(tree.bodies, velocities, strict=True)
+        if body.mass
     ]
     state = newton_euler.PaperState(field.pose.full(stored), motion.joint_angles, motion.wrist_angles, duals)
     wheels = tree.wheels, inputs.wheel_torques, motion.wheel_momenta, motion.angular
@@ -43,7 +45,7 @@ def paper_solution(kernels, x, u):
     rates, reactions = newton_euler.paper_rates(tree, state, *given)
     accelerations = [tuple(body) for body in np.reshape(rates[-8 * len(bodies) :], (-1, 8))]
     frames = newton_euler.joint_frames(tree, motion.joint_angles, motion.wrist_angles)
-    joints = newton_euler.along_joints(tree, frames, accelerations)
+    joints = newton_euler.joint_accelerations(tree, frames, duals, accelerations)
     base = np.array([*accelerations[0][1:4], *accelerations[0][5:8]])
     return np.array([*base[list(field.pose.directions)], *joints]), np.array(reactions)
 

@@ -48,7 +48,7 @@ SIZES = {  # n_x, n_t, n_u
     "tip-load": (23, 21, 12),
     "sliding": (22, 20, 10),
     "dual-arm": (30, 28, 14),
-    "heavy-wrist": (26, 24, 12),
+    "heavy-wrist": (27, 25, 12),
     "solar-panels": (31, 29, 12),
     "thrusters": (23, 21, 14),
     "tracking": (23, 21, 12),

@@ -10,6 +10,7 @@ import pytest
 
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.layout import unit_quaternions
 from dq_space_arm_env.viewing.replay import Trajectory
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -22,7 +23,9 @@ def make_flight() -> Callable[..., Trajectory]:
         states = np.tile(layout.initial_state, (steps + 1, 1))
         share = np.linspace(0.0, 1.0, steps + 1)[:, None]
         joints = layout.state.joint_angles
-        states[:, joints] += sway * np.sin(3.0 * share + np.arange(layout.n_joints))
+        states[:, joints] += sway * np.sin(3.0 * share + np.arange(joints.stop - joints.start))
+        for where in unit_quaternions(scene):
+            states[:, where] /= np.linalg.norm(states[:, where], axis=1, keepdims=True)
         limit = np.minimum(layout.control_limit, 10.0)
         controls = limit * np.cos(5.0 * share[:-1] + np.arange(layout.n_u))
         return Trajectory(label, states, controls)

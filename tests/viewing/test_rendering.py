@@ -127,7 +127,9 @@ def test_drawn_starts_are_in_view(name):
     size = np.array([renderer.camera.width, renderer.camera.height])
     for _ in range(200):
         spread = scene.spread.joint_angles
-        angles = scene.initial_state.joint_angles + rng.uniform(-spread, spread, len(scene.links))
+        angles = scene.initial_state.joint_angles + rng.uniform(
+            -spread, spread, len(scene.initial_state.joint_angles)
+        )
         seen = renderer.camera.project(np.array(poses.position(start_poses(scene, angles).T)).T)[:, :2]
         assert ((seen > 0) & (seen < size)).all()
 

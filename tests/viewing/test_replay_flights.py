@@ -28,7 +28,7 @@ def test_frames_are_those_of_the_chain_one_state_at_a_time(name, make_flight):
         base = np.zeros(8)
         base[list(PLANAR_POSE) if layout.planar else list(range(8))] = state[layout.state.pose]
         joints, wrist = state[layout.state.joint_angles], state[layout.state.wrist_angles]
-        expected = kinematics.frame_poses(tree, tuple(base.tolist()), joints, wrist)
+        expected = kinematics.frame_poses(tree, tuple(base.tolist()), tree.coordinates(joints), wrist)
         np.testing.assert_allclose(shown.frames[instant], expected, atol=1e-14)
         pairs = [(tuple(expected[-1]), tuple(targets[instant].tolist()))]
         for index, tip in enumerate(scene.other_tips, 1 + len(scene.links)):

@@ -194,7 +194,8 @@ class DerivativePrograms:
         return self._stage_weights("terminal_")
 
     def _angle_count(self) -> int:
-        return self.layout.n_joints + (3 if self.layout.has_wrist else 0)
+        state = self.layout.state
+        return int(state.wrist_angles.stop - state.joint_angles.start)
 
     def cost(self) -> Program:
         """Gradient and Gauss-Newton Hessian of the stage cost."""
@@ -313,8 +314,8 @@ class DerivativePrograms:
         hessian = self._state_cost_derivatives(x, weights, emphasis)[1]
         base = self.equations.base_pose(x)
         increment, angles = symbols("d", n), symbols("angle", self._angle_count())
-        n_joints = self.layout.n_joints
-        arm = kinematics.arm_pose(self.tree, angles[:n_joints], angles[n_joints:])
+        motion = field.motion([*angles, *[0.0] * (field.n_y - len(angles))])
+        arm = kinematics.arm_pose(self.tree, motion.joint_angles, motion.wrist_angles)
         half = dq.from_vector([0.5 * entry for entry in field.pose.full_twist(increment)])
         square = dq.multiply(half, half)
         turned = [a + 0.5 * b for a, b in zip(half, square, strict=True)]

@@ -8,7 +8,9 @@ from typing import Any
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics import newton_euler
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.paper_field import PaperField
+from dq_space_arm_env.dynamics.paper_joints import bodies_of
 from dq_space_arm_env.integrators import integrator_of
 from dq_space_arm_env.kernels.programs.derivative_programs import sparse_buffer
 from dq_space_arm_env.scene.layout import StateLayout
@@ -23,17 +25,24 @@ Scalars = Sequence[Scalar]
 INTEGRATOR = "rk4"
 
 
+def _fixed_to_base(scene: Scene) -> bool:
+    """Whether a link is one body with the base."""
+    return any(body == 0 for body, _ in KinematicTree.from_scene(scene).places[1:])
+
+
 class PaperPrograms:
     """Builds the programs of one scene in the paper's formulation."""
 
     def __init__(self, scene: Scene) -> None:
-        """Lay out the equations; ValueError for drives that the system (20) has no rows for."""
+        """Lay out the equations; ValueError for what (20) has no rows or frames for."""
         self.scene = scene
         self.layout = StateLayout.of(scene)
         missing = {
             "elastic gears": any(link.is_elastic for link in scene.links),
             "actuators that lag or delay": bool(self.layout.chains),
             "tanks": scene.actuators.tank is not None,
+            # The base's frame would not be at its center of mass, where e_0 is.
+            "links fixed to the base": _fixed_to_base(scene),
         }
         for what, present in missing.items():
             if present:
@@ -134,7 +143,7 @@ class PaperPrograms:
         return self._of_state_and(
             "free_accelerations",
             lambda x, ydot: {"accelerations": self.field.free_accelerations(x, ydot)},
-            ydot=8 * (len(self.field.tree.links) + 1),
+            ydot=8 * len(bodies_of(self.field.tree)),
         )
 
     def _state_weights(self, pose: Scalars, velocity: Scalars) -> tuple[list[float], list[float]]:

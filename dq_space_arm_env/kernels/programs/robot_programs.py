@@ -99,6 +99,8 @@ class RobotPrograms:
 
         def outputs(x: Scalars) -> Mapping[str, Scalars]:
             base, arm = self._tip_columns(x)
+            if self.tree.has_spherical:
+                arm = self._by_angles(x, arm)
             error = poses.error_pose(self.equations.tip(x), self.equations.target)
             columns = []
             for twist in (*base, *arm):
@@ -117,6 +119,17 @@ class RobotPrograms:
             return {"jacobian": casadi.densify(jacobian.T).nonzeros()}
 
         return self._program("observation_jacobian", outputs, x=field.n_x)
+
+    def _by_angles(self, x: Scalars, arm: Columns) -> Columns:
+        """The tip's twists per unit of the angles of a state, from those per unit of rates."""
+        angles, found = self.field.motion(self.equations.y(x)).joint_angles, list[list[Scalar]]()
+        for index, link in enumerate(self.tree.links):
+            if link.spherical is None:
+                found.append(list(arm[index]))
+            elif link.spherical == 0:
+                turns = minimal.turn_by_quaternion(angles[index])
+                found += [combined(arm[index : index + 3], turn) for turn in zip(*turns, strict=True)]
+        return [*found, *arm[len(self.tree.links) :]]
 
     def _besides_by_pose(self, x: Scalars, count: int) -> Any:
         """Derivative of the last entries by the base's pose: `besides`, before twists and time left."""

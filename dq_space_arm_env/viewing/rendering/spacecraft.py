@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.kinematics import frame_poses
-from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.constraint_rows import sides
 from dq_space_arm_env.scene.constraints import JointLimits
 from dq_space_arm_env.scene.path import shown_target
@@ -131,9 +132,9 @@ class SpacecraftModel:
         """Balls around start, target, and the arm between: centers (n, 3) and radii (n,), m."""
         start, spread = self.scene.initial_state, self.scene.spread
         tree = KinematicTree.from_scene(self.scene)
-        poses_at_start = frame_poses(
-            tree, start.base_pose.dual_quaternion, start.joint_angles, start.wrist_angles
-        )
+        layout = StateLayout.of(self.scene)
+        joints = tree.coordinates(layout.initial_state[layout.state.joint_angles].tolist())
+        poses_at_start = frame_poses(tree, start.base_pose.dual_quaternion, joints, start.wrist_angles)
         frames = np.array([poses.position(pose) for pose in poses_at_start], dtype=np.float64)
         rotation = np.array(start.base_pose.rotation_matrix)
         wing = rotation @ (self._body_axes[:, self._wing_axes[0]] * self._wing_tip[self._wing_axes[0]])
@@ -295,10 +296,12 @@ class SpacecraftModel:
             if not shapes[frame]:
                 size, axes = equivalent_box(link.mass, link.inertia)
                 yield box(frame, link.center_of_mass, size, LINK, axes)
-        for joint in range(1, len(self.scene.links) + 1):
+        for joint, link in enumerate(self.scene.links, start=1):
             if shapes[joint]:
                 yield from shape_meshes(joint, shapes[joint], LINK)
-            else:
+            elif link.is_spherical:
+                yield ball(joint, (0.0, 0.0, 0.0), 1.5 * self._radius(joint), JOINT)
+            elif not link.is_fixed:
                 yield from self._joint(joint)
         if self.scene.wrist is not None:
             frame = len(self._before) - 1
@@ -311,9 +314,12 @@ class SpacecraftModel:
         for limits in (each for each in self.scene.constraints if isinstance(each, JointLimits)):
             for side in sides(self.scene, limits):
                 if side.sign > 0 and not side.is_rate:
-                    farthest[side.link] = max(farthest[side.link], side.bound)
-        tree = KinematicTree.from_scene(self.scene)
-        return [max(link.screw.slide * most, 0.0) for link, most in zip(tree.links, farthest, strict=True)]
+                    farthest[side.joint] = max(farthest[side.joint], side.bound)
+        tree, masts = KinematicTree.from_scene(self.scene), [0.0] * len(self.scene.links)
+        moving = zip(freedoms(self.scene.links), tree.links, farthest, strict=True)
+        for (index, _), link, most in moving:
+            masts[index] = max(link.screw.slide * most, 0.0)
+        return masts
 
     @property
     def _geometry(self) -> list[tuple[Shape, ...]]:

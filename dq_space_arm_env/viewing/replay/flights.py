@@ -124,7 +124,8 @@ def frame_poses(scene: Scene, layout: StateLayout, states: FloatArray) -> FloatA
     stored = list(PLANAR_POSE) if layout.planar else list(range(8))
     base[stored] = states[:, entries.pose].T
     joints, wrist = tuple(states[:, entries.joint_angles].T), tuple(states[:, entries.wrist_angles].T)
-    frames = kinematics.frame_poses(KinematicTree.from_scene(scene), tuple(base), joints, wrist)
+    tree = KinematicTree.from_scene(scene)
+    frames = kinematics.frame_poses(tree, tuple(base), tree.coordinates(joints), wrist)
     return np.stack([np.stack(frame, axis=1) for frame in frames], axis=1)
 
 
