@@ -2,8 +2,8 @@
 
 State: base pose, joint angles (quaternions of spherical joints), wrist angles, base velocity, joint rates,
 angles and rates of motors behind elastic gears, axial momenta of wheels, mass of the propellant in a tank,
-and what actuators keep from step to step: the previous controls whose rates are limited, then commands on their
-way and outputs. Tangent: the same, with a twist increment of the base in base axes (rotation, then
+and what actuators keep from step to step: the previous controls whose rates are limited, then commands on
+their way and outputs. Tangent: the same, with a twist increment of the base in base axes (rotation, then
 translation) in place of the pose. Controls: base force, base torque, joint torques of the actuated joints,
 wrist rates, wheel torques, thruster forces. Parameters: target, bodies from base to payload, weights, limits.
 What a scene does not have is missing; the order stays.

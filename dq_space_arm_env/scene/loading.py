@@ -70,8 +70,7 @@ def load_scene(source: str | Path | Mapping[str, Any] | Scene) -> Scene:
             f"no scene is named {shortened(source)}; {did_you_mean(source, names)}The scenes are "
             f"{', '.join(names)}; give your own file by its path, ending in .yaml"
         )
-    file = scenes_directory() / f"{source}.yaml"
-    return _shipped(file, file.read_text(encoding="utf-8"))
+    return _shipped(source, (scenes_directory() / f"{source}.yaml").read_text(encoding="utf-8"))
 
 
 def _is_path(source: str) -> bool:
@@ -79,9 +78,9 @@ def _is_path(source: str) -> bool:
 
 
 @lru_cache(maxsize=64)  # scenes do not change, and YAML takes 20 to 50 ms
-def _shipped(file: Traversable, text: str) -> Scene:
-    """The scene of a file that has this text."""
-    return _read(file)
+def _shipped(name: str, text: str) -> Scene:
+    """The shipped scene whose file has this text."""
+    return _read(scenes_directory() / f"{name}.yaml")
 
 
 def _read(file: Traversable) -> Scene:
