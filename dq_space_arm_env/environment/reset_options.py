@@ -13,12 +13,11 @@ from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import Scene, StateLayout
-from dq_space_arm_env.scene.layout import unit_quaternions
 from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.parameters import TARGET, target_entries
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.scene.pose import PLANAR_POSE, Pose
-from dq_space_arm_env.scene.start import episode_scene
+from dq_space_arm_env.scene.start import episode_scene, unit_quaternions
 from dq_space_arm_env.task.step_report import STATE_LIMIT
 
 Array = NDArray[Any]

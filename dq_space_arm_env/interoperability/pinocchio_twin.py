@@ -15,8 +15,8 @@ from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Placement, R
 from dq_space_arm_env.interoperability.exporting import coupled_rotors, tip_on_its_body
 from dq_space_arm_env.scene import Scene, SceneError, StateLayout
 from dq_space_arm_env.scene.bodies import freedoms
-from dq_space_arm_env.scene.layout import unit_quaternions
 from dq_space_arm_env.scene.pose import PLANAR_POSE
+from dq_space_arm_env.scene.start import unit_quaternions
 
 Array = NDArray[np.float64]
 

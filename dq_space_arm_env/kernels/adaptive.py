@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.kernels.library import KernelLibrary
-from dq_space_arm_env.scene.layout import unit_quaternions
+from dq_space_arm_env.scene.start import unit_quaternions
 
 Array = NDArray[Any]
 

@@ -171,6 +171,13 @@ class Link(Model):
         return self.motor is not None and self.motor.is_elastic
 
     @property
+    def coordinates(self) -> list[tuple[str, str]]:
+        """Names and units of the joint's coordinates."""
+        if self.is_spherical:
+            return [(f"q_{index}", "1") for index in range(4)]
+        return [("angle" if self.turns else "displacement", self.unit)] * self.freedoms
+
+    @property
     def unit(self) -> str:
         """Unit of the joint's coordinate."""
         return "rad" if self.turns else "m"

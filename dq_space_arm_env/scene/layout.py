@@ -22,7 +22,7 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.actuator_chains import Chain, chains
-from dq_space_arm_env.scene.bodies import Link, freedoms
+from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.constraint_rows import previous_controls
 from dq_space_arm_env.scene.parameters import (
     GRASP,
@@ -387,7 +387,7 @@ class _Collector:
         """Append what state and tangent have in common."""
         turning, moving = free_axes(scene)
         wrist = _EULER_ANGLES if scene.wrist else ()
-        angles = [(f"{link.name} {name}", unit) for link in scene.links for name, unit in _coordinates(link)]
+        angles = [(f"{link.name} {name}", unit) for link in scene.links for name, unit in link.coordinates]
         joint_angles = self.add_each([unit for _, unit in angles], [name for name, _ in angles])
         freely = [(scene.links[index], axis) for index, axis in freedoms(scene.links)]
         wrist_angles = self.add("rad", [f"wrist {angle}" for angle in wrist])
@@ -496,30 +496,6 @@ def _actuated_joints(scene: Scene) -> tuple[int, ...]:
         return ()
     driven = (scene.links[index].actuated for index, _ in freedoms(scene.links))
     return tuple(number for number, actuated in enumerate(driven) if actuated)
-
-
-def unit_quaternions(scene: Scene) -> list[slice]:
-    """Find where the quaternions of spherical joints are.
-
-    Args:
-        scene: A scene.
-
-    Returns:
-        Slices of its state, of 4 numbers each.
-    """
-    start, found = (len(PLANAR_POSE) if is_planar(scene) else 8), list[slice]()
-    for link in scene.links:
-        if link.is_spherical:
-            found.append(slice(start, start + 4))
-        start += len(_coordinates(link))
-    return found
-
-
-def _coordinates(link: Link) -> list[tuple[str, str]]:
-    """Names and units of a joint's coordinates."""
-    if link.is_spherical:
-        return [(f"q_{index}", "1") for index in range(4)]
-    return [("angle" if link.turns else "displacement", link.unit)] * link.freedoms
 
 
 def _entries(vectors: Array) -> tuple[Array, ...]:

@@ -63,6 +63,23 @@ def free_axes(scene: Scene) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return ((2,), (0, 1)) if is_planar(scene) else ((0, 1, 2), (0, 1, 2))
 
 
+def unit_quaternions(scene: Scene) -> list[slice]:
+    """Find where the quaternions of spherical joints are.
+
+    Args:
+        scene: A scene.
+
+    Returns:
+        Slices of its state, of 4 numbers each.
+    """
+    start, found = (len(PLANAR_POSE) if is_planar(scene) else 8), list[slice]()
+    for link in scene.links:
+        if link.is_spherical:
+            found.append(slice(start, start + 4))
+        start += len(link.coordinates)
+    return found
+
+
 def initial_state(scene: Scene) -> Array:
     """Nominal state, shape (n_x,); the sign of the base quaternion puts q_{G/I} near q_{D/I}."""
     return start_from_draws(scene, np.zeros(number_of_draws(scene)))

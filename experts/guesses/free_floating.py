@@ -18,8 +18,8 @@ from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.kinematics import wrist_rate_matrix
 from dq_space_arm_env.dynamics.minimal import angle_rates, turn_by_quaternion
 from dq_space_arm_env.scene.bodies import freedoms
-from dq_space_arm_env.scene.layout import unit_quaternions
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
+from dq_space_arm_env.scene.start import unit_quaternions
 from experts.problems.shooting_problem import FloatArray
 
 PROJECTIONS = 30

@@ -18,7 +18,7 @@ from dq_space_arm_env.dynamics.newton_euler import solve_schur
 from dq_space_arm_env.dynamics.paper_field import PaperField
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
 from dq_space_arm_env.scene import Scene, StateLayout
-from dq_space_arm_env.scene.layout import unit_quaternions
+from dq_space_arm_env.scene.start import unit_quaternions
 from dq_space_arm_env.task.equations import SceneEquations
 
 pin = pytest.importorskip("pinocchio")

@@ -5,7 +5,7 @@ import pytest
 
 from dq_space_arm_env import compile_scene
 from dq_space_arm_env.algebra import screw
-from dq_space_arm_env.scene.layout import unit_quaternions
+from dq_space_arm_env.scene.start import unit_quaternions
 
 
 def random_states(kernels, count, seed=0, scale=1.0):

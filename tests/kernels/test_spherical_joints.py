@@ -5,7 +5,7 @@ import pytest
 
 from dq_space_arm_env import DQSpaceArmEnv, SceneError, compile_scene, load_scene
 from dq_space_arm_env.scene import draw_initial_state
-from dq_space_arm_env.scene.layout import unit_quaternions
+from dq_space_arm_env.scene.start import unit_quaternions
 
 
 @pytest.fixture(scope="module")

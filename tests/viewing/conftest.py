@@ -10,7 +10,7 @@ import pytest
 
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.scene import StateLayout
-from dq_space_arm_env.scene.layout import unit_quaternions
+from dq_space_arm_env.scene.start import unit_quaternions
 from dq_space_arm_env.viewing.replay import Trajectory
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

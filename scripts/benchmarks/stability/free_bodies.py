@@ -55,7 +55,7 @@ def beyond_free_bodies(scene: Scene) -> list[str]:
     """What a scene has besides rigid bodies on joints that turn, with ideal torques and a net force."""
     actuators = scene.actuators
     has = {
-        "a joint that slides": any(link.joint_type != "revolute" for link in scene.links),
+        "a joint that is not revolute": any(link.joint_type != "revolute" for link in scene.links),
         "a motor": any(link.motor is not None for link in scene.links),
         "wheels": actuators.wheels is not None,
         "thrusters": actuators.thrusters is not None,
