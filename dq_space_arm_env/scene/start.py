@@ -283,7 +283,11 @@ def _tip_rotation(
 ) -> Sequence[Any]:
     """Rotation of q_{G/e0}: real parts of eq. (27), without the base."""
     q: Sequence[Any] = (1.0, 0.0, 0.0, 0.0)
-    for link, coordinates in zip(scene.links, joint_angles, strict=True):
+    way, body = list[int](), scene.tip_body
+    while body:
+        way.insert(0, body - 1)
+        body = scene.parent_bodies[body - 1]
+    for link, coordinates in ((scene.links[index], joint_angles[index]) for index in way):
         q = multiply(q, link.joint.rotation)
         if link.is_spherical:
             q = multiply(q, coordinates)
