@@ -2,6 +2,7 @@
 
 import warnings
 from importlib.metadata import PackageNotFoundError, distribution
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -69,9 +70,23 @@ def robot_file(name):
     return str(file), tip, arguments
 
 
-def foreign_scene(name):
+def held_scene(name, moving):
+    """The scene of a robot of which, beside the way from base to tip, only these joints move."""
+    file, tip, _ = robot_file(name)
+    joints = ElementTree.parse(file).getroot().findall("joint")
+    before = {joint.find("child").get("link"): joint for joint in joints}
+    link, free = tip, [*moving]
+    while link in before:
+        free.append(before[link].get("name"))
+        link = before[link].find("parent").get("link")
+    movable = [each.get("name") for each in joints if each.get("type") not in ("fixed", "floating")]
+    return foreign_scene(name, lock_branches=[each for each in movable if each not in free])
+
+
+def foreign_scene(name, **others):
     """The scene of a robot; friction that is left out and inertias of no body come with a warning."""
     file, tip, arguments = robot_file(name)
+    arguments = {**arguments, **others}
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*(Coulomb friction|used as it is)")
         return scene_from_urdf(file, tip, **arguments)

@@ -4,7 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_robots import ROBOTS, accelerations, drawn, foreign_scene, relative_error, robot_file, tip_pose
+from foreign_robots import (
+    ROBOTS,
+    accelerations,
+    drawn,
+    foreign_scene,
+    held_scene,
+    relative_error,
+    robot_file,
+    tip_pose,
+)
 
 from dq_space_arm_env import DQSpaceArmEnv, compile_scene, load_scene, scene_from_urdf, scene_to_urdf
 from dq_space_arm_env.algebra import poses
@@ -252,3 +261,38 @@ def test_a_robot_of_others_flies_in_the_environment(odd_scene):
     environment.reset(seed=0)
     observation, reward, *_ = environment.step(environment.action_space.sample())
     assert np.isfinite([*observation, reward]).all()
+
+
+# Joints that move besides those from base to tip, the rest is held; and what is changed.
+SHORT = {"simulation": {"dt": 0.02, "steps": 500}}
+FLOWN = {
+    "anymal-on-legs": (["LF_HAA", "LF_HFE", "LF_KFE"], {}),
+    "baxter": (["right_s0", "right_s1"], {}),
+    "centauro": (["j_arm2_1", "j_arm2_4"], SHORT),
+    "g1": (["right_shoulder_pitch_joint", "right_elbow_joint"], SHORT),
+    "tiago-dual": (
+        ["arm_right_1_joint", "arm_right_4_joint"],
+        # The weight that suits the dampers of its sliding torso would let the arms fling.
+        {"simulation": {"dt": 0.01, "steps": 1000, "integrator": "rk4"}, "cost.joint_torque": 1.0},
+    ),
+}
+
+
+@pytest.mark.endurance
+@pytest.mark.parametrize("name", FLOWN)
+def test_trees_of_others_are_solved_and_flown(name):
+    """The maneuver that the import writes, of robots that branch."""
+    from experts import GuidedDDP
+
+    moving, changes = FLOWN[name]
+    scene = held_scene(name, moving).replace(changes)
+    assert scene.parent_bodies != (*range(len(scene.links)),)  # it branches
+    plan = GuidedDDP(scene).solve()
+    assert plan.converged
+    assert plan.constraints.violation <= 1e-6
+    environment = DQSpaceArmEnv(scene)
+    environment.reset(options={"nominal": True})
+    for u in plan.controls:
+        *_, info = environment.step(environment.kernels.layout.to_action(u))
+    assert info["is_success"]
+    np.testing.assert_allclose(environment.state, plan.states[-1], atol=1e-9)
