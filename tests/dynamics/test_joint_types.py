@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dq_space_arm_env import SceneError, load_scene, scene_to_mjcf, scene_to_urdf
+from dq_space_arm_env import SceneError, load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.dynamics import kinematics, minimal
 from dq_space_arm_env.dynamics.articulated_body import ArticulatedBodies
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.forward import forward_dynamics
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
+from dq_space_arm_env.dynamics.mass_matrix import mass_matrix
 from dq_space_arm_env.dynamics.newton_euler import solve_schur
 from dq_space_arm_env.dynamics.paper_field import PaperField
 from dq_space_arm_env.dynamics.space_arm_field import SpaceArmField
@@ -276,6 +277,16 @@ def test_a_fixed_link_keeps_its_frame_and_its_mass():
         if link.is_fixed:
             expected = dq.multiply(frames[parent], link.joint.dual_quaternion)
             np.testing.assert_allclose(frame, expected, atol=1e-12)
+
+
+def test_fixed_links_are_written_as_urdf_and_read_as_parts_of_what_carries_them():
+    start = {"joint_angles": (), "joint_rates": ()}
+    scene = load_scene("no-wrist").replace({"links.1.joint_type": "fixed"}, initial_state=start)
+    text = scene_to_urdf(scene.replace(links=[link.model_dump() | {"damping": 0.0} for link in scene.links]))
+    assert text.count('type="fixed"') == 2  # the tip's besides
+    trees = [KinematicTree.from_scene(each) for each in (scene, scene_from_urdf(text, tip="tip"))]
+    matrices = [mass_matrix(tree, minimal.link_frames(tree, [0.3, -0.7])) for tree in trees]
+    np.testing.assert_allclose(*matrices, rtol=1e-12, atol=1e-12)
 
 
 def test_what_spherical_and_fixed_joints_do_not_have_is_refused():
