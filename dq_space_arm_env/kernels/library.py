@@ -22,7 +22,8 @@ from dq_space_arm_env.common.host_machine import host_machine
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.compiler import native
 from dq_space_arm_env.kernels.bound import BoundKernel, SingleRowCalls, rows_of
-from dq_space_arm_env.scene.layout import ParameterEntries, StateLayout
+from dq_space_arm_env.scene.entries import ParameterEntries
+from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.schema import Scene
 
 if TYPE_CHECKING:

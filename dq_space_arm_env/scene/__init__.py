@@ -2,8 +2,9 @@
 
 from dq_space_arm_env.scene.bodies import Base, Link, Payload, Wrist
 from dq_space_arm_env.scene.constraint_rows import Row, path_rows, terminal_rows
+from dq_space_arm_env.scene.entries import ControlEntries, StateEntries, TangentEntries
 from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
-from dq_space_arm_env.scene.layout import ControlEntries, StateEntries, StateLayout, TangentEntries
+from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.loading import list_scenes, load_scene, scenes_directory
 from dq_space_arm_env.scene.maneuver import (
     Actuators,

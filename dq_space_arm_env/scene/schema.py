@@ -17,8 +17,9 @@ from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.bodies import BASE, Base, Link, Payload, Wrist, freedoms, parent_bodies
+from dq_space_arm_env.scene.constraint_problems import constraint_problems
 from dq_space_arm_env.scene.constraint_rows import previous_controls
-from dq_space_arm_env.scene.constraints import AnyConstraint, constraint_problems
+from dq_space_arm_env.scene.constraints import AnyConstraint
 from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
 from dq_space_arm_env.scene.maneuver import (
     Actuators,

@@ -28,7 +28,7 @@ import numpy as np
 import dq_space_arm_env
 from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.worker_process import WorkerLostError, WorkerProcess
-from dq_space_arm_env.scene.layout import ParameterEntries
+from dq_space_arm_env.scene.entries import ParameterEntries
 from experts.demonstrations.reading import Demonstration, Demonstrations
 from experts.demonstrations.shard import PARAMETERS, are_successes, tip_errors
 from experts.demonstrations.tensors import DemonstrationsError
