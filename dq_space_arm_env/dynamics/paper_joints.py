@@ -17,8 +17,6 @@ Scalar = Any
 TRANSMITTED, FORBIDDEN = (1, 2, 3, 5, 6), (1, 2, 5, 6, 7)
 # A prismatic joint transmits a torque about its axis, and no force along it.
 PRISMATIC_TRANSMITTED, PRISMATIC_FORBIDDEN = (1, 2, 5, 6, 7), (1, 2, 3, 5, 6)
-
-
 # A spherical joint transmits a force alone, and forbids no turning.
 SPHERICAL_TRANSMITTED, SPHERICAL_FORBIDDEN = (1, 2, 3), (5, 6, 7)
 
