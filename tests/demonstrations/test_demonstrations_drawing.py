@@ -115,6 +115,7 @@ def test_where_nothing_varies_there_is_no_column(whole: Demonstrations):
         whole.column(PARAMETERS)
 
 
+@pytest.mark.slow
 def test_it_is_optimal_for_its_own_target_masses_and_limits(drawn: Demonstrations):
     solver = BoxDDP(drawn.scene)
     demonstration = next(each for each in drawn if ends_inside(each))

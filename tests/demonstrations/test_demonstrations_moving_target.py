@@ -54,6 +54,7 @@ def test_observations_are_those_of_states_and_stages(made: Demonstrations) -> No
         np.testing.assert_allclose(demonstration.observations, seen, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_batches_hold_the_parameters_of_their_stages(made: Demonstrations) -> None:
     names = ("states", "observations", "parameters")
     (batch,) = made.batches(COUNT * made.scene.simulation.steps, names)

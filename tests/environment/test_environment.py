@@ -62,6 +62,7 @@ def test_check_env_has_no_complaint_about_pictures(monkeypatch):
         check_env(make(render_mode="rgb_array").unwrapped)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", list_scenes())
 def test_a_thousand_random_steps(scene):
     env = make(scene)

@@ -57,6 +57,7 @@ def test_with_unknown_springs_only_who_estimates_them_reaches_the_target(experts
     assert experts[False].replans == expert.fallbacks == 0
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(
     ("changes", "factors"), [(SPRINGS, {}), (DAMPERS, {}), ({}, LOADS)], ids=["springs", "dampers", "load"]
 )

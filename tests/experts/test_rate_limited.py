@@ -75,6 +75,7 @@ def test_guided_solver_flies_in_the_environment():
         assert charge <= 1e-9
 
 
+@pytest.mark.slow
 def test_receding_horizon_keeps_to_the_rates():
     env, expert = DQSpaceArmEnv(LIMITED), RecedingHorizonExpert(LIMITED, horizon=30)
     env.reset(seed=4)

@@ -86,6 +86,7 @@ def test_noise_on_the_state_hardly_costs_anything(plans, experts):
     assert distance <= 0.1
 
 
+@pytest.mark.slow
 def test_pushes_are_recovered_from(plans, experts):
     """Pushes of 0.02 rad/s and 0.02 m/s: the open-loop plan misses by 19 degrees, its feedback by 5."""
     kernels, plan = compile_scene("paper"), plans["paper"]
@@ -160,6 +161,7 @@ def fly_with_change(expert, later, told):
         return cost + kernels.terminal_cost(x, p=later), maneuver.misses(x)
 
 
+@pytest.mark.slow
 def test_a_new_target_in_mid_flight_is_reached(varying):
     """The old plan ends where the target was."""
     scene = varying.maneuver.scene
@@ -458,6 +460,7 @@ def test_the_plan_knows_what_remains_to_be_paid(plans):
     assert np.linalg.eigvalsh(made.Vxx).min() > -1e-6
 
 
+@pytest.mark.slow
 def test_where_the_cheapest_maneuver_misses_the_target_it_is_reached_all_the_same():
     """From a third of the starts of `paper` the cost's own minimum ends outside of the tolerances."""
     expert, kernels = RecedingHorizonExpert("paper"), compile_scene("paper")

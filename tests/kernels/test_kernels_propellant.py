@@ -192,6 +192,7 @@ def test_an_empty_tank_stops_the_jets() -> None:
     np.testing.assert_allclose(after, env.state, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_the_expert_keeps_its_reserve() -> None:
     from experts import GuidedDDP
 

@@ -247,6 +247,7 @@ class TestEpisodes:
         assert info["angular_velocity_error"] == pytest.approx(np.degrees(np.linalg.norm(held[:3])))
         assert info["velocity_error"] == pytest.approx(np.linalg.norm(held[3:]))
 
+    @pytest.mark.sampled
     @pytest.mark.parametrize("options", ["parameters", "target"])
     def test_a_given_target_moves_from_where_it_is_given(self, kind: str, options: str) -> None:
         """Not from where one was drawn."""
@@ -455,6 +456,7 @@ def test_the_velocity_of_the_base_may_be_relative_to_the_target(kind: str) -> No
     assert info["terminal_cost_base_velocity"] == pytest.approx(2.0 * deviation @ deviation, rel=1e-11)
 
 
+@pytest.mark.slow
 def test_a_relative_velocity_without_weights_is_not_computed() -> None:
     free = scene_of("screw", **{"cost.base_velocity": 0.0, "cost.terminal_base_velocity": 0.0})
     follows = free.replace({"target.base_velocity_relative": True})

@@ -39,6 +39,7 @@ SCENES = {name: shortened(name) for name in ("capture-and-detumble", "release", 
 SCENES["refuelling"] = SCENES["refuelling"].replace({"phases.2.changes.cost.base_torque": 3.0})
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", SCENES)
 def test_an_episode_costs_what_the_kernels_say_stage_by_stage(name: str) -> None:
     scene = SCENES[name]

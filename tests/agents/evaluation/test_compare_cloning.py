@@ -62,6 +62,7 @@ def test_it_measures_draws_and_goes_on(arguments, tmp_path, capsys):
         assert {**json.loads(one), "seconds": 0} == {**json.loads(other), "seconds": 0}
 
 
+@pytest.mark.slow
 def test_what_cannot_be_measured_is_refused(arguments, demonstrations, tmp_path, capsys):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / LINES).write_text('{"updates": 7}\n')

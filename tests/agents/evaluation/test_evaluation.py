@@ -51,6 +51,7 @@ STIFF = PAPER.replace(
 """Most of its episodes diverge, and restart without being counted."""
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize(("scene", "seeds"), [(SHORT, [3, 11, 2**40]), (STIFF, list(range(12)))])
 def test_flights_are_those_of_single_environments(scene, seeds):
     flights = fly(gentle, scene, seeds)
@@ -66,6 +67,7 @@ def test_flights_are_those_of_single_environments(scene, seeds):
             assert flights.base_turn[i] == pytest.approx(turn, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_policy_that_gives_nan_is_no_success():
     scene = SHORT.replace(success={"attitude_error_deg": 180.0, "position_error": 100.0})
     evaluation = evaluate(lambda seen: np.full((len(seen), 12), np.nan), scene, 3, expert=False)
@@ -139,6 +141,7 @@ def idle(scene):
     return lambda observations: np.zeros((len(observations), n_u))
 
 
+@pytest.mark.slow
 def test_an_evaluation_reports_what_the_protocol_asks_for(cache, quick):
     evaluation = evaluate(idle(quick), quick, 10, executor=SerialExecutor(), label="idle")
     summary = evaluation.summary()
@@ -198,6 +201,7 @@ def test_what_is_no_policy_is_refused(tmp_path):
         as_policy(tmp_path / "model.zip")
 
 
+@pytest.mark.slow
 def test_a_policy_of_the_goal_environment_sees_what_that_shows():
     """Its observations are the goal environment's own, joined in alphabetical order."""
     seen = []
@@ -228,6 +232,7 @@ def test_a_policy_of_another_scene_is_refused_in_a_sentence(tmp_path, quick):
         evaluate(exported(agent="stub", observation="residual"), SHORT, 3, expert=False)
 
 
+@pytest.mark.slow
 def test_it_is_told_whether_the_scene_is_that_of_the_training():
     for made_in, same in ((SHORT.content_hash(), True), ("another", False), (None, None)):
         metadata = {"scene": "short"} | ({} if made_in is None else {"scene_hash": made_in})
@@ -243,6 +248,7 @@ def test_the_physics_are_neither_names_nor_tolerances():
     assert physics_hash(scene_under(SHORT, "heavy_payload")) != physics_hash(SHORT)
 
 
+@pytest.mark.slow
 def test_records_give_evaluations_back(cache, quick):
     evaluation = evaluate(idle(quick), quick, 4, executor=SerialExecutor())
     text = json.dumps(evaluation.record(), allow_nan=False)

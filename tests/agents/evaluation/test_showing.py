@@ -104,6 +104,7 @@ def test_the_verb_draws_the_flight(exported, tmp_path):
         assert picture.n_frames == 151
 
 
+@pytest.mark.slow
 def test_the_verb_needs_neither_torch_nor_matplotlib(exported, run_without, tmp_path):
     """In a process where neither can be imported: the core install."""
     code = """

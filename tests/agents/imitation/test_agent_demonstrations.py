@@ -53,6 +53,7 @@ def datasets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
 
 
+@pytest.mark.slow
 def test_what_minari_gives_back_is_what_was_exported(demonstrations, datasets, tmp_path):
     export_to_minari(demonstrations, ID)
     source = DemonstrationSource(minari=ID)
@@ -69,6 +70,7 @@ def test_what_minari_gives_back_is_what_was_exported(demonstrations, datasets, t
     assert expert_seconds(read) == 0.0
 
 
+@pytest.mark.slow
 def test_without_gains_they_can_be_cloned_plainly_only(demonstrations, datasets, tmp_path):
     pytest.importorskip("torch")
     from agents.configuration.imitation import Cloning, ObjectiveWeights, Optimization
@@ -85,6 +87,7 @@ def test_without_gains_they_can_be_cloned_plainly_only(demonstrations, datasets,
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_other_data_sets_and_folders_are_refused(demonstrations, datasets, tmp_path):
     def prepare(name):
         prepare_demonstrations(DemonstrationSource(minari=name), demonstrations.scene, tmp_path / "copied")

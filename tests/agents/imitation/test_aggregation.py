@@ -109,6 +109,7 @@ def test_plans_know_the_target_and_the_masses_of_each_stage(staged):
     plans_know_the_target_and_the_masses(staged)
 
 
+@pytest.mark.slow
 def test_plans_know_the_target_and_the_masses_of_each_flight(drawn):
     plans_know_the_target_and_the_masses(drawn)
 

@@ -92,6 +92,7 @@ def test_observations_around_a_demonstration_are_relative_to_its_own_target(draw
     assert torch.isfinite(objective(network, batch, np.random.default_rng(0)).total)
 
 
+@pytest.mark.sampled
 def test_time_steps_have_the_target_and_the_masses_of_their_stage(staged):
     batch, kernels = next(staged.batches(200, COLUMNS, seed=0)), staged.kernels
     states, observations, parameters = (

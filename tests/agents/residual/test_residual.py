@@ -173,6 +173,7 @@ def test_controllers_are_compared_start_by_start(comparison, demonstrations):
     assert all(row.evaluation.action_seconds > 0.0 for row in comparison.rows)
 
 
+@pytest.mark.slow
 def test_savings_are_of_the_starts_that_both_have_flown(comparison, demonstrations):
     base, receding = (row_of(comparison, TESTED.name, name) for name in (FEEDBACK, RECEDING))
     cost, base_cost = receding.evaluation.flights.cost, base.evaluation.flights.cost

@@ -65,6 +65,7 @@ def solved(request, free):
     return problem, solution, cost
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("case", CASES)
 def test_minimum_from_the_unconstrained_one(case, free):
     constraints, cost = CASES[case]
@@ -91,6 +92,7 @@ def test_minimum(solved):
     assert solution.cost == pytest.approx(spent, rel=1e-12)  # without penalties
 
 
+@pytest.mark.sampled
 def test_first_order_conditions(solved):
     """With the multipliers, no input inside its bounds changes the Lagrangian to first order."""
     problem, solution, _ = solved
@@ -158,6 +160,7 @@ def test_penalties_leave_no_trace(solved):
     assert again.cost == pytest.approx(solution.cost, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_an_infeasible_scene_is_named():
     """The elbow cannot keep a meter from what it is attached to."""
     entry = {**BALL, "obstacles": [{"frame": "base", "position": [0, 0, 0.8], "radius": 0.5}]}
@@ -175,6 +178,7 @@ def test_without_constraints_there_are_no_multipliers(free):
         BoxDDP("paper").solve(multipliers=np.zeros((1001, 1)))
 
 
+@pytest.mark.slow
 def test_constraints_that_the_cheapest_maneuver_keeps_change_nothing(free):
     wide = {**LIMITS, "lower": -3.0, "upper": 3.0}
     solution = BoxDDP(load_scene("paper").replace(constraints=[wide])).solve()

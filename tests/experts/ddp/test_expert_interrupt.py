@@ -23,6 +23,7 @@ print(solution.stop_reason.value, solution.iterations > 0, solution.cost > 0.0)
 """
 
 
+@pytest.mark.sampled
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 @pytest.mark.parametrize("delay", [0.02, 0.05, 0.11, 0.17])
 def test_a_real_interrupt_ends_the_solve_with_its_best_trajectory(delay):

@@ -174,6 +174,7 @@ def test_a_disturbed_solution_leads_back_to_it(name, request):
     np.testing.assert_allclose(solution.states, reference.states, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_solution_as_a_guess_needs_no_iteration(pendulum):
     solver = BoxDDP(pendulum)
     solution = solver.solve()
@@ -195,6 +196,7 @@ def test_unstable_dynamics_of_which_no_rollout_is_finite(unstable):
     assert_rolled_out(solution, unstable)
 
 
+@pytest.mark.slow
 def test_a_start_far_from_the_guess(unicycle):
     """The guess ends where it should but begins elsewhere, turned by a right angle and more."""
     elsewhere = np.array([np.cos(-1.0), np.sin(-1.0), -0.7, -0.4])
@@ -228,6 +230,7 @@ def test_a_disturbed_maneuver_of_the_arm_leads_back_to_it(arm):
     np.testing.assert_array_equal(problem.kernels.step(*rows), solution.states[1:])
 
 
+@pytest.mark.slow
 def test_rounded_poses_are_made_unit_dual_quaternions(arm):
     problem, reference = arm
     rounded = reference.states.astype(np.float32)

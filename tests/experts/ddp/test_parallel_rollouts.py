@@ -25,6 +25,7 @@ def prepared():
     return work
 
 
+@pytest.mark.slow
 def test_every_lane_is_the_rollout_of_its_step_length(prepared):
     costs = prepared.try_steps(SHORTER_STEPS)
     at_bounds = 0

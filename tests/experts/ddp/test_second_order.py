@@ -198,6 +198,7 @@ def test_exact_derivatives_that_are_not_finite_are_reported(pendulum):
     assert "derivatives are not finite" in solution.message
 
 
+@pytest.mark.slow
 def test_an_integrator_without_second_derivatives_leaves_gauss_newton():
     scene = load_scene("planar")
     problem = ArmProblem(scene.replace(simulation={"dt": 0.1, "steps": 20}), "rodas4")

@@ -38,6 +38,7 @@ def values(solver, target=(0.1, -0.1), turn=0.2, **others):
     return p
 
 
+@pytest.mark.slow
 def test_a_solve_is_that_of_the_scene_with_these_numbers(scene, solver):
     p = values(solver, links__0__mass=14.0, base__inertia__zz=7.0)
     solution = solver.solve(parameters=p)

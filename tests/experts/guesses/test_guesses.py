@@ -127,6 +127,7 @@ def test_where_a_policy_is_near_no_screw_motion_is_asked_for(unicycle):
     assert names(solution) == ["policy 0", "zero controls"]
 
 
+@pytest.mark.slow
 def test_an_arm_needs_no_library():
     """The screw motion alone leads to the minimum, in one solve."""
     start = random_start("paper", 1)
@@ -265,6 +266,7 @@ def random_start(scene, seed):
     return draw_initial_state(load_scene(scene), np.random.default_rng(seed))
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("seed", [4, 13])
 def test_starts_of_which_zero_controls_make_little(paper, seed):
     """Starts from which zero controls end in a poor minimum, or do not end."""
@@ -468,6 +470,7 @@ def test_solves_of_six_joints_converge():
     assert np.all([solution.cost for solution in solutions] <= 1.01 * best)
 
 
+@pytest.mark.slow
 def test_steps_too_long_for_a_scene_are_not_taken():
     """Joints that turn within a long step: no policy of theirs survives."""
     scene = load_scene("planar").replace(simulation={"dt": 1.0, "steps": 56})
