@@ -264,7 +264,7 @@ def _rates(scene: Scene, each: ControlRate, field: str, count: int) -> list[floa
         return [math.inf] * count
     if field == "joint_torque":
         rates = per_link(given, len(scene.links))
-        return [rate for rate, link in zip(rates, scene.links, strict=True) if link.actuated]
+        return [rates[index] for index, _ in freedoms(scene.links) if scene.links[index].actuated]
     if scene.base.motion == "planar" and field in ("base_force", "base_torque"):
         given = given[:2] if field == "base_force" else given[2:]
     return list(per_link(given, count))

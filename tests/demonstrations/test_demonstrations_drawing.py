@@ -29,6 +29,8 @@ from experts.demonstrations.settings import Settings
 from experts.demonstrations.shard import FAILURES, PARAMETERS, SUMMARIES, TRAJECTORIES, draw_starts
 from experts.demonstrations.tensors import map_tensors
 
+pytestmark = pytest.mark.slow
+
 N, SHARD_SIZE, SEED = 9, 4, 3
 
 
@@ -79,7 +81,6 @@ def assert_is_an_episode(made: Demonstrations, position: int) -> None:
     assert demonstration.facts["final_errors"] == [info["attitude_error"], info["position_error"]]
 
 
-@pytest.mark.slow
 def test_each_is_an_episode_with_parameters_of_its_own(drawn: Demonstrations):
     assert len(drawn) == N
     for position in (0, 5, -1):
@@ -92,7 +93,6 @@ def test_each_is_an_episode_with_parameters_of_its_own(drawn: Demonstrations):
     np.testing.assert_array_equal(drawn.select([7, 2]).column(PARAMETERS), rows[[7, 2]])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["random-target", "random-masses"])
 def test_shipped_scenes_that_draw_have_the_scene_of_the_episode(name: str, tmp_path: Path):
     # Steps so coarse err by more than the environment lets pass, and the expert plans with whole ones.
@@ -115,7 +115,6 @@ def test_where_nothing_varies_there_is_no_column(whole: Demonstrations):
         whole.column(PARAMETERS)
 
 
-@pytest.mark.slow
 def test_it_is_optimal_for_its_own_target_masses_and_limits(drawn: Demonstrations):
     solver = BoxDDP(drawn.scene)
     demonstration = next(each for each in drawn if ends_inside(each))
@@ -135,7 +134,6 @@ def test_batches_have_the_parameters_of_each_time_step(drawn: Demonstrations):
     np.testing.assert_array_equal(batch.arrays[PARAMETERS], expected)
 
 
-@pytest.mark.slow
 def test_an_interrupted_run_is_resumed_to_the_same_bytes(
     drawn: Demonstrations, drawing_scene: Scene, tmp_path: Path
 ):
@@ -147,7 +145,6 @@ def test_an_interrupted_run_is_resumed_to_the_same_bytes(
     assert contents(tmp_path) == contents(drawn.path)
 
 
-@pytest.mark.slow
 def test_failures_keep_their_parameters(drawing_scene: Scene, tmp_path: Path):
     """The errors at start and end are to the target that was drawn."""
     spread = {**drawing_scene.spread.model_dump(), "target_position": 2.0}
@@ -200,7 +197,6 @@ def test_a_shard_with_a_column_of_earlier_versions_reads_as_ever(copied: Path):
     assert read[0].facts == expected.facts
 
 
-@pytest.mark.slow
 def test_a_poor_minimum_is_found_out_by_a_neighbor_with_another_target(drawing_scene: Scene):
     expert, outcomes = solved_problems(Settings.of(drawing_scene, 12, SEED, 12))
     old = outcomes[5]
@@ -217,7 +213,6 @@ def test_a_poor_minimum_is_found_out_by_a_neighbor_with_another_target(drawing_s
     np.testing.assert_array_equal(outcomes[5].parameters, old.parameters)
 
 
-@pytest.mark.slow
 def test_card_and_summary_name_what_varies(copied: Path, capsys: pytest.CaptureFixture[str]):
     card = data_card(gather(load_demonstrations(copied)))
     assert "| `parameters` | (9,) |" in card
@@ -245,7 +240,6 @@ def test_a_replayed_demonstration_shows_its_own_target(drawn: Demonstrations):
     assert not np.allclose(flight.target, drawn.kernels.layout.target, atol=1e-3)
 
 
-@pytest.mark.slow
 def test_minari_has_the_parameters_in_every_row_and_gives_them_back(
     drawn: Demonstrations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -15,6 +15,8 @@ from experts.demonstrations import (
     load_demonstrations,
 )
 
+pytestmark = pytest.mark.slow
+
 COUNT = 5
 
 
@@ -41,7 +43,6 @@ def made(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Demonstratio
     return load_demonstrations(folder, verify=True)
 
 
-@pytest.mark.slow
 def test_observations_are_those_of_states_and_stages(made: Demonstrations) -> None:
     kernels, steps = made.kernels, made.scene.simulation.steps
     assert len(made) == COUNT
@@ -54,7 +55,6 @@ def test_observations_are_those_of_states_and_stages(made: Demonstrations) -> No
         np.testing.assert_allclose(demonstration.observations, seen, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_batches_hold_the_parameters_of_their_stages(made: Demonstrations) -> None:
     names = ("states", "observations", "parameters")
     (batch,) = made.batches(COUNT * made.scene.simulation.steps, names)
@@ -73,7 +73,6 @@ def test_a_demonstration_is_shown_with_the_path_of_its_target(made: Demonstratio
     np.testing.assert_array_equal(flight.target_body, layout.target_body_with(rows))
 
 
-@pytest.mark.slow
 def test_minari_holds_the_stages_and_gives_the_demonstrations_back(
     made: Demonstrations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -163,6 +163,10 @@ def test_each_joint_wheel_and_thruster_may_have_a_rate_of_its_own():
     assert [limit.rate for limit in rates_of(wheels)] == [1.0, 2.0, 3.0, 4.0]
     jets = load_scene("thrusters").replace(constraints=[{**rates, "thrusters": 2.0}])
     assert [limit.name for limit in rates_of(jets)] == [f"{name} force" for name in thruster_names(jets)]
+    heavy = load_scene("heavy-wrist")  # whose wrist has three torques
+    torques = [float(index + 1) for index in range(len(heavy.links))]
+    heavy = heavy.replace(constraints=[*heavy.constraints, {**rates, "joint_torque": torques}])
+    assert [limit.rate for limit in rates_of(heavy)] == [*torques[:-1], *[torques[-1]] * 3]
     with pytest.raises(SceneError, match=r"joint_torque = .*: must be one number, or 3: one for each"):
         few.replace(constraints=[{**rates, "joint_torque": [1.0, 2.0]}])
     with pytest.raises(SceneError, match="must be one number or several numbers, each greater than 0"):

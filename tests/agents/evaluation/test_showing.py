@@ -43,6 +43,7 @@ def exported(tmp_path, quick):
     return tmp_path / "policy.npz"
 
 
+@pytest.mark.slow
 def test_the_experts_own_controls_have_no_gap(quick):
     nominal, drawn = fly_beside_expert(as_policy(Expert(quick)), quick, [None, 5])
     for pair in (nominal, drawn):

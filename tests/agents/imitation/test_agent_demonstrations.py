@@ -11,6 +11,8 @@ from agents.demonstrations import check_scene, expert_seconds, prepare_demonstra
 from experts.demonstrations import DemonstrationsError, export_to_minari
 from experts.demonstrations.shard import SUMMARIES, TRAJECTORIES
 
+pytestmark = pytest.mark.slow
+
 ID = "space-arm/small/expert-v0"
 
 
@@ -53,7 +55,6 @@ def datasets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
 
 
-@pytest.mark.slow
 def test_what_minari_gives_back_is_what_was_exported(demonstrations, datasets, tmp_path):
     export_to_minari(demonstrations, ID)
     source = DemonstrationSource(minari=ID)
@@ -70,7 +71,6 @@ def test_what_minari_gives_back_is_what_was_exported(demonstrations, datasets, t
     assert expert_seconds(read) == 0.0
 
 
-@pytest.mark.slow
 def test_without_gains_they_can_be_cloned_plainly_only(demonstrations, datasets, tmp_path):
     pytest.importorskip("torch")
     from agents.configuration.imitation import Cloning, ObjectiveWeights, Optimization
@@ -87,7 +87,6 @@ def test_without_gains_they_can_be_cloned_plainly_only(demonstrations, datasets,
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.slow
 def test_other_data_sets_and_folders_are_refused(demonstrations, datasets, tmp_path):
     def prepare(name):
         prepare_demonstrations(DemonstrationSource(minari=name), demonstrations.scene, tmp_path / "copied")

@@ -14,7 +14,7 @@ from agents.imitation.samples import COLUMNS, NAMES, Corrections, Mixture  # noq
 from agents.imitation.trainer import CheckpointError, TrainingAdvance  # noqa: E402
 from dq_space_arm_env.environment.rollouts import rollout  # noqa: E402
 
-pytestmark = pytest.mark.agents
+pytestmark = [pytest.mark.agents, pytest.mark.slow]
 
 STEPS = {"batch_size": 128, "warm_up": 10}
 CLONING = Cloning.model_validate(
@@ -104,12 +104,10 @@ def test_new_plans_begin_where_the_flight_went_and_are_optimal(some):
         np.testing.assert_allclose(again.actions[begin:end], rest, atol=2e-3)
 
 
-@pytest.mark.slow
 def test_plans_know_the_target_and_the_masses_of_each_stage(staged):
     plans_know_the_target_and_the_masses(staged)
 
 
-@pytest.mark.slow
 def test_plans_know_the_target_and_the_masses_of_each_flight(drawn):
     plans_know_the_target_and_the_masses(drawn)
 
@@ -218,7 +216,6 @@ def test_a_round_has_no_more_flights_than_starts(demonstrations, cloned):
     assert corrected.history[-1]["environment_steps"] == 5 * steps
 
 
-@pytest.mark.slow
 def test_correction_brings_flights_closer_to_the_expert(demonstrations, cloned):
     def gap(network):
         seeds = demonstrations.column("seed").tolist()

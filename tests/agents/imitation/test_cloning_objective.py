@@ -12,7 +12,7 @@ from agents.policies import PolicyNetwork  # noqa: E402
 from dq_space_arm_env import compile_scene, load_scene  # noqa: E402
 from experts.demonstrations.reading import Batch  # noqa: E402
 
-pytestmark = pytest.mark.agents
+pytestmark = [pytest.mark.agents, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,6 @@ def test_observations_around_a_demonstration_are_relative_to_its_own_target(draw
     assert torch.isfinite(objective(network, batch, np.random.default_rng(0)).total)
 
 
-@pytest.mark.sampled
 def test_time_steps_have_the_target_and_the_masses_of_their_stage(staged):
     batch, kernels = next(staged.batches(200, COLUMNS, seed=0)), staged.kernels
     states, observations, parameters = (

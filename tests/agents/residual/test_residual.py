@@ -28,6 +28,8 @@ from dq_space_arm_env.command_line import main
 from dq_space_arm_env.environment.rollouts import rollout
 from experts.demonstrations.shard import draw_starts
 
+pytestmark = pytest.mark.slow
+
 HEAVY = 1.3
 """A factor of masses."""
 CALM = Worlds(1.0, 0.0, 0.0, 6.0, seed=0)
@@ -158,7 +160,6 @@ def row_of(comparison, condition, name):
     return row
 
 
-@pytest.mark.slow
 def test_controllers_are_compared_start_by_start(comparison, demonstrations):
     gains = row_of(comparison, "as-planned", FEEDBACK).evaluation
     assert gains.median_cost_gap.value == pytest.approx(0.0, abs=1e-9)
@@ -173,7 +174,6 @@ def test_controllers_are_compared_start_by_start(comparison, demonstrations):
     assert all(row.evaluation.action_seconds > 0.0 for row in comparison.rows)
 
 
-@pytest.mark.slow
 def test_savings_are_of_the_starts_that_both_have_flown(comparison, demonstrations):
     base, receding = (row_of(comparison, TESTED.name, name) for name in (FEEDBACK, RECEDING))
     cost, base_cost = receding.evaluation.flights.cost, base.evaluation.flights.cost
@@ -308,7 +308,6 @@ def test_corrections_see_the_target_of_each_plan(drawing):
     np.testing.assert_allclose(seen[:, : kernels.n_x + 1], expected, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.slow
 def test_the_receding_horizon_plans_with_what_it_is_told(drawing):
     scene, drawn = drawing
     expert = RecedingHorizon(scene, 20)

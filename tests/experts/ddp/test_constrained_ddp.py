@@ -76,6 +76,7 @@ def test_minimum_from_the_unconstrained_one(case, free):
     assert solution.iterations <= MOST_ITERATIONS[case]
 
 
+@pytest.mark.sampled
 def test_minimum(solved):
     problem, solution, cost = solved
     report = solution.constraints

@@ -9,6 +9,8 @@ from experts.ddp.parallel_rollouts import LANES
 from experts.ddp.shooting import SHORTER_STEPS, ShootingWorkspace, line_search
 from experts.problems.arm_problem import ArmProblem
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def prepared():
@@ -25,7 +27,6 @@ def prepared():
     return work
 
 
-@pytest.mark.slow
 def test_every_lane_is_the_rollout_of_its_step_length(prepared):
     costs = prepared.try_steps(SHORTER_STEPS)
     at_bounds = 0

@@ -49,6 +49,7 @@ def nearly_optimal(problem, seed=0, disturbance=0.02):
     return solution.controls + np.where(free, np.clip(noise, -0.01 * limit, 0.01 * limit), 0.0)
 
 
+@pytest.mark.slow
 def test_exact_steps_converge_quadratically(pendulum):
     """The predicted reduction is the squared norm of the gradient: each step doubles its exponent."""
     free = replace(pendulum, control_lower=np.array([-50.0]), control_upper=np.array([50.0]))
