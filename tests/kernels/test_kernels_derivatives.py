@@ -67,6 +67,9 @@ def scenes_and_integrators():
     """Every robot with rk4; the other methods on scenes of each structure; by default what compiles fast."""
     for integrator in INTEGRATORS:
         for scene in robots():
+            spherical = any(link.is_spherical for link in load_scene(scene).links)
+            if spherical and not INTEGRATORS[integrator].turns_quaternions:
+                continue
             if scene in FAST_SCENES or (scene, integrator) == ("paper", "rk4"):
                 yield scene, integrator
             elif integrator == "rodas5p":
