@@ -18,10 +18,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 @pytest.hookimpl(tryfirst=True)  # before slow ones are left out
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
-    """Of the cases of a test with the mark `sampled`, all but one are slow."""
+    """Of the cases of a test with the mark `sampled` that are not slow anyway, all but one are."""
     families: dict[str, list[pytest.Function]] = defaultdict(list)
     for item in items:
-        if item.get_closest_marker("sampled"):
+        if item.get_closest_marker("sampled") and not item.get_closest_marker("slow"):
             families[item.nodeid.partition("[")[0]].append(item)
     for cases in families.values():
         sample = next((case for case in cases if "paper" in case.name.partition("[")[2]), cases[0])

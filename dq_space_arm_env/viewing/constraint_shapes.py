@@ -37,10 +37,8 @@ GAS = -2
 
 _COLOR: Color = (1.0, 1.0, 1.0)  # the page tints them
 _SIDES = 32
-_JET = (
-    0.3,
-    15.0,
-)  # of a thruster that misses nothing in particular: share of the length, half angle, degrees
+# Of a thruster that misses nothing in particular: share of the length, half angle in degrees.
+_JET = (0.3, 15.0)
 _NEEDLE = 0.012  # radius of a direction over its length
 _POINT = 0.02  # radius of what a camera sees over the length of its cone
 

@@ -23,11 +23,8 @@ _ACTUATORS = {
     "thrusters": "thrusters",
     "tank": "tank",
 }
-_CONSTRAINTS = {
-    "wheels": WheelLimits,
-    "joint_torque": TorqueSpeed,
-    "tank": Propellant,
-}  # of actuators that are there
+# Of actuators that are there.
+_CONSTRAINTS = {"wheels": WheelLimits, "joint_torque": TorqueSpeed, "tank": Propellant}
 
 
 def feature_variants(scene: Scene) -> dict[str, Scene]:

@@ -1,5 +1,7 @@
 """Exact derivatives: complex steps through the traced graphs, for every robot and integrator."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -59,23 +61,19 @@ def complex_step_jacobians(kernels, program, x, u):
     return columns[: kernels.n_t].T, columns[kernels.n_t :].T
 
 
-FAST_SCENES = ("planar",)
-SLOW_SCENES = ("no-wrist", "paper", "random-masses", "six-joint", "tip-load")
+STRUCTURES = ("no-wrist", "paper", "planar", "random-masses", "six-joint", "tip-load")
 
 
 def scenes_and_integrators():
-    """Every robot with rk4; the other methods on scenes of each structure; by default what compiles fast."""
-    for integrator in INTEGRATORS:
-        for scene in robots():
-            spherical = any(link.is_spherical for link in load_scene(scene).links)
-            if spherical and not INTEGRATORS[integrator].turns_quaternions:
-                continue
-            if scene in FAST_SCENES or (scene, integrator) == ("paper", "rk4"):
-                yield scene, integrator
-            elif integrator == "rodas5p":
-                continue  # it shares all but numbers with rodas4
-            elif integrator == "rk4" or scene in SLOW_SCENES or INTEGRATORS[integrator].has_curvature:
-                yield pytest.param(scene, integrator, marks=pytest.mark.slow)
+    """Every robot with rk4 and methods with second derivatives; the others on scenes of each structure."""
+    for integrator, scene in product(INTEGRATORS, robots()):
+        spherical = any(link.is_spherical for link in load_scene(scene).links)
+        if spherical and not INTEGRATORS[integrator].turns_quaternions:
+            continue
+        if integrator == "rodas5p" and scene != "planar":
+            continue  # it shares all but numbers with rodas4
+        if integrator == "rk4" or scene in STRUCTURES or INTEGRATORS[integrator].has_curvature:
+            yield scene, integrator
 
 
 @pytest.mark.sampled
