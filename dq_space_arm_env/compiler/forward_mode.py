@@ -53,7 +53,7 @@ _PARTIALS: Mapping[str, Callable[..., tuple[Expression, ...]]] = {
 
 # Nodes that hand on one of their arguments: the condition under which it is the first, and the arguments. At
 # a tie it is the one that the machine code returns.
-_SELECTIONS: Mapping[str, Callable[..., Expression]] = {
+SELECTIONS: Mapping[str, Callable[..., Expression]] = {
     "minimum": lambda a, b: casadi.lt(a, b),
     "maximum": lambda a, b: casadi.lt(b, a),
 }
@@ -70,14 +70,14 @@ def dependencies(graph: Graph) -> dict[str, frozenset[str]]:
         if node.operation == "input":
             found.append(frozenset((names[node.slot[0]],)))
         else:
-            found.append(frozenset().union(*(found[i] for i in _varied(node))))
+            found.append(frozenset().union(*(found[i] for i in varied_arguments(node))))
     return {
         name: frozenset().union(*(found[i] for i in indices))
         for (name, _), indices in zip(graph.outputs, graph.results, strict=True)
     }
 
 
-def _varied(node: Node) -> tuple[int, ...]:
+def varied_arguments(node: Node) -> tuple[int, ...]:
     """Arguments by which a node has a derivative."""
     if node.operation in _PIECEWISE_CONSTANT:
         return ()
@@ -106,7 +106,7 @@ def tangent_graphs(graph: Graph, inputs: Sequence[str], outputs: Sequence[str]) 
     changes = {f"{name}{TANGENT}": [_or_zero(tangents[i]) for i in results[name]] for name in outputs}
     moved = {f"{name}{TANGENT}": direction for name, direction in directions.items()}
     joint = graph_of(f"{graph.name}_tangent", {**given, **moved}, {**computed, **changes})
-    return _divided(joint, graph, len(graph.inputs), len(graph.outputs))
+    return TangentGraphs(*divided(joint, graph, len(graph.inputs), len(graph.outputs)))
 
 
 def _symbols(name: str, size: int) -> list[Expression]:
@@ -135,7 +135,7 @@ def _differentiated(
         else:
             arguments = [values[i] for i in node.arguments]
             values.append(EXPRESSIONS[node.operation](*arguments))
-            changes = [tangents[i] if i in _varied(node) else None for i in node.arguments]
+            changes = [tangents[i] if i in varied_arguments(node) else None for i in node.arguments]
             tangents.append(_tangent(node.operation, values[-1], arguments, changes))
     return values, tangents
 
@@ -149,23 +149,37 @@ def _tangent(
     if operation == "if_else_zero":
         # By selection, not multiplication: the branch that is not taken may be infinite.
         return casadi.if_else(arguments[0], changes[1], 0.0)
-    if operation in _SELECTIONS:
-        is_first = _SELECTIONS[operation](*arguments)
+    if operation in SELECTIONS:
+        is_first = SELECTIONS[operation](*arguments)
         first, second = (_or_zero(change) for change in changes)
         return casadi.if_else(is_first, first, second)
     total: Expression = 0.0
-    if operation in LIBRARY_FUNCTIONS:
-        partials = _partials_by_casadi(operation, *arguments)
-    else:
-        partials = _PARTIALS[operation](value, *arguments)
-    for partial, change in zip(partials, changes, strict=True):
+    for partial, change in zip(partials_of(operation, value, arguments), changes, strict=True):
         if change is not None:
             total = total + partial * change
     return total
 
 
-def _divided(joint: Graph, graph: Graph, n_inputs: int, n_outputs: int) -> TangentGraphs:
-    """Divide a graph of values and tangents: what depends on no direction is done once."""
+def partials_of(operation: str, value: Expression, arguments: Sequence[Expression]) -> tuple[Expression, ...]:
+    """Partial derivatives of a node that is neither a selection nor piecewise constant."""
+    if operation in LIBRARY_FUNCTIONS:
+        return _partials_by_casadi(operation, *arguments)
+    return _PARTIALS[operation](value, *arguments)
+
+
+def divided(joint: Graph, graph: Graph, n_inputs: int, n_outputs: int) -> tuple[Graph, Graph]:
+    """Divide a graph of values and of what is linear in further inputs: what depends on none is done once.
+
+    Args:
+        joint: The first inputs and outputs are those of `graph`; the others follow.
+        graph: The graph that was differentiated.
+        n_inputs: Number of its inputs.
+        n_outputs: Number of its outputs.
+
+    Returns:
+        Its values with the coefficients, an output named with `COEFFICIENTS` if there are any, and the linear
+        part, which takes them as an input.
+    """
     moving: set[int] = set()
     for index, node in enumerate(joint.nodes):
         is_direction = node.operation == "input" and node.slot[0] >= n_inputs
@@ -183,7 +197,7 @@ def _divided(joint: Graph, graph: Graph, n_inputs: int, n_outputs: int) -> Tange
         values = _part(joint, f"{graph.name}_values", joint.inputs[:n_inputs], computed, found)
     else:
         values = graph
-    return TangentGraphs(values, _applied(joint, graph.name, n_inputs, n_outputs, coefficients))
+    return values, _applied(joint, graph.name, n_inputs, n_outputs, coefficients)
 
 
 def _applied(joint: Graph, name: str, n_inputs: int, n_outputs: int, coefficients: Sequence[int]) -> Graph:

@@ -132,7 +132,7 @@ class _Transformation:
             if name not in self._sizes:
                 raise ValueError(f"program {program.name!r} has no buffer {name!r} to differentiate")
         for call in program.calls:
-            for name in set(self._by) & set(_buffers(call, call.graph.outputs).values()):
+            for name in set(self._by) & set(bound(call, call.graph.outputs).values()):
                 raise ValueError(f"program {program.name!r}: {call.graph.name!r} overwrites {name!r}")
 
     def names(self, buffer: str) -> Names | None:
@@ -145,7 +145,7 @@ class _Transformation:
         """Buffers that a call reads and writes, where the latter has a derivative by the former."""
         links = []
         for call in self._program.calls:
-            read, written = (_buffers(call, arrays) for arrays in (call.graph.inputs, call.graph.outputs))
+            read, written = (bound(call, arrays) for arrays in (call.graph.inputs, call.graph.outputs))
             for output, inputs in self._dependencies[call.graph.name].items():
                 if written[output] not in self._program.held:
                     links += [(read[name], written[output]) for name in inputs]
@@ -153,11 +153,11 @@ class _Transformation:
 
     def _active(self) -> set[str]:
         """Buffers that depend on the input."""
-        return _reached(set(self._by), self._links())
+        return reached(set(self._by), self._links())
 
     def _needed(self, of: Sequence[str]) -> set[str]:
         """Buffers on which the wanted ones depend."""
-        return _reached(set(of), [(after, before) for before, after in self._links()])
+        return reached(set(of), [(after, before) for before, after in self._links()])
 
     def _tangent_graphs(self) -> dict[str, TangentGraphs]:
         """Tangents by name of the graph, for whatever any of its calls needs."""
@@ -178,7 +178,7 @@ class _Transformation:
 
     def _live_names(self, call: Call) -> tuple[list[str], list[str]]:
         """Names of a call's inputs and outputs that have tangents."""
-        read, written = (_buffers(call, arrays) for arrays in (call.graph.inputs, call.graph.outputs))
+        read, written = (bound(call, arrays) for arrays in (call.graph.inputs, call.graph.outputs))
         return [k for k, v in read.items() if v in self._live], [
             k for k, v in written.items() if v in self._live
         ]
@@ -238,14 +238,14 @@ class _Transformation:
         return f"no_tangent_{size}" if is_input else f"unread_{name}"
 
 
-def _buffers(call: Call, arrays: Sequence[tuple[str, int]]) -> dict[str, str]:
+def bound(call: Call, arrays: Sequence[tuple[str, int]]) -> dict[str, str]:
     """Buffers by the graph's names."""
     return {name: call.bindings.get(name, name) for name, _ in arrays}
 
 
-def _reached(start: set[str], links: Sequence[tuple[str, str]]) -> set[str]:
+def reached(start: set[str], links: Sequence[tuple[str, str]]) -> set[str]:
     """What the links lead to from the start."""
-    reached = set(start)
-    while more := {after for before, after in links if before in reached} - reached:
-        reached |= more
-    return reached
+    found = set(start)
+    while more := {after for before, after in links if before in found} - found:
+        found |= more
+    return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi
@@ -33,7 +33,7 @@ def append_tangent_linearization(
     )
     a = by_x
     if pose is not None:
-        moved = casadi.mtimes(by_x[:, : field.n_x - field.n_y], _retraction(pose, x))
+        moved = casadi.mtimes(by_x[:, : field.n_x - field.n_y], retraction(pose, x))
         a = casadi.horzcat(moved, by_x[:, field.n_x - field.n_y :])
     a, b = casadi.densify(a), casadi.densify(by_u)
     inputs = {"x": x, **{f"d{j}": entries for j, entries in enumerate(free)}}
@@ -43,17 +43,23 @@ def append_tangent_linearization(
 
 
 def tangent_graph(field: VectorField) -> Any:
-    """Graph of the tangent coordinates of a small change of x_next: twist 2 vec(q* dq), and dy."""
+    """Graph of the tangent coordinates of a small change of x_next, see `tangent_changes`."""
     x, change = symbols("x", field.n_x), symbols("change", field.n_x)
+    outputs = {"dx_next": tangent_changes(field, x, change)}
+    return graph_of(f"{field.name}_tangent", {"x_next": x, "change": change}, outputs)
+
+
+def tangent_changes(field: VectorField, x: Sequence[Scalar], change: Sequence[Scalar]) -> list[Scalar]:
+    """Tangent coordinates of a small change of a state, n_t: twist 2 vec(q* dq), and dy."""
     rest = list(split_state(field, change)[1])
-    if field.pose is not None:
-        pose, moved = (field.pose.full(split_state(field, each)[0]) for each in (x, change))
-        twist = dq.to_vector(dq.scale(2.0, dq.multiply(dq.conjugate(pose), moved)))
-        rest = [*(twist[i] for i in field.pose.directions), *rest]
-    return graph_of(f"{field.name}_tangent", {"x_next": x, "change": change}, {"dx_next": rest})
+    if field.pose is None:
+        return rest
+    pose, moved = (field.pose.full(split_state(field, each)[0]) for each in (x, change))
+    twist = dq.to_vector(dq.scale(2.0, dq.multiply(dq.conjugate(pose), moved)))
+    return [*(twist[i] for i in field.pose.directions), *rest]
 
 
-def _retraction(pose: PoseCoordinates, x: list[Scalar]) -> Any:
+def retraction(pose: PoseCoordinates, x: Sequence[Scalar]) -> Any:
     """Derivative of the stored pose q exp(d / 2) by d at zero, SX (stored, directions)."""
     here = pose.full(x[: len(pose.stored)])
     result = zeros(len(pose.stored), len(pose.directions))

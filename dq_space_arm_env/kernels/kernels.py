@@ -7,7 +7,6 @@ disk; the next process loads it without tracing, compiling or importing CasADi.
 from __future__ import annotations
 
 from functools import cache
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import walk
-from dq_space_arm_env.kernels.constraint_kernels import ConstraintKernels
-from dq_space_arm_env.kernels.library import matrices
+from dq_space_arm_env.kernels.derivative_kernels import DerivativeKernels
 from dq_space_arm_env.scene import INTEGRATORS, Scene, load_scene
-from dq_space_arm_env.task.step_report import n_observations
 
 if TYPE_CHECKING:
     from dq_space_arm_env.kernels.adaptive import IntegratedMotion
@@ -27,7 +24,7 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 
-class Kernels(ConstraintKernels):
+class Kernels(DerivativeKernels):
     """The compiled functions of a scene.
 
     What varies in the scene, by its spread or its list of `parameters`, is an argument p of every function
@@ -183,89 +180,6 @@ class Kernels(ConstraintKernels):
         held = {"u": np.broadcast_to(inputs, (steps, self.n_u)), "parameters": given}
         return walk(kernel, start, handed_on, held, steps, self._time_step(dt), every)
 
-    def linearize(
-        self,
-        x: ArrayLike,
-        u: ArrayLike,
-        dt: float | None = None,
-        integrator: str | None = None,
-        p: ArrayLike | None = None,
-    ) -> tuple[Array, Array]:
-        """Exact derivatives of a step in tangent coordinates: dx+ = A dx + B du.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            u: Inputs, shape (n_u,) or (B, n_u).
-            dt: Time step, s; the scene's by default.
-            integrator: Name of the integrator; the scene's by default.
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            A, shape (n_t, n_t) or (B, n_t, n_t), and B, shape (n_t, n_u) or (B, n_t, n_u).
-
-        Raises:
-            ValueError: As for `step`.
-        """
-        a, b = self._step_call("linearize", x, u, dt, integrator, p)
-        return matrices(a, self.n_t, self.n_t), matrices(b, self.n_t, self.n_u)
-
-    def linearize_parameters(
-        self,
-        x: ArrayLike,
-        u: ArrayLike,
-        dt: float | None = None,
-        integrator: str | None = None,
-        p: ArrayLike | None = None,
-    ) -> Array:
-        """Exact derivative of a step by the parameters, in tangent coordinates: dx+ = P dp.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            u: Inputs, shape (n_u,) or (B, n_u).
-            dt: Time step, s; the scene's by default.
-            integrator: Name of the integrator; the scene's by default.
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            P, shape (n_t, n_p) or (B, n_t, n_p).
-
-        Raises:
-            ValueError: As for `step`, or if the scene has no parameters.
-        """
-        by_parameters = self._step_call("linearize_parameters", x, u, dt, integrator, p)[0]
-        return matrices(by_parameters, self.n_t, self.n_p)
-
-    def cost_by_parameters(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Exact gradient of the stage cost by the parameters.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            u: Inputs, shape (n_u,) or (B, n_u).
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Gradients, shape (n_p,) or (B, n_p).
-
-        Raises:
-            ValueError: If the scene has no parameters.
-        """
-        return self.call("cost_by_parameters", x=x, u=u, p=p)[0]
-
-    def terminal_cost_by_parameters(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Exact gradient of the terminal cost by the parameters.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Gradients, shape (n_p,) or (B, n_p).
-
-        Raises:
-            ValueError: If the scene has no parameters.
-        """
-        return self.call("terminal_cost_by_parameters", x=x, p=p)[0]
-
     def integrate(
         self,
         x: ArrayLike,
@@ -418,20 +332,6 @@ class Kernels(ConstraintKernels):
             fill_stages(self, rows)
         return rows
 
-    def observation_jacobian(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Exact derivative of the observation in tangent coordinates, of observation(retract(x, z)) by z.
-
-        Args:
-            x: States, shape (n_x,) or (B, n_x).
-            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
-
-        Returns:
-            Derivatives at z = 0, shape (n_obs, n_t) or (B, n_obs, n_t), units of the observation per unit of
-            `layout.tangent`. The time left has no derivative: its row is zero.
-        """
-        jacobian = self.call("observation_jacobian", x=x, p=p)[0]
-        return matrices(jacobian, n_observations(self.scene), self.n_t)
-
     def state_from_observation(self, observation: ArrayLike, p: ArrayLike | None = None) -> Array:
         """The state behind an observation.
 
@@ -444,33 +344,6 @@ class Kernels(ConstraintKernels):
             States, shape (n_x,) or (B, n_x), units of `layout.state`.
         """
         return self.call("state_from_observation", observation=observation, p=p)[0]
-
-    def _step_call(
-        self,
-        name: str,
-        x: ArrayLike,
-        u: ArrayLike,
-        dt: float | None,
-        integrator: str | None,
-        p: ArrayLike | None,
-    ) -> tuple[Array, ...]:
-        """Run a program of a step."""
-        if integrator is not None:
-            integrator = self._integrator(integrator)
-        if dt is None:
-            return self.call(name, integrator, x=x, u=u, p=p)
-        return self.call(name, integrator, x=x, u=u, h=self._time_step(dt), p=p)
-
-    def _integrator(self, name: str | None) -> str | None:
-        if name is not None and name not in INTEGRATORS:
-            raise ValueError(f"integrator: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
-        return name
-
-    def _time_step(self, dt: float | None) -> Array:
-        step = self.scene.simulation.dt if dt is None else float(dt)
-        if not isfinite(step):
-            raise ValueError(f"dt: {step} is not a finite time step in s")
-        return np.array([step], self.dtype)
 
 
 @cache

@@ -264,6 +264,8 @@ _STEPS = (
     "walk",
     "linearize",
     "linearize_parameters",
+    "vjp",
+    "step_with_cost_vjp",
     "lagrangian_hessian",
     "environment_step",
     "environment_step_float32_actions",

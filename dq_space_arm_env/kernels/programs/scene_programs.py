@@ -20,6 +20,7 @@ from dq_space_arm_env.integrators import checked_integrator_of
 from dq_space_arm_env.integrators.actuated import append_measured_step
 from dq_space_arm_env.integrators.method import MomentumIntegrator, program_inputs
 from dq_space_arm_env.kernels.programs.constraint_programs import ConstraintPrograms
+from dq_space_arm_env.kernels.programs.cotangent_programs import CotangentPrograms
 from dq_space_arm_env.kernels.programs.derivative_programs import DerivativePrograms
 from dq_space_arm_env.kernels.programs.parameter_programs import ParameterPrograms
 from dq_space_arm_env.kernels.programs.quadratic_programs import QuadraticPrograms
@@ -48,6 +49,7 @@ class ScenePrograms:
         derivatives = self._derivatives = DerivativePrograms(self.equations)
         quadratic = QuadraticPrograms(self.equations)
         robot = RobotPrograms(self.equations, self._program)
+        cotangents = self._cotangents = CotangentPrograms(self.equations, self._program)
         self._builders: Mapping[str, Callable[[], Program]] = {
             "forward_dynamics": self._forward_dynamics,
             "forward_dynamics_with_tip_wrench": self._forward_dynamics_with_tip_wrench,
@@ -65,6 +67,9 @@ class ScenePrograms:
             "terminal_cost": self._terminal_cost,
             "emphasized_terminal_cost": self._emphasized_terminal_cost,
             **ConstraintPrograms(self.equations).builders,
+            "cost_vjp": lambda: cotangents.of_cost(self._cost()),
+            "emphasized_terminal_cost_vjp": lambda: cotangents.of_cost(self._emphasized_terminal_cost()),
+            "observation_vjp": cotangents.observation,
             "cost_derivatives": derivatives.cost,
             "terminal_cost_derivatives": derivatives.terminal_cost,
             "terminal_cost_hessian": derivatives.terminal_cost_hessian,
@@ -92,6 +97,8 @@ class ScenePrograms:
             return self._walk(integrator)
         if name == "linearize":
             return self._derivatives.linearize(integrator)
+        if name in ("vjp", "step_with_cost_vjp"):
+            return self._cotangents.step(integrator, with_cost=name != "vjp")
         if name == "linearize_parameters":
             return ParameterPrograms(self.equations).linearize(integrator)
         if name == "lagrangian_hessian":
