@@ -21,6 +21,7 @@ from dq_space_arm_env.common.real_arrays import DOUBLE, SINGLE, real_array
 from dq_space_arm_env.compiler.random_draws import generator_of, generator_state
 from dq_space_arm_env.environment.reset_options import GivenStart, check_scene, given_start, saved_state
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
+from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene, load_scene
@@ -189,6 +190,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     * v0: Initial version.
     """
 
+    spec = PlainSpec()
     metadata: dict[str, Any] = {  # noqa: RUF012 - as in every Gymnasium environment
         "render_modes": ["human", "rgb_array"],
         "render_fps": 60,
