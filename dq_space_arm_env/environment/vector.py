@@ -197,7 +197,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             result.observation[others] = self._seen[others]
         result.report[:, others], result.flags[:, others] = 0.0, False
         self._remember(result.observation)
-        return result.observation, self._info(result, mask)
+        return result.observation, self._info(result, mask) | self._drawn(rows)
 
     def _remember(self, observations: Array) -> None:
         """Keep observations for resets of some sub-environments, which return the others' last ones."""
@@ -293,7 +293,9 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         self._extend_trails()
         info = self._info(result, self._all)
         if final is not None:
-            info |= final
+            info |= final | self._drawn(rows)
+        elif len(resetting):
+            info |= self._drawn(resetting)
         return result.observation, rewards, terminated, np.zeros(self.num_envs, dtype=np.bool_), info
 
     def perturb(self, increments: ArrayLike) -> None:
@@ -482,6 +484,19 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             "_final_obs": ended,
             "final_info": self._info(last, ended),
             "_final_info": ended.copy(),
+        }
+
+    def _drawn(self, rows: Rows) -> dict[str, Any]:
+        """Entry of `info` on parameters of episodes that have just begun; none where nothing varies."""
+        if not self.kernels.n_p:
+            return {}
+        mask = np.zeros(self.num_envs, dtype=np.bool_)
+        mask[rows] = True
+        columns = np.where(mask, self._envs.parameters.T, 0.0).astype(np.float64)
+        values: dict[str, Any] = dict(zip(self.kernels.parameters.names, columns, strict=True))
+        return {
+            "parameters": values | {f"_{name}": mask.copy() for name in values},
+            "_parameters": mask,
         }
 
     def _info(self, result: StepResult, mask: Mask) -> dict[str, Any]:
