@@ -82,7 +82,7 @@ def test_own_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.agents
 def test_train_ppo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("stable_baselines3")
-    few = ("--copies", "8", "--steps", "80000", "--starts", "4")
+    few = ("--copies", "8", "--steps", "16000", "--starts", "4")
     run("train_ppo", "--scene", "planar", *few, "--out", str(tmp_path))
     printed = capsys.readouterr().out
     costs = [rows(printed, rf"^ +{name} .* (\d+)$")[0][0] for name in ("untrained", "trained")]
