@@ -2,8 +2,9 @@
 
 `train` trains an agent from a configuration, `evaluate` flies it from fixed starts beside the expert,
 `compare` compares agents with the expert's controllers, `zoo` holds those that ship with the package, and
-`DQSpaceArmVecEnv` is the native vector environment for Stable-Baselines3. That library and PyTorch are loaded
-on first use; an exported policy needs neither.
+`DQSpaceArmVecEnv` is the native vector environment for Stable-Baselines3, `SB3VecEnv` adapts wrapped ones
+(`agents.wrappers`), and `export_policy` turns a trained model into a file that flies with NumPy alone.
+Stable-Baselines3 and PyTorch are loaded on first use; an exported policy needs neither.
 """
 
 from __future__ import annotations
@@ -14,16 +15,27 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from agents.evaluation import compare, evaluate
     from agents.policies import ExportedPolicy
+    from agents.reinforcement.networks import export_policy
     from agents.training import train
-    from agents.vec_env import DQSpaceArmVecEnv
+    from agents.vec_env import DQSpaceArmVecEnv, SB3VecEnv
 
-__all__ = ["DQSpaceArmVecEnv", "ExportedPolicy", "compare", "evaluate", "train"]
+__all__ = [
+    "DQSpaceArmVecEnv",
+    "ExportedPolicy",
+    "SB3VecEnv",
+    "compare",
+    "evaluate",
+    "export_policy",
+    "train",
+]
 
 _HOMES = {
     "DQSpaceArmVecEnv": "vec_env",
     "ExportedPolicy": "policies",
+    "SB3VecEnv": "vec_env",
     "compare": "evaluation",
     "evaluate": "evaluation",
+    "export_policy": "reinforcement.networks",
     "train": "training",
 }
 

@@ -1,81 +1,85 @@
-"""The native vector environment as a `VecEnv` of Stable-Baselines3, episode statistics included."""
+"""Gymnasium's vector environments, native and wrapped, as a `VecEnv` of Stable-Baselines3."""
 
 from __future__ import annotations
 
+import copy
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from gymnasium import Wrapper, spaces
 from gymnasium.utils import EzPickle
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv, VectorWrapper
+from gymnasium.wrappers.vector import RescaleAction
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.wrappers.vector import RepeatAction, ShapeReward
+from agents.wrappers.vector_infos import Info, single_infos
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
 
-Observations = NDArray[np.float32]
-Info = dict[str, Any]
+Observations = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
 
-class DQSpaceArmVecEnv(VecEnv, EzPickle):
-    """`num_envs` copies of `DQSpaceArm-v0` for the algorithms of Stable-Baselines3.
+class SB3VecEnv(VecEnv):
+    """A vector environment of Gymnasium, with its wrappers, for the algorithms of Stable-Baselines3.
 
     Given the same seeds and actions it returns what `DummyVecEnv` returns over as many single environments in
-    a `Monitor`, but steps all copies in one call of machine code. It needs neither `Monitor` nor
-    `VecMonitor`. The differences:
+    a `Monitor`, but steps all copies in one call. It needs neither `Monitor` nor `VecMonitor`. The
+    differences:
 
-    - Observations and their space are float32 whatever the scene's precision: networks compute in float32
-      anyway, and buffers, which take the space's type, need half the memory. Bounds are rounded as well, so
-      rounded observations stay within them.
-    - Infos are empty except at the end of an episode: a hundred dictionaries of a dozen entries would take
-      longer than the physics, and no algorithm reads them. At its end an episode's info holds every entry of
-      `DQSpaceArmEnv`'s, `terminal_observation`, `episode` (return "r", length "l", seconds since this object
-      was made "t") and `TimeLimit.truncated`.
-    - `TimeLimit.truncated` is always False. The time left is observed and the terminal cost is part of the
-      task, so the time limit is a true end: no value beyond it could be estimated.
-
-    A pickled or deep-copied environment is rebuilt from its arguments, like a `DQSpaceArmEnv`; running
-    episodes and seeds are not copied.
+    - Observations and their space are float32 whatever the environment's precision: networks compute in
+      float32 anyway, and buffers, which take the space's type, need half the memory. Bounds are rounded as
+      well, so rounded observations stay within them.
+    - Infos are empty except at the end of an episode, unless you ask for those of every step: a hundred
+      dictionaries of a dozen entries take longer than the physics, and no algorithm reads them. At its end an
+      episode's info holds every entry of the environment's, `terminal_observation`, `episode` (return "r",
+      length "l", seconds since this object was made "t") and `TimeLimit.truncated`.
+    - The action space notes how `RescaleAction` inside maps actions: models that Stable-Baselines3 saves then
+      fly without the wrapper, as `evaluate` and `export_policy` read it there.
+    - Returns and lengths are those of the environment inside `agents.wrappers.vector.ShapeReward` and
+      `RepeatAction`: they show rewards that are not shaped, and time steps, as a `Monitor` inside does.
 
     Attributes:
-        vector_env: The underlying `DQSpaceArmVectorEnv`.
+        vector_env: The vector environment.
     """
 
-    observation_space: spaces.Box
-
     def __init__(
-        self, num_envs: int = 64, scene: Scene | str | Path = "paper", seed: int | None = None, **kwargs: Any
+        self, vector_env: VectorEnv[Any, Any, Any], seed: int | None = None, *, step_infos: bool = False
     ) -> None:
-        """Load a scene, and compile its step or take it from the cache.
+        """Adapt a vector environment.
 
         Args:
-            num_envs: Number of copies.
-            scene: Name of a shipped scene, path of a YAML file, or a scene.
+            vector_env: The environment, in autoreset mode `SAME_STEP`.
             seed: Seed s, for seeds s, s + 1, ... of the copies at the first reset; an algorithm with a seed
                 sets its own.
-            **kwargs: Other arguments of `DQSpaceArmVectorEnv`, except the autoreset mode.
+            step_infos: Whether infos are given at every step.
 
         Raises:
-            SceneError: If the scene cannot be loaded.
-            ValueError: If `DQSpaceArmVectorEnv` rejects an argument.
+            ValueError: If the autoreset mode is another one.
         """
-        EzPickle.__init__(self, num_envs, scene, seed, **kwargs)
-        self.vector_env = DQSpaceArmVectorEnv(
-            num_envs, scene, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs
-        )
-        self._given = frozenset(dir(self.vector_env))
-        observation_space = _in_single_precision(cast(spaces.Box, self.vector_env.single_observation_space))
-        VecEnv.__init__(self, num_envs, observation_space, self.vector_env.single_action_space)
+        mode = vector_env.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(
+                f"vector_env: autoreset mode {mode}, should be AutoresetMode.SAME_STEP, as algorithms "
+                "expect: give it to gymnasium.make_vec as autoreset_mode"
+            )
+        self.vector_env = vector_env
+        self._chain = _chain(vector_env)
+        self._given = frozenset(dir(vector_env.unwrapped))
+        self._shaper = next((env for env in reversed(self._chain) if isinstance(env, ShapeReward)), None)
+        self._repeater = next((env for env in reversed(self._chain) if isinstance(env, RepeatAction)), None)
+        space = _in_single_precision(vector_env.single_observation_space)
+        VecEnv.__init__(self, vector_env.num_envs, space, _noted_actions(self._chain))
         self._actions: NDArray[Any] | None = None
+        self._step_infos = step_infos
         self._start_time = time.time()
-        self._step_count = 0
-        self._first_steps = np.zeros(num_envs, dtype=np.int64)  # _step_count when each episode started
-        self._returns = np.zeros(num_envs)
+        self._returns = np.zeros(self.num_envs)
+        self._lengths = np.zeros(self.num_envs, dtype=np.int64)
         if seed is not None:
             self.seed(seed)
 
@@ -103,27 +107,28 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
         """Start new episodes of all copies, with the seeds and options set since the last reset.
 
         Returns:
-            Observations, shape (num_envs, n_obs), units as in `DQSpaceArmEnv`; infos are in `reset_infos`.
+            Observations, shape (num_envs, n_obs) or arrays by name, units as in the environment; infos are
+            in `reset_infos`.
 
         Raises:
             ValueError: If an option is wrong.
         """
-        observations = np.empty((self.num_envs, *self.observation_space.shape), dtype=np.float32)
+        begin: Any = self.vector_env.reset  # Gymnasium's own take a list of seeds too
         for options, mask in self._groups_of_options():
-            seen, info = self.vector_env.reset(seed=self._seeds, options={**options, "reset_mask": mask})
-            observations[mask] = seen[mask]
-            copies = np.flatnonzero(mask)
-            self._begin_episodes(copies, info)
+            # The last reset returns the observations of all copies.
+            observations, info = begin(seed=self._seeds, options={**options, "reset_mask": mask})
+            self._begin_episodes(np.flatnonzero(mask), info)
         self._reset_seeds()
         self._reset_options()
-        return observations
+        seen: Observations = _single(observations)
+        return seen
 
     def _begin_episodes(self, copies: NDArray[np.intp], info: Info) -> None:
         """Keep the infos of a reset of some copies, and restart their statistics."""
-        for i, single_info in zip(copies.tolist(), _single_infos(info, copies), strict=True):
+        for i, single_info in zip(copies.tolist(), single_infos(info, copies), strict=True):
             self.reset_infos[i] = single_info
         self._returns[copies] = 0.0
-        self._first_steps[copies] = self._step_count
+        self._lengths[copies] = 0
 
     def _groups_of_options(self) -> Iterator[tuple[Info, NDArray[np.bool_]]]:
         """Pairs of options and a mask of the copies that share them."""
@@ -137,16 +142,16 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
         """Set the actions of the next `step_wait`.
 
         Args:
-            actions: Inputs as fractions of their limits, shape (num_envs, n_u); clipped to [-1, 1].
+            actions: Actions of all copies, shape (num_envs, n_u), units of the action space.
         """
         self._actions = actions
 
     def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[Info]]:
-        """Apply the actions for one time step; copies whose episode ends start the next one at once.
+        """Apply the actions; copies whose episode ends start the next one at once.
 
         Returns:
-            Observations, shape (num_envs, n_obs), of the new episode where one ended; rewards and ends of
-            episodes, shape (num_envs,); infos, see the class.
+            Observations, shape (num_envs, n_obs) or arrays by name, of the new episode where one ended;
+            rewards and ends of episodes, shape (num_envs,); infos, see the class.
 
         Raises:
             ResetNeeded: Before the first reset.
@@ -155,25 +160,30 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
         """
         if self._actions is None:
             raise RuntimeError("call step_async() before step_wait()")
-        # The environment never truncates: terminated is done.
-        observations, rewards, dones, _, info = self.vector_env.step(self._actions)
-        self._step_count += 1
-        self._returns += rewards
+        observations, rewards, terminated, truncated, info = self.vector_env.step(self._actions)
+        dones = terminated | truncated
+        self._returns += rewards if self._shaper is None else self._shaper.unshaped
+        self._lengths += 1 if self._repeater is None else self._repeater.steps_taken
         infos: list[Info] = [{} for _ in range(self.num_envs)]
-        if "final_info" in info:
-            self._end_episodes(np.flatnonzero(dones), info, infos)
-        return observations.astype(np.float32, copy=False), rewards.astype(np.float32), dones, infos
+        if self._step_infos:
+            going = np.flatnonzero(~dones)
+            for i, single_info in zip(going.tolist(), single_infos(info, going), strict=True):
+                infos[i] = {**single_info, "TimeLimit.truncated": False}
+        if dones.any():
+            self._end_episodes(np.flatnonzero(dones), truncated & ~terminated, info, infos)
+        return _single(observations), rewards.astype(np.float32), dones, infos
 
-    def _end_episodes(self, copies: NDArray[np.intp], info: Info, infos: list[Info]) -> None:
+    def _end_episodes(
+        self, copies: NDArray[np.intp], truncated: NDArray[np.bool_], info: Info, infos: list[Info]
+    ) -> None:
         """Fill the infos of copies whose episode ended, and start the next one."""
         elapsed = round(time.time() - self._start_time, 6)
-        returns = self._returns[copies].tolist()
-        lengths = (self._step_count - self._first_steps[copies]).tolist()
-        last_infos = _single_infos(info["final_info"], copies)
+        returns, lengths = self._returns[copies].tolist(), self._lengths[copies].tolist()
+        last_infos = single_infos(info["final_info"], copies)
         for k, i in enumerate(copies.tolist()):
             infos[i] = last_infos[k]
-            infos[i]["TimeLimit.truncated"] = False
-            infos[i]["terminal_observation"] = info["final_obs"][i].astype(np.float32)
+            infos[i]["TimeLimit.truncated"] = bool(truncated[i])
+            infos[i]["terminal_observation"] = _single(info["final_obs"][i])
             infos[i]["episode"] = {"r": round(returns[k], 6), "l": lengths[k], "t": elapsed}
         self._begin_episodes(copies, info)
 
@@ -184,10 +194,11 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
             Arrays by name, see `DQSpaceArmVectorEnv.get_state`.
 
         Raises:
+            AttributeError: If the environment cannot save states.
             ResetNeeded: Before the first reset.
         """
-        lengths = self._step_count - self._first_steps
-        return {**self.vector_env.get_state(), "returns": self._returns.copy(), "lengths": lengths}
+        home: Any = self.vector_env.unwrapped
+        return {**home.get_state(), "returns": self._returns.copy(), "lengths": self._lengths.copy()}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Go on where `get_state` was called.
@@ -201,9 +212,9 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
         for name in ("returns", "lengths"):
             if name not in state or state[name].shape != (self.num_envs,):
                 raise ValueError(f"state: {name} is missing, or not of shape ({self.num_envs},)")
-        self.vector_env.set_state(state)
-        self._returns[:] = state["returns"]
-        self._first_steps = self._step_count - state["lengths"].astype(np.int64)
+        home: Any = self.vector_env.unwrapped
+        home.set_state(state)
+        self._returns[:], self._lengths[:] = state["returns"], state["lengths"]
 
     def close(self) -> None:
         """Close the vector environment; closing twice is harmless."""
@@ -214,15 +225,20 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
         if self.render_mode is None:
             warnings.warn('There is nothing to render: use render_mode="rgb_array".', stacklevel=2)
             return [None] * self.num_envs
-        return list(self.vector_env.render() or ())
+        pictures: Any = self.vector_env.render()
+        return list(pictures or ())
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Read an attribute of the vector environment, which all copies share, once per copy in `indices`.
 
-        Spaces are those of one copy, as in this class.
+        Wrappers that lack it pass it on. Spaces are those of one copy, as in this class.
         """
-        home = self if attr_name in ("observation_space", "action_space") else self.vector_env
+        home = self if attr_name in ("observation_space", "action_space") else self._home(attr_name)
         return [getattr(home, attr_name)] * len(self._checked(indices))
+
+    def _home(self, attr_name: str) -> Any:
+        """The outermost wrapper with an attribute, or the environment."""
+        return next((env for env in self._chain if hasattr(env, attr_name)), self.vector_env.unwrapped)
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Set an attribute of your own on the vector environment, for all copies; `indices` must be all.
@@ -234,7 +250,7 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
             raise AttributeError(
                 f"attribute {attr_name!r} is fixed at construction: make another environment"
             )
-        setattr(self.vector_env, attr_name, value)
+        setattr(self.vector_env.unwrapped, attr_name, value)
 
     def env_method(
         self,
@@ -253,7 +269,8 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
                 f"method {method_name!r} would bypass the episode statistics: "
                 f"call that of {type(self).__name__}"
             )
-        return [getattr(self.vector_env, method_name)(*method_args, **method_kwargs)] * self.num_envs
+        method = getattr(self._home(method_name), method_name)
+        return [method(*method_args, **method_kwargs)] * self.num_envs
 
     def env_is_wrapped(
         self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: int | Iterable[int] | None = None
@@ -279,16 +296,89 @@ class DQSpaceArmVecEnv(VecEnv, EzPickle):
             )
 
 
-def _in_single_precision(space: spaces.Box) -> spaces.Box:
-    """The box with its bounds rounded to float32."""
-    return spaces.Box(space.low.astype(np.float32), space.high.astype(np.float32), dtype=np.float32)
+class DQSpaceArmVecEnv(SB3VecEnv, EzPickle):
+    """`num_envs` copies of `DQSpaceArm-v0` for the algorithms of Stable-Baselines3, see `SB3VecEnv`.
+
+    `TimeLimit.truncated` is always False. The time left is observed and the terminal cost is part of the
+    task, so the time limit is a true end: no value beyond it could be estimated.
+
+    A pickled or deep-copied environment is rebuilt from its arguments; running episodes and seeds are not
+    copied.
+
+    Attributes:
+        vector_env: The underlying `DQSpaceArmVectorEnv`.
+    """
+
+    observation_space: spaces.Box
+    vector_env: DQSpaceArmVectorEnv
+
+    def __init__(
+        self,
+        num_envs: int = 64,
+        scene: Scene | str | Path = "paper",
+        seed: int | None = None,
+        *,
+        step_infos: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        """Load a scene, and compile its step or take it from the cache.
+
+        Args:
+            num_envs: Number of copies.
+            scene: Name of a shipped scene, path of a YAML file, or a scene.
+            seed: Seed s, for seeds s, s + 1, ... of the copies at the first reset; an algorithm with a seed
+                sets its own.
+            step_infos: Whether infos are given at every step.
+            **kwargs: Other arguments of `DQSpaceArmVectorEnv`, except the autoreset mode.
+
+        Raises:
+            SceneError: If the scene cannot be loaded.
+            ValueError: If `DQSpaceArmVectorEnv` rejects an argument.
+        """
+        EzPickle.__init__(self, num_envs, scene, seed, step_infos=step_infos, **kwargs)
+        native = DQSpaceArmVectorEnv(num_envs, scene, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs)
+        SB3VecEnv.__init__(self, native, seed, step_infos=step_infos)
 
 
-def _single_infos(info: Info, copies: NDArray[np.intp]) -> list[Info]:
-    """Infos of some copies as Python numbers, from the vector environment's arrays."""
-    names = [name for name in info if not name.startswith(("_", "final_"))]
-    columns = (
-        _single_infos(each, copies) if isinstance(each := info[name], dict) else each[copies].tolist()
-        for name in names
-    )
-    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+def _chain(env: VectorEnv[Any, Any, Any]) -> list[VectorEnv[Any, Any, Any]]:
+    """The environment with its wrappers, from the outermost in."""
+    return [env, *_chain(env.env)] if isinstance(env, VectorWrapper) else [env]
+
+
+def _noted_actions(chain: list[VectorEnv[Any, Any, Any]]) -> spaces.Space[Any]:
+    """The action space, with the factors from its actions to those of the environment as an attribute."""
+    space: spaces.Space[Any] = chain[0].single_action_space
+    mapping = [env for env in chain if isinstance(env, VectorActionWrapper)]
+    if not mapping or not isinstance(space, spaces.Box):
+        return space
+    noted: Any = copy.copy(space)
+    others = [type(env).__name__ for env in mapping if not isinstance(env, RescaleAction)]
+    ends = np.stack([np.resize(end, (chain[0].num_envs, *space.shape)) for end in (space.low, space.high)])
+    for env in mapping:
+        ends = np.stack([env.actions(end).copy() for end in ends])
+    low, high = ends[:, 0].astype(np.float64)
+    symmetric = np.array_equal(space.low, -space.high) and np.allclose(low, -high, rtol=1e-6, atol=0.0)
+    if others or not symmetric:
+        noted.environment_scale = ", ".join(others) or "RescaleAction to another middle"
+    else:
+        noted.environment_scale = (high / space.high).tolist()
+    result: spaces.Space[Any] = noted
+    return result
+
+
+def _in_single_precision(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """The space with the bounds of its boxes of floats rounded to float32."""
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({name: _in_single_precision(part) for name, part in space.items()})
+    if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating):
+        return spaces.Box(space.low.astype(np.float32), space.high.astype(np.float32), dtype=np.float32)
+    return space
+
+
+def _single(observations: Any) -> Any:
+    """Observations with their floats rounded to float32."""
+    if isinstance(observations, dict):
+        return {name: _single(part) for name, part in observations.items()}
+    if np.issubdtype(observations.dtype, np.floating):
+        return observations.astype(np.float32, copy=False)
+    return observations

@@ -23,6 +23,13 @@ from dq_space_arm_env.common.files import check_writable, check_writable_file
 
 Function = Callable[..., Any]
 
+_normalize_option = click.option(
+    "--normalize",
+    metavar="FILE",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Statistics of a model (.zip), saved by VecNormalize.",
+)
+
 
 def _conditions() -> Iterable[str]:
     from agents.evaluation.conditions import CONDITIONS
@@ -97,6 +104,7 @@ def evaluate() -> None:
     type=click.Path(file_okay=False, path_type=Path),
     help="Folder for a JSON file per evaluation, with its episodes.",
 )
+@_normalize_option
 @trust_option
 @json_option
 def policies_verb(
@@ -108,6 +116,7 @@ def policies_verb(
     workers: int | None,
     expert: bool,
     out: Path | None,
+    normalize: Path | None,
     trust: bool,
     as_json: bool,
 ) -> None:
@@ -126,7 +135,15 @@ def policies_verb(
     with keeping("the expert's solutions are kept; run the same command to resume"):
         console, named = wide_console(150, stderr=as_json), (*policies, *more)
         summaries = evaluate_policies(
-            console, named, scene, expert=expert, workers=workers, out=out, trust=trust, **chosen
+            console,
+            named,
+            scene,
+            expert=expert,
+            workers=workers,
+            out=out,
+            trust=trust,
+            normalize=normalize,
+            **chosen,
         )
     if as_json:
         print_document(summaries)
@@ -151,6 +168,7 @@ def policies_verb(
     type=click.Path(dir_okay=False, path_type=Path),
     help="Animate the flight in this file (needs the extra plots).",
 )
+@_normalize_option
 @trust_option
 @results_options("flight")
 def show(
@@ -160,6 +178,7 @@ def show(
     seed: int | None,
     n: int,
     gif: Path | None,
+    normalize: Path | None,
     trust: bool,
     out: Path,
     picture: bool,
@@ -180,5 +199,6 @@ def show(
 
     if gif is not None:
         check_writable_file(gif)
-    reached = fly_and_show(destination(out, as_json, picture), chosen, scene, seed, n, gif, trust=trust)
+    written = destination(out, as_json, picture)
+    reached = fly_and_show(written, chosen, scene, seed, n, gif, trust=trust, normalize=normalize)
     return SUCCESS if reached else FAILURE

@@ -182,6 +182,7 @@ def evaluate(
     executor: Executor | None = None,
     label: str | None = None,
     trust: bool = False,
+    normalize: str | Path | None = None,
     progress: Callable[[Advance], None] = lambda advance: None,
 ) -> Evaluation:
     """Evaluate a policy from the fixed evaluation starts of a scene.
@@ -200,6 +201,8 @@ def evaluate(
         label: Name in tables.
         trust: Whether to execute the code in a model's file (.zip) where its tensors do not suffice; only if
             you trust whoever made it.
+        normalize: File of the `VecNormalize` that a Stable-Baselines3 model (.zip) was trained in, as its
+            `save` writes it.
         progress: Called now and then.
 
     Returns:
@@ -211,7 +214,7 @@ def evaluate(
             read.
         ValueError: If an argument is out of range, or the policy's actions do not fit the scene.
     """
-    acting, given = as_policy(policy, label, trust=trust), load_scene(scene)
+    acting, given = as_policy(policy, label, trust=trust, normalize=normalize), load_scene(scene)
     flown = scene_under(given, condition)
     check_fit(acting, flown)
     seeds = evaluation_seeds(flown, n)

@@ -53,12 +53,20 @@ def evaluate_policies(
     workers: int | None = None,
     out: Path | None = None,
     trust: bool = False,
+    normalize: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Evaluate policies, print a table for each condition, and return the summaries.
 
-    A folder `out` receives a JSON file for each evaluation, with its episodes.
+    A folder `out` receives a JSON file for each evaluation, with its episodes. Statistics in `normalize` are
+    those of the one model (.zip) among the policies.
     """
     summaries = []
+    models = [policy for policy in policies if Path(policy).suffix == ".zip"]
+    if normalize is not None and len(models) != 1:
+        raise ValueError(
+            f"--normalize: {normalize} belongs to one model (.zip), and there are {len(models)}: evaluate "
+            "each with its own"
+        )
     for condition in CONDITIONS if ALL in conditions else conditions:
         with progress_bar() as show:
             evaluations = [
@@ -70,6 +78,7 @@ def evaluate_policies(
                     expert=expert,
                     workers=workers,
                     trust=trust,
+                    normalize=normalize if policy in models else None,
                     progress=show,
                 )
                 for policy in policies

@@ -34,6 +34,7 @@ def show(
     gif: Path | None = None,
     *,
     trust: bool = False,
+    normalize: Path | None = None,
 ) -> bool:
     """Fly, print a table, write record and pictures; whether the agent reaches the target in all flights.
 
@@ -45,7 +46,7 @@ def show(
         raise ValueError(f"--seed: {seed}, should be at least 0")
     if gif is not None and find_spec("PIL") is None:
         raise ModuleNotFoundError('--gif: needs Pillow: pip install "dq-space-arm[plots]"')
-    console, acting = destination.console(120), as_policy(policy, trust=trust)
+    console, acting = destination.console(120), as_policy(policy, trust=trust, normalize=normalize)
     flown = load_scene(scene or str(acting.metadata.get("scene", "paper")))
     first = 0 if seed is None else seed + 1
     pairs = fly_beside_expert(acting, flown, [seed, *range(first, first + n - 1)])

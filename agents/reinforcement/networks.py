@@ -17,6 +17,8 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
 from agents.policies import ExportedPolicy
+from agents.zoo.model_archive import environment_scale
+from agents.zoo.normalization import statistics_of
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "silu": nn.SiLU}
 
@@ -89,8 +91,21 @@ class ScaledActionsPolicy(ActorCriticPolicy):
         return values.float()
 
 
-def export_policy(model: BaseAlgorithm, metadata: Mapping[str, Any]) -> ExportedPolicy:
-    """Export the deterministic policy of PPO, SAC, TQC or TD3; ValueError if it cannot be exported."""
+def export_policy(model: BaseAlgorithm, metadata: Mapping[str, Any] | None = None) -> ExportedPolicy:
+    """Export the deterministic policy of a model to arrays, which fly without Stable-Baselines3.
+
+    Statistics of `VecNormalize` and the rescaling of actions in `agents.SB3VecEnv` become part of the policy.
+
+    Args:
+        model: PPO, A2C, SAC, TQC, TD3 or DDPG, with its environment.
+        metadata: JSON values to keep with the policy.
+
+    Returns:
+        The policy of raw observations and of the environment's own actions.
+
+    Raises:
+        ValueError: If the model acts in another way than by plain layers.
+    """
     modules, squash = _layers(model)
     linear = [module for module in modules if isinstance(module, nn.Linear)]
     weights = [layer.weight.detach().double().numpy().T for layer in linear]
@@ -109,18 +124,23 @@ def export_policy(model: BaseAlgorithm, metadata: Mapping[str, Any]) -> Exported
         elif not (scale == 1.0).all():
             raise ValueError("actions are not in [-1, 1]: use ScaledActionsPolicy for a smaller box")
         scale = np.ones_like(scale)
+    factors = environment_scale(space, len(biases[-1]))
+    if isinstance(model.policy, ScaledActionsPolicy) and (factors != 1.0).any():
+        raise ValueError("actions of ScaledActionsPolicy are rescaled: use a smaller action space instead")
     mean, factor = _units(model, weights[0].shape[0])
     kind = "goal" if isinstance(model.observation_space, spaces.Dict) else "plain"
-    return ExportedPolicy(
+    exported = ExportedPolicy(
         weights=tuple(weights),
         biases=tuple(biases),
         activation=_activation(modules),
         squash=squash,
-        action_scale=scale,
+        action_scale=scale * factors,
         mean=mean,
         scale=factor,
-        metadata={**metadata, "observation": kind},
+        metadata={**(metadata or {}), "observation": kind},
     )
+    statistics = statistics_of(model.get_vec_normalize_env())
+    return exported if statistics is None else statistics.of(exported)
 
 
 def _layers(model: BaseAlgorithm) -> tuple[list[nn.Module], str]:
@@ -150,8 +170,6 @@ def _activation(modules: list[nn.Module]) -> str:
 
 
 def _units(model: BaseAlgorithm, n_observation: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    if model.get_vec_normalize_env() is not None:
-        raise ValueError("observations of VecNormalize cannot be exported: use ScaledObservations instead")
     policy: Any = model.policy
     # PPO shares one extractor; in the other algorithms each network has its own.
     extractor = getattr(policy, "actor", policy).features_extractor

@@ -7,7 +7,6 @@ from pathlib import Path
 from traceback import walk_tb
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -16,25 +15,23 @@ from sb3_contrib import TQC
 from stable_baselines3 import TD3, HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from agents import configuration as c
 from agents.demonstrations import expert_seconds, prepare_demonstrations
 from agents.policies import ExportedPolicy
 from agents.reinforcement.callback import Advance, TimeIsUp, TrainingCallback
 from agents.reinforcement.checkpoint import read_checkpoint
-from agents.reinforcement.held_actions import HeldActions, action_limits
 from agents.reinforcement.networks import ACTIVATIONS, ScaledActionsPolicy, ScaledObservations
 from agents.reinforcement.ppo import ProximalPolicyOptimization
 from agents.reinforcement.sac import DemonstrationBuffer, LayerNormalizedPolicy, SoftActorCritic
+from agents.reinforcement.training_environment import action_limits, make_environment
 from agents.reinforcement.training_progress import Progress
 from agents.reinforcement.warm_start import fly_again, load_start, set_actor, spent_before
 from agents.run_folder import DEMONSTRATIONS, MODEL, POLICY, TENSORBOARD, RunFolder
-from agents.vec_env import DQSpaceArmVecEnv
-from dq_space_arm_env import Scene, compile_scene, load_scene
+from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.files import write_atomically
 
 LEARNERS: Mapping[str, type[BaseAlgorithm]] = {
@@ -76,7 +73,7 @@ def train_by_reinforcement(
 def train_learner(
     configuration: c.Configuration,
     folder: RunFolder,
-    environment: HeldActions,
+    environment: VecEnv,
     begin: Callable[[], tuple[BaseAlgorithm, Progress]],
     watch: Callable[[Progress], TrainingCallback],
 ) -> Trained:
@@ -107,75 +104,11 @@ def train_learner(
     return Trained(folder.path, model, policy)
 
 
-# --- environment ---
-
-
-def make_environment(configuration: c.Configuration, scene: Scene) -> HeldActions:
-    """Make the training environment: native copies, or goal environments for hindsight, with held actions."""
-    _check_lengths(configuration, scene)
-    practice, hindsight, success = configuration.environment, configuration.hindsight, scene.success
-    environment: VecEnv
-    if hindsight is None:
-        environment = DQSpaceArmVecEnv(practice.copies, scene)
-    else:
-        reward_type = hindsight.reward_type
-
-        def make() -> gymnasium.Env[Any, Any]:
-            goal = gymnasium.make("DQSpaceArmGoal-v0", scene=scene, reward_type=reward_type)
-            monitored: gymnasium.Env[Any, Any] = Monitor(goal)
-            return monitored
-
-        environment = DummyVecEnv([make] * practice.copies)
-    return HeldActions(
-        environment,
-        repeat=practice.action_repeat,
-        action_scale=action_scale(practice.action_scale, scene),
-        reward_scale=practice.reward_scale,
-        cost_power=practice.cost_power,
-        success_reward=practice.success_reward,
-        end_error_cost=practice.end_error_cost,
-        tolerances=(
-            success.attitude_error_deg,
-            success.position_error,
-            success.angular_velocity_error_deg,
-            success.velocity_error,
-        ),
-        add_rewards=hindsight is None,
-    )
-
-
-def _check_lengths(configuration: c.Configuration, scene: Scene) -> None:
-    practice, steps = configuration.environment, scene.simulation.steps
-    if practice.action_repeat > steps:
-        raise c.ConfigurationError(
-            f"environment.action_repeat = {practice.action_repeat}: must be at most {steps}, the steps of an "
-            f"episode of scene {scene.name!r}"
-        )
-    algorithm = configuration.algorithm
-    if not isinstance(algorithm, c.OffPolicy) or algorithm.hindsight is None:
-        return
-    episodes = practice.copies * configuration.decisions(steps)
-    if algorithm.learning_starts < episodes:
-        raise c.ConfigurationError(
-            f"algorithm.learning_starts = {algorithm.learning_starts}: must be at least {episodes}, one "
-            "episode of each copy; there is no hindsight before that"
-        )
-
-
-def action_scale(scale: c.ActionScale, scene: Scene) -> NDArray[np.float32]:
-    """Expand the scale of each actuator to its inputs, shape (n_u,), fractions of the limits."""
-    layout = compile_scene(scene).layout
-    values = np.ones(layout.n_u, dtype=np.float32)
-    for name, value in scale:
-        values[getattr(layout.control, name)] = value
-    return values
-
-
 # --- learner ---
 
 
 def _begin(
-    configuration: c.Configuration, scene: Scene, folder: RunFolder, environment: HeldActions
+    configuration: c.Configuration, scene: Scene, folder: RunFolder, environment: VecEnv
 ) -> tuple[BaseAlgorithm, Progress]:
     """Make a learner, with demonstrations in its replay buffer where the configuration asks for them."""
     model, spent = make_learner(configuration, environment), spent_before(configuration)
@@ -184,7 +117,7 @@ def _begin(
         return model, spent
     given = algorithm.demonstrations
     demonstrations = prepare_demonstrations(given.source, scene, folder.path / DEMONSTRATIONS)
-    flown = fly_again(demonstrations, scene, environment)
+    flown = fly_again(demonstrations, configuration, scene)
     assert isinstance(model, SoftActorCritic)
     assert isinstance(model.replay_buffer, DemonstrationBuffer)
     model.replay_buffer.demonstrate(flown, action_limits(environment), given.share)
@@ -200,7 +133,7 @@ def _begin(
 
 
 def make_learner(
-    configuration: c.Configuration, environment: HeldActions, *, blank: bool = False
+    configuration: c.Configuration, environment: VecEnv, *, blank: bool = False
 ) -> BaseAlgorithm:
     """Make an untrained algorithm; PPO's actor starts from `start_from` if given.
 
@@ -267,7 +200,7 @@ def _set_off_policy_options(
         options["replay_buffer_kwargs"] = algorithm.hindsight.model_dump(exclude={"reward_type"})
 
 
-def _units(configuration: c.Configuration, environment: HeldActions) -> tuple[list[float], list[float]]:
+def _units(configuration: c.Configuration, environment: VecEnv) -> tuple[list[float], list[float]]:
     """Mean and inverse standard deviation of observations over one episode of each copy.
 
     The random actions are gentle: full ones would show how the arm whirls, not how it works. A goal takes

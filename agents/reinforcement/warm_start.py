@@ -11,9 +11,8 @@ from torch import nn
 
 from agents.configuration import Configuration, ConfigurationError
 from agents.policies import ExportedPolicy, PolicyFileError
-from agents.reinforcement.held_actions import HeldActions, action_limits
+from agents.reinforcement.training_environment import action_limits, native_environment
 from agents.reinforcement.training_progress import Progress
-from agents.vec_env import DQSpaceArmVecEnv
 from agents.zoo.finding import PolicyError, policy_path
 from dq_space_arm_env import Scene
 from experts.demonstrations import Demonstration, Demonstrations, DemonstrationsError
@@ -99,7 +98,7 @@ class Flown(NamedTuple):
     done: NDArray[np.bool_]  # (D,)
 
 
-def fly_again(demonstrations: Demonstrations, scene: Scene, environment: HeldActions) -> Flown:
+def fly_again(demonstrations: Demonstrations, configuration: Configuration, scene: Scene) -> Flown:
     """Replay demonstrations in the agent's environment, and keep the flights that succeed there.
 
     A demonstration acts at every step with full authority; the agent may hold its actions, and have smaller
@@ -109,36 +108,37 @@ def fly_again(demonstrations: Demonstrations, scene: Scene, environment: HeldAct
     flights = [
         flight
         for first in range(0, len(demonstrations), BATCH)
-        for flight in _flights(demonstrations, [*demonstrations[first : first + BATCH]], scene, environment)
+        for flight in _flights(demonstrations, [*demonstrations[first : first + BATCH]], configuration, scene)
     ]
     if not flights:
         raise DemonstrationsError(
             f"none of the {len(demonstrations)} demonstrations in {demonstrations.path} succeeds with "
-            f"actions held for {environment.repeat} steps: reduce environment.action_repeat, or raise "
-            "environment.action_scale"
+            f"actions held for {configuration.environment.action_repeat} steps: reduce "
+            "environment.action_repeat, or raise environment.action_scale"
         )
     arrays = [np.concatenate(column) for column in zip(*flights, strict=True)]
     return Flown(*cast(Any, arrays))
 
 
 def _flights(
-    data: Demonstrations, chosen: list[Demonstration], scene: Scene, settings: HeldActions
+    data: Demonstrations, chosen: list[Demonstration], configuration: Configuration, scene: Scene
 ) -> Iterator[tuple[NDArray[Any], ...]]:
     """The columns of `Flown` for each successful flight."""
-    plain = DQSpaceArmVecEnv(len(chosen), scene)
-    environment = settings.around(plain)
+    environment = native_environment(configuration, scene, len(chosen))
+    repeat = configuration.environment.action_repeat
+    native: Any = environment.vector_env.unwrapped
     options = {"initial_state": np.array([each.states[0] for each in chosen])}
     if data.kernels.n_p:
         options["parameters"] = np.array([each.parameters for each in chosen])
-    plain.set_options(options)
-    observation = environment.reset()
+    environment.set_options(options)
+    observation: Any = environment.reset()
     unit = action_limits(environment)
     rows = np.array([data.kernels.stage_parameters(each.parameters) for each in chosen])
     columns: list[tuple[NDArray[Any], ...]] = []
     infos: list[dict[str, Any]] = []
-    for stage in range(0, data.scene.simulation.steps, settings.repeat):
-        states = plain.vector_env.states
-        actions = np.clip(_mean_action(data, chosen, rows, states, stage, settings.repeat), -unit, unit)
+    for stage in range(0, data.scene.simulation.steps, repeat):
+        states = native.states
+        actions = np.clip(_mean_action(data, chosen, rows, states, stage, repeat), -unit, unit)
         following, reward, done, infos = environment.step(actions)
         after = np.array(
             [info.get("terminal_observation", row) for info, row in zip(infos, following, strict=True)]

@@ -1,16 +1,16 @@
-"""Corrections of plans as a vector environment for Stable-Baselines3."""
+"""Corrections of plans as a vector environment of Gymnasium."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from agents.configuration.residual import Mismatch
 from agents.evaluation.plans import FloatArray, Followed, Plans
@@ -20,9 +20,10 @@ from dq_space_arm_env.environment.disturbances import Disturbances, with_loads
 from experts.demonstrations import Demonstrations
 
 Info = dict[str, Any]
+Mask = NDArray[np.bool_]
 
 
-class ResidualVecEnv(VecEnv):
+class ResidualVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
     """Episodes in which a plan flies with its gains, and actions correct it.
 
     Each episode starts where a demonstration does, and follows its plan; masses differ from the plan's,
@@ -31,13 +32,11 @@ class ResidualVecEnv(VecEnv):
     corrected flight. This cancels much of the luck, and a policy that corrects nothing has rewards of zero.
 
     An action is a correction, in fractions of limits, within `action_space`; observations are those of
-    `CorrectionObserver`. All episodes begin and end together. At the end, an episode's info has `episode`, as
-    of SB3's `Monitor`, `cost` and `twin_cost`.
+    `CorrectionObserver`. All episodes begin and end together, and the next ones begin in the same step. At
+    the end, an episode's info has `cost`, `twin_cost` and `is_success`; it is empty before.
     """
 
-    observation_space: spaces.Box
-    action_space: spaces.Box
-    render_mode: None = None
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(
         self,
@@ -75,21 +74,38 @@ class ResidualVecEnv(VecEnv):
         self._scale, self._power = np.asarray(action_scale, dtype=np.float64), cost_power
         self._observer = CorrectionObserver(scene, memory, full_authority)
         self._rng = np.random.default_rng(seed)
-        self._actions: NDArray[Any] | None = None
+        self.num_envs = copies
         size = CorrectionObserver.size(self._worlds.kernels)
-        super().__init__(
-            copies,
-            spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32),
-            spaces.Box(-action_scale, action_scale, dtype=np.float32),
-        )
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)
+        self.single_action_space = spaces.Box(-action_scale, action_scale, dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, copies)
+        self.action_space = batch_space(self.single_action_space, copies)
 
-    def seed(self, seed: int | None = None) -> list[int | None]:
-        """Renew the random generator of all episodes."""
-        self._rng = np.random.default_rng(seed)
-        return [seed] * self.num_envs
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], Info]:
+        """Begin new episodes, all together.
 
-    def reset(self) -> NDArray[np.float32]:
-        """Begin new episodes; returns observations, shape (num_envs, n_obs)."""
+        Args:
+            seed: Seed of everything random, or a sequence whose first number is; None keeps the generator.
+            options: None, or a "reset_mask" that is True for all.
+
+        Returns:
+            Observations, shape (num_envs, n_obs), and an empty info.
+
+        Raises:
+            ValueError: If an option is another one.
+        """
+        asked = dict(options or {})
+        if not np.all(asked.pop("reset_mask", True)) or asked:
+            raise ValueError(f"options: {options}, should be None: all episodes begin together, at random")
+        first = seed if seed is None or isinstance(seed, int | np.integer) else seed[0]
+        if first is not None:
+            self._rng = np.random.default_rng(first)
+        return self._begin(), {}
+
+    def _begin(self) -> NDArray[np.float32]:
+        """Draw plans, masses and disturbances, and observe."""
         mismatch, count = self._mismatch, self.num_envs
         chosen = self._rng.integers(len(self._plans.states), size=count)
         self._plans = self._plans.choose(np.tile(chosen, 2))
@@ -98,7 +114,7 @@ class ResidualVecEnv(VecEnv):
         _, parameters = with_loads(self._scene, self._factors, self._plans.known)
         # What diverges restarts at the next step, in some other world, and is not counted.
         self._worlds.reset(options={"initial_state": self._plans.starts, "parameters": parameters})
-        self._stage, self._cost, self._returns = 0, np.zeros(2 * count), np.zeros(count)
+        self._stage, self._cost = 0, np.zeros(2 * count)
         self._flying, self._success = np.ones(2 * count, dtype=np.bool_), np.zeros(2 * count, dtype=np.bool_)
         self._observer.reset(self._plans.known[:count])
         return self._observe()
@@ -122,7 +138,6 @@ class ResidualVecEnv(VecEnv):
             "push": self._push,
             "stage": self._stage,
             "cost": self._cost,
-            "returns": self._returns,
             "flying": self._flying,
             "success": self._success,
             "uncorrected": self._uncorrected,
@@ -150,7 +165,7 @@ class ResidualVecEnv(VecEnv):
         self._plans = self._plans.choose(state["chosen"])
         self._disturb(state["noise"], state["push"])
         self._stage = int(state["stage"])
-        self._cost, self._returns = state["cost"].copy(), state["returns"].copy()
+        self._cost = state["cost"].copy()
         self._flying, self._success = state["flying"].copy(), state["success"].copy()
         self._uncorrected = state["uncorrected"].copy()
         self._observer.reset(self._plans.known[: self.num_envs])
@@ -168,29 +183,23 @@ class ResidualVecEnv(VecEnv):
         few = Followed(*(part[:count] for part in followed))
         return self._observer(self._stage, measured[:count], few)
 
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Set the corrections of the next step, fractions of limits, clipped to the action space."""
-        self._actions = actions
-
-    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[Info]]:
+    def step(self, actions: NDArray[Any]) -> tuple[NDArray[np.float32], FloatArray, Mask, Mask, Info]:
         """Fly one time step; after the last one the next episodes begin at once.
 
-        Raises:
-            RuntimeError: Before the first `step_async`.
+        Args:
+            actions: Corrections, fractions of limits, shape (num_envs, n_u), clipped to the action space.
+
+        Returns:
+            Observations, rewards, terminated, truncated (always False), info.
         """
-        if self._actions is None:
-            raise RuntimeError("call step_async() before step_wait()")
-        count, actions = self.num_envs, self._uncorrected.copy()
-        actions[:count] = corrected(actions[:count], self._actions, self._scale, self._observer.authority())
-        charged = self._charged(actions)
-        rewards = charged[count:] - charged[:count]
-        self._returns += rewards
+        count, applied = self.num_envs, self._uncorrected.copy()
+        applied[:count] = corrected(applied[:count], actions, self._scale, self._observer.authority())
+        charged = self._charged(applied)
         over = self._stage == self._scene.simulation.steps
-        infos: list[Info] = [{} for _ in range(count)]
-        if over:
-            self._describe(infos)
-        observations = self.reset() if over else self._observe()
-        return observations, rewards.astype(np.float32), np.full(count, over), infos
+        info = self._ending() if over else {}
+        observations = self._begin() if over else self._observe()
+        ended, truncated = np.full(count, over), np.zeros(count, dtype=np.bool_)
+        return observations, charged[count:] - charged[:count], ended, truncated, info
 
     def _charged(self, actions: FloatArray) -> FloatArray:
         """Fly a time step, and give its costs as they count in rewards, shape (2 num_envs,)."""
@@ -206,41 +215,19 @@ class ResidualVecEnv(VecEnv):
         self._stage += 1
         return np.asarray(left * (cost / left) ** self._power)
 
-    def _describe(self, infos: list[Info]) -> None:
-        for i, info in enumerate(infos):
-            steps = self._scene.simulation.steps
-            info["episode"] = {"r": float(self._returns[i]), "l": steps, "t": 0.0}
-            info["cost"], info["twin_cost"] = self._cost[[i, i + self.num_envs]].tolist()
-            info["is_success"] = bool(self._success[i])
-            info["TimeLimit.truncated"] = False
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute, which all episodes share."""
-        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of all episodes."""
-        self._require_all(indices)
-        setattr(self, attr_name, value)
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Call a method once, for all episodes."""
-        self._require_all(indices)
-        return [getattr(self, method_name)(*method_args, **method_kwargs)] * self.num_envs
-
-    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """No episode has a Gymnasium wrapper."""
-        return [False] * len(list(self._get_indices(indices)))
-
-    def _require_all(self, indices: VecEnvIndices) -> None:
-        if isinstance(indices, Iterable) and len(set(indices)) == self.num_envs:
-            return
-        if indices is not None:
-            raise ValueError(
-                f"indices: {indices}, should be left out: all {self.num_envs} episodes share attributes"
-            )
+    def _ending(self) -> Info:
+        """Last observations, undisturbed, and infos of episodes that are over."""
+        count, kernels, everyone = self.num_envs, self._worlds.kernels, np.ones(self.num_envs, dtype=np.bool_)
+        flown = self._plans.choose(self._plans.chosen[:count])
+        states = self._worlds.states[:count]
+        deviation = kernels.difference(flown.states[flown.chosen, self._stage], states)
+        idle = np.zeros((count, kernels.n_u))
+        last = np.empty(count, dtype=object)
+        last[:] = list(self._observer(self._stage, states, Followed(idle, deviation)))
+        found = {
+            "cost": self._cost[:count],
+            "twin_cost": self._cost[count:],
+            "is_success": self._success[:count],
+        }
+        masked = found | {f"_{name}": everyone for name in found}
+        return {"final_obs": last, "final_info": masked, "_final_obs": everyone, "_final_info": everyone}

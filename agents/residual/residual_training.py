@@ -16,14 +16,17 @@ from agents.evaluation.plan_followers import follower
 from agents.evaluation.plans import Plans
 from agents.policies import ExportedPolicy
 from agents.reinforcement.callback import Advance, TrainingCallback
-from agents.reinforcement.held_actions import HeldActions
 from agents.reinforcement.networks import export_policy
-from agents.reinforcement.reinforcement_training import Trained, action_scale, make_learner, train_learner
+from agents.reinforcement.reinforcement_training import Trained, make_learner, train_learner
+from agents.reinforcement.training_environment import held_environment
 from agents.reinforcement.training_progress import Progress
 from agents.residual.corrections import correction
-from agents.residual.environment import ResidualVecEnv
+from agents.residual.environment import ResidualVectorEnv
 from agents.residual.mismatch import Worlds, fly_mismatched
 from agents.run_folder import BEST, DEMONSTRATIONS, RunFolder
+from agents.vec_env import SB3VecEnv
+from agents.wrappers.shaping import action_scale
+from agents.wrappers.vector import ShapeReward
 from dq_space_arm_env import Scene, load_scene
 from experts.demonstrations import Demonstrations
 
@@ -69,11 +72,11 @@ def split(demonstrations: Demonstrations, episodes: int) -> tuple[Demonstrations
 
 def make_residual_environment(
     configuration: ResidualConfiguration, scene: Scene, demonstrations: Demonstrations
-) -> HeldActions:
+) -> SB3VecEnv:
     """The environment that a correction is trained in."""
     practice = configuration.environment
-    scale = action_scale(practice.action_scale, scene)
-    environment = ResidualVecEnv(
+    scale = action_scale(dict(practice.action_scale), scene)
+    environment = ResidualVectorEnv(
         demonstrations,
         scene,
         practice.copies,
@@ -84,9 +87,8 @@ def make_residual_environment(
         cost_power=practice.cost_power,
         seed=configuration.seed,
     )
-    return HeldActions(
-        environment, repeat=practice.action_repeat, action_scale=scale, reward_scale=practice.reward_scale
-    )
+    held = held_environment(environment, practice.action_repeat)
+    return SB3VecEnv(ShapeReward(held, practice.reward_scale))
 
 
 def silence(model: BaseAlgorithm) -> None:
@@ -125,7 +127,7 @@ class ResidualCallback(TrainingCallback):
         return super().metadata() | {
             "configuration": self._residual.model_dump(mode="json", exclude_none=True),
             "residual": {
-                "action_scale": action_scale(practice.action_scale, self._scene).tolist(),
+                "action_scale": action_scale(dict(practice.action_scale), self._scene).tolist(),
                 "repeat": practice.action_repeat,
                 "memory": practice.memory,
                 "full_authority": practice.full_authority,

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from agents.policies import ExportedPolicy
 from agents.policies.flying import Policy
-from agents.zoo.model_archive import ModelArchiveError, NeedsCodeError, read_attributes, read_model
+from agents.zoo.model_archive import (
+    ModelArchiveError,
+    NeedsCodeError,
+    environment_scale,
+    read_attributes,
+    read_model,
+)
+from agents.zoo.normalization import ObservationStatistics, StatisticsError, read_statistics, statistics_of
 from agents.zoo.shelf import ZooError, policy_file
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
 
@@ -33,7 +40,9 @@ class ActingPolicy(NamedTuple):
     sizes: tuple[int, int] | None = None  # entries of observations and actions, if known
 
 
-def as_policy(policy: Any, label: str | None = None, *, trust: bool = False) -> ActingPolicy:
+def as_policy(
+    policy: Any, label: str | None = None, *, trust: bool = False, normalize: str | Path | None = None
+) -> ActingPolicy:
     """Make a policy ready to fly, whatever it is.
 
     A model's file (.zip) may hold code. None is run unless you trust the file: built-in policies of
@@ -45,18 +54,24 @@ def as_policy(policy: Any, label: str | None = None, *, trust: bool = False) -> 
             to actions, shape (B, n_u).
         label: Its name in tables; the file or class by default.
         trust: Whether to execute the code in a model's file where its tensors do not suffice.
+        normalize: File of the `VecNormalize` that a model's file (.zip) was trained in, as its `save` writes
+            it; nothing in it is executed. A model in memory has its own.
 
     Returns:
         The policy.
 
     Raises:
-        PolicyError: If it is none of these, or cannot be read.
+        PolicyError: If it is none of these, or cannot be read, or normalization is missing or of no use.
         PolicyFileError: If an exported policy cannot be read.
         ImportError: If a model is given and the extra `agents` is not installed.
     """
     if isinstance(policy, str | Path):
-        path = policy_path(policy)
-        return as_policy(read_policy(path, trust=trust), label or _label(policy))
+        path, name = policy_path(policy), label or _label(policy)
+        if normalize is None:
+            return as_policy(read_policy(path, trust=trust), name)
+        return _as_normalized(path, name, trust, Path(normalize))
+    if normalize is not None:
+        raise PolicyError("normalize: is for the file of a model (.zip); a model in memory has its own")
     if isinstance(policy, ExportedPolicy):
         name = label or str(policy.metadata.get("agent", "exported policy"))
         sizes = policy.n_observation, policy.n_action
@@ -65,7 +80,7 @@ def as_policy(policy: Any, label: str | None = None, *, trust: bool = False) -> 
             return ActingPolicy(name, act, act, True, policy.metadata, sizes)
         return ActingPolicy(name, policy, policy, False, policy.metadata, sizes)
     if callable(getattr(policy, "predict", None)):
-        predict = _predictor(policy)
+        predict = _predictor(policy, _own_statistics(policy))
         return ActingPolicy(label or type(policy).__name__, predict, predict, True, {})
     if callable(policy):
         name = label or str(getattr(policy, "__name__", type(policy).__name__))
@@ -74,6 +89,30 @@ def as_policy(policy: Any, label: str | None = None, *, trust: bool = False) -> 
         f"policy: {policy!r}, should be a path, an ExportedPolicy, a model of Stable-Baselines3, or a "
         "function of observations"
     )
+
+
+def _as_normalized(path: Path, label: str, trust: bool, file: Path) -> ActingPolicy:
+    """Make a model's file ready to fly, with the statistics of its observations."""
+    if path.suffix != ".zip":
+        raise PolicyError(f"normalize: {path} is no model of Stable-Baselines3 (.zip), which alone needs it")
+    try:
+        statistics = read_statistics(file)
+        loaded = read_policy(path, trust=trust, normalized=True)
+        if isinstance(loaded, ExportedPolicy):
+            return as_policy(loaded if statistics is None else statistics.of(loaded), label)
+    except StatisticsError as error:
+        raise PolicyError(f"normalize: {error}") from error
+    predict = _predictor(loaded, statistics)
+    return ActingPolicy(label, predict, predict, True, {})
+
+
+def _own_statistics(model: Any) -> ObservationStatistics | None:
+    """Statistics of the environment that a model in memory is trained in."""
+    normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
+    try:
+        return statistics_of(normalizer)
+    except StatisticsError as error:
+        raise PolicyError(f"policy: {error}") from error
 
 
 def policy_path(policy: str | Path) -> Path:
@@ -126,11 +165,21 @@ def _label(policy: str | Path) -> str:
     return path.name if path.suffix != ".npz" else "/".join(path.parts[-2:])
 
 
-def _predictor(model: Any) -> Policy:
-    """Deterministic actions of a model of Stable-Baselines3."""
+def _predictor(model: Any, statistics: ObservationStatistics | None) -> Policy:
+    """Deterministic actions of a model of Stable-Baselines3, in units of the environment's."""
+    space: Any = getattr(model, "action_space", None)
+    factors = None
+    if hasattr(space, "environment_scale"):
+        try:
+            factors = environment_scale(space, space.shape[0]).astype(np.float32)
+        except NeedsCodeError as error:
+            raise PolicyError(f"policy: {error}") from error
 
     def act(observations: Any) -> NDArray[Any]:
-        return np.asarray(model.predict(observations, deterministic=True)[0])
+        if statistics is not None:
+            observations = statistics.normalize(observations)
+        actions = np.asarray(model.predict(observations, deterministic=True)[0])
+        return actions if factors is None else actions * factors
 
     if hasattr(getattr(model, "observation_space", None), "spaces"):
         return _OnGoals(act, joined=False)
@@ -164,24 +213,27 @@ class _OnGoals:
         return self._act(np.concatenate(list(single.values()), axis=1) if self._joined else single)
 
 
-def read_policy(path: Path, *, trust: bool = False) -> Any:
-    """Read an exported policy or a model of Stable-Baselines3; only a trusted file's code is executed."""
+def read_policy(path: Path, *, trust: bool = False, normalized: bool = False) -> Any:
+    """Read an exported policy or a model of Stable-Baselines3; only a trusted file's code is executed.
+
+    A model that was trained on normalized observations is refused unless the caller normalizes them.
+    """
     if not path.exists():
         raise PolicyError(f"{path}: there is no such file or folder")
     if path.suffix == ".npz":
         return ExportedPolicy.load(path)
     if path.suffix == ".zip":
-        return _read_model(path, trust=trust)
+        return _read_model(path, trust=trust, normalized=normalized)
     raise PolicyError(
         f"{path}: should be an exported policy (.npz), a model of Stable-Baselines3 (.zip), a run folder, "
         "or a name in the zoo"
     )
 
 
-def _read_model(path: Path, *, trust: bool) -> Any:
+def _read_model(path: Path, *, trust: bool, normalized: bool) -> Any:
     """Read a model by its tensors, or have Stable-Baselines3 load it, which executes what its pickles say."""
     try:
-        return read_model(path)
+        return read_model(path, normalized=normalized)
     except NeedsCodeError as error:
         if trust:
             return _load_model(path)

@@ -7,6 +7,7 @@ tensors and the JSON, which names classes, spaces and options beside the pickles
 
 from __future__ import annotations
 
+import base64
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.policies import ExportedPolicy
+from agents.policies.pickled_arrays import PickledError, read_pickled
 from agents.policies.tensor_files import TensorFileError, read_tensors
+from agents.zoo.normalization import are_missing
 from dq_space_arm_env.common.bounded_reading import parse_json, read_member
 
 MOST_BYTES = {"data": 1 << 23, "policy.pth": 1 << 27}
@@ -44,6 +47,10 @@ class ModelArchiveError(ValueError):
 
 class NeedsCodeError(ModelArchiveError):
     """A model acts by code in its file."""
+
+
+class NeedsStatisticsError(ModelArchiveError):
+    """A model sees observations that `VecNormalize` has normalized."""
 
 
 class _Actor(NamedTuple):
@@ -78,22 +85,32 @@ _ACTORS = (
 )
 
 
-def read_model(path: Path) -> ExportedPolicy:
+def read_model(path: Path, *, normalized: bool = False) -> ExportedPolicy:
     """Read the deterministic policy of PPO, A2C, SAC, TQC, TD3 or DDPG without executing anything.
 
     Args:
         path: The model's file.
+        normalized: Whether the caller normalizes observations, should the model have been trained so.
 
     Returns:
         The policy; it acts like the model up to rounding in single precision.
 
     Raises:
+        NeedsStatisticsError: If it was trained on normalized observations, and nobody normalizes them.
         NeedsCodeError: If the policy is not one of Stable-Baselines3's or of this package.
         ModelArchiveError: If the file is damaged, or no model.
         ImportError: If PyTorch is not installed.
     """
     try:
-        return _policy(read_attributes(path), _read_arrays(path))
+        attributes = read_attributes(path)
+        if not normalized and _sees_normalized(attributes):
+            raise NeedsStatisticsError(
+                f"{path}: its observations were normalized by VecNormalize, whose statistics are in a file "
+                "of their own: evaluate --normalize FILE, in Python normalize=FILE, takes them"
+            )
+        return _policy(attributes, _read_arrays(path))
+    except NeedsStatisticsError:
+        raise
     except NeedsCodeError as error:
         raise NeedsCodeError(f"{path}: {error}") from error
     except TensorFileError as error:
@@ -109,6 +126,21 @@ def read_attributes(path: Path) -> dict[str, Any]:
     if not isinstance(attributes, dict):
         raise ValueError("data should be a mapping")
     return attributes
+
+
+def _sees_normalized(attributes: Mapping[str, Any]) -> bool:
+    """Whether a model was trained on normalized observations.
+
+    Stable-Baselines3 keeps original observations beside a `VecNormalize` alone, which may still leave them as
+    they are and normalize rewards: the last observations tell.
+    """
+    if attributes.get("_last_original_obs") is None:
+        return False
+    try:
+        last = read_pickled(base64.b64decode(attributes["_last_obs"][":serialized:"]))
+    except (LookupError, TypeError, ValueError, PickledError):
+        return True
+    return are_missing(last, attributes["observation_space"])
 
 
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -135,22 +167,25 @@ def _policy(data: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]]) -> Exp
         raise NeedsCodeError("its network is none of PPO, A2C, SAC, TQC, TD3 or DDPG")
     weights, biases = _layers(actor, tensors)
     scale = _action_scale(data["action_space"], len(biases[-1]))
+    factor = environment_scale(data["action_space"], len(biases[-1]))
     if actor.squash == "clip":
         if module == _SCALED_ACTIONS:
+            if (factor != 1.0).any():
+                raise NeedsCodeError("its actions are rescaled, and not clipped before")
             weights[-1], biases[-1] = weights[-1] * scale, biases[-1] * scale
         elif not (scale == 1.0).all():
             raise NeedsCodeError(f"its actions reach {scale}, should reach 1")
         scale = np.ones_like(scale)
-    mean, factor = _units(actor, tensors, len(weights[0]))
+    mean, units = _units(actor, tensors, len(weights[0]))
     is_goal = str(data["observation_space"][":type:"]) == "<class 'gymnasium.spaces.dict.Dict'>"
     return ExportedPolicy(
         weights=tuple(weights),
         biases=tuple(biases),
         activation=_activation(options, actor.activation),
         squash=actor.squash,
-        action_scale=scale,
+        action_scale=scale * factor,
         mean=mean,
-        scale=factor,
+        scale=units,
         metadata={"observation": "goal" if is_goal else "plain"},
     )
 
@@ -198,6 +233,26 @@ def _action_scale(space: Mapping[str, Any], n_action: int) -> NDArray[np.float64
             "ranges, at most 1"
         )
     return high
+
+
+def environment_scale(space: Any, n_action: int) -> NDArray[np.float64]:
+    """Factors from a model's actions to the environment's, shape (n_u,), which its action space carries.
+
+    Args:
+        space: The space, or its attributes by name; `SB3VecEnv` notes there what Gymnasium's wrappers do.
+        n_action: n_u.
+
+    Raises:
+        NeedsCodeError: If a wrapper does something else than to rescale actions.
+    """
+    attributes = space if isinstance(space, Mapping) else vars(space)
+    found = attributes.get("environment_scale", [1.0] * n_action)
+    if isinstance(found, str):
+        raise NeedsCodeError(f"its actions pass {found[:80]!r}, which only the environment can apply")
+    factors = np.array(found, dtype=np.float64)
+    if factors.shape != (n_action,) or not ((factors > 0.0) & (factors <= 1.0)).all():
+        raise ValueError(f"environment_scale of {n_action} actions is {str(found)[:80]}")
+    return factors
 
 
 def _units(

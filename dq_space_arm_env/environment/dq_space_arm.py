@@ -21,6 +21,7 @@ from dq_space_arm_env.common.real_arrays import DOUBLE, SINGLE, real_array
 from dq_space_arm_env.compiler.random_draws import generator_of, generator_state
 from dq_space_arm_env.environment.reset_options import GivenStart, check_scene, given_start, saved_state
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
+from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene, load_scene
@@ -126,7 +127,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     `info` also holds the `attitude_error` [deg] and `position_error` [m] of the tip (of several the worst), `is_success` (both within the scene's tolerances, 3 deg and 0.1 m) and
     `diverged`; where the target moves, or success asks for it, the tip's `angular_velocity_error` [deg/s] and `velocity_error` [m/s] relative to the target with the
-    wrist held. `reset` returns the same keys, with costs of zero.
+    wrist held. `reset` returns the same keys, with costs of zero; where target, masses or anything else vary, its `info["parameters"]` has their
+    values in this episode by name.
 
     Where a scene has constraints, `info["constraints"]` has every residual by its name, which is at most 0 where the constraint holds, of the state after
     the step and of the input, and `info["cost"]` the sum of their violations, each over its tolerance (the convention of safe reinforcement learning; the
@@ -189,6 +191,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     * v0: Initial version.
     """
 
+    spec = PlainSpec()
     metadata: dict[str, Any] = {  # noqa: RUF012 - as in every Gymnasium environment
         "render_modes": ["human", "rgb_array"],
         "render_fps": 60,
@@ -458,7 +461,12 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             self._show()
         _, success, diverged = self._flags.tolist()
         info = grouped(dict(zip(self._more_names or REPORT[1:], self._report.tolist()[1:], strict=True)))
-        return self._observation.copy(), {**info, "is_success": success, "diverged": diverged}
+        info |= {"is_success": success, "diverged": diverged}
+        if self.kernels.n_p:
+            info["parameters"] = dict(
+                zip(self.kernels.parameters.names, self._parameters.tolist(), strict=True)
+            )
+        return self._observation.copy(), info
 
     def _begin(self, start: GivenStart) -> None:
         """Draw an episode, except for what is given."""

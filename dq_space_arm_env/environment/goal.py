@@ -15,6 +15,7 @@ from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.environment.reset_options import saved_state
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
+from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
@@ -137,6 +138,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
     * v0: Initial version.
     """
 
+    spec = PlainSpec()
     metadata: dict[str, Any] = DQSpaceArmEnv.metadata
 
     def __init__(

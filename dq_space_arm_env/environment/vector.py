@@ -20,6 +20,7 @@ from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.environment.reset_options import GivenStart, given_start, saved_state
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
+from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene
@@ -57,6 +58,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
     vector environments; after a step that has reset one, its picture shows the new episode.
     """
 
+    spec = PlainSpec()
     metadata: dict[str, Any] = {  # noqa: RUF012
         "render_modes": ["rgb_array"],
         "render_fps": DQSpaceArmEnv.metadata["render_fps"],
@@ -73,6 +75,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         width: int = 640,
         height: int = 480,
         default_camera_config: Mapping[str, Any] | None = None,
+        max_episode_steps: int | None = None,
     ) -> None:
         """Load a scene and compile its step, or take it from the cache.
 
@@ -86,12 +89,20 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             width: Width of the pictures, pixels.
             height: Height of the pictures, pixels.
             default_camera_config: As for `DQSpaceArmEnv`.
+            max_episode_steps: None; episodes are as long as the scene says.
 
         Raises:
             SceneError: If the scene cannot be loaded.
             ValueError: If num_envs or threads is not positive, the scene has no normalized actions, the
-                render mode is unknown, or size or camera of the pictures is invalid.
+                render mode is unknown, size or camera of the pictures is invalid, or `max_episode_steps` is
+                given.
         """
+        if max_episode_steps not in (None, -1):
+            raise ValueError(
+                f"max_episode_steps: {max_episode_steps}, should be left out: the task ends with the "
+                "scene's steps. For shorter tasks give scene.replace(simulation={'steps': ...}); to cut "
+                "episodes off, vectorization_mode='sync'"
+            )
         picture = width, height, default_camera_config
         PicklesEpisodes.__init__(self, num_envs, scene, autoreset_mode, render_mode, threads, *picture)
         if num_envs < 1:
@@ -186,7 +197,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             result.observation[others] = self._seen[others]
         result.report[:, others], result.flags[:, others] = 0.0, False
         self._remember(result.observation)
-        return result.observation, self._info(result, mask)
+        return result.observation, self._info(result, mask) | self._drawn(rows)
 
     def _remember(self, observations: Array) -> None:
         """Keep observations for resets of some sub-environments, which return the others' last ones."""
@@ -282,7 +293,9 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         self._extend_trails()
         info = self._info(result, self._all)
         if final is not None:
-            info |= final
+            info |= final | self._drawn(rows)
+        elif len(resetting):
+            info |= self._drawn(resetting)
         return result.observation, rewards, terminated, np.zeros(self.num_envs, dtype=np.bool_), info
 
     def perturb(self, increments: ArrayLike) -> None:
@@ -471,6 +484,19 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             "_final_obs": ended,
             "final_info": self._info(last, ended),
             "_final_info": ended.copy(),
+        }
+
+    def _drawn(self, rows: Rows) -> dict[str, Any]:
+        """Entry of `info` on parameters of episodes that have just begun; none where nothing varies."""
+        if not self.kernels.n_p:
+            return {}
+        mask = np.zeros(self.num_envs, dtype=np.bool_)
+        mask[rows] = True
+        columns = np.where(mask, self._envs.parameters.T, 0.0).astype(np.float64)
+        values: dict[str, Any] = dict(zip(self.kernels.parameters.names, columns, strict=True))
+        return {
+            "parameters": values | {f"_{name}": mask.copy() for name in values},
+            "_parameters": mask,
         }
 
     def _info(self, result: StepResult, mask: Mask) -> dict[str, Any]:

@@ -1,74 +1,88 @@
-"""PPO in five minutes: train an agent on the paper's maneuver from scratch and watch its learning curve.
+"""PPO of Stable-Baselines3 on the paper's maneuver: the wrappers that make it learn, and the trained policy.
 
-Trains the shipped configuration `ppo` for as many minutes as you allow. It holds each action for 0.3 s and
-scales actions and rewards; without that, PPO learns next to nothing here. At intervals the agent flies
-validation starts without noise; that curve is printed and plotted. Needs the extra `agents`. Re-run the
-command to resume an interrupted run; another --out starts afresh.
-Expect: one in ten episodes succeeds after 5 million steps, and 82 to 95 % after all 60 million (three seeds,
-4 to 6 minutes on one core).
+Left alone, PPO learns next to nothing here. It learns with actions held for 0.3 s, gentle thrusters and base
+torques, and rewards that grow like errors, not their squares: three wrappers. Needs the extra `agents`. The
+output folder receives model.zip and vecnormalize.pkl, as Stable-Baselines3 saves them, and policy.npz, which
+flies with NumPy alone.
+Expect: in a minute on one core (4 million steps) the median errors at the end fall from 106 deg and 1.9 m to
+6 deg and 0.35 m, and the median cost from 72,000 to 2,200; the optimum is 1,422 from the nominal start.
+`dq-space-arm train ppo` trains longer, with an adaptive step size, and succeeds in 9 of 10 episodes.
 
-    python scripts/examples/train_ppo.py [--minutes 5] [--out results/examples/ppo]
+    python scripts/examples/train_ppo.py [--steps 4000000] [--out results/examples/ppo]
 """
 
 import argparse
-import json
-from importlib.util import find_spec
 from pathlib import Path
+from time import perf_counter
 
-from rich.console import Console
+import gymnasium
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RescaleAction
+from stable_baselines3 import PPO
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecNormalize
 
-from agents import train
-from agents.configuration import load_configuration
-from dq_space_arm_env.common.progress import ProgressDisplay
+import dq_space_arm_env  # registers the environments
+from agents import SB3VecEnv, evaluate, export_policy
+from agents.wrappers.vector import RepeatAction, ShapeReward, ShrinkActionSpace
 
-MILLION = 1_000_000
+REPEAT = 20
+"""Time steps for which an action is held: 0.3 s in scene `paper`."""
+
+
+def make_environment(scene: str, copies: int) -> VecNormalize:
+    """Make the training environment."""
+    env = gymnasium.make_vec(
+        "DQSpaceArm-v0", num_envs=copies, scene=scene, autoreset_mode=AutoresetMode.SAME_STEP
+    )
+    env = RepeatAction(env, REPEAT)
+    env = ShrinkActionSpace(env, {"base_force": 0.003, "base_torque": 0.05})
+    env = RescaleAction(env, -1, 1)
+    env = ShapeReward(env, scale=0.005, power=0.5, success_reward=0.5)
+    return VecNormalize(SB3VecEnv(env), norm_reward=False)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the example."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--minutes", type=float, default=5.0)
-    parser.add_argument("--steps", type=int, default=60 * MILLION, help="maximum number of environment steps")
+    parser.add_argument("--steps", type=int, default=4_000_000, help="environment steps of all copies")
     parser.add_argument("--scene", default="paper")
+    parser.add_argument("--copies", type=int, default=128)
+    parser.add_argument("--starts", type=int, default=100, help="evaluation starts")
     parser.add_argument("--out", type=Path, default=Path("results/examples/ppo"))
     options = parser.parse_args(arguments)
 
-    settings = load_configuration("ppo").model_dump()
-    settings["scene"] = options.scene
-    settings["schedule"] |= {
-        "total_steps": options.steps,
-        "minutes": options.minutes,
-        "evaluate_every": max(options.steps // 12, 1),
-        "evaluation_episodes": 256,
-    }
-    with ProgressDisplay(Console(stderr=True)) as shown:
-        train(settings, options.out, report=shown.update)
-
-    lines = (options.out / "evaluations.jsonl").read_text(encoding="utf-8").splitlines()
-    curve = [json.loads(line) for line in lines]
-    print(
-        f"{'steps':>12} {'seconds':>8} {'success':>8} {'attitude, deg':>14} {'position, m':>12}   (medians)"
+    environment = make_environment(options.scene, options.copies)
+    decisions = dq_space_arm_env.load_scene(options.scene).simulation.steps // REPEAT
+    model = PPO(
+        "MlpPolicy",
+        environment,
+        learning_rate=LinearSchedule(1e-3, 5e-5, 1.0),
+        n_steps=decisions,  # a whole episode of each copy
+        batch_size=min(1600, options.copies * decisions),
+        n_epochs=10,
+        gamma=0.98,
+        policy_kwargs={"net_arch": [128, 128], "log_std_init": -1.0},
+        seed=0,
+        device="cpu",
     )
-    for point in curve:
-        errors = f"{point['attitude_error']:14.2f} {point['position_error']:12.3f}"
-        row = (
-            f"{point['environment_steps']:12,} {point['seconds']:8.0f} {point['success_rate']:8.0%} {errors}"
-        )
-        print(row)
-    print(f"watch the agent: dq-space-arm evaluate show {options.out} --gif agent.gif")
+    untrained = evaluate(model, options.scene, options.starts, expert=False)
+    started = perf_counter()
+    model.learn(options.steps // REPEAT)
+    print(f"trained for {perf_counter() - started:.0f} s")
 
-    if find_spec("matplotlib") is None:
-        print('no picture: it needs matplotlib (pip install "dq-space-arm[plots]")')
-        return
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
-    names = {"success_rate": "success rate", "position_error": "median position error, m"}
-    for axes, (key, label) in zip(figure.subplots(1, 2), names.items(), strict=True):
-        axes.plot([p["environment_steps"] / MILLION for p in curve], [p[key] for p in curve], marker="o")
-        axes.set(xlabel="million environment steps", ylabel=label, ylim=(0, None))
-    figure.savefig(options.out / "train_ppo.png", dpi=120)
-    print(f"picture: {options.out / 'train_ppo.png'}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    model.save(options.out / "model.zip")
+    environment.save(str(options.out / "vecnormalize.pkl"))
+    policy = export_policy(model, {"agent": "ppo example", "scene": options.scene})
+    policy.save(options.out / "policy.npz")
+    trained = evaluate(policy, options.scene, options.starts, expert=False)
+    print(f"{'':>10} {'success':>8} {'attitude, deg':>14} {'position, m':>12} {'cost':>10}   (medians)")
+    for name, found in (("untrained", untrained), ("trained", trained)):
+        row = found.summary()
+        errors = f"{row['attitude_error']:14.2f} {row['position_error']:12.3f} {row['median_cost']:10.0f}"
+        print(f"{name:>10} {row['success_rate'][0]:8.0%} {errors}")
+    print(f"watch the agent: dq-space-arm evaluate show {options.out / 'policy.npz'} --gif agent.gif")
 
 
 if __name__ == "__main__":

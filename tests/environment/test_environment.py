@@ -9,6 +9,7 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from short_scenes import diverging, short
@@ -284,3 +285,16 @@ def test_scenes_that_have_no_normalized_actions_are_refused():
         make(scene.replace(actuators=Actuators()))
     with pytest.raises(ValueError, match="render_mode: 'ansi' is unknown"):
         dq_space_arm_env.DQSpaceArmEnv(render_mode="ansi")
+
+
+@pytest.mark.parametrize("kind", ["name", "path", "mapping", "scene"])
+@pytest.mark.parametrize("name", ["DQSpaceArm-v0", "DQSpaceArmGoal-v0"])
+def test_environments_are_made_again_from_their_specification_as_json(name, kind, tmp_path):
+    scene = load_scene("planar").replace(simulation={"steps": 7})
+    file = tmp_path / "short.yaml"
+    file.write_text(scene.to_yaml(), encoding="utf-8")
+    given = {"name": "planar", "path": file, "mapping": scene.model_dump(mode="json"), "scene": scene}[kind]
+    env = gymnasium.make(name, scene=given)
+    again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.scene == env.unwrapped.scene
+    assert gymnasium.make_vec("DQSpaceArm-v0", 2, scene=given).spec.to_json()

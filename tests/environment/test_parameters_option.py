@@ -107,3 +107,15 @@ def test_parameters_that_no_scene_may_have_are_refused(scene, name, parameters, 
         env.reset(options={"parameters": parameters})
     assert isinstance(caught.value, SceneError) == ("mass = " in message or message == "target")
     np.testing.assert_array_equal(env.state, before["x"])
+
+
+def test_what_is_drawn_is_told_by_name_at_reset():
+    env = gymnasium.make("DQSpaceArm-v0", scene="random-masses")
+    _, info = env.reset(seed=4)
+    inside = env.unwrapped
+    assert info["parameters"] == dict(
+        zip(inside.kernels.parameters.names, inside.parameters.tolist(), strict=True)
+    )
+    assert len(set(info["parameters"])) == inside.kernels.n_p > 0
+    assert "parameters" not in env.step(env.action_space.sample())[4]
+    assert "parameters" not in gymnasium.make("DQSpaceArm-v0", scene="paper").reset(seed=4)[1]

@@ -239,6 +239,19 @@ def test_bad_construction_is_refused():
         DQSpaceArmVectorEnv(2).step(np.zeros((2, 12)))
 
 
+def test_episodes_are_cut_off_by_single_environments_alone():
+    with pytest.raises(
+        ValueError, match=r"max_episode_steps: 3, should be left out.*vectorization_mode='sync'"
+    ):
+        gymnasium.make_vec("DQSpaceArm-v0", 2, scene=short(), max_episode_steps=3)
+    cut = gymnasium.make_vec(
+        "DQSpaceArm-v0", 2, scene=short(), max_episode_steps=3, vectorization_mode="sync"
+    )
+    cut.reset(seed=0)
+    ends = [cut.step(np.zeros((2, 12), dtype=np.float32))[3].all() for _ in range(3)]
+    assert ends == [False, False, True]
+
+
 def test_the_final_info_of_copies_that_go_on_is_zero():
     venv = gymnasium.make_vec("DQSpaceArm-v0", 2, scene=short(), autoreset_mode=AutoresetMode.SAME_STEP)
     venv.reset(seed=0)

@@ -8,11 +8,12 @@ pytest.importorskip("sb3_contrib")
 
 import torch
 
-from agents import DQSpaceArmVecEnv, ExportedPolicy
+from agents import ExportedPolicy
 from agents.configuration import load_configuration
 from agents.reinforcement.checkpoint import read_checkpoint
 from agents.reinforcement.reinforcement_training import make_environment, make_learner
 from agents.reinforcement.sac import DemonstrationBuffer, LayerNormalizedCritic
+from agents.reinforcement.training_environment import native_environment
 from agents.reinforcement.warm_start import fly_again
 from agents.run_folder import RunFolder
 from agents.training import train
@@ -48,8 +49,7 @@ def configuration(demonstrations, small_file, total_steps=1200, cloning_weight=0
 @pytest.fixture(scope="module")
 def flown(demonstrations, small_scene, small_file):
     """All demonstrations, flown again."""
-    environment = make_environment(configuration(demonstrations, small_file), small_scene)
-    return fly_again(demonstrations, small_scene, environment)
+    return fly_again(demonstrations, configuration(demonstrations, small_file), small_scene)
 
 
 @pytest.fixture(scope="module")
@@ -59,20 +59,20 @@ def trained(demonstrations, small_file, tmp_path_factory):
 
 def test_a_demonstration_is_flown_again_to_its_own_target(drawn, small_file):
     settings = configuration(drawn, small_file, action_repeat=1)
-    flown = fly_again(drawn, drawn.scene, make_environment(settings, drawn.scene))
+    flown = fly_again(drawn, settings, drawn.scene)
     returns = flown.rewards.reshape(len(drawn), -1).sum(axis=1, dtype=np.float64) / 0.01
     np.testing.assert_allclose(returns, -drawn.column("cost"), rtol=1e-5)
 
 
 def test_a_demonstration_flown_again_is_what_the_environment_does(demonstrations, small_scene, small_file):
-    environment = make_environment(configuration(demonstrations, small_file), small_scene)
-    flown = fly_again(demonstrations[:4], small_scene, environment)
+    settings = configuration(demonstrations, small_file)
+    flown = fly_again(demonstrations[:4], settings, small_scene)
     assert len(flown.actions) == 4 * DECISIONS
     np.testing.assert_array_equal(np.flatnonzero(flown.done) % DECISIONS, DECISIONS - 1)
     # The same actions in the agent's environment, one flight after the other.
-    alone = environment.around(DQSpaceArmVecEnv(1, small_scene))
+    alone = native_environment(settings, small_scene, 1)
     for flight in range(4):
-        alone.venv.set_options({"initial_state": demonstrations[flight].states[0]})
+        alone.set_options({"initial_state": demonstrations[flight].states[0]})
         observation = alone.reset()
         for row in range(flight * DECISIONS, (flight + 1) * DECISIONS):
             np.testing.assert_array_equal(flown.observations[row], observation[0])
@@ -90,7 +90,7 @@ def test_actions_too_small_to_succeed_are_named(demonstrations, small_scene, sma
     weak = {"base_torque": 0.001, "joint_torque": 0.001, "base_force": 0.001}
     settings = configuration(demonstrations, small_file, action_scale=weak)
     with pytest.raises(DemonstrationsError, match=r"none of the 2 demonstrations .*raise environment"):
-        fly_again(demonstrations[:2], small_scene, make_environment(settings, small_scene))
+        fly_again(demonstrations[:2], settings, small_scene)
 
 
 def test_batches_end_with_demonstrated_decisions(trained, flown):

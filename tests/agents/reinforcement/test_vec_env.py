@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 pytest.importorskip("stable_baselines3")
 
@@ -15,7 +16,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from agents import DQSpaceArmVecEnv
+from agents import DQSpaceArmVecEnv, SB3VecEnv
+from agents.wrappers import RepeatAction, ShapeReward, ShrinkActionSpace, vector
 from dq_space_arm_env import load_scene
 
 pytestmark = pytest.mark.agents
@@ -97,6 +99,80 @@ def test_steps_are_those_of_monitored_single_environments(scene, steps):
     expected_ends = {(STEPS, False)} if scene is SHORT else {(5, True), (6, True), (7, True), (7, False)}
     assert set(ended) == expected_ends
     assert len(ended) >= 15
+
+
+def same_step(scene, *wrap, **options):
+    env = gymnasium.make_vec("DQSpaceArm-v0", 5, scene=scene, autoreset_mode=AutoresetMode.SAME_STEP)
+    for each in wrap:
+        env = each(env)
+    return SB3VecEnv(env, **options)
+
+
+@pytest.mark.parametrize("step_infos", [False, True])
+def test_wrapped_copies_are_those_of_wrapped_single_environments(step_infos):
+    """Decisions that their episodes end early, with shaped rewards; statistics are the environment's."""
+    scale, shape = {"joint_torque": 0.5}, {"scale": 0.1, "power": 0.5, "success_reward": 1.0}
+
+    def single():
+        env = RepeatAction(Monitor(gymnasium.make("DQSpaceArm-v0", scene=DIVERGING)), 3)
+        return ShapeReward(ShrinkActionSpace(env, scale), **shape)
+
+    native = same_step(
+        DIVERGING,
+        lambda env: vector.RepeatAction(env, 3),
+        lambda env: vector.ShapeReward(vector.ShrinkActionSpace(env, scale), **shape),
+        step_infos=step_infos,
+    )
+    singles = DummyVecEnv([single] * 5)
+    assert native.action_space == singles.action_space
+    assert native.seed(7) == singles.seed(7)
+    np.testing.assert_array_equal(native.reset(), singles.reset().astype(np.float32))
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(12):
+        actions = rng.uniform(-1.0, 1.0, (5, 12)).astype(np.float32)
+        observations, rewards, dones, infos = native.step(actions)
+        expected = singles.step(actions)
+        np.testing.assert_array_equal(observations, expected[0].astype(np.float32))
+        np.testing.assert_array_equal(rewards, expected[1])
+        np.testing.assert_array_equal(dones, expected[2])
+        ends += dones.sum()
+        for done, info, expected_info in zip(dones, infos, expected[3], strict=True):
+            if done or step_infos:
+                assert_same_infos(info, expected_info)
+            else:
+                assert info == {}
+    assert ends >= 15
+
+
+def test_any_vector_environment_is_adapted_time_limits_included():
+    def single():
+        return gymnasium.make("DQSpaceArmGoal-v0", scene=SHORT)
+
+    adapted = SB3VecEnv(SyncVectorEnv([single] * 2, autoreset_mode=AutoresetMode.SAME_STEP), seed=3)
+    singles = DummyVecEnv([lambda: Monitor(single()) for _ in range(2)])
+    singles.seed(3)
+    first = adapted.reset()
+    assert {part.dtype for part in first.values()} == {np.dtype(np.float32)}
+    for name, part in singles.reset().items():
+        np.testing.assert_array_equal(first[name], part.astype(np.float32))
+    for _ in range(STEPS):
+        observations, _, dones, infos = adapted.step(np.zeros((2, 12)))
+        expected = singles.step(np.zeros((2, 12)))
+    assert dones.all()
+    for name, part in expected[0].items():
+        np.testing.assert_array_equal(observations[name], part.astype(np.float32))
+    for info, other in zip(infos, expected[3], strict=True):
+        assert info["TimeLimit.truncated"]
+        assert other["TimeLimit.truncated"]
+        assert info["episode"]["l"] == STEPS
+        last = other["terminal_observation"]
+        for name, part in info["terminal_observation"].items():
+            np.testing.assert_array_equal(part, last[name].astype(np.float32))
+
+
+def test_vector_environments_that_reset_at_the_next_step_are_refused():
+    with pytest.raises(ValueError, match=r"autoreset mode AutoresetMode.NEXT_STEP, should be .*SAME_STEP"):
+        SB3VecEnv(gymnasium.make_vec("DQSpaceArm-v0", 2, scene=SHORT))
 
 
 def test_what_is_returned_is_the_callers():

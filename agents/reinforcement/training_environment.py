@@ -1,0 +1,80 @@
+"""The environment of a configuration: wrapped native copies, or goal environments for hindsight."""
+
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.wrappers.vector import TransformReward
+from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from agents import configuration as c
+from agents import wrappers
+from agents.vec_env import SB3VecEnv
+from agents.wrappers import vector
+from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
+
+
+def make_environment(configuration: c.Configuration, scene: Scene) -> VecEnv:
+    """Make the training environment, with held actions and shaped rewards."""
+    _check_lengths(configuration, scene)
+    practice, hindsight = configuration.environment, configuration.hindsight
+    if hindsight is None:
+        return native_environment(configuration, scene, practice.copies)
+    reward_type = hindsight.reward_type
+
+    def make() -> gymnasium.Env[Any, Any]:
+        goal = Monitor(gymnasium.make("DQSpaceArmGoal-v0", scene=scene, reward_type=reward_type))
+        held = wrappers.RepeatAction(goal, practice.action_repeat, reward="last")
+        return wrappers.ShrinkActionSpace(held, dict(practice.action_scale))
+
+    return DummyVecEnv([make] * practice.copies)
+
+
+def native_environment(configuration: c.Configuration, scene: Scene, copies: int) -> SB3VecEnv:
+    """Make native copies that practice what the configuration says."""
+    practice = configuration.environment
+    native = DQSpaceArmVectorEnv(copies, scene, autoreset_mode=AutoresetMode.SAME_STEP)
+    held = held_environment(native, practice.action_repeat)
+    shaped = vector.ShapeReward(
+        vector.ShrinkActionSpace(held, dict(practice.action_scale)),
+        practice.reward_scale,
+        practice.cost_power,
+        success_reward=practice.success_reward,
+        end_error_cost=practice.end_error_cost,
+    )
+    return SB3VecEnv(shaped)
+
+
+def held_environment(env: VectorEnv[Any, Any, Any], repeat: int) -> vector.RepeatAction:
+    """Hold the actions of an environment, and round its rewards to single precision.
+
+    Policies of the zoo were trained with such rewards: their weights can be reproduced.
+    """
+    return vector.RepeatAction(TransformReward(env, np.float32), repeat)
+
+
+def action_limits(venv: VecEnv) -> NDArray[np.float32]:
+    """Upper bounds of the actions, shape (n_u,)."""
+    return np.asarray(cast(spaces.Box, venv.action_space).high, dtype=np.float32)
+
+
+def _check_lengths(configuration: c.Configuration, scene: Scene) -> None:
+    practice, steps = configuration.environment, scene.simulation.steps
+    if practice.action_repeat > steps:
+        raise c.ConfigurationError(
+            f"environment.action_repeat = {practice.action_repeat}: must be at most {steps}, the steps of an "
+            f"episode of scene {scene.name!r}"
+        )
+    algorithm = configuration.algorithm
+    if not isinstance(algorithm, c.OffPolicy) or algorithm.hindsight is None:
+        return
+    episodes = practice.copies * configuration.decisions(steps)
+    if algorithm.learning_starts < episodes:
+        raise c.ConfigurationError(
+            f"algorithm.learning_starts = {algorithm.learning_starts}: must be at least {episodes}, one "
+            "episode of each copy; there is no hindsight before that"
+        )

@@ -1,0 +1,144 @@
+"""Statistics of observations that `VecNormalize` of Stable-Baselines3 saves beside a model."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.policies import ExportedPolicy
+from agents.policies.pickled_arrays import Inert, PickledError, as_array, read_pickled
+from dq_space_arm_env.common.bounded_reading import UnreadableError, read_bytes
+
+_MOST_BYTES = 1 << 24
+_VEC_NORMALIZE = "stable_baselines3.common.vec_env.vec_normalize.VecNormalize"
+
+
+class StatisticsError(ValueError):
+    """A file holds no statistics of `VecNormalize`, or they do not fit a policy."""
+
+
+class ObservationStatistics(NamedTuple):
+    """What a policy sees: clip((observation - mean) scale, -limit, limit)."""
+
+    mean: NDArray[np.float64]  # (n_obs,), units of the observation
+    scale: NDArray[np.float64]  # (n_obs,), one over these units
+    limit: float
+
+    def normalize(self, observations: Any) -> Any:
+        """Normalize observations, shape (B, n_obs), or arrays by name whose parts the statistics join."""
+        if not isinstance(observations, Mapping):
+            return np.clip((observations - self.mean) * self.scale, -self.limit, self.limit).astype(
+                np.float32
+            )
+        names = sorted(observations)
+        sizes = np.cumsum([observations[name].shape[-1] for name in names])[:-1]
+        joined = self.normalize(np.concatenate([observations[name] for name in names], axis=-1))
+        return dict(zip(names, np.split(joined, sizes, axis=-1), strict=True))
+
+    def of(self, policy: ExportedPolicy) -> ExportedPolicy:
+        """The policy of raw observations, from one that sees normalized ones."""
+        if self.mean.shape != policy.mean.shape:
+            raise StatisticsError(
+                f"statistics of {self.mean.size} observations, should be {policy.mean.size}, those of the "
+                "policy"
+            )
+        if policy.mean.any() or (policy.scale != 1.0).any():
+            raise StatisticsError("statistics for a policy that has units of observations already")
+        return dataclasses.replace(policy, mean=self.mean, scale=self.scale, normalized_limit=self.limit)
+
+
+def read_statistics(path: str | Path) -> ObservationStatistics | None:
+    """Read a file that `VecNormalize.save` wrote; nothing in it is executed.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its statistics; None if it normalizes rewards alone.
+
+    Raises:
+        StatisticsError: If the file holds something else.
+    """
+    try:
+        saved = read_pickled(read_bytes(path, _MOST_BYTES))
+        if not isinstance(saved, Inert) or saved.name != _VEC_NORMALIZE or not isinstance(saved.state, dict):
+            raise StatisticsError(f"{path} is no VecNormalize of Stable-Baselines3, saved by its save()")
+        return _statistics(saved.state)
+    except UnreadableError as error:
+        raise StatisticsError(str(error)) from error
+    except PickledError as error:
+        raise StatisticsError(f"{path} is no VecNormalize of Stable-Baselines3 ({error})") from error
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, StatisticsError):
+            raise
+        raise StatisticsError(f"{path} is damaged: it has no {error}") from error
+
+
+def statistics_of(normalizer: Any) -> ObservationStatistics | None:
+    """Statistics of a `VecNormalize`; None if it is none, or normalizes rewards alone."""
+    return None if normalizer is None else _statistics(vars(normalizer))
+
+
+def _statistics(state: Mapping[str, Any]) -> ObservationStatistics | None:
+    """Statistics from the attributes of a `VecNormalize`."""
+    if not state["norm_obs"]:
+        return None
+    moments, epsilon, limit = state["obs_rms"], float(state["epsilon"]), float(state["clip_obs"])
+    if isinstance(moments, dict):
+        _check_keys(state, moments)
+    parts = [moments[name] for name in sorted(moments)] if isinstance(moments, dict) else [moments]
+    mean, variance = (np.concatenate([_moment(part, name) for part in parts]) for name in ("mean", "var"))
+    if not (np.isfinite(mean).all() and (variance >= 0.0).all() and epsilon > 0.0 and limit > 0.0):
+        raise StatisticsError("statistics of VecNormalize that are not finite, or negative")
+    return ObservationStatistics(mean, 1.0 / np.sqrt(variance + epsilon), limit)
+
+
+def _check_keys(state: Mapping[str, Any], moments: Mapping[str, Any]) -> None:
+    """Refuse statistics of some parts of observations alone."""
+    space = state["observation_space"]
+    whole = space.state["spaces"] if isinstance(space, Inert) else space.spaces
+    if set(moments) != set(whole):
+        missing = ", ".join(sorted(set(whole) - set(moments)))
+        raise StatisticsError(f"statistics of all parts of observations but {missing}, should be of all")
+
+
+def _moment(part: Any, name: str) -> NDArray[np.float64]:
+    """Mean or variance of a `RunningMeanStd`, shape (n,)."""
+    if isinstance(part, Inert):
+        array = as_array(part.state[name])
+        if array is None:
+            raise StatisticsError(f"statistics whose {name} is no array of floats")
+    else:
+        array = np.asarray(getattr(part, name), dtype=np.float64)
+    return array.reshape(-1)
+
+
+def are_missing(observation: Any, space: Mapping[str, Any]) -> bool:
+    """Whether a model's last observation, pickled, was normalized: its unit quaternion has another length.
+
+    Args:
+        observation: What `read_pickled` found, an array or arrays by name.
+        space: The observation space as a model's file describes it.
+
+    Returns:
+        True also where that cannot be told.
+    """
+    if isinstance(observation, dict):
+        seen, length = as_array(observation.get("achieved_goal")), 4
+    else:
+        bounds = [float(number) for number in str(space.get("high", "")).strip("[]").split()[:4]]
+        units = [math.isclose(bound, 1.0 + 1e-5, abs_tol=1e-7) for bound in bounds]
+        seen, length = (
+            as_array(observation),
+            next((i for i, unit in enumerate(units) if not unit), len(units)),
+        )
+    if seen is None or not length or not seen.size:
+        return True
+    sizes = np.linalg.norm(seen[..., :length], axis=-1)
+    return bool((np.abs(sizes - 1.0) > 1e-3).any())

@@ -1,0 +1,171 @@
+"""Models trained in VecNormalize, or with rescaled actions, fly as they were trained, or are refused."""
+
+import pickle
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RescaleAction, TransformAction
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import VecNormalize
+
+from agents import DQSpaceArmVecEnv, SB3VecEnv, evaluate, export_policy
+from agents.policies.pickled_arrays import as_array, read_pickled
+from agents.wrappers.vector import ShrinkActionSpace
+from agents.zoo.finding import PolicyError, as_policy
+from dq_space_arm_env.command_line import main
+
+pytestmark = pytest.mark.agents
+
+SMALL = {"net_arch": [16, 16]}
+
+
+def trained(environment, kind=PPO, **options):
+    """A model after some steps, with a policy that tells observations apart."""
+    options |= {"n_steps": 8, "batch_size": 8} if kind is PPO else {"buffer_size": 100, "learning_starts": 4}
+    model = kind("MlpPolicy", environment, seed=0, device="cpu", policy_kwargs=dict(SMALL), **options)
+    return model.learn(16)
+
+
+@pytest.fixture(scope="module")
+def normalized(small_scene, tmp_path_factory):
+    """A model in memory, its file, and that of its statistics."""
+    folder = tmp_path_factory.mktemp("normalized")
+    environment = VecNormalize(DQSpaceArmVecEnv(2, small_scene), clip_obs=3.0)
+    model = trained(environment)
+    model.save(folder / "model.zip")
+    environment.save(folder / "vecnormalize.pkl")
+    return model, folder / "model.zip", folder / "vecnormalize.pkl"
+
+
+def observations(scene):
+    env = gymnasium.make_vec("DQSpaceArm-v0", 50, scene=scene)
+    env.reset(seed=3)
+    env.action_space.seed(0)
+    return np.concatenate([env.step(env.action_space.sample())[0] for _ in range(4)])
+
+
+def test_every_way_to_fly_a_normalized_model_normalizes(normalized, small_scene):
+    model, file, statistics = normalized
+    seen = observations(small_scene)
+    environment = model.get_vec_normalize_env()
+    expected = model.predict(environment.normalize_obs(seen.astype(np.float32)), deterministic=True)[0]
+    raw = np.clip(model.predict(seen, deterministic=True)[0], -1.0, 1.0)
+    assert np.abs(raw - expected).max() > 0.01
+    for acting in (as_policy(model), as_policy(export_policy(model)), as_policy(file, normalize=statistics)):
+        np.testing.assert_allclose(acting.act(seen), expected, rtol=0.0, atol=2e-6)
+
+
+def test_a_normalized_model_is_refused_without_its_statistics(normalized, small_file, tmp_path, capsys):
+    _, file, statistics = normalized
+    with pytest.raises(PolicyError, match=r"normalized by VecNormalize.*normalize=FILE"):
+        evaluate(file, small_file, 2, expert=False)
+    words = ["evaluate", str(file), "--scene", str(small_file), "-n", "2", "--no-expert"]
+    assert main(words) == 2
+    assert "--normalize FILE" in capsys.readouterr().err
+    assert main(["simulate", str(small_file), "--policy", str(file)]) == 2
+    assert main([*words, "--normalize", str(statistics)]) == 0
+    assert main([*words, str(file), "--normalize", str(statistics)]) == 2
+    assert "belongs to one model (.zip), and there are 2" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", [PPO, SAC])
+def test_a_model_whose_rewards_alone_are_normalized_flies(kind, small_scene, tmp_path):
+    environment = VecNormalize(DQSpaceArmVecEnv(2, small_scene), norm_obs=False)
+    model = trained(environment, kind)
+    model.save(tmp_path / "model.zip")
+    environment.save(tmp_path / "statistics.pkl")
+    seen = observations(small_scene)
+    expected = as_policy(model).act(seen)
+    for options in ({}, {"normalize": tmp_path / "statistics.pkl"}):
+        acting = as_policy(tmp_path / "model.zip", **options)
+        np.testing.assert_allclose(acting.act(seen), np.clip(expected, -1.0, 1.0), rtol=0.0, atol=2e-6)
+
+
+class Bomb:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "no VecNormalize"),
+        (b"\x80\x04N.", "no VecNormalize"),
+        (pickle.dumps({("a", "b"): 1}), "a key that is no text"),
+        (pickle.dumps(Path("a")), "no VecNormalize"),
+        (None, "no such file"),
+    ],
+)
+def test_other_files_are_no_statistics(content, message, normalized, tmp_path):
+    file = tmp_path / "statistics.pkl"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(PolicyError, match=f"normalize: .*{message}"):
+        as_policy(normalized[1], normalize=file)
+
+
+def test_statistics_execute_nothing(normalized, tmp_path):
+    _, file, statistics = normalized
+    saved = pickle.loads(statistics.read_bytes())
+    saved.venv = saved.class_attributes = saved.returns = None
+    saved.clip_obs = Bomb(tmp_path / "executed")
+    (tmp_path / "armed.pkl").write_bytes(pickle.dumps(saved))
+    with pytest.raises(PolicyError, match="normalize"):
+        as_policy(file, normalize=tmp_path / "armed.pkl")
+    assert not (tmp_path / "executed").exists()
+
+
+def test_statistics_of_another_scene_are_refused(normalized, tmp_path):
+    environment = VecNormalize(DQSpaceArmVecEnv(1, "paper"))
+    environment.save(tmp_path / "statistics.pkl")
+    with pytest.raises(PolicyError, match="statistics of 24 observations, should be 14"):
+        as_policy(normalized[1], normalize=tmp_path / "statistics.pkl")
+
+
+@pytest.mark.parametrize("protocol", [3, 4, 5])
+def test_arrays_are_read_from_pickles(protocol):
+    for array in (np.arange(6.0).reshape(2, 3), np.arange(6, dtype=np.float32).reshape(2, 3).T, np.zeros(())):
+        found = as_array(read_pickled(pickle.dumps({"here": array}, protocol=protocol))["here"])
+        np.testing.assert_array_equal(found, array)
+    assert as_array(read_pickled(pickle.dumps(np.array([None])))) is None
+
+
+def wrapped(scene, *wrap):
+    environment = gymnasium.make_vec("DQSpaceArm-v0", 2, scene=scene, autoreset_mode=AutoresetMode.SAME_STEP)
+    for each in wrap:
+        environment = each(environment)
+    return SB3VecEnv(environment)
+
+
+@pytest.mark.parametrize("kind", [PPO, SAC])
+def test_rescaled_actions_fly_at_their_scale(kind, small_scene, tmp_path):
+    scale = {"base_force": 0.01, "base_torque": 0.1}
+    rescale = [lambda env: ShrinkActionSpace(env, scale), lambda env: RescaleAction(env, -1, 1)]
+    environment = wrapped(small_scene, *rescale)
+    model = trained(environment, kind)
+    model.save(tmp_path / "model.zip")
+    seen = observations(small_scene)
+    factors = environment.vector_env.env.single_action_space.high
+    expected = model.predict(seen.astype(np.float32), deterministic=True)[0] * factors
+    assert np.abs(expected).max() > 0.0
+    for way in (model, export_policy(model), tmp_path / "model.zip"):
+        np.testing.assert_allclose(as_policy(way).act(seen), expected, rtol=0.0, atol=2e-6)
+
+
+def test_actions_that_pass_unknown_wrappers_are_refused(small_scene, tmp_path):
+    environment = wrapped(small_scene, lambda env: TransformAction(env, np.square))
+    model = PPO("MlpPolicy", environment, device="cpu")
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(PolicyError, match="its actions pass 'TransformAction'"):
+        as_policy(model)
+    with pytest.raises(PolicyError, match="its actions pass 'TransformAction'"):
+        as_policy(tmp_path / "model.zip")
