@@ -136,6 +136,12 @@ class Target(Model):
         description="whether base_velocity is relative to a target that moves: at 0 the base moves along as "
         "if fixed to it",
     )
+    observed: bool = Field(
+        default=False,
+        exclude_if=lambda observed: not observed,
+        description="whether q_{D/I} is observed besides q_{D/G}: where the target varies, the cost with "
+        "pose_error: paper depends on it",
+    )
     geometry: tuple[Shape, ...] = geometry_field("only axes and the ghost of a hand")
 
 

@@ -244,6 +244,7 @@ class SceneEquations:
             *motion.previous_controls,
             *motion.drives,
             *([self.given[PHASE]] if self.scene.phases else []),
+            *(self.field.pose.reduced(self.target) if self.scene.target.observed else []),
             *besides,
             *twists,
             time_left,

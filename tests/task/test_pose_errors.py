@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dq_space_arm_env import load_scene
+from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import screw
 from dq_space_arm_env.compiler.graph import trace
 from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.task import episode
+from dq_space_arm_env.task.step_report import observation_entries
 from dq_space_arm_env.task.worst_case import WorstCase
 from experts.problems.paper_problem import PaperProblem
 
@@ -212,6 +213,38 @@ def test_goals_are_compared_as_the_cost_compares() -> None:
     ):
         found = interpreter.evaluate_graph(graph, [*pair], np.float64)[names.index("cost")]
         assert found[0] == pytest.approx(expected, rel=1e-12)
+
+
+def observed(scene: Scene, x: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    built = ScenePrograms(scene).build("observation")
+    inputs = {"x": x, "parameters": parameters, "time_left": np.array([1.0])}
+    return interpreter.evaluate_program(built, inputs)["observation"]
+
+
+@pytest.mark.parametrize("name", ["random-target", "planar", "tumbling-target", "capture-and-detumble"])
+def test_an_observed_target_tells_the_papers_cost(name: str) -> None:
+    """The cost follows from the observation, whose other entries stay; the new ones' derivative is zero."""
+    plain = load_scene(name)
+    scene, layout = plain.replace({"target.observed": True}), StateLayout.of(plain)
+    x, parameters = layout.initial_state.copy(), layout.parameters.nominal.copy()
+    entries = [entry for entry, _ in observation_entries(scene)]
+    where = [index for index, entry in enumerate(entries) if entry.startswith("target q_")]
+    seen, less = observed(scene, x, parameters), observed(plain, x, parameters)
+    np.testing.assert_array_equal(np.delete(seen, where), less)
+    target, error = (full(layout, seen[each]) for each in (where, slice(len(where))))
+    np.testing.assert_array_equal(target, layout.target_with(parameters))
+    tip = np.array(dq.multiply(tuple(target), dq.conjugate(tuple(error))))
+    programs = ScenePrograms(scene)
+    found = interpreter.evaluate_program(programs.build("tip_pose"), {"x": x, "parameters": parameters})[
+        "pose"
+    ]
+    np.testing.assert_allclose(tip, found, atol=1e-14)
+    built = programs.build("observation_jacobian")
+    jacobian = interpreter.evaluate_program(built, {"x": x, "parameters": parameters})["jacobian"]
+    assert not jacobian.reshape(len(entries), layout.n_t)[where].any()
+    assert plain.content_hash() != scene.content_hash()
+    assert "observed" not in plain.model_dump()["target"]
+    assert "pose_error" not in plain.model_dump()["cost"]
 
 
 def test_the_papers_formulation_refuses_the_relative_error() -> None:
