@@ -14,6 +14,7 @@ from agents.policies.flying import Policy
 from agents.zoo.model_archive import ModelArchiveError, NeedsCodeError, read_attributes, read_model
 from agents.zoo.shelf import ZooError, policy_file
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
+from dq_space_arm_env.environment.rollouts import StateFeedback
 
 POLICY_OF_A_RUN = "policy.npz"
 
@@ -26,8 +27,9 @@ class ActingPolicy(NamedTuple):
     """A policy ready to fly."""
 
     label: str  # its name in tables
-    act: Policy  # batches of observations -> actions; may have `begin(environment)`
-    act_once: Policy  # for timing single actions: takes an observation without a batch if it can, else `act`
+    act: Policy | StateFeedback  # batches -> actions, for `rollout`
+    # For timing single actions: takes an observation without a batch if it can, else `act`.
+    act_once: Policy | StateFeedback
     batched: bool  # whether `act_once` wants a batch nevertheless
     metadata: Mapping[str, Any]  # JSON values; empty if unknown
     sizes: tuple[int, int] | None = None  # entries of observations and actions, if known
@@ -61,7 +63,7 @@ def as_policy(policy: Any, label: str | None = None, *, trust: bool = False) -> 
         name = label or str(policy.metadata.get("agent", "exported policy"))
         sizes = policy.n_observation, policy.n_action
         if sees_goals(policy):
-            act = _OnGoals(policy, joined=True)
+            act = _on_goals(policy, joined=True)
             return ActingPolicy(name, act, act, True, policy.metadata, sizes)
         return ActingPolicy(name, policy, policy, False, policy.metadata, sizes)
     if callable(getattr(policy, "predict", None)):
@@ -126,14 +128,14 @@ def _label(policy: str | Path) -> str:
     return path.name if path.suffix != ".npz" else "/".join(path.parts[-2:])
 
 
-def _predictor(model: Any) -> Policy:
+def _predictor(model: Any) -> Policy | StateFeedback:
     """Deterministic actions of a model of Stable-Baselines3."""
 
     def act(observations: Any) -> NDArray[Any]:
         return np.asarray(model.predict(observations, deterministic=True)[0])
 
     if hasattr(getattr(model, "observation_space", None), "spaces"):
-        return _OnGoals(act, joined=False)
+        return _on_goals(act, joined=False)
 
     def act_in_single_precision(observations: NDArray[Any]) -> NDArray[Any]:
         return act(observations.astype(np.float32))  # as in training
@@ -141,27 +143,25 @@ def _predictor(model: Any) -> Policy:
     return act_in_single_precision
 
 
-class _OnGoals:
-    """A policy of the goal environment, flown in the ordinary one."""
+def _on_goals(act: Callable[[Any], NDArray[Any]], *, joined: bool) -> StateFeedback:
+    """A policy of the goal environment, flown in the ordinary one; it sees measured states, as others do."""
+    flown_in: list[DQSpaceArmVectorEnv] = []
 
-    def __init__(self, act: Callable[[Any], NDArray[Any]], *, joined: bool) -> None:
-        self._act, self._joined = act, joined
-        self._environment: DQSpaceArmVectorEnv | None = None
+    def begin(environment: DQSpaceArmVectorEnv) -> None:
+        flown_in[:] = [environment]
 
-    def begin(self, environment: DQSpaceArmVectorEnv) -> None:
-        self._environment = environment
-
-    def __call__(self, observations: NDArray[Any]) -> NDArray[Any]:
-        environment = self._environment
-        assert environment is not None
-        states, layout = environment.states, environment.kernels.layout
+    def act_on_states(states: NDArray[np.float64], step: int) -> NDArray[Any]:
+        (environment,) = flown_in
+        layout = environment.kernels.layout
         parts = {
             "achieved_goal": np.reshape(environment.kernels.tip_pose(states), (len(states), 8)),
             "desired_goal": environment.targets,
             "observation": layout.goal_observation(states, environment.stage_parameters),
         }
         single = {name: np.asarray(part, dtype=np.float32) for name, part in parts.items()}
-        return self._act(np.concatenate(list(single.values()), axis=1) if self._joined else single)
+        return act(np.concatenate(list(single.values()), axis=1) if joined else single)
+
+    return StateFeedback(act_on_states, begin)
 
 
 def read_policy(path: Path, *, trust: bool = False) -> Any:
