@@ -33,7 +33,7 @@ from dq_space_arm_env.common.files import remove_leftovers, temporary_name, writ
 from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.shown_text import shortened
-from dq_space_arm_env.environment.rollouts import Policy, rollout
+from dq_space_arm_env.environment.rollouts import Policy, StateFeedback, rollout
 from dq_space_arm_env.validation import dump_yaml
 from experts.demonstrations.settings import differences
 
@@ -155,7 +155,7 @@ def validation_seeds(episodes: int) -> list[int]:
     return [int(seed) for seed in np.random.SeedSequence(VALIDATION_SEED).generate_state(episodes)]
 
 
-def validate(policy: Policy, scene: Scene, seeds: Sequence[int]) -> dict[str, float]:
+def validate(policy: Policy | StateFeedback, scene: Scene, seeds: Sequence[int]) -> dict[str, float]:
     """Fly a policy for the learning curve: success rate, and medians of cost and final errors (deg, m)."""
     flights = rollout(policy, scene, seeds)
     return {

@@ -12,6 +12,7 @@ this record alone, so that it cannot go stale or be embellished. The record (`<n
 | `training_command` | the command that trains it |
 | `trained_here` | whether it was trained in the very scene it was evaluated in; null if unknown |
 | `evaluations` | a summary per condition, see `Evaluation.summary`, "training" first |
+| `elsewhere` | `scene`, `episodes` and `success_rate` in other scenes, if there are any (`--also`) |
 | `seeds`, `is_success` | the first flights of "training", one by one, which the tests repeat |
 | `versions`, `processor`, `date` | of the evaluation |
 """
@@ -48,6 +49,7 @@ from experts.demonstrations import DemonstrationsError
 from experts.demonstrations.executors import Executor
 
 REPEATED = 32  # flights whose seeds and results a record keeps
+_ELSEWHERE = ("scene", "episodes", "success_rate")
 _VERSIONS = ("dq-space-arm", "numpy", "python")
 
 
@@ -57,6 +59,7 @@ def add_to_zoo(
     *,
     conditions: Sequence[str] = CONDITIONS,
     n: int = EVALUATION_SEEDS,
+    also: Sequence[str] = (),
     training: str | None = None,
     shelf: Path = SHELF,
     workers: int | None = None,
@@ -65,8 +68,8 @@ def add_to_zoo(
 ) -> Path:
     """Evaluate a policy and put it into the zoo with its card, which is returned; replaces one of that name.
 
-    Condition "training" always comes first. `training` is the command that trains it, needed if it does not
-    follow from a shipped configuration.
+    Condition "training" always comes first; `also` are further scenes to fly it in. `training` is the
+    command that trains it, needed if it does not follow from a shipped configuration.
     """
     file = policy_path(run)
     policy, content = ExportedPolicy.load(file), file.read_bytes()
@@ -90,10 +93,13 @@ def add_to_zoo(
         )
         for condition in ordered
     ]
+    elsewhere = [evaluate(policy, other, n, label=chosen, expert=False).summary() for other in also]
     shelf.mkdir(parents=True, exist_ok=True)
     weights = shelf / f"{chosen}.npz"
     write_atomically(weights, content)  # as evaluated, even if the file changed since
     record = _record(scene, weights, command, evaluations)
+    told = [{key: summary[key] for key in _ELSEWHERE} for summary in elsewhere]
+    record |= {"elsewhere": _rounded(told)} if told else {}
     write_atomically(weights.with_suffix(".json"), json.dumps(record, indent=1, allow_nan=False) + "\n")
     write_atomically(weights.with_suffix(".md"), card(chosen, policy, record))
     return weights.with_suffix(".md")
@@ -206,6 +212,9 @@ _MEANINGS = {
     "light_payload": "last link or payload 30 % lighter",
     "heavy_payload": "last link or payload 30 % heavier",
     "spin": "base turning at the start",
+    "delay": "actions 0.15 s late",
+    "noise": "noise of 0.01 rad, m, rad/s, m/s on what is measured",
+    "push": "three pushes of 0.05 rad/s and 0.05 m/s",
 }
 
 
@@ -228,7 +237,7 @@ def card(name: str, policy: ExportedPolicy, record: Mapping[str, Any]) -> str:
         angle=f"{success['attitude_error_deg']:g}",
         distance=f"{success['position_error']:g}",
         again=f"dq-space-arm evaluate {name} --scene {record['scene']} -n {starts} --condition {conditions}",
-        limits="\n".join(f"- {sentence}" for sentence in _limits(record)),
+        limits="\n".join(f"- {sentence}" for sentence in _limits(name, record)),
     )
 
 
@@ -301,12 +310,19 @@ def _table(record: Mapping[str, Any]) -> TextTable:
     )
 
 
-def _limits(record: Mapping[str, Any]) -> Iterator[str]:
+_NOT_FLOWN = {"delay": "delays", "noise": "sensor noise", "push": "pushes"}
+
+
+def _limits(name: str, record: Mapping[str, Any]) -> Iterator[str]:
     """Limits that the evaluation shows."""
     yield (
-        f"It knows only the scene `{record['scene']}` and its target: another robot, time step or target is "
-        "another task."
+        f"It knows only the robot and the maneuver of scene `{record['scene']}`: another robot or time step "
+        "is another task. It sees the target relative to the tip alone: base and target may be "
+        "anywhere together."
     )
+    for summary in record.get("elsewhere", ()):
+        rate, command = _percent(summary["success_rate"]), f"dq-space-arm evaluate {name} --scene"
+        yield f"In scene `{summary['scene']}` {rate} % succeed: `{command} {summary['scene']}`."
     training = _first(record)["success_rate"][0]
     worst = min(record["evaluations"], key=lambda summary: summary["success_rate"][0])
     if worst["success_rate"][0] < training:
@@ -318,7 +334,10 @@ def _limits(record: Mapping[str, Any]) -> Iterator[str]:
     unknown = _first(record)["unknown_optima"]
     if unknown:
         yield f"The optimum is unknown for {unknown} starts, which have no cost gap."
-    yield "Delays, sensor noise and faults were not part of the evaluation."
+    flown = {summary["condition"] for summary in record["evaluations"]}
+    left_out = [what for condition, what in _NOT_FLOWN.items() if condition not in flown]
+    missing = f"{', '.join(left_out)} and faults" if left_out else "faults"
+    yield f"{missing.capitalize()} were not part of the evaluation."
     if record["trained_here"] is False:
         yield "It was trained in another version of the scene than the one it was evaluated in."
 
@@ -361,6 +380,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         choices=CONDITIONS,
         help="what to evaluate it under, besides training (default: all)",
     )
+    parser.add_argument("--also", nargs="+", default=[], metavar="SCENE", help="other scenes to fly it in")
     parser.add_argument(
         "-n", type=int, default=EVALUATION_SEEDS, help="number of evaluation starts (default: all 500)"
     )
@@ -380,6 +400,7 @@ def _run(options: argparse.Namespace) -> int:
                 options.run,
                 options.name,
                 conditions=options.condition,
+                also=options.also,
                 n=options.n,
                 training=options.training,
                 shelf=options.zoo,

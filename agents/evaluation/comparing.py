@@ -331,6 +331,8 @@ def _notes(controllers: Sequence[str], conditions: Sequence[str]) -> Iterator[st
     )
     if controllers and any(condition.endswith("payload") for condition in conditions):
         yield "Controllers plan with the payload of the unchanged scene: they do not know the new one."
+    if any(condition in conditions for condition in ("delay", "noise", "push")):
+        yield "J_expert is that of flights without delay, noise and pushes."
 
 
 def _commands(rows: Sequence[Row]) -> Iterator[str]:

@@ -1,13 +1,17 @@
-"""Evaluation conditions: the scene that agents are trained in, and variants they have not seen."""
+"""Evaluation conditions: the scene that agents are trained in, and variants they have not seen.
+
+Some change the scene, others disturb the flights in it.
+"""
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dq_space_arm_env import Scene
-from dq_space_arm_env.environment.disturbances import load_place
+from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances, load_place
 
 WIDER = 1.5
 """Factor of the spread of starts."""
@@ -15,6 +19,12 @@ PAYLOAD_CHANGE = 0.3
 """Share by which the payload is lighter or heavier."""
 SPIN = 0.05
 """Angular velocity of the base that is added about its z axis, rad/s: 43 degrees in the paper's 15 s."""
+DELAY = 0.15
+"""Time from an action to its effect, s."""
+NOISE = 0.01
+"""Standard deviation of the noise on every tangent coordinate, rad, m, rad/s, m/s."""
+PUSH, PUSHES = 0.05, 3
+"""Root mean square of the jumps of the base's velocities, rad/s, m/s; and their mean number."""
 
 _WIDENED = (
     "base_rotation",
@@ -37,7 +47,7 @@ def scene_under(scene: Scene, condition: str) -> Scene:
         condition: One of `CONDITIONS`: "training" changes nothing; "wide_starts" spreads starts 1.5 times as
             far; "light_payload" and "heavy_payload" change mass and inertia of the payload by 30 %, or, where
             there is no payload, as with the paper's massless wrist, of the last link; "spin" starts with a
-            turning base.
+            turning base; "delay", "noise" and "push" change nothing but the name, see `disturbance_under`.
 
     Returns:
         The scene to evaluate in.
@@ -56,6 +66,51 @@ def as_known(scene: Scene, condition: str) -> Scene:
     """The scene that a controller plans in: it measures its start, and does not know a changed payload."""
     flown = scene_under(scene, condition)
     return flown if condition in _MEASURED else scene
+
+
+class FlightDisturbance(NamedTuple):
+    """How a condition disturbs flights. The default: not at all."""
+
+    delay: float = 0.0  # from an action to its effect, s
+    noise: float = 0.0  # standard deviation of the measured state, rad, m, rad/s, m/s
+    push: float = 0.0  # standard deviation along each axis of the base's jumps in velocity, rad/s, m/s
+
+    def steps(self, scene: Scene) -> int:
+        """Whole time steps of the delay, at least 1 if there is any."""
+        return max(round(self.delay / scene.simulation.dt), 1) if self.delay else 0
+
+    def drawn(self, scene: Scene, flights: Sequence[int], of: int, seed: int) -> "Disturbances | None":
+        """Noise and pushes of some of many flights; those of a flight depend on its number alone."""
+        if not (self.noise or self.push):
+            return None
+        settings = {"measurement": self.noise or None, "push": self.push or None, "pushes": PUSHES}
+        return ChosenDisturbances(flights, scene, np.random.default_rng([seed, 1]), count=of, **settings)
+
+
+class ChosenDisturbances(Disturbances):
+    """Disturbances of some flights, equal to those that they meet among all flights.
+
+    Args:
+        flights: Their numbers.
+        scene: The scene.
+        rng: Source of random numbers.
+        settings: As of `Disturbances`, for all flights.
+    """
+
+    def __init__(
+        self, flights: Sequence[int], scene: Scene, rng: np.random.Generator, **settings: Any
+    ) -> None:
+        super().__init__(scene, rng, **settings)
+        self._flights = np.array(flights, dtype=np.int64)
+
+    def draw(self) -> Disturbance:
+        """Draw the disturbances of the next step."""
+        return Disturbance(*(None if part is None else part[self._flights] for part in super().draw()))
+
+
+def disturbance_under(condition: str) -> FlightDisturbance:
+    """Tell how a condition, one of `CONDITIONS`, disturbs flights."""
+    return _DISTURBANCES.get(condition, FlightDisturbance())
 
 
 def physics_hash(scene: Scene) -> str:
@@ -87,12 +142,18 @@ def _spin(scene: Scene) -> Scene:
     return scene.replace(initial_state={"base_velocity": velocity})
 
 
+_DISTURBANCES = {
+    "delay": FlightDisturbance(delay=DELAY),
+    "noise": FlightDisturbance(noise=NOISE),
+    "push": FlightDisturbance(push=PUSH / 3.0**0.5),
+}
 _CHANGES: Mapping[str, Callable[[Scene], Scene]] = {
     "training": lambda scene: scene,
     "wide_starts": _wide_starts,
     "light_payload": _with_load(1.0 - PAYLOAD_CHANGE),
     "heavy_payload": _with_load(1.0 + PAYLOAD_CHANGE),
     "spin": _spin,
+    **dict.fromkeys(_DISTURBANCES, lambda scene: scene),
 }
 CONDITIONS = tuple(_CHANGES)
 """Names of the conditions."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,12 +12,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluation.conditions import scene_under
+from agents.configuration.schema import RESERVED_SEED
+from agents.evaluation.conditions import disturbance_under, scene_under
 from agents.evaluation.expert_costs import EVALUATION_SEEDS, OptimalCosts, evaluation_seeds, optimal_costs
 from agents.evaluation.statistics import Interval, bootstrap_interval, wilson_interval
-from agents.policies.flying import Flights, fly, from_json_list, json_list, time_per_action
+from agents.policies.flying import Flights, Policy, fly, from_json_list, json_list, time_per_action
 from agents.zoo.finding import as_policy, check_fit
 from dq_space_arm_env import Scene, load_scene
+from dq_space_arm_env.environment.rollouts import StateFeedback
 from experts.demonstrations.executors import Executor
 
 CHEAPER = 1e-3
@@ -228,7 +230,9 @@ def evaluate(
             progress=lambda done, total: progress(Advance("optimal costs", done, total)),
         )
     started = perf_counter()
-    flights = fly(acting.act, flown, seeds, lambda done, total: progress(Advance("flights", done, total)))
+    flights = fly_under(
+        condition, acting.act, given, seeds, lambda done, total: progress(Advance("flights", done, total))
+    )
     wall_seconds, made_in = perf_counter() - started, acting.metadata.get("scene_hash")
     return Evaluation(
         policy=acting.label,
@@ -242,6 +246,25 @@ def evaluate(
         metadata=dict(acting.metadata),
         same_scene=None if made_in is None else bool(made_in == given.content_hash()),
     )
+
+
+def fly_under(
+    condition: str,
+    policy: Policy | StateFeedback,
+    scene: Scene,
+    seeds: Sequence[int],
+    progress: Callable[[int, int], None] = lambda step, steps: None,
+) -> Flights:
+    """Fly in a scene under a condition, from some of its evaluation starts.
+
+    Noise and pushes of a flight depend on its start alone: all policies meet the same.
+    """
+    disturbance = disturbance_under(condition)
+    numbers = {seed: number for number, seed in enumerate(evaluation_seeds(scene))}
+    flights = [numbers[seed] for seed in seeds]
+    disturbances = disturbance.drawn(scene, flights, EVALUATION_SEEDS, RESERVED_SEED)
+    flown, delay = scene_under(scene, condition), disturbance.steps(scene)
+    return fly(policy, flown, seeds, progress, disturbances=disturbances, delay=delay)
 
 
 def known_interval(interval: Interval) -> list[float] | None:

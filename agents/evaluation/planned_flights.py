@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.configuration.schema import RESERVED_SEED
-from agents.evaluation.conditions import as_known, scene_under
-from agents.evaluation.evaluating import Advance
+from agents.evaluation.conditions import as_known, disturbance_under, scene_under
+from agents.evaluation.evaluating import Advance, fly_under
 from agents.evaluation.expert_costs import (
     EVALUATION_SEEDS,
     GROUP,
@@ -28,7 +28,7 @@ from agents.evaluation.expert_costs import (
 )
 from agents.evaluation.kept_results import CachedGroups, Row
 from agents.evaluation.plan_followers import FEEDBACK, RECEDING, RecedingHorizon, follower, plans_of
-from agents.policies.flying import Flights, FloatArray, fly
+from agents.policies.flying import Flights, FloatArray
 from dq_space_arm_env import Scene
 from experts.demonstrations.executors import Executor
 from experts.demonstrations.settings import Settings, software
@@ -76,7 +76,7 @@ def fly_plans(
         settings = evaluation_settings(as_known(scene, alike[0]))
         seeds = group_seeds(settings, n)
         files = {
-            (controller, condition): _files(controller, settings.scene, scene_under(scene, condition), seeds)
+            (controller, condition): _files(controller, settings.scene, scene, condition, seeds)
             for condition in alike
             for controller in controllers
         }
@@ -105,7 +105,7 @@ def _fly_missing(
                 if result.shard in cached.missing:
                     flying = follower(settings.scene, plans, feedback=controller == FEEDBACK)
                     seeds = cached.seeds(result.shard)
-                    flights = fly(flying, scene_under(scene, condition), seeds)
+                    flights = fly_under(condition, flying, scene, seeds)
                     cached.add(result.shard, _rows(seeds, flights, seconds))
             done += 1
             progress(Advance(stage, done, total))
@@ -118,9 +118,8 @@ def fly_receding(
     progress: Callable[[Advance], None] = lambda advance: None,
 ) -> PlannedFlights:
     """Fly the receding-horizon expert from the first n evaluation starts."""
-    flown = scene_under(scene, condition)
     settings = evaluation_settings(as_known(scene, condition))
-    files = _files(RECEDING, settings.scene, flown, group_seeds(settings, n, _FEW))
+    files = _files(RECEDING, settings.scene, scene, condition, group_seeds(settings, n, _FEW))
     stage, done, total = f"receding horizon, {condition}", len(files.rows), len(files.rows)
     total += _FEW * len(files.missing)
     progress(Advance(stage, done, total))
@@ -130,7 +129,7 @@ def fly_receding(
         rows: list[Row] = []
         for seed in files.seeds(group):
             told = draw_starts(settings.scene, [seed]).parameters
-            flights = fly(controller.policy(told), flown, [seed])
+            flights = fly_under(condition, controller.policy(told), scene, [seed])
             rows += _rows([seed], flights, np.array([controller.planning_seconds]))
             done += 1
             progress(Advance(stage, done, total))
@@ -143,12 +142,15 @@ def _rows(seeds: Sequence[int], flights: Flights, seconds: FloatArray) -> list[R
     return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 
-def _files(controller: str, planned_in: Scene, flown: Scene, seeds: Sequence[int]) -> CachedGroups:
+def _files(
+    controller: str, planned_in: Scene, scene: Scene, condition: str, seeds: Sequence[int]
+) -> CachedGroups:
     size = _FEW if controller == RECEDING else GROUP
     content = {
         "controller": controller,
         "planned in": planned_in.content_hash(),
-        "flown in": flown.content_hash(),
+        "flown in": scene_under(scene, condition).content_hash(),
+        "disturbed by": disturbance_under(condition)._asdict(),
         "problems": EVALUATION_SEEDS,
         "seed": RESERVED_SEED,
         "group": size,

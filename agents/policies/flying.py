@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env import Scene
+from dq_space_arm_env.environment.disturbances import Disturbances
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
 
 FloatArray = NDArray[np.float64]
@@ -76,9 +77,13 @@ def fly(
     scene: Scene,
     seeds: Sequence[int],
     progress: Callable[[int, int], None] = lambda step, steps: None,
+    *,
+    disturbances: Disturbances | None = None,
+    delay: int = 0,
 ) -> Flights:
     """Fly one episode for each seed, all side by side, see `rollout`."""
-    return Flights.of(rollout(policy, scene, seeds, progress=progress))
+    flown = rollout(policy, scene, seeds, disturbances=disturbances, delay=delay, progress=progress)
+    return Flights.of(flown)
 
 
 def time_per_action(policy: Policy | StateFeedback, scene: Scene, *, batched: bool = True) -> float:

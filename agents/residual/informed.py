@@ -23,7 +23,7 @@ from experts.demonstrations import Demonstrations
 from experts.problems.arm_problem import ArmProblem
 
 SOURCES = (
-    *("evaluation/plan_followers.py", "evaluation/plans.py", "policies"),
+    *("evaluation/conditions.py", "evaluation/plan_followers.py", "evaluation/plans.py", "policies"),
     *(f"residual/{name}.py" for name in ("corrections", "informed", "mismatch", "mismatch_comparison")),
 )
 """Files and folders of this package that flights under mismatch follow from."""

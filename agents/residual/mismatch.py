@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from agents.configuration.residual import Mismatch
-from agents.evaluation.conditions import PAYLOAD_CHANGE
+from agents.evaluation.conditions import NOISE, PAYLOAD_CHANGE, ChosenDisturbances
 from agents.evaluation.plans import Plans
 from dq_space_arm_env import Scene
-from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances, with_loads
+from dq_space_arm_env.environment.disturbances import with_loads
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
 
-NOISE = 0.01
-"""Standard deviation of the noise on every tangent coordinate, rad, m, rad/s, m/s."""
 PUSH, PUSHES = 0.02, 6
 """Standard deviation of the jumps of the base's velocities, rad/s, m/s; and their mean number."""
 
@@ -84,7 +82,9 @@ def fly_mismatched(
     drawn = max(count, *(np.size(value) for value in worlds[:3]))
     factors, noise, push = (np.broadcast_to(np.asarray(value, np.float64), (drawn,)) for value in worlds[:3])
     rng = np.random.default_rng([worlds.seed, 1])
-    disturbances = _First(count, scene, rng, push=push, pushes=worlds.pushes, measurement=noise)
+    disturbances = ChosenDisturbances(
+        range(count), scene, rng, push=push, pushes=worlds.pushes, measurement=noise
+    )
     flown, parameters = with_loads(scene, factors[:count], plans.known)
     return rollout(
         controller,
@@ -94,15 +94,3 @@ def fly_mismatched(
         disturbances=disturbances,
         progress=progress,
     )
-
-
-class _First(Disturbances):
-    """Disturbances of the first flights only."""
-
-    def __init__(self, flights: int, scene: Scene, rng: np.random.Generator, **settings: Any) -> None:
-        super().__init__(scene, rng, **settings)
-        self._flights = flights
-
-    def draw(self) -> Disturbance:
-        parts = super().draw()
-        return Disturbance(*(None if part is None else part[: self._flights] for part in parts))

@@ -21,6 +21,7 @@ from agents.zoo.model_archive import (
 from agents.zoo.normalization import ObservationStatistics, StatisticsError, read_statistics, statistics_of
 from agents.zoo.shelf import ZooError, policy_file
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
+from dq_space_arm_env.environment.rollouts import StateFeedback
 
 POLICY_OF_A_RUN = "policy.npz"
 
@@ -33,8 +34,9 @@ class ActingPolicy(NamedTuple):
     """A policy ready to fly."""
 
     label: str  # its name in tables
-    act: Policy  # batches of observations -> actions; may have `begin(environment)`
-    act_once: Policy  # for timing single actions: takes an observation without a batch if it can, else `act`
+    act: Policy | StateFeedback  # batches -> actions, for `rollout`
+    # For timing single actions: takes an observation without a batch if it can, else `act`.
+    act_once: Policy | StateFeedback
     batched: bool  # whether `act_once` wants a batch nevertheless
     metadata: Mapping[str, Any]  # JSON values; empty if unknown
     sizes: tuple[int, int] | None = None  # entries of observations and actions, if known
@@ -76,7 +78,7 @@ def as_policy(
         name = label or str(policy.metadata.get("agent", "exported policy"))
         sizes = policy.n_observation, policy.n_action
         if sees_goals(policy):
-            act = _OnGoals(policy, joined=True)
+            act = _on_goals(policy, joined=True)
             return ActingPolicy(name, act, act, True, policy.metadata, sizes)
         return ActingPolicy(name, policy, policy, False, policy.metadata, sizes)
     if callable(getattr(policy, "predict", None)):
@@ -165,7 +167,7 @@ def _label(policy: str | Path) -> str:
     return path.name if path.suffix != ".npz" else "/".join(path.parts[-2:])
 
 
-def _predictor(model: Any, statistics: ObservationStatistics | None) -> Policy:
+def _predictor(model: Any, statistics: ObservationStatistics | None) -> Policy | StateFeedback:
     """Deterministic actions of a model of Stable-Baselines3, in units of the environment's."""
     space: Any = getattr(model, "action_space", None)
     factors = None
@@ -182,7 +184,7 @@ def _predictor(model: Any, statistics: ObservationStatistics | None) -> Policy:
         return actions if factors is None else actions * factors
 
     if hasattr(getattr(model, "observation_space", None), "spaces"):
-        return _OnGoals(act, joined=False)
+        return _on_goals(act, joined=False)
 
     def act_in_single_precision(observations: NDArray[Any]) -> NDArray[Any]:
         return act(observations.astype(np.float32))  # as in training
@@ -190,27 +192,25 @@ def _predictor(model: Any, statistics: ObservationStatistics | None) -> Policy:
     return act_in_single_precision
 
 
-class _OnGoals:
-    """A policy of the goal environment, flown in the ordinary one."""
+def _on_goals(act: Callable[[Any], NDArray[Any]], *, joined: bool) -> StateFeedback:
+    """A policy of the goal environment, flown in the ordinary one; it sees measured states, as others do."""
+    flown_in: list[DQSpaceArmVectorEnv] = []
 
-    def __init__(self, act: Callable[[Any], NDArray[Any]], *, joined: bool) -> None:
-        self._act, self._joined = act, joined
-        self._environment: DQSpaceArmVectorEnv | None = None
+    def begin(environment: DQSpaceArmVectorEnv) -> None:
+        flown_in[:] = [environment]
 
-    def begin(self, environment: DQSpaceArmVectorEnv) -> None:
-        self._environment = environment
-
-    def __call__(self, observations: NDArray[Any]) -> NDArray[Any]:
-        environment = self._environment
-        assert environment is not None
-        states, layout = environment.states, environment.kernels.layout
+    def act_on_states(states: NDArray[np.float64], step: int) -> NDArray[Any]:
+        (environment,) = flown_in
+        layout = environment.kernels.layout
         parts = {
             "achieved_goal": np.reshape(environment.kernels.tip_pose(states), (len(states), 8)),
             "desired_goal": environment.targets,
             "observation": layout.goal_observation(states, environment.stage_parameters),
         }
         single = {name: np.asarray(part, dtype=np.float32) for name, part in parts.items()}
-        return self._act(np.concatenate(list(single.values()), axis=1) if self._joined else single)
+        return act(np.concatenate(list(single.values()), axis=1) if joined else single)
+
+    return StateFeedback(act_on_states, begin)
 
 
 def read_policy(path: Path, *, trust: bool = False, normalized: bool = False) -> Any:

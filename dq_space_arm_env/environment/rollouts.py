@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -149,6 +150,7 @@ def rollout(
     starts: ArrayLike | None = None,
     parameters: ArrayLike | None = None,
     disturbances: Disturbances | None = None,
+    delay: int = 0,
     record: bool = False,
     steps: int | None = None,
     progress: Callable[[int, int], None] = lambda step, steps: None,
@@ -164,6 +166,8 @@ def rollout(
         parameters: What varies, shape (n_p,) or (B, n_p), units of the parameters, instead of what is drawn;
             nominal with starts. The policy is not told.
         disturbances: Pushes and noise. The policy sees measured states or their observations.
+        delay: Steps from an action to its effect; until the first one arrives all inputs are zero. Unlike
+            that of a scene's actuators it is not modeled: no state and no observation tells of it.
         record: Whether to keep states, observations and controls.
         steps: Number of steps at most; the scene's by default.
         progress: Called after each step with its number and the number of all.
@@ -172,15 +176,19 @@ def rollout(
         The rollout.
 
     Raises:
-        ValueError: If actions have a wrong shape, or both seeds and starts are given.
+        ValueError: If actions have a wrong shape, delay is negative, or both seeds and starts are given.
     """
     if seeds is not None and starts is not None:
         raise ValueError("seeds and starts exclude each other")
+    if delay < 0:
+        raise ValueError(f"delay: {delay}, should be at least 0 steps")
     environment, observation, info = _begin(scene, seeds, starts, parameters)
     if (begin := getattr(policy, "begin", None)) is not None:
         begin(environment)
     log = _Log(environment, observation, info, steps or scene.simulation.steps, record)
     observes = record or not isinstance(policy, StateFeedback)
+    idle = np.zeros((len(log.state), environment.kernels.n_u))
+    waiting = deque([idle] * delay)  # actions on their way, the oldest first
     for step in range(log.steps):
         known = measured = log.state
         disturbance = Disturbance() if disturbances is None else disturbances.draw()
@@ -194,7 +202,8 @@ def rollout(
         began = perf_counter()
         asked = policy.act(measured, step) if isinstance(policy, StateFeedback) else policy(observation)
         log.action_seconds[step] = perf_counter() - began
-        actions = log.before_step(step, observation, np.array(asked), disturbance.inputs)
+        waiting.append(np.array(asked))
+        actions = log.before_step(step, observation, waiting.popleft(), disturbance.inputs)
         observation, reward, terminated, _, info = environment.step(actions)
         log.after_step(step, reward, terminated, info)
         progress(step + 1, log.steps)

@@ -136,6 +136,12 @@ class Target(Model):
         description="whether base_velocity is relative to a target that moves: at 0 the base moves along as "
         "if fixed to it",
     )
+    observed: bool = Field(
+        default=False,
+        exclude_if=lambda observed: not observed,
+        description="whether q_{D/I} is observed besides q_{D/G}: where the target varies, the cost with "
+        "pose_error: paper depends on it",
+    )
     geometry: tuple[Shape, ...] = geometry_field("only axes and the ghost of a hand")
 
 
@@ -170,11 +176,17 @@ class OtherTip(Model):
 class Cost(Model):
     """Weights of the quadratic cost; the defaults are the paper's. The running terms carry no dt."""
 
+    pose_error: Literal["paper", "relative"] = Field(
+        default="paper",
+        exclude_if=lambda error: error == "paper",
+        description="error of the tip's pose, 8 numbers: 'paper': q_{G/I} - q_{D/I}, whose dual part depends "
+        "on where the origin is; 'relative': q_{D/G} - 1, the same wherever base and target are together",
+    )
     pose: StateWeights8 = Field(
-        default=(15.0,) * 8, description="running weight on q_{G/I} - q_{D/I} (W_kq): one number or 8"
+        default=(15.0,) * 8, description="running weight on the pose error (W_kq): one number or 8"
     )
     terminal_pose: StateWeights8 = Field(
-        default=(150.0,) * 8, description="terminal weight on q_{G/I} - q_{D/I} (W_fq): one number or 8"
+        default=(150.0,) * 8, description="terminal weight on the pose error (W_fq): one number or 8"
     )
     base_velocity: StateWeights6 = Field(
         default=(1.0,) * 6,

@@ -38,6 +38,7 @@ from dq_space_arm_env.task.equations import (
     SceneEquations,
     body_pose,
     body_velocity,
+    compared_poses,
     larger,
     total,
     weighted_square,
@@ -167,7 +168,8 @@ def compare_goals(scene: Scene, achieved: Scalars, desired: Scalars) -> Outputs:
     distance = poses.error_distance(achieved, desired)
     # q and -q are the same goal: the nearer one counts.
     signs = (desired, [-entry for entry in desired])
-    cost = casadi.fmin(*(weighted_square(achieved, goal, scene.cost.pose) for goal in signs))
+    errors = (compared_poses(scene, achieved, goal) for goal in signs)
+    cost = casadi.fmin(*(weighted_square(*error, scene.cost.pose) for error in errors))
     return {"errors": [angle, distance], "cost": [cost], "is_success": [is_success(scene, [angle, distance])]}
 
 

@@ -6,7 +6,8 @@ The stage cost of step k is
 
 without a factor dt; the terminal cost has the first two terms with weights W_fq, W_fomega. q and -q are the
 same pose but cost differently: the sign of q_{G/I} is fixed at the start, q_r . q_{D,r} >= 0, and carried
-along by continuity.
+along by continuity. A scene may square q_{D/G} - 1 instead, with q_{D/G} = q_{G/I}* q_{D/I} (31), which a
+common rigid motion of base and target leaves as it is (`cost.pose_error: relative`).
 
 Where a scene weighs it, the tip's twist relative to the target is a further term,
 
@@ -183,8 +184,12 @@ class SceneEquations:
                 twists[index] = dual_vectors.subtract(twists[index], along)
         return twists
 
+    def compared_poses(self, tip: Scalars) -> tuple[Scalars, Scalars]:
+        """What the cost squares the difference of, for a pose of the tip: q_{G/I}, q_{D/I}, or q_{D/G}, 1."""
+        return compared_poses(self.scene, tip, self.target)
+
     def _pose_cost(self, x: Scalars, field: str) -> Scalar:
-        cost = weighted_square(self.tip(x), self.target, self.state_weights(field))
+        cost = weighted_square(*self.compared_poses(self.tip(x)), self.state_weights(field))
         for tip, error in zip(
             self.scene.other_tips, self.other_errors(self.base_pose(x), self.y(x)), strict=True
         ):
@@ -239,6 +244,7 @@ class SceneEquations:
             *motion.previous_controls,
             *motion.drives,
             *([self.given[PHASE]] if self.scene.phases else []),
+            *(self.field.pose.reduced(self.target) if self.scene.target.observed else []),
             *besides,
             *twists,
             time_left,
@@ -250,6 +256,13 @@ class SceneEquations:
             own = poses.error_angle(other, dq.IDENTITY), norm(poses.position(other))
             errors = [larger(a, b) for a, b in zip(errors, own, strict=True)]
         return {"observation": observation, "errors": errors}
+
+
+def compared_poses(scene: Scene, tip: Scalars, target: Scalars) -> tuple[Scalars, Scalars]:
+    """Two dual quaternions whose difference is the pose error of a scene's cost, 8 numbers each."""
+    if scene.cost.pose_error == "paper":
+        return tip, target
+    return poses.error_pose(tip, target), dq.IDENTITY
 
 
 def vector_parts(pose: Scalars) -> list[Scalar]:

@@ -97,6 +97,7 @@ def observation_entries(scene: Scene) -> list[tuple[str, str]]:
         *state[where.wrist_angles],
         *state[where.joint_rates.start :],
         *([("phase", "1")] if scene.phases else []),
+        *((f"target {name}", unit) for name, unit in pose if scene.target.observed),
         *((f"goal from {tip.name} {name}", unit) for tip in scene.other_tips for name, unit in pose),
         *((f"margin of {row.name}", "1") for row in rows if row.observed is not None),
         *((f"tip relative to the target {name}", unit) for name, unit in twist if moves),

@@ -84,11 +84,7 @@ class WorstCase:
         if self.tree.tank is not None:
             drift = speed / casadi.sqrt(base.mass)
         # The dual part of a pose has half the length of its position; unit quaternions are at most 2 apart.
-        start, target = (norm(poses.position(pose)) for pose in (equations.base_pose(x), equations.target))
-        if equations.scene.target.motion is not None:  # its body is at |r| = 2 |q_d|
-            body = body_pose(equations.scene, equations.given)
-            target = 2.0 * quaternion.norm(body[4:]) + self._target_way(duration)
-        gaps = 2.0, 0.5 * (start + target + duration * drift + 2.0 * reach)
+        gaps = 2.0, 0.5 * (self._apart(x, duration) + duration * drift + 2.0 * reach)
         references = equations.scene.target.base_velocity
         carried = (0.0, 0.0)
         if equations.scene.target.base_velocity_relative:
@@ -110,6 +106,20 @@ class WorstCase:
         effort = equations.effort(equations.control_limits)
         stage = state_cost("pose", "base_velocity", "tip_twist") + effort
         return steps * stage + state_cost("terminal_pose", "terminal_base_velocity", "terminal_tip_twist")
+
+    def _apart(self, x: Scalars, duration: Scalar) -> Scalar:
+        """Bound of how far base and target are from the origin, added; or, with relative errors, apart."""
+        scene, base, target = self.equations.scene, self.equations.base_pose(x), self.equations.target
+        way: Scalar = 0.0
+        if scene.target.motion is not None:
+            target, way = body_pose(scene, self.equations.given), self._target_way(duration)
+        inertial = any(tip.relative_to == "inertial" for tip in scene.other_tips)
+        if scene.cost.pose_error == "relative" and not inertial:
+            return norm(poses.position(poses.error_pose(base, target))) + way
+        if scene.target.motion is None:
+            return norm(poses.position(base)) + norm(poses.position(target))
+        # its body is at |r| = 2 |q_d|
+        return norm(poses.position(base)) + (2.0 * quaternion.norm(target[4:]) + way)
 
     def _target_way(self, duration: Scalar) -> Scalar:
         """Bound of the way of the target from where its body is now."""

@@ -18,6 +18,7 @@ def beyond_the_paper(scene: Scene) -> list[str]:
     """What a scene asks for beyond the paper's cost of one target pose at rest, in words for a sentence."""
     cost = scene.cost
     asked = {
+        "errors relative to the tip (cost.pose_error)": cost.pose_error != "paper",
         "a target that moves (target.motion)": scene.target.motion is not None,
         "phases": bool(scene.phases),
         "tips of other arms (other_tips)": bool(scene.other_tips),
@@ -48,8 +49,8 @@ class PaperProblem:
         self.scene = in_double_precision(load_scene(scene))
         if more := beyond_the_paper(self.scene):
             raise ValueError(
-                f"scene {self.scene.name!r} has {' and '.join(more)}: the paper's formulation knows only a "
-                "target at rest"
+                f"scene {self.scene.name!r} has {' and '.join(more)}: the paper's formulation knows only its "
+                "own cost of a target at rest"
             )
         self.kernels = compile_scene(self.scene)
         layout = self.kernels.layout

@@ -286,7 +286,7 @@ def test_crocoddyl_is_left_out_with_a_sentence(name: str, reason: str) -> None:
 
 @pytest.mark.parametrize("name", ["tracking", "release"])
 def test_the_papers_formulation_refuses_more_than_a_target_at_rest(name: str) -> None:
-    with pytest.raises(ValueError, match="formulation knows only a target at rest"):
+    with pytest.raises(ValueError, match="formulation knows only its own cost of a target at rest"):
         PaperProblem(load_scene(name))
 
 

@@ -81,28 +81,35 @@ class DerivativePrograms:
             hessian[start + index, start + index] += 2.0 * weight
         return gradient, casadi.sparsify(hessian)
 
-    def _twist_residual(self, x: Scalars, u: Scalars, cost: str) -> tuple[Matrix, Matrix, Matrix]:
-        """Twist relative to the target, of tip or base, by tangent state z and input; their values."""
+    def _relative_residual(self, x: Scalars, u: Scalars, cost: str) -> tuple[Matrix, Matrix, Matrix]:
+        """Twist of tip or base, or pose of the tip, relative to the target, by tangent state z and input.
+
+        Then z and input, and their values.
+        """
         field = self.field
         z, w = symbols("z", field.n_t), symbols("w", field.n_u)
         frame, y = self.equations.moved(x, z)
         motion = field.motion(y)
-        if cost.endswith("tip_twist"):
+        if not cost.endswith("base_velocity"):
             arm = kinematics.arm_pose(self.tree, motion.joint_angles, motion.wrist_angles)
             frame = dq.multiply(frame, arm)
+        if cost.endswith("pose"):
+            own, target = self.equations.compared_poses(frame)
+        elif cost.endswith("tip_twist"):
             own = self.equations.tip_twist(motion, field.inputs(w).wrist_rates)
+            target = self.equations.target_twist(frame)
         else:
             own = dual_vectors.subtract((*motion.angular, *motion.linear), self.scene.target.base_velocity)
-        target = self.equations.target_twist(frame)
+            target = self.equations.target_twist(frame)
         residual = column(*(a - b for a, b in zip(own, target, strict=True)))
         return residual, column(*z, *w), casadi.densify(column(*[0.0] * field.n_t, *u))
 
-    def _twist_cost_derivatives(
+    def _relative_cost_derivatives(
         self, x: Scalars, u: Scalars, field: str, *, exact: bool, emphasis: Scalar = 1.0
     ) -> tuple[Matrix, Matrix]:
-        """Gradient and Hessian (exact or Gauss-Newton's) of a relative twist's cost by tangent state, u."""
+        """Gradient and Hessian (exact or Gauss-Newton's) of one of `_relative_costs` by tangent state, u."""
         weights = [emphasis * weight for weight in self.equations.state_weights(field)]
-        return self._square_derivatives(*self._twist_residual(x, u, field), weights, exact=exact)
+        return self._square_derivatives(*self._relative_residual(x, u, field), weights, exact=exact)
 
     def _other_tip_derivatives(
         self, x: Scalars, u: Scalars, index: int, weights: Scalars, *, exact: bool
@@ -117,13 +124,13 @@ class DerivativePrograms:
     def _square_derivatives(
         self, residual: Matrix, moved: Matrix, values: Matrix, given: Scalars, *, exact: bool
     ) -> tuple[Matrix, Matrix]:
-        """Gradient and Hessian of the weighted square of a residual, 6, at the values of what moves it."""
+        """Gradient and Hessian of the weighted square of a residual at the values of what moves it."""
         weights = casadi.diag(column(*(2.0 * weight for weight in given)))
         jacobian = casadi.jacobian(residual, moved)
         gradient = casadi.mtimes(jacobian.T, casadi.mtimes(weights, residual))
         hessian = casadi.mtimes(jacobian.T, casadi.mtimes(weights, jacobian))
         if exact:
-            factor = casadi.SX.sym("factor", 6)
+            factor = casadi.SX.sym("factor", len(given))
             curvature = casadi.hessian(casadi.dot(factor, residual), moved)[0]
             weighted = casadi.densify(casadi.mtimes(weights, residual))
             hessian = hessian + casadi.substitute(curvature, factor, weighted)
@@ -154,8 +161,8 @@ class DerivativePrograms:
 
     def _further_terms(self, x: Scalars, u: Scalars, *, exact: bool) -> Iterator[tuple[Matrix, Matrix]]:
         """Gradients and Hessians by tangent state and input of what only some stage costs have."""
-        for cost in self._twist_costs():
-            yield self._twist_cost_derivatives(x, u, cost, exact=exact)
+        for cost in self._relative_costs():
+            yield self._relative_cost_derivatives(x, u, cost, exact=exact)
         for index, tip in enumerate(self.scene.other_tips):
             yield self._other_tip_derivatives(x, u, index, tip.pose, exact=exact)
         if isinstance(self.equations, PenalizedEquations) and penalized_rows(self.scene):
@@ -166,9 +173,9 @@ class DerivativePrograms:
     ) -> Iterator[tuple[Matrix, Matrix]]:
         """Likewise of terminal costs by the tangent state; for their twists the wrist is held."""
         held, n_t = [0.0] * self.field.n_u, self.field.n_t
-        for cost in self._twist_costs("terminal_"):
-            stressed = emphasis if cost == "terminal_tip_twist" else 1.0
-            slope, curvature = self._twist_cost_derivatives(x, held, cost, exact=exact, emphasis=stressed)
+        for cost in self._relative_costs("terminal_"):
+            stressed = 1.0 if cost == "terminal_base_velocity" else emphasis
+            slope, curvature = self._relative_cost_derivatives(x, held, cost, exact=exact, emphasis=stressed)
             yield slope[:n_t], curvature[:n_t, :n_t]
         for index, tip in enumerate(self.scene.other_tips):
             weights = [emphasis * weight for weight in tip.terminal_pose]
@@ -178,17 +185,21 @@ class DerivativePrograms:
             slope, curvature = self._penalty_derivatives(self.equations, x, None, exact=exact)
             yield emphasis * slope, emphasis * curvature
 
-    def _twist_costs(self, prefix: str = "") -> list[str]:
-        """Those terms of twists relative to the target that have weights."""
+    def _relative_costs(self, prefix: str = "") -> list[str]:
+        """Those terms relative to the target that have weights."""
         fields = ["tip_twist", *(["base_velocity"] if self.scene.target.base_velocity_relative else [])]
+        fields += ["pose"] if self.scene.cost.pose_error == "relative" else []
         return [prefix + field for field in fields if any(getattr(self.scene.cost, prefix + field))]
 
     def _stage_weights(self, prefix: str = "") -> tuple[Scalars, Scalars]:
-        """Weights of pose and base velocity, none of the latter where it is a relative twist."""
+        """Weights of pose and base velocity, none of those in `_relative_costs`."""
+        pose = self.equations.state_weights(prefix + "pose")
         velocity = self.equations.state_weights(prefix + "base_velocity")
+        if self.scene.cost.pose_error == "relative":
+            pose = [0.0] * 8
         if self.scene.target.base_velocity_relative:
             velocity = [0.0] * 6
-        return self.equations.state_weights(prefix + "pose"), velocity
+        return pose, velocity
 
     def _terminal_weights(self) -> tuple[Scalars, Scalars]:
         return self._stage_weights("terminal_")

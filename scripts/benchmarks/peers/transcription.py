@@ -324,7 +324,8 @@ def _state_cost(equations: SceneEquations, x: Any, when: str, wrist_rates: Any) 
     """Cost of a state by the weights of stages or of the end."""
     entries, target = casadi.vertsplit(x), equations.scene.target
     motion = equations.field.motion(equations.y(entries))
-    pose = casadi.vertcat(*equations.tip(entries)) - casadi.vertcat(*equations.target)
+    tip, reference = equations.compared_poses(equations.tip(entries))
+    pose = casadi.vertcat(*tip) - casadi.vertcat(*reference)
     twist = casadi.vertcat(*motion.angular, *motion.linear) - casadi.DM(target.base_velocity)
     if target.base_velocity_relative:
         twist -= casadi.vertcat(*equations.target_twist(equations.base_pose(entries)))

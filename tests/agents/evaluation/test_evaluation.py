@@ -10,12 +10,14 @@ import pytest
 from agents import evaluate
 from agents.evaluation import CONDITIONS, EVALUATION_SEEDS, evaluation_seeds, fly, optimal_costs, scene_under
 from agents.evaluation.comparison_tables import remarks
-from agents.evaluation.conditions import physics_hash
-from agents.evaluation.evaluating import Evaluation
+from agents.evaluation.conditions import FlightDisturbance, physics_hash
+from agents.evaluation.evaluating import Evaluation, fly_under
 from agents.policies import ExportedPolicy
 from agents.zoo.finding import PolicyError, as_policy
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.command_line import main
+from dq_space_arm_env.environment.rollouts import rollout
+from dq_space_arm_env.task.step_report import n_observations
 from experts.demonstrations import SerialExecutor, generate_demonstrations
 from experts.demonstrations.settings import Settings
 
@@ -173,6 +175,33 @@ def test_conditions_change_what_they_say():
     assert scene_under(carrying, "heavy_payload").links == carrying.links
     with pytest.raises(ValueError, match="condition: 'rain' is unknown; choose from training, wide_starts"):
         scene_under(PAPER, "rain")
+
+
+def test_a_delayed_action_acts_steps_later():
+    """Nothing acts before the first one arrives, and nothing that is observed tells of it."""
+    steps = FlightDisturbance(delay=0.15).steps(SHORT)
+    assert steps == round(0.15 / SHORT.simulation.dt) > 1
+    policy = exported(n_observation=n_observations(SHORT), n_action=compile_scene(SHORT).n_u)
+    flown = rollout(policy, SHORT, [3, 4], delay=steps, record=True)
+    limits = compile_scene(SHORT).layout.control_limit
+    asked = np.clip([policy(seen) for seen in flown.observations], -1.0, 1.0) * limits
+    assert not flown.controls[:, :steps].any()
+    np.testing.assert_allclose(flown.controls[:, steps:], asked[:, : -steps - 1], atol=1e-7)
+    with pytest.raises(ValueError, match="delay: -1, should be at least 0 steps"):
+        rollout(policy, SHORT, delay=-1)
+
+
+@pytest.mark.parametrize("condition", ["delay", "noise", "push"])
+def test_disturbances_of_a_flight_depend_on_its_start_alone(condition):
+    policy = exported(n_observation=n_observations(SHORT), n_action=compile_scene(SHORT).n_u)
+    seeds = evaluation_seeds(SHORT, 6)
+    together = fly_under(condition, policy, SHORT, seeds)
+    some = fly_under(condition, policy, SHORT, [seeds[4], seeds[1]])
+    np.testing.assert_array_equal(some.cost, together.cost[[4, 1]])
+    calm = fly_under("training", policy, SHORT, seeds)
+    np.testing.assert_array_equal(calm.cost, fly(policy, SHORT, seeds).cost)
+    assert np.sum(calm.cost != together.cost) >= 4
+    assert scene_under(SHORT, condition).content_hash() == SHORT.content_hash()
 
 
 def exported(n_observation=24, n_action=12, **metadata):
