@@ -88,7 +88,9 @@ class _Reader(pickle._Unpickler):
         arguments, kind = self.stack.pop(), self.stack.pop()
         if not isinstance(kind, _Named) or not isinstance(arguments, tuple):
             raise PickledError("calls what is no name")
-        self.append(kind(*arguments))
+        # Observations by name are ordered dictionaries in `DummyVecEnv`; made empty, filled like others.
+        is_mapping = kind.name == "collections.OrderedDict" and not arguments
+        self.append({} if is_mapping else kind(*arguments))
 
     def _set_items(self) -> None:
         items = self.pop_mark()

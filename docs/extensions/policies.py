@@ -7,8 +7,11 @@ from collections.abc import Iterator
 from agents.zoo import list_policies
 from agents.zoo.shelf import load_record
 
-CONDITIONS = ("wide_starts", "light_payload", "heavy_payload", "spin")
-_HEADINGS = ("policy", "success", "wide starts", "light", "heavy", "spin", "cost gap [%]", "training [min]")
+CONDITIONS = ("wide_starts", "light_payload", "heavy_payload", "spin", "delay", "noise", "push")
+_HEADINGS = (
+    *("policy", "success", "wide starts", "light", "heavy", "spin", "delay", "noise", "push"),
+    *("cost gap [%]", "training [min]"),
+)
 
 
 def policy_table() -> str:

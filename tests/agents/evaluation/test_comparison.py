@@ -121,12 +121,14 @@ def test_the_receding_horizon_stays_near_the_optimum(comparison):
 
 def test_conditions_share_plans(cache, counting, quick):
     executor = counting()
-    conditions = ("training", "heavy_payload", "light_payload")
+    conditions = ("training", "heavy_payload", "light_payload", "delay")
     first = fly_plans(quick, (OPEN_LOOP, FEEDBACK), conditions, 2, executor)
     assert executor.tasks == 1
     again = fly_plans(quick, (OPEN_LOOP, FEEDBACK), conditions, 2, counting(limit=0))
     for key, planned in first.items():
         np.testing.assert_array_equal(again[key].flights.cost, planned.flights.cost)
+    calm, late = (first[OPEN_LOOP, condition].flights.cost for condition in ("training", "delay"))
+    assert (calm != late).all()
     # The optimal costs have been kept along.
     optimal_costs(quick, 2, executor=counting(limit=0))
     for damaged in (cache / "planned-flights").rglob("*.json"):

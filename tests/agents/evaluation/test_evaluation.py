@@ -16,6 +16,7 @@ from agents.policies import ExportedPolicy
 from agents.zoo.finding import PolicyError, as_policy
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.command_line import main
+from dq_space_arm_env.environment.disturbances import Disturbances
 from dq_space_arm_env.environment.rollouts import rollout
 from dq_space_arm_env.task.step_report import n_observations
 from experts.demonstrations import SerialExecutor, generate_demonstrations
@@ -232,7 +233,7 @@ def test_what_is_no_policy_is_refused(tmp_path):
 
 @pytest.mark.slow
 def test_a_policy_of_the_goal_environment_sees_what_that_shows():
-    """Its observations are the goal environment's own, joined in alphabetical order."""
+    """Its observations are the goal environment's own, joined in alphabetical order; noise disturbs them."""
     seen = []
     scene = load_scene("random-target").replace(simulation={"dt": 0.015, "steps": 4})
     policy = exported(8 + 8 + 23, observation="goal")
@@ -251,6 +252,11 @@ def test_a_policy_of_the_goal_environment_sees_what_that_shows():
             joined = np.concatenate([observation[key] for key in sorted(observation)]).astype(np.float32)
             np.testing.assert_allclose(seen[step][copy], joined, atol=1e-6)
             observation = env.step(policy(joined))[0]
+    first = seen[0]
+    seen.clear()
+    noise = Disturbances(scene, np.random.default_rng(0), measurement=0.1, count=2)
+    fly(as_policy(spy).act, scene, [5, 6], disturbances=noise)
+    assert np.abs(seen[0] - first).max() > 0.05
 
 
 def test_a_policy_of_another_scene_is_refused_in_a_sentence(tmp_path, quick):
