@@ -13,10 +13,12 @@ from agents.configuration import (
     ImitationConfiguration,
     load_configuration,
 )
+from agents.configuration.gradients import GradientConfiguration
 from agents.configuration.residual import ResidualConfiguration
 from dq_space_arm_env.common.progress import Advance
 
 if TYPE_CHECKING:
+    from agents.gradients.gradient_training import Learned
     from agents.imitation.imitation_training import Imitated
     from agents.reinforcement.reinforcement_training import Trained
 
@@ -26,7 +28,7 @@ def train(
     out: str | os.PathLike[str] | None = None,
     *,
     report: Callable[[Advance], None] | None = None,
-) -> "Trained | Imitated":
+) -> "Trained | Imitated | Learned":
     """Train an agent in a run folder; the same call resumes an interrupted run at its last checkpoint.
 
     Args:
@@ -36,7 +38,7 @@ def train(
         report: Called with the progress between updates.
 
     Returns:
-        The folder, the Stable-Baselines3 model or the network, and the exported policy.
+        The folder, the Stable-Baselines3 model or the network if it has one, and the exported policy.
 
     Raises:
         ConfigurationError: If the configuration is invalid.
@@ -51,7 +53,7 @@ def train(
     try:
         run = _run(checked, folder, report or (lambda advance: None))
     except ModuleNotFoundError as error:
-        if error.name not in ("stable_baselines3", "sb3_contrib", "torch", "tensorboard"):
+        if error.name not in ("stable_baselines3", "sb3_contrib", "torch", "tensorboard", "threadpoolctl"):
             raise
         raise ImportError(f'training needs {error.name}: pip install "dq-space-arm[agents]"') from error
     from agents.run_folder import reserved
@@ -62,12 +64,16 @@ def train(
 
 def _run(
     checked: AgentConfiguration, folder: Path, tell: Callable[[Advance], None]
-) -> "Callable[[], Trained | Imitated]":
+) -> "Callable[[], Trained | Imitated | Learned]":
     """The training function for a configuration, imported with what it needs."""
     if isinstance(checked, ImitationConfiguration):
         from agents.imitation.imitation_training import train_by_imitation
 
         return partial(train_by_imitation, checked, folder, tell)
+    if isinstance(checked, GradientConfiguration):
+        from agents.gradients.gradient_training import train_by_gradients
+
+        return partial(train_by_gradients, checked, folder, tell)
     if isinstance(checked, ResidualConfiguration):
         from agents.residual.residual_training import train_residual
 
@@ -99,7 +105,7 @@ def with_changes(
             if "schedule" not in content:
                 option = "--" + name.replace("_", "-")
                 raise ConfigurationError(
-                    f"{option} is for reinforcement learning, and {configuration.name} imitates"
+                    f"{option} is for reinforcement learning, not for {configuration.name}"
                 )
             content["schedule"][name] = value
     return load_configuration(content)

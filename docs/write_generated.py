@@ -21,6 +21,7 @@ from extensions.keys import key_tables  # noqa: E402
 from extensions.policies import policy_table  # noqa: E402
 
 from agents import configuration  # noqa: E402
+from agents.configuration.gradients import GradientConfiguration  # noqa: E402
 from agents.configuration.residual import ResidualConfiguration  # noqa: E402
 from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmGoalEnv, Scene  # noqa: E402
 from dq_space_arm_env.scene import Cylinder, Pose, Shape  # noqa: E402
@@ -48,6 +49,7 @@ TEXTS: Mapping[str, Callable[[], str]] = {
     "scene-keys": partial(key_tables, Scene, _PLACES),
     "reinforcement-keys": partial(key_tables, configuration.Configuration),
     "imitation-keys": partial(key_tables, configuration.ImitationConfiguration),
+    "gradient-keys": partial(key_tables, GradientConfiguration),
     "residual-keys": partial(key_tables, ResidualConfiguration),
     "environment": partial(docstring_page, DQSpaceArmEnv),
     "goal-environment": partial(docstring_page, DQSpaceArmGoalEnv),

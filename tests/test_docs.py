@@ -17,6 +17,7 @@ import agents
 import dq_space_arm_env
 import experts
 from agents.configuration import Configuration, ImitationConfiguration
+from agents.configuration.gradients import GradientConfiguration
 from agents.configuration.residual import ResidualConfiguration
 from agents.zoo import list_policies
 from agents.zoo.shelf import policy_file
@@ -177,7 +178,8 @@ def test_every_public_name_is_described(package):
 
 
 def models() -> list[type[BaseModel]]:
-    roots = (dq_space_arm_env.Scene, Configuration, ImitationConfiguration, ResidualConfiguration)
+    trainings = (Configuration, GradientConfiguration, ImitationConfiguration, ResidualConfiguration)
+    roots = (dq_space_arm_env.Scene, *trainings)
     return list(dict.fromkeys(model for root in roots for model in keys.models_of(root)))
 
 

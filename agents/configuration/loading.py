@@ -9,6 +9,7 @@ from typing import Any, get_args
 from pydantic import ValidationError
 
 from agents.configuration.algorithms import Algorithm
+from agents.configuration.gradients import AnalyticPolicyGradient, GradientConfiguration
 from agents.configuration.imitation import Cloning, Dagger, ImitationConfiguration
 from agents.configuration.reinforcement import Configuration
 from agents.configuration.residual import ResidualConfiguration, ResidualPPO, ResidualSAC
@@ -35,6 +36,7 @@ _CLASSES: dict[str, type[AgentConfiguration]] = {
     name: kind
     for kind, algorithms in (
         (Configuration, get_args(get_args(Algorithm)[0])),
+        (GradientConfiguration, (AnalyticPolicyGradient,)),
         (ImitationConfiguration, (Cloning, Dagger)),
         (ResidualConfiguration, (ResidualPPO, ResidualSAC)),
     )

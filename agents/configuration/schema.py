@@ -38,7 +38,7 @@ class AgentConfiguration(Model):
     description: StrictStr = Field(default="", description="what it is, and what to expect")
     scene: StrictStr = Field(default="paper", description="name of a shipped scene, or path of a YAML file")
     seed: StrictInt = Field(default=0, ge=0, lt=2**31, description="seed of everything random")
-    threads: Few = Field(default=1, description="threads of PyTorch")
+    threads: Few = Field(default=1, description="threads of PyTorch, or of NumPy's matrices")
     network: Network = Field(default_factory=Network, description="the networks")
 
 

@@ -31,7 +31,7 @@ def test_shipped_configurations_are_named_like_their_files_and_have_scenes(name)
 
 def test_every_algorithm_ships():
     configurations = [load_configuration(name) for name in list_configurations()]
-    names = {"PPO", "SAC", "TQC", "TD3", "cloning", "dagger", "residual-PPO"}
+    names = {"APG", "PPO", "SAC", "TQC", "TD3", "cloning", "dagger", "residual-PPO"}
     assert {each.algorithm.name for each in configurations} == names
     assert any(getattr(each.algorithm, "hindsight", None) for each in configurations)
 
@@ -59,7 +59,7 @@ def test_unknown_keys_are_refused_with_a_suggestion():
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"algorithm": {"name": "DQN"}}, "it must be one of PPO, SAC, TQC, TD3, cloning, dagger"),
+        ({"algorithm": {"name": "DQN"}}, "it must be one of PPO, SAC, TQC, TD3, APG, cloning, dagger"),
         ({"algorithm": {"name": "PPO", "gamma": 1.5}}, "gamma = 1.5: must be a fraction"),
         (
             {"algorithm": {"name": "SAC", "buffer_size": 10, "learning_starts": 20}},

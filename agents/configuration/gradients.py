@@ -1,0 +1,69 @@
+"""Configuration of an agent that follows the exact gradient of its episodes' cost."""
+
+from collections.abc import Iterator
+from typing import Literal
+
+from pydantic import Field
+
+from agents.configuration.reinforcement import ActionScale
+from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many
+from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
+
+
+class AnalyticPolicyGradient(Model):
+    """Analytic policy gradient: reverse mode through whole episodes, and SOAP on the network's weights."""
+
+    name: Literal["APG"] = "APG"
+    updates: Count = Field(default=2000, description="updates of the weights")
+    learning_rate: Positive = Field(
+        default=0.01, description="at its peak: it rises over the first updates, and falls like a cosine"
+    )
+    copies: Many = Field(default=128, description="episodes of an update")
+    decisions: Many = Field(
+        default=80, description="decisions of an episode in training, at least 2; it flies at every time step"
+    )
+    crowding: NonNegative = Field(
+        default=0.8,
+        description="how much closer decisions are at both ends, from 0, evenly, to 1, as cosines",
+    )
+    starts: Many = Field(default=16384, description="starts that episodes are drawn from")
+    end_weight: Positive = Field(
+        default=400.0, description="factor of the terminal pose's cost, for ending within the tolerances"
+    )
+
+    def _problems(self) -> Iterator[Problem]:
+        if self.crowding > 1.0:
+            yield Problem(("crowding",), self.crowding, "must be at most 1, as cosines")
+        if self.decisions < 2:
+            yield Problem(("decisions",), self.decisions, "must be at least 2")
+
+
+class Progression(Model):
+    """Flights and checkpoints during training."""
+
+    evaluate_every: Count = Field(default=1000, description="updates between flights for the learning curve")
+    evaluation_episodes: Many = Field(default=64, description="flights, always from the same starts")
+    checkpoint_every: Count = Field(default=500, description="updates between checkpoints")
+
+
+class GradientConfiguration(AgentConfiguration):
+    """Everything that determines a run of analytic policy gradients, apart from the code."""
+
+    action_scale: ActionScale = Field(
+        default_factory=ActionScale,
+        description="units of the network's outputs, as fractions of the limits; outputs may be larger",
+    )
+    algorithm: AnalyticPolicyGradient = Field(description="the algorithm, with its hyperparameters")
+    progression: Progression = Field(default_factory=Progression, description="evaluations and checkpoints")
+
+    def _problems(self) -> Iterator[Problem]:
+        if self.network.activation != "tanh":
+            yield Problem(
+                ("network", "activation"),
+                self.network.activation,
+                "must be tanh for analytic gradients",
+            )
+        decisions = self.algorithm.copies * self.algorithm.decisions
+        if decisions > MOST_IN_MEMORY:
+            sentence = f"all copies take {decisions:,} decisions, at most {MOST_IN_MEMORY:,} fit into memory"
+            yield Problem(("algorithm", "copies"), self.algorithm.copies, sentence)

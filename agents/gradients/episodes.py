@@ -1,0 +1,178 @@
+"""Episodes flown by a network, and the exact gradient of their cost by its weights.
+
+An episode is divided into K decisions, at t_0 = 0, ..., t_K = T, instead of its N time steps, which are many
+more. Between two times the input is constant: what the network would give at their middle, extrapolated from
+its last two outputs. The cost is summed by the trapezoidal rule. Both err with the square of the steps, so
+that a policy flies at every time step as it was trained.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.gradients.layers import Layers, SingleArray
+from dq_space_arm_env import Scene, compile_scene
+from dq_space_arm_env.kernels.bound import KernelCall
+
+Array = NDArray[Any]
+
+DIVERGED = 20.0  # times the median cost; episodes beyond it do not count
+STEEP = 10.0  # times the median episode's largest slope; slopes beyond it are shortened
+
+
+def decision_times(scene: Scene, decisions: int, crowding: float) -> Array:
+    """Times of decisions and end, s, (K + 1,); closer at both ends by a share of a cosine's spacing."""
+    even = np.linspace(0.0, 1.0, decisions + 1)
+    ends = 0.5 * (1.0 - np.cos(np.pi * even))
+    return scene.simulation.steps * scene.simulation.dt * (even + crowding * (ends - even))
+
+
+class Episodes:
+    """B episodes of K decisions: their arrays, and kernels bound to these.
+
+    Attributes:
+        parameters: Parameters of each decision and of the end, shape (K + 1, B, n_p).
+    """
+
+    def __init__(self, scene: Scene, layers: Layers, times: Array, action_scale: Array) -> None:
+        """Prepare episodes; the network's outputs are fractions of the limits in units of `action_scale`."""
+        self._kernels = kernels = compile_scene(scene)
+        self._layers, (decisions, count, n_obs) = layers, layers.values[0].shape
+        dtype, limit = kernels.dtype, kernels.layout.control_limit
+        self._units, self._limit, self._efforts = action_scale * limit, limit, kernels.layout.control_weight
+        steps, dt = np.diff(times), scene.simulation.dt
+        self._weights = 0.5 * (np.append(0.0, steps) + np.append(steps, 0.0)) / dt
+        # The sum over time steps has the first one's state whole, and the last one's not at all.
+        self._weights += 0.5 * (np.arange(decisions + 1) == 0) - 0.5 * (np.arange(decisions + 1) == decisions)
+        self._held = steps / dt - self._weights[:-1]  # of the input's cost, which is not of a point in time
+        self._ahead = np.append(0.0, 0.5 * steps[1:] / steps[:-1]).astype(np.float32)
+        self.parameters = np.zeros((decisions + 1, count, kernels.n_p), dtype)
+        self._states = np.zeros((decisions + 1, count, kernels.n_x), dtype)
+        self._observations = np.zeros((decisions, count, n_obs), dtype)
+        self._wanted = np.zeros((decisions, count, kernels.n_u), dtype)
+        self._inputs = np.zeros((decisions + 1, count, kernels.n_u), dtype)
+        self._costs = np.zeros((decisions + 1, count, 1), dtype)
+        self._terminal, self._emphasis = np.zeros((2, count, 1), dtype)
+        self._cotangents = np.zeros((decisions + 1, count, kernels.n_t), dtype)
+        self._by_input = np.zeros((count, kernels.n_u), dtype)
+        self._by_observation = np.zeros((count, n_obs), dtype)
+        self._by_state = np.zeros((count, kernels.n_t), dtype)
+        self._cost_weights = np.repeat(self._weights[:, None, None], count, axis=1).astype(dtype)
+        self._calls = [self._bind(index, times) for index in range(decisions)]
+        self._end = self._bind_end()
+
+    def _bind(self, k: int, times: Array) -> dict[str, KernelCall]:
+        """The calls of a decision."""
+        count, dtype = self._states.shape[1], self._kernels.dtype
+        given = {
+            "x": self._states[k],
+            "u": self._inputs[k],
+            "h": np.array([times[k + 1] - times[k]], dtype),
+            "parameters": self.parameters[k],
+            "time_left": np.full((count, 1), times[-1] - times[k], dtype),
+        }
+        after = {"x_next": self._states[k + 1], "cost": self._costs[k]}
+        seen = {"observation": self._observations[k], "errors": np.zeros((count, 2), dtype)}
+        back = {"v": self._cotangents[k + 1], "v_cost": self._cost_weights[k]}
+        back |= {"x_cotangent": self._cotangents[k], "u_cotangent": self._by_input}
+        by_observation = {"v": self._by_observation, "x_cotangent": self._by_state}
+        arrays = {
+            "observation": seen,
+            "step_with_cost": after,
+            "step_with_cost_vjp": back,
+            "observation_vjp": by_observation,
+        }
+        return {
+            name: KernelCall(self._kernels.kernel(name), given | others) for name, others in arrays.items()
+        }
+
+    def _bind_end(self) -> dict[str, KernelCall]:
+        """The calls at the end, where the inputs are zero."""
+        one = np.ones_like(self._terminal)
+        given = {"x": self._states[-1], "u": self._inputs[-1], "parameters": self.parameters[-1]}
+        given |= {"emphasis": self._emphasis}
+        arrays = {
+            "cost": {"cost": self._costs[-1]},
+            "emphasized_terminal_cost": {"cost": self._terminal},
+            "cost_vjp": {
+                "v": self._cost_weights[-1],
+                "x_cotangent": self._by_state,
+                "u_cotangent": self._by_input,
+            },
+            "emphasized_terminal_cost_vjp": {"v": one, "x_cotangent": self._cotangents[-1]},
+        }
+        return {
+            name: KernelCall(self._kernels.kernel(name), given | others) for name, others in arrays.items()
+        }
+
+    def fly(self, starts: Array, mean: Array, scale: Array, emphasis: float) -> Array:
+        """Fly from states (B, n_x); observations are normalized as `(o - mean) * scale`.
+
+        Returns the costs, (B,), with the terminal pose's multiplied by the emphasis.
+        """
+        self._states[0], self._emphasis[:] = starts, emphasis
+        outputs, rows = self._layers.values[-1], len(starts)
+        for k, calls in enumerate(self._calls):
+            calls["observation"](rows)
+            with np.errstate(over="ignore", invalid="ignore"):  # of episodes that diverge
+                self._layers.values[0][k] = (self._observations[k] - mean) * scale
+                action = self._layers.forward(k)
+            if ahead := self._ahead[k]:
+                action = action + ahead * (action - outputs[k - 1])
+            np.multiply(action, self._units, out=self._wanted[k])
+            np.clip(self._wanted[k], -self._limit, self._limit, out=self._inputs[k])
+            calls["step_with_cost"](rows)
+        self._end["cost"](rows)
+        self._end["emphasized_terminal_cost"](rows)
+        efforts = np.square(self._inputs[:-1]) @ self._efforts
+        total = self._weights @ self._costs[..., 0] + self._held @ efforts + self._terminal[:, 0]
+        return np.asarray(total)
+
+    def gradient(
+        self, starts: Array, mean: Array, scale: Array, emphasis: float
+    ) -> tuple[list[SingleArray], Array]:
+        """Exact gradient of the mean cost by the network's weights, and the costs of `fly`.
+
+        Episodes that diverge, or cost many times the median, do not count; where the slope of one grows to
+        many times the median, it is shortened, and the gradient is no longer exact.
+        """
+        costs = self.fly(starts, mean, scale, emphasis)
+        finite = np.isfinite(costs)
+        lost = ~finite | (costs > DIVERGED * (np.median(costs[finite]) if finite.any() else 0.0))
+        rows, kept = len(starts), max(1, len(starts) - int(lost.sum()))
+        for values in self._layers.values:
+            values[:, lost] = 0.0
+        self._end["emphasized_terminal_cost_vjp"](rows)
+        self._end["cost_vjp"](rows)
+        self._cotangents[-1] += self._by_state
+        self._cotangents[-1][lost] = 0.0
+        later, ahead = np.zeros_like(self._by_input), np.append(self._ahead, 0.0)
+        for k in range(len(self._calls) - 1, -1, -1):
+            self._calls[k]["step_with_cost_vjp"](rows)
+            slope = self._by_input + 2.0 * self._held[k] * self._efforts * self._inputs[k]
+            # Beyond a limit only what leads back counts.
+            wanted = self._wanted[k]
+            slope[((wanted > self._limit) & (slope < 0.0)) | ((wanted < -self._limit) & (slope > 0.0))] = 0.0
+            slope[lost] = 0.0
+            by_output = (1.0 + ahead[k]) * slope - ahead[k + 1] * later
+            later = slope
+            back = self._layers.backward(k, by_output * (self._units / kept))
+            np.multiply(back, scale * kept, out=self._by_observation)
+            self._calls[k]["observation_vjp"](rows)
+            self._cotangents[k] += self._by_state
+            self._cotangents[k][lost] = 0.0
+            _shorten(self._cotangents[k])
+        return self._layers.gradient(), costs
+
+
+def _shorten(slopes: Array) -> None:
+    """Shorten rows that are much longer than the median, as chaotic motions have; drop those not finite."""
+    sizes = np.abs(slopes).max(axis=1)
+    finite = np.isfinite(sizes)
+    most = STEEP * np.median(sizes[finite]) if finite.any() else 0.0
+    long = finite & (sizes > most)
+    slopes[long] *= (most / sizes[long])[:, None]
+    slopes[~finite] = 0.0

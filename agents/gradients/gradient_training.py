@@ -1,0 +1,251 @@
+"""Train an agent by analytic policy gradients: configuration -> episodes -> updates -> exported policy."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+from collections.abc import Callable, Mapping
+from datetime import timedelta
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from agents.configuration.gradients import GradientConfiguration
+from agents.configuration.reinforcement import ActionScale
+from agents.configuration.schema import RESERVED_SEED
+from agents.gradients.episodes import Episodes, decision_times
+from agents.gradients.layers import Layers, random_weights
+from agents.gradients.soap import SOAP
+from agents.policies import ExportedPolicy
+from agents.run_folder import POLICY, RunFolder, RunFolderError, validate, validation_seeds
+from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, load_scene
+from dq_space_arm_env.common.bounded_formats import read_arrays
+from dq_space_arm_env.common.bounded_reading import UnreadableError
+from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.progress import Advance, Status
+
+Array = NDArray[Any]
+
+WARM_UP = 50  # updates in which the learning rate rises
+FINAL_RATE = 3e-3  # learning rate at the end, relative to its peak
+TRIAL_ACTIONS = 0.05  # standard deviation of the actions that measure the spread of observations, in units
+SEEN = 128  # episodes of that
+WORSE = 2.0  # median cost relative to recent ones, above which the weights go back to what they were
+FORGETTING = 0.05  # share of the newest in the mean of recent costs
+BETWEEN_COPIES = 50  # updates between copies of the weights to go back to
+MOST_CAUTION = 1e-3  # factor of the learning rate at which the training gives up
+CAUTION = 0.7  # factor of the learning rate when they do
+CONSTANT = 1e-6  # standard deviation below which an entry of the observation is constant, in its unit
+BETWEEN_MESSAGES = 20  # updates
+CHECKPOINT = "checkpoint.npz"
+
+
+class Learned(NamedTuple):
+    """Result of a training run: its folder, and the exported policy."""
+
+    folder: Path
+    policy: ExportedPolicy
+
+
+class DivergedError(RuntimeError):
+    """No episode of an update stayed finite."""
+
+
+def train_by_gradients(
+    configuration: GradientConfiguration,
+    out: str | os.PathLike[str],
+    report: Callable[[Advance], None] = lambda advance: None,
+) -> Learned:
+    """Train an agent in a run folder, resuming from its last checkpoint."""
+    scene = load_scene(configuration.scene)
+    if scene.phases:
+        raise ValueError(
+            f"scene {scene.name!r} has phases, which analytic policy gradients do not cross: train on a "
+            "scene without, or by imitation"
+        )
+    folder = RunFolder(Path(out), configuration)
+    learner = _Learner(configuration, scene)
+    learner.resume(folder)
+    # On small matrices several threads wait for each other.
+    with threadpool_limits(configuration.threads, user_api="blas"):
+        learner.learn(folder, report)
+    policy = learner.export(folder.metadata(configuration, scene, learner.effort()))
+    policy.save(folder.path / POLICY)
+    return Learned(folder.path, policy)
+
+
+class Starts(NamedTuple):
+    """States (n, n_x) that episodes begin at, and parameters of each decision and the end (K + 1, n, n_p)."""
+
+    states: Array
+    parameters: Array
+
+    @classmethod
+    def draw(cls, scene: Scene, count: int, times: Array, seed: int) -> Starts:
+        """Draw starts with a seed, and look up their parameters at some times."""
+        environment = DQSpaceArmVectorEnv(count, scene)
+        environment.reset(seed=int(np.random.SeedSequence([RESERVED_SEED, seed]).generate_state(1)[0] >> 2))
+        kernels, given = environment.kernels, environment.parameters
+        rows = np.rint(times / scene.simulation.dt).astype(int)
+        parameters = np.repeat(given[None], len(times), axis=0)
+        if kernels.parameters.moving:
+            for index, row in enumerate(given):
+                parameters[:, index] = kernels.stage_parameters(row)[rows]
+        return cls(environment.states, parameters)
+
+
+def action_units(control: Any, scale: ActionScale, count: int) -> Array:
+    """Units of the inputs, fractions of their limits, (n_u,); one for those that the scale does not name."""
+    units = np.ones(count)
+    for name, value in scale:
+        units[getattr(control, name)] = value
+    return units
+
+
+class _Learner:
+    """The network, its episodes and its optimizer."""
+
+    def __init__(self, configuration: GradientConfiguration, scene: Scene) -> None:
+        self._settings, self._configuration, self._scene = configuration.algorithm, configuration, scene
+        settings, rng = configuration.algorithm, np.random.default_rng(configuration.seed)
+        self._times = decision_times(scene, settings.decisions, settings.crowding)
+        self._starts = Starts.draw(scene, settings.starts, self._times, configuration.seed)
+        seen = DQSpaceArmVectorEnv(SEEN, scene)
+        control = seen.kernels.layout.control
+        self._units = action_units(control, configuration.action_scale, seen.kernels.n_u)
+        self._mean, self._scale = self._spread(seen, rng)
+        sizes = [len(self._mean), *configuration.network.hidden, len(self._units)]
+        self._weights = random_weights(sizes, rng)
+        layers = Layers(self._weights, settings.decisions, settings.copies)
+        self._episodes = Episodes(scene, layers, self._times, self._units)
+        self._optimizer = SOAP(self._weights)
+        self._updates, self._seconds = 0, 0.0
+        self._typical, self._caution = math.inf, 1.0  # recent cost; factor of the learning rate
+        self._kept = self._state()
+
+    def _spread(self, environment: DQSpaceArmVectorEnv, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Mean and inverse standard deviation of observations under small random inputs; 0 if constant."""
+        environment.reset(seed=int(rng.integers(2**31)))
+        kernels, states = environment.kernels, environment.states
+        p = environment.parameters if kernels.n_p else None
+        units, seen = TRIAL_ACTIONS * self._units * kernels.layout.control_limit, []
+        for here, after in zip(self._times[:-1], self._times[1:], strict=True):
+            left = np.full((SEEN, 1), self._times[-1] - here)
+            seen.append(kernels.observation(states, left, p)[0])
+            states = kernels.step(states, units * rng.normal(size=(SEEN, len(units))), after - here, p=p)
+        samples = np.concatenate(seen).astype(np.float64)
+        samples = samples[np.isfinite(samples).all(axis=1)]
+        deviation = samples.std(axis=0)
+        varies = deviation > CONSTANT
+        return samples.mean(axis=0), np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
+
+    def learn(self, folder: RunFolder, report: Callable[[Advance], None]) -> None:
+        """Update to the end; flights and checkpoints on the way."""
+        progression, total = self._configuration.progression, self._settings.updates
+        first, begin = self._updates, perf_counter() - self._seconds
+        seeds = validation_seeds(progression.evaluation_episodes)
+        while self._updates < total:
+            cost = self._update()
+            self._seconds = perf_counter() - begin
+            done = self._updates
+            if done % BETWEEN_MESSAGES == 0:
+                left = self._seconds * (total - done) / max(1, done)
+                line = f"{done} of {total} updates, mean cost {cost:.5g}"
+                report(Status(done, total, f"{line}, {timedelta(seconds=round(left))} left"))
+            if done % progression.evaluate_every == 0 or done == total:
+                found = validate(self.export({}), self._scene, seeds)
+                lines = [line for line in folder.evaluations() if line["updates"] < done]
+                folder.write_evaluations([*lines, {**self.effort(), **found}])
+                begin = perf_counter() - self._seconds  # flights are no training
+            if done > first and (done % progression.checkpoint_every == 0 or done == total):
+                folder.add_checkpoint(done, self._write)
+
+    def _update(self) -> float:
+        """Take a step, and return the mean cost of its episodes."""
+        settings, done = self._settings, self._updates
+        # Seeded by the update, so that checkpoints need no generator's state.
+        rng = np.random.default_rng([self._configuration.seed, done])
+        rows = rng.integers(len(self._starts.states), size=settings.copies)
+        self._episodes.parameters[:] = self._starts.parameters[:, rows]
+        starts = self._starts.states[rows]
+        gradient, costs = self._episodes.gradient(starts, self._mean, self._scale, settings.end_weight)
+        if not np.isfinite(costs).any() or self._caution < MOST_CAUTION:
+            raise DivergedError(
+                f"training diverged: at update {done + 1} flights cost {WORSE:g} times what they did, again "
+                f"and again; reduce algorithm.learning_rate = {settings.learning_rate:g}"
+            )
+        warm_up = min(1.0, (done + 1) / WARM_UP)
+        falling = FINAL_RATE + (1.0 - FINAL_RATE) * 0.5 * (1.0 + math.cos(math.pi * done / settings.updates))
+        median = float(np.median(costs[np.isfinite(costs)]))
+        if done > WARM_UP and median > WORSE * self._typical:
+            # The motion has become unstable: take the weights from before, and smaller steps.
+            self._restore(self._kept)
+            self._caution *= CAUTION
+        else:
+            if done % BETWEEN_COPIES == 0:
+                self._kept = self._state()
+            # Relative to the cost, which differs by orders between scenes, a gradient has the norm 1 at most.
+            norm = math.sqrt(sum(float(np.square(each, dtype=np.float64).sum()) for each in gradient))
+            relative = [each / np.float32(max(norm, median)) for each in gradient]
+            self._optimizer.update(relative, self._caution * warm_up * falling * settings.learning_rate)
+        recent = self._typical if math.isfinite(self._typical) else median
+        self._typical = recent + FORGETTING * (median - recent)
+        self._updates += 1
+        return float(np.mean(costs[np.isfinite(costs)]))
+
+    def effort(self) -> dict[str, Any]:
+        """What the training has taken; an environment step is one between decisions."""
+        steps = self._updates * self._settings.copies * self._settings.decisions
+        return {"environment_steps": steps, "updates": self._updates, "seconds": round(self._seconds, 3)}
+
+    def export(self, metadata: dict[str, Any]) -> ExportedPolicy:
+        """The policy now, with the units of its actions folded into the last layer."""
+        *weights, last = self._weights[::2]
+        *biases, end = self._weights[1::2]
+        return ExportedPolicy(
+            weights=tuple(each.copy() for each in (*weights, last * self._units)),
+            biases=tuple(each.copy() for each in (*biases, end * self._units)),
+            activation="tanh",
+            mean=self._mean,
+            scale=self._scale,
+            metadata=metadata,
+        )
+
+    def _state(self) -> dict[str, Array]:
+        """Copies of weights and optimizer by name."""
+        weights = {f"weight{index}": each for index, each in enumerate(self._weights)}
+        return {name: np.array(each) for name, each in {**weights, **self._optimizer.arrays()}.items()}
+
+    def _restore(self, arrays: Mapping[str, Array]) -> None:
+        for index, weight in enumerate(self._weights):
+            weight[:] = arrays[f"weight{index}"]
+        self._optimizer.restore(arrays)
+
+    def _write(self, path: Path) -> None:
+        stream = io.BytesIO()
+        numbers = {"seconds": self._seconds, "typical": self._typical, "caution": self._caution}
+        kept = {f"kept.{name}": each for name, each in self._kept.items()}
+        arrays = {**self._state(), **kept, **{name: np.array(each) for name, each in numbers.items()}}
+        np.savez(stream, **arrays)  # type: ignore[arg-type]
+        write_atomically(path / CHECKPOINT, stream.getvalue())
+
+    def resume(self, folder: RunFolder) -> None:
+        """Go on from the folder's checkpoint, if it has one."""
+        place = folder.checkpoint()
+        if place is None:
+            return
+        try:
+            arrays = read_arrays(place / CHECKPOINT)
+            self._restore(arrays)
+            self._kept = {name.removeprefix("kept."): a for name, a in arrays.items() if "kept." in name}
+            self._updates, self._seconds = int(place.name), float(arrays["seconds"])
+            self._typical, self._caution = float(arrays["typical"]), float(arrays["caution"])
+        except (KeyError, ValueError, OSError, UnreadableError) as error:
+            raise RunFolderError(
+                f"{place} cannot be read ({error}); remove it to restart the training"
+            ) from error

@@ -1,0 +1,171 @@
+"""Analytic policy gradients: exact slopes of whole episodes, and a training that resumes to the bit."""
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("threadpoolctl")
+
+from agents.configuration import ConfigurationError, load_configuration
+from agents.gradients import episodes, gradient_training
+from agents.gradients.episodes import Episodes, decision_times
+from agents.gradients.gradient_training import train_by_gradients
+from agents.gradients.layers import Layers, random_weights
+from agents.policies import ExportedPolicy
+from agents.run_folder import RunFolder, RunFolderError, validation_seeds
+from dq_space_arm_env import DQSpaceArmVectorEnv, load_scene
+from dq_space_arm_env.environment.rollouts import rollout
+
+pytestmark = pytest.mark.agents
+
+COUNT, DECISIONS, HIDDEN, SEEDS = 16, 30, 12, list(range(16))
+
+
+class Flown:
+    """Episodes of a small scene, flown by a random network."""
+
+    def __init__(self, scene, decisions=DECISIONS, outputs=3.0):
+        environment = DQSpaceArmVectorEnv(COUNT, scene)
+        seen = environment.reset(seed=SEEDS)[0]
+        self.states, n_u = environment.states, environment.kernels.n_u
+        rng = np.random.default_rng(0)
+        self.weights = random_weights([seen.shape[1], HIDDEN, HIDDEN, n_u], rng)
+        self.weights[-2] *= np.float32(outputs)
+        self.mean, deviation = seen.mean(axis=0), seen.std(axis=0)
+        self.scale = np.where(deviation > 1e-6, 1.0 / np.maximum(deviation, 1e-6), 0.0)
+        layers = Layers(self.weights, decisions, COUNT)
+        self.episodes = Episodes(scene, layers, decision_times(scene, decisions, 0.4), np.full(n_u, 0.05))
+
+    def in_double_precision(self):
+        layers = self.episodes._layers
+        for arrays in (self.weights, layers.values, layers._cotangents):
+            arrays[:] = [each.astype(np.float64) for each in arrays]
+
+    def costs(self, emphasis=1.0):
+        return self.episodes.fly(self.states, self.mean, self.scale, emphasis)
+
+    def gradient(self, emphasis=1.0):
+        return self.episodes.gradient(self.states, self.mean, self.scale, emphasis)
+
+    def policy(self):
+        return ExportedPolicy(
+            weights=tuple(self.weights[::2]),
+            biases=tuple(self.weights[1::2]),
+            action_scale=np.full(len(self.weights[-1]), 0.05),
+            activation="tanh",
+            mean=self.mean,
+            scale=self.scale,
+        )
+
+
+def test_gradients_agree_with_differences(small_scene, monkeypatch):
+    monkeypatch.setattr(episodes, "STEEP", math.inf)  # which shortens slopes
+    flown = Flown(small_scene)
+    flown.in_double_precision()
+    gradient, costs = flown.gradient(emphasis=10.0)
+    np.testing.assert_array_equal(costs, flown.costs(emphasis=10.0))
+    rng = np.random.default_rng(1)
+    for weight, slope in zip(flown.weights, gradient, strict=True):
+        direction = rng.normal(size=weight.shape)
+        direction *= 1e-5 / np.linalg.norm(direction)
+        kept, ends = weight.copy(), []
+        for sign in (1, -1):
+            weight[:] = kept + sign * direction
+            ends.append(flown.costs(emphasis=10.0).mean())
+        weight[:] = kept
+        expected = (ends[0] - ends[1]) / 2.0
+        assert expected == pytest.approx(float((slope * direction).sum()), rel=1e-6)
+
+
+def test_an_episode_that_diverges_does_not_count(small_scene):
+    calm, wild = Flown(small_scene), Flown(small_scene)
+    calm.states[-1] = calm.states[0]
+    wild.states[-1] = wild.states[0]
+    velocities = wild.episodes._kernels.layout.state.joint_rates
+    wild.states[-1, velocities] = 1e6
+    expected = [each.astype(np.float64) * COUNT for each in calm.gradient()[0]]
+    calm.states[:-1] = calm.states[0]  # what the last one adds
+    alone = [each.astype(np.float64) for each in calm.gradient()[0]]
+    found = [each.astype(np.float64) * (COUNT - 1) for each in wild.gradient()[0]]
+    for whole, one, rest in zip(expected, alone, found, strict=True):
+        np.testing.assert_allclose(rest, whole - one, rtol=1e-3, atol=1e-4 * np.abs(whole).max())
+
+
+def test_decisions_fly_as_at_every_time_step():
+    """Costs differ by the square of the time between decisions."""
+    scene = load_scene("planar")
+    flights = rollout(Flown(scene).policy(), scene, SEEDS)
+    errors = [np.abs(Flown(scene, n).costs() / flights.cost - 1.0).mean() for n in (20, 40)]
+    assert errors[1] < 1e-3
+    assert errors[1] < 0.35 * errors[0]
+
+
+def settings(small_file, **algorithm):
+    changes = {"updates": 120, "copies": 16, "decisions": 20, "starts": 256, **algorithm}
+    return load_configuration(
+        {
+            "name": "small",
+            "scene": str(small_file),
+            "network": {"hidden": [16, 16]},
+            "action_scale": {"base_force": 0.01, "base_torque": 0.1},
+            "algorithm": {"name": "APG", **changes},
+            "progression": {"evaluate_every": 60, "evaluation_episodes": 8, "checkpoint_every": 60},
+        }
+    )
+
+
+def test_training_lowers_the_cost_and_resumes_to_the_bit(small_file, small_scene, tmp_path, monkeypatch):
+    trained = train_by_gradients(settings(small_file), tmp_path / "whole")
+    curve = [line["median_cost"] for line in trained_curve(tmp_path / "whole")]
+    idle = np.median(rollout(lambda seen: np.zeros((len(seen), 6)), small_scene, validation_seeds(8)).cost)
+    assert curve[-1] < 0.7 * idle
+    assert trained.policy.metadata["training"]["updates"] == 120
+
+    class StopError(Exception):
+        """As if the process were killed."""
+
+    update, done = gradient_training._Learner._update, []
+
+    def stopped(learner):
+        if len(done) == 77:
+            raise StopError
+        done.append(learner)
+        return update(learner)
+
+    monkeypatch.setattr(gradient_training._Learner, "_update", stopped)
+    with pytest.raises(StopError):
+        train_by_gradients(settings(small_file), tmp_path / "halves")
+    monkeypatch.undo()
+    resumed = train_by_gradients(settings(small_file), tmp_path / "halves")
+    for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert len(trained_curve(tmp_path / "halves")) == 2
+
+
+def trained_curve(folder):
+    return RunFolder(folder, load_configuration(folder / "config.yaml")).evaluations()
+
+
+def test_a_damaged_checkpoint_and_phases_are_refused(small_file, tmp_path):
+    train_by_gradients(settings(small_file, updates=20), tmp_path)
+    (checkpoint,) = (tmp_path / "checkpoints").glob("*/checkpoint.npz")
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    with pytest.raises(RunFolderError, match=r"cannot be read .* remove it"):
+        train_by_gradients(settings(small_file, updates=20), tmp_path)
+    phased = settings(small_file).model_copy(update={"scene": "release"})
+    with pytest.raises(ValueError, match="scene 'release' has phases"):
+        train_by_gradients(phased, tmp_path / "phased")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"crowding": 1.5}, "algorithm.*crowding = 1.5: must be at most 1"),
+        ({"decisions": 1}, "algorithm.*decisions = 1: must be at least 2"),
+        ({"copies": 10_000_000}, "algorithm.copies = 10000000: all copies take 200,000,000 decisions"),
+    ],
+)
+def test_mistakes_are_named(small_file, changes, message):
+    with pytest.raises(ConfigurationError, match=message):
+        settings(small_file, **changes)
