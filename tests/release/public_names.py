@@ -9,7 +9,15 @@ from typing import assert_type
 import numpy as np
 from numpy.typing import NDArray
 
-from agents import DQSpaceArmVecEnv, ExportedPolicy, compare, evaluate, train
+from agents import (
+    DQSpaceArmVecEnv,
+    ExportedPolicy,
+    SB3VecEnv,
+    compare,
+    evaluate,
+    export_policy,
+    train,
+)
 from agents.zoo import list_policies, load_policy
 from dq_space_arm_env import (
     CasadiDynamics,
@@ -112,6 +120,8 @@ def learn() -> NDArray[np.float64]:
     generate_demonstrations("planar", n=8, out="demonstrations", seed=0)
     demonstrations = load_demonstrations("demonstrations")
     train("cloning", "run")
+    adapter: type[SB3VecEnv] = DQSpaceArmVecEnv
+    print(adapter.__name__, export_policy.__name__)
     copies = DQSpaceArmVecEnv(4, "planar", seed=0)
     print(copies.reset(), copies.num_envs)
     policy: ExportedPolicy = load_policy(list_policies()[0])
