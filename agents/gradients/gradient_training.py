@@ -80,7 +80,10 @@ def train_by_gradients(
 
 
 class Starts(NamedTuple):
-    """States (n, n_x) that episodes begin at, and parameters of each decision and the end (K + 1, n, n_p)."""
+    """States (n, n_x) that episodes begin at, and parameters of each decision and the end.
+
+    Those have the shape (K + 1, n, n_p), or (1, n, n_p) where nothing moves.
+    """
 
     states: Array
     parameters: Array
@@ -91,12 +94,11 @@ class Starts(NamedTuple):
         environment = DQSpaceArmVectorEnv(count, scene)
         environment.reset(seed=int(np.random.SeedSequence([RESERVED_SEED, seed]).generate_state(1)[0] >> 2))
         kernels, given = environment.kernels, environment.parameters
+        if not kernels.parameters.moving:
+            return cls(environment.states, given[None])
         rows = np.rint(times / scene.simulation.dt).astype(int)
-        parameters = np.repeat(given[None], len(times), axis=0)
-        if kernels.parameters.moving:
-            for index, row in enumerate(given):
-                parameters[:, index] = kernels.stage_parameters(row)[rows]
-        return cls(environment.states, parameters)
+        stages = [kernels.stage_parameters(row)[rows] for row in given]
+        return cls(environment.states, np.stack(stages, axis=1))
 
 
 def action_units(control: Any, scale: ActionScale, count: int) -> Array:
