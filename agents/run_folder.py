@@ -54,6 +54,10 @@ class RunFolderError(RuntimeError):
     """A folder is for another run, or damaged."""
 
 
+class DivergedError(RuntimeError):
+    """Training diverged: the network yields what is not finite, or flies ever worse."""
+
+
 @contextmanager
 def reserved(path: Path) -> Iterator[None]:
     """Lock a folder against other training processes; the system releases the lock when the process ends."""

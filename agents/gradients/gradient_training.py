@@ -1,11 +1,14 @@
-"""Train an agent by analytic policy gradients: configuration -> episodes -> updates -> exported policy."""
+"""Train an agent by analytic policy gradients: configuration -> episodes -> updates -> exported policy.
+
+Through exact derivatives of the simulation, as in Brax (Freeman et al., 2021, arXiv:2106.13281).
+"""
 
 from __future__ import annotations
 
 import io
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from time import perf_counter
@@ -16,13 +19,21 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from agents.configuration.gradients import GradientConfiguration
-from agents.configuration.reinforcement import ActionScale
 from agents.configuration.schema import RESERVED_SEED
 from agents.gradients.episodes import Episodes, decision_times
 from agents.gradients.layers import Layers, random_weights
 from agents.gradients.soap import SOAP
 from agents.policies import ExportedPolicy
-from agents.run_folder import POLICY, RunFolder, RunFolderError, validate, validation_seeds
+from agents.policies.exported import units_of
+from agents.run_folder import (
+    POLICY,
+    DivergedError,
+    RunFolder,
+    RunFolderError,
+    validate,
+    validation_seeds,
+)
+from agents.wrappers.shaping import action_scale
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, load_scene
 from dq_space_arm_env.common.bounded_formats import read_arrays
 from dq_space_arm_env.common.bounded_reading import UnreadableError
@@ -40,7 +51,6 @@ FORGETTING = 0.05  # share of the newest in the mean of recent costs
 BETWEEN_COPIES = 50  # updates between copies of the weights to go back to
 MOST_CAUTION = 1e-3  # factor of the learning rate at which the training gives up
 CAUTION = 0.7  # factor of the learning rate when they do
-CONSTANT = 1e-6  # standard deviation below which an entry of the observation is constant, in its unit
 BETWEEN_MESSAGES = 20  # updates
 CHECKPOINT = "checkpoint.npz"
 
@@ -50,10 +60,6 @@ class Learned(NamedTuple):
 
     folder: Path
     policy: ExportedPolicy
-
-
-class DivergedError(RuntimeError):
-    """No episode of an update stayed finite."""
 
 
 def train_by_gradients(
@@ -101,14 +107,6 @@ class Starts(NamedTuple):
         return cls(environment.states, np.stack(stages, axis=1))
 
 
-def action_units(control: Any, scale: ActionScale, count: int) -> Array:
-    """Units of the inputs, fractions of their limits, (n_u,); one for those that the scale does not name."""
-    units = np.ones(count)
-    for name, value in scale:
-        units[getattr(control, name)] = value
-    return units
-
-
 class _Learner:
     """The network, its episodes and its optimizer."""
 
@@ -117,10 +115,8 @@ class _Learner:
         settings, rng = configuration.algorithm, np.random.default_rng(configuration.seed)
         self._times = decision_times(scene, settings.decisions, settings.crowding)
         self._starts = Starts.draw(scene, settings.starts, self._times, configuration.seed)
-        seen = DQSpaceArmVectorEnv(SEEN, scene)
-        control = seen.kernels.layout.control
-        self._units = action_units(control, configuration.action_scale, seen.kernels.n_u)
-        self._mean, self._scale = self._spread(seen, rng)
+        self._units = action_scale(dict(configuration.action_scale), scene).astype(np.float64)
+        self._mean, self._scale = units_of(self._trial(DQSpaceArmVectorEnv(SEEN, scene), rng))
         sizes = [len(self._mean), *configuration.network.hidden, len(self._units)]
         self._weights = random_weights(sizes, rng)
         layers = Layers(self._weights, settings.decisions, settings.copies)
@@ -130,8 +126,8 @@ class _Learner:
         self._typical, self._caution = math.inf, 1.0  # recent cost; factor of the learning rate
         self._kept = self._state()
 
-    def _spread(self, environment: DQSpaceArmVectorEnv, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Mean and inverse standard deviation of observations under small random inputs; 0 if constant."""
+    def _trial(self, environment: DQSpaceArmVectorEnv, rng: np.random.Generator) -> Array:
+        """Observations (N, n_obs) under small random inputs, those that stay finite."""
         environment.reset(seed=int(rng.integers(2**31)))
         kernels, states = environment.kernels, environment.states
         p = environment.parameters if kernels.n_p else None
@@ -140,16 +136,13 @@ class _Learner:
             left = np.full((SEEN, 1), self._times[-1] - here)
             seen.append(kernels.observation(states, left, p)[0])
             states = kernels.step(states, units * rng.normal(size=(SEEN, len(units))), after - here, p=p)
-        samples = np.concatenate(seen).astype(np.float64)
-        samples = samples[np.isfinite(samples).all(axis=1)]
-        deviation = samples.std(axis=0)
-        varies = deviation > CONSTANT
-        return samples.mean(axis=0), np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
+        samples = np.concatenate(seen)
+        return np.asarray(samples[np.isfinite(samples).all(axis=1)])
 
     def learn(self, folder: RunFolder, report: Callable[[Advance], None]) -> None:
         """Update to the end; flights and checkpoints on the way."""
         progression, total = self._configuration.progression, self._settings.updates
-        first, begin = self._updates, perf_counter() - self._seconds
+        begin = perf_counter() - self._seconds
         seeds = validation_seeds(progression.evaluation_episodes)
         while self._updates < total:
             cost = self._update()
@@ -157,18 +150,18 @@ class _Learner:
             done = self._updates
             if done % BETWEEN_MESSAGES == 0:
                 left = self._seconds * (total - done) / max(1, done)
-                line = f"{done} of {total} updates, mean cost {cost:.5g}"
+                line = f"{done} of {total} updates, median cost {cost:.5g}"
                 report(Status(done, total, f"{line}, {timedelta(seconds=round(left))} left"))
             if done % progression.evaluate_every == 0 or done == total:
                 found = validate(self.export({}), self._scene, seeds)
                 lines = [line for line in folder.evaluations() if line["updates"] < done]
                 folder.write_evaluations([*lines, {**self.effort(), **found}])
                 begin = perf_counter() - self._seconds  # flights are no training
-            if done > first and (done % progression.checkpoint_every == 0 or done == total):
+            if done % progression.checkpoint_every == 0 or done == total:
                 folder.add_checkpoint(done, self._write)
 
     def _update(self) -> float:
-        """Take a step, and return the mean cost of its episodes."""
+        """Fly episodes, take a step, and return their median cost."""
         settings, done = self._settings, self._updates
         # Seeded by the update, so that checkpoints need no generator's state.
         rng = np.random.default_rng([self._configuration.seed, done])
@@ -176,29 +169,35 @@ class _Learner:
         self._episodes.parameters[:] = self._starts.parameters[:, rows]
         starts = self._starts.states[rows]
         gradient, costs = self._episodes.gradient(starts, self._mean, self._scale, settings.end_weight)
-        if not np.isfinite(costs).any() or self._caution < MOST_CAUTION:
-            raise DivergedError(
-                f"training diverged: at update {done + 1} flights cost {WORSE:g} times what they did, again "
-                f"and again; reduce algorithm.learning_rate = {settings.learning_rate:g}"
-            )
-        warm_up = min(1.0, (done + 1) / WARM_UP)
-        falling = FINAL_RATE + (1.0 - FINAL_RATE) * 0.5 * (1.0 + math.cos(math.pi * done / settings.updates))
-        median = float(np.median(costs[np.isfinite(costs)]))
+        median = float(np.median(costs[np.isfinite(costs)])) if np.isfinite(costs).any() else math.inf
         if done > WARM_UP and median > WORSE * self._typical:
             # The motion has become unstable: take the weights from before, and smaller steps.
             self._restore(self._kept)
             self._caution *= CAUTION
         else:
-            if done % BETWEEN_COPIES == 0:
-                self._kept = self._state()
-            # Relative to the cost, which differs by orders between scenes, a gradient has the norm 1 at most.
-            norm = math.sqrt(sum(float(np.square(each, dtype=np.float64).sum()) for each in gradient))
-            relative = [each / np.float32(max(norm, median)) for each in gradient]
-            self._optimizer.update(relative, self._caution * warm_up * falling * settings.learning_rate)
+            self._follow(gradient, median)
+        if self._caution < MOST_CAUTION or (math.isinf(median) and done <= WARM_UP):
+            raise DivergedError(
+                f"training diverged: at update {done + 1} flights cost {median:.4g} where they did "
+                f"{self._typical:.4g}, again and again; reduce algorithm.learning_rate = "
+                f"{settings.learning_rate:g}"
+            )
+        self._updates += 1
+        return median
+
+    def _follow(self, gradient: Sequence[Array], median: float) -> None:
+        """Take a step against the gradient of episodes with a median cost."""
+        done, settings = self._updates, self._settings
+        if done % BETWEEN_COPIES == 0:
+            self._kept = self._state()
+        warm_up = min(1.0, (done + 1) / WARM_UP)
+        falling = FINAL_RATE + (1.0 - FINAL_RATE) * 0.5 * (1.0 + math.cos(math.pi * done / settings.updates))
+        # Relative to the cost, which differs by orders between scenes, a gradient has the norm 1 at most.
+        norm = math.sqrt(sum(float(np.square(each, dtype=np.float64).sum()) for each in gradient))
+        relative = [each / np.float32(max(norm, median)) for each in gradient]
+        self._optimizer.update(relative, self._caution * warm_up * falling * settings.learning_rate)
         recent = self._typical if math.isfinite(self._typical) else median
         self._typical = recent + FORGETTING * (median - recent)
-        self._updates += 1
-        return float(np.mean(costs[np.isfinite(costs)]))
 
     def effort(self) -> dict[str, Any]:
         """What the training has taken; an environment step is one between decisions."""
@@ -210,8 +209,8 @@ class _Learner:
         *weights, last = self._weights[::2]
         *biases, end = self._weights[1::2]
         return ExportedPolicy(
-            weights=tuple(each.copy() for each in (*weights, last * self._units)),
-            biases=tuple(each.copy() for each in (*biases, end * self._units)),
+            weights=tuple(np.array(each) for each in (*weights, last * self._units)),
+            biases=tuple(np.array(each) for each in (*biases, end * self._units)),
             activation="tanh",
             mean=self._mean,
             scale=self._scale,

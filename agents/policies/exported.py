@@ -37,8 +37,27 @@ FloatArray = NDArray[np.float64]
 SingleArray = NDArray[np.float32]
 
 
+CONSTANT = 1e-6
+"""Standard deviation below which an entry of the observation is constant, in its unit."""
+
+
 class PolicyFileError(Exception):
     """A file is not a policy that this version can read."""
+
+
+def units_of(observations: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Units in which a network sees observations.
+
+    Args:
+        observations: Samples, shape (N, n_obs).
+
+    Returns:
+        Mean and inverse standard deviation of each entry, shape (n_obs,); 0 for the latter of a constant.
+    """
+    samples = np.asarray(observations).astype(np.float64)
+    deviation = samples.std(axis=0)
+    varies = deviation > CONSTANT
+    return samples.mean(axis=0), np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
 
 
 def _tanh(values: FloatArray, spare: FloatArray) -> None:

@@ -16,7 +16,7 @@ from agents.policies import ExportedPolicy
 from agents.reinforcement.checkpoint import write_checkpoint
 from agents.reinforcement.networks import export_policy
 from agents.reinforcement.training_progress import Progress
-from agents.run_folder import BEST, RunFolder, validate, validation_seeds
+from agents.run_folder import BEST, DivergedError, RunFolder, validate, validation_seeds
 from agents.zoo.finding import as_policy
 from dq_space_arm_env import Scene
 
@@ -47,10 +47,6 @@ class Advance(NamedTuple):
                 f"{curve['attitude_error']:.1f} deg, {curve['position_error']:.3f} m"
             )
         return line
-
-
-class DivergedError(RuntimeError):
-    """Training diverged: the network yields NaN or infinity."""
 
 
 class TimeIsUp(Exception):  # noqa: N818 - an event, not a mistake

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents import configuration as c
 from agents.demonstrations import expert_seconds, prepare_demonstrations
 from agents.policies import ExportedPolicy
+from agents.policies.exported import units_of
 from agents.reinforcement.callback import Advance, TimeIsUp, TrainingCallback
 from agents.reinforcement.checkpoint import read_checkpoint
 from agents.reinforcement.networks import ACTIVATIONS, ScaledActionsPolicy, ScaledObservations
@@ -125,7 +126,7 @@ def _begin(
         # Good flights cover a narrower range of observations than random ones.
         for module in model.policy.modules():
             if isinstance(module, ScaledObservations):
-                module.set_units(*units_of(flown.observations))
+                module.set_units(*(each.tolist() for each in units_of(flown.observations)))
     return model, spent._replace(
         expert_solves=spent.expert_solves + demonstrations.settings["problems"],
         seconds_before=spent.seconds_before + expert_seconds(demonstrations),
@@ -219,7 +220,8 @@ def _units(configuration: c.Configuration, environment: VecEnv) -> tuple[list[fl
     samples = np.concatenate(seen)
     if not configuration.environment.normalize_observations:
         return [0.0] * samples.shape[1], [1.0] * samples.shape[1]
-    return units_of(samples)
+    mean, scale = units_of(samples)
+    return mean.tolist(), scale.tolist()
 
 
 def _joined(observations: Any) -> NDArray[Any]:
@@ -228,15 +230,6 @@ def _joined(observations: Any) -> NDArray[Any]:
         observations = observations | {"desired_goal": observations["achieved_goal"]}
         return np.concatenate([observations[key] for key in sorted(observations)], axis=1)
     return np.asarray(observations)
-
-
-def units_of(observations: NDArray[Any]) -> tuple[list[float], list[float]]:
-    """Mean and inverse standard deviation of each entry (0 if constant) of observations, shape (N, n_obs)."""
-    samples = observations.astype(np.float64)
-    deviation = samples.std(axis=0)
-    varies = deviation > 1e-6
-    scale = np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
-    return samples.mean(axis=0).tolist(), scale.tolist()
 
 
 # --- learning ---

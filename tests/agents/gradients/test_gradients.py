@@ -102,7 +102,7 @@ def test_decisions_fly_as_at_every_time_step():
 
 
 def settings(small_file, **algorithm):
-    changes = {"updates": 120, "copies": 16, "decisions": 20, "starts": 256, **algorithm}
+    changes = {"updates": 120, "copies": 16, "decisions": 40, "starts": 256, **algorithm}
     return load_configuration(
         {
             "name": "small",
@@ -119,7 +119,7 @@ def test_training_lowers_the_cost_and_resumes_to_the_bit(small_file, small_scene
     trained = train_by_gradients(settings(small_file), tmp_path / "whole")
     curve = [line["median_cost"] for line in trained_curve(tmp_path / "whole")]
     idle = np.median(rollout(lambda seen: np.zeros((len(seen), 6)), small_scene, validation_seeds(8)).cost)
-    assert curve[-1] < 0.7 * idle
+    assert curve[-1] < 0.2 * idle
     assert trained.policy.metadata["training"]["updates"] == 120
 
     class StopError(Exception):
@@ -163,7 +163,7 @@ def test_a_damaged_checkpoint_and_phases_are_refused(small_file, tmp_path):
     [
         ({"crowding": 1.5}, "algorithm.*crowding = 1.5: must be at most 1"),
         ({"decisions": 1}, "algorithm.*decisions = 1: must be at least 2"),
-        ({"copies": 10_000_000}, "algorithm.copies = 10000000: all copies take 200,000,000 decisions"),
+        ({"copies": 10_000_000}, "algorithm.copies = 10000000: all copies take 400,000,000 decisions"),
     ],
 )
 def test_mistakes_are_named(small_file, changes, message):

@@ -18,11 +18,11 @@ from stable_baselines3 import PPO
 
 from agents import DQSpaceArmVecEnv, ExportedPolicy, evaluate
 from agents.configuration import ConfigurationError, load_configuration
-from agents.reinforcement.callback import DivergedError, TrainingCallback
+from agents.reinforcement.callback import TrainingCallback
 from agents.reinforcement.checkpoint import read_checkpoint
 from agents.reinforcement.networks import export_policy
 from agents.reinforcement.reinforcement_training import make_environment, make_learner
-from agents.run_folder import RunFolder, RunFolderError, reserved
+from agents.run_folder import DivergedError, RunFolder, RunFolderError, reserved
 from agents.training import train
 from agents.zoo.finding import as_policy, read_policy
 from dq_space_arm_env import load_scene
