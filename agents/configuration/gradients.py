@@ -18,9 +18,10 @@ class AnalyticPolicyGradient(Model):
     learning_rate: Positive = Field(
         default=0.01, description="at its peak: it rises over the first updates, and falls like a cosine"
     )
-    copies: Many = Field(default=128, description="episodes of an update")
+    copies: Many = Field(default=64, description="episodes of an update")
     decisions: Many = Field(
-        default=80, description="decisions of an episode in training, at least 2; it flies at every time step"
+        default=200,
+        description="decisions of an episode in training, at least 2; flights decide at every time step",
     )
     crowding: NonNegative = Field(
         default=0.8,

@@ -170,13 +170,13 @@ class _Learner:
         starts = self._starts.states[rows]
         gradient, costs = self._episodes.gradient(starts, self._mean, self._scale, settings.end_weight)
         median = float(np.median(costs[np.isfinite(costs)])) if np.isfinite(costs).any() else math.inf
-        if done > WARM_UP and median > WORSE * self._typical:
+        if math.isinf(median) or (done > WARM_UP and median > WORSE * self._typical):
             # The motion has become unstable: take the weights from before, and smaller steps.
             self._restore(self._kept)
             self._caution *= CAUTION
         else:
             self._follow(gradient, median)
-        if self._caution < MOST_CAUTION or (math.isinf(median) and done <= WARM_UP):
+        if self._caution < MOST_CAUTION:
             raise DivergedError(
                 f"training diverged: at update {done + 1} flights cost {median:.4g} where they did "
                 f"{self._typical:.4g}, again and again; reduce algorithm.learning_rate = "
