@@ -3,6 +3,8 @@
 The units are part of the model: a saved one needs no file of statistics, and acts in the environment as is.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any
 
