@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING, Any
 from dq_space_arm_env.registration import register_environments
 
 if TYPE_CHECKING:
-    from dq_space_arm_env.environment import DQSpaceArmEnv, DQSpaceArmGoalEnv, DQSpaceArmVectorEnv
+    from dq_space_arm_env.environment import (
+        DQSpaceArmEnv,
+        DQSpaceArmGoalEnv,
+        DQSpaceArmGoalVectorEnv,
+        DQSpaceArmVectorEnv,
+    )
     from dq_space_arm_env.interoperability.casadi_dynamics import CasadiDynamics, casadi_dynamics
     from dq_space_arm_env.interoperability.mjcf_export import scene_to_mjcf
     from dq_space_arm_env.interoperability.pinocchio_twin import (
@@ -32,6 +37,7 @@ __all__ = [
     "CasadiDynamics",
     "DQSpaceArmEnv",
     "DQSpaceArmGoalEnv",
+    "DQSpaceArmGoalVectorEnv",
     "DQSpaceArmVectorEnv",
     "Kernels",
     "Scene",
@@ -53,6 +59,7 @@ _HOMES = {
     "CasadiDynamics": "interoperability.casadi_dynamics",
     "DQSpaceArmEnv": "environment",
     "DQSpaceArmGoalEnv": "environment",
+    "DQSpaceArmGoalVectorEnv": "environment",
     "DQSpaceArmVectorEnv": "environment",
     "Kernels": "kernels",
     "Scene": "scene",

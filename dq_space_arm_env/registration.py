@@ -32,7 +32,11 @@ def _register() -> None:
             vector_entry_point="dq_space_arm_env.environment:DQSpaceArmVectorEnv",
         )
     if "DQSpaceArmGoal-v0" not in registry:
-        register(id="DQSpaceArmGoal-v0", entry_point="dq_space_arm_env.environment:DQSpaceArmGoalEnv")
+        register(
+            id="DQSpaceArmGoal-v0",
+            entry_point="dq_space_arm_env.environment:DQSpaceArmGoalEnv",
+            vector_entry_point="dq_space_arm_env.environment:DQSpaceArmGoalVectorEnv",
+        )
 
 
 class _RegisterOnImport:

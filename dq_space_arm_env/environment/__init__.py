@@ -2,6 +2,7 @@
 
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.environment.goal import DQSpaceArmGoalEnv
+from dq_space_arm_env.environment.goal_vector import DQSpaceArmGoalVectorEnv
 from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
 
-__all__ = ["DQSpaceArmEnv", "DQSpaceArmGoalEnv", "DQSpaceArmVectorEnv"]
+__all__ = ["DQSpaceArmEnv", "DQSpaceArmGoalEnv", "DQSpaceArmGoalVectorEnv", "DQSpaceArmVectorEnv"]

@@ -2,40 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
+from dq_space_arm_env.environment.goal_rewards import (
+    Comparison,
+    ComputesRewards,
+    GoalRewards,
+    Observation,
+    RewardType,
+    show_goals,
+)
 from dq_space_arm_env.environment.reset_options import saved_state
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
 from dq_space_arm_env.environment.specification import PlainSpec
-from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
 
 Array = NDArray[Any]
-Observation = dict[str, Array]
-Info = Mapping[str, Any]
-RewardType = Literal["sparse", "dense"]
 
 
-class _Comparison(NamedTuple):
-    """Distances of achieved from desired goals: arrays of the shape of the batch, () for a single pair."""
-
-    attitude_error: Array
-    position_error: Array
-    pose_cost: Array
-    is_success: NDArray[np.bool_]
-
-
-class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisodes):
+class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]], PicklesEpisodes):
     """
     ## Description
 
@@ -135,6 +129,18 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
 
     ```
 
+    ## Vectorized environment
+
+    `DQSpaceArmGoalVectorEnv` steps many sub-environments together, bit-equal to single environments with the same seeds.
+
+    ```python
+    >>> venv = gymnasium.make_vec("DQSpaceArmGoal-v0", num_envs=3)
+    >>> observations, infos = venv.reset(seed=0)
+    >>> observations["desired_goal"].shape
+    (3, 8)
+
+    ```
+
     ## Version History
 
     * v0: Initial version.
@@ -168,9 +174,6 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
                 or a constraint of it terminates episodes.
         """
         PicklesEpisodes.__init__(self, scene, reward_type, render_mode, width, height, default_camera_config)
-        if reward_type not in get_args(RewardType):
-            kinds = " and ".join(get_args(RewardType))
-            raise ValueError(f"reward_type: {reward_type!r} is unknown; choose from {kinds}")
         self._env = DQSpaceArmEnv(scene, render_mode, width, height, default_camera_config)
         self.scene, self.kernels = self._env.scene, self._env.kernels
         if self.scene.other_tips:
@@ -184,6 +187,7 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
                 "costs 1, ending early would pay: set terminates: false"
             )
         self.reward_type, self.render_mode = reward_type, render_mode
+        self._goals = GoalRewards(self.kernels, reward_type)
         self.metadata = self._env.metadata
         layout = self.kernels.layout
         seen = layout.goal_observation(layout.initial_state, layout.parameters.nominal)
@@ -195,7 +199,6 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
                 "desired_goal": self._box(8, 4),
             }
         )
-        self._compare_rows = KernelCall(self.kernels.kernel("environment_goal"), {})
         self._truncated = False
 
     def _box(self, size: int, real_part: int) -> spaces.Box:
@@ -288,45 +291,21 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
         _, _, self._truncated, _, info = self._env.step(action)
         observation = self._observe()
         comparison = self._compare_goals(observation)
-        reward = float(self._rewards(comparison, info["diverged"]))
+        reward = float(self._goals.of(comparison, info["diverged"]))
         return observation, reward, False, self._truncated, self._judged(info, comparison)
 
     def _observe(self) -> Observation:
-        x, parameters = self._env.state, self._env.stage_parameters
-        layout = self.kernels.layout
-        seen = layout.goal_observation(x, parameters)
-        goals = {"achieved_goal": self.kernels.tip_pose(x), "desired_goal": layout.target_with(parameters)}
-        return {"observation": seen, **goals}
+        return show_goals(self.kernels, self._env.state, self._env.stage_parameters)
 
-    def _judged(self, info: dict[str, Any], comparison: _Comparison) -> dict[str, Any]:
+    def _compare_goals(self, observation: Observation) -> Comparison:
+        return self._goals.compare(observation["achieved_goal"], observation["desired_goal"])
+
+    def _judged(self, info: dict[str, Any], comparison: Comparison) -> dict[str, Any]:
         """Make `info` agree with the reward about the goal, to the last bit."""
         info["attitude_error"] = float(comparison.attitude_error)
         info["position_error"] = float(comparison.position_error)
         info["is_success"] = bool(comparison.is_success) and not info["diverged"]
         return info
-
-    def compute_reward(
-        self,
-        achieved_goal: ArrayLike,
-        desired_goal: ArrayLike,
-        info: Info | Sequence[Info] | NDArray[Any] | None = None,
-    ) -> float | Array:
-        """Compute the reward of steps for any achieved and desired goals.
-
-        Args:
-            achieved_goal: Poses of the tip after the step, shape (8,) or (B, 8), real part dimensionless, dual part m.
-            desired_goal: Goals, shape (8,) or (B, 8), real part dimensionless, dual part m.
-            info: The step's info, one dictionary or a sequence of shape (B,); only "diverged" is read, False by default.
-
-        Returns:
-            Reward, dimensionless, a float or shape (B,).
-
-        Raises:
-            TypeError: If a goal is masked, or not of real numbers.
-            ValueError: If the goals have wrong or different shapes.
-        """
-        rewards = self._rewards(self._compare(achieved_goal, desired_goal), _diverged(info))
-        return rewards if rewards.ndim else float(rewards)
 
     def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> bool:
         """Tell whether a step terminates the episode, which none does.
@@ -354,31 +333,6 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
         """
         return self._truncated
 
-    def _rewards(self, comparison: _Comparison, diverged: bool | NDArray[np.bool_]) -> Array:
-        steps = float(self.scene.simulation.steps)
-        if self.reward_type == "dense":
-            return np.where(diverged, steps, 1.0) * -comparison.pose_cost
-        return np.where(diverged, -steps, np.where(comparison.is_success, 0.0, -1.0))
-
-    def _compare_goals(self, observation: Observation) -> _Comparison:
-        return self._compare(observation["achieved_goal"], observation["desired_goal"])
-
-    def _compare(self, achieved: ArrayLike, desired: ArrayLike) -> _Comparison:
-        """Compare goals in machine code, bit-equal for a pair alone and in a batch."""
-        goals = [real_array("goals", goal, self.kernels.dtype) for goal in (achieved, desired)]
-        if any(goal.shape[-1:] != (8,) for goal in goals):
-            shapes = " and ".join(str(goal.shape) for goal in goals)
-            raise ValueError(f"goals: shapes {shapes}, should be (8,) or (B, 8)")
-        pairs = np.broadcast_arrays(*goals)
-        batch = pairs[0].shape[:-1]
-        rows = [np.ascontiguousarray(goal).reshape(-1, 8) for goal in pairs]
-        errors, cost, success = np.empty((*batch, 2)), np.empty(batch), np.empty(batch, dtype=np.bool_)
-        self._compare_rows.place(
-            achieved=rows[0], desired=rows[1], errors=errors, cost=cost, is_success=success
-        )
-        self._compare_rows(len(rows[0]))
-        return _Comparison(errors[..., 0], errors[..., 1], cost, success)
-
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the present state, see `DQSpaceArmEnv.render`.
 
@@ -390,12 +344,3 @@ class DQSpaceArmGoalEnv(gymnasium.Env[Observation, NDArray[Any]], PicklesEpisode
     def close(self) -> None:
         """Close the window, if there is one."""
         self._env.close()
-
-
-def _diverged(info: Info | Sequence[Info] | NDArray[Any] | None) -> bool | NDArray[np.bool_]:
-    """Whether simulations diverged according to their infos."""
-    if info is None:
-        return False
-    if isinstance(info, Mapping):
-        return np.asarray(info.get("diverged", False), dtype=np.bool_)
-    return np.array([bool(entry.get("diverged", False)) for entry in info])

@@ -29,7 +29,7 @@ _SPARES = 4  # a training loop holds the results of the last step or two
 class StepResult(NamedTuple):
     """Arrays that a step fills."""
 
-    observation: Array  # shape (count, n_obs)
+    observation: Any  # shape (count, n_obs); of goal environments, such arrays by name
     report: NDArray[np.float64]  # a row for each of `report_names`, shape (len(report_names(scene)), count)
     flags: NDArray[np.bool_]  # a row for each name in FLAGS, shape (len(FLAGS), count)
 
@@ -91,16 +91,21 @@ class SubEnvironments:
             "generator": self._generators,
         }
 
-    def stage_parameters(self) -> Array:
-        """Parameters with pose and velocity of moving targets as they are now, shape (count, n_p); a copy."""
-        parameters = self.parameters.copy()
+    def stage_parameters(self, rows: Rows | slice = slice(None)) -> Array:
+        """Parameters with pose and velocity of moving targets as they are now, shape (k, n_p); a copy."""
+        parameters, memory = self.parameters[rows].copy(), self._memory[rows]
         entries = self._kernels.parameters
         if entries.staged:
-            stages = self._memory[:, 0].astype(np.int64)
-            for row, (first, stage) in enumerate(zip(self.parameters, stages, strict=True)):
-                parameters[row] = self._kernels.stage_parameters(first)[stage]
+            starts, values, _, catches = self._kernels.scene.staged
+            stages = memory[:, 0].astype(np.int64)
+            caught = [start for start, catch in zip(starts, catches, strict=True) if catch]
+            for row in np.flatnonzero(np.isin(stages + 1, caught)):  # with the twist of the target then
+                parameters[row] = self._kernels.stage_parameters(parameters[row])[stages[row]]
+            phases = np.searchsorted(starts, stages, side="right") - 1
+            for name, each in values.items():
+                parameters[:, entries.names.index(name)] = np.array(each)[phases]
         size = len(entries.moving)
-        parameters[:, list(entries.moving)] = self._memory[:, len(MEMORY) : len(MEMORY) + size]
+        parameters[:, list(entries.moving)] = memory[:, len(MEMORY) : len(MEMORY) + size]
         return parameters
 
     def seed(self, rows: Rows, seeds: Sequence[int | None]) -> None:
@@ -132,7 +137,7 @@ class SubEnvironments:
         self._observe.on_rows(rows)
         return seen
 
-    def observe_states(self, x: Array) -> Array:
+    def observe_states(self, x: Array) -> Any:
         """Observations of other states, shape (count, n_x), at the present times."""
         seen = self._results.fresh()
         x = np.ascontiguousarray(x, self.x.dtype)

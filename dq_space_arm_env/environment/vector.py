@@ -39,7 +39,7 @@ Rows = NDArray[np.int64]
 _NONE = np.empty(0, dtype=np.int64)
 
 
-class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesEpisodes):
+class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpisodes):
     """`num_envs` sub-environments, bit-equal to single `DQSpaceArmEnv` with the same seeds and actions.
 
     `gymnasium.make_vec("DQSpaceArm-v0", num_envs=1024)` creates it. Spaces, reward, `info`, options and
@@ -113,7 +113,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
                 "should be 'rgb_array' or None"
             )
         self._picture = PictureFormat.checked(*picture)
-        single = DQSpaceArmEnv(scene)
+        single = self._make_single(scene)
         self.scene, self.kernels = single.scene, compile_scene(single.scene, threads)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -126,7 +126,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
-        self._envs = SubEnvironments(self.kernels, num_envs)
+        self._envs = self._make_sub_environments()
         self._begun, disabled = False, self.autoreset_mode is AutoresetMode.DISABLED
         self._all = np.ones(num_envs, dtype=np.bool_)
         self._all.setflags(write=False)
@@ -139,6 +139,13 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         self._trails = None if render_mode is None else Trails(num_envs)
         self._payloads = Payloads(self.kernels, num_envs) if leaves_tip(self.scene) else None
         self._renderer: Renderer | None = None
+
+    def _make_single(self, scene: Scene | Mapping[str, Any] | str | Path) -> Any:
+        """Make an environment of the kind that is here many times; it refuses what it cannot take."""
+        return DQSpaceArmEnv(scene)
+
+    def _make_sub_environments(self) -> SubEnvironments:
+        return SubEnvironments(self.kernels, self.num_envs)
 
     @property
     def states(self) -> Array:
@@ -162,7 +169,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin episodes.
 
         Args:
@@ -191,13 +198,17 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             self.set_state(self._given_state(saved, rows), rows)
             self._seed(seed, rows)
         result = self._envs.observe(rows)
-        if self._seen is None or begins:
-            result.observation[others] = self._envs.observe(others).observation[others]
-        else:
-            result.observation[others] = self._seen[others]
+        self._show_again(others, result, begins)
         result.report[:, others], result.flags[:, others] = 0.0, False
         self._remember(result.observation)
         return result.observation, self._info(result, mask) | self._drawn(rows)
+
+    def _show_again(self, rows: Rows, result: StepResult, begins: bool) -> None:
+        """Put observations of sub-environments that are not reset into a result."""
+        if self._seen is None or begins:
+            result.observation[rows] = self._envs.observe(rows).observation[rows]
+        else:
+            result.observation[rows] = self._seen[rows]
 
     def _remember(self, observations: Array) -> None:
         """Keep observations for resets of some sub-environments, which return the others' last ones."""
@@ -254,7 +265,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             *(None if parts[0] is None else np.array(parts) for parts in zip(*starts, strict=True))
         )
 
-    def step(self, actions: ArrayLike) -> tuple[Array, Array, Mask, Mask, dict[str, Any]]:
+    def step(self, actions: ArrayLike) -> tuple[Any, Array, Mask, Mask, dict[str, Any]]:
         """Apply an action to every sub-environment for one time step.
 
         Args:
@@ -320,7 +331,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         if len(rows):
             self._envs.move(rows, self.kernels.retract(self._envs.x[rows], increments[rows]))
 
-    def observe(self, states: ArrayLike | None = None) -> Array:
+    def observe(self, states: ArrayLike | None = None) -> Any:
         """Give observations without a step.
 
         Args:
@@ -477,7 +488,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
         ended = result.flags[0].copy()
         last_observations = np.full(self.num_envs, None, dtype=object)
         for i in rows:
-            last_observations[i] = result.observation[i].copy()
+            last_observations[i] = _row(result.observation, i)
         last = result._replace(report=np.where(ended, result.report, 0.0), flags=result.flags & ended)
         return {
             "final_obs": last_observations,
@@ -514,3 +525,10 @@ class DQSpaceArmVectorEnv(VectorEnv[Array, NDArray[Any], NDArray[Any]], PicklesE
             "diverged": diverged,
             **(self._masks if whole else {key: mask.copy() for key in self._masks}),
         }
+
+
+def _row(observations: Any, row: int) -> Any:
+    """A copy of the observation of one sub-environment, of an array or of arrays by name."""
+    if isinstance(observations, dict):
+        return {name: part[row].copy() for name, part in observations.items()}
+    return observations[row].copy()

@@ -304,8 +304,10 @@ def test_same_seed_same_episode_to_the_bit_in_copies_too():
     assert not np.array_equal(*(env.reset()[0]["desired_goal"] for _ in range(2)))
 
 
-def test_make_vec_steps_several():
-    venv = gymnasium.make_vec("DQSpaceArmGoal-v0", num_envs=4, scene=short("random-target", 3))
+def test_make_vec_steps_several_one_by_one_too():
+    venv = gymnasium.make_vec(
+        "DQSpaceArmGoal-v0", num_envs=4, scene=short("random-target", 3), vectorization_mode="sync"
+    )
     observations, _ = venv.reset(seed=0)
     assert observations["desired_goal"].shape == (4, 8)
     venv.action_space.seed(0)

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 from short_scenes import short
 
-from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, list_scenes
+from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmGoalVectorEnv, DQSpaceArmVectorEnv, list_scenes
 
 LENGTH, MODES = 12, ("NextStep", "SameStep", "Disabled")
 DRAWN = short("random-target", LENGTH)
@@ -80,6 +80,11 @@ def test_a_goal_environment_goes_on():
 @pytest.mark.parametrize("name", list_scenes())
 def test_a_vector_environment_goes_on(name, mode):
     check(*(DQSpaceArmVectorEnv(3, short(name, LENGTH), mode) for _ in range(2)), seed=[1, 2, 3])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_goal_vector_environment_goes_on(mode):
+    check(*(DQSpaceArmGoalVectorEnv(3, DRAWN, "dense", mode) for _ in range(2)), seed=[1, 2, 3])
 
 
 @pytest.mark.parametrize("kind", ["DQSpaceArm-v0", "DQSpaceArmGoal-v0"])

@@ -23,6 +23,7 @@ from dq_space_arm_env import (
     CasadiDynamics,
     DQSpaceArmEnv,
     DQSpaceArmGoalEnv,
+    DQSpaceArmGoalVectorEnv,
     DQSpaceArmVectorEnv,
     Kernels,
     Scene,
@@ -63,6 +64,7 @@ def simulate(name: str) -> float:
     observations, _ = many.reset(seed=0)
     goals = DQSpaceArmGoalEnv(scene="random-target")
     goals.reset(seed=0)
+    DQSpaceArmGoalVectorEnv(8, "random-target").reset(seed=0)
     kernels = compile_scene(name)
     assert_type(kernels, Kernels)
     x = kernels.step(kernels.layout.initial_state, np.zeros(kernels.n_u))

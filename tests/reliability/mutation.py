@@ -90,7 +90,9 @@ TESTS: dict[str, dict[str, list[str]]] = {
         "quick": ["tests/task"],
         "default": [*_ENVIRONMENT, *_VECTORS, "tests/kernels/test_kernels_randomization.py"],
     },
-    "dq_space_arm_env/environment/goal.py": {"quick": ["tests/environment/test_goal_environment.py"]},
+    "dq_space_arm_env/environment/goal": {
+        "quick": [f"tests/environment/test_goal_{name}environment.py" for name in ("", "vector_")]
+    },
     "dq_space_arm_env/environment/": {"quick": _ENVIRONMENT[:2], "default": _VECTORS + _ENVIRONMENT[2:]},
     "dq_space_arm_env/integrators/": {
         "quick": [

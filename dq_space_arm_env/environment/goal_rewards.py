@@ -1,0 +1,109 @@
+"""What goal environments show, and the rewards of goals: alike for one environment and for many."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.kernels import Kernels
+from dq_space_arm_env.kernels.bound import KernelCall
+
+Array = NDArray[Any]
+Observation = dict[str, Array]
+Info = Mapping[str, Any]
+RewardType = Literal["sparse", "dense"]
+
+
+class Comparison(NamedTuple):
+    """Distances of achieved from desired goals: arrays of the shape of the batch, () for a single pair."""
+
+    attitude_error: Array  # deg
+    position_error: Array  # m
+    pose_cost: Array
+    is_success: NDArray[np.bool_]
+
+
+def show_goals(kernels: Kernels, x: Array, parameters: Array) -> Observation:
+    """Observations of states (..., n_x) with the parameters (..., n_p) of their stages."""
+    layout = kernels.layout
+    seen = layout.goal_observation(x, parameters)
+    goals = {"achieved_goal": kernels.tip_pose(x), "desired_goal": layout.target_with(parameters)}
+    return {"observation": seen, **goals}
+
+
+class GoalRewards:
+    """Compares goals in machine code, bit-equal for a pair alone and in a batch."""
+
+    def __init__(self, kernels: Kernels, reward_type: RewardType) -> None:
+        if reward_type not in get_args(RewardType):
+            kinds = " and ".join(get_args(RewardType))
+            raise ValueError(f"reward_type: {reward_type!r} is unknown; choose from {kinds}")
+        self._kernels, self._dense = kernels, reward_type == "dense"
+        self._compare_rows = KernelCall(kernels.kernel("environment_goal"), {})
+
+    def compare(self, achieved: ArrayLike, desired: ArrayLike) -> Comparison:
+        """Compare goals, shape (8,) or (B, 8)."""
+        goals = [real_array("goals", goal, self._kernels.dtype) for goal in (achieved, desired)]
+        if any(goal.shape[-1:] != (8,) for goal in goals):
+            shapes = " and ".join(str(goal.shape) for goal in goals)
+            raise ValueError(f"goals: shapes {shapes}, should be (8,) or (B, 8)")
+        pairs = np.broadcast_arrays(*goals)
+        batch = pairs[0].shape[:-1]
+        rows = [np.ascontiguousarray(goal).reshape(-1, 8) for goal in pairs]
+        errors, cost, success = np.empty((*batch, 2)), np.empty(batch), np.empty(batch, dtype=np.bool_)
+        self._compare_rows.place(
+            achieved=rows[0], desired=rows[1], errors=errors, cost=cost, is_success=success
+        )
+        self._compare_rows(len(rows[0]), self._kernels.threads)
+        return Comparison(errors[..., 0], errors[..., 1], cost, success)
+
+    def of(self, comparison: Comparison, diverged: bool | NDArray[np.bool_]) -> Array:
+        """Rewards of steps, of the shape of the batch."""
+        steps = float(self._kernels.scene.simulation.steps)
+        if self._dense:
+            return np.where(diverged, steps, 1.0) * -comparison.pose_cost
+        return np.where(diverged, -steps, np.where(comparison.is_success, 0.0, -1.0))
+
+
+class ComputesRewards:
+    """The reward of any goal, for environments that have `GoalRewards`."""
+
+    _goals: GoalRewards
+
+    def compute_reward(
+        self,
+        achieved_goal: ArrayLike,
+        desired_goal: ArrayLike,
+        info: Info | Sequence[Info] | NDArray[Any] | None = None,
+    ) -> float | Array:
+        """Compute the reward of steps for any achieved and desired goals.
+
+        Args:
+            achieved_goal: Poses of the tip after the step, shape (8,) or (B, 8), real part dimensionless,
+                dual part m.
+            desired_goal: Goals, shape (8,) or (B, 8), real part dimensionless, dual part m.
+            info: The step's info, one dictionary or a sequence of shape (B,); only "diverged" is read, False
+                by default.
+
+        Returns:
+            Reward, dimensionless, a float or shape (B,).
+
+        Raises:
+            TypeError: If a goal is masked, or not of real numbers.
+            ValueError: If the goals have wrong or different shapes.
+        """
+        rewards = self._goals.of(self._goals.compare(achieved_goal, desired_goal), _diverged(info))
+        return rewards if rewards.ndim else float(rewards)
+
+
+def _diverged(info: Info | Sequence[Info] | NDArray[Any] | None) -> bool | NDArray[np.bool_]:
+    """Whether simulations diverged according to their infos."""
+    if info is None:
+        return False
+    if isinstance(info, Mapping):
+        return np.asarray(info.get("diverged", False), dtype=np.bool_)
+    return np.array([bool(entry.get("diverged", False)) for entry in info])
