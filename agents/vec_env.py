@@ -71,7 +71,6 @@ class SB3VecEnv(VecEnv):
         self.vector_env = vector_env
         self._chain = _chain(vector_env)
         self._given = frozenset(dir(vector_env.unwrapped))
-        self._shaper = next((env for env in reversed(self._chain) if isinstance(env, ShapeReward)), None)
         self._repeater = next((env for env in reversed(self._chain) if isinstance(env, RepeatAction)), None)
         space = _in_single_precision(vector_env.single_observation_space)
         VecEnv.__init__(self, vector_env.num_envs, space, _noted_actions(self._chain))
@@ -162,7 +161,7 @@ class SB3VecEnv(VecEnv):
             raise RuntimeError("call step_async() before step_wait()")
         observations, rewards, terminated, truncated, info = self.vector_env.step(self._actions)
         dones = terminated | truncated
-        self._returns += rewards if self._shaper is None else self._shaper.unshaped
+        self._returns += self._unshaped(rewards)
         self._lengths += 1 if self._repeater is None else self._repeater.steps_taken
         infos: list[Info] = [{} for _ in range(self.num_envs)]
         if self._step_infos:
@@ -172,6 +171,15 @@ class SB3VecEnv(VecEnv):
         if dones.any():
             self._end_episodes(np.flatnonzero(dones), truncated & ~terminated, info, infos)
         return _single(observations), rewards.astype(np.float32), dones, infos
+
+    def _unshaped(self, rewards: NDArray[Any]) -> NDArray[Any]:
+        """Rewards of the environment inside the innermost wrapper that changes them."""
+        for env in reversed(self._chain):
+            if isinstance(env, RepeatAction):
+                return env.collected
+            if isinstance(env, ShapeReward):
+                return env.unshaped
+        return rewards
 
     def _end_episodes(
         self, copies: NDArray[np.intp], truncated: NDArray[np.bool_], info: Info, infos: list[Info]
@@ -261,16 +269,18 @@ class SB3VecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method of the vector environment once for all copies; `indices` must be all.
 
-        `reset` and `step` are refused: they would bypass the episode statistics.
+        Some alone may be asked for `compute_reward`, which depends on none of them. `reset` and `step` are
+        refused: they would bypass the episode statistics.
         """
-        self._require_all(indices, f"method {method_name!r}")
+        if method_name != "compute_reward":
+            self._require_all(indices, f"method {method_name!r}")
         if method_name in ("reset", "step"):
             raise ValueError(
                 f"method {method_name!r} would bypass the episode statistics: "
                 f"call that of {type(self).__name__}"
             )
         method = getattr(self._home(method_name), method_name)
-        return [method(*method_args, **method_kwargs)] * self.num_envs
+        return [method(*method_args, **method_kwargs)] * len(self._checked(indices))
 
     def env_is_wrapped(
         self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: int | Iterable[int] | None = None

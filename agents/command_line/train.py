@@ -46,8 +46,7 @@ def train(
 
     The folder of the run receives the resolved configuration, commit and versions, checkpoints, the learning
     curve and the exported policy. Re-run the command to resume an interrupted run at its last checkpoint:
-    it ends with the same weights, except with hindsight, where new episodes begin. Nothing in the folder is
-    executed.
+    it ends with the same weights. Nothing in the folder is executed.
     Exit status 1: the folder belongs to another run. Needs the extra `agents`.
     """
     chosen = configuration or config

@@ -6,9 +6,7 @@
 | `arrays.npz` | running episodes with the last observations, and the replay buffer |
 | `state.json` | progress of the run, counters, and the states of the other random generators |
 
-A run that is killed and resumed ends with the weights of one that was not, bit for bit on one machine, where
-the environment can be put back into its running episodes. Goal environments (hindsight) cannot: there new
-episodes begin, seeded by the run's seed and its number of steps.
+A run that is killed and resumed ends with the weights of one that was not, bit for bit on one machine.
 
 Nothing in these files is executed: a run folder that somebody else made can be resumed.
 """
@@ -108,13 +106,9 @@ def _restored(
         if name in _COUNTERS:
             setattr(model, name, type(getattr(model, name))(value))
     _fill(model, state["buffer"], arrays)
-    if "last_observations" not in arrays:
-        assert model.seed is not None
-        model.set_random_seed(model.seed + progress.environment_steps)
-        return progress
     environment: Any = model.get_env()
     environment.set_state(_part("environment.", arrays))
-    model._last_obs = arrays["last_observations"]
+    model._last_obs = _part("last_observations.", arrays) or arrays["last_observations"]
     model._last_episode_starts = arrays["episode_starts"]
     _seed_again(model, state["generators"], parts["generator"])
     return progress
@@ -129,13 +123,15 @@ def _variables(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
 
 
 def _running(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
-    """Running episodes of an environment that can be put back into them; else nothing."""
+    """The environment's running episodes, with what was last seen of them."""
     environment: Any = model.get_env()
-    if not hasattr(environment, "get_state") or not isinstance(model._last_obs, np.ndarray):
-        return {}
     found = {f"environment.{name}": array for name, array in environment.get_state().items()}
-    starts = np.asarray(model._last_episode_starts)
-    return {**found, "last_observations": model._last_obs, "episode_starts": starts}
+    seen: Any = model._last_obs
+    if isinstance(seen, dict):
+        found |= {f"last_observations.{name}": part for name, part in seen.items()}
+    else:
+        found["last_observations"] = seen
+    return {**found, "episode_starts": np.asarray(model._last_episode_starts)}
 
 
 def _part(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -181,7 +177,6 @@ def _fill(model: BaseAlgorithm, place: Any, arrays: Mapping[str, NDArray[Any]]) 
         rows[...] = arrays[name]
     if isinstance(buffer, HerReplayBuffer):
         buffer._current_ep_start = arrays["episodes.start"]
-        buffer.truncate_last_trajectory()  # its episodes do not go on
     if isinstance(buffer, DemonstrationBuffer):
         shown = _part("demonstrated.", arrays)
         buffer.share = float(shown.pop("share"))

@@ -1,37 +1,29 @@
-"""The environment of a configuration: wrapped native copies, or goal environments for hindsight."""
+"""The environment of a configuration: wrapped native copies, those of goals for hindsight."""
 
 from typing import Any, cast
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import TransformReward
 from numpy.typing import NDArray
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from agents import configuration as c
-from agents import wrappers
 from agents.vec_env import SB3VecEnv
 from agents.wrappers import vector
-from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
+from dq_space_arm_env import DQSpaceArmGoalVectorEnv, DQSpaceArmVectorEnv, Scene
 
 
-def make_environment(configuration: c.Configuration, scene: Scene) -> VecEnv:
+def make_environment(configuration: c.Configuration, scene: Scene) -> SB3VecEnv:
     """Make the training environment, with held actions and shaped rewards."""
     _check_lengths(configuration, scene)
     practice, hindsight = configuration.environment, configuration.hindsight
     if hindsight is None:
         return native_environment(configuration, scene, practice.copies)
-    reward_type = hindsight.reward_type
-
-    def make() -> gymnasium.Env[Any, Any]:
-        goal = Monitor(gymnasium.make("DQSpaceArmGoal-v0", scene=scene, reward_type=reward_type))
-        held = wrappers.RepeatAction(goal, practice.action_repeat, reward="last")
-        return wrappers.ShrinkActionSpace(held, dict(practice.action_scale))
-
-    return DummyVecEnv([make] * practice.copies)
+    native = DQSpaceArmGoalVectorEnv(practice.copies, scene, hindsight.reward_type, AutoresetMode.SAME_STEP)
+    held = vector.RepeatAction(native, practice.action_repeat, reward="last")
+    return SB3VecEnv(vector.ShrinkActionSpace(held, dict(practice.action_scale)))
 
 
 def native_environment(configuration: c.Configuration, scene: Scene, copies: int) -> SB3VecEnv:

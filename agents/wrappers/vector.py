@@ -39,6 +39,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         repeat: Number of time steps for which an action is held.
         steps_taken: Number of time steps of the last decision in each sub-environment, shape (num_envs,);
             fewer where its episode ended, 0 where the step was a reset.
+        collected: Sum of the rewards of these time steps, of whatever reward the decision has.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         super().__init__(env)
         _check_restorable(env)
         self.repeat, self.steps_taken = int(repeat), np.zeros(env.num_envs, dtype=np.int64)
+        self.collected = np.zeros(env.num_envs)
         self._sum, self._discount, self._step_infos = reward == "sum", discount, step_infos
 
     def step(self, actions: Any) -> Result:
@@ -78,12 +80,14 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         mode, none = self.env.metadata["autoreset_mode"], np.zeros(self.num_envs, dtype=np.bool_)
         # In this mode the first step of those that are over is their reset.
         resetting = home.get_state()["over"] if mode is AutoresetMode.NEXT_STEP else none
-        total, taken, resting, weight = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64), none, 1.0
+        total, collected = np.zeros(self.num_envs), np.zeros(self.num_envs)
+        taken, resting, weight = np.zeros(self.num_envs, np.int64), none, 1.0
         finished: list[_Finished] = []
         infos: list[list[Info]] = [[] for _ in range(self.num_envs)]
         for step in range(self.repeat):
             observations, rewards, terminated, truncated, info = self.env.step(actions)
             total = np.where(resting, total, total + weight * rewards if self._sum else rewards)
+            collected = np.where(resting, collected, collected + rewards)
             weight *= self._discount
             taken += ~(resting | resetting)
             if self._step_infos:
@@ -104,7 +108,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
             truncated = with_rows(truncated, each.truncated, each.rows)
             info = merged(info, each.info, each.rows)
             home.set_state(each.state, each.rows)
-        self.steps_taken = taken
+        self.steps_taken, self.collected = taken, collected
         if self._step_infos:
             info = _with_step_infos(info, infos, taken > 0, terminated | truncated, mode)
         return observations, total, terminated, truncated, info

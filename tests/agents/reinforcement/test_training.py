@@ -141,7 +141,7 @@ def test_saved_and_exported_policies_act_like_the_model(algorithm, trained):
 def test_a_run_resumes_with_optimizer_and_buffer(algorithm, trained, scene_file, tmp_path):
     """Killed after its first checkpoint: what a new process reads there is what was written.
 
-    It ends with the very weights of a run that was not killed; new episodes begin with hindsight alone.
+    It ends with the very weights of a run that was not killed.
     """
     settings = configuration(algorithm, scene_file)
     kept = {}
@@ -178,19 +178,39 @@ def test_a_run_resumes_with_optimizer_and_buffer(algorithm, trained, scene_file,
     whole = trained(algorithm)
     run = train(settings, tmp_path / "run")
     assert run.model.num_timesteps * REPEAT == 3200
-    if algorithm != "HER":
-        for actual, expected in zip(state_of(run.model), state_of(whole.model), strict=True):
-            np.testing.assert_array_equal(actual, expected)
-        if "actions" in kept:
-            for name in ("observations", "actions", "rewards", "dones"):
-                columns = (getattr(each.model.replay_buffer, name) for each in (run, whole))
-                np.testing.assert_array_equal(*columns)
+    for actual, expected in zip(state_of(run.model), state_of(whole.model), strict=True):
+        np.testing.assert_array_equal(actual, expected)
+    if "actions" in kept:
+        for name in ("observations", "actions", "rewards", "dones"):
+            columns = (getattr(each.model.replay_buffer, name) for each in (run, whole))
+            np.testing.assert_equal(*columns)
     curve = [json.loads(line) for line in (tmp_path / "run" / "evaluations.jsonl").read_text().splitlines()]
     assert [line["environment_steps"] for line in curve] == [1600, 3200]
     assert len(json.loads((tmp_path / "run" / "provenance.json").read_text())) == 3
     again = train(settings, tmp_path / "run")  # nothing is left to do
     for actual, expected in zip(state_of(again.model), state_of(run.model), strict=True):
         np.testing.assert_array_equal(actual, expected)
+
+
+@pytest.mark.sampled
+@pytest.mark.parametrize("algorithm", ["HER", "SAC"])
+def test_a_run_resumes_in_the_middle_of_episodes(algorithm, scene_file, tmp_path):
+    schedule = {"total_steps": 1920, "evaluation_episodes": 4, **EVERY, "checkpoint_every": 1296}
+    settings = configuration(algorithm, scene_file, schedule=schedule)
+
+    def kill(advance):
+        if advance.environment_steps > 1500:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(settings, tmp_path / "run", report=kill)
+    state = np.load(RunFolder(tmp_path / "run", settings).checkpoint() / "arrays.npz")
+    assert 0 < state["environment.memory"][0, 0] < STEPS  # steps taken of the episode
+    resumed, whole = (train(settings, tmp_path / name) for name in ("run", "whole"))
+    for actual, expected in zip(state_of(resumed.model), state_of(whole.model), strict=True):
+        np.testing.assert_array_equal(actual, expected)
+    for name in ("ep_start", "ep_length", "dones") if algorithm == "HER" else ("dones",):
+        np.testing.assert_array_equal(*(getattr(run.model.replay_buffer, name) for run in (resumed, whole)))
 
 
 class Bomb:

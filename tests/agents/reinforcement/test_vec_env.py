@@ -170,6 +170,37 @@ def test_any_vector_environment_is_adapted_time_limits_included():
             np.testing.assert_array_equal(part, last[name].astype(np.float32))
 
 
+def test_native_goals_are_those_of_held_and_monitored_single_environments():
+    def single():
+        return RepeatAction(Monitor(gymnasium.make("DQSpaceArmGoal-v0", scene=SHORT)), 3, reward="last")
+
+    mode = AutoresetMode.SAME_STEP
+    native = gymnasium.make_vec("DQSpaceArmGoal-v0", 3, scene=SHORT, autoreset_mode=mode)
+    native, singles = SB3VecEnv(vector.RepeatAction(native, 3, reward="last")), DummyVecEnv([single] * 3)
+    assert native.seed(7) == singles.seed(7)
+    seen, expected = native.reset(), singles.reset()
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(STEPS):
+        for name, part in expected.items():
+            np.testing.assert_array_equal(seen[name], part.astype(np.float32))
+        actions = rng.uniform(-1.0, 1.0, (3, 12)).astype(np.float32)
+        seen, rewards, dones, infos = native.step(actions)
+        expected, *others, other_infos = singles.step(actions)
+        np.testing.assert_array_equal([rewards, dones], others)
+        for done, info, other in zip(dones, infos, other_infos, strict=True):
+            if done:
+                last, other_last = info.pop("terminal_observation"), other.pop("terminal_observation")
+                for name, part in other_last.items():
+                    np.testing.assert_array_equal(last[name], part.astype(np.float32))
+                assert_same_infos(info, other)
+        ends += dones.sum()
+    assert ends >= 6
+    goals = expected["achieved_goal"], expected["desired_goal"]
+    for venv in (native, singles):  # as hindsight asks
+        (rewards,) = venv.env_method("compute_reward", *goals, [{}] * 3, indices=[0])
+        np.testing.assert_array_equal(rewards, [-1.0] * 3)
+
+
 def test_vector_environments_that_reset_at_the_next_step_are_refused():
     with pytest.raises(ValueError, match=r"autoreset mode AutoresetMode.NEXT_STEP, should be .*SAME_STEP"):
         SB3VecEnv(gymnasium.make_vec("DQSpaceArm-v0", 2, scene=SHORT))
