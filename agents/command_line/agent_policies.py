@@ -40,7 +40,14 @@ def owns_policy(policy: str) -> bool:
     return policy in policy_files() or "weight_0" in archive_members(path)
 
 
-def load_policy(policy: str, start: Start, console: Console, seed: int | None, trust: bool) -> Pilot:
+def load_policy(
+    policy: str,
+    start: Start,
+    console: Console,
+    seed: int | None,
+    trust: bool,
+    normalize: Path | None = None,
+) -> Pilot:
     """Load a trained policy."""
     from agents.policies import PolicyFileError
     from agents.zoo.finding import as_policy, check_fit
@@ -48,7 +55,8 @@ def load_policy(policy: str, start: Start, console: Console, seed: int | None, t
 
     path = Path(policy) if Path(policy).exists() else policy_files()[policy]
     try:
-        acting = as_policy(path, path.stem if path.is_file() else path.name, trust=trust)
+        label = path.stem if path.is_file() else path.name
+        acting = as_policy(path, label, trust=trust, normalize=normalize)
     except PolicyFileError as error:
         raise ValueError(str(error)) from error
     check_fit(acting, start.scene)

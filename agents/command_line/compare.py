@@ -9,7 +9,7 @@ import click
 
 from agents.command_line.agent_policies import CONFIGURATION
 from agents.command_line.evaluate import policies_options
-from dq_space_arm_env.command_line.names import OneOf, given, trust_option
+from dq_space_arm_env.command_line.names import OneOf, given, normalize_option, trust_option
 from dq_space_arm_env.command_line.results_options import destination, results_options
 from dq_space_arm_env.command_line.verb import DefaultGroup, MultiWordCommand, keeping
 
@@ -71,6 +71,7 @@ def compare() -> None:
     type=int,
     help="Starts of the receding-horizon expert, a second each.  [default: 100]",
 )
+@normalize_option
 @trust_option
 @results_options("comparison")
 def agents(
@@ -82,6 +83,7 @@ def agents(
     workers: int | None,
     controllers: tuple[str, ...],
     receding_starts: int | None,
+    normalize: Path | None,
     trust: bool,
     out: Path,
     picture: bool,
@@ -97,7 +99,15 @@ def agents(
     chosen = given(n=n, conditions=conditions, controllers=controllers, receding_starts=receding_starts)
     with keeping("finished rows are kept; run the same command to resume"):
         written = destination(out, as_json, picture)
-        compare_controllers(written, (*policies, *more), scene, workers=workers, trust=trust, **chosen)
+        compare_controllers(
+            written,
+            (*policies, *more),
+            scene,
+            workers=workers,
+            trust=trust,
+            normalize=normalize,
+            **chosen,
+        )
 
 
 @compare.command(

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from agents.command_line.agent_policies import TRAINED_POLICY, policy_files
-from dq_space_arm_env.command_line.names import SCENE, OneOf, given, trust_option
+from dq_space_arm_env.command_line.names import SCENE, OneOf, given, normalize_option, trust_option
 from dq_space_arm_env.command_line.results_options import destination, results_options
 from dq_space_arm_env.command_line.verb import (
     DefaultGroup,
@@ -22,13 +22,6 @@ from dq_space_arm_env.common.console import FAILURE, SUCCESS
 from dq_space_arm_env.common.files import check_writable, check_writable_file
 
 Function = Callable[..., Any]
-
-_normalize_option = click.option(
-    "--normalize",
-    metavar="FILE",
-    type=click.Path(dir_okay=False, path_type=Path),
-    help="Statistics of a model (.zip), saved by VecNormalize.",
-)
 
 
 def _conditions() -> Iterable[str]:
@@ -104,7 +97,7 @@ def evaluate() -> None:
     type=click.Path(file_okay=False, path_type=Path),
     help="Folder for a JSON file per evaluation, with its episodes.",
 )
-@_normalize_option
+@normalize_option
 @trust_option
 @json_option
 def policies_verb(
@@ -168,7 +161,7 @@ def policies_verb(
     type=click.Path(dir_okay=False, path_type=Path),
     help="Animate the flight in this file (needs the extra plots).",
 )
-@_normalize_option
+@normalize_option
 @trust_option
 @results_options("flight")
 def show(

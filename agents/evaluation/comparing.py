@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,7 @@ def compare(
     workers: int | None = None,
     executor: Executor | None = None,
     trust: bool = False,
+    normalize: Mapping[str, str | Path] = MappingProxyType({}),
     progress: Callable[[Advance], None] = lambda advance: None,
 ) -> Comparison:
     """Compare agents with the expert's controllers, from the fixed evaluation starts of a scene.
@@ -125,6 +127,8 @@ def compare(
         workers: Number of processes of the expert; one per processor by default.
         executor: Used instead of local processes.
         trust: Whether to execute the code in a model's file (.zip) where its tensors do not suffice.
+        normalize: Files of the `VecNormalize` that models (.zip) were trained in, as for `evaluate`, by the
+            models' paths, as they are among the policies.
         progress: Called now and then.
 
     Returns:
@@ -157,13 +161,16 @@ def compare(
         progress,
     )
     files = [policy_path(policy) for policy in policies]
-    for file in files:
-        check_fit(as_policy(file, trust=trust), given)  # refuse unusable policies before hours of work
-    names = distinct_names(files)
+    if unknown := set(normalize) - {str(policy) for policy in policies}:
+        raise ValueError(f"normalize: {min(unknown)} is not among the policies")
+    statistics = [normalize.get(str(policy)) for policy in policies]
+    for file, its in zip(files, statistics, strict=True):  # refuse unusable policies before hours of work
+        check_fit(as_policy(file, trust=trust, normalize=its), given)
+    agents = list(zip(files, distinct_names(files), statistics, strict=True))
     rows: list[Row] = []
     for condition in conditions:
         rows += [work.controller(short, condition, conditions, controllers) for short in controllers]
-        rows += [work.agent(file, name, condition) for file, name in zip(files, names, strict=True)]
+        rows += [work.agent(*agent, condition) for agent in agents]
     trained = [row.evaluation for row in rows if row.facts["is_agent"]]
     notes = tuple(_notes(controllers, conditions))
     return Comparison(given.name, tuple(rows), tuple(groups(trained)), notes, tuple(_commands(rows)))
@@ -182,7 +189,7 @@ class _Work:
     trust: bool
     progress: Callable[[Advance], None]
 
-    def agent(self, file: Path, name: str, condition: str) -> Row:
+    def agent(self, file: Path, name: str, normalize: str | Path | None, condition: str) -> Row:
         """Evaluate an agent, or read its finished row."""
 
         def fly() -> tuple[Evaluation, float]:
@@ -194,19 +201,23 @@ class _Work:
                 executor=self.executor,
                 label=name,
                 trust=self.trust,
+                normalize=normalize,
                 progress=self._announced(name, condition),
             )
             return evaluation, 0.0
 
         content = {"policy": file_hash(file) if file.is_file() else None, **self._common(condition, self.n)}
+        if normalize is not None:
+            content["normalize"] = file_hash(Path(normalize))
         evaluation, _ = finished(self.kept, f"{name}-{condition}", content, fly)
         solves = evaluation.summary()["expert_solves"]
+        command = evaluation_command(file, self.scene_name, self.n, normalize)
         facts = {
             "is_agent": True,
             "planning_seconds": 0.0,
             "solves": "-" if solves is None else f"{solves:,}",
             "training_command": training_command(evaluation.metadata, file),
-            "evaluation_command": f"{evaluation_command(file, self.scene_name, self.n)} {condition}",
+            "evaluation_command": f"{command} {condition}",
             "learning_curve": learning_curve(file),
         }
         return Row(evaluation, facts)

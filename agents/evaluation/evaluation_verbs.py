@@ -24,6 +24,7 @@ from agents.evaluation.evaluating import Advance, evaluate
 from agents.evaluation.expert_costs import EVALUATION_SEEDS
 from agents.evaluation.plan_followers import CONTROLLERS
 from agents.evaluation.training_runs import groups
+from dq_space_arm_env.command_line.policy_sources import statistics_by_model
 from dq_space_arm_env.common.console import message_console
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import ProgressDisplay
@@ -61,12 +62,7 @@ def evaluate_policies(
     those of the one model (.zip) among the policies.
     """
     summaries = []
-    models = [policy for policy in policies if Path(policy).suffix == ".zip"]
-    if normalize is not None and len(models) != 1:
-        raise ValueError(
-            f"--normalize: {normalize} belongs to one model (.zip), and there are {len(models)}: evaluate "
-            "each with its own"
-        )
+    statistics = statistics_by_model(policies, normalize)
     for condition in CONDITIONS if ALL in conditions else conditions:
         with progress_bar() as show:
             evaluations = [
@@ -78,7 +74,7 @@ def evaluate_policies(
                     expert=expert,
                     workers=workers,
                     trust=trust,
-                    normalize=normalize if policy in models else None,
+                    normalize=statistics.get(policy),
                     progress=show,
                 )
                 for policy in policies
@@ -109,6 +105,7 @@ def compare_controllers(
     receding_starts: int = RECEDING_STARTS,
     workers: int | None = None,
     trust: bool = False,
+    normalize: Path | None = None,
 ) -> None:
     """Compare, print the tables, and write the files; finished rows are read from the folder."""
     with progress_bar() as show:
@@ -122,6 +119,7 @@ def compare_controllers(
             out=destination.folder,
             workers=workers,
             trust=trust,
+            normalize=statistics_by_model(policies, normalize),
             progress=show,
         )
 

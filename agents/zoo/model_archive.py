@@ -106,7 +106,7 @@ def read_model(path: Path, *, normalized: bool = False) -> ExportedPolicy:
         if not normalized and _sees_normalized(attributes):
             raise NeedsStatisticsError(
                 f"{path}: its observations were normalized by VecNormalize, whose statistics are in a file "
-                "of their own: evaluate --normalize FILE, in Python normalize=FILE, takes them"
+                "of their own: --normalize FILE, in Python normalize=FILE, takes them"
             )
         return _policy(attributes, _read_arrays(path))
     except NeedsStatisticsError:

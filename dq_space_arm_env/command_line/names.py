@@ -120,3 +120,9 @@ trust_option = click.option(
     is_flag=True,
     help="Execute the code in models (.zip) that need it, with your rights: only if you trust who made them.",
 )
+normalize_option = click.option(
+    "--normalize",
+    metavar="FILE",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Statistics of a model (.zip), saved by VecNormalize.",
+)

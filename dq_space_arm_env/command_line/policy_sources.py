@@ -6,11 +6,13 @@ An entry point of the group `dq_space_arm.policies` names a module with three fu
     owns_policy(policy: str) -> bool                        whether it can load this name or path
     load_policy(policy, start, console, seed, trust) -> Pilot  for an episode that begins at `start`;
                                                             executes no code of the file unless `trust`
+
+A source of models (.zip) takes one more argument where `--normalize` is given, the file of their statistics.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,14 +39,21 @@ def policy_names() -> dict[str, str]:
 
 
 def load_policy(
-    policy: str, start: Start, console: Console, seed: int | None, *, trust: bool = False
+    policy: str,
+    start: Start,
+    console: Console,
+    seed: int | None,
+    *,
+    trust: bool = False,
+    normalize: Path | None = None,
 ) -> Pilot:
     """Load a policy by name or path; `console` shows the progress of a solve."""
+    statistics = statistics_by_model([policy], normalize).values()
     if policy.lower() in _BUILT_IN:
         return _built_in(policy.lower(), start, seed)
     for source in _sources():
         if source.owns_policy(policy):
-            pilot: Pilot = source.load_policy(policy, start, console, seed, trust)
+            pilot: Pilot = source.load_policy(policy, start, console, seed, trust, *statistics)
             return pilot
     known = list(policy_names())
     if Path(policy).exists():
@@ -56,6 +65,19 @@ def load_policy(
         f"no policy is named {policy!r}, and there is no such file; {did_you_mean(policy, known)}The "
         f"policies are {', '.join(known)}; give your own as a file (.npz, .zip) or the folder of its run"
     )
+
+
+def statistics_by_model(policies: Sequence[str], normalize: Path | None) -> dict[str, Path]:
+    """The file of `--normalize`, if any, by the one model (.zip) among the policies, to which it belongs."""
+    if normalize is None:
+        return {}
+    models = [policy for policy in policies if Path(policy).suffix == ".zip"]
+    if len(models) != 1:
+        raise ValueError(
+            f"--normalize: {normalize} belongs to one model (.zip), and there are {len(models)}: give each "
+            "its own, one at a time"
+        )
+    return {models[0]: normalize}
 
 
 def owns_policy(policy: str) -> bool:

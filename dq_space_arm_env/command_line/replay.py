@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from dq_space_arm_env.command_line.names import SCENE, trust_option
+from dq_space_arm_env.command_line.names import SCENE, normalize_option, trust_option
 from dq_space_arm_env.command_line.verb import json_option, print_document
 from dq_space_arm_env.common.console import message_console, table_console
 from dq_space_arm_env.common.files import check_writable_file
@@ -34,6 +34,7 @@ from dq_space_arm_env.common.files import check_writable_file
 @click.option("--scene", type=SCENE, help="Scene of flights whose file does not name one.")
 @click.option("--seed", type=click.IntRange(min=0), help="Start policies where env.reset(seed=...) does.")
 @click.option("--open", "show", is_flag=True, help="Open the page in the browser.")
+@normalize_option
 @trust_option
 @json_option
 def replay(
@@ -43,6 +44,7 @@ def replay(
     scene: str | None,
     seed: int | None,
     show: bool,
+    normalize: Path | None,
     trust: bool,
     as_json: bool,
 ) -> None:
@@ -67,7 +69,12 @@ def replay(
     for place, label in enumerate(labels):
         sources[place] = label, sources[place][1]
     shown, robot = collect_flights(
-        sources, None if scene is None else load_scene(scene), message_console(), seed=seed, trust=trust
+        sources,
+        None if scene is None else load_scene(scene),
+        message_console(),
+        seed=seed,
+        trust=trust,
+        normalize=normalize,
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     size = write_replay(out, shown, robot).stat().st_size / 1e6

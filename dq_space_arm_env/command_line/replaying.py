@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 
 from dq_space_arm_env import Scene
-from dq_space_arm_env.command_line.policy_sources import load_policy, owns_policy
+from dq_space_arm_env.command_line.policy_sources import load_policy, owns_policy, statistics_by_model
 from dq_space_arm_env.command_line.simulated_episode import (
     begin,
     fly,
@@ -22,6 +22,7 @@ def collect_flights(
     *,
     seed: int | None = None,
     trust: bool = False,
+    normalize: Path | None = None,
 ) -> tuple[list[Trajectory], Scene]:
     """Read flights, and let policies fly from where the first one starts, or where `seed` does.
 
@@ -29,6 +30,7 @@ def collect_flights(
     a recording names.
     """
     sources = [(label, _file_of(source)) for label, source in sources]
+    statistics = statistics_by_model([source for _, source in sources], normalize)
     recordings: dict[int, Trajectory] = {}
     for place, (label, source) in enumerate(sources):
         if not _is_policy(source):
@@ -43,7 +45,8 @@ def collect_flights(
         begun = begin(scene, seed, state)
         for place, (label, source) in enumerate(sources):
             if place not in recordings:
-                pilot = load_policy(source, begun, console, seed, trust=trust)
+                given = statistics.get(source)
+                pilot = load_policy(source, begun, console, seed, trust=trust, normalize=given)
                 recordings[place] = fly(scene, begun, pilot, seed=seed, label=label)
     return common_scene([recordings[place] for place in range(len(sources))], scene)
 

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dq_space_arm_env.command_line.names import SCENE, seed_option, start_option, trust_option
+from dq_space_arm_env.command_line.names import (
+    SCENE,
+    normalize_option,
+    seed_option,
+    start_option,
+    trust_option,
+)
 from dq_space_arm_env.command_line.policy_sources import POLICY, load_policy
 from dq_space_arm_env.command_line.verb import json_option, print_document
 from dq_space_arm_env.common.console import message_console, table_console
@@ -58,6 +64,7 @@ if TYPE_CHECKING:
     help="File for the flight (.npz), which `replay` shows.",
 )
 @click.option("--label", help="Name of the flight in a replay.")
+@normalize_option
 @trust_option
 @json_option
 def simulate(
@@ -68,6 +75,7 @@ def simulate(
     noise: float,
     out: Path | None,
     label: str | None,
+    normalize: Path | None,
     trust: bool,
     as_json: bool,
 ) -> None:
@@ -87,7 +95,7 @@ def simulate(
     if out is not None:
         check_writable_file(out)
     begun = begin(loaded, seed, start)
-    pilot = load_policy(policy, begun, message_console(), seed, trust=trust)
+    pilot = load_policy(policy, begun, message_console(), seed, trust=trust, normalize=normalize)
     flight = fly(loaded, begun, pilot, seed=seed, noise=noise, label=label)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ from gymnasium.wrappers.vector import RescaleAction, TransformAction
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents import DQSpaceArmVecEnv, SB3VecEnv, evaluate, export_policy
+from agents import DQSpaceArmVecEnv, SB3VecEnv, compare, evaluate, export_policy
 from agents.policies.pickled_arrays import as_array, read_pickled
 from agents.wrappers.vector import ShrinkActionSpace
 from agents.zoo.finding import PolicyError, as_policy
@@ -68,10 +68,57 @@ def test_a_normalized_model_is_refused_without_its_statistics(normalized, small_
     words = ["evaluate", str(file), "--scene", str(small_file), "-n", "2", "--no-expert"]
     assert main(words) == 2
     assert "--normalize FILE" in capsys.readouterr().err
-    assert main(["simulate", str(small_file), "--policy", str(file)]) == 2
     assert main([*words, "--normalize", str(statistics)]) == 0
     assert main([*words, str(file), "--normalize", str(statistics)]) == 2
     assert "belongs to one model (.zip), and there are 2" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["simulate", "replay", pytest.param("compare", marks=pytest.mark.slow)])
+def test_every_verb_takes_the_statistics_of_a_model(verb, normalized, small_file, tmp_path, capsys):
+    file, statistics = (str(each) for each in normalized[1:])
+    out = ["--out", str(tmp_path / "out")]
+    words = {
+        "simulate": ["simulate", str(small_file), "--policy", file, *out],
+        "replay": ["replay", "zero", f"agent={file}", "--scene", str(small_file), *out],
+        "compare": ["compare", file, "--scene", str(small_file), "-n", "2", "--controller", "none", *out],
+    }[verb]
+    assert main(words) == 2
+    assert "--normalize FILE" in capsys.readouterr().err
+    assert main([*words, "--normalize", str(tmp_path / "missing.pkl")]) == 2
+    assert "no such file" in capsys.readouterr().err
+    assert main([*words, "--normalize", statistics]) == 0
+    others = ["zero" if word.endswith(file) else word for word in words]
+    assert main([*others, "--normalize", statistics]) == 2
+    assert "belongs to one model (.zip), and there are 0" in capsys.readouterr().err
+
+
+def test_a_simulated_flight_of_a_normalized_model_is_that_of_the_model(normalized, small_file, tmp_path):
+    model, file, statistics = normalized
+    words = ["simulate", str(small_file), "--policy", str(file), "--normalize", str(statistics)]
+    assert main([*words, "--seed", "3", "--out", str(tmp_path / "flight.npz")]) == 0
+    env = gymnasium.make("DQSpaceArm-v0", scene=str(small_file))
+    observation, _ = env.reset(seed=3)
+    action = as_policy(model).act(observation[None])[0]
+    with np.load(tmp_path / "flight.npz") as flight:
+        limits = env.unwrapped.kernels.layout.to_control(np.clip(action, -1.0, 1.0))
+        np.testing.assert_allclose(flight["controls"][0], limits, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_compared_flights_of_a_normalized_model_are_those_of_the_model(normalized, small_file, tmp_path):
+    model, file, statistics = normalized
+    with pytest.raises(ValueError, match=r"normalize: other\.zip is not among the policies"):
+        compare([file], small_file, 1, controllers=(), normalize={"other.zip": statistics})
+    given = {str(file): statistics}
+    (row,) = compare([file], small_file, 1, controllers=(), normalize=given, out=tmp_path).rows
+    expected = evaluate(model, small_file, 1, expert=False).flights.cost
+    np.testing.assert_allclose(row.evaluation.flights.cost, expected, rtol=1e-6)
+    assert f"--normalize {statistics}" in row.facts["evaluation_command"]
+    other = tmp_path / "other.pkl"
+    environment = VecNormalize(DQSpaceArmVecEnv(2, small_file))
+    environment.save(other)  # a kept row is that of its statistics alone
+    (row,) = compare([file], small_file, 1, controllers=(), normalize={str(file): other}, out=tmp_path).rows
+    assert abs(row.evaluation.flights.cost[0] / expected[0] - 1.0) > 1e-6
 
 
 @pytest.mark.parametrize("kind", [PPO, SAC])
