@@ -28,6 +28,7 @@ from scripts.benchmarks.harness import Row, select
 
 OURS = "dq-space-arm"
 DYNAMICS, STEP, ENVIRONMENT = "forward dynamics", "step", "environment step"
+GOALS = "goal environment step"
 FLOAT64, FLOAT32 = "float64", "float32"
 COMPARED_INTEGRATORS = ("symplectic_euler", "rk4")  # integrators that other engines and solvers have as well
 
@@ -36,7 +37,7 @@ COMPARED_INTEGRATORS = ("symplectic_euler", "rk4")  # integrators that other eng
 class Subject:
     """A subject of timing."""
 
-    what: str  # DYNAMICS, STEP or ENVIRONMENT
+    what: str  # DYNAMICS, STEP, ENVIRONMENT or GOALS
     engine: str
     way: str  # of calling it
     integrator: str = ""
@@ -184,6 +185,7 @@ def _episodes(kernels: Kernels, count: int) -> dict[str, np.ndarray]:
 
 
 MAKE, MAKE_VEC, UNWRAPPED = "gymnasium.make", "gymnasium.make_vec", "gymnasium.make, unwrapped"
+SYNCHRONOUS, SYNCHRONOUS_COPIES = "SyncVectorEnv", 64
 
 
 def environment_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
@@ -208,6 +210,20 @@ def environment_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
                     threads=variant.threads,
                 )
                 cases.append(vector_case(subject, variant.make_vec(scene, batch, integrator), steps))
+    return cases
+
+
+def goal_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
+    """Native vector environments of goals, and single ones in Gymnasium's own; none with several tips."""
+    chosen, cases = scene.simulation.integrator, []
+    ways = [(MAKE_VEC, batch) for batch in batch_sizes] + [(SYNCHRONOUS, SYNCHRONOUS_COPIES)]
+    for way, batch in () if scene.other_tips else ways:
+        mode = "sync" if way == SYNCHRONOUS else "vector_entry_point"
+        env = gymnasium.make_vec(
+            "DQSpaceArmGoal-v0", batch, scene=PLAIN.scene(scene), vectorization_mode=mode
+        )
+        subject = Subject(what=GOALS, engine=OURS, way=way, integrator=chosen, batch=batch)
+        cases.append(vector_case(subject, env, scene.simulation.steps))
     return cases
 
 

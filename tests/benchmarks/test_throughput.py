@@ -11,7 +11,7 @@ from dq_space_arm_env import Scene, compile_scene
 from experts.report import timing as clock_module
 from scripts.benchmarks.effort import QUICK, Sampling
 from scripts.benchmarks.harness import Row, select, shortcomings
-from scripts.benchmarks.peers.mujoco_peer import SYNCHRONOUS, WRAPPED
+from scripts.benchmarks.peers.mujoco_peer import WRAPPED
 from scripts.benchmarks.subjects import (
     COMPARED_INTEGRATORS,
     DYNAMICS,
@@ -24,6 +24,7 @@ from scripts.benchmarks.subjects import (
     PLAIN,
     SCALAR,
     STEP,
+    SYNCHRONOUS,
     VECTOR,
     Case,
     Subject,

@@ -27,6 +27,8 @@ from scripts.benchmarks.subjects import (
     DYNAMICS,
     ENVIRONMENT,
     STEP,
+    SYNCHRONOUS,
+    SYNCHRONOUS_COPIES,
     Case,
     Subject,
     finite_limits,
@@ -34,8 +36,7 @@ from scripts.benchmarks.subjects import (
     vector_case,
 )
 
-WRAPPED, SYNCHRONOUS = "gymnasium.make", "SyncVectorEnv"
-SYNCHRONOUS_COPIES = 64
+WRAPPED = "gymnasium.make"
 # States and steps of a call; which of them is fastest depends on the caches.
 _ROLLOUTS = ((64, 32), (1024, 1), (1024, 8))
 _BATCHES = ((64, 1), (1024, 1), (1024, 8))

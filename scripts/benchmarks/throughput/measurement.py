@@ -12,24 +12,28 @@ from experts.report.part_costs import moving_states
 from scripts.benchmarks.effort import Effort, Sampling
 from scripts.benchmarks.harness import Row, note, select
 from scripts.benchmarks.peers import peers_of
-from scripts.benchmarks.peers.mujoco_peer import SYNCHRONOUS, SYNCHRONOUS_COPIES, WRAPPED, MujocoPeer
+from scripts.benchmarks.peers.mujoco_peer import WRAPPED, MujocoPeer
 from scripts.benchmarks.peers.pinocchio_peer import PinocchioPeer
 from scripts.benchmarks.subjects import (
     COMPARED_INTEGRATORS,
     DYNAMICS,
     ENVIRONMENT,
     FLOAT64,
+    GOALS,
     MAKE,
     MAKE_VEC,
     OURS,
     PLAIN,
     SCALAR,
     STEP,
+    SYNCHRONOUS,
+    SYNCHRONOUS_COPIES,
     VECTOR,
     Subject,
     environment_cases,
     fastest,
     function_cases,
+    goal_cases,
     kernel_cases,
     time_cases,
 )
@@ -69,6 +73,7 @@ def measure_scene(scene: Scene, effort: Effort, peaks: Mapping[str, float]) -> I
         *kernel_cases(scene, sizes),
         *function_cases(scene, sizes),
         *environment_cases(scene, sizes),
+        *goal_cases(scene, (SYNCHRONOUS_COPIES, TRAINING_COPIES)),
     ]
     for peer in peers:
         cases += peer.cases(*moving_states(kernels, TRAINING_COPIES))
@@ -153,6 +158,10 @@ def _pairs(timings: Sequence[Row]) -> Iterator[tuple[str, Row | None, Row | None
         yield "dynamics, one state", single, fastest(theirs, batch=1)
         batches = [timing for timing in theirs if timing["batch"] > 1]
         yield "dynamics, batch", fastest(ours, what=DYNAMICS, way=VECTOR), fastest(batches)
+    goals = select(ours, what=GOALS)
+    for batch in (SYNCHRONOUS_COPIES, TRAINING_COPIES):
+        many = fastest(goals, way=MAKE_VEC, batch=batch)
+        yield f"{batch:,} goal environments", many, fastest(goals, way=SYNCHRONOUS)
     for name in COMPARED_INTEGRATORS:
         theirs = select(timings, engine=MujocoPeer.name, integrator=name)
         own = select(ours, integrator=name)
