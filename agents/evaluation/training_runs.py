@@ -16,6 +16,7 @@ from agents.zoo.shelf import SHELF
 from dq_space_arm_env.common.bounded_reading import parse_json, read_text
 
 CONFIGURATION, EVALUATIONS = "config.yaml", "evaluations.jsonl"
+_EPISODES = {"schedule": "evaluation_episodes", "progression": "evaluation_episodes", "curve": "episodes"}
 _BUDGET = {"total_steps": "--total-steps", "minutes": "--minutes"}
 
 
@@ -27,6 +28,11 @@ class Group(NamedTuple):
     seeds: tuple[int, ...]
     runs: Runs
     evaluations: tuple[Evaluation, ...]
+
+    @property
+    def label(self) -> str:
+        """Name in tables."""
+        return f"{self.name}, seeds {', '.join(map(str, self.seeds))}"
 
 
 def groups(evaluations: Sequence[Evaluation]) -> list[Group]:
@@ -89,6 +95,16 @@ def seed_of(metadata: Mapping[str, Any]) -> int | None:
     configuration = metadata.get("configuration")
     seed = configuration.get("seed") if isinstance(configuration, Mapping) else None
     return None if seed is None else int(seed)
+
+
+def validation_episodes(metadata: Mapping[str, Any]) -> int | None:
+    """Number of flights of each point of a learning curve; None if the metadata lack it."""
+    configuration = metadata.get("configuration")
+    for part, name in _EPISODES.items():
+        found = configuration.get(part) if isinstance(configuration, Mapping) else None
+        if isinstance(found, Mapping) and isinstance(found.get(name), int):
+            return int(found[name])
+    return None
 
 
 def training_command(metadata: Mapping[str, Any], policy: Path | None = None) -> str | None:
