@@ -234,10 +234,8 @@ class _Work:
 
     def _validation_optimum(self, evaluation: Evaluation, name: str) -> float | None:
         """Median of the optimal costs from the starts of a learning curve; None if they are unknown."""
-        episodes, announced = (
-            validation_episodes(evaluation.metadata),
-            self._announced(name, "learning curve"),
-        )
+        episodes = validation_episodes(evaluation.metadata)
+        announced = self._announced(name, "learning curve")
         if episodes is None:
             return None
         found = validation_costs(

@@ -71,11 +71,14 @@ def _data(
 ) -> tuple[list[Demonstrations], Demonstrations]:
     """Demonstrations to learn from, for each seed or for all, and to fly from."""
     scene, source = load_scene(configuration.scene), configuration.resolved().demonstrations
-    learned = {"demonstrations": DemonstrationSource(folder=str(options.demonstrations))}
-    if options.demonstrations is None:
+    if options.demonstrations is not None:
+        source = DemonstrationSource(folder=str(options.demonstrations))
+    learned = {"demonstrations": source}
+    if source.folder is None and source.minari is None:
+        first = source.seed or 0
         learned = {
-            "-".join(["demonstrations", *([str(seed)] if seed else [])]): source.model_copy(
-                update={"problems": count, "seed": (source.seed or 0) + seed}
+            f"demonstrations-{seed}" if seed else "demonstrations": source.model_copy(
+                update={"problems": count, "seed": first + seed}
             )
             for seed in range(options.seeds)
         }
