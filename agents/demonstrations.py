@@ -38,6 +38,8 @@ def prepare_demonstrations(
     elif source.minari is not None:
         demonstrations = read_from_minari(source.minari, folder)
     else:
+        if source.seed is None:
+            raise ValueError("demonstrations.seed is absent: give one, or `configuration.resolved()`")
         _check_seed(source.seed)
         generated = generate_demonstrations(
             stricter(scene, source.tolerance_scale),

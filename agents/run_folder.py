@@ -77,10 +77,10 @@ class RunFolder:
     def __init__(self, path: Path, configuration: AgentConfiguration) -> None:
         self.path = path
         (path / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
-        here = configuration.model_dump(mode="json", exclude_none=True)
+        here = configuration.resolved().model_dump(mode="json", exclude_none=True)
         file = path / CONFIGURATION
         if file.exists():
-            there = load_configuration(file).model_dump(mode="json", exclude_none=True)
+            there = load_configuration(file).resolved().model_dump(mode="json", exclude_none=True)
             found = differences(_identity(there), _identity(here))
             if found:
                 raise RunFolderError(
@@ -117,7 +117,7 @@ class RunFolder:
             "agent": configuration.name,
             "scene": scene.name,
             "scene_hash": scene.content_hash(),
-            "configuration": configuration.model_dump(mode="json", exclude_none=True),
+            "configuration": configuration.resolved().model_dump(mode="json", exclude_none=True),
             "provenance": self._starts()[-1],
             "training": dict(training),
         }

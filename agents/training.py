@@ -48,7 +48,7 @@ def train(
         DivergedError, ValueError: If the training diverges; the last checkpoint remains.
         KeyboardInterrupt: On Ctrl-C; the last checkpoint remains.
     """
-    checked = load_configuration(configuration)
+    checked = load_configuration(configuration).resolved()
     folder = Path(out) if out is not None else default_folder(checked)
     try:
         run = _run(checked, folder, report or (lambda advance: None))

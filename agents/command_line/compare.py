@@ -92,7 +92,8 @@ def agents(
     """Compare the expert's controllers and each POLICY: error against run time, one table, one figure.
 
     The output folder receives table.md, comparison.json, the rows with each episode, and comparison.png.
-    Three or more runs that differ only in their seeds are also aggregated.
+    Three or more runs that differ only in their seeds are also aggregated. Learning curves need the expert's
+    optima of their own starts, which are solved once.
     """
     from agents.evaluation.evaluation_verbs import compare_controllers
 
@@ -114,7 +115,7 @@ def agents(
     cls=MultiWordCommand,
     epilog="""\b
         Examples:
-          dq-space-arm compare cloning                            # ten to 1000 demonstrations, 3 seeds
+          dq-space-arm compare cloning                            # ten to 1000 demonstrations, 5 seeds
           dq-space-arm compare cloning --counts 20 100 --seeds 1  # a shorter run
     """,
 )
@@ -131,10 +132,10 @@ def agents(
     multiple=True,
     help="Numbers of demonstrations.  [default: 10 20 50 100 200 500 1000]",
 )
-@click.option("--seeds", type=int, default=3, show_default=True, help="Trainings per variant.")
+@click.option("--seeds", type=int, default=5, show_default=True, help="Trainings per variant.")
 @click.option("--updates", type=int, default=5000, show_default=True, help="Updates per training.")
 @click.option("--tests", type=int, default=400, show_default=True, help="Starts to fly from.")
-@click.option("--demonstrations", type=_folder, help="Folder of demonstrations to use instead of new ones.")
+@click.option("--demonstrations", type=_folder, help="Folder of demonstrations for all trainings.")
 @click.option("--test-demonstrations", type=_folder, help="The same for the starts to fly from.")
 @results_options("cloning")
 def cloning(
@@ -151,9 +152,10 @@ def cloning(
 ) -> None:
     """Compare cloning with and without the expert's feedback gains: success over demonstrations.
 
-    All variants learn from the same demonstrations with the same network and number of updates, and fly from
-    the same held-out starts. The output folder receives trainings.jsonl, cloning.json and cloning.png, and
-    demonstrations/ and tests/ unless you name others. Needs the extra `agents`.
+    Each seed draws its own demonstrations, from which all variants learn with the same network and number of
+    updates, and all fly from the same held-out starts. The output folder receives trainings.jsonl,
+    cloning.json and cloning.png, and demonstrations and tests unless you name others. Needs the extra
+    `agents`.
     """
     from agents.evaluation import data_efficiency_command as command
 

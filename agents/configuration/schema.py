@@ -1,7 +1,7 @@
 """Settings shared by all agents: name, scene, seed, network, and demonstrations."""
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import Field, StrictInt, StrictStr
 
@@ -20,6 +20,7 @@ Many = Annotated[int, count_up_to(10_000_000)]
 MOST_IN_MEMORY = 100_000_000
 """Largest number of decisions in memory, some ten gigabytes."""
 _MOST_LAYERS = 32
+_Part = TypeVar("_Part", bound=Model)
 
 
 class Network(Model):
@@ -41,6 +42,10 @@ class AgentConfiguration(Model):
     threads: Few = Field(default=1, description="threads of PyTorch, or of NumPy's matrices")
     network: Network = Field(default_factory=Network, description="the networks")
 
+    def resolved(self) -> Self:
+        """The configuration with a seed for its demonstrations: the run's, unless they have their own."""
+        return _with_demonstrations_drawn(self, self.seed)
+
 
 class DemonstrationSource(Model):
     """Demonstrations to learn from: generated for the run, or existing ones.
@@ -50,7 +55,11 @@ class DemonstrationSource(Model):
     """
 
     problems: Many = Field(default=1000, description="problems to solve; few of them fail")
-    seed: StrictInt = Field(default=0, ge=0, description="seed of their starts")
+    seed: StrictInt | None = Field(
+        default=None,
+        ge=0,
+        description="seed of their starts; absent: the run's, so that each run draws its own",
+    )
     tolerance_scale: Positive = Field(
         default=1.0, description="tolerances of success that they meet, relative to the scene's, at most 1"
     )
@@ -70,3 +79,16 @@ class DemonstrationSource(Model):
             )
         if self.folder is not None and self.minari is not None:
             yield Problem(("minari",), self.minari, "must be absent if a folder is given: give one")
+
+
+def _with_demonstrations_drawn(model: _Part, seed: int) -> _Part:
+    """A copy in which all demonstrations have a seed."""
+    if isinstance(model, DemonstrationSource):
+        return model.model_copy(update={"seed": seed if model.seed is None else model.seed})
+    parts = {name: getattr(model, name) for name in type(model).model_fields}
+    drawn = {
+        name: _with_demonstrations_drawn(part, seed)
+        for name, part in parts.items()
+        if isinstance(part, Model)
+    }
+    return model.model_copy(update=drawn)

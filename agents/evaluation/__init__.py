@@ -16,6 +16,9 @@ from agents.evaluation.statistics import (
     bootstrap_interval,
     compare_runs,
     interquartile_mean,
+    performance_profile,
+    probability_of_improvement,
+    rate_over_runs,
     wilson_interval,
 )
 from agents.policies.flying import Flights, fly
@@ -39,6 +42,9 @@ __all__ = [
     "fly",
     "interquartile_mean",
     "optimal_costs",
+    "performance_profile",
+    "probability_of_improvement",
+    "rate_over_runs",
     "scene_under",
     "wilson_interval",
 ]

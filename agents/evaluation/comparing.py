@@ -14,7 +14,12 @@ import numpy as np
 
 from agents.evaluation.conditions import CONDITIONS, as_known, scene_under
 from agents.evaluation.evaluating import Advance, Evaluation, evaluate
-from agents.evaluation.expert_costs import EVALUATION_SEEDS, evaluation_seeds, optimal_costs
+from agents.evaluation.expert_costs import (
+    EVALUATION_SEEDS,
+    evaluation_seeds,
+    optimal_costs,
+    validation_costs,
+)
 from agents.evaluation.kept_results import KeptRows
 from agents.evaluation.plan_followers import (
     CONTROLLERS,
@@ -30,6 +35,7 @@ from agents.evaluation.training_runs import (
     groups,
     learning_curve,
     training_command,
+    validation_episodes,
 )
 from agents.policies.flying import time_per_action
 from agents.zoo.finding import as_policy, check_fit, policy_path
@@ -50,7 +56,8 @@ class Row:
         evaluation: Its evaluation; `policy` is the name.
         facts: JSON values beside the evaluation's summary: `is_agent`, `planning_seconds` (before a flight,
             s), `solves` (problems the expert solved for it), `training_command`, `evaluation_command`,
-            `learning_curve`; under model mismatch `saving` and the condition's parameters.
+            `learning_curve`, `validation_optimum` (median optimal cost from the starts of that curve); under
+            model mismatch `saving` and the condition's parameters.
     """
 
     evaluation: Evaluation
@@ -92,6 +99,17 @@ class Comparison:
     def under(self, condition: str) -> tuple[Row, ...]:
         """Rows of a condition."""
         return tuple(row for row in self.rows if row.evaluation.condition == condition)
+
+    def entrants(self, condition: str) -> list[tuple[str, tuple[Row, ...]]]:
+        """Rows of a condition with a name: the training runs of an agent together, all others alone."""
+        group_of = {each: group for group in self.groups for each in group.evaluations}
+        found: dict[object, list[Row]] = {}
+        for row in self.under(condition):
+            found.setdefault(group_of.get(row.evaluation, row), []).append(row)
+        return [
+            (key.label if isinstance(key, Group) else rows[0].name, tuple(rows))
+            for key, rows in found.items()
+        ]
 
 
 def compare(
@@ -219,8 +237,25 @@ class _Work:
             "training_command": training_command(evaluation.metadata, file),
             "evaluation_command": f"{command} {condition}",
             "learning_curve": learning_curve(file),
+            "validation_optimum": None,
         }
+        if facts["learning_curve"] and evaluation.same_scene is not False:
+            facts["validation_optimum"] = self._validation_optimum(evaluation, name)
         return Row(evaluation, facts)
+
+    def _validation_optimum(self, evaluation: Evaluation, name: str) -> float | None:
+        """Median of the optimal costs from the starts of a learning curve; None if they are unknown."""
+        episodes = validation_episodes(evaluation.metadata)
+        announced = self._announced(name, "learning curve")
+        if episodes is None:
+            return None
+        found = validation_costs(
+            self.scene,
+            episodes,
+            self.executor,
+            lambda done, total: announced(Advance("optimal costs", done, total)),
+        )
+        return None if np.isnan(found.cost).all() else float(np.nanmedian(found.cost))
 
     def controller(
         self, short: str, condition: str, conditions: Sequence[str], controllers: Sequence[str]
@@ -251,6 +286,7 @@ class _Work:
             "training_command": None,
             "evaluation_command": command,
             "learning_curve": [],
+            "validation_optimum": None,
         }
         return Row(evaluation, facts)
 

@@ -1,7 +1,7 @@
-"""Figures of comparisons: cost gap over the time of an action and of training, and by conditions.
+"""Figures of comparisons: cost gaps over the time of an action, their profile, training, and conditions.
 
-Lower left is better. Gaps at or below zero have no place on a logarithmic axis: they are drawn at its lower
-edge as triangles, as the label says.
+Gaps at or below zero have no place on a logarithmic axis: they are drawn at its lower edge as triangles, as
+the label says.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedFormatter, FixedLocator, FuncFormatter, NullLocator
 
 from agents.evaluation.comparing import Comparison, Row
-from agents.evaluation.statistics import Interval
+from agents.evaluation.statistics import Interval, performance_profile
 from agents.evaluation.training_runs import agent_of
 from experts.figures.plots import MARKERS, PALETTE
 from experts.figures.style import LIMIT_STYLE, WIDTH
@@ -26,6 +26,8 @@ FLOOR = 0.01
 
 _PANEL_HEIGHT, _LEGEND_ROW = 2.7, 0.2  # inches
 _LEGEND_COLUMNS = 3
+_THRESHOLDS = 80
+_NEARLY = 0.97  # of the time of a training: its last flights stand for its end
 _ROUND_TIMES = {1.0: "1 s", 10.0: "10 s", 60.0: "1 min", 600.0: "10 min", 3600.0: "1 h", 36000.0: "10 h"}
 
 Looks = Mapping[str, dict[str, Any]]
@@ -38,20 +40,18 @@ def comparison_figure(comparison: Comparison) -> Figure:
     rows = comparison.under(first)
     looks = _looks(rows)
     trained = any(_training_seconds(row) is not None for row in rows)
-    panels = [_draw_action_times, *([_draw_training_times, _draw_learning_curves] if trained else [])]
-    height = _PANEL_HEIGHT * (1 + several) + _LEGEND_ROW * -(-len(looks) // _LEGEND_COLUMNS)
-    width = WIDTH if len(panels) > 1 or several else 0.6 * WIDTH
-    figure = Figure(figsize=(width, height), layout="constrained")
-    parts = figure.subfigures(1 + several, 1, squeeze=False)[:, 0]
-    over_times = np.atleast_1d(parts[0].subplots(1, len(panels)))
-    for axes, draw in zip(over_times, panels, strict=True):
-        draw(axes, rows, looks)
-    top = max(axes.get_ylim()[1] for axes in over_times[:2]) if trained else None
-    for axes in over_times[:2]:
-        axes.set_ylim(FLOOR, top)
+    lines = 1 + trained + several
+    height = _PANEL_HEIGHT * lines + _LEGEND_ROW * -(-len(looks) // _LEGEND_COLUMNS)
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    parts = figure.subfigures(lines, 1, squeeze=False)[:, 0]
+    left, right = np.transpose([part.subplots(1, 2) for part in parts])
+    _draw_action_times(left[0], rows, looks)
+    _draw_profiles(right[0], comparison, looks)
+    if trained:
+        _draw_training_costs(left[1], rows, looks)
+        _draw_training_rates(right[1], rows, looks)
     if several:
-        left, right = parts[1].subplots(1, 2)
-        _draw_conditions(left, right, comparison, looks)
+        _draw_conditions(left[-1], right[-1], comparison, looks)
     rates = {row.name: f": {100.0 * row.evaluation.success_rate.value:.1f} %" for row in rows}
     title = f"Scene {comparison.scene}, {first}: success rates, and 95 % intervals as bars"
     _add_legend(figure, looks, title, rates)
@@ -112,42 +112,81 @@ def _draw_action_times(axes: Axes, rows: Sequence[Row], looks: Looks) -> None:
         if np.isfinite(tail) and tail > FLOOR:
             axes.plot([time], [tail], marker="_", markersize=8.0, color=look["color"])
     axes.margins(x=0.12)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     _logarithmic_gaps(axes)
     axes.set_xlabel("time per action [µs]", fontsize=8.5)
     axes.set_title("Marker: median, dash: 95th percentile", loc="left", fontsize=8.5)
 
 
-def _draw_training_times(axes: Axes, rows: Sequence[Row], looks: Looks) -> None:
-    """Cost gaps over the time of training: the learning curve, and the final result."""
+def _draw_profiles(axes: Axes, comparison: Comparison, looks: Looks) -> None:
+    """Shares of flights within a cost gap, of the first condition; bands are 95 % intervals."""
+    condition = comparison.conditions[0]
+    gaps = np.concatenate([row.evaluation.cost_gaps for row in comparison.under(condition)])
+    known = 100.0 * gaps[np.isfinite(gaps)]
+    top = max(100.0, float(np.percentile(known, 99.0))) if known.size else 100.0
+    thresholds = np.geomspace(FLOOR, top, _THRESHOLDS)
+    for _, members in comparison.entrants(condition):
+        shares = performance_profile([row.evaluation.cost_gaps for row in members], thresholds / 100.0)
+        if shares:
+            value, low, high = 100.0 * np.array(shares).T
+            color = looks[members[0].name]["color"]
+            axes.plot(thresholds, value, color=color)
+            axes.fill_between(thresholds, low, high, color=color, alpha=0.15, linewidth=0.0)
     axes.set_xscale("log")
+    axes.set_xlim(FLOOR, top)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    _rates(axes)
+    axes.set_xlabel("cost gap [%]", fontsize=8.5)
+    axes.set_ylabel("flights within it [%]", fontsize=8.5)
+    axes.set_title("Performance profile; bands: 95 % intervals", loc="left", fontsize=8.5)
+
+
+def _draw_training_costs(axes: Axes, rows: Sequence[Row], looks: Looks) -> None:
+    """Median costs over the time of training, relative to the median optimum from the same starts.
+
+    A learning curve has medians alone, so the markers are ratios of medians as well.
+    """
     for row in rows:
-        look, optimum = looks[row.name], _median_optimum(row)
-        known = [
-            (max(point["seconds"], 1.0), max(100.0 * (point["median_cost"] / optimum - 1.0), FLOOR))
-            for point in row.facts["learning_curve"]
-            if point["median_cost"] is not None and np.isfinite(optimum)
-        ]
-        if known:
-            axes.plot(*zip(*known, strict=True), color=look["color"], linewidth=0.9)
+        optimum = row.facts["validation_optimum"]
+        costs = [point["median_cost"] for point in row.facts["learning_curve"]]
+        known = [None if cost is None or optimum is None else _excess(cost / optimum) for cost in costs]
+        end = _excess(float(np.median(row.evaluation.flights.cost)) / _median_optimum(row))
+        _draw_training(axes, row, known, end, looks)
         if (seconds := _training_seconds(row)) is not None:
-            _draw_gap(axes, seconds, row.evaluation.median_cost_gap, look)
+            _draw_gap(axes, seconds, Interval(*3 * [end / 100.0]), looks[row.name])
     _logarithmic_gaps(axes)
+    axes.set_ylabel("median cost above\nmedian optimum [%]", fontsize=8.5)
     _set_training_axis(axes, rows)
 
 
-def _draw_learning_curves(axes: Axes, rows: Sequence[Row], looks: Looks) -> None:
-    """Success rates over the time of training: the learning curve, and the final result."""
-    axes.set_xscale("log")
+def _excess(ratio: float) -> float:
+    """What a ratio exceeds 1 by, %, at least what the axis shows."""
+    return max(100.0 * (ratio - 1.0), FLOOR)
+
+
+def _draw_training_rates(axes: Axes, rows: Sequence[Row], looks: Looks) -> None:
+    """Success rates over the time of training."""
     for row in rows:
-        look, curve = looks[row.name], row.facts["learning_curve"]
-        if curve:
-            times = [max(point["seconds"], 1.0) for point in curve]
-            rates = [100.0 * point["success_rate"] for point in curve]
-            axes.plot(times, rates, color=look["color"], linewidth=0.9)
+        rates = [100.0 * point["success_rate"] for point in row.facts["learning_curve"]]
+        rate = row.evaluation.success_rate
+        _draw_training(axes, row, rates, 100.0 * rate.value, looks)
         if (seconds := _training_seconds(row)) is not None:
-            _draw_rate(axes, seconds, row.evaluation.success_rate, look)
+            _draw_rate(axes, seconds, rate, looks[row.name])
     _rates(axes)
     _set_training_axis(axes, rows)
+
+
+def _draw_training(axes: Axes, row: Row, values: Sequence[float | None], end: float, looks: Looks) -> None:
+    """A learning curve that ends in the evaluation, which replaces the flights at the end of the training."""
+    seconds = _training_seconds(row)
+    last = np.inf if seconds is None else _NEARLY * seconds
+    times = [point["seconds"] for point in row.facts["learning_curve"]]
+    known = [(max(time, 1.0), value) for time, value in zip(times, values, strict=True) if value is not None]
+    points = [(time, value) for time, value in known if time < last]
+    if seconds is not None and np.isfinite(end):
+        points.append((max(seconds, 1.0), end))
+    color = looks[row.name]["color"]
+    axes.plot([time for time, _ in points], [value for _, value in points], color=color, linewidth=0.9)
 
 
 def _draw_conditions(rates: Axes, gaps: Axes, comparison: Comparison, looks: Looks) -> None:
@@ -213,12 +252,13 @@ def _set_training_axis(axes: Axes, rows: Sequence[Row]) -> None:
         del marks[0]
     while len(marks) > 2 and marks[-2] >= 1.1 * max(times):
         del marks[-1]
+    axes.set_xscale("log")
     axes.set_xlim(marks[0], marks[-1])
     axes.xaxis.set_major_locator(FixedLocator(marks))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FixedFormatter([_ROUND_TIMES[mark] for mark in marks]))
     axes.set_xlabel("time of training", fontsize=8.5)
-    axes.set_title("Line: validation starts", loc="left", fontsize=8.5)
+    axes.set_title("Line: validation starts; marker: evaluation", loc="left", fontsize=8.5)
 
 
 def _median_optimum(row: Row) -> float:

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
+import numpy as np
+
 from agents.evaluation.comparing import Comparison
+from agents.evaluation.comparing import Row as ComparedRow
 from agents.evaluation.evaluating import Evaluation, known_interval
+from agents.evaluation.statistics import performance_profile, probability_of_improvement
 from agents.evaluation.training_runs import Group
 from dq_space_arm_env.common.tables import Column, Row, TextTable, tabulate
 
@@ -64,6 +69,8 @@ COLUMNS = {
     )
 }
 """Columns of all tables, by the keys of the rows."""
+PROFILE = (0.001, 0.01, 0.1, 1.0)
+"""Cost gaps of the performance profiles in tables."""
 _FLIGHTS = (
     *("attitude_error", "position_error", "effort", "base_turn"),
     *("constraint_violations", "action_seconds"),
@@ -93,7 +100,60 @@ def comparison_tables(comparison: Comparison) -> list[TextTable]:
         of_condition = [group for group in comparison.groups if group.condition == condition]
         if of_condition:
             made.append(groups_table(of_condition))
+        if profiles := profile_rows(comparison, condition):
+            made.append(_profiles_table(profiles))
+        if improvements := improvement_rows(comparison, condition):
+            made.append(_improvements_table(improvements))
     return made
+
+
+def profile_rows(comparison: Comparison, condition: str) -> list[Row]:
+    """Shares of flights within cost gaps, with their intervals, of all that have known gaps."""
+    rows: list[Row] = []
+    for name, members in comparison.entrants(condition):
+        shares = performance_profile([row.evaluation.cost_gaps for row in members], PROFILE)
+        if shares:
+            found = [list(share) for share in shares]
+            rows.append({"condition": condition, "policy": name, "cost_gaps": list(PROFILE), "shares": found})
+    return rows
+
+
+def improvement_rows(comparison: Comparison, condition: str) -> list[Row]:
+    """Probability of improvement of each agent over each other row, from the starts that both have flown."""
+    rows: list[Row] = []
+    # Agents come first; two controllers are not compared.
+    entrants = sorted(comparison.entrants(condition), key=lambda each: not _is_agent(each[1]))
+    for (name, members), (other, others) in combinations(entrants, 2):
+        if _is_agent(members):
+            starts = min(len(row.evaluation.seeds) for row in (*members, *others))
+            costs, costs_of_other = (
+                np.array([row.evaluation.flights.cost[:starts] for row in each]) for each in (members, others)
+            )
+            found = list(probability_of_improvement(costs, costs_of_other))
+            row = {"condition": condition, "policy": name, "over": other}
+            rows.append({**row, "episodes": starts, "probability": found})
+    return rows
+
+
+def _is_agent(members: Sequence[ComparedRow]) -> bool:
+    return bool(members[0].facts.get("is_agent"))
+
+
+def _profiles_table(rows: Sequence[Row]) -> TextTable:
+    title = "Performance profile: flights within a cost gap, %"
+    keys = [f"{100.0 * gap:g} %" for gap in PROFILE]
+    spread = ({"policy": row["policy"], **dict(zip(keys, row["shares"], strict=True))} for row in rows)
+    columns = [Column("policy", ""), *(Column(key, f"within\n{key}", percent) for key in keys)]
+    return replace(tabulate(title, spread, columns), right=1)
+
+
+def _improvements_table(rows: Sequence[Row]) -> TextTable:
+    title = "Probability of improvement: a flight costs less than one of the other from the same start, %"
+    columns = (
+        *(Column("policy", ""), Column("over"), COLUMNS["episodes"]),
+        Column("probability", "costs less\n%", percent),
+    )
+    return replace(tabulate(title, rows, columns), right=2)
 
 
 def mismatch_table(comparison: Comparison) -> TextTable:
@@ -170,6 +230,8 @@ def record(comparison: Comparison) -> dict[str, Any]:
         "scene": comparison.scene,
         "rows": [row.record() for row in comparison.rows],
         "groups": [group_record(group) for group in comparison.groups],
+        "profiles": [row for each in comparison.conditions for row in profile_rows(comparison, each)],
+        "improvements": [row for each in comparison.conditions for row in improvement_rows(comparison, each)],
         "notes": notes(comparison),
         "commands": list(comparison.commands),
     }

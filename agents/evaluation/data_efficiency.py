@@ -1,8 +1,8 @@
 """Measure how many demonstrations cloning needs: plain, with augmentation, and with feedback gains.
 
-All variants learn from the same growing sets of demonstrations, with the same network and the same number of
-updates, and fly from the same unseen starts. Each training is written as a line, so that an interrupted
-measurement resumes.
+For each seed all variants learn from the same growing sets of demonstrations, with the same network and the
+same number of updates, and fly from the same unseen starts. Each training is written as a line, so that an
+interrupted measurement resumes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.configuration.imitation import ImitationConfiguration, ObjectiveWeights
-from agents.evaluation.statistics import wilson_interval
+from agents.evaluation.statistics import rate_over_runs
 from agents.imitation.cloning import Making, clone, fingerprint
 from agents.imitation.trainer import Progress
 from dq_space_arm_env.common.bounded_reading import parse_json, read_text
@@ -56,21 +56,23 @@ class Saving(NamedTuple):
 def measure(
     configuration: ImitationConfiguration,
     effort: Effort,
-    demonstrations: Demonstrations,
+    demonstrations: Sequence[Demonstrations],
     tests: Demonstrations,
     folder: Path,
     progress: Progress | None = None,
 ) -> list[Row]:
     """Train all variants, fly each from the starts of `tests`, and return a row per training.
 
-    Network and optimizer are the configuration's; finished trainings in the folder are kept.
+    Each seed learns from demonstrations of its own, or all from the only ones. Network and optimizer are the
+    configuration's; finished trainings in the folder are kept.
     """
-    if max(effort.counts) > len(demonstrations):
-        raise ValueError(
-            f"{max(effort.counts)} demonstrations are requested, there are {len(demonstrations)}"
-        )
-    if set(demonstrations.column("seed").tolist()) & set(tests.column("seed").tolist()):
-        raise ValueError("demonstrations and tests share starts: give them different seeds")
+    if len(demonstrations) not in (1, effort.seeds):
+        raise ValueError(f"{len(demonstrations)} sets of demonstrations: should be 1 or {effort.seeds}")
+    for pool in demonstrations:
+        if max(effort.counts) > len(pool):
+            raise ValueError(f"{max(effort.counts)} demonstrations are requested, there are {len(pool)}")
+        if set(pool.column("seed").tolist()) & set(tests.column("seed").tolist()):
+            raise ValueError("demonstrations and tests share starts: give them different seeds")
     identity = _identity(configuration, effort, demonstrations, tests)
     done = _read(folder / LINES, identity)
     found = {(row["variant"], row["count"], row["seed"]) for row in done}
@@ -86,7 +88,8 @@ def measure(
                 progress(Status(finished, total, f"{label}: {advance.describe()}"))
 
         # A larger set contains the smaller ones of the same seed.
-        chosen = demonstrations.select(np.random.default_rng(seed).permutation(len(demonstrations))[:count])
+        pool = demonstrations[seed % len(demonstrations)]
+        chosen = pool.select(np.random.default_rng(seed).permutation(len(pool))[:count])
         done.append(_train(configuration, effort, variant, chosen, seed, tests, tell))
         lines = "".join(json.dumps(line) + "\n" for line in (identity, *done))
         write_atomically(folder / LINES, lines)
@@ -126,15 +129,14 @@ def _train(
         "variant": variant,
         "count": len(chosen),
         "seed": seed,
-        "successes": int(flights.is_success.sum()),
-        "flights": len(tests),
+        "successes": flights.is_success.astype(int).tolist(),
         "gap": float(np.median(flights.cost / tests.column("cost") - 1.0)),  # of J / J_expert - 1
         "seconds": cloned.history[-1]["seconds"],
     }
 
 
 def points(trainings: Sequence[Row]) -> list[Row]:
-    """Aggregate the seeds: a row per variant and count, with the Wilson interval over all flights."""
+    """Aggregate the seeds: a row per variant and count, with an interval over trainings and starts."""
     counts = sorted({row["count"] for row in trainings})
     groups = (
         [row for row in trainings if (row["variant"], row["count"]) == (variant, count)]
@@ -145,8 +147,8 @@ def points(trainings: Sequence[Row]) -> list[Row]:
 
 
 def _point(rows: Sequence[Row]) -> Row:
-    interval = wilson_interval(sum(row["successes"] for row in rows), sum(row["flights"] for row in rows))
-    shares = [row["successes"] / row["flights"] for row in rows]
+    interval = rate_over_runs([row["successes"] for row in rows])
+    shares = [float(np.mean(row["successes"])) for row in rows]
     return {
         "variant": rows[0]["variant"],
         "count": rows[0]["count"],
@@ -177,7 +179,7 @@ def saving(measured: Sequence[Row], variant: str) -> Saving | None:
 def _identity(
     configuration: ImitationConfiguration,
     effort: Effort,
-    demonstrations: Demonstrations,
+    demonstrations: Sequence[Demonstrations],
     tests: Demonstrations,
 ) -> dict[str, Any]:
     """Inputs that determine a training besides variant, count and seed, JSON values."""
@@ -187,8 +189,8 @@ def _identity(
         "updates": effort.updates,
         "threads": configuration.threads,
         **{
-            name: [data.manifest["settings_sha256"], fingerprint(data)]
-            for name, data in (("demonstrations", demonstrations), ("tests", tests))
+            name: [[data.manifest["settings_sha256"], fingerprint(data)] for data in sets]
+            for name, sets in (("demonstrations", demonstrations), ("tests", [tests]))
         },
     }
 

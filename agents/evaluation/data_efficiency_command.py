@@ -29,7 +29,7 @@ class Options:
 
     configuration: str = "cloning-with-gains"
     counts: Sequence[int] = (10, 20, 50, 100, 200, 500, 1000)
-    seeds: int = 3
+    seeds: int = 5
     updates: int = 5000
     tests: int = 400
     demonstrations: Path | None = None
@@ -68,24 +68,28 @@ def run(destination: Destination, options: Options) -> None:
 
 def _data(
     configuration: ImitationConfiguration, options: Options, folder: Path, count: int, shown: ProgressDisplay
-) -> tuple[Demonstrations, Demonstrations]:
-    """Demonstrations to learn from, and to fly from."""
-    source = configuration.demonstrations.model_copy(update={"problems": count})
+) -> tuple[list[Demonstrations], Demonstrations]:
+    """Demonstrations to learn from, for each seed or for all, and to fly from."""
+    scene, source = load_scene(configuration.scene), configuration.resolved().demonstrations
+    if options.demonstrations is not None:
+        source = DemonstrationSource(folder=str(options.demonstrations))
+    learned = {"demonstrations": source}
+    if source.folder is None and source.minari is None:
+        first = source.seed or 0
+        learned = {
+            f"demonstrations-{seed}" if seed else "demonstrations": source.model_copy(
+                update={"problems": count, "seed": first + seed}
+            )
+            for seed in range(options.seeds)
+        }
     tests = DemonstrationSource(problems=options.tests, seed=TEST_SEED)
-    scene = load_scene(configuration.scene)
-    learned, flown = (
-        prepare_demonstrations(
-            source if given is None else DemonstrationSource(folder=str(given)),
-            scene,
-            folder / name,
-            progress=shown.update,
-        )
-        for source, given, name in (
-            (source, options.demonstrations, "demonstrations"),
-            (tests, options.test_demonstrations, "tests"),
-        )
+    if options.test_demonstrations is not None:
+        tests = DemonstrationSource(folder=str(options.test_demonstrations))
+    *pools, flown = (
+        prepare_demonstrations(given, scene, folder / name, progress=shown.update)
+        for name, given in {**learned, "tests": tests}.items()
     )
-    return learned, flown[: options.tests]
+    return pools, flown[: options.tests]
 
 
 def _columns() -> list[Column]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from agents.configuration.schema import RESERVED_SEED
 from agents.evaluation.kept_results import CachedGroups, Row
+from agents.run_folder import VALIDATION_SEED, validation_seeds
 from dq_space_arm_env import Scene
 from experts.demonstrations.executors import Executor, local_executor
 from experts.demonstrations.outcomes import MISSED_TARGET, REASONS
@@ -101,12 +102,35 @@ def optimal_costs(
         KeyboardInterrupt: If the user interrupts it; likewise.
     """
     evaluation_seeds(scene, n)  # refuses a wrong n
-    settings = evaluation_settings(scene)
+    return _look_up(evaluation_settings(scene), n, executor or local_executor(workers), progress)
+
+
+def validation_costs(
+    scene: Scene,
+    n: int,
+    executor: Executor,
+    progress: Callable[[int, int], None] = lambda done, problems: None,
+) -> OptimalCosts:
+    """Likewise from the first n validation starts, which learning curves are flown from."""
+    settings = _ValidationStarts.of(scene, max(n, EVALUATION_SEEDS), VALIDATION_SEED, GROUP)
+    return _look_up(settings, n, executor, progress)
+
+
+class _ValidationStarts(Settings):
+    """Settings whose problems begin at validation starts."""
+
+    def problem_seed(self, problem: int) -> int:
+        return validation_seeds(problem + 1)[problem]
+
+
+def _look_up(
+    settings: Settings, n: int, executor: Executor, progress: Callable[[int, int], None]
+) -> OptimalCosts:
     files = cost_files(settings, n)
     progress(min(n, len(files.rows)), n)
     if files.missing:
         tasks = (Task(settings, group) for group in files.missing)
-        with closing((executor or local_executor(workers)).run(tasks)) as results:
+        with closing(executor.run(tasks)) as results:
             for result in results:
                 files.add(result.shard, cost_rows(result))
                 progress(min(n, len(files.rows)), n)

@@ -1,10 +1,17 @@
 """Statistics of evaluations: intervals for rates and medians, and aggregates over training runs.
 
-Policies must be evaluated without SciPy, a hundred megabytes for three formulas; the tests compare with it.
+All runs fly from the same starts, so a mean over runs and starts has two sources of error: the runs drawn and
+the starts drawn. Both variances are estimated as in a two-way analysis of variance, and Student's t accounts
+for the small number of runs. A bootstrap over runs does not: its intervals cover too little. On the need for
+intervals see Agarwal et al. (NeurIPS 2021, arXiv:2108.13264), on their coverage with few runs Jordan et al.
+(ICML 2024, arXiv:2406.16241).
+
+Policies must be evaluated without SciPy, a hundred megabytes for a few formulas; the tests compare with it.
 """
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +24,9 @@ RESAMPLES = 2000
 """Resamples of a bootstrap: enough for bounds within a few per cent of the interval's width."""
 FEWEST_RUNS = 3
 """Training runs below which a result describes a seed rather than an algorithm."""
+
+TIE = 1e-6
+"""Relative difference of costs below which neither is lower."""
 
 _NORMAL_QUANTILE = 1.959963984540054  # of CONFIDENCE, two-sided
 
@@ -32,7 +42,7 @@ class Interval(NamedTuple):
 class Runs(NamedTuple):
     """Aggregates over training runs of one agent with different seeds."""
 
-    success_rate: Interval  # of all episodes of all runs
+    success_rate: Interval  # mean over runs and episodes
     cost_gap: Interval  # interquartile mean over runs and episodes
 
 
@@ -40,7 +50,11 @@ def wilson_interval(successes: int, trials: int) -> Interval:
     """Wilson's score interval of a rate, which holds near 0 and 1 too (Wilson, JASA 1927)."""
     if not 0 <= successes <= trials or trials == 0:
         raise ValueError(f"{successes} successes of {trials} trials: should be 0 <= successes <= trials > 0")
-    z, n, rate = _NORMAL_QUANTILE, trials, successes / trials
+    return _score_interval(successes / trials, trials, _NORMAL_QUANTILE)
+
+
+def _score_interval(rate: float, n: float, z: float) -> Interval:
+    """Wilson's interval for a quantile z."""
     center = (rate + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
     # At rates of 0 and 1 one bound equals the rate; guard against rounding.
@@ -56,7 +70,9 @@ def bootstrap_interval(
         return Interval(math.nan, math.nan, math.nan)
     rng = np.random.default_rng(seed)
     resamples = [statistic(sample[rng.integers(len(sample), size=len(sample))]) for _ in range(RESAMPLES)]
-    return _percentiles(statistic(sample), resamples)
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.percentile(resamples, [tail, 100.0 - tail])
+    return Interval(statistic(sample), float(low), float(high))
 
 
 def interquartile_mean(values: ArrayLike) -> float:
@@ -68,16 +84,32 @@ def interquartile_mean(values: ArrayLike) -> float:
     return float(np.mean(ordered[cut : ordered.size - cut]))
 
 
-def compare_runs(successes: Sequence[ArrayLike], gaps: Sequence[ArrayLike], *, seed: int = 0) -> Runs:
-    """Aggregate training runs that differ in their seeds (after Agarwal et al., NeurIPS 2021).
+def rate_over_runs(scores: ArrayLike) -> Interval:
+    """Mean of scores over runs and starts, with an interval in [0, 1] for other runs from other starts.
 
-    Each resample draws whole runs and starts. Episodes of a run share its policy: drawing a run for each
-    start anew, as if they were independent, would make three runs look like hundreds.
+    It is Wilson's with the number of independent trials that would have the variance found (the effective
+    sample size of Korn and Graubard, Survey Methodology 1998). Where that is zero, all runs count as one.
+
+    Args:
+        scores: Successes or shares in [0, 1], shape (runs, starts), or (runs, runs of another, starts).
+
+    Raises:
+        ValueError: If there is no score.
+    """
+    values = np.asarray(scores, dtype=np.float64)
+    if values.size == 0:
+        raise ValueError(f"scores have shape {values.shape}: should be at least one run and one start")
+    rate, variance, quantile = _crossed(values)
+    n = float(values.shape[-1]) if variance == 0.0 else min(values.size, rate * (1.0 - rate) / variance)
+    return _score_interval(rate, n, quantile)
+
+
+def compare_runs(successes: Sequence[ArrayLike], gaps: Sequence[ArrayLike]) -> Runs:
+    """Aggregate training runs that differ in their seeds.
 
     Args:
         successes: Success of each episode: for each run, shape (n,), the same starts in all runs.
         gaps: Cost gaps likewise; NaN where the optimal cost is unknown.
-        seed: Seed of the resamples.
 
     Raises:
         ValueError: If there are fewer than 3 runs, or their numbers of episodes differ.
@@ -90,26 +122,82 @@ def compare_runs(successes: Sequence[ArrayLike], gaps: Sequence[ArrayLike], *, s
     lengths = {len(np.asarray(run)) for run in (*successes, *gaps)}
     if len(lengths) != 1:
         raise ValueError(f"runs have {sorted(lengths)} episodes: evaluate all of them on the same starts")
-    succeeded, gap = (np.array(runs, dtype=np.float64) for runs in (successes, gaps))
-    known = ~np.isnan(gap).any(axis=0)
-    return Runs(
-        _over_runs(succeeded, lambda scores: float(np.mean(scores)), seed),
-        _over_runs(gap[:, known], interquartile_mean, seed),
-    )
+    success_rate, gap = rate_over_runs(np.array(successes)), _known(gaps)
+    if gap.size == 0:
+        return Runs(success_rate, Interval(math.nan, math.nan, math.nan))
+    # The variance of a trimmed mean is that of its winsorized values (Tukey and McLaughlin, Sankhya 1963).
+    middle = interquartile_mean(gap)
+    _, variance, quantile = _crossed(2.0 * np.clip(gap, *np.quantile(gap, [0.25, 0.75])))
+    half = quantile * math.sqrt(variance)
+    return Runs(success_rate, Interval(middle, middle - half, middle + half))
 
 
-def _over_runs(scores: FloatArray, statistic: Callable[[FloatArray], float], seed: int) -> Interval:
-    rng, (runs, starts) = np.random.default_rng(seed), scores.shape
-    if starts == 0:
-        return Interval(math.nan, math.nan, math.nan)
-    resamples = [
-        statistic(scores[rng.integers(runs, size=runs)][:, rng.integers(starts, size=starts)])
-        for _ in range(RESAMPLES)
-    ]
-    return _percentiles(statistic(scores), resamples)
+def probability_of_improvement(costs: ArrayLike, others: ArrayLike) -> Interval:
+    """Probability that a flight costs less than one of another agent from the same start (Agarwal et al.).
+
+    All runs of one meet all runs of the other, start by start; equal costs count half.
+
+    Args:
+        costs: J of the flights, shape (runs, n), dimensionless; NaN counts as infinite.
+        others: J of the other agent from the same starts, shape (its runs, n), dimensionless.
+
+    Raises:
+        ValueError: If the numbers of starts differ, or are zero.
+    """
+    mine, theirs = (np.nan_to_num(np.asarray(each, float), nan=np.inf) for each in (costs, others))
+    if mine.shape[-1] != theirs.shape[-1]:
+        raise ValueError(f"flights from {mine.shape[-1]} and {theirs.shape[-1]} starts: should be the same")
+    mine, theirs = mine[:, None], theirs[None]
+    return rate_over_runs(np.where(np.isclose(mine, theirs, rtol=TIE, atol=0.0), 0.5, mine < theirs))
 
 
-def _percentiles(value: float, resamples: Sequence[float]) -> Interval:
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(resamples, [tail, 100.0 - tail])
-    return Interval(value, float(low), float(high))
+def performance_profile(gaps: Sequence[ArrayLike], thresholds: ArrayLike) -> list[Interval]:
+    """Share of flights whose cost gap is at most each threshold (Agarwal et al.); none if no gap is known.
+
+    Args:
+        gaps: Cost gaps of each run, shape (n,), the same starts in all runs; NaN where unknown.
+        thresholds: Cost gaps, shape (k,), dimensionless.
+    """
+    known = _known(gaps)
+    return [rate_over_runs(known <= threshold) for threshold in np.asarray(thresholds)] if known.size else []
+
+
+@cache
+def student_quantile(freedom: int) -> float:
+    """Two-sided 95 % quantile of Student's t with a number of degrees of freedom, at least 1."""
+    # With t = sqrt(freedom) tan(angle) the density is proportional to a power of the cosine.
+    angle = np.linspace(0.0, min(0.5 * math.pi, 12.0 / math.sqrt(freedom)), 4001)
+    density = np.cos(angle) ** (freedom - 1)
+    below = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
+    return math.sqrt(freedom) * math.tan(float(np.interp(CONFIDENCE * below[-1], below, angle)))
+
+
+def _known(gaps: Sequence[ArrayLike]) -> FloatArray:
+    """Gaps (runs, starts) from the starts whose gap is known in all runs."""
+    values = np.array(gaps, dtype=np.float64)
+    return values[:, ~np.isnan(values).any(axis=0)]
+
+
+def _crossed(scores: FloatArray) -> tuple[float, float, float]:
+    """Mean of scores, its variance where every axis is a random draw, and the quantile for its interval.
+
+    Each axis adds the variance of its means, with its own Student's t, so that the interval never covers too
+    little (Banerjee, Sankhya 1960). The residual is in all of them and is counted once; an axis of one adds
+    nothing.
+    """
+    mean, axes = float(np.mean(scores)), [axis for axis, size in enumerate(scores.shape) if size > 1]
+    residual, variances, squares = scores - mean, [], []
+    for axis in axes:
+        others = tuple(other for other in range(scores.ndim) if other != axis)
+        effect, freedom = np.mean(scores, axis=others, keepdims=True) - mean, scores.shape[axis] - 1
+        residual = residual - effect
+        variances.append(float(np.sum(effect**2)) / (freedom * (freedom + 1)))
+        squares.append(student_quantile(freedom) ** 2 * variances[-1])
+    left = scores.size - 1 - sum(scores.shape[axis] - 1 for axis in axes)
+    noise = float(np.sum(residual**2)) / (left * scores.size) if left > 0 else 0.0
+    twice = (len(axes) - 1) * noise
+    variance = max(sum(variances) - twice, *variances, 0.0)
+    if variance == 0.0:
+        return mean, 0.0, _NORMAL_QUANTILE
+    square = max(sum(squares) - _NORMAL_QUANTILE**2 * twice, *squares)
+    return mean, variance, math.sqrt(square / variance)

@@ -16,6 +16,7 @@ from agents.zoo.shelf import SHELF
 from dq_space_arm_env.common.bounded_reading import parse_json, read_text
 
 CONFIGURATION, EVALUATIONS = "config.yaml", "evaluations.jsonl"
+_EPISODES = {"schedule": "evaluation_episodes", "progression": "evaluation_episodes", "curve": "episodes"}
 _BUDGET = {"total_steps": "--total-steps", "minutes": "--minutes"}
 
 
@@ -26,28 +27,33 @@ class Group(NamedTuple):
     condition: str
     seeds: tuple[int, ...]
     runs: Runs
+    evaluations: tuple[Evaluation, ...]
+
+    @property
+    def label(self) -> str:
+        """Name in tables."""
+        return f"{self.name}, seeds {', '.join(map(str, self.seeds))}"
 
 
 def groups(evaluations: Sequence[Evaluation]) -> list[Group]:
     """Aggregate agents with at least 3 training runs, condition by condition."""
-    found: dict[tuple[str, str], dict[int, Evaluation]] = {}
+    found: dict[tuple[str, str], dict[str, Evaluation]] = {}
     for evaluation in evaluations:
-        agent, seed = agent_of(evaluation.metadata), seed_of(evaluation.metadata)
-        if agent is not None and seed is not None:
-            found.setdefault((evaluation.condition, agent), {})[seed] = evaluation
+        agent = agent_of(evaluation.metadata)
+        if agent is not None and seed_of(evaluation.metadata) is not None:
+            run = json.dumps(evaluation.metadata["configuration"], sort_keys=True)
+            found.setdefault((evaluation.condition, agent), {})[run] = evaluation
     return [
-        Group(
-            str(next(iter(members.values())).metadata.get("agent")),
-            condition,
-            tuple(members),
-            compare_runs(
-                [evaluation.flights.is_success for evaluation in members.values()],
-                [evaluation.cost_gaps for evaluation in members.values()],
-            ),
-        )
+        _group(condition, tuple(members.values()))
         for (condition, _), members in found.items()
         if len(members) >= FEWEST_RUNS
     ]
+
+
+def _group(condition: str, members: tuple[Evaluation, ...]) -> Group:
+    seeds = tuple(seed for each in members if (seed := seed_of(each.metadata)) is not None)
+    runs = compare_runs([each.flights.is_success for each in members], [each.cost_gaps for each in members])
+    return Group(str(members[0].metadata.get("agent")), condition, seeds, runs, members)
 
 
 def learning_curve(policy: Path) -> list[dict[str, Any]]:
@@ -81,7 +87,7 @@ def agent_of(metadata: Mapping[str, Any]) -> str | None:
     configuration = metadata.get("configuration")
     if not isinstance(configuration, Mapping):
         return None
-    return json.dumps([metadata.get("scene_hash"), _without(configuration, "seed")], sort_keys=True)
+    return json.dumps([metadata.get("scene_hash"), _without_seeds(configuration)], sort_keys=True)
 
 
 def seed_of(metadata: Mapping[str, Any]) -> int | None:
@@ -89,6 +95,16 @@ def seed_of(metadata: Mapping[str, Any]) -> int | None:
     configuration = metadata.get("configuration")
     seed = configuration.get("seed") if isinstance(configuration, Mapping) else None
     return None if seed is None else int(seed)
+
+
+def validation_episodes(metadata: Mapping[str, Any]) -> int | None:
+    """Number of flights of each point of a learning curve; None if the metadata lack it."""
+    configuration = metadata.get("configuration")
+    for part, name in _EPISODES.items():
+        found = configuration.get(part) if isinstance(configuration, Mapping) else None
+        if isinstance(found, Mapping) and isinstance(found.get(name), int):
+            return int(found[name])
+    return None
 
 
 def training_command(metadata: Mapping[str, Any], policy: Path | None = None) -> str | None:
@@ -118,7 +134,9 @@ def _shipped(configuration: Mapping[str, Any]) -> list[str] | None:
     if name not in list_configurations():
         return None
     try:
-        shipped = load_configuration(name).model_dump(mode="json", exclude_none=True)
+        content = load_configuration(name).model_dump(exclude_none=True)
+        same_seed = load_configuration({**content, "seed": configuration.get("seed", 0)}).resolved()
+        shipped = same_seed.model_dump(mode="json", exclude_none=True)
     except ConfigurationError:
         return None
     options = [str(name), "--seed", str(configuration.get("seed", 0))]
@@ -131,9 +149,16 @@ def _shipped(configuration: Mapping[str, Any]) -> list[str] | None:
                 options += [option, f"{here[key]}"]
         configuration = {**configuration, "schedule": _without(here, *_BUDGET)}
         shipped = {**shipped, "schedule": _without(there, *_BUDGET)}
-    left_out = ("seed", "description")
-    return options if _without(configuration, *left_out) == _without(shipped, *left_out) else None
+    same = _without(configuration, "description") == _without(shipped, "description")
+    return options if same else None
 
 
 def _without(content: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in content.items() if name not in names}
+
+
+def _without_seeds(content: Any) -> Any:
+    """JSON values without the seeds of training and of demonstrations."""
+    if not isinstance(content, Mapping):
+        return content
+    return {name: _without_seeds(value) for name, value in content.items() if name != "seed"}

@@ -41,7 +41,7 @@ def train_by_imitation(
     report: Callable[[Advance], None] = lambda advance: None,
 ) -> Imitated:
     """Train an agent in a run folder, resuming from its last checkpoint."""
-    scene = load_scene(configuration.scene)
+    scene, configuration = load_scene(configuration.scene), configuration.resolved()
     folder = RunFolder(Path(out), configuration)
     demonstrations = prepare_demonstrations(
         configuration.demonstrations, scene, folder.path / DEMONSTRATIONS, progress=report

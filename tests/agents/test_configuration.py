@@ -9,6 +9,8 @@ from agents.configuration import (
     list_configurations,
     load_configuration,
 )
+from agents.evaluation.training_runs import agent_of, training_command
+from agents.training import with_changes
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.validation import dump_yaml
 
@@ -46,6 +48,26 @@ def test_files_mappings_and_configurations_are_one(tmp_path):
     resolved = configuration.model_dump(mode="json", exclude_none=True)
     assert resolved["algorithm"]["clip_range"] == 0.2
     assert load_configuration(resolved) == configuration
+
+
+@pytest.mark.parametrize("name", ["cloning", "residual", "sac-with-demonstrations"])
+def test_each_run_draws_its_own_demonstrations(name):
+    def source(configuration):
+        given = getattr(configuration, "demonstrations", None)
+        return (given or configuration.algorithm.demonstrations.source).seed
+
+    configuration = load_configuration(name)
+    assert source(configuration) is None
+    other = with_changes(configuration, seed=3)
+    assert (source(configuration.resolved()), source(other.resolved())) == (0, 3)
+    resolved = other.resolved().model_dump(mode="json", exclude_none=True)
+    fixed = load_configuration({**resolved, "seed": 4})
+    assert fixed.seed == 4
+    assert source(fixed.resolved()) == 3
+    assert training_command({"configuration": resolved}) == f"dq-space-arm train {name} --seed 3"
+    assert training_command({"configuration": {**resolved, "seed": 4}}) is None
+    resolved_again = with_changes(configuration, seed=4).resolved().model_dump(mode="json", exclude_none=True)
+    assert agent_of({"configuration": resolved}) == agent_of({"configuration": resolved_again})
 
 
 def test_unknown_keys_are_refused_with_a_suggestion():

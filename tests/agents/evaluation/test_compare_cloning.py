@@ -10,7 +10,7 @@ pytest.importorskip("torch")
 from agents.evaluation.data_efficiency import LINES, points, saving
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.common.console import UNUSABLE
-from experts import generate_demonstrations
+from experts import generate_demonstrations, load_demonstrations
 from experts.demonstrations import SerialExecutor
 
 pytestmark = pytest.mark.agents
@@ -63,6 +63,17 @@ def test_it_measures_draws_and_goes_on(arguments, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_each_seed_draws_its_own_demonstrations(arguments, tmp_path):
+    own = [*arguments[:2], *arguments[4:-1], "2", "--counts", "3", "--out", str(tmp_path), "--no-picture"]
+    assert main(["compare", "cloning", *own]) == 0
+    first, second = (load_demonstrations(tmp_path / name) for name in ("demonstrations", "demonstrations-1"))
+    assert [each.settings["seed"] for each in (first, second)] == [0, 1]
+    assert not set(first.column("seed").tolist()) & set(second.column("seed").tolist())
+    (row, *_) = json.loads((tmp_path / "cloning.json").read_text())["points"]
+    assert (row["trainings"], row["count"]) == (2, 3)
+
+
+@pytest.mark.slow
 def test_what_cannot_be_measured_is_refused(arguments, demonstrations, tmp_path, capsys):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / LINES).write_text('{"updates": 7}\n')
@@ -79,7 +90,8 @@ def test_what_cannot_be_measured_is_refused(arguments, demonstrations, tmp_path,
 
 def training(variant, count, seed, successes):
     named = {"variant": variant, "count": count, "seed": seed}
-    return {**named, "successes": successes, "flights": 100, "gap": 0.1 * (seed + 1), "seconds": 2.0}
+    reached = [int(flight < successes) for flight in range(100)]
+    return {**named, "successes": reached, "gap": 0.1 * (seed + 1), "seconds": 2.0}
 
 
 def test_points_put_seeds_together():

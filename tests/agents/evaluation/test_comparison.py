@@ -14,11 +14,22 @@ from agents.command_line.evaluate import evaluate as evaluate_verb
 from agents.configuration import load_configuration
 from agents.evaluation import CONTROLLERS, evaluation_seeds, fly, optimal_costs, scene_under
 from agents.evaluation.comparing import Comparison
-from agents.evaluation.comparison_tables import comparison_tables, group_record, markdown, notes, record
+from agents.evaluation.comparison_tables import (
+    comparison_tables,
+    group_record,
+    improvement_rows,
+    markdown,
+    notes,
+    profile_rows,
+    record,
+)
+from agents.evaluation.expert_costs import validation_costs
 from agents.evaluation.plan_followers import FEEDBACK, OPEN_LOOP, RECEDING
 from agents.evaluation.planned_flights import fly_plans
 from agents.evaluation.training_runs import agent_of, training_command
 from agents.policies import ExportedPolicy
+from agents.run_folder import validation_seeds
+from dq_space_arm_env import DQSpaceArmVectorEnv
 from dq_space_arm_env.command_line import main
 from experts import GuidedDDP
 from experts.demonstrations import SerialExecutor
@@ -37,7 +48,7 @@ def write_policy(folder, scene, seed=0, name="stub", **training):
         "agent": name,
         "scene": scene.name,
         "scene_hash": scene.content_hash(),
-        "configuration": {"name": name, "seed": seed},
+        "configuration": {"name": name, "seed": seed, "curve": {"episodes": 5}},
         "training": {"environment_steps": 1000, "seconds": 90.0, "expert_solves": 7, **training},
     }
     weights = 0.1 * rng.standard_normal((14, 6))
@@ -164,6 +175,33 @@ def test_runs_of_one_agent_are_taken_together(comparison):
     assert agent_of(one) == agent_of(same) != agent_of(other)
 
 
+def test_agents_meet_all_others_flight_by_flight(comparison):
+    found = improvement_rows(comparison, "training")
+    assert [(row["over"], row["episodes"]) for row in found] == [(OPEN_LOOP, N), (FEEDBACK, N), (RECEDING, 3)]
+    stubs = [row.evaluation.flights.cost for row in comparison.under("training") if row.facts["is_agent"]]
+    gains = row_of(comparison, FEEDBACK, "training").evaluation.flights.cost
+    assert found[1]["probability"][0] == pytest.approx(np.mean(np.array(stubs) < gains))
+    blind, *_, stub = profile_rows(comparison, "training")
+    assert blind["shares"][0][0] == 1.0  # plans cost the optimum
+    gaps = np.array(
+        [row.evaluation.cost_gaps for row in comparison.under("training") if row.facts["is_agent"]]
+    )
+    known = gaps[:, ~np.isnan(gaps).any(axis=0)]
+    assert [share[0] for share in stub["shares"]] == [np.mean(known <= gap) for gap in stub["cost_gaps"]]
+
+
+def test_curves_are_relative_to_the_optima_of_their_own_starts(comparison, counting, quick):
+    costs = validation_costs(quick, 5, counting(limit=0))  # kept by the comparison
+    assert costs.seeds.tolist() == validation_seeds(5)
+    problem = ArmProblem(quick)
+    environment = DQSpaceArmVectorEnv(1, quick)
+    environment.reset(seed=[int(costs.seeds[1])])
+    solution = GuidedDDP(problem).solve(environment.states[0])
+    assert costs.cost[1] == pytest.approx(solution.cost, rel=1e-3)
+    row = row_of(comparison, "stub-0", "training")
+    assert row.facts["validation_optimum"] == np.nanmedian(costs.cost)
+
+
 def test_finished_rows_are_taken_up(tmp_path, monkeypatch, quick):
     run = write_policy(tmp_path / "stub-0", quick)
     arguments = {"controllers": ("gains",), "out": tmp_path / "out", "executor": SerialExecutor()}
@@ -187,7 +225,7 @@ def test_finished_rows_are_taken_up(tmp_path, monkeypatch, quick):
 
 
 def test_tables_have_all_columns_of_the_protocol(comparison):
-    first, _, second, _ = comparison_tables(comparison)
+    first, _, profiles, improvements, second, *_ = comparison_tables(comparison)
     assert [row[0] for row in first.rows] == [*CONTROLLERS.values(), "stub-0", "stub-1", "stub-2"]
     stub = dict(zip(first.headings, first.rows[3], strict=True))
     assert (stub["training\nsteps"], stub["expert\nsolves"], stub["plan\ns"]) == ("1,000", "7", "-")
@@ -196,6 +234,9 @@ def test_tables_have_all_columns_of_the_protocol(comparison):
     for sentence in notes(comparison):
         assert sentence in text
     assert any("they do not know the new one" in sentence for sentence in notes(comparison))
+    entrants = [*CONTROLLERS.values(), "stub, seeds 0, 1, 2"]
+    assert [row[0] for row in profiles.rows] == entrants
+    assert [row[1] for row in improvements.rows] == entrants[:-1]
     content = json.loads(json.dumps(record(comparison), allow_nan=False))
     assert content["groups"] == [group_record(group) for group in comparison.groups]
     curve = content["rows"][3]["learning_curve"]  # in the order of time
@@ -268,7 +309,7 @@ def test_the_figure_draws_gaps_that_no_logarithm_has(comparison):
 
     figure = comparison_figure(comparison)
     panels = [axes for part in figure.subfigs for axes in part.axes]
-    assert len(panels) == 5
+    assert len(panels) == 6
     drawn = [line for line in panels[0].lines if line.get_marker() == "v"]
     assert [line.get_ydata()[0] for line in drawn[:2]] == [FLOOR, FLOOR]
     for axes in panels:
@@ -277,3 +318,22 @@ def test_the_figure_draws_gaps_that_no_logarithm_has(comparison):
         if axes.get_yscale() == "log":
             assert axes.get_ylim()[0] == FLOOR
     assert not math.isnan(panels[0].get_ylim()[1])
+
+
+def test_learning_curves_end_in_their_markers(comparison):
+    pytest.importorskip("matplotlib")
+    from agents.evaluation.comparison_figure import comparison_figure
+
+    figure = comparison_figure(comparison)
+    stub = row_of(comparison, "stub-0", "training")
+    ratio = np.median(stub.evaluation.flights.cost) / np.nanmedian(stub.evaluation.optimal.cost)
+    for axes, end in zip(
+        figure.subfigs[1].axes, (100.0 * (ratio - 1.0), stub.evaluation.success_rate.value), strict=True
+    ):
+        curve = next(line for line in axes.lines if len(line.get_xdata()) == 3)
+        marker = next(line for line in axes.lines if line.get_marker() not in ("None", None))
+        assert (curve.get_xdata()[-1], curve.get_ydata()[-1]) == pytest.approx((90.0, end))
+        assert (marker.get_xdata()[0], marker.get_ydata()[0]) == pytest.approx((90.0, end))
+    shown = 100.0 * (900.0 / stub.facts["validation_optimum"] - 1.0)
+    curve = next(line for line in figure.subfigs[1].axes[0].lines if len(line.get_xdata()) == 3)
+    assert curve.get_ydata()[0] == pytest.approx(max(shown, 0.01))

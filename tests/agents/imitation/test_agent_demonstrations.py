@@ -45,6 +45,8 @@ def test_only_tolerances_may_differ(demonstrations, small_scene, tmp_path):
 def test_starts_of_the_evaluation_are_refused(small_scene, tmp_path):
     with pytest.raises(DemonstrationsError, match="where agents are evaluated: use another seed"):
         prepare_demonstrations(DemonstrationSource(seed=RESERVED_SEED), small_scene, tmp_path)
+    with pytest.raises(ValueError, match=r"demonstrations\.seed is absent: give one"):
+        prepare_demonstrations(DemonstrationSource(), small_scene, tmp_path)
 
 
 @pytest.fixture
