@@ -14,6 +14,7 @@ from dq_space_arm_env.registration import register_environments
 if TYPE_CHECKING:
     from dq_space_arm_env.environment import DQSpaceArmEnv, DQSpaceArmGoalEnv, DQSpaceArmVectorEnv
     from dq_space_arm_env.interoperability.casadi_dynamics import CasadiDynamics, casadi_dynamics
+    from dq_space_arm_env.interoperability.jax_dynamics import JaxDynamics, jax_dynamics
     from dq_space_arm_env.interoperability.mjcf_export import scene_to_mjcf
     from dq_space_arm_env.interoperability.pinocchio_twin import (
         from_pinocchio,
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
         pinocchio_model,
         to_pinocchio,
     )
+    from dq_space_arm_env.interoperability.torch_dynamics import TorchDynamics, torch_dynamics
     from dq_space_arm_env.interoperability.urdf_export import scene_to_urdf
     from dq_space_arm_env.interoperability.urdf_import import scene_from_urdf
     from dq_space_arm_env.kernels import Kernels, compile_scene
@@ -33,13 +35,16 @@ __all__ = [
     "DQSpaceArmEnv",
     "DQSpaceArmGoalEnv",
     "DQSpaceArmVectorEnv",
+    "JaxDynamics",
     "Kernels",
     "Scene",
     "SceneError",
+    "TorchDynamics",
     "casadi_dynamics",
     "compile_scene",
     "from_pinocchio",
     "generalized_forces",
+    "jax_dynamics",
     "list_scenes",
     "load_scene",
     "pinocchio_model",
@@ -47,6 +52,7 @@ __all__ = [
     "scene_to_mjcf",
     "scene_to_urdf",
     "to_pinocchio",
+    "torch_dynamics",
 ]
 
 _HOMES = {
@@ -54,13 +60,16 @@ _HOMES = {
     "DQSpaceArmEnv": "environment",
     "DQSpaceArmGoalEnv": "environment",
     "DQSpaceArmVectorEnv": "environment",
+    "JaxDynamics": "interoperability.jax_dynamics",
     "Kernels": "kernels",
     "Scene": "scene",
     "SceneError": "scene",
+    "TorchDynamics": "interoperability.torch_dynamics",
     "casadi_dynamics": "interoperability.casadi_dynamics",
     "compile_scene": "kernels",
     "from_pinocchio": "interoperability.pinocchio_twin",
     "generalized_forces": "interoperability.pinocchio_twin",
+    "jax_dynamics": "interoperability.jax_dynamics",
     "list_scenes": "scene",
     "load_scene": "scene",
     "pinocchio_model": "interoperability.pinocchio_twin",
@@ -68,6 +77,7 @@ _HOMES = {
     "scene_to_mjcf": "interoperability.mjcf_export",
     "scene_to_urdf": "interoperability.urdf_export",
     "to_pinocchio": "interoperability.pinocchio_twin",
+    "torch_dynamics": "interoperability.torch_dynamics",
 }
 
 register_environments()
