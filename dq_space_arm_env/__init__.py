@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         DQSpaceArmVectorEnv,
     )
     from dq_space_arm_env.interoperability.casadi_dynamics import CasadiDynamics, casadi_dynamics
+    from dq_space_arm_env.interoperability.jax_dynamics import JaxDynamics, jax_dynamics
     from dq_space_arm_env.interoperability.mjcf_export import scene_to_mjcf
     from dq_space_arm_env.interoperability.pinocchio_twin import (
         from_pinocchio,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
         pinocchio_model,
         to_pinocchio,
     )
+    from dq_space_arm_env.interoperability.torch_dynamics import TorchDynamics, torch_dynamics
     from dq_space_arm_env.interoperability.urdf_export import scene_to_urdf
     from dq_space_arm_env.interoperability.urdf_import import scene_from_urdf
     from dq_space_arm_env.kernels import Kernels, compile_scene
@@ -39,13 +41,16 @@ __all__ = [
     "DQSpaceArmGoalEnv",
     "DQSpaceArmGoalVectorEnv",
     "DQSpaceArmVectorEnv",
+    "JaxDynamics",
     "Kernels",
     "Scene",
     "SceneError",
+    "TorchDynamics",
     "casadi_dynamics",
     "compile_scene",
     "from_pinocchio",
     "generalized_forces",
+    "jax_dynamics",
     "list_scenes",
     "load_scene",
     "pinocchio_model",
@@ -53,6 +58,7 @@ __all__ = [
     "scene_to_mjcf",
     "scene_to_urdf",
     "to_pinocchio",
+    "torch_dynamics",
 ]
 
 _HOMES = {
@@ -61,13 +67,16 @@ _HOMES = {
     "DQSpaceArmGoalEnv": "environment",
     "DQSpaceArmGoalVectorEnv": "environment",
     "DQSpaceArmVectorEnv": "environment",
+    "JaxDynamics": "interoperability.jax_dynamics",
     "Kernels": "kernels",
     "Scene": "scene",
     "SceneError": "scene",
+    "TorchDynamics": "interoperability.torch_dynamics",
     "casadi_dynamics": "interoperability.casadi_dynamics",
     "compile_scene": "kernels",
     "from_pinocchio": "interoperability.pinocchio_twin",
     "generalized_forces": "interoperability.pinocchio_twin",
+    "jax_dynamics": "interoperability.jax_dynamics",
     "list_scenes": "scene",
     "load_scene": "scene",
     "pinocchio_model": "interoperability.pinocchio_twin",
@@ -75,6 +84,7 @@ _HOMES = {
     "scene_to_mjcf": "interoperability.mjcf_export",
     "scene_to_urdf": "interoperability.urdf_export",
     "to_pinocchio": "interoperability.pinocchio_twin",
+    "torch_dynamics": "interoperability.torch_dynamics",
 }
 
 register_environments()

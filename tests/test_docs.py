@@ -87,7 +87,7 @@ def blocks() -> list[tuple[str, int]]:
 def test_code_in_the_documentation_runs(page, number, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)  # results of older code would be refused
     code = code_of(WITH_README[page], "python")[number]
-    for package in ("pinocchio", "stable_baselines3"):
+    for package in ("jax", "pinocchio", "stable_baselines3", "torch"):
         if package in code:
             pytest.importorskip(package)
     exec(compile(code, f"{page}.md, block {number}", "exec"), {})

@@ -1,1 +1,1 @@
-"""Import from URDF, export to URDF and MJCF, dynamics in CasADi and Pinocchio."""
+"""Import from URDF, export to URDF and MJCF, dynamics in CasADi, PyTorch, JAX and Pinocchio."""

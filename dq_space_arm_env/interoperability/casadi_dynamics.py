@@ -13,13 +13,13 @@ from typing import Any
 import casadi
 
 from dq_space_arm_env.algebra import dual_quaternion
-from dq_space_arm_env.compiler.graph import EXPRESSIONS, Graph, trace
+from dq_space_arm_env.compiler.graph import EXPRESSIONS, trace
 from dq_space_arm_env.compiler.program import Buffer, Program
 from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators.method import program_inputs
+from dq_space_arm_env.interoperability.traced_functions import evaluated, step_of_fixed_stages
 from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
-from dq_space_arm_env.scene import INTEGRATORS, Scene, StateLayout
-from dq_space_arm_env.validation import did_you_mean
+from dq_space_arm_env.scene import Scene, StateLayout
 
 Scalar = Any
 
@@ -70,19 +70,8 @@ def casadi_dynamics(scene: Scene, integrator: str | None = None) -> CasadiDynami
     Raises:
         ValueError: If the integrator is unknown, adaptive or implicit.
     """
-    name = scene.simulation.integrator if integrator is None else integrator
-    if name not in INTEGRATORS:
-        raise ValueError(
-            f"integrator: {name!r} is unknown; {did_you_mean(name, INTEGRATORS)}It must be one of "
-            f"{', '.join(INTEGRATORS)}"
-        )
     programs = ScenePrograms(scene)
-    step = programs.build("step", name)
-    if step.loops:
-        raise ValueError(
-            f"integrator: {name!r} repeats calls until tolerances are met or stages converge, which CasADi "
-            "cannot differentiate; give one with a fixed number of stages, for example integrator='rk8'"
-        )
+    step = step_of_fixed_stages(programs, integrator, "CasADi")
     return CasadiDynamics(
         scene=scene,
         layout=programs.layout,
@@ -128,22 +117,10 @@ def _function(program: Program) -> casadi.Function:
         buffers[name] = [column[i] for i in range(column.shape[0])]
     for call in program.calls:
         arguments = [buffers[call.bindings.get(name, name)] for name, _ in call.graph.inputs]
-        for (name, _), values in zip(call.graph.outputs, _evaluated(call.graph, arguments), strict=True):
+        results = evaluated(call.graph, arguments, EXPRESSIONS, casadi.SX)
+        for (name, _), values in zip(call.graph.outputs, results, strict=True):
             buffers[call.bindings.get(name, name)] = values
     outputs = [casadi.densify(casadi.vertcat(*buffers[buffer.name])) for buffer in program.outputs]
     return casadi.Function(
         program.name, [*inputs.values()], outputs, [*inputs], [buffer.name for buffer in program.outputs]
     )
-
-
-def _evaluated(graph: Graph, arguments: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
-    """Evaluate a graph node by node."""
-    values: list[Scalar] = []
-    for node in graph.nodes:
-        if node.operation == "constant":
-            values.append(casadi.SX(node.constant))
-        elif node.operation == "input":
-            values.append(arguments[node.slot[0]][node.slot[1]])
-        else:
-            values.append(EXPRESSIONS[node.operation](*(values[i] for i in node.arguments)))
-    return [[values[i] for i in indices] for indices in graph.results]

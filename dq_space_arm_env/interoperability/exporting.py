@@ -1,4 +1,4 @@
-"""Shared by the exports to URDF and MJCF: numbers as text, names, and features that the formats lack."""
+"""Shared by the exports: numbers as text, names, and features that the formats lack."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from collections.abc import Collection, Iterable, Iterator
 
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.dynamics.kinematics import wrist_rotation
-from dq_space_arm_env.scene import Scene, SceneError
+from dq_space_arm_env.scene import INTEGRATORS, Scene, SceneError
 from dq_space_arm_env.scene.actuator_chains import chains
 from dq_space_arm_env.scene.constraint_rows import sides
 from dq_space_arm_env.scene.constraints import JointLimits
+from dq_space_arm_env.validation import did_you_mean
 
 
 def words(numbers: Iterable[float]) -> str:
@@ -24,6 +25,17 @@ def free_name(wanted: str, taken: Collection[str]) -> str:
     while wanted in taken:
         wanted += "_"
     return wanted
+
+
+def integrator_name(scene: Scene, integrator: str | None) -> str:
+    """The scene's integrator, or the named one; ValueError if it is unknown."""
+    name = scene.simulation.integrator if integrator is None else integrator
+    if name not in INTEGRATORS:
+        raise ValueError(
+            f"integrator: {name!r} is unknown; {did_you_mean(name, INTEGRATORS)}It must be one of "
+            f"{', '.join(INTEGRATORS)}"
+        )
+    return name
 
 
 def coupled_rotors(scene: Scene) -> Iterator[str]:

@@ -58,7 +58,7 @@ def main() -> None:
         single = gymnasium.make("DQSpaceArm-v0", scene=policy.metadata["scene"])
         observation, _ = single.reset(seed=0)
         assert single.action_space.contains(policy(observation))
-    assert not {"torch", "stable_baselines3", "matplotlib"} & set(sys.modules)
+    assert not {"jax", "torch", "stable_baselines3", "matplotlib"} & set(sys.modules)
     found = {
         "version": dq_space_arm_env.__version__,
         "scenes": list_scenes(),

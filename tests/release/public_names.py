@@ -25,13 +25,16 @@ from dq_space_arm_env import (
     DQSpaceArmGoalEnv,
     DQSpaceArmGoalVectorEnv,
     DQSpaceArmVectorEnv,
+    JaxDynamics,
     Kernels,
     Scene,
     SceneError,
+    TorchDynamics,
     casadi_dynamics,
     compile_scene,
     from_pinocchio,
     generalized_forces,
+    jax_dynamics,
     list_scenes,
     load_scene,
     pinocchio_model,
@@ -39,6 +42,7 @@ from dq_space_arm_env import (
     scene_to_mjcf,
     scene_to_urdf,
     to_pinocchio,
+    torch_dynamics,
 )
 from experts import (
     BoxDDP,
@@ -98,10 +102,13 @@ def own_problems() -> list[StopReason]:
 
 
 def other_engines(scene: Scene) -> NDArray[np.float64]:
-    """Hand the dynamics to CasADi, and to Pinocchio."""
+    """Hand the dynamics to CasADi, PyTorch, JAX and Pinocchio."""
     dynamics = casadi_dynamics(scene, "rk4")
     assert_type(dynamics, CasadiDynamics)
     x, u = dynamics.layout.initial_state, np.zeros(dynamics.layout.n_u)
+    assert_type(torch_dynamics(scene, threads=2), TorchDynamics)
+    assert_type(jax_dynamics(scene, kernels=True), JaxDynamics)
+    print(jax_dynamics(scene, "rk4").rollout(x, u[None]))
     print(dynamics.step(x, u, 0.01), pinocchio_model(scene), generalized_forces(scene, x, u))
     q, v = to_pinocchio(scene, x)
     return from_pinocchio(scene, q, v, (0.0, 0.0, 0.0))
