@@ -315,7 +315,8 @@ class _ParquetFiles:
             chunk, file = divmod(self._number, CHUNK)
             path = self._folder / FILES.format(chunk_index=chunk, file_index=file)
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = parquet.ParquetWriter(path, self._schema)
+            # A dictionary of numbers that hardly repeat would add a sixth.
+            self._writer = parquet.ParquetWriter(path, self._schema, use_dictionary=False)
         self._size += size
         return divmod(self._number, CHUNK)
 

@@ -30,16 +30,14 @@ def staged(place: Path, staging: Path, *, marker: str, overwrite: bool, name: st
             writing it.
         OSError: If a folder cannot be created, moved or removed.
     """
-    if place.exists() and not (overwrite and (place / marker).exists()):
-        advice = "choose another name, or allow it to be overwritten"
-        if overwrite:
-            advice = f"it holds no {marker}, so it is not overwritten; choose another name"
-        raise DemonstrationsError(f"{name} exists: {advice}")
+    if not staging.exists():  # else a killed process left it, perhaps with what it was about to replace
+        _check_free(place, marker, overwrite, name)
     staging.mkdir(parents=True, exist_ok=True)
     with locked(staging / "lock", DemonstrationsError(f"another process is writing {name}")):
         made, replaced = staging / "made", staging / "replaced"
         try:
             _put_back(replaced, place)
+            _check_free(place, marker, overwrite, name)
             for leftover in staging.iterdir():
                 if leftover.is_dir():  # all but the lock
                     shutil.rmtree(leftover)
@@ -50,6 +48,15 @@ def staged(place: Path, staging: Path, *, marker: str, overwrite: bool, name: st
         finally:
             _put_back(replaced, place)
             shutil.rmtree(staging, ignore_errors=True)  # Windows keeps a file that is locked
+
+
+def _check_free(place: Path, marker: str, overwrite: bool, name: str) -> None:
+    """Raise DemonstrationsError if something is in the place that may not be overwritten."""
+    if place.exists() and not (overwrite and (place / marker).exists()):
+        advice = "choose another name, or allow it to be overwritten"
+        if overwrite:
+            advice = f"it holds no {marker}, so it is not overwritten; choose another name"
+        raise DemonstrationsError(f"{name} exists: {advice}")
 
 
 def _put_back(replaced: Path, place: Path) -> None:

@@ -195,6 +195,9 @@ def test_what_a_killed_process_left_is_cleared_away(whole: Demonstrations, tmp_p
         locked(staging / "lock", RuntimeError()),
     ):
         export_to_lerobot(whole, place)
+    with pytest.raises(DemonstrationsError, match="exists: choose another name"):
+        export_to_lerobot(whole, place)
+    assert information(place)["total_episodes"] == 2
     export_to_lerobot(whole[:3], place, overwrite=True)
     assert information(place)["total_episodes"] == 3
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
