@@ -127,43 +127,65 @@ def generate(
         Examples:
           dq-space-arm demonstrations export results/demonstrations/paper dq-space-arm/paper-v0
           dq-space-arm demonstrations export results/demonstrations/paper new/paper-v1 --no-gains --overwrite
+          dq-space-arm demonstrations export results/demonstrations/paper results/lerobot --format lerobot
     """
 )
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.argument("dataset")
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(["minari", "lerobot"]),
+    default="minari",
+    show_default=True,
+    help="Format of the data set.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace a data set of this name.")
-@click.option("--gains/--no-gains", default=True, help="Write the feedback gains, most of the size.")
-@click.option("--author", help="Author of the data.")
-@click.option("--author-email", help="Address of the author.")
-@click.option("--code-permalink", help="Address of the code that generated the data.")
+@click.option("--gains/--no-gains", default=None, help="Minari: write the feedback gains, most of the size.")
+@click.option("--author", help="Minari: author of the data.")
+@click.option("--author-email", help="Minari: address of the author.")
+@click.option("--code-permalink", help="Minari: address of the code that generated the data.")
 @json_option
 def export(
     folder: Path,
     dataset: str,
+    kind: str,
     overwrite: bool,
-    gains: bool,
+    gains: bool | None,
     author: str | None,
     author_email: str | None,
     code_permalink: str | None,
     as_json: bool,
 ) -> None:
-    """Write the demonstrations in FOLDER as Minari's DATASET, a name with a version.
+    """Write the demonstrations in FOLDER as DATASET, of Minari or LeRobot.
 
-    It goes where Minari looks for data sets: MINARI_DATASETS_PATH, or ~/.minari/datasets. Needs the extra
-    `minari`.
+    For Minari, DATASET is a name with a version. It goes where Minari looks for data sets:
+    MINARI_DATASETS_PATH, or ~/.minari/datasets. Needs the extra `minari`.
+
+    For LeRobot, DATASET is a folder to create, a LeRobotDataset v3.0. Needs the extra `lerobot`.
     """
     from experts.command_line import demonstrations_work as command
 
-    record = command.export(
-        table_console(stderr=as_json),
-        folder,
-        dataset,
-        gains=gains,
-        author=author,
-        author_email=author_email,
-        code_permalink=code_permalink,
-        overwrite=overwrite,
-    )
+    console = table_console(stderr=as_json)
+    if kind == "lerobot":
+        if (gains, author, author_email, code_permalink) != (None,) * 4:
+            raise click.UsageError(
+                "--gains, --author, --author-email and --code-permalink are for --format minari",
+                click.get_current_context(),
+            )
+        check_writable(Path(dataset))
+        record = command.export_lerobot(console, folder, Path(dataset), overwrite=overwrite)
+    else:
+        record = command.export(
+            console,
+            folder,
+            dataset,
+            gains=gains is not False,
+            author=author,
+            author_email=author_email,
+            code_permalink=code_permalink,
+            overwrite=overwrite,
+        )
     if as_json:
         print_document(record)
 

@@ -19,6 +19,7 @@ from experts.demonstrations import (
 from experts.demonstrations import facts as tables
 from experts.demonstrations.data_card import data_card
 from experts.demonstrations.facts import gather
+from experts.demonstrations.lerobot_export import export_to_lerobot
 from experts.demonstrations.minari_export import export_to_minari
 from experts.report.data_set_summary import write_summary
 
@@ -107,6 +108,29 @@ def export(
         "dataset": written.id,
         "episodes": int(written.total_episodes),
         "megabytes": float(size),
+        "path": str(path),
+    }
+
+
+def export_lerobot(console: Console, folder: Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
+    """Write demonstrations as a data set of LeRobot, with a data card."""
+    demonstrations = load_demonstrations(folder, verify=True)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("episodes", total=len(demonstrations))
+        path = export_to_lerobot(
+            demonstrations,
+            out,
+            card=data_card(gather(demonstrations), lerobot=True),
+            overwrite=overwrite,
+            progress=lambda done: progress.update(task, completed=done),
+        )
+    size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) / 1e6
+    line = f"{path}: {len(demonstrations)} episodes, {size:.1f} MB"
+    console.print(line, markup=False, soft_wrap=True)
+    return {
+        "dataset": str(path),
+        "episodes": len(demonstrations),
+        "megabytes": round(size, 1),
         "path": str(path),
     }
 

@@ -8,6 +8,7 @@ ends with the same files.
 
 from experts.demonstrations.executors import Executor, ProcessExecutor, SerialExecutor
 from experts.demonstrations.generation import Advance, generate_demonstrations
+from experts.demonstrations.lerobot_export import export_to_lerobot
 from experts.demonstrations.minari_export import export_to_minari
 from experts.demonstrations.ray_executor import RayExecutor
 from experts.demonstrations.reading import Batch, Demonstration, Demonstrations, load_demonstrations
@@ -23,6 +24,7 @@ __all__ = [
     "ProcessExecutor",
     "RayExecutor",
     "SerialExecutor",
+    "export_to_lerobot",
     "export_to_minari",
     "generate_demonstrations",
     "load_demonstrations",

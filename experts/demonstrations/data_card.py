@@ -47,9 +47,9 @@ tags:
 - imitation-learning
 - optimal-control
 - feedback-gains
-- gymnasium
+- gymnasium$tags
 size_categories:
-- $size_category
+- $size_category$configurations
 ---
 
 # $demonstrations optimal maneuvers, scene $scene
@@ -93,7 +93,7 @@ demonstration = demonstrations[0]
 deviations = demonstrations.tangent(demonstration.states[:1], demonstration.states[1:2])
 ```
 
-The shards are safetensors files, which other libraries can read as well.$minari
+The shards are safetensors files, which other libraries can read as well.$copy
 
 ## How to reproduce it
 
@@ -125,8 +125,13 @@ A. Valverde and P. Tsiotras, "Modeling of Spacecraft-Mounted Robot Dynamics and 
 Quaternions", American Control Conference, 2018: the robot, the maneuver and the cost of scene `paper`.
 """)
 
+_CONFIGURATIONS = """
+configs:
+- config_name: default
+  data_files: data/*/*.parquet"""
 _FILES = """ `dq-space-arm demonstrations export` makes a
-Minari data set of them. `summary/summary.html` shows distributions and sample trajectories."""
+Minari data set of them, or one of LeRobot. `summary/summary.html` shows distributions and sample
+trajectories."""
 _MINARI = """
 
 This copy is the Minari data set `$id`, one HDF5 file instead of shards; the code above is for the original.
@@ -141,10 +146,21 @@ observation, info = environment.reset(seed=metadata["seed"])
 for action in dataset[0].actions:
     observation, reward, terminated, truncated, info = environment.step(action)
 ```"""
+_LEROBOT = """
+
+This copy is a data set of LeRobot (LeRobotDataset v3.0), Parquet files instead of shards, without feedback
+gains; the code above is for the original. `meta/demonstrations.json` holds the scene.
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("local/demonstrations", root=".")  # the folder of this file
+frame = dataset[0]  # observation.state, action, next.reward, next.done, ...
+```"""
 
 
-def data_card(facts: Facts, minari_id: str | None = None) -> str:
-    """Fill in the template; minari_id names the Minari data set that the card goes with."""
+def data_card(facts: Facts, minari_id: str | None = None, *, lerobot: bool = False) -> str:
+    """Fill in the template; for a copy, the Minari data set of this name or a data set of LeRobot."""
     demonstrations, settings = facts.demonstrations, facts.demonstrations.settings
     success, layout = demonstrations.scene.success, demonstrations.kernels.layout
     return _TEMPLATE.substitute(
@@ -160,7 +176,9 @@ def data_card(facts: Facts, minari_id: str | None = None) -> str:
         numbers=_numbers(facts),
         arrays="\n\n".join(line for table in _arrays(facts) for line in table.markdown()),
         failure_columns=", ".join(with_parameters(FAILURES, layout)).replace("_", " "),
-        minari=_FILES if minari_id is None else _MINARI.replace("$id", minari_id),
+        tags="\n- LeRobot" if lerobot else "",
+        configurations=_CONFIGURATIONS if lerobot else "",
+        copy=_LEROBOT if lerobot else _FILES if minari_id is None else _MINARI.replace("$id", minari_id),
         problems=facts.problems,
         seed=settings["seed"],
         shard_size=settings["shard_size"],

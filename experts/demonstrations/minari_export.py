@@ -26,11 +26,11 @@ import gymnasium
 import numpy as np
 
 import dq_space_arm_env
-from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.worker_process import WorkerLostError, WorkerProcess
 from dq_space_arm_env.scene.entries import ParameterEntries
 from experts.demonstrations.reading import Demonstration, Demonstrations
 from experts.demonstrations.shard import PARAMETERS, are_successes, tip_errors
+from experts.demonstrations.staging import staged
 from experts.demonstrations.tensors import DemonstrationsError
 
 ALGORITHM = "Control-limited differential dynamic programming (box-DDP)"
@@ -139,47 +139,20 @@ def check_dataset_id(dataset_id: str) -> None:
 
 @contextmanager
 def _staging(dataset_id: str, overwrite: bool) -> Iterator[Path]:
-    """Yield a hidden folder for a data set, and move the data set into place at the end of a `with` block.
-
-    The folder's name follows from that of the data set, so that the next process removes the leftovers of a
-    killed one; the lock vanishes with the process.
-    """
+    """Yield a folder for Minari to work in, and move the data set into place at the end."""
     from minari.namespace import create_namespace, list_local_namespaces
     from minari.storage import get_dataset_path
 
     place = get_dataset_path(dataset_id)
+    staging = get_dataset_path() / f".{dataset_id.replace('/', '-')}.part"
+    name = f"the Minari data set {dataset_id}"
     # A folder without data is a namespace that holds other data sets.
-    if place.exists() and not (overwrite and (place / "data").is_dir()):
-        raise DemonstrationsError(
-            f"the Minari data set {dataset_id} exists: choose another name or version, or allow it to be "
-            "overwritten"
-        )
-    folder = get_dataset_path() / f".{dataset_id.replace('/', '-')}.part"
-    folder.mkdir(exist_ok=True)
-    refusal = DemonstrationsError(f"another process is writing the Minari data set {dataset_id}")
-    with locked(folder / "lock", refusal):
-        replaced = folder / "replaced"
-        try:
-            _put_back(replaced, place)
-            for leftover in folder.iterdir():
-                if leftover.is_dir():  # all but the lock
-                    shutil.rmtree(leftover)
-            yield folder
-            namespace = dataset_id.rpartition("/")[0]
-            if namespace and namespace not in list_local_namespaces():
-                create_namespace(namespace)
-            if overwrite and place.exists():
-                place.rename(replaced)
-            (folder / dataset_id).rename(place)
-        finally:
-            _put_back(replaced, place)
-            shutil.rmtree(folder, ignore_errors=True)  # Windows keeps a file that is locked
-
-
-def _put_back(replaced: Path, place: Path) -> None:
-    """Undo the first of the two renames if the second did not happen."""
-    if replaced.exists() and not place.exists():
-        replaced.rename(place)
+    with staged(place, staging, marker="data", overwrite=overwrite, name=name) as made:
+        yield staging
+        namespace = dataset_id.rpartition("/")[0]
+        if namespace and namespace not in list_local_namespaces():
+            create_namespace(namespace)
+        (staging / dataset_id).rename(made)
 
 
 def _create(

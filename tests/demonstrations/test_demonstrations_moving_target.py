@@ -11,6 +11,7 @@ from experts import generate_demonstrations
 from experts.demonstrations import (
     Demonstrations,
     SerialExecutor,
+    export_to_lerobot,
     export_to_minari,
     load_demonstrations,
 )
@@ -95,3 +96,10 @@ def test_minari_holds_the_stages_and_gives_the_demonstrations_back(
         np.testing.assert_array_equal(found.states, expected.states)
         np.testing.assert_array_equal(found.observations, expected.observations)
         np.testing.assert_array_equal(found.feedback_gains, expected.feedback_gains)
+
+
+def test_lerobot_holds_the_parameters_of_the_stages(made: Demonstrations, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = parquet.read_table(export_to_lerobot(made, tmp_path / "moving") / "data")
+    rows = [made.kernels.stage_parameters(each.parameters)[:-1] for each in made]
+    np.testing.assert_array_equal(np.array(table["parameters"].to_pylist()), np.concatenate(rows))

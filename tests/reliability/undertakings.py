@@ -109,6 +109,12 @@ UNDERTAKINGS = (
         (".short-a-v0.lock", "minari/.short-a-v0.lock"),
         once=True,
     ),
+    Undertaking(
+        "demonstrations export to LeRobot",
+        "demonstrations export {inputs}/data out/set --format lerobot",
+        EVERYTHING,
+        once=True,
+    ),
     Undertaking("train cloning", "train {inputs}/cloning.yaml --out out", _RUN, _LOGS),
     Undertaking("train dagger", "train {inputs}/dagger.yaml --out out", _RUN, _LOGS, weight=0.5),
     Undertaking("train ppo", "train {inputs}/ppo.yaml --out out", (*_RUN, "out/model.zip"), _LOGS),

@@ -19,6 +19,7 @@ for _name in (
     "experts.figures.plots",
     "h5py",
     "minari",
+    "pyarrow.parquet",
     "scripts.reproduce_paper",
     "torch.utils.tensorboard",
 ):
