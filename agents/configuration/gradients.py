@@ -5,7 +5,6 @@ from typing import Literal
 
 from pydantic import Field
 
-from agents.configuration.reinforcement import ActionScale
 from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many
 from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
 
@@ -50,10 +49,6 @@ class Progression(Model):
 class GradientConfiguration(AgentConfiguration):
     """Everything that determines a run of analytic policy gradients, apart from the code."""
 
-    action_scale: ActionScale = Field(
-        default_factory=ActionScale,
-        description="units of the network's outputs, as fractions of the limits; outputs may be larger",
-    )
     algorithm: AnalyticPolicyGradient = Field(description="the algorithm, with its hyperparameters")
     progression: Progression = Field(default_factory=Progression, description="evaluations and checkpoints")
 

@@ -8,14 +8,16 @@ that a policy flies at every time step as it was trained.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from agents.gradients.layers import Layers, SingleArray
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.scene.parameters import CONTROL_UNITS
 
 Array = NDArray[Any]
 
@@ -35,14 +37,17 @@ class Episodes:
 
     Attributes:
         parameters: Parameters of each decision and of the end, shape (K + 1, B, n_p).
+        units: Inputs of an output of 1, fractions of the limits, shape (n_u,).
     """
 
-    def __init__(self, scene: Scene, layers: Layers, times: Array, action_scale: Array) -> None:
-        """Prepare episodes; the network's outputs are fractions of the limits in units of `action_scale`."""
+    def __init__(self, scene: Scene, layers: Layers, times: Array, units: ArrayLike) -> None:
+        """Prepare episodes whose network gives its outputs in some units, alike or not for all inputs."""
         self._kernels = kernels = compile_scene(scene)
         self._layers, (decisions, count, n_obs) = layers, layers.values[0].shape
-        dtype, limit = kernels.dtype, kernels.layout.control_limit
-        self._units, self._limit, self._efforts = action_scale * limit, limit, kernels.layout.control_weight
+        dtype, layout = kernels.dtype, kernels.layout
+        self.units, self._efforts = np.full(kernels.n_u, units, np.float64), layout.control_weight
+        actuators = (getattr(layout.control, name) for name in CONTROL_UNITS)
+        self._actuators = [entries for entries in actuators if entries.start < entries.stop]
         steps, dt = np.diff(times), scene.simulation.dt
         self._weights = 0.5 * (np.append(0.0, steps) + np.append(steps, 0.0)) / dt
         # The sum over time steps has the first one's state whole, and the last one's not at all.
@@ -114,7 +119,9 @@ class Episodes:
         Returns the costs, (B,), with the terminal pose's multiplied by the emphasis.
         """
         self._states[0], self._emphasis[:] = starts, emphasis
-        outputs, rows = self._layers.values[-1], len(starts)
+        outputs, rows, layout = self._layers.values[-1], len(starts), self._kernels.layout
+        units, high = self.units * layout.control_limit, layout.limits_with(self.parameters[0])
+        self._low, self._high = layout.lower_limits(high), high
         for k, calls in enumerate(self._calls):
             calls["observation"](rows)
             with np.errstate(over="ignore", invalid="ignore"):  # of episodes that diverge
@@ -122,8 +129,8 @@ class Episodes:
                 action = self._layers.forward(k)
             if ahead := self._ahead[k]:
                 action = action + ahead * (action - outputs[k - 1])
-            np.multiply(action, self._units, out=self._wanted[k])
-            np.clip(self._wanted[k], -self._limit, self._limit, out=self._inputs[k])
+            np.multiply(action, units, out=self._wanted[k])
+            np.clip(self._wanted[k], self._low, self._high, out=self._inputs[k])
             calls["step_with_cost"](rows)
         self._end["cost"](rows)
         self._end["emphasized_terminal_cost"](rows)
@@ -150,22 +157,46 @@ class Episodes:
         self._cotangents[-1] += self._by_state
         self._cotangents[-1][lost] = 0.0
         later, ahead = np.zeros_like(self._by_input), np.append(self._ahead, 0.0)
+        by_unit = self.units * self._kernels.layout.control_limit / kept
         for k in range(len(self._calls) - 1, -1, -1):
             self._calls[k]["step_with_cost_vjp"](rows)
             slope = self._by_input + 2.0 * self._held[k] * self._efforts * self._inputs[k]
             # Beyond a limit only what leads back counts.
             wanted = self._wanted[k]
-            slope[((wanted > self._limit) & (slope < 0.0)) | ((wanted < -self._limit) & (slope > 0.0))] = 0.0
+            slope[((wanted > self._high) & (slope < 0.0)) | ((wanted < self._low) & (slope > 0.0))] = 0.0
             slope[lost] = 0.0
             by_output = (1.0 + ahead[k]) * slope - ahead[k + 1] * later
             later = slope
-            back = self._layers.backward(k, by_output * (self._units / kept))
+            back = self._layers.backward(k, by_output * by_unit)
             np.multiply(back, scale * kept, out=self._by_observation)
             self._calls[k]["observation_vjp"](rows)
             self._cotangents[k] += self._by_state
             self._cotangents[k][lost] = 0.0
             _shorten(self._cotangents[k])
         return self._layers.gradient(), costs
+
+    def misses(self) -> Array:
+        """Largest error of the tip at the end of each episode flown last, relative to its tolerance, (B,)."""
+        kernels, success = self._kernels, self._kernels.scene.success
+        states, given = self._states[-1], self.parameters[-1] if kernels.n_p else None
+        with np.errstate(invalid="ignore"):  # of episodes that diverged
+            angle, distance = kernels.observation(states, np.zeros((len(states), 1)), given)[1].T
+            relative = [np.degrees(angle) / success.attitude_error_deg, distance / success.position_error]
+            turning, moving = success.angular_velocity_error_deg, success.velocity_error
+            if turning is not None or moving is not None:
+                twist = kernels.relative_twist(states, p=given)
+                relative.append(np.degrees(np.linalg.norm(twist[:, :3], axis=1)) / (turning or math.inf))
+                relative.append(np.linalg.norm(twist[:, 3:], axis=1) / (moving or math.inf))
+        return np.max(relative, axis=0)
+
+    def sizes(self) -> Array:
+        """Root mean squares of the inputs flown last, by actuator, fractions of the limits, (n_u,)."""
+        squares = np.square(self._inputs[:-1]).mean(axis=0)
+        squares = squares[np.isfinite(squares).all(axis=1)].mean(axis=0)
+        squares /= np.square(self._kernels.layout.control_limit)
+        for entries in self._actuators:
+            squares[entries] = squares[entries].mean()
+        return np.asarray(np.sqrt(squares))
 
 
 def _shorten(slopes: Array) -> None:

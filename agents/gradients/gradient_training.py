@@ -33,18 +33,25 @@ from agents.run_folder import (
     validate,
     validation_seeds,
 )
-from agents.wrappers.shaping import action_scale
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, load_scene
 from dq_space_arm_env.common.bounded_formats import read_arrays
 from dq_space_arm_env.common.bounded_reading import UnreadableError
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import Advance, Status
+from dq_space_arm_env.scene import StateLayout
 
 Array = NDArray[Any]
 
 WARM_UP = 50  # updates in which the learning rate rises
 FINAL_RATE = 3e-3  # learning rate at the end, relative to its peak
-TRIAL_ACTIONS = 0.05  # standard deviation of the actions that measure the spread of observations, in units
+FIRST_UNITS = 0.1  # of the network's outputs, fractions of the limits
+UNITS_PER_SIZE = 4.0  # units that they become, relative to the root mean square of the inputs
+FASTEST_UNITS = 1.03  # largest factor by which units change in an update
+TRAVELLED = 0.3  # share of the updates after which the end weight may rise
+ENOUGH = 0.98  # share of successful episodes at which it does not
+STRICTER = 1.01  # its factor in an update
+STRICTEST = 1000.0  # largest end weight, relative to its first value
+TRIAL_ACTIONS = 0.005  # standard deviation of the actions that measure the spread of observations
 SEEN = 128  # episodes of that
 WORSE = 2.0  # median cost relative to recent ones, above which the weights go back to what they were
 FORGETTING = 0.05  # share of the newest in the mean of recent costs
@@ -115,15 +122,16 @@ class _Learner:
         settings, rng = configuration.algorithm, np.random.default_rng(configuration.seed)
         self._times = decision_times(scene, settings.decisions, settings.crowding)
         self._starts = Starts.draw(scene, settings.starts, self._times, configuration.seed)
-        self._units = action_scale(dict(configuration.action_scale), scene).astype(np.float64)
         self._mean, self._scale = units_of(self._trial(DQSpaceArmVectorEnv(SEEN, scene), rng))
-        sizes = [len(self._mean), *configuration.network.hidden, len(self._units)]
+        sizes = [len(self._mean), *configuration.network.hidden, StateLayout.of(scene).n_u]
         self._weights = random_weights(sizes, rng)
         layers = Layers(self._weights, settings.decisions, settings.copies)
-        self._episodes = Episodes(scene, layers, self._times, self._units)
+        self._episodes = Episodes(scene, layers, self._times, FIRST_UNITS)
         self._optimizer = SOAP(self._weights)
         self._updates, self._seconds = 0, 0.0
         self._typical, self._caution = math.inf, 1.0  # recent cost; factor of the learning rate
+        self._growth = FASTEST_UNITS  # of units, at most
+        self._end_weight = settings.end_weight
         self._kept = self._state()
 
     def _trial(self, environment: DQSpaceArmVectorEnv, rng: np.random.Generator) -> Array:
@@ -131,11 +139,11 @@ class _Learner:
         environment.reset(seed=int(rng.integers(2**31)))
         kernels, states = environment.kernels, environment.states
         p = environment.parameters if kernels.n_p else None
-        units, seen = TRIAL_ACTIONS * self._units * kernels.layout.control_limit, []
+        spread, seen = TRIAL_ACTIONS * kernels.layout.control_limit, []
         for here, after in zip(self._times[:-1], self._times[1:], strict=True):
             left = np.full((SEEN, 1), self._times[-1] - here)
             seen.append(kernels.observation(states, left, p)[0])
-            states = kernels.step(states, units * rng.normal(size=(SEEN, len(units))), after - here, p=p)
+            states = kernels.step(states, spread * rng.normal(size=(SEEN, len(spread))), after - here, p=p)
         samples = np.concatenate(seen)
         return np.asarray(samples[np.isfinite(samples).all(axis=1)])
 
@@ -168,12 +176,13 @@ class _Learner:
         rows = rng.integers(len(self._starts.states), size=settings.copies)
         self._episodes.parameters[:] = self._starts.parameters[:, rows]
         starts = self._starts.states[rows]
-        gradient, costs = self._episodes.gradient(starts, self._mean, self._scale, settings.end_weight)
+        gradient, costs = self._episodes.gradient(starts, self._mean, self._scale, self._end_weight)
         median = float(np.median(costs[np.isfinite(costs)])) if np.isfinite(costs).any() else math.inf
         if math.isinf(median) or (done > WARM_UP and median > WORSE * self._typical):
             # The motion has become unstable: take the weights from before, and smaller steps.
             self._restore(self._kept)
             self._caution *= CAUTION
+            self._growth = 1.0
         else:
             self._follow(gradient, median)
         if self._caution < MOST_CAUTION:
@@ -198,6 +207,21 @@ class _Learner:
         self._optimizer.update(relative, self._caution * warm_up * falling * settings.learning_rate)
         recent = self._typical if math.isfinite(self._typical) else median
         self._typical = recent + FORGETTING * (median - recent)
+        if done > TRAVELLED * settings.updates and np.mean(self._episodes.misses() <= 1.0) < ENOUGH:
+            self._end_weight = min(STRICTER * self._end_weight, STRICTEST * settings.end_weight)
+        self._change_units(
+            np.clip(
+                UNITS_PER_SIZE * self._episodes.sizes() / self._episodes.units,
+                1.0 / FASTEST_UNITS,
+                self._growth,
+            )
+        )
+
+    def _change_units(self, factors: Array) -> None:
+        """Change units of the outputs, and the last layer so that the policy stays what it is."""
+        self._episodes.units *= factors
+        for weight in self._weights[-2:]:
+            weight /= factors.astype(np.float32)
 
     def effort(self) -> dict[str, Any]:
         """What the training has taken; an environment step is one between decisions."""
@@ -209,8 +233,8 @@ class _Learner:
         *weights, last = self._weights[::2]
         *biases, end = self._weights[1::2]
         return ExportedPolicy(
-            weights=tuple(np.array(each) for each in (*weights, last * self._units)),
-            biases=tuple(np.array(each) for each in (*biases, end * self._units)),
+            weights=tuple(np.array(each) for each in (*weights, last * self._episodes.units)),
+            biases=tuple(np.array(each) for each in (*biases, end * self._episodes.units)),
             activation="tanh",
             mean=self._mean,
             scale=self._scale,
@@ -220,16 +244,24 @@ class _Learner:
     def _state(self) -> dict[str, Array]:
         """Copies of weights and optimizer by name."""
         weights = {f"weight{index}": each for index, each in enumerate(self._weights)}
-        return {name: np.array(each) for name, each in {**weights, **self._optimizer.arrays()}.items()}
+        everything = {**weights, **self._optimizer.arrays(), "units": self._episodes.units}
+        return {name: np.array(each) for name, each in everything.items()}
 
     def _restore(self, arrays: Mapping[str, Array]) -> None:
         for index, weight in enumerate(self._weights):
             weight[:] = arrays[f"weight{index}"]
         self._optimizer.restore(arrays)
+        self._episodes.units[:] = arrays["units"]
 
     def _write(self, path: Path) -> None:
         stream = io.BytesIO()
-        numbers = {"seconds": self._seconds, "typical": self._typical, "caution": self._caution}
+        numbers = {
+            "seconds": self._seconds,
+            "typical": self._typical,
+            "caution": self._caution,
+            "growth": self._growth,
+        }
+        numbers["end_weight"] = self._end_weight
         kept = {f"kept.{name}": each for name, each in self._kept.items()}
         arrays = {**self._state(), **kept, **{name: np.array(each) for name, each in numbers.items()}}
         np.savez(stream, **arrays)  # type: ignore[arg-type]
@@ -246,6 +278,7 @@ class _Learner:
             self._kept = {name.removeprefix("kept."): a for name, a in arrays.items() if "kept." in name}
             self._updates, self._seconds = int(place.name), float(arrays["seconds"])
             self._typical, self._caution = float(arrays["typical"]), float(arrays["caution"])
+            self._growth, self._end_weight = float(arrays["growth"]), float(arrays["end_weight"])
         except (KeyError, ValueError, OSError, UnreadableError) as error:
             raise RunFolderError(
                 f"{place} cannot be read ({error}); remove it to restart the training"
