@@ -9,6 +9,7 @@ from pathlib import Path
 from agents.configuration.schema import RESERVED_SEED, DemonstrationSource
 from agents.minari_reading import read_from_minari
 from dq_space_arm_env import Scene
+from dq_space_arm_env.common.files import differences
 from experts.demonstrations import (
     Advance,
     Demonstrations,
@@ -17,7 +18,6 @@ from experts.demonstrations import (
     load_demonstrations,
 )
 from experts.demonstrations.facts import read_log
-from experts.demonstrations.settings import differences
 from experts.problems.arm_problem import in_double_precision
 
 

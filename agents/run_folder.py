@@ -29,13 +29,12 @@ import numpy as np
 from agents.configuration import AgentConfiguration, load_configuration
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json, read_text
-from dq_space_arm_env.common.files import remove_leftovers, temporary_name, write_atomically
+from dq_space_arm_env.common.files import differences, remove_leftovers, temporary_name, write_atomically
 from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.environment.rollouts import Policy, StateFeedback, rollout
 from dq_space_arm_env.validation import dump_yaml
-from experts.demonstrations.settings import differences
 
 CONFIGURATION, PROVENANCE, EVALUATIONS = "config.yaml", "provenance.json", "evaluations.jsonl"
 CHECKPOINTS, TENSORBOARD, DEMONSTRATIONS = "checkpoints", "tensorboard", "demonstrations"
