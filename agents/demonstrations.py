@@ -18,6 +18,7 @@ from experts.demonstrations import (
     load_demonstrations,
 )
 from experts.demonstrations.facts import read_log
+from experts.executors import Executor
 from experts.problems.arm_problem import in_double_precision
 
 
@@ -27,6 +28,7 @@ def prepare_demonstrations(
     folder: Path,
     *,
     workers: int | None = None,
+    executor: Executor | None = None,
     progress: Callable[[Advance], None] | None = None,
 ) -> Demonstrations:
     """Generate or load the demonstrations an agent learns from, and check that they fit its scene.
@@ -45,6 +47,7 @@ def prepare_demonstrations(
             folder,
             source.seed,
             workers=workers,
+            executor=executor,
             progress=progress,
         )
         assert generated is not None  # not one part of several
