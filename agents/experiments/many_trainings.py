@@ -9,7 +9,6 @@ from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from time import perf_counter
-from typing import Protocol
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from agents.training import default_folder, with_changes
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.common.progress import Advance, Status
 from dq_space_arm_env.common.tables import Column, Row, TextTable, tabulate
-from experts.executors import Executor, ProcessExecutor, Task, processors
+from experts.executors import Executor, ProcessExecutor, processors
 
 Report = Callable[[Advance], None]
 _PARTS = 1000  # of a training, in the bar
@@ -35,24 +34,15 @@ _STEPS = Column("environment_steps", "environment\nsteps", COLUMNS["training_ste
 _COLUMNS = ("agent", "seed", SUCCESS, COST, _STEPS, SECONDS, OUTCOME)
 
 
-class _Training(Task[Row], Protocol):
-    """A task whose progress can be read."""
-
-    @property
-    def folder(self) -> Path: ...
-
-    def progress(self) -> Status: ...
-
-
 class Overview:
     """How far many trainings have come, from what each notes in its folder."""
 
-    def __init__(self, total: int, name: str = "trainings") -> None:
-        self._total, self._name = total, name
-        self._under_way: dict[str, _Training] = {}
-        self._done, self._failed, self._begun, self._line = 0, 0, perf_counter(), ""
+    def __init__(self, total: int, name: str = "trainings", found: int = 0) -> None:
+        self._total, self._name, self._found = total, name, found
+        self._under_way: dict[str, TrainingTask] = {}
+        self._done, self._failed, self._begun, self._line = found, 0, perf_counter(), ""
 
-    def begin(self, task: _Training) -> None:
+    def begin(self, task: TrainingTask) -> None:
         """Watch a training from now on."""
         self._line, self._under_way[str(task.folder)] = "", task
 
@@ -75,8 +65,9 @@ class Overview:
         if self._failed:
             line += f", {self._failed} failed"
         spent = perf_counter() - self._begun
-        if self._done and share < 1.0:
-            line += f", about {timedelta(seconds=round(spent * (1.0 / share - 1.0)))} left"
+        new = share - self._found / self._total
+        if new > 0.0 and share < 1.0:
+            line += f", about {timedelta(seconds=round(spent * (1.0 - share) / new))} left"
         if self._line:
             line += self._line
         elif under_way:
@@ -86,11 +77,11 @@ class Overview:
 
 
 def run_trainings(
-    executor: Executor, tasks: Iterable[_Training], overview: Overview, report: Report
+    executor: Executor, tasks: Iterable[TrainingTask], overview: Overview, report: Report
 ) -> Iterator[Row]:
     """Run trainings; yields the row of each that ends."""
 
-    def begun() -> Iterator[_Training]:
+    def begun() -> Iterator[TrainingTask]:
         for task in tasks:
             overview.begin(task)
             yield task
@@ -131,7 +122,7 @@ def train_seeds(
         ExecutorError: If the cluster cannot be used.
     """
     if count < 1:
-        raise ConfigurationError(f"--seeds is {count}, it should be at least 1")
+        raise ConfigurationError(f"seeds: {count}, should be at least 1")
     names = [each.name for each in configurations]
     shared = next((name for name in names if names.count(name) > 1), None)
     if shared is not None:

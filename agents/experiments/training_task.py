@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import traceback
-from collections.abc import Callable
 from contextlib import chdir, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -29,13 +29,15 @@ TRAINED, PRUNED, FAILED = "trained", "pruned", "failed"
 """Outcomes of a training; pruned ones were stopped early because others were better."""
 PROGRESS = "progress.json"
 """File in a run folder, how far the training has come."""
+PRUNE = "prune"
+"""File in a run folder, whose existence stops the training."""
 BETWEEN_NOTES = 1.0  # s
 _PACKAGES = ("sb3-contrib", "stable-baselines3", "torch")
 _EXPECTED = (DemonstrationsError, DivergedError, ImportError, OSError, RunFolderError, ValueError)
 _MEASURED = ("success_rate", "median_cost", "environment_steps", "seconds")
 
 
-class PrunedError(Exception):
+class _Pruned(Exception):  # noqa: N818 - an event, not a mistake
     """A training is stopped because others are better."""
 
 
@@ -56,8 +58,8 @@ class TrainingTask(NamedTuple):
             scene = load_scene(self.configuration.scene)
             DQSpaceArmVectorEnv(1, scene).reset(seed=0)
 
-    def run(self, watch: Callable[[], None] = lambda: None) -> Row:
-        """Train, or find the trained policy; `watch` is called between updates, and may raise `PrunedError`.
+    def run(self) -> Row:
+        """Train, or find the trained policy.
 
         An error is a result: the other trainings do not depend on this one.
         """
@@ -69,9 +71,9 @@ class TrainingTask(NamedTuple):
                 )
             with chdir(self.place):
                 if not self.is_trained():
-                    self._train(watch)
+                    self._train()
             return self.row(TRAINED)
-        except PrunedError:
+        except _Pruned:
             return self.row(PRUNED)
         except _EXPECTED as error:
             return self.row(FAILED, failure=str(error))
@@ -125,17 +127,19 @@ class TrainingTask(NamedTuple):
             "folder": str(self.folder),
         }
 
-    def _train(self, watch: Callable[[], None]) -> None:
-        last = -BETWEEN_NOTES
+    def _train(self) -> None:
+        last = -math.inf
 
         def report(advance: Advance) -> None:
             nonlocal last
-            if monotonic() - last >= BETWEEN_NOTES:
-                last = monotonic()
-                note = {"done": advance.done, "total": advance.total, "line": advance.describe()}
-                with suppress(OSError):  # a full disk ends the training where it matters
-                    write_atomically(self.folder / PROGRESS, json.dumps(note))
-            watch()
+            if monotonic() - last < BETWEEN_NOTES:
+                return
+            last = monotonic()
+            if (self.folder / PRUNE).exists():
+                raise _Pruned
+            note = {"done": advance.done, "total": advance.total, "line": advance.describe()}
+            with suppress(OSError):  # a full disk ends the training where it matters
+                write_atomically(self.folder / PROGRESS, json.dumps(note))
 
         train(self.configuration, self.folder, report=report)
         (self.folder / PROGRESS).unlink(missing_ok=True)
