@@ -12,6 +12,7 @@ from agents.command_line.evaluate import policies_options
 from dq_space_arm_env.command_line.names import OneOf, given, trust_option
 from dq_space_arm_env.command_line.results_options import destination, results_options
 from dq_space_arm_env.command_line.verb import DefaultGroup, MultiWordCommand, keeping
+from experts.command_line.ray_option import chosen_executor
 
 
 def _controllers() -> Iterable[str]:
@@ -80,6 +81,7 @@ def agents(
     n: int | None,
     conditions: tuple[str, ...],
     workers: int | None,
+    ray: str | None,
     controllers: tuple[str, ...],
     receding_starts: int | None,
     trust: bool,
@@ -92,12 +94,13 @@ def agents(
     The output folder receives table.md, comparison.json, the rows with each episode, and comparison.png.
     Three or more runs that differ only in their seeds are also aggregated.
     """
+    executor = chosen_executor(workers, ray)
     from agents.evaluation.evaluation_verbs import compare_controllers
 
     chosen = given(n=n, conditions=conditions, controllers=controllers, receding_starts=receding_starts)
     with keeping("finished rows are kept; run the same command to resume"):
         written = destination(out, as_json, picture)
-        compare_controllers(written, (*policies, *more), scene, workers=workers, trust=trust, **chosen)
+        compare_controllers(written, (*policies, *more), scene, executor=executor, trust=trust, **chosen)
 
 
 @compare.command(
@@ -190,6 +193,7 @@ def residual(
     tolerance_scale: float,
     receding_starts: int,
     workers: int | None,
+    ray: str | None,
     out: Path,
     picture: bool,
     as_json: bool,
@@ -200,6 +204,7 @@ def residual(
     table.md, comparison.json, the plans, the rows with each episode, and comparison.png. Re-run the command
     to resume. Exit status 1: the expert had to stop, or the file of a policy is damaged.
     """
+    executor = chosen_executor(workers, ray)
     from agents.residual.mismatch_comparison import compare_corrections
 
     with keeping("finished rows are kept; run the same command to resume"):
@@ -210,6 +215,6 @@ def residual(
             128 if n is None else n,
             tolerance_scale=tolerance_scale,
             receding_starts=receding_starts,
-            workers=workers,
+            executor=executor,
             **given(conditions=conditions),
         )

@@ -125,9 +125,14 @@ def _picture(rows: Sequence[Row], space: SearchSpace) -> bytes:
 
     ranges = {key: parameter for key, parameter in space.search.items() if parameter.choices is None}
     points: list[dict[str, Any]] = [
-        {"panel": panel, "value": row.get(panel), "median_cost": row["median_cost"], "outcome": row["outcome"]}
+        {
+            "panel": panel,
+            "value": row.get(panel),
+            "median_cost": row["median_cost"],
+            "outcome": row["outcome"],
+        }
         for panel, row in ((panel, row) for panel in ("trial", *ranges) for row in rows)
-        if row["median_cost"] is not None and row.get(panel) is not None
+        if row["median_cost"] is not None
     ]
 
     def decorate(axes: Axes, panel: str) -> None:

@@ -30,6 +30,7 @@ from dq_space_arm_env.common.progress import ProgressDisplay
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.results import Destination
 from dq_space_arm_env.common.tables import TextTable
+from experts.executors import Executor
 
 ALL, NONE = "all", "none"
 """In place of the names of conditions and of controllers."""
@@ -50,7 +51,7 @@ def evaluate_policies(
     *,
     conditions: Sequence[str] = ("training",),
     expert: bool = True,
-    workers: int | None = None,
+    executor: Executor | None = None,
     out: Path | None = None,
     trust: bool = False,
     normalize: Path | None = None,
@@ -76,7 +77,7 @@ def evaluate_policies(
                     n,
                     condition=condition,
                     expert=expert,
-                    workers=workers,
+                    executor=executor,
                     trust=trust,
                     normalize=normalize if policy in models else None,
                     progress=show,
@@ -107,7 +108,7 @@ def compare_controllers(
     conditions: Sequence[str] = ("training",),
     controllers: Sequence[str] = tuple(CONTROLLERS),
     receding_starts: int = RECEDING_STARTS,
-    workers: int | None = None,
+    executor: Executor | None = None,
     trust: bool = False,
 ) -> None:
     """Compare, print the tables, and write the files; finished rows are read from the folder."""
@@ -120,7 +121,7 @@ def compare_controllers(
             conditions=CONDITIONS if ALL in conditions else conditions,
             receding_starts=receding_starts,
             out=destination.folder,
-            workers=workers,
+            executor=executor,
             trust=trust,
             progress=show,
         )

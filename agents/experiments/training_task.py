@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from agents.configuration import AgentConfiguration, load_configuration
 from agents.evaluation.planned_flights import agents_source
 from agents.policies import ExportedPolicy, PolicyFileError
-from agents.run_folder import CONFIGURATION, POLICY, DivergedError, RunFolderError, learned
+from agents.run_folder import CONFIGURATION, EVALUATIONS, POLICY, DivergedError, RunFolderError, learned
 from agents.training import train
 from dq_space_arm_env import DQSpaceArmVectorEnv, SceneError, load_scene
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
@@ -72,6 +72,8 @@ class TrainingTask(NamedTuple):
             with chdir(self.place):
                 if not self.is_trained():
                     self._train()
+            if not learned(self.folder):
+                raise RunFolderError(f"{self.folder / EVALUATIONS} is missing: train in another folder")
             return self.row(TRAINED)
         except _Pruned:
             return self.row(PRUNED)
