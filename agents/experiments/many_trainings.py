@@ -52,6 +52,11 @@ class Overview:
         self._done += 1
         self._failed += row["outcome"] == FAILED
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether all have ended; a cluster may take seconds to let go."""
+        return self._done >= self._total
+
     def say(self, advance: Advance) -> None:
         """Show what happens before the next training begins."""
         self._line = f"; {advance.describe()}"
@@ -86,7 +91,11 @@ def run_trainings(
             overview.begin(task)
             yield task
 
-    with _every_second(lambda: report(overview.status())), closing(executor.run(begun())) as results:
+    def show() -> None:
+        if not overview.is_complete:
+            report(overview.status())
+
+    with _every_second(show), closing(executor.run(begun())) as results:
         for row in results:
             overview.end(row)
             yield row
