@@ -104,7 +104,7 @@ def evaluate() -> None:
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
-    help="Folder for a JSON file per evaluation, with its episodes.",
+    help="Folder for a JSON file per evaluation, with its episodes, and one for all seeds of an agent.",
 )
 @_normalize_option
 @trust_option

@@ -13,6 +13,7 @@ from agents.evaluation.comparing import RECEDING_STARTS, Comparison, compare
 from agents.evaluation.comparison_tables import (
     comparison_tables,
     evaluation_table,
+    group_record,
     groups_table,
     markdown,
     notes,
@@ -58,7 +59,8 @@ def evaluate_policies(
 ) -> list[dict[str, Any]]:
     """Evaluate policies, print a table for each condition, and return the summaries.
 
-    A folder `out` receives a JSON file for each evaluation, with its episodes. Statistics in `normalize` are
+    A folder `out` receives a JSON file for each evaluation, with its episodes, and one for agents with
+    several training seeds. Statistics in `normalize` are
     those of the one model (.zip) among the policies.
     """
     summaries = []
@@ -96,6 +98,9 @@ def evaluate_policies(
                 name = f"{number}-{Path(evaluation.policy).stem}-{condition}"
                 content = json.dumps({**evaluation.record(), "provenance": provenance()})
                 write_atomically(out / (re.sub(r"[^\w.-]+", "-", name) + ".json"), content + "\n")
+            if together:
+                seeds = {"groups": [group_record(group) for group in together], "provenance": provenance()}
+                write_atomically(out / f"seeds-{condition}.json", json.dumps(seeds) + "\n")
     return summaries
 
 

@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 from agents.configuration import AgentConfiguration, load_configuration
 from agents.evaluation.planned_flights import agents_source
 from agents.policies import ExportedPolicy, PolicyFileError
-from agents.run_folder import CONFIGURATION, EVALUATIONS, POLICY, DivergedError, RunFolderError, learned
+from agents.run_folder import CONFIGURATION, EVALUATIONS, LOCK, POLICY, DivergedError, RunFolderError, learned
 from agents.training import train
 from dq_space_arm_env import DQSpaceArmVectorEnv, SceneError, load_scene
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
 from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.progress import Advance, Status
 from dq_space_arm_env.common.tables import Row
 from experts.demonstrations import DemonstrationsError
@@ -31,7 +32,7 @@ PROGRESS = "progress.json"
 """File in a run folder, how far the training has come."""
 PRUNE = "prune"
 """File in a run folder, whose existence stops the training."""
-BETWEEN_NOTES = 1.0  # s
+BETWEEN_NOTES, PATIENCE = 1.0, 10.0  # s
 _PACKAGES = ("sb3-contrib", "stable-baselines3", "torch")
 _EXPECTED = (DemonstrationsError, DivergedError, ImportError, OSError, RunFolderError, ValueError)
 _MEASURED = ("success_rate", "median_cost", "environment_steps", "seconds")
@@ -143,5 +144,11 @@ class TrainingTask(NamedTuple):
             with suppress(OSError):  # a full disk ends the training where it matters
                 write_atomically(self.folder / PROGRESS, json.dumps(note))
 
+        # The worker of a killed run notices within seconds that nobody waits for it.
+        refusal = RunFolderError(
+            f"another process trains in {self.folder}: wait for it, or use another folder"
+        )
+        with locked(self.folder / LOCK, refusal, seconds=PATIENCE):
+            pass
         train(self.configuration, self.folder, report=report)
         (self.folder / PROGRESS).unlink(missing_ok=True)

@@ -7,9 +7,11 @@ from numba.core.registry import cpu_target
 for _name in (
     "agents.command_line.compare",
     "agents.command_line.train",
+    "agents.command_line.search",
     "agents.evaluation.comparison_figure",
     "agents.evaluation.data_efficiency_command",
     "agents.evaluation.showing",
+    "agents.experiments.hyperparameter_search",
     "agents.imitation.imitation_training",
     "agents.residual.mismatch_comparison",
     "agents.residual.residual_training",
@@ -19,6 +21,7 @@ for _name in (
     "experts.figures.plots",
     "h5py",
     "minari",
+    "optuna",
     "scripts.reproduce_paper",
     "torch.utils.tensorboard",
 ):
