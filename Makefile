@@ -1,7 +1,7 @@
 # make paper   solve and replay the paper's maneuver: figures and table in results/paper
 # make docs    bring generated parts of the pages up to date, build the documentation in results/docs
 # make test    lint, import contracts, types, tests; with CI set also the slow tests, the quick benchmarks (but
-#              stability, whose cases are slow tests), and the tests of the extras agents, ray and jax (skipped
+#              stability, whose cases are slow tests), and the tests of the extras agents, jax, ray and search (skipped
 #              otherwise: PyTorch is a download of gigabytes)
 # make clean   remove the virtual environment and the results
 
@@ -10,7 +10,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 COMMA := ,
 BENCHMARKS := work-precision scene-cost solvers throughput rendering
-TEST := test$(if $(CI),$(COMMA)agents$(COMMA)ray$(COMMA)jax)
+TEST := test$(if $(CI),$(COMMA)agents$(COMMA)jax$(COMMA)ray$(COMMA)search)
 
 .PHONY: paper docs test lint lock clean
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from agents.configuration.schema import RESERVED_SEED, DemonstrationSource
 from agents.minari_reading import read_from_minari
 from dq_space_arm_env import Scene
+from dq_space_arm_env.common.files import differences
 from experts.demonstrations import (
     Advance,
     Demonstrations,
@@ -17,7 +18,7 @@ from experts.demonstrations import (
     load_demonstrations,
 )
 from experts.demonstrations.facts import read_log
-from experts.demonstrations.settings import differences
+from experts.executors import Executor
 from experts.problems.arm_problem import in_double_precision
 
 
@@ -27,6 +28,7 @@ def prepare_demonstrations(
     folder: Path,
     *,
     workers: int | None = None,
+    executor: Executor | None = None,
     progress: Callable[[Advance], None] | None = None,
 ) -> Demonstrations:
     """Generate or load the demonstrations an agent learns from, and check that they fit its scene.
@@ -47,6 +49,7 @@ def prepare_demonstrations(
             folder,
             source.seed,
             workers=workers,
+            executor=executor,
             progress=progress,
         )
         assert generated is not None  # not one part of several

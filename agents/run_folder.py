@@ -9,6 +9,7 @@
 of imitation, a folder for each part |
 | `demonstrations/` | what was generated to learn from, if anything was |
 | `tensorboard/` | curves for TensorBoard |
+| `progress.json` | how far the training has come, where it is one of several |
 | `best.npz` | of reinforcement: the policy that was best in these evaluations, exported |
 | `policy.npz`, `model.zip` | the policy at the end, exported, and the model; written last |
 | `.lock` | empty; locked while a process trains here |
@@ -29,13 +30,12 @@ import numpy as np
 from agents.configuration import AgentConfiguration, load_configuration
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json, read_text
-from dq_space_arm_env.common.files import remove_leftovers, temporary_name, write_atomically
+from dq_space_arm_env.common.files import differences, remove_leftovers, temporary_name, write_atomically
 from dq_space_arm_env.common.locks import locked
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.environment.rollouts import Policy, StateFeedback, rollout
 from dq_space_arm_env.validation import dump_yaml
-from experts.demonstrations.settings import differences
 
 CONFIGURATION, PROVENANCE, EVALUATIONS = "config.yaml", "provenance.json", "evaluations.jsonl"
 CHECKPOINTS, TENSORBOARD, DEMONSTRATIONS = "checkpoints", "tensorboard", "demonstrations"
@@ -143,15 +143,18 @@ class RunFolder:
 
     def evaluations(self, until: int | None = None) -> list[dict[str, Any]]:
         """Lines of the learning curve, up to a number of environment steps."""
-        file = self.path / EVALUATIONS
-        if not file.exists():
-            return []
-        lines = [_point(file, line) for line in _text(file).splitlines()]
+        lines = learned(self.path)
         return [line for line in lines if until is None or line["environment_steps"] <= until]
 
     def write_evaluations(self, lines: list[dict[str, Any]]) -> None:
         text = "".join(json.dumps(line) + "\n" for line in lines)
         write_atomically(self.path / EVALUATIONS, text)
+
+
+def learned(path: Path) -> list[dict[str, Any]]:
+    """The learning curve in a run's folder, its lines in order; RunFolderError if it is damaged."""
+    file = path / EVALUATIONS
+    return [_point(file, line) for line in _text(file).splitlines()] if file.exists() else []
 
 
 def validation_seeds(episodes: int) -> list[int]:

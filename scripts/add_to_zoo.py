@@ -46,7 +46,7 @@ from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.tables import TextTable
 from dq_space_arm_env.validation import dump_yaml
 from experts.demonstrations import DemonstrationsError
-from experts.demonstrations.executors import Executor
+from experts.executors import Executor
 
 REPEATED = 32  # flights whose seeds and results a record keeps
 _ELSEWHERE = ("scene", "episodes", "success_rate")

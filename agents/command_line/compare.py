@@ -12,6 +12,7 @@ from agents.command_line.evaluate import policies_options
 from dq_space_arm_env.command_line.names import OneOf, given, normalize_option, trust_option
 from dq_space_arm_env.command_line.results_options import destination, results_options
 from dq_space_arm_env.command_line.verb import DefaultGroup, MultiWordCommand, keeping
+from experts.command_line.ray_option import chosen_executor
 
 
 def _controllers() -> Iterable[str]:
@@ -81,6 +82,7 @@ def agents(
     n: int | None,
     conditions: tuple[str, ...],
     workers: int | None,
+    ray: str | None,
     controllers: tuple[str, ...],
     receding_starts: int | None,
     normalize: Path | None,
@@ -95,6 +97,7 @@ def agents(
     Three or more runs that differ only in their seeds are also aggregated. Learning curves need the expert's
     optima of their own starts, which are solved once.
     """
+    executor = chosen_executor(workers, ray)
     from agents.evaluation.evaluation_verbs import compare_controllers
 
     chosen = given(n=n, conditions=conditions, controllers=controllers, receding_starts=receding_starts)
@@ -104,7 +107,7 @@ def agents(
             written,
             (*policies, *more),
             scene,
-            workers=workers,
+            executor=executor,
             trust=trust,
             normalize=normalize,
             **chosen,
@@ -202,6 +205,7 @@ def residual(
     tolerance_scale: float,
     receding_starts: int,
     workers: int | None,
+    ray: str | None,
     out: Path,
     picture: bool,
     as_json: bool,
@@ -212,6 +216,7 @@ def residual(
     table.md, comparison.json, the plans, the rows with each episode, and comparison.png. Re-run the command
     to resume. Exit status 1: the expert had to stop, or the file of a policy is damaged.
     """
+    executor = chosen_executor(workers, ray)
     from agents.residual.mismatch_comparison import compare_corrections
 
     with keeping("finished rows are kept; run the same command to resume"):
@@ -222,6 +227,6 @@ def residual(
             128 if n is None else n,
             tolerance_scale=tolerance_scale,
             receding_starts=receding_starts,
-            workers=workers,
+            executor=executor,
             **given(conditions=conditions),
         )

@@ -20,6 +20,7 @@ from dq_space_arm_env.command_line.verb import (
 )
 from dq_space_arm_env.common.console import FAILURE, SUCCESS
 from dq_space_arm_env.common.files import check_writable, check_writable_file
+from experts.command_line.ray_option import chosen_executor, ray_option
 
 Function = Callable[..., Any]
 
@@ -36,11 +37,12 @@ def policies_options(
     changes: str = "Changes of the scene, several or all.  [default: training, none]",
     starts: str = "Number of evaluation starts.  [default: all 500]",
 ) -> Callable[[Function], Function]:
-    """Add policies, --policy, --scene, -n, --condition and --workers to a verb."""
+    """Add policies, --policy, --scene, -n, --condition, --workers and --ray to a verb."""
 
     def add(function: Function) -> Function:
         condition = OneOf("condition", conditions)
         for option in (
+            ray_option,
             click.option(
                 "--workers", type=int, help="Processes of the expert.  [default: one per processor]"
             ),
@@ -95,7 +97,7 @@ def evaluate() -> None:
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
-    help="Folder for a JSON file per evaluation, with its episodes.",
+    help="Folder for a JSON file per evaluation, with its episodes, and one for all seeds of an agent.",
 )
 @normalize_option
 @trust_option
@@ -107,6 +109,7 @@ def policies_verb(
     n: int | None,
     conditions: tuple[str, ...],
     workers: int | None,
+    ray: str | None,
     expert: bool,
     out: Path | None,
     normalize: Path | None,
@@ -119,6 +122,7 @@ def policies_verb(
             f"name a policy to evaluate: a file, the folder of a run, or one of {', '.join(policy_files())}",
             click.get_current_context(),
         )
+    executor = chosen_executor(workers, ray)
     from agents.evaluation.evaluation_verbs import evaluate_policies
     from dq_space_arm_env.common.console import table_console as wide_console
 
@@ -132,7 +136,7 @@ def policies_verb(
             named,
             scene,
             expert=expert,
-            workers=workers,
+            executor=executor,
             out=out,
             trust=trust,
             normalize=normalize,

@@ -41,8 +41,8 @@ from agents.policies.flying import time_per_action
 from agents.zoo.finding import as_policy, check_fit, policy_path
 from agents.zoo.shelf import file_hash
 from dq_space_arm_env import Scene, load_scene
-from experts.demonstrations.executors import Executor, local_executor
 from experts.demonstrations.settings import software
+from experts.executors import Executor, local_executor
 
 RECEDING_STARTS = 100
 """Default number of starts of the receding-horizon expert, which takes a second per flight."""

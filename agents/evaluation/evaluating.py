@@ -20,7 +20,7 @@ from agents.policies.flying import Flights, Policy, fly, from_json_list, json_li
 from agents.zoo.finding import as_policy, check_fit
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
-from experts.demonstrations.executors import Executor
+from experts.executors import Executor
 
 CHEAPER = 1e-3
 """Relative margin from which a flight counts as cheaper than the expert's."""

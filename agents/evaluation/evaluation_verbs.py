@@ -13,6 +13,7 @@ from agents.evaluation.comparing import RECEDING_STARTS, Comparison, compare
 from agents.evaluation.comparison_tables import (
     comparison_tables,
     evaluation_table,
+    group_record,
     groups_table,
     markdown,
     notes,
@@ -31,6 +32,7 @@ from dq_space_arm_env.common.progress import ProgressDisplay
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.results import Destination
 from dq_space_arm_env.common.tables import TextTable
+from experts.executors import Executor
 
 ALL, NONE = "all", "none"
 """In place of the names of conditions and of controllers."""
@@ -51,14 +53,15 @@ def evaluate_policies(
     *,
     conditions: Sequence[str] = ("training",),
     expert: bool = True,
-    workers: int | None = None,
+    executor: Executor | None = None,
     out: Path | None = None,
     trust: bool = False,
     normalize: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Evaluate policies, print a table for each condition, and return the summaries.
 
-    A folder `out` receives a JSON file for each evaluation, with its episodes. Statistics in `normalize` are
+    A folder `out` receives a JSON file for each evaluation, with its episodes, and one for agents with
+    several training seeds. Statistics in `normalize` are
     those of the one model (.zip) among the policies.
     """
     summaries = []
@@ -72,7 +75,7 @@ def evaluate_policies(
                     n,
                     condition=condition,
                     expert=expert,
-                    workers=workers,
+                    executor=executor,
                     trust=trust,
                     normalize=statistics.get(policy),
                     progress=show,
@@ -91,6 +94,9 @@ def evaluate_policies(
                 name = f"{number}-{Path(evaluation.policy).stem}-{condition}"
                 content = json.dumps({**evaluation.record(), "provenance": provenance()})
                 write_atomically(out / (re.sub(r"[^\w.-]+", "-", name) + ".json"), content + "\n")
+            if together:
+                seeds = {"groups": [group_record(group) for group in together], "provenance": provenance()}
+                write_atomically(out / f"seeds-{condition}.json", json.dumps(seeds) + "\n")
     return summaries
 
 
@@ -103,7 +109,7 @@ def compare_controllers(
     conditions: Sequence[str] = ("training",),
     controllers: Sequence[str] = tuple(CONTROLLERS),
     receding_starts: int = RECEDING_STARTS,
-    workers: int | None = None,
+    executor: Executor | None = None,
     trust: bool = False,
     normalize: Path | None = None,
 ) -> None:
@@ -117,7 +123,7 @@ def compare_controllers(
             conditions=CONDITIONS if ALL in conditions else conditions,
             receding_starts=receding_starts,
             out=destination.folder,
-            workers=workers,
+            executor=executor,
             trust=trust,
             normalize=statistics_by_model(policies, normalize),
             progress=show,

@@ -15,10 +15,10 @@ from agents.configuration.schema import RESERVED_SEED
 from agents.evaluation.kept_results import CachedGroups, Row
 from agents.run_folder import VALIDATION_SEED, validation_seeds
 from dq_space_arm_env import Scene
-from experts.demonstrations.executors import Executor, local_executor
 from experts.demonstrations.outcomes import MISSED_TARGET, REASONS
 from experts.demonstrations.settings import Settings, software
 from experts.demonstrations.shard import ShardResult, Task
+from experts.executors import Executor, local_executor
 
 EVALUATION_SEEDS = 500
 """Evaluation seeds of a scene."""

@@ -30,9 +30,9 @@ from agents.evaluation.kept_results import CachedGroups, Row
 from agents.evaluation.plan_followers import FEEDBACK, RECEDING, RecedingHorizon, follower, plans_of
 from agents.policies.flying import Flights, FloatArray
 from dq_space_arm_env import Scene
-from experts.demonstrations.executors import Executor
 from experts.demonstrations.settings import Settings, software
 from experts.demonstrations.shard import Task, draw_starts
+from experts.executors import Executor
 
 _SOURCES = (
     *(f"evaluation/{name}.py" for name in ("conditions", "evaluating", "expert_costs", "plan_followers")),

@@ -23,9 +23,8 @@ from agents.policies.network import PolicyNetwork
 from agents.policies.tensor_files import read_tensors
 from agents.run_folder import RunFolderError
 from dq_space_arm_env.common.bounded_reading import read_bytes
-from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.files import differences, write_atomically
 from dq_space_arm_env.common.progress import Advance
-from experts.demonstrations.settings import differences
 
 CHECKPOINT = "checkpoint.pt"
 MOST_BYTES = 1 << 30  # of a checkpoint that is read

@@ -41,6 +41,7 @@ from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.results import Destination
 from dq_space_arm_env.environment.rollouts import StateFeedback
 from experts.demonstrations import Demonstrations, generate_demonstrations
+from experts.executors import Executor
 
 RECEDING_HORIZON = 50
 """Stages that the receding-horizon expert looks ahead."""
@@ -181,7 +182,7 @@ def evaluation_plans(
     n: int = EVALUATION_SEEDS,
     *,
     tolerance_scale: float = TOLERANCE_SCALE,
-    workers: int | None = None,
+    executor: Executor | None = None,
     progress: Callable[[Advance], None] = lambda advance: None,
 ) -> Demonstrations:
     """Plan the maneuvers from the first n evaluation starts, for evaluations only; existing plans are reused.
@@ -196,7 +197,7 @@ def evaluation_plans(
         n,
         out / f"plans-{scene.name}-{n}-{tolerance_scale:g}",
         RESERVED_SEED,
-        workers=workers,
+        executor=executor,
         progress=lambda advance: progress(Advance("plans", advance.done, advance.problems)),
     )
     assert plans is not None  # one part is all of it
@@ -302,14 +303,14 @@ def compare_corrections(
     conditions: Sequence[str] = tuple(CONDITIONS),
     tolerance_scale: float = TOLERANCE_SCALE,
     receding_starts: int = 0,
-    workers: int | None = None,
+    executor: Executor | None = None,
 ) -> None:
     """Plan, compare, print the table, and write the files; finished rows are read from the folder."""
     flown = load_scene(scene)
     corrections = read_corrections(policies, flown)  # refuse unusable policies before planning
     with progress_bar() as show:
         folder = destination.folder
-        options: dict[str, Any] = {"tolerance_scale": tolerance_scale, "workers": workers, "progress": show}
+        options: dict[str, Any] = {"tolerance_scale": tolerance_scale, "executor": executor, "progress": show}
         plans = evaluation_plans(flown, folder, n, **options)
         found = compare_under_mismatch(
             policies,

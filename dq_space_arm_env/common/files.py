@@ -148,3 +148,20 @@ def json_value(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def differences(there: dict[str, Any], here: dict[str, Any], prefix: str = "") -> list[str]:
+    """Describe each entry in which two mappings of JSON values differ."""
+    found = []
+    for key in sorted({*there, *here}):
+        name, old, new = f"{prefix}{key}", there.get(key), here.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += differences(old, new, f"{name}.")
+        elif old != new:
+            found.append(f"{name} is {_short_json(old)} there and {_short_json(new)} here")
+    return found
+
+
+def _short_json(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:36]} ..."

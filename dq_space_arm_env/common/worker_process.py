@@ -22,6 +22,8 @@ BEGIN = (
 )
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
+_work = {"is_worker": False}
+
 
 class WorkerLostError(Exception):
     """A worker ended before its answer."""
@@ -73,8 +75,19 @@ class WorkerProcess:
         self._process.wait()
 
 
+def become_worker() -> None:
+    """Note that this process is one of several that share the machine."""
+    _work["is_worker"] = True
+
+
+def is_worker() -> bool:
+    """Tell whether this process is one of several that share the machine."""
+    return _work["is_worker"]
+
+
 def serve(parent: int) -> None:
     """Work for a parent until it closes standard input or exits."""
+    become_worker()
 
     def watch() -> None:
         while os.getppid() == parent:

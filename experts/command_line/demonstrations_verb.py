@@ -9,6 +9,7 @@ from dq_space_arm_env.command_line.names import scene_option
 from dq_space_arm_env.command_line.verb import json_option, keeping, print_document
 from dq_space_arm_env.common.console import table_console
 from dq_space_arm_env.common.files import check_writable
+from experts.command_line.ray_option import chosen_executor, ray_option
 
 _KEPT = "complete shards remain; run the same command to resume"
 
@@ -68,14 +69,7 @@ def demonstrations() -> None:
 )
 @click.option("--summary/--no-summary", default=True, help="Write data card and summary page.")
 @click.option("--workers", type=int, help="Number of processes.  [default: one per processor]")
-@click.option(
-    "--ray",
-    is_flag=False,
-    flag_value="",
-    metavar="[ADDRESS]",
-    help="Work on a Ray cluster: host:port of its head, or local for a new one on this machine. Default: the "
-    "one that RAY_ADDRESS names, else the one that this machine belongs to, else a new one.",
-)
+@ray_option
 @json_option
 def generate(
     scene: str,
@@ -95,8 +89,7 @@ def generate(
     data card), and summary/ with a page of distributions, failures and trajectories. Exit status 1: the run
     had to stop, for example because the disk is full.
     """
-    if workers is not None and ray is not None:
-        raise click.UsageError("--workers and --ray exclude each other", click.get_current_context())
+    executor = chosen_executor(workers, ray)
     from dq_space_arm_env import load_scene
     from experts.command_line import demonstrations_work as command
     from experts.demonstrations.settings import SHARD_SIZE
@@ -114,8 +107,7 @@ def generate(
             seed=seed,
             shard_size=SHARD_SIZE if shard_size is None else shard_size,
             part=shard,
-            workers=workers,
-            ray=ray,
+            executor=executor,
             summary=summary,
         )
     if as_json:

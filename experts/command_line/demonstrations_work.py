@@ -12,7 +12,7 @@ from dq_space_arm_env.common.tables import TextTable
 from experts.demonstrations import (
     Demonstrations,
     DemonstrationsError,
-    RayExecutor,
+    Executor,
     generate_demonstrations,
     load_demonstrations,
 )
@@ -33,8 +33,7 @@ def generate(
     seed: int,
     shard_size: int,
     part: tuple[int, int] = (1, 1),
-    workers: int | None = None,
-    ray: str | None = None,
+    executor: Executor | None = None,
     summary: bool = True,
 ) -> dict[str, Any]:
     """Generate demonstrations, or go on with a folder of them, and say how it went."""
@@ -47,8 +46,7 @@ def generate(
                 seed,
                 shard_size=shard_size,
                 part=part,
-                workers=workers,
-                executor=None if ray is None else RayExecutor(ray or None),
+                executor=executor,
                 progress=progress.update,
             )
         if demonstrations is not None and summary:

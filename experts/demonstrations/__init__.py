@@ -6,13 +6,13 @@ On a given kind of processor its bytes follow from the settings alone: an interr
 ends with the same files.
 """
 
-from experts.demonstrations.executors import Executor, ProcessExecutor, SerialExecutor
 from experts.demonstrations.generation import Advance, generate_demonstrations
 from experts.demonstrations.lerobot_export import export_to_lerobot
 from experts.demonstrations.minari_export import export_to_minari
-from experts.demonstrations.ray_executor import RayExecutor
 from experts.demonstrations.reading import Batch, Demonstration, Demonstrations, load_demonstrations
 from experts.demonstrations.tensors import DemonstrationsError
+from experts.executors import Executor, ProcessExecutor, SerialExecutor
+from experts.ray_executor import RayExecutor
 
 __all__ = [
     "Advance",

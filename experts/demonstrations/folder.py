@@ -25,10 +25,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
-from dq_space_arm_env.common.files import remove_leftovers, write_atomically
+from dq_space_arm_env.common.files import differences, remove_leftovers, write_atomically
 from dq_space_arm_env.common.locks import locked
 from experts.demonstrations.outcomes import REASONS
-from experts.demonstrations.settings import Settings, differences
+from experts.demonstrations.settings import Settings
 from experts.demonstrations.shard import ShardResult
 from experts.demonstrations.tensors import DemonstrationsError, map_tensors
 

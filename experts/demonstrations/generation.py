@@ -11,12 +11,12 @@ from time import perf_counter
 from typing import NamedTuple
 
 from dq_space_arm_env import Scene
-from experts.demonstrations.executors import Executor, local_executor
 from experts.demonstrations.folder import Folder, Part
 from experts.demonstrations.reading import Demonstrations, load_demonstrations
 from experts.demonstrations.settings import SHARD_SIZE, Settings
 from experts.demonstrations.shard import ShardResult, Task
 from experts.demonstrations.tensors import DemonstrationsError, map_tensors
+from experts.executors import Executor, ExecutorError, local_executor
 
 
 class Advance(NamedTuple):
@@ -121,6 +121,8 @@ def generate_demonstrations(
         with folder.opened():
             _fill(folder, chosen, progress or (lambda advance: None))
             complete = folder.complete()
+    except ExecutorError as error:
+        raise DemonstrationsError(str(error)) from error
     except OSError as error:
         raise DemonstrationsError(
             f"{error.filename or folder.path} cannot be written: {error.strerror or error}. Finished "

@@ -89,23 +89,6 @@ def software() -> dict[str, Any]:
     }
 
 
-def differences(there: dict[str, Any], here: dict[str, Any], prefix: str = "") -> list[str]:
-    """Describe each entry in which two records of settings differ."""
-    found = []
-    for key in sorted({*there, *here}):
-        name, old, new = f"{prefix}{key}", there.get(key), here.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            found += differences(old, new, f"{name}.")
-        elif old != new:
-            found.append(f"{name} is {_short(old)} there and {_short(new)} here")
-    return found
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 40 else f"{text[:36]} ..."
-
-
 @cache
 def _source_hash() -> str:
     """Hash the code that demonstrations come from: environment and experts, without `PRESENTATION`."""

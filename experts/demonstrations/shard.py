@@ -52,7 +52,7 @@ from experts.demonstrations.outcomes import (
     solve,
     solve_again,
 )
-from experts.demonstrations.settings import Settings
+from experts.demonstrations.settings import Settings, software
 from experts.demonstrations.tensors import DemonstrationsError, pack
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
@@ -89,13 +89,6 @@ class Starts(NamedTuple):
     parameters: FloatArray  # shape (B, n_p), units of the parameters
 
 
-class Task(NamedTuple):
-    """A shard to make: all that a worker has to know."""
-
-    settings: Settings
-    shard: int
-
-
 class ShardResult(NamedTuple):
     """A shard that has been made, not yet written."""
 
@@ -122,6 +115,34 @@ class _Clock:
         elapsed, self._last = now - self._last, now
         self.seconds[part] = self.seconds.get(part, 0.0) + elapsed
         return elapsed
+
+
+class Task(NamedTuple):
+    """A shard to make: all that a worker has to know."""
+
+    settings: Settings
+    shard: int
+
+    @property
+    def label(self) -> str:
+        return f"shard {self.shard}"
+
+    def prepare(self) -> None:
+        """Compile the expert."""
+        expert_of(self.settings.scene)
+
+    def run(self) -> ShardResult:
+        """Make the shard."""
+        return make_shard(self)
+
+    def lost(self, sentence: str) -> ShardResult:
+        """End the run; finished shards remain."""
+        raise DemonstrationsError(sentence)
+
+    @staticmethod
+    def software() -> dict[str, Any]:
+        """Identify the code that its bytes follow from."""
+        return software()
 
 
 def make_shard(task: Task) -> ShardResult:

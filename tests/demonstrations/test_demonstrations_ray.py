@@ -19,10 +19,11 @@ import pytest
 from demonstration_files import contents
 
 from dq_space_arm_env import Scene
-from experts import generate_demonstrations
-from experts.demonstrations import Demonstrations, DemonstrationsError, RayExecutor, ray_executor
+from experts import generate_demonstrations, ray_executor
+from experts.demonstrations import Demonstrations, DemonstrationsError, RayExecutor
 from experts.demonstrations.settings import Settings, software
 from experts.demonstrations.shard import Task
+from experts.executors import ExecutorError
 
 
 def wait_until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
@@ -111,7 +112,7 @@ def direct(monkeypatch: pytest.MonkeyPatch, folder: Path, victim: str, victim_ha
     """
     begun, go, original = folder / "begun", folder / "go", ray_executor.remote_task()
 
-    def make(expected: dict[str, Any], packed: bytes) -> Any:
+    def make(expected: dict[str, Any], software: bytes, packed: bytes) -> Any:
         import ray
 
         machine = ray.get_runtime_context().get_node_id()
@@ -123,7 +124,7 @@ def direct(monkeypatch: pytest.MonkeyPatch, folder: Path, victim: str, victim_ha
         else:
             while machine != victim and not go.exists():
                 time.sleep(0.05)
-        return original(expected, packed)
+        return original(expected, software, packed)
 
     monkeypatch.setattr(ray_executor, "remote_task", lambda: make)
     return begun
@@ -213,7 +214,7 @@ class _Cluster:
         self_ = self
 
         class Remote:
-            def remote(self, here: Any, packed: bytes) -> tuple[int, int]:
+            def remote(self, expected: Any, software: bytes, packed: bytes) -> tuple[int, int]:
                 shard = pickle.loads(packed).shard
                 self_.attempts.append(shard)
                 return shard, self_.attempts.count(shard)
@@ -234,7 +235,7 @@ class _Cluster:
         failure = self.outcome(*reference)
         if failure is not None:
             raise getattr(self.exceptions, failure)(f"{failure}: gone\nand more")
-        return reference
+        return reference, None
 
     def cancel(self, reference: tuple[int, int], force: bool) -> None:
         assert force
@@ -256,7 +257,7 @@ def test_losses_are_counted_shard_by_shard(tasks: list[Task], monkeypatch: pytes
 
 def test_a_lost_cluster_is_not_a_shard_lost_eleven_times(tasks: list[Task]):
     cluster = _Cluster(lambda shard, attempt: "LocalRayletDiedError")
-    with pytest.raises(DemonstrationsError, match=r"^the Ray cluster cannot go on: LocalRayletDiedError"):
+    with pytest.raises(ExecutorError, match=r"^the Ray cluster cannot go on: LocalRayletDiedError"):
         list(ray_executor._run_on(cluster, tasks))
     assert len(cluster.attempts) <= len(tasks)
 
@@ -332,22 +333,28 @@ def test_machines_with_other_software_are_refused(
 ):
     import ray
 
-    monkeypatch.setattr(ray_executor, "software", lambda: {**software(), "source": "another"})
-    with pytest.raises(DemonstrationsError, match=r'other software: source is .* there and "another" here'):
+    def other() -> dict[str, Any]:
+        return {**software(), "source": "another"}
+
+    # Machines find the function under this name.
+    other.__module__, other.__qualname__ = Task.__module__, "Task.software"
+    monkeypatch.setattr(Task, "software", staticmethod(other))
+    with pytest.raises(ExecutorError, match=r'other software: source is .* there and "another" here'):
         list(RayExecutor(cluster.address).run(tasks))
     assert not ray.is_initialized()
 
 
 def test_a_machine_without_this_package_says_so(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.delattr("experts.demonstrations.ray_executor")
-    monkeypatch.setitem(sys.modules, "experts.demonstrations.ray_executor", None)
-    sentence = ray_executor.remote_task()(software(), b"")
+    monkeypatch.delattr("experts.ray_executor")
+    monkeypatch.setitem(sys.modules, "experts.ray_executor", None)
+    _, sentence = ray_executor.remote_task()(software(), b"", b"")
+    assert sentence is not None
     assert "cannot load this version of dq-space-arm" in sentence
 
 
 def test_without_ray_a_sentence_tells_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tasks: list[Task]):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(DemonstrationsError, match=r"pip install 'dq-space-arm\[ray\]'"):
+    with pytest.raises(ExecutorError, match=r"pip install 'dq-space-arm\[ray\]'"):
         next(RayExecutor().run(tasks))
 
 
@@ -356,9 +363,7 @@ def test_a_cluster_that_is_not_there_is_noticed_soon(tasks: list[Task]):
     pytest.importorskip("ray")
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    with pytest.raises(
-        DemonstrationsError, match=f"no Ray cluster can be used at 127.0.0.1:{port}: .*refused"
-    ):
+    with pytest.raises(ExecutorError, match=f"no Ray cluster can be used at 127.0.0.1:{port}: .*refused"):
         next(RayExecutor(f"127.0.0.1:{port}").run(tasks))
 
 

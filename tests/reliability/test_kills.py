@@ -37,6 +37,7 @@ def place(tmp_path_factory):
     """Folders of inputs, of compiled kernels, and of attempts."""
     pytest.importorskip("sb3_contrib")
     pytest.importorskip("minari")
+    pytest.importorskip("optuna")
     base = tmp_path_factory.mktemp("kills")
     inputs, cache = base / "inputs", base / "cache"
     inputs.mkdir()

@@ -68,6 +68,8 @@ def prepare(folder: Path) -> None:
         source = {"demonstrations": {"folder": f"{folder}/data"}} if "demonstrations" in content else {}
         settings = {"name": name, "scene": f"{folder}/short.yaml", "network": _SMALL, **content, **source}
         (folder / f"{name}.yaml").write_text(dump_yaml(settings, ""))
+    space = {"algorithm.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True}}
+    (folder / "space.yaml").write_text(dump_yaml({"search": space}, ""))
     for name in ("cloning", "residual"):
         run(f"train {{0}}/{name}.yaml --out {{0}}/{name}")
 
@@ -119,6 +121,20 @@ UNDERTAKINGS = (
     Undertaking("train dagger", "train {inputs}/dagger.yaml --out out", _RUN, _LOGS, weight=0.5),
     Undertaking("train ppo", "train {inputs}/ppo.yaml --out out", (*_RUN, "out/model.zip"), _LOGS),
     Undertaking("train residual", "train {inputs}/residual.yaml --out out", _RUN, _LOGS, weight=0.5),
+    Undertaking(
+        "train --seeds",
+        "train {inputs}/cloning.yaml --seeds 2 --workers 2 --out out",
+        ("out/*/policy.npz", "out/*/config.yaml"),
+        ("*/log/*", "*/tensorboard/*", "*.lock", "out/*/progress.json"),
+        weight=0.5,
+    ),
+    Undertaking(
+        "search",
+        "search {inputs}/ppo.yaml {inputs}/space.yaml --trials 3 --workers 1 --no-picture --out out",
+        ("out/best.yaml", "out/trials/*/policy.npz", "out/trials/*/config.yaml"),
+        ("*/tensorboard/*", "*.lock", "out/trials/*/progress.json"),
+        weight=0.5,
+    ),
     Undertaking("evaluate", "evaluate {inputs}/cloning -n 25 --workers 1 " + _BESIDE, EVERYTHING),
     Undertaking(
         "evaluate show", "evaluate show {inputs}/cloning --no-picture " + _BESIDE, EVERYTHING, weight=0.5

@@ -303,7 +303,9 @@ def test_the_command_writes_a_table_json_and_every_episode(tmp_path, capsys):
     out = ["--out", str(tmp_path / "out")]
     assert main(["evaluate", "--policy", *policies, *arguments, *out]) == 0
     assert "All training runs of an agent" in capsys.readouterr().out
-    records = [json.loads(path.read_text()) for path in sorted((tmp_path / "out").iterdir())]
+    records = [json.loads(path.read_text()) for path in sorted((tmp_path / "out").glob("[1-3]-*"))]
+    seeds = json.loads((tmp_path / "out" / "seeds-training.json").read_text())
+    assert [group["seeds"] for group in seeds["groups"]] == [[0, 1, 2]]
     assert [record["episodes"]["seed"] for record in records] == [evaluation_seeds(SHORT, 4)] * 3
     assert len(records[0]["episodes"]["cost"]) == 4
     conditions = ["--condition", "training", "spin"]

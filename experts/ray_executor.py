@@ -1,11 +1,11 @@
-"""Shards made by the machines of a Ray cluster, and returned as bytes: no shared disk is needed.
+"""Tasks run by the machines of a Ray cluster, whose results are sent back.
 
-If a process or machine is lost, its tasks are given to Ray again, including those whose shards were not
-fetched yet; the bytes are the same. Every machine needs the same version of this package and its
+If a process or machine is lost, its tasks are given to Ray again, including those whose results were not
+fetched yet. Every machine needs the same version of this package and its
 dependencies, and reports a difference. Processors with different instruction sets agree only up to rounding.
 
-The run itself, which writes the files, should be on a machine of the cluster. If that machine or the head of
-the cluster is lost, the run ends and is resumed like any other.
+The process that runs the executor should be on a machine of the cluster. If that machine or the head of the
+cluster is lost, the run ends and is resumed like any other.
 """
 
 import os
@@ -15,21 +15,17 @@ import re
 import signal
 import socket
 import threading
-from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from functools import lru_cache
 from itertools import islice
 from time import monotonic, sleep
-from typing import Any
+from typing import Any, NamedTuple
 
-from dq_space_arm_env import Scene
 from dq_space_arm_env.common.code_cache import cache_directory
+from dq_space_arm_env.common.files import differences
 from dq_space_arm_env.common.locks import locked
-from experts.demonstrations.outcomes import expert_of
-from experts.demonstrations.settings import differences, software
-from experts.demonstrations.shard import ShardResult, Task, make_shard
-from experts.demonstrations.tensors import DemonstrationsError
+from dq_space_arm_env.common.worker_process import become_worker
+from experts.executors import ExecutorError, Result, Task
 
 AHEAD = 2
 """Tasks queued per processor of the cluster, so that none waits for this process, and an autoscaling cluster
@@ -37,18 +33,28 @@ sees the demand."""
 WAITING = 2
 """Additional tasks, queued even while the cluster has no processor yet."""
 MOST_LOSSES = 10
-"""Times that a shard is repeated after its process or machine was lost."""
+"""Times that a task is repeated after its process or machine was lost."""
 LONGEST_PAUSE = 10.0
 """Time before the last repetitions, s; the first follow sooner. A cluster takes seconds to notice that a
 machine is gone, and gives it tasks until then."""
 CONNECTION_SECONDS = 10.0
 """Time after which a cluster counts as unreachable, and cancelled tasks are left to it."""
 
-RemoteTask = Callable[[dict[str, Any], bytes], ShardResult | str]
+
+class _UnderWay(NamedTuple):
+    """A task that Ray has, and how often it was lost."""
+
+    task: Task[Any]
+    losses: int
+
+
+Answer = tuple[Any, str | None]
+"""Of a machine: a result, and why there is none."""
+RemoteTask = Callable[[dict[str, Any], bytes, bytes], Answer]
 
 
 class RayExecutor:
-    """Makes shards on a Ray cluster, one process per processor."""
+    """Runs tasks on a Ray cluster, one process per processor."""
 
     def __init__(self, address: str | None = None) -> None:
         """Choose the cluster.
@@ -61,12 +67,12 @@ class RayExecutor:
         """
         self.address = address
 
-    def run(self, tasks: Iterable[Task]) -> Generator[ShardResult]:
-        """Make shards."""
+    def run(self, tasks: Iterable[Task[Result]]) -> Generator[Result]:
+        """Run tasks."""
         try:
             import ray
         except ModuleNotFoundError as error:
-            raise DemonstrationsError(
+            raise ExecutorError(
                 "a cluster needs Ray: pip install 'dq-space-arm[ray]' on all of its machines"
             ) from error
         with _connected(ray, self.address):
@@ -86,7 +92,7 @@ def _connected(ray: Any, address: str | None) -> Iterator[None]:
             ray.init(address=address, log_to_driver=False, logging_level="ERROR")
         except (OSError, RuntimeError, ValueError) as error:
             where = asked or "the default address"
-            raise DemonstrationsError(f"no Ray cluster can be used at {where}: {error}") from error
+            raise ExecutorError(f"no Ray cluster can be used at {where}: {error}") from error
         try:
             yield
         finally:
@@ -125,34 +131,39 @@ def _same_signals() -> Iterator[None]:
             signal.signal(signal.SIGTERM, handler)
 
 
-def _run_on(ray: Any, tasks: Iterable[Task]) -> Generator[ShardResult]:
+def _run_on(ray: Any, tasks: Iterable[Task[Result]]) -> Generator[Result]:
     """Run tasks on the connected cluster."""
-    under_way: dict[Any, Task] = {}  # tasks by the references to their shards
-    losses: Counter[int] = Counter()  # by shard
-    here, remaining = software(), iter(tasks)
+    under_way: dict[Any, _UnderWay] = {}  # by the references to their results
+    remaining = iter(tasks)
     # Ray's own repetitions are not counted where they can be seen.
-    make = ray.remote(num_cpus=1, max_retries=0)(remote_task())
+    remote = ray.remote(num_cpus=1, max_retries=0)(remote_task())
+
+    def begin(task: Task[Result], losses: int = 0) -> None:
+        software = type(task).software
+        reference = remote.remote(software(), pickle.dumps(software), pickle.dumps(task))
+        under_way[reference] = _UnderWay(task, losses)
+
     try:
         while True:
             most = AHEAD * int(ray.cluster_resources().get("CPU", 0.0)) + WAITING
             for task in islice(remaining, max(most - len(under_way), 0)):
-                under_way[make.remote(here, pickle.dumps(task))] = task
+                begin(task)
             if not under_way:
                 return
             (ready, *_), _ = ray.wait(list(under_way))
-            task = under_way.pop(ready)
+            task, losses = under_way.pop(ready)
             try:
                 result = _fetch(ray, ready)
-            except _ShardLost as loss:
-                losses[task.shard] += 1
-                if losses[task.shard] > MOST_LOSSES:
-                    raise DemonstrationsError(
-                        f"shard {task.shard} was lost {losses[task.shard]} times with the process or the "
-                        f"machine that made it: {loss}"
-                    ) from loss
-                sleep(min(0.1 * 2.0 ** losses[task.shard], LONGEST_PAUSE))
-                under_way[make.remote(here, pickle.dumps(task))] = task
-                continue
+            except _TaskLost as loss:
+                losses += 1
+                if losses <= MOST_LOSSES:
+                    sleep(min(0.1 * 2.0**losses, LONGEST_PAUSE))
+                    begin(task, losses)
+                    continue
+                result = task.lost(
+                    f"{task.label} was lost {losses} times with the process or the machine that ran it: "
+                    f"{loss}"
+                )
             del ready  # frees the cluster's copy
             yield result
     finally:
@@ -169,14 +180,14 @@ def _cancel(ray: Any, references: list[Any]) -> None:
             _, references = ray.wait(references, num_returns=len(references), timeout=0.5, fetch_local=False)
 
 
-class _ShardLost(Exception):  # noqa: N818 - an event, not a mistake
-    """The process or machine that made a shard, or held it, is gone."""
+class _TaskLost(Exception):  # noqa: N818 - an event, not a mistake
+    """The process or machine that ran a task, or held its result, is gone."""
 
 
-def _fetch(ray: Any, reference: Any) -> ShardResult:
+def _fetch(ray: Any, reference: Any) -> Any:
     failures = ray.exceptions
     try:
-        result: ShardResult | str = ray.get(reference)
+        result, refusal = ray.get(reference)
     except failures.RayTaskError:
         raise  # a bug, with its remote traceback
     except (
@@ -185,12 +196,12 @@ def _fetch(ray: Any, reference: Any) -> ShardResult:
         failures.ObjectLostError,
         failures.OutOfMemoryError,
     ) as error:
-        raise _ShardLost(str(error).partition("\n")[0]) from error
+        raise _TaskLost(str(error).partition("\n")[0]) from error
     except failures.RayError as error:
         reason = str(error).partition("\n")[0]
-        raise DemonstrationsError(f"the Ray cluster cannot go on: {reason}") from error
-    if isinstance(result, str):
-        raise DemonstrationsError(result)
+        raise ExecutorError(f"the Ray cluster cannot go on: {reason}") from error
+    if refusal is not None:
+        raise ExecutorError(refusal)
     return result
 
 
@@ -201,43 +212,36 @@ def remote_task() -> RemoteTask:
     or has another version.
     """
 
-    def make(expected: dict[str, Any], packed: bytes) -> ShardResult | str:
+    def run(expected: dict[str, Any], software: bytes, packed: bytes) -> Answer:
         # NumPy reads these when it is imported.
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
         try:
-            from experts.demonstrations import ray_executor
-        except ImportError as error:
-            return (
+            from experts import ray_executor
+
+            known = pickle.loads(software)
+        except (ImportError, AttributeError) as error:
+            return None, (
                 f"machine {platform.node()} of the cluster cannot load this version of dq-space-arm "
                 f"({error}): install the same version on all machines"
             )
-        return ray_executor.make_here(expected, packed)
+        return ray_executor.run_here(expected, known(), packed)
 
-    return make
+    return run
 
 
-def make_here(expected: dict[str, Any], packed: bytes) -> ShardResult | str:
-    """Make a shard on this machine if it has the same software, else say what differs."""
-    differing = differences(software(), expected)
+def run_here(expected: dict[str, Any], software: dict[str, Any], packed: bytes) -> Answer:
+    """Run a task on this machine if it has the expected software, else say what differs."""
+    differing = differences(software, expected)
     if differing:
-        return (
+        return None, (
             f"machine {platform.node()} of the cluster has other software: {'; '.join(differing)}. Install "
             "the same on all machines"
         )
-    task: Task = pickle.loads(packed)
-    _prepare(task.settings.scene)
-    return make_shard(task)
-
-
-@lru_cache(maxsize=1)
-def _prepare(scene: Scene) -> None:
-    """Compile or load the expert of this process.
-
-    One process of a fresh machine compiles while the others wait for the cache: dozens of compilers at once
-    take more memory than dozens of solvers.
-    """
+    become_worker()
+    task: Task[Any] = pickle.loads(packed)
     with _first_alone():
-        expert_of(scene)
+        task.prepare()
+    return task.run(), None
 
 
 @contextmanager

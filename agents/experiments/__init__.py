@@ -1,0 +1,1 @@
+"""Many trainings side by side: several seeds of several configurations, and searches for hyperparameters."""
