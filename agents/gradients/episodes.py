@@ -187,7 +187,7 @@ class Episodes:
                 twist = kernels.relative_twist(states, p=given)
                 relative.append(np.degrees(np.linalg.norm(twist[:, :3], axis=1)) / (turning or math.inf))
                 relative.append(np.linalg.norm(twist[:, 3:], axis=1) / (moving or math.inf))
-        return np.max(relative, axis=0)
+        return np.asarray(np.max(relative, axis=0))
 
     def sizes(self) -> Array:
         """Root mean squares of the inputs flown last, by actuator, fractions of the limits, (n_u,)."""

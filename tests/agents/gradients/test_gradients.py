@@ -108,7 +108,6 @@ def settings(small_file, **algorithm):
             "name": "small",
             "scene": str(small_file),
             "network": {"hidden": [16, 16]},
-            "action_scale": {"base_force": 0.01, "base_torque": 0.1},
             "algorithm": {"name": "APG", **changes},
             "progression": {"evaluate_every": 60, "evaluation_episodes": 8, "checkpoint_every": 60},
         }
