@@ -32,7 +32,7 @@ class SharedDemonstrations:
     def provided(self, task: TrainingTask) -> TrainingTask:
         """The task, once its folder exists with its demonstrations."""
         task.folder.mkdir(parents=True, exist_ok=True)
-        source, place = _generated(task.configuration), task.folder / DEMONSTRATIONS
+        source, place = _generated(task.configuration.resolved()), task.folder / DEMONSTRATIONS
         if source is None:
             return task
         scene = load_scene(task.configuration.scene)

@@ -207,20 +207,17 @@ class _Learner:
         self._optimizer.update(relative, self._caution * warm_up * falling * settings.learning_rate)
         recent = self._typical if math.isfinite(self._typical) else median
         self._typical = recent + FORGETTING * (median - recent)
-        if done > TRAVELLED * settings.updates and np.mean(self._episodes.misses() <= 1.0) < ENOUGH:
-            self._end_weight = min(STRICTER * self._end_weight, STRICTEST * settings.end_weight)
-        self._change_units(
-            np.clip(
-                UNITS_PER_SIZE * self._episodes.sizes() / self._episodes.units,
-                1.0 / FASTEST_UNITS,
-                self._growth,
-            )
-        )
+        self._adapt()
 
-    def _change_units(self, factors: Array) -> None:
-        """Change units of the outputs, and the last layer so that the policy stays what it is."""
-        self._episodes.units *= factors
-        for weight in self._weights[-2:]:
+    def _adapt(self) -> None:
+        """Let the end weight rise while episodes miss, and the outputs' units follow the inputs flown."""
+        settings, episodes = self._settings, self._episodes
+        if self._updates > TRAVELLED * settings.updates and np.mean(episodes.misses() <= 1.0) < ENOUGH:
+            self._end_weight = min(STRICTER * self._end_weight, STRICTEST * settings.end_weight)
+        factors = UNITS_PER_SIZE * episodes.sizes() / episodes.units
+        factors = np.clip(factors, 1.0 / FASTEST_UNITS, self._growth)
+        episodes.units *= factors
+        for weight in self._weights[-2:]:  # the policy stays what it is
             weight /= factors.astype(np.float32)
 
     def effort(self) -> dict[str, Any]:

@@ -14,7 +14,6 @@ def settings(small_file: Path) -> dict:
         "name": "quick",
         "scene": str(small_file),
         "network": {"hidden": [12]},
-        "action_scale": {"base_force": 0.01, "base_torque": 0.1},
         "algorithm": {"name": "APG", "updates": 40, "copies": 8, "decisions": 40, "starts": 64},
         "progression": {"evaluate_every": 20, "evaluation_episodes": 8, "checkpoint_every": 20},
     }

@@ -190,7 +190,7 @@ def test_seeds_are_summarized_without_failures() -> None:
 
 
 def test_demonstrations_are_generated_once_and_linked(small_file: Path, tmp_path: Path) -> None:
-    settings = {"name": "clone", "scene": str(small_file), "demonstrations": {"problems": 2}}
+    settings = {"name": "clone", "scene": str(small_file), "demonstrations": {"problems": 2, "seed": 0}}
     configuration = load_configuration({**settings, "algorithm": {"name": "cloning"}})
     other = load_configuration(
         {**settings, "name": "few", "demonstrations": {"problems": 1}, "algorithm": {"name": "cloning"}}
