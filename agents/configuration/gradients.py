@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many
+from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many, StartFrom
 from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
 
 
@@ -49,6 +49,7 @@ class Progression(Model):
 class GradientConfiguration(AgentConfiguration):
     """Everything that determines a run of analytic policy gradients, apart from the code."""
 
+    start_from: StartFrom = None
     algorithm: AnalyticPolicyGradient = Field(description="the algorithm, with its hyperparameters")
     progression: Progression = Field(default_factory=Progression, description="evaluations and checkpoints")
 

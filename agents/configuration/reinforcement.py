@@ -3,10 +3,10 @@
 import math
 from collections.abc import Iterator
 
-from pydantic import Field, StrictBool, StrictStr
+from pydantic import Field, StrictBool
 
 from agents.configuration.algorithms import PPO, SAC, Algorithm, Hindsight, OffPolicy
-from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many
+from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many, StartFrom
 from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
 
 _REWARD_SHAPING = ("reward_scale", "cost_power", "success_reward", "end_error_cost")
@@ -76,11 +76,7 @@ class Configuration(AgentConfiguration):
     """Everything that determines a reinforcement-learning run, apart from the code."""
 
     environment: Practice = Field(default_factory=Practice, description="the training environment")
-    start_from: StrictStr | None = Field(
-        default=None,
-        min_length=1,
-        description="policy to start from: name in the zoo, file or run folder; absent: a random one",
-    )
+    start_from: StartFrom = None
     algorithm: Algorithm = Field(description="the algorithm, with its hyperparameters")
     schedule: Schedule = Field(description="budget, evaluations and checkpoints")
 

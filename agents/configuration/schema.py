@@ -17,6 +17,13 @@ Few = Annotated[int, count_up_to(10_000)]
 """Number of networks, rounds or the like."""
 Many = Annotated[int, count_up_to(10_000_000)]
 """Number of things that are in memory together, some hundred bytes each."""
+StartFrom = Annotated[
+    StrictStr | None,
+    Field(
+        min_length=1,
+        description="policy to start from: name in the zoo, file or run folder; absent: a random one",
+    ),
+]
 MOST_IN_MEMORY = 100_000_000
 """Largest number of decisions in memory, some ten gigabytes."""
 _MOST_LAYERS = 32

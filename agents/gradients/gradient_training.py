@@ -33,6 +33,7 @@ from agents.run_folder import (
     validate,
     validation_seeds,
 )
+from agents.zoo.starting import load_start, spent_before
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, load_scene
 from dq_space_arm_env.common.bounded_formats import read_arrays
 from dq_space_arm_env.common.bounded_reading import UnreadableError
@@ -125,6 +126,7 @@ class _Learner:
         self._mean, self._scale = units_of(self._trial(DQSpaceArmVectorEnv(SEEN, scene), rng))
         sizes = [len(self._mean), *configuration.network.hidden, StateLayout.of(scene).n_u]
         self._weights = random_weights(sizes, rng)
+        self._begin_with(load_start(configuration.start_from, configuration.network, sizes[0], sizes[-1]))
         layers = Layers(self._weights, settings.decisions, settings.copies)
         self._episodes = Episodes(scene, layers, self._times, FIRST_UNITS)
         self._optimizer = SOAP(self._weights)
@@ -133,6 +135,19 @@ class _Learner:
         self._growth = FASTEST_UNITS  # of units, at most
         self._end_weight = settings.end_weight
         self._kept = self._state()
+
+    def _begin_with(self, policy: ExportedPolicy | None) -> None:
+        """Take the weights and units of a policy."""
+        self._before = spent_before(self._configuration.start_from)
+        if policy is None:
+            return
+        self._mean, self._scale = policy.mean, policy.scale
+        factor = (1.0 if policy.action_scale is None else policy.action_scale) / FIRST_UNITS
+        for index, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+            last = factor if index == len(policy.biases) - 1 else 1.0
+            self._weights[2 * index : 2 * index + 2] = [
+                np.asarray(each * last, np.float32) for each in (weight, bias)
+            ]
 
     def _trial(self, environment: DQSpaceArmVectorEnv, rng: np.random.Generator) -> Array:
         """Observations (N, n_obs) under small random inputs, those that stay finite."""
@@ -223,7 +238,9 @@ class _Learner:
     def effort(self) -> dict[str, Any]:
         """What the training has taken; an environment step is one between decisions."""
         steps = self._updates * self._settings.copies * self._settings.decisions
-        return {"environment_steps": steps, "updates": self._updates, "seconds": round(self._seconds, 3)}
+        solves, seconds = self._before
+        spent = {"expert_solves": solves, "seconds": round(seconds + self._seconds, 3)}
+        return {"environment_steps": steps, "updates": self._updates, **spent}
 
     def export(self, metadata: dict[str, Any]) -> ExportedPolicy:
         """The policy now, with the units of its actions folded into the last layer."""

@@ -30,8 +30,9 @@ from agents.reinforcement.ppo import ProximalPolicyOptimization
 from agents.reinforcement.sac import DemonstrationBuffer, LayerNormalizedPolicy, SoftActorCritic
 from agents.reinforcement.training_environment import action_limits, make_environment
 from agents.reinforcement.training_progress import Progress
-from agents.reinforcement.warm_start import fly_again, load_start, set_actor, spent_before
+from agents.reinforcement.warm_start import fly_again, set_actor
 from agents.run_folder import DEMONSTRATIONS, MODEL, POLICY, TENSORBOARD, RunFolder
+from agents.zoo.starting import load_start, spent_before
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.files import write_atomically
 
@@ -112,8 +113,9 @@ def _begin(
     configuration: c.Configuration, scene: Scene, folder: RunFolder, environment: VecEnv
 ) -> tuple[BaseAlgorithm, Progress]:
     """Make a learner, with demonstrations in its replay buffer where the configuration asks for them."""
-    model, spent = make_learner(configuration, environment), spent_before(configuration)
-    algorithm = configuration.algorithm
+    model, algorithm = make_learner(configuration, environment), configuration.algorithm
+    solves, seconds = spent_before(configuration.start_from)
+    spent = Progress(expert_solves=solves, seconds_before=seconds)
     if not isinstance(algorithm, c.SAC) or algorithm.demonstrations is None:
         return model, spent
     given = algorithm.demonstrations
@@ -148,7 +150,7 @@ def make_learner(
     first, last = algorithm.learning_rate, algorithm.final_learning_rate
     options["learning_rate"] = LinearSchedule(first, first if last is None else last, 1.0)
     sizes = spaces.flatdim(environment.observation_space), len(action_limits(environment))
-    start = None if blank else load_start(configuration, *sizes)
+    start = None if blank else load_start(configuration.start_from, network, *sizes)
     if blank:
         units = [0.0] * sizes[0], [1.0] * sizes[0]
     elif start is None:

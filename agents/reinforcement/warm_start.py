@@ -1,4 +1,4 @@
-"""Start a learner from an exported policy, or from demonstrations replayed by its own actions."""
+"""Give a learner the layers of an exported policy, or demonstrations replayed by its own actions."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple, cast
@@ -9,66 +9,15 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from agents.configuration import Configuration, ConfigurationError
-from agents.policies import ExportedPolicy, PolicyFileError
+from agents.configuration import Configuration
+from agents.policies import ExportedPolicy
 from agents.reinforcement.training_environment import action_limits, native_environment
-from agents.reinforcement.training_progress import Progress
-from agents.zoo.finding import PolicyError, policy_path
 from dq_space_arm_env import Scene
 from experts.demonstrations import Demonstration, Demonstrations, DemonstrationsError
 
 SingleArray = NDArray[np.float32]
 BATCH = 64
 """Demonstrations flown together; each holds some megabytes of gains."""
-
-
-def load_start(configuration: Configuration, n_observation: int, n_action: int) -> ExportedPolicy | None:
-    """Load the policy that `start_from` names, and check that it fits network and environment."""
-    if configuration.start_from is None:
-        return None
-    policy = _load(configuration.start_from)
-    network = configuration.network
-    hidden = tuple(len(bias) for bias in policy.biases[:-1])
-    problems = [
-        f"{name} is {there} there and {here} here"
-        for name, there, here in (
-            ("network.hidden", list(hidden), list(network.hidden)),
-            ("network.activation", policy.activation, network.activation),
-            ("squash", policy.squash, "clip"),
-            ("entries of observations", policy.n_observation, n_observation),
-            ("entries of actions", policy.n_action, n_action),
-        )
-        if there != here
-    ]
-    if policy.normalized_limit != float("inf"):
-        problems.append("normalized observations are clipped there and are not here")
-    if problems:
-        raise ConfigurationError(
-            f"start_from: {configuration.start_from} does not fit: {'; '.join(problems)}"
-        )
-    return policy
-
-
-def spent_before(configuration: Configuration) -> Progress:
-    """Look up what training the policy of `start_from` took; nothing without one."""
-    if configuration.start_from is None:
-        return Progress()
-    training = _load(configuration.start_from).metadata.get("training", {})
-    solves, seconds = int(training.get("expert_solves") or 0), float(training.get("seconds") or 0.0)
-    return Progress(expert_solves=solves, seconds_before=seconds)
-
-
-def _load(source: str) -> ExportedPolicy:
-    try:
-        path = policy_path(source)
-        if not path.exists():
-            raise ConfigurationError(
-                f"start_from: there is no {path}; train a policy first, "
-                "dq-space-arm train cloning-with-gains, and give its run folder"
-            )
-        return ExportedPolicy.load(path)
-    except (PolicyError, PolicyFileError) as error:
-        raise ConfigurationError(f"start_from: {error}") from error
 
 
 def set_actor(model: BaseAlgorithm, policy: ExportedPolicy) -> None:
