@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("threadpoolctl")
 
 from agents.configuration import ConfigurationError, load_configuration
+from agents.configuration.schema import Network
 from agents.gradients import episodes, gradient_training
 from agents.gradients.episodes import Episodes, decision_times
 from agents.gradients.gradient_training import train_by_gradients
@@ -16,6 +17,7 @@ from agents.policies import ExportedPolicy
 from agents.run_folder import RunFolder, RunFolderError, validation_seeds
 from dq_space_arm_env import DQSpaceArmVectorEnv, load_scene
 from dq_space_arm_env.environment.rollouts import rollout
+from experts.problems.arm_problem import ArmProblem
 
 pytestmark = pytest.mark.agents
 
@@ -101,6 +103,13 @@ def test_decisions_fly_as_at_every_time_step():
     assert errors[1] < 0.35 * errors[0]
 
 
+def test_misses_are_those_of_the_end(small_scene):
+    flown, problem = Flown(small_scene), ArmProblem(small_scene)
+    flown.costs()
+    expected = [problem.misses(state) for state in flown.episodes._states[-1]]
+    np.testing.assert_allclose(flown.episodes.misses(), expected, rtol=1e-9)
+
+
 def settings(small_file, **algorithm):
     changes = {"updates": 120, "copies": 16, "decisions": 40, "starts": 256, **algorithm}
     return load_configuration(
@@ -140,6 +149,47 @@ def test_training_lowers_the_cost_and_resumes_to_the_bit(small_file, small_scene
     for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
         np.testing.assert_array_equal(one, other)
     assert len(trained_curve(tmp_path / "halves")) == 2
+
+
+def test_units_follow_the_inputs_and_leave_the_policy(small_file, small_scene):
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    seen = DQSpaceArmVectorEnv(COUNT, small_scene).reset(seed=SEEDS)[0]
+    for _ in range(60):
+        learner._update()
+    before, units = learner.export({})(seen), learner._episodes.units.copy()
+    for _ in range(300):
+        learner._adapt()
+    np.testing.assert_allclose(learner.export({})(seen), before, atol=1e-6)
+    sizes = learner._episodes.sizes()
+    np.testing.assert_allclose(learner._episodes.units, 4.0 * sizes, rtol=1e-9)
+    assert not np.allclose(units, 4.0 * sizes, rtol=0.1)
+
+
+def test_end_weights_rise_where_episodes_miss(small_file, small_scene):
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    learner._update()
+    assert learner._end_weight == 400.0  # it is too early
+    learner._updates = 100
+    learner._adapt()
+    assert learner._end_weight == pytest.approx(404.0)
+    learner._episodes.misses = lambda: np.zeros(COUNT)
+    learner._adapt()
+    assert learner._end_weight == pytest.approx(404.0)
+
+
+def test_training_starts_from_a_policy(small_file, tmp_path):
+    first = train_by_gradients(settings(small_file), tmp_path / "first").policy
+    start = {"start_from": str(tmp_path / "first")}
+    going_on = settings(small_file, updates=2, learning_rate=1e-9).model_copy(update=start)
+    after = train_by_gradients(going_on, tmp_path / "second").policy
+    for one, other in zip(first.weights, after.weights, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-6)
+    assert after.metadata["training"]["seconds"] > first.metadata["training"]["seconds"]
+    wider = {**start, "network": Network(hidden=[8])}
+    with pytest.raises(
+        ConfigurationError, match=r"start_from: .* not fit: network.hidden is \[16, 16\]"
+    ):
+        train_by_gradients(settings(small_file).model_copy(update=wider), tmp_path / "third")
 
 
 def trained_curve(folder):
