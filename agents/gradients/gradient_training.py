@@ -61,6 +61,7 @@ MOST_CAUTION = 1e-3  # factor of the learning rate at which the training gives u
 CAUTION = 0.7  # factor of the learning rate when they do
 BETWEEN_MESSAGES = 20  # updates
 CHECKPOINT = "checkpoint.npz"
+_NUMBERS = ("_seconds", "_typical", "_caution", "_growth", "_end_weight")  # of a checkpoint
 
 
 class Learned(NamedTuple):
@@ -269,13 +270,7 @@ class _Learner:
 
     def _write(self, path: Path) -> None:
         stream = io.BytesIO()
-        numbers = {
-            "seconds": self._seconds,
-            "typical": self._typical,
-            "caution": self._caution,
-            "growth": self._growth,
-        }
-        numbers["end_weight"] = self._end_weight
+        numbers = {name: getattr(self, name) for name in _NUMBERS}
         kept = {f"kept.{name}": each for name, each in self._kept.items()}
         arrays = {**self._state(), **kept, **{name: np.array(each) for name, each in numbers.items()}}
         np.savez(stream, **arrays)  # type: ignore[arg-type]
@@ -290,9 +285,9 @@ class _Learner:
             arrays = read_arrays(place / CHECKPOINT)
             self._restore(arrays)
             self._kept = {name.removeprefix("kept."): a for name, a in arrays.items() if "kept." in name}
-            self._updates, self._seconds = int(place.name), float(arrays["seconds"])
-            self._typical, self._caution = float(arrays["typical"]), float(arrays["caution"])
-            self._growth, self._end_weight = float(arrays["growth"]), float(arrays["end_weight"])
+            self._updates = int(place.name)
+            for name in _NUMBERS:
+                setattr(self, name, float(arrays[name]))
         except (KeyError, ValueError, OSError, UnreadableError) as error:
             raise RunFolderError(
                 f"{place} cannot be read ({error}); remove it to restart the training"
