@@ -186,9 +186,7 @@ def test_training_starts_from_a_policy(small_file, tmp_path):
         np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-6)
     assert after.metadata["training"]["seconds"] > first.metadata["training"]["seconds"]
     wider = {**start, "network": Network(hidden=[8])}
-    with pytest.raises(
-        ConfigurationError, match=r"start_from: .* not fit: network.hidden is \[16, 16\]"
-    ):
+    with pytest.raises(ConfigurationError, match=r"start_from: .* not fit: network.hidden is \[16, 16\]"):
         train_by_gradients(settings(small_file).model_copy(update=wider), tmp_path / "third")
 
 
