@@ -8,7 +8,6 @@ that a policy flies at every time step as it was trained.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from agents.gradients.layers import Layers, SingleArray
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene.parameters import CONTROL_UNITS
+from experts.problems.arm_problem import misses
 
 Array = NDArray[Any]
 
@@ -177,17 +177,8 @@ class Episodes:
 
     def misses(self) -> Array:
         """Largest error of the tip at the end of each episode flown last, relative to its tolerance, (B,)."""
-        kernels, success = self._kernels, self._kernels.scene.success
-        states, given = self._states[-1], self.parameters[-1] if kernels.n_p else None
         with np.errstate(invalid="ignore"):  # of episodes that diverged
-            angle, distance = kernels.observation(states, np.zeros((len(states), 1)), given)[1].T
-            relative = [np.degrees(angle) / success.attitude_error_deg, distance / success.position_error]
-            turning, moving = success.angular_velocity_error_deg, success.velocity_error
-            if turning is not None or moving is not None:
-                twist = kernels.relative_twist(states, p=given)
-                relative.append(np.degrees(np.linalg.norm(twist[:, :3], axis=1)) / (turning or math.inf))
-                relative.append(np.linalg.norm(twist[:, 3:], axis=1) / (moving or math.inf))
-        return np.asarray(np.max(relative, axis=0))
+            return misses(self._kernels, self._states[-1], self.parameters[-1])
 
     def sizes(self) -> Array:
         """Root mean squares of the inputs flown last, by actuator, fractions of the limits, (n_u,)."""

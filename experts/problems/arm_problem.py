@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dq_space_arm_env import Scene, compile_scene, load_scene
+from dq_space_arm_env import Kernels, Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.kernels.library import PENALIZED
@@ -230,18 +230,7 @@ class ArmProblem:
 
     def misses(self, state: FloatArray) -> float:
         """Largest of the tip's errors at a final state, each relative to its tolerance."""
-        success, last = self.scene.success, self.parameters.rows[-1]
-        angle, distance = self.kernels.observation(state, [0.0], p=last)[1]
-        relative = [
-            float(np.degrees(angle)) / success.attitude_error_deg,
-            float(distance) / success.position_error,
-        ]
-        turning, moving = success.angular_velocity_error_deg, success.velocity_error
-        if turning is not None or moving is not None:
-            twist = self.kernels.relative_twist(state, p=last)
-            relative.append(math.degrees(math.hypot(*twist[:3])) / (turning or math.inf))
-            relative.append(math.hypot(*twist[3:]) / (moving or math.inf))
-        return max(relative)
+        return float(misses(self.kernels, state, self.parameters.rows[-1]))
 
     def is_success(self, state: FloatArray) -> bool:
         """Whether an episode that ends in a state is a success."""
@@ -256,6 +245,31 @@ class ArmProblem:
         if self.is_constrained and name not in ("difference", "retract"):
             name = PENALIZED + name
         return self.kernels.kernel(name, integrator=integrator, lanes=None if batched else 1)
+
+
+def misses(kernels: Kernels, states: FloatArray, parameters: FloatArray) -> FloatArray:
+    """Largest of the tip's errors at final states, each relative to its tolerance.
+
+    Args:
+        kernels: Those of the scene, whose `success` has the tolerances.
+        states: Shape (n_x,) or (B, n_x), units of the state.
+        parameters: Of the end, shape (n_p,) or (B, n_p), units of `parameters`.
+
+    Returns:
+        Errors, at most 1 in success, shape () or (B,); NaN or infinite where a state is.
+    """
+    success, given = kernels.scene.success, parameters if kernels.n_p else None
+    errors = kernels.observation(states, np.zeros((*states.shape[:-1], 1)), given)[1]
+    relative = [
+        np.degrees(errors[..., 0]) / success.attitude_error_deg,
+        errors[..., 1] / success.position_error,
+    ]
+    turning, moving = success.angular_velocity_error_deg, success.velocity_error
+    if turning is not None or moving is not None:
+        twist = kernels.relative_twist(states, p=given)
+        relative.append(np.degrees(np.linalg.norm(twist[..., :3], axis=-1)) / (turning or math.inf))
+        relative.append(np.linalg.norm(twist[..., 3:], axis=-1) / (moving or math.inf))
+    return np.asarray(np.max(relative, axis=0))
 
 
 def carried_along(

@@ -15,9 +15,8 @@ from agents.gradients.gradient_training import train_by_gradients
 from agents.gradients.layers import Layers, random_weights
 from agents.policies import ExportedPolicy
 from agents.run_folder import RunFolder, RunFolderError, validation_seeds
-from dq_space_arm_env import DQSpaceArmVectorEnv, load_scene
+from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, load_scene
 from dq_space_arm_env.environment.rollouts import rollout
-from experts.problems.arm_problem import ArmProblem
 
 pytestmark = pytest.mark.agents
 
@@ -104,9 +103,13 @@ def test_decisions_fly_as_at_every_time_step():
 
 
 def test_misses_are_those_of_the_end(small_scene):
-    flown, problem = Flown(small_scene), ArmProblem(small_scene)
+    flown, environment, success = Flown(small_scene), DQSpaceArmEnv(small_scene), small_scene.success
     flown.costs()
-    expected = [problem.misses(state) for state in flown.episodes._states[-1]]
+    expected = []
+    for state in flown.episodes._states[-1]:
+        info = environment.reset(options={"initial_state": state})[1]
+        angle = info["attitude_error"] / success.attitude_error_deg
+        expected.append(max(angle, info["position_error"] / success.position_error))
     np.testing.assert_allclose(flown.episodes.misses(), expected, rtol=1e-9)
 
 
