@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many, StartFrom
+from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many, Mismatch, StartFrom
 from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
 
 
@@ -40,6 +40,12 @@ class AnalyticPolicyGradient(Model):
             yield Problem(("decisions",), self.decisions, "must be at least 2")
 
 
+class FlightMismatch(Mismatch):
+    """Model mismatch of half of the episodes of each update; the other half has that of the masses alone."""
+
+    delay: NonNegative = Field(default=0.2, description="longest time from an action to its effect, s")
+
+
 class Progression(Model):
     """Flights and checkpoints during training."""
 
@@ -52,6 +58,9 @@ class GradientConfiguration(AgentConfiguration):
     """Everything that determines a run of analytic policy gradients, apart from the code."""
 
     start_from: StartFrom = None
+    mismatch: FlightMismatch | None = Field(
+        default=None, description="what disturbs the flights of the training; absent: nothing"
+    )
     algorithm: AnalyticPolicyGradient = Field(description="the algorithm, with its hyperparameters")
     progression: Progression = Field(default_factory=Progression, description="evaluations and checkpoints")
 

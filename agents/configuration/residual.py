@@ -7,31 +7,10 @@ from pydantic import Field
 
 from agents.configuration.algorithms import PPO, SAC
 from agents.configuration.reinforcement import ActionScale, Configuration, Practice, Schedule
-from agents.configuration.schema import AgentConfiguration, DemonstrationSource, Many
-from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
+from agents.configuration.schema import AgentConfiguration, DemonstrationSource, Many, Mismatch
+from dq_space_arm_env.validation import Model, Positive, Problem
 
 PREFIX = "residual-"
-
-
-class Mismatch(Model):
-    """Model mismatch: how an episode's world may differ from the plan's model.
-
-    Masses are fixed per copy of the environment; the rest is drawn per episode, uniformly between zero and
-    these numbers.
-    """
-
-    mass_factors: tuple[Positive, ...] = Field(
-        default=(0.7, 0.85, 1.0, 1.15, 1.3),
-        min_length=1,
-        description="factors of mass and inertia of the payload, or of the last link without one",
-    )
-    noise: NonNegative = Field(
-        default=0.01, description="largest standard deviation of the measurement noise, rad, m, rad/s, m/s"
-    )
-    push: NonNegative = Field(
-        default=0.02, description="largest standard deviation of jumps of the base velocities, rad/s, m/s"
-    )
-    pushes: Count = Field(default=6, description="mean number of these jumps per episode, at random times")
 
 
 class ResidualPractice(Model):

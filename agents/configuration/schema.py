@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import Field, StrictInt, StrictStr
 
-from dq_space_arm_env.validation import Model, Positive, Problem, count_up_to
+from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem, count_up_to
 
 RESERVED_SEED = 20180627
 """Seed that the evaluation starts follow from; demonstrations with it would hold the answers."""
@@ -86,6 +86,27 @@ class DemonstrationSource(Model):
             )
         if self.folder is not None and self.minari is not None:
             yield Problem(("minari",), self.minari, "must be absent if a folder is given: give one")
+
+
+class Mismatch(Model):
+    """Model mismatch: how an episode's world may differ from the scene.
+
+    Masses are those of a copy or start; the rest is drawn per episode, uniformly between zero and these
+    numbers.
+    """
+
+    mass_factors: tuple[Positive, ...] = Field(
+        default=(0.7, 0.85, 1.0, 1.15, 1.3),
+        min_length=1,
+        description="factors of mass and inertia of the payload, or of the last link without one",
+    )
+    noise: NonNegative = Field(
+        default=0.01, description="largest standard deviation of the measurement noise, rad, m, rad/s, m/s"
+    )
+    push: NonNegative = Field(
+        default=0.02, description="largest standard deviation of jumps of the base velocities, rad/s, m/s"
+    )
+    pushes: Count = Field(default=6, description="mean number of these jumps per episode, at random times")
 
 
 def _with_demonstrations_drawn(model: _Part, seed: int) -> _Part:

@@ -2,17 +2,20 @@
 
 An episode is divided into K decisions, at t_0 = 0, ..., t_K = T, instead of its N time steps, which are many
 more. Between two times the input is constant: what the network would give at their middle, extrapolated from
-its last two outputs. The cost is summed by the trapezoidal rule. Both err with the square of the steps, so
-that a policy flies at every time step as it was trained.
+its last two outputs, or, where actions act late, interpolated between earlier ones. The cost is summed by the
+trapezoidal rule. Both err with the square of the steps, so that a policy flies at every time step as it was
+trained.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from agents.gradients.disturbed_flights import Arrival, Met, arrivals
 from agents.gradients.layers import Layers, SingleArray
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
@@ -22,7 +25,9 @@ from experts.problems.arm_problem import misses
 Array = NDArray[Any]
 
 DIVERGED = 20.0  # times the median cost; episodes beyond it do not count
-STEEP = 10.0  # times the median episode's largest slope; slopes beyond it are shortened
+STEEP = 10.0  # times the slope that usual episodes do not exceed; slopes beyond it are shortened
+USUAL = 0.5  # share of these
+USUAL_DISTURBED = 0.9  # where a push just before the end is as usual as none, and a thousand times as steep
 
 
 def decision_times(scene: Scene, decisions: int, crowding: float) -> Array:
@@ -40,7 +45,9 @@ class Episodes:
         units: Inputs of an output of 1, fractions of the limits, shape (n_u,).
     """
 
-    def __init__(self, scene: Scene, layers: Layers, times: Array, units: ArrayLike) -> None:
+    def __init__(
+        self, scene: Scene, layers: Layers, times: Array, units: ArrayLike, *, noisy: bool = False
+    ) -> None:
         """Prepare episodes whose network gives its outputs in some units, alike or not for all inputs."""
         self._kernels = kernels = compile_scene(scene)
         self._layers, (decisions, count, n_obs) = layers, layers.values[0].shape
@@ -53,9 +60,9 @@ class Episodes:
         # The sum over time steps has the first one's state whole, and the last one's not at all.
         self._weights += 0.5 * (np.arange(decisions + 1) == 0) - 0.5 * (np.arange(decisions + 1) == decisions)
         self._held = steps / dt - self._weights[:-1]  # of the input's cost, which is not of a point in time
-        self._ahead = np.append(0.0, 0.5 * steps[1:] / steps[:-1]).astype(np.float32)
         self.parameters = np.zeros((decisions + 1, count, kernels.n_p), dtype)
         self._states = np.zeros((decisions + 1, count, kernels.n_x), dtype)
+        self._measured = np.zeros_like(self._states) if noisy else self._states
         self._observations = np.zeros((decisions, count, n_obs), dtype)
         self._wanted = np.zeros((decisions, count, kernels.n_u), dtype)
         self._inputs = np.zeros((decisions + 1, count, kernels.n_u), dtype)
@@ -63,11 +70,14 @@ class Episodes:
         self._terminal, self._emphasis = np.zeros((2, count, 1), dtype)
         self._cotangents = np.zeros((decisions + 1, count, kernels.n_t), dtype)
         self._by_input = np.zeros((count, kernels.n_u), dtype)
+        self._by_output = np.zeros((decisions, count, kernels.n_u))
         self._by_observation = np.zeros((count, n_obs), dtype)
         self._by_state = np.zeros((count, kernels.n_t), dtype)
         self._cost_weights = np.repeat(self._weights[:, None, None], count, axis=1).astype(dtype)
         self._calls = [self._bind(index, times) for index in range(decisions)]
         self._end = self._bind_end()
+        self._times, self._met, self._usual = times, Met(), USUAL
+        self._arrivals: list[Arrival] = arrivals(times)
 
     def _bind(self, k: int, times: Array) -> dict[str, KernelCall]:
         """The calls of a decision."""
@@ -80,10 +90,11 @@ class Episodes:
             "time_left": np.full((count, 1), times[-1] - times[k], dtype),
         }
         after = {"x_next": self._states[k + 1], "cost": self._costs[k]}
-        seen = {"observation": self._observations[k], "errors": np.zeros((count, 2), dtype)}
+        seen = {"x": self._measured[k], "observation": self._observations[k]}
+        seen |= {"errors": np.zeros((count, 2), dtype)}
         back = {"v": self._cotangents[k + 1], "v_cost": self._cost_weights[k]}
         back |= {"x_cotangent": self._cotangents[k], "u_cotangent": self._by_input}
-        by_observation = {"v": self._by_observation, "x_cotangent": self._by_state}
+        by_observation = {"x": self._measured[k], "v": self._by_observation, "x_cotangent": self._by_state}
         arrays = {
             "observation": seen,
             "step_with_cost": after,
@@ -113,23 +124,28 @@ class Episodes:
             name: KernelCall(self._kernels.kernel(name), given | others) for name, others in arrays.items()
         }
 
+    def meet(self, met: Met) -> None:
+        """Let delays, jumps and noise disturb the next flights."""
+        self._met, self._arrivals = met, arrivals(self._times, met.delays)
+        self._usual = USUAL_DISTURBED
+
     def fly(self, starts: Array, mean: Array, scale: Array, emphasis: float) -> Array:
         """Fly from states (B, n_x); observations are normalized as `(o - mean) * scale`.
 
         Returns the costs, (B,), with the terminal pose's multiplied by the emphasis.
         """
         self._states[0], self._emphasis[:] = starts, emphasis
-        outputs, rows, layout = self._layers.values[-1], len(starts), self._kernels.layout
+        rows, layout = len(starts), self._kernels.layout
         units, high = self.units * layout.control_limit, layout.limits_with(self.parameters[0])
         self._low, self._high = layout.lower_limits(high), high
         for k, calls in enumerate(self._calls):
+            self._disturb(k)
             calls["observation"](rows)
             with np.errstate(over="ignore", invalid="ignore"):  # of episodes that diverge
                 self._layers.values[0][k] = (self._observations[k] - mean) * scale
-                action = self._layers.forward(k)
-            if ahead := self._ahead[k]:
-                action = action + ahead * (action - outputs[k - 1])
-            np.multiply(action, units, out=self._wanted[k])
+                self._layers.forward(k)
+            arrival = self._arrivals[k]
+            np.multiply(arrival.of(self._layers.values[-1]), units * arrival.arrived, out=self._wanted[k])
             np.clip(self._wanted[k], self._low, self._high, out=self._inputs[k])
             calls["step_with_cost"](rows)
         self._end["cost"](rows)
@@ -137,6 +153,17 @@ class Episodes:
         efforts = np.square(self._inputs[:-1]) @ self._efforts
         total = self._weights @ self._costs[..., 0] + self._held @ efforts + self._terminal[:, 0]
         return np.asarray(total)
+
+    def _disturb(self, k: int) -> None:
+        """Push the bases at the beginning of a decision, and measure the states with noise."""
+        jumps, noise = self._met.jumps, self._met.noise
+        if jumps is not None:
+            struck = jumps[k].any(axis=1)
+            self._states[k][struck] = self._kernels.retract(self._states[k][struck], jumps[k][struck])
+        if noise is not None:
+            self._measured[k] = self._kernels.retract(self._states[k], noise[k])
+        elif self._measured is not self._states:
+            self._measured[k] = self._states[k]
 
     def gradient(
         self, starts: Array, mean: Array, scale: Array, emphasis: float
@@ -156,7 +183,7 @@ class Episodes:
         self._end["cost_vjp"](rows)
         self._cotangents[-1] += self._by_state
         self._cotangents[-1][lost] = 0.0
-        later, ahead = np.zeros_like(self._by_input), np.append(self._ahead, 0.0)
+        self._by_output[:] = 0.0
         by_unit = self.units * self._kernels.layout.control_limit / kept
         for k in range(len(self._calls) - 1, -1, -1):
             self._calls[k]["step_with_cost_vjp"](rows)
@@ -165,14 +192,13 @@ class Episodes:
             wanted = self._wanted[k]
             slope[((wanted > self._high) & (slope < 0.0)) | ((wanted < self._low) & (slope > 0.0))] = 0.0
             slope[lost] = 0.0
-            by_output = (1.0 + ahead[k]) * slope - ahead[k + 1] * later
-            later = slope
-            back = self._layers.backward(k, by_output * by_unit)
+            self._arrivals[k].back(slope, self._by_output)
+            back = self._layers.backward(k, self._by_output[k] * by_unit)
             np.multiply(back, scale * kept, out=self._by_observation)
             self._calls[k]["observation_vjp"](rows)
             self._cotangents[k] += self._by_state
             self._cotangents[k][lost] = 0.0
-            _shorten(self._cotangents[k])
+            _shorten(self._cotangents[k], self._usual)
         return self._layers.gradient(), costs
 
     def misses(self) -> Array:
@@ -190,13 +216,14 @@ class Episodes:
         return np.asarray(np.sqrt(squares))
 
 
-def _shorten(slopes: Array) -> None:
-    """Shorten rows that are much longer than the median, as chaotic motions have; drop those not finite."""
+def _shorten(slopes: Array, share: float) -> None:
+    """Shorten rows much longer than a share of them, as chaotic motions have; drop those not finite."""
     sizes = np.abs(slopes).max(axis=1)
     finite = np.isfinite(sizes)
     ordered, count = np.sort(sizes), int(np.count_nonzero(finite))  # finite ones first
-    # The median; `numpy.median` takes several times as long for a few numbers.
-    most = STEEP * 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2]) if count else 0.0
+    # A quantile; `numpy.quantile` takes several times as long for a few numbers.
+    place = share * (count - 1)
+    most = STEEP * 0.5 * (ordered[math.floor(place)] + ordered[math.ceil(place)]) if count else 0.0
     long = finite & (sizes > most)
     if long.any():
         slopes[long] *= (most / sizes[long])[:, None]

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from agents.configuration.gradients import GradientConfiguration
 from agents.configuration.schema import RESERVED_SEED
+from agents.gradients.disturbed_flights import Met, calm
 from agents.gradients.episodes import Episodes, decision_times
 from agents.gradients.layers import Layers, random_weights
 from agents.gradients.soap import SOAP
@@ -34,11 +35,12 @@ from agents.run_folder import (
     validation_seeds,
 )
 from agents.zoo.starting import load_start, spent_before
-from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, load_scene
+from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, compile_scene, load_scene
 from dq_space_arm_env.common.bounded_formats import read_arrays
 from dq_space_arm_env.common.bounded_reading import UnreadableError
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import Advance, Status
+from dq_space_arm_env.environment.disturbances import with_loads
 from dq_space_arm_env.scene import StateLayout
 
 Array = NDArray[Any]
@@ -104,16 +106,21 @@ class Starts(NamedTuple):
     parameters: Array
 
     @classmethod
-    def draw(cls, scene: Scene, count: int, times: Array, seed: int) -> Starts:
-        """Draw starts with a seed, and look up their parameters at some times."""
+    def draw(
+        cls, scene: Scene, count: int, times: Array, seed: int, mass_factors: Sequence[float]
+    ) -> tuple[Scene, Starts]:
+        """Draw starts with a seed, and their parameters at some times; first the scene that has them."""
         environment = DQSpaceArmVectorEnv(count, scene)
         environment.reset(seed=int(np.random.SeedSequence([RESERVED_SEED, seed]).generate_state(1)[0] >> 2))
         kernels, given = environment.kernels, environment.parameters
+        if set(mass_factors) != {1.0}:
+            scene, given = with_loads(scene, np.resize(mass_factors, count), given)
+            kernels = compile_scene(scene)
         if not kernels.parameters.moving:
-            return cls(environment.states, given[None])
+            return scene, cls(environment.states, given[None])
         rows = np.rint(times / scene.simulation.dt).astype(int)
         stages = [kernels.stage_parameters(row)[rows] for row in given]
-        return cls(environment.states, np.stack(stages, axis=1))
+        return scene, cls(environment.states, np.stack(stages, axis=1))
 
 
 class _Learner:
@@ -123,13 +130,17 @@ class _Learner:
         self._settings, self._configuration, self._scene = configuration.algorithm, configuration, scene
         settings, rng = configuration.algorithm, np.random.default_rng(configuration.seed)
         self._times = decision_times(scene, settings.decisions, settings.crowding)
-        self._starts = Starts.draw(scene, settings.starts, self._times, configuration.seed)
+        self._mismatch = mismatch = configuration.mismatch
+        factors = (1.0,) if mismatch is None else mismatch.mass_factors
+        drawn = Starts.draw(scene, settings.starts, self._times, configuration.seed, factors)
+        self._flown, self._starts = drawn
         self._mean, self._scale = units_of(self._trial(DQSpaceArmVectorEnv(SEEN, scene), rng))
         sizes = [len(self._mean), *configuration.network.hidden, StateLayout.of(scene).n_u]
         self._weights = random_weights(sizes, rng)
         self._begin_with(load_start(configuration.start_from, configuration.network, sizes[0], sizes[-1]))
         layers = Layers(self._weights, settings.decisions, settings.copies)
-        self._episodes = Episodes(scene, layers, self._times, FIRST_UNITS)
+        noisy = mismatch is not None and mismatch.noise > 0.0
+        self._episodes = Episodes(self._flown, layers, self._times, FIRST_UNITS, noisy=noisy)
         self._optimizer = SOAP(self._weights)
         self._updates, self._seconds = 0, 0.0
         self._typical, self._caution = math.inf, 1.0  # recent cost; factor of the learning rate
@@ -192,6 +203,8 @@ class _Learner:
         rows = rng.integers(len(self._starts.states), size=settings.copies)
         self._episodes.parameters[:] = self._starts.parameters[:, rows]
         starts = self._starts.states[rows]
+        if self._mismatch is not None:
+            self._episodes.meet(Met.draw(self._mismatch, self._flown, self._times, len(rows), rng))
         gradient, costs = self._episodes.gradient(starts, self._mean, self._scale, self._end_weight)
         median = float(np.median(costs[np.isfinite(costs)])) if np.isfinite(costs).any() else math.inf
         if math.isinf(median) or (done > WARM_UP and median > WORSE * self._typical):
@@ -228,7 +241,9 @@ class _Learner:
     def _adapt(self) -> None:
         """Let the end weight rise while episodes miss, and the outputs' units follow the inputs flown."""
         settings, episodes = self._settings, self._episodes
-        if self._updates > TRAVELLED * settings.updates and np.mean(episodes.misses() <= 1.0) < ENOUGH:
+        judged = settings.copies if self._mismatch is None else calm(settings.copies)
+        reaches = np.mean(episodes.misses()[:judged] <= 1.0)
+        if self._updates > TRAVELLED * settings.updates and reaches < ENOUGH:
             self._end_weight = min(STRICTER * self._end_weight, STRICTEST * settings.end_weight)
         factors = UNITS_PER_SIZE * episodes.sizes() / episodes.units
         factors = np.clip(factors, 1.0 / FASTEST_UNITS, self._growth)

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from agents.configuration.residual import Mismatch
+from agents.configuration.schema import Mismatch
 from agents.evaluation.plans import FloatArray, Followed, Plans
 from agents.residual.corrections import CorrectionObserver, corrected
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from agents.configuration.residual import Mismatch
+from agents.configuration.schema import Mismatch
 from agents.evaluation.conditions import NOISE, PAYLOAD_CHANGE, ChosenDisturbances
 from agents.evaluation.plans import Plans
 from dq_space_arm_env import Scene

@@ -8,14 +8,17 @@ import pytest
 pytest.importorskip("threadpoolctl")
 
 from agents.configuration import ConfigurationError, load_configuration
+from agents.configuration.gradients import FlightMismatch
 from agents.configuration.schema import Network
 from agents.gradients import episodes, gradient_training
+from agents.gradients.disturbed_flights import Met
 from agents.gradients.episodes import Episodes, decision_times
 from agents.gradients.gradient_training import train_by_gradients
 from agents.gradients.layers import Layers, random_weights
 from agents.policies import ExportedPolicy
 from agents.run_folder import RunFolder, RunFolderError, validation_seeds
 from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, load_scene
+from dq_space_arm_env.environment.disturbances import Disturbance
 from dq_space_arm_env.environment.rollouts import rollout
 
 pytestmark = pytest.mark.agents
@@ -26,7 +29,7 @@ COUNT, DECISIONS, HIDDEN, SEEDS = 16, 30, 12, list(range(16))
 class Flown:
     """Episodes of a small scene, flown by a random network."""
 
-    def __init__(self, scene, decisions=DECISIONS, outputs=3.0):
+    def __init__(self, scene, decisions=DECISIONS, outputs=3.0, *, noisy=False):
         environment = DQSpaceArmVectorEnv(COUNT, scene)
         seen = environment.reset(seed=SEEDS)[0]
         self.states, n_u = environment.states, environment.kernels.n_u
@@ -36,12 +39,18 @@ class Flown:
         self.mean, deviation = seen.mean(axis=0), seen.std(axis=0)
         self.scale = np.where(deviation > 1e-6, 1.0 / np.maximum(deviation, 1e-6), 0.0)
         layers = Layers(self.weights, decisions, COUNT)
-        self.episodes = Episodes(scene, layers, decision_times(scene, decisions, 0.4), np.full(n_u, 0.05))
+        times = decision_times(scene, decisions, 0.4)
+        self.episodes = Episodes(scene, layers, times, np.full(n_u, 0.05), noisy=noisy)
 
     def in_double_precision(self):
         layers = self.episodes._layers
         for arrays in (self.weights, layers.values, layers._cotangents):
             arrays[:] = [each.astype(np.float64) for each in arrays]
+
+    def meet(self, mismatch):
+        rng, times = np.random.default_rng(2), self.episodes._times
+        self.episodes.meet(Met.draw(mismatch, self.episodes._kernels.scene, times, COUNT, rng))
+        return self.episodes._met
 
     def costs(self, emphasis=1.0):
         return self.episodes.fly(self.states, self.mean, self.scale, emphasis)
@@ -60,10 +69,16 @@ class Flown:
         )
 
 
-def test_gradients_agree_with_differences(small_scene, monkeypatch):
+MISMATCH = FlightMismatch(mass_factors=(1.0,), noise=0.0, push=0.05, pushes=3, delay=1.0)
+
+
+@pytest.mark.parametrize("disturbed", [False, True])
+def test_gradients_agree_with_differences(small_scene, monkeypatch, disturbed):
     monkeypatch.setattr(episodes, "STEEP", math.inf)  # which shortens slopes
     flown = Flown(small_scene)
     flown.in_double_precision()
+    if disturbed:
+        flown.meet(MISMATCH)
     gradient, costs = flown.gradient(emphasis=10.0)
     np.testing.assert_array_equal(costs, flown.costs(emphasis=10.0))
     rng = np.random.default_rng(1)
@@ -100,6 +115,66 @@ def test_decisions_fly_as_at_every_time_step():
     errors = [np.abs(Flown(scene, n).costs() / flights.cost - 1.0).mean() for n in (20, 40)]
     assert errors[1] < 1e-3
     assert errors[1] < 0.35 * errors[0]
+
+
+@pytest.mark.parametrize("without", ["push", "delay"])
+def test_disturbed_decisions_fly_as_at_every_time_step(without):
+    """Delayed and pushed episodes cost what flights do that meet the same."""
+    scene, row = load_scene("planar"), COUNT - 4
+    flown, step = Flown(scene, 200), scene.simulation.dt
+    met = flown.meet(MISMATCH.model_copy(update={without: 0.0}))
+    delay, pushes = 0, None
+    if without == "push":
+        assert not met.delays[: COUNT // 2].any()
+        delay = round(met.delays[row] / step)
+        assert delay > 10
+    else:
+        assert not met.jumps[:, : COUNT // 2].any()
+        assert met.jumps[:, row].any()
+        pushes = Pushed(met.jumps[:, row], flown.episodes._times, step)
+    flight = rollout(flown.policy(), scene, [SEEDS[row]], delay=delay, disturbances=pushes)
+    calm = rollout(flown.policy(), scene, [SEEDS[row]])
+    assert flown.costs()[row] == pytest.approx(flight.cost[0], rel=2e-3)
+    assert calm.cost[0] != pytest.approx(flight.cost[0], rel=5e-3)
+
+
+class Pushed:
+    """The jumps of an episode's decisions at the time steps in which these begin."""
+
+    def __init__(self, jumps, times, step):
+        self.steps, self.jumps, self.step = np.rint(times[:-1] / step), jumps, -1
+
+    def draw(self):
+        self.step += 1
+        return Disturbance(push=self.jumps[self.steps == self.step].sum(axis=0)[None])
+
+
+def test_noise_is_that_of_means_over_decisions(small_scene):
+    mismatch = MISMATCH.model_copy(update={"push": 0.0, "delay": 0.0, "noise": 0.01})
+    flown, exact = Flown(small_scene, noisy=True), Flown(small_scene)
+    np.testing.assert_array_equal(flown.costs(), exact.costs())
+    noise = flown.meet(mismatch).noise
+    assert not noise[:, : COUNT // 2].any()
+    steps = np.diff(flown.episodes._times)[:, None, None] / small_scene.simulation.dt
+    deviations = (noise * np.sqrt(steps))[:, COUNT // 2 :].std(axis=(0, 2))
+    assert 0.0 < deviations.min() < deviations.max() < 0.0105
+    costs = flown.costs()
+    np.testing.assert_array_equal(costs[: COUNT // 2], exact.costs()[: COUNT // 2])
+    assert (costs[COUNT // 2 :] != exact.costs()[COUNT // 2 :]).all()
+
+
+def test_masses_are_those_of_starts(small_file, small_scene):
+    factors = (0.5, 2.0)
+    given = settings(small_file).model_copy(
+        update={"mismatch": MISMATCH.model_copy(update={"mass_factors": factors})}
+    )
+    learner = gradient_training._Learner(given, small_scene)
+    assert learner._mean.shape == DQSpaceArmVectorEnv(1, small_scene).single_observation_space.shape
+    entry = learner._episodes._kernels.parameters.names.index("links.2.mass")
+    learner._update()
+    masses = learner._episodes.parameters[0, :, entry] / small_scene.links[2].mass
+    assert set(masses.tolist()) == set(factors)
+    learner._adapt()
 
 
 def test_misses_are_those_of_the_end(small_scene):

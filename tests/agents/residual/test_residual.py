@@ -8,7 +8,7 @@ import pytest
 
 from agents.command_line.compare import residual
 from agents.configuration import ConfigurationError, load_configuration
-from agents.configuration.residual import Mismatch
+from agents.configuration.schema import Mismatch
 from agents.evaluation.comparison_tables import mismatch_table, notes, record
 from agents.evaluation.plan_followers import FEEDBACK, OPEN_LOOP, RECEDING, RecedingHorizon, follower
 from agents.evaluation.plans import Followed, Plans
