@@ -107,8 +107,9 @@ class Evaluation:
     def constraint_violations(self) -> Interval:
         """Share of the steps that violate constraints, mean over episodes, with a bootstrap interval."""
         shares = self.flights.constraint_violations
-        known = shares if np.isfinite(shares).all() else []
-        return bootstrap_interval(known, lambda drawn: float(np.mean(drawn)))
+        return bootstrap_interval(
+            shares if np.isfinite(shares).all() else (), lambda drawn: float(np.mean(drawn))
+        )
 
     @property
     def _known_gaps(self) -> NDArray[np.float64]:

@@ -14,8 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agents.gradients.layers import Layers, SingleArray
+from agents.gradients.penalties import Penalties
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.kernels.library import PENALIZED
+from dq_space_arm_env.scene.constraint_rows import penalized_rows
 from dq_space_arm_env.scene.parameters import CONTROL_UNITS
 from experts.problems.arm_problem import misses
 
@@ -38,6 +41,7 @@ class Episodes:
     Attributes:
         parameters: Parameters of each decision and of the end, shape (K + 1, B, n_p).
         units: Inputs of an output of 1, fractions of the limits, shape (n_u,).
+        penalties: Those of the scene's constraints in the cost; None without.
     """
 
     def __init__(self, scene: Scene, layers: Layers, times: Array, units: ArrayLike) -> None:
@@ -55,6 +59,9 @@ class Episodes:
         self._held = steps / dt - self._weights[:-1]  # of the input's cost, which is not of a point in time
         self._ahead = np.append(0.0, 0.5 * steps[1:] / steps[:-1]).astype(np.float32)
         self.parameters = np.zeros((decisions + 1, count, kernels.n_p), dtype)
+        self.penalties: Penalties | None = None
+        if penalized_rows(scene):
+            self.penalties = Penalties(kernels, decisions, count, self._weights[-1])
         self._states = np.zeros((decisions + 1, count, kernels.n_x), dtype)
         self._observations = np.zeros((decisions, count, n_obs), dtype)
         self._wanted = np.zeros((decisions, count, kernels.n_u), dtype)
@@ -90,9 +97,13 @@ class Episodes:
             "step_with_cost_vjp": back,
             "observation_vjp": by_observation,
         }
-        return {
-            name: KernelCall(self._kernels.kernel(name), given | others) for name, others in arrays.items()
-        }
+        return {name: self._call(name, k, given | others) for name, others in arrays.items()}
+
+    def _call(self, name: str, k: int, arrays: dict[str, Array]) -> KernelCall:
+        """A kernel on arrays; slopes of costs have those of the penalties."""
+        if self.penalties is not None and name in ("step_with_cost_vjp", "emphasized_terminal_cost_vjp"):
+            name, arrays = PENALIZED + name, {**arrays, "parameters": self.penalties.parameters[k]}
+        return KernelCall(self._kernels.kernel(name), arrays)
 
     def _bind_end(self) -> dict[str, KernelCall]:
         """The calls at the end, where the inputs are zero."""
@@ -109,9 +120,7 @@ class Episodes:
             },
             "emphasized_terminal_cost_vjp": {"v": one, "x_cotangent": self._cotangents[-1]},
         }
-        return {
-            name: KernelCall(self._kernels.kernel(name), given | others) for name, others in arrays.items()
-        }
+        return {name: self._call(name, -1, given | others) for name, others in arrays.items()}
 
     def fly(self, starts: Array, mean: Array, scale: Array, emphasis: float) -> Array:
         """Fly from states (B, n_x); observations are normalized as `(o - mean) * scale`.
@@ -119,6 +128,8 @@ class Episodes:
         Returns the costs, (B,), with the terminal pose's multiplied by the emphasis.
         """
         self._states[0], self._emphasis[:] = starts, emphasis
+        if self.penalties is not None:
+            self.penalties.prepare(self.parameters, emphasis)
         outputs, rows, layout = self._layers.values[-1], len(starts), self._kernels.layout
         units, high = self.units * layout.control_limit, layout.limits_with(self.parameters[0])
         self._low, self._high = layout.lower_limits(high), high
@@ -174,6 +185,12 @@ class Episodes:
             self._cotangents[k][lost] = 0.0
             _shorten(self._cotangents[k])
         return self._layers.gradient(), costs
+
+    def price_violations(self, cost: float) -> None:
+        """Let penalties follow what the episodes flown last violate, and the cost of recent ones."""
+        if self.penalties is not None:
+            self.penalties.cost = cost
+            self.penalties.follow(self._states, self._inputs, self.parameters)
 
     def misses(self) -> Array:
         """Largest error of the tip at the end of each episode flown last, relative to its tolerance, (B,)."""
