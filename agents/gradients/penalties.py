@@ -1,9 +1,9 @@
 """Penalties of a scene's constraints in the cost of episodes, with one multiplier per row for all of them.
 
 The slopes of an episode's cost are then those of the augmented Lagrangian of `task.augmented_lagrangian`. A
-policy has to keep to a row from all starts: the price of its violation rises while an episode violates it,
-however far, and falls slowly while none does. Since the penalty is a barrier inside, a higher price keeps
-flights at a larger distance. Rates of controls, and what is exact at the end, have no penalty.
+policy has to keep to a row from all starts: dual ascent lets the price of a violation rise while too many
+episodes have one, however large, and else fall slowly. Since the penalty is a barrier inside, a higher price
+keeps flights at a larger distance. Rates of controls, and what is exact at the end, have no penalty.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, pen
 Array = NDArray[Any]
 
 FIRST = 0.01  # price at first
-RISE = 1.02  # factor of a price in an update whose episodes violate its row
-FALL = 0.996  # its factor in others
+ALLOWED = 0.005  # share of the episodes that may violate a row
+MOST = 0.1  # share beyond which a price rises no faster
+RATE = 0.5  # of change of a price's logarithm in an update, for all episodes
 
 
 class Penalties:
@@ -72,5 +73,6 @@ class Penalties:
             np.reshape(each, (rows, each.shape[-1])) for each in (states[1:], inputs[:-1], parameters[1:])
         )
         residuals = kernels.constraints(after, held, given if kernels.n_p else None)
-        violated = (residuals[:, self._is_penalized] > 0.0).any(axis=0)
-        self.prices *= np.where(violated, RISE, FALL)
+        violated = (residuals[:, self._is_penalized] > 0.0).reshape(len(inputs) - 1, -1, len(self.prices))
+        shares = violated.any(axis=0).mean(axis=0)
+        self.prices *= np.exp(RATE * (np.minimum(shares, MOST) - ALLOWED))

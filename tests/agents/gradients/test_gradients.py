@@ -140,9 +140,10 @@ def test_prices_rise_where_an_episode_violates(limited):
     flown.costs()
     penalties, states, inputs = flown.episodes.penalties, flown.episodes._states, flown.episodes._inputs
     found = [compile_scene(limited).constraints(*each) for each in zip(states[1:], inputs[:-1], strict=True)]
-    violated = (np.array(found) > 0.0).any(axis=(0, 1))
+    shares = (np.array(found) > 0.0).any(axis=0).mean(axis=0)
+    assert len(set(shares)) > 3
     flown.episodes.price_violations(1500.0)
-    np.testing.assert_allclose(penalties.prices, 0.01 * np.where(violated, 1.02, 0.996))
+    np.testing.assert_allclose(penalties.prices, 0.01 * np.exp(0.5 * (np.minimum(shares, 0.1) - 0.005)))
     assert penalties.cost == 1500.0
 
 
