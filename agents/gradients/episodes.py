@@ -26,6 +26,7 @@ Array = NDArray[Any]
 
 DIVERGED = 20.0  # times the median cost; episodes beyond it do not count
 STEEP = 10.0  # times the median episode's largest slope; slopes beyond it are shortened
+STEEP_PENALTIES = 100.0  # likewise where few episodes may violate constraints
 
 
 def decision_times(scene: Scene, decisions: int, crowding: float) -> Array:
@@ -183,7 +184,7 @@ class Episodes:
             self._calls[k]["observation_vjp"](rows)
             self._cotangents[k] += self._by_state
             self._cotangents[k][lost] = 0.0
-            _shorten(self._cotangents[k])
+            _shorten(self._cotangents[k], STEEP if self.penalties is None else STEEP_PENALTIES)
         return self._layers.gradient(), costs
 
     def price_violations(self, cost: float) -> None:
@@ -207,13 +208,13 @@ class Episodes:
         return np.asarray(np.sqrt(squares))
 
 
-def _shorten(slopes: Array) -> None:
-    """Shorten rows that are much longer than the median, as chaotic motions have; drop those not finite."""
+def _shorten(slopes: Array, steep: float) -> None:
+    """Shorten rows that are times longer than the median, as chaotic motions have; drop those not finite."""
     sizes = np.abs(slopes).max(axis=1)
     finite = np.isfinite(sizes)
     ordered, count = np.sort(sizes), int(np.count_nonzero(finite))  # finite ones first
     # The median; `numpy.median` takes several times as long for a few numbers.
-    most = STEEP * 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2]) if count else 0.0
+    most = steep * 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2]) if count else 0.0
     long = finite & (sizes > most)
     if long.any():
         slopes[long] *= (most / sizes[long])[:, None]

@@ -19,6 +19,8 @@ from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, pen
 Array = NDArray[Any]
 
 FIRST = 0.01  # price at first
+STIFFNESS = 5.0  # penalty of a row, relative to one over its tolerance
+CHARGED = 0.5  # violation that counts, relative to the tolerance: flights between decisions keep within it
 ALLOWED = 0.005  # share of the episodes that may violate a row
 MOST = 0.1  # share beyond which a price rises no faster
 RATE = 0.5  # of change of a price's logarithm in an update, for all episodes
@@ -52,8 +54,8 @@ class Penalties:
         The emphasis multiplies all of the terminal cost but the base's velocity: here, not the penalties.
         """
         self.parameters[..., : self._kernels.n_p] = parameters
-        m, at_end, penalties = len(self.prices), self._at_end, 1.0 / self._tolerances
-        multipliers = self.prices * penalties * (self.cost / self._kernels.scene.simulation.steps)
+        m, at_end, penalties = len(self.prices), self._at_end, STIFFNESS / self._tolerances
+        multipliers = self.prices / self._tolerances * (self.cost / self._kernels.scene.simulation.steps)
         self._multipliers[:-1, :, :m], self._penalties[:-1, :, :m] = multipliers, penalties
         # Those of success, which come after the path's, stay zero.
         n_end = int(at_end.sum())
@@ -73,6 +75,6 @@ class Penalties:
             np.reshape(each, (rows, each.shape[-1])) for each in (states[1:], inputs[:-1], parameters[1:])
         )
         residuals = kernels.constraints(after, held, given if kernels.n_p else None)
-        violated = (residuals[:, self._is_penalized] > 0.0).reshape(len(inputs) - 1, -1, len(self.prices))
-        shares = violated.any(axis=0).mean(axis=0)
+        violated = residuals[:, self._is_penalized] > CHARGED * self._tolerances
+        shares = violated.reshape(len(inputs) - 1, -1, len(self.prices)).any(axis=0).mean(axis=0)
         self.prices *= np.exp(RATE * (np.minimum(shares, MOST) - ALLOWED))

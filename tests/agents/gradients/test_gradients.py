@@ -101,7 +101,7 @@ def penalty(t, slope_at_zero):
 
 
 def test_slopes_have_those_of_penalties(limited, monkeypatch):
-    monkeypatch.setattr(episodes, "STEEP", math.inf)
+    monkeypatch.setattr(episodes, "STEEP_PENALTIES", math.inf)
     flown = Flown(limited)
     flown.in_double_precision()
     kernels, rows, penalties = flown.episodes._kernels, path_rows(limited), flown.episodes.penalties
@@ -115,7 +115,7 @@ def test_slopes_have_those_of_penalties(limited, monkeypatch):
         scene_costs = flown.costs(emphasis=10.0)
         states, inputs = flown.episodes._states, flown.episodes._inputs
         found = [kernels.constraints(x, u) for x, u in zip(states, inputs, strict=True)]
-        each = penalty((np.array(found) + margins) / tolerances, at_tolerance)
+        each = penalty(5.0 * (np.array(found) + margins) / tolerances, at_tolerance / 5.0)
         return scene_costs + flown.episodes._weights @ each.sum(axis=-1), np.array(found)
 
     gradient, plain = flown.gradient(emphasis=10.0)
@@ -139,8 +139,10 @@ def test_prices_rise_where_an_episode_violates(limited):
     flown = Flown(limited)
     flown.costs()
     penalties, states, inputs = flown.episodes.penalties, flown.episodes._states, flown.episodes._inputs
-    found = [compile_scene(limited).constraints(*each) for each in zip(states[1:], inputs[:-1], strict=True)]
-    shares = (np.array(found) > 0.0).any(axis=0).mean(axis=0)
+    tolerances = np.array([row.tolerance for row in path_rows(limited)])
+    at_ends = zip(states[1:], inputs[:-1], strict=True)
+    found = np.array([compile_scene(limited).constraints(*each) for each in at_ends])
+    shares = (found > 0.5 * tolerances).any(axis=0).mean(axis=0)
     assert len(set(shares)) > 3
     flown.episodes.price_violations(1500.0)
     np.testing.assert_allclose(penalties.prices, 0.01 * np.exp(0.5 * (np.minimum(shares, 0.1) - 0.005)))
