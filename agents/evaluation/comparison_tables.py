@@ -59,7 +59,8 @@ COLUMNS = {
         Column("position_error", "distance\nm", ".3f"),
         Column("effort", "effort", ".3g"),
         Column("base_turn", "base turn\ndeg", ".1f"),
-        Column("constraint_violations", "violations\n% of steps", lambda share: f"{100.0 * share:.2f}"),
+        Column("violating_episodes", "violating\nflights %", percent),
+        Column("constraint_violations", "violations\n% of steps", percent),
         Column("action_seconds", "action\nus", _microseconds),
         Column("planning_seconds", "plan\ns", lambda seconds: f"{seconds:.2f}" if seconds else "-"),
         Column("training_steps", "training\nsteps", lambda steps: f"{steps:,.0f}"),
@@ -71,15 +72,17 @@ COLUMNS = {
 """Columns of all tables, by the keys of the rows."""
 PROFILE = (0.001, 0.01, 0.1, 1.0)
 """Cost gaps of the performance profiles in tables."""
+_VIOLATIONS = ("violating_episodes", "constraint_violations")
 _FLIGHTS = (
     *("attitude_error", "position_error", "effort", "base_turn"),
-    *("constraint_violations", "action_seconds"),
+    *_VIOLATIONS,
+    "action_seconds",
 )
 _TRAINING = ("training_steps", "training_seconds")
 _COMPARED = ("policy", "episodes", "success_rate", "median_cost_gap", "tail_cost_gap", *_FLIGHTS)
 _MISMATCH = (
     *("condition", "policy", "episodes", "success_rate", "median_cost_gap", "saving"),
-    *("attitude_error", "position_error", "constraint_violations", "action_seconds"),
+    *("attitude_error", "position_error", *_VIOLATIONS, "action_seconds"),
 )
 
 
@@ -177,7 +180,7 @@ def groups_table(groups: Sequence[Group]) -> TextTable:
 def _table(title: str, rows: Iterable[Row], keys: Iterable[str], right: int = 1) -> TextTable:
     found = list(rows)
     without = all(row.get("constraint_violations") is None for row in found)
-    shown = (COLUMNS[key] for key in keys if not (without and key == "constraint_violations"))
+    shown = (COLUMNS[key] for key in keys if not (without and key in _VIOLATIONS))
     return replace(tabulate(title, found, shown), right=right)
 
 

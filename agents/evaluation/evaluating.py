@@ -92,6 +92,25 @@ class Evaluation:
         """95th percentile of the known cost gaps, with a bootstrap interval."""
         return bootstrap_interval(self._known_gaps, lambda gaps: float(np.percentile(gaps, TAIL)))
 
+    @cached_property
+    def violating_episodes(self) -> Interval:
+        """Share of the episodes with a step that violates constraints, with Wilson's interval.
+
+        See `Flights.constraint_violations`; NaN where that is unknown.
+        """
+        shares = self.flights.constraint_violations
+        if not np.isfinite(shares).all():
+            return Interval(np.nan, np.nan, np.nan)
+        return wilson_interval(int((shares > 0.0).sum()), len(shares))
+
+    @cached_property
+    def constraint_violations(self) -> Interval:
+        """Share of the steps that violate constraints, mean over episodes, with a bootstrap interval."""
+        shares = self.flights.constraint_violations
+        return bootstrap_interval(
+            shares if np.isfinite(shares).all() else (), lambda drawn: float(np.mean(drawn))
+        )
+
     @property
     def _known_gaps(self) -> NDArray[np.float64]:
         return self.cost_gaps[~np.isnan(self.cost_gaps)]
@@ -126,7 +145,8 @@ class Evaluation:
             "position_error": float(np.median(flights.position_error)),
             "effort": float(np.median(flights.effort)),
             "base_turn": float(np.median(flights.base_turn)),
-            "constraint_violations": _known_mean(flights.constraint_violations),
+            "violating_episodes": known_interval(self.violating_episodes),
+            "constraint_violations": known_interval(self.constraint_violations),
             "action_seconds": self.action_seconds,
             "wall_seconds": self.wall_seconds,
             "training_steps": training.get("environment_steps"),
@@ -166,11 +186,6 @@ class Evaluation:
             metadata=dict(record["metadata"]),
             same_scene=summary["same_scene"],
         )
-
-
-def _known_mean(values: NDArray[np.float64]) -> float | None:
-    """Mean of values; None if there are none, or one is not known."""
-    return float(np.mean(values)) if values.size and np.isfinite(values).all() else None
 
 
 def evaluate(

@@ -17,8 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.gradients.disturbed_flights import Arrival, Met, arrivals
 from agents.gradients.layers import Layers, SingleArray
+from agents.gradients.penalties import Penalties
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.kernels.library import PENALIZED
+from dq_space_arm_env.scene.constraint_rows import penalized_rows
 from dq_space_arm_env.scene.parameters import CONTROL_UNITS
 from experts.problems.arm_problem import misses
 
@@ -26,7 +29,8 @@ Array = NDArray[Any]
 
 DIVERGED = 20.0  # times the median cost; episodes beyond it do not count
 STEEP = 10.0  # times the slope that usual episodes do not exceed; slopes beyond it are shortened
-USUAL = 0.5  # share of these
+STEEP_PENALTIES = 100.0  # likewise where few episodes may violate constraints
+USUAL = 0.5  # share of the usual episodes
 USUAL_DISTURBED = 0.9  # where a push just before the end is as usual as none, and a thousand times as steep
 
 
@@ -43,6 +47,7 @@ class Episodes:
     Attributes:
         parameters: Parameters of each decision and of the end, shape (K + 1, B, n_p).
         units: Inputs of an output of 1, fractions of the limits, shape (n_u,).
+        penalties: Those of the scene's constraints in the cost; None without.
     """
 
     def __init__(
@@ -61,6 +66,9 @@ class Episodes:
         self._weights += 0.5 * (np.arange(decisions + 1) == 0) - 0.5 * (np.arange(decisions + 1) == decisions)
         self._held = steps / dt - self._weights[:-1]  # of the input's cost, which is not of a point in time
         self.parameters = np.zeros((decisions + 1, count, kernels.n_p), dtype)
+        self.penalties: Penalties | None = None
+        if penalized_rows(scene):
+            self.penalties = Penalties(kernels, decisions, count, self._weights[-1])
         self._states = np.zeros((decisions + 1, count, kernels.n_x), dtype)
         self._measured = np.zeros_like(self._states) if noisy else self._states
         self._observations = np.zeros((decisions, count, n_obs), dtype)
@@ -101,9 +109,13 @@ class Episodes:
             "step_with_cost_vjp": back,
             "observation_vjp": by_observation,
         }
-        return {
-            name: KernelCall(self._kernels.kernel(name), given | others) for name, others in arrays.items()
-        }
+        return {name: self._call(name, k, given | others) for name, others in arrays.items()}
+
+    def _call(self, name: str, k: int, arrays: dict[str, Array]) -> KernelCall:
+        """A kernel on arrays; slopes of costs have those of the penalties."""
+        if self.penalties is not None and name in ("step_with_cost_vjp", "emphasized_terminal_cost_vjp"):
+            name, arrays = PENALIZED + name, {**arrays, "parameters": self.penalties.parameters[k]}
+        return KernelCall(self._kernels.kernel(name), arrays)
 
     def _bind_end(self) -> dict[str, KernelCall]:
         """The calls at the end, where the inputs are zero."""
@@ -120,9 +132,7 @@ class Episodes:
             },
             "emphasized_terminal_cost_vjp": {"v": one, "x_cotangent": self._cotangents[-1]},
         }
-        return {
-            name: KernelCall(self._kernels.kernel(name), given | others) for name, others in arrays.items()
-        }
+        return {name: self._call(name, -1, given | others) for name, others in arrays.items()}
 
     def meet(self, met: Met) -> None:
         """Let delays, jumps and noise disturb the next flights."""
@@ -135,6 +145,8 @@ class Episodes:
         Returns the costs, (B,), with the terminal pose's multiplied by the emphasis.
         """
         self._states[0], self._emphasis[:] = starts, emphasis
+        if self.penalties is not None:
+            self.penalties.prepare(self.parameters, emphasis)
         rows, layout = len(starts), self._kernels.layout
         units, high = self.units * layout.control_limit, layout.limits_with(self.parameters[0])
         self._low, self._high = layout.lower_limits(high), high
@@ -198,8 +210,15 @@ class Episodes:
             self._calls[k]["observation_vjp"](rows)
             self._cotangents[k] += self._by_state
             self._cotangents[k][lost] = 0.0
-            _shorten(self._cotangents[k], self._usual)
+            steep = STEEP if self.penalties is None else STEEP_PENALTIES
+            _shorten(self._cotangents[k], steep, self._usual)
         return self._layers.gradient(), costs
+
+    def price_violations(self, cost: float) -> None:
+        """Let penalties follow what the episodes flown last violate, and the cost of recent ones."""
+        if self.penalties is not None:
+            self.penalties.cost = cost
+            self.penalties.follow(self._states, self._inputs, self.parameters)
 
     def misses(self) -> Array:
         """Largest error of the tip at the end of each episode flown last, relative to its tolerance, (B,)."""
@@ -216,14 +235,14 @@ class Episodes:
         return np.asarray(np.sqrt(squares))
 
 
-def _shorten(slopes: Array, share: float) -> None:
-    """Shorten rows much longer than a share of them, as chaotic motions have; drop those not finite."""
+def _shorten(slopes: Array, steep: float, share: float) -> None:
+    """Shorten rows many times longer than a share of them, as chaotic motions have; drop those not finite."""
     sizes = np.abs(slopes).max(axis=1)
     finite = np.isfinite(sizes)
     ordered, count = np.sort(sizes), int(np.count_nonzero(finite))  # finite ones first
     # A quantile; `numpy.quantile` takes several times as long for a few numbers.
     place = share * (count - 1)
-    most = STEEP * 0.5 * (ordered[math.floor(place)] + ordered[math.ceil(place)]) if count else 0.0
+    most = steep * 0.5 * (ordered[math.floor(place)] + ordered[math.ceil(place)]) if count else 0.0
     long = finite & (sizes > most)
     if long.any():
         slopes[long] *= (most / sizes[long])[:, None]

@@ -245,6 +245,7 @@ class _Learner:
         reaches = np.mean(episodes.misses()[:judged] <= 1.0)
         if self._updates > TRAVELLED * settings.updates and reaches < ENOUGH:
             self._end_weight = min(STRICTER * self._end_weight, STRICTEST * settings.end_weight)
+        episodes.price_violations(self._typical)
         factors = UNITS_PER_SIZE * episodes.sizes() / episodes.units
         factors = np.clip(factors, 1.0 / FASTEST_UNITS, self._growth)
         episodes.units *= factors
@@ -275,6 +276,8 @@ class _Learner:
         """Copies of weights and optimizer by name."""
         weights = {f"weight{index}": each for index, each in enumerate(self._weights)}
         everything = {**weights, **self._optimizer.arrays(), "units": self._episodes.units}
+        if (penalties := self._episodes.penalties) is not None:
+            everything["prices"] = penalties.prices
         return {name: np.array(each) for name, each in everything.items()}
 
     def _restore(self, arrays: Mapping[str, Array]) -> None:
@@ -282,6 +285,8 @@ class _Learner:
             weight[:] = arrays[f"weight{index}"]
         self._optimizer.restore(arrays)
         self._episodes.units[:] = arrays["units"]
+        if (penalties := self._episodes.penalties) is not None:
+            penalties.prices[:] = arrays["prices"]
 
     def _write(self, path: Path) -> None:
         stream = io.BytesIO()
@@ -303,6 +308,8 @@ class _Learner:
             self._updates = int(place.name)
             for name in _NUMBERS:
                 setattr(self, name, float(arrays[name]))
+            if (penalties := self._episodes.penalties) is not None and math.isfinite(self._typical):
+                penalties.cost = self._typical
         except (KeyError, ValueError, OSError, UnreadableError) as error:
             raise RunFolderError(
                 f"{place} cannot be read ({error}); remove it to restart the training"

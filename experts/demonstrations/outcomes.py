@@ -27,7 +27,7 @@ REASONS = (*(reason.value for reason in StopReason), MISSED_TARGET, REPLAY_DIFFE
 """Why a solve ended, or what else is wrong: the final errors exceed the tolerances, or the replay in the
 environment costs something else than planned."""
 NEIGHBOR = "neighbor"
-GUESSES = ("policy", "screw motion", "zero controls", NEIGHBOR)
+GUESSES = ("policy", "screw motion", "zero controls", NEIGHBOR, "other side")
 """Initial guesses of a solve, see `experts.guesses.guided`; a neighbor is another problem of the shard."""
 LEAST_GAIN = 1e-6
 """Share by which a second solution must be cheaper to replace the first."""

@@ -9,9 +9,10 @@ import pytest
 
 from agents import evaluate
 from agents.evaluation import CONDITIONS, EVALUATION_SEEDS, evaluation_seeds, fly, optimal_costs, scene_under
-from agents.evaluation.comparison_tables import remarks
+from agents.evaluation.comparison_tables import evaluation_table, remarks
 from agents.evaluation.conditions import FlightDisturbance, physics_hash
 from agents.evaluation.evaluating import Evaluation, fly_under
+from agents.evaluation.statistics import wilson_interval
 from agents.policies import ExportedPolicy
 from agents.zoo.finding import PolicyError, as_policy
 from dq_space_arm_env import compile_scene, load_scene
@@ -160,6 +161,31 @@ def test_an_evaluation_reports_what_the_protocol_asks_for(cache, quick):
     without = evaluate(idle(quick), quick, 10, expert=False).summary()
     assert without["median_cost_gap"] is None
     assert without["success_rate"] == summary["success_rate"]
+
+
+def test_violations_have_intervals_and_columns():
+    limits = {"kind": "joint_limits", "name": "elbow", "lower": [-4, 0.85, -4], "tolerance": 0.01}  # rad
+    scene = SHORT.replace(constraints=[limits])
+    evaluation = evaluate(gentle, scene, 40, expert=False)
+    summary, shares = evaluation.summary(), []
+    for seed in evaluation_seeds(scene, 40):
+        env = gymnasium.make("DQSpaceArm-v0", scene=scene)
+        seen = env.reset(seed=seed)[0]
+        costs = []
+        for _ in range(12):
+            seen, *_, info = env.step(gentle(seen[None])[0])
+            costs.append(info["cost"])
+        shares.append(np.mean(np.array(costs) > 1.0))
+    assert 0.2 < np.mean(np.array(shares) > 0.0) < 0.8
+    assert summary["violating_episodes"] == list(wilson_interval(np.count_nonzero(shares), 40))
+    mean, low, high = summary["constraint_violations"]
+    assert mean == pytest.approx(np.mean(shares))
+    half = 1.96 * np.std(shares) / math.sqrt(40)  # of the normal approximation
+    assert (mean - low, high - mean) == pytest.approx((half, half), rel=0.15)
+    assert "violating" in str(evaluation_table([evaluation]).headings)
+    plain = evaluate(gentle, SHORT, 2, expert=False)
+    assert plain.summary()["violating_episodes"] is plain.summary()["constraint_violations"] is None
+    assert "violat" not in str(evaluation_table([plain]).headings)
 
 
 def test_conditions_change_what_they_say():

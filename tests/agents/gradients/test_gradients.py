@@ -17,9 +17,10 @@ from agents.gradients.gradient_training import train_by_gradients
 from agents.gradients.layers import Layers, random_weights
 from agents.policies import ExportedPolicy
 from agents.run_folder import RunFolder, RunFolderError, validation_seeds
-from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, load_scene
+from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.environment.disturbances import Disturbance
 from dq_space_arm_env.environment.rollouts import rollout
+from dq_space_arm_env.scene.constraint_rows import path_rows
 
 pytestmark = pytest.mark.agents
 
@@ -92,6 +93,75 @@ def test_gradients_agree_with_differences(small_scene, monkeypatch, disturbed):
         weight[:] = kept
         expected = (ends[0] - ends[1]) / 2.0
         assert expected == pytest.approx(float((slope * direction).sum()), rel=1e-6)
+
+
+@pytest.fixture(scope="session")
+def limited(small_scene):
+    """The small scene with limits of its joints and of its momentum."""
+    limits = {
+        "kind": "joint_limits",
+        "name": "joints",
+        "lower": -0.9,
+        "upper": 0.9,
+        "rate": 0.3,
+    }  # rad, rad/s
+    momentum = {"kind": "momentum", "name": "whole", "linear": 2.0, "margin": 0.1, "tolerance": 0.1}  # N s
+    return small_scene.replace(name="limited", constraints=[limits, momentum])
+
+
+def penalty(t, slope_at_zero):
+    """That of Ben-Tal & Zibulevsky with a penalty of 1."""
+    inside = -0.25 * np.log(-2.0 * np.minimum(t, -0.5)) - 0.375
+    return slope_at_zero * np.where(t < -0.5, inside, t + 0.5 * t * t)
+
+
+def test_slopes_have_those_of_penalties(limited, monkeypatch):
+    monkeypatch.setattr(episodes, "STEEP_PENALTIES", math.inf)
+    flown = Flown(limited)
+    flown.in_double_precision()
+    kernels, rows, penalties = flown.episodes._kernels, path_rows(limited), flown.episodes.penalties
+    tolerances, margins = (np.array([getattr(row, key) for row in rows]) for key in ("tolerance", "margin"))
+    penalties.prices[:] = np.random.default_rng(2).uniform(0.5, 2.0, len(rows))
+    penalties.cost = 100.0
+    at_tolerance = penalties.prices * penalties.cost / limited.simulation.steps
+
+    def costs():
+        """Costs, and penalties from the residuals."""
+        scene_costs = flown.costs(emphasis=10.0)
+        states, inputs = flown.episodes._states, flown.episodes._inputs
+        found = [kernels.constraints(x, u) for x, u in zip(states, inputs, strict=True)]
+        each = penalty(5.0 * (np.array(found) + margins) / tolerances, at_tolerance / 5.0)
+        return scene_costs + flown.episodes._weights @ each.sum(axis=-1), np.array(found)
+
+    gradient, plain = flown.gradient(emphasis=10.0)
+    np.testing.assert_array_equal(plain, flown.costs(emphasis=10.0))  # without penalties
+    violated = (costs()[1] > 0.0).any(axis=(0, 1))
+    assert violated.any()
+    assert not violated.all()
+    rng = np.random.default_rng(1)
+    for weight, slope in zip(flown.weights, gradient, strict=True):
+        direction = rng.normal(size=weight.shape)
+        direction *= 1e-6 / np.linalg.norm(direction)
+        kept, ends = weight.copy(), []
+        for sign in (1, -1):
+            weight[:] = kept + sign * direction
+            ends.append(costs()[0].mean())
+        weight[:] = kept
+        assert (ends[0] - ends[1]) / 2.0 == pytest.approx(float((slope * direction).sum()), rel=1e-5)
+
+
+def test_prices_rise_where_an_episode_violates(limited):
+    flown = Flown(limited)
+    flown.costs()
+    penalties, states, inputs = flown.episodes.penalties, flown.episodes._states, flown.episodes._inputs
+    tolerances = np.array([row.tolerance for row in path_rows(limited)])
+    at_ends = zip(states[1:], inputs[:-1], strict=True)
+    found = np.array([compile_scene(limited).constraints(*each) for each in at_ends])
+    shares = (found > 0.5 * tolerances).any(axis=0).mean(axis=0)
+    assert len(set(shares)) > 3
+    flown.episodes.price_violations(1500.0)
+    np.testing.assert_allclose(penalties.prices, 0.01 * np.exp(0.5 * (np.minimum(shares, 0.1) - 0.005)))
+    assert penalties.cost == 1500.0
 
 
 def test_an_episode_that_diverges_does_not_count(small_scene):
@@ -208,25 +278,50 @@ def test_training_lowers_the_cost_and_resumes_to_the_bit(small_file, small_scene
     assert curve[-1] < 0.2 * idle
     assert trained.policy.metadata["training"]["updates"] == 120
 
+    resumed = resume_after(77, settings(small_file), tmp_path / "halves", monkeypatch)
+    for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert len(trained_curve(tmp_path / "halves")) == 2
+
+
+def resume_after(updates, configuration, folder, monkeypatch):
+    """Train with an interruption."""
+
     class StopError(Exception):
         """As if the process were killed."""
 
     update, done = gradient_training._Learner._update, []
 
     def stopped(learner):
-        if len(done) == 77:
+        if len(done) == updates:
             raise StopError
         done.append(learner)
         return update(learner)
 
     monkeypatch.setattr(gradient_training._Learner, "_update", stopped)
     with pytest.raises(StopError):
-        train_by_gradients(settings(small_file), tmp_path / "halves")
+        train_by_gradients(configuration, folder)
     monkeypatch.undo()
-    resumed = train_by_gradients(settings(small_file), tmp_path / "halves")
+    return train_by_gradients(configuration, folder)
+
+
+def test_constraints_are_learned_and_prices_resumed(limited, small_file, tmp_path, monkeypatch):
+    limited.to_yaml(tmp_path / "limited.yaml")
+    constrained = settings(tmp_path / "limited.yaml")
+    trained = train_by_gradients(constrained, tmp_path / "whole")
+    resumed = resume_after(77, constrained, tmp_path / "halves", monkeypatch)
     for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert len(trained_curve(tmp_path / "halves")) == 2
+    prices = []
+    for folder in ("whole", "halves"):
+        last = max((tmp_path / folder / "checkpoints").glob("*/checkpoint.npz"))
+        with np.load(last) as arrays:
+            prices.append(arrays["prices"])
+    np.testing.assert_array_equal(*prices)
+    unaware = train_by_gradients(settings(small_file), tmp_path / "unaware").policy
+    policies = trained.policy, unaware
+    violated = [rollout(each, limited, SEEDS).constraint_violations.mean() for each in policies]
+    assert violated[0] < 0.5 * violated[1], violated  # some starts violate
 
 
 def test_units_follow_the_inputs_and_leave_the_policy(small_file, small_scene):

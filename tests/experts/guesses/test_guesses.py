@@ -19,6 +19,7 @@ from dq_space_arm_env.scene.start import (
     start_from_draws,
 )
 from experts import BoxDDP, GuidedDDP, StopReason
+from experts.demonstrations.outcomes import GUESSES
 from experts.guesses.guided import START_REGULARIZATIONS
 from experts.guesses.initial_guesses import STRAYED, ZERO_REGULARIZATION
 from experts.guesses.other_side import other_side
@@ -556,6 +557,7 @@ def test_a_cheaper_way_is_found_on_the_other_side_of_an_obstacle():
             costs[side].append(attempt["cost"])
     assert solution.converged
     assert solution.metadata["guess"] == "other side"
+    assert "other side" in GUESSES  # demonstrations know it
     assert min(costs["other side"]) < 0.998 * min(costs["same side"])
 
 

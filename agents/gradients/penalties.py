@@ -1,0 +1,80 @@
+"""Penalties of a scene's constraints in the cost of episodes, with one multiplier per row for all of them.
+
+The slopes of an episode's cost are then those of the augmented Lagrangian of `task.augmented_lagrangian`. A
+policy has to keep to a row from all starts: dual ascent lets the price of a violation rise while too many
+episodes have one, however large, and else fall slowly. Since the penalty is a barrier inside, a higher price
+keeps flights at a larger distance. Rates of controls, and what is exact at the end, have no penalty.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dq_space_arm_env import Kernels
+from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, penalized_rows
+
+Array = NDArray[Any]
+
+FIRST = 0.01  # price at first
+STIFFNESS = 5.0  # penalty of a row, relative to one over its tolerance
+CHARGED = 0.5  # violation that counts, relative to the tolerance: flights between decisions keep within it
+ALLOWED = 0.005  # share of the episodes that may violate a row
+MOST = 0.1  # share beyond which a price rises no faster
+RATE = 0.5  # of change of a price's logarithm in an update, for all episodes
+
+
+class Penalties:
+    """Penalties of B episodes of K decisions.
+
+    Attributes:
+        parameters: Those of the penalized programs, shape (K + 1, B, n_p + 2 m).
+        prices: Of the rows along the path, shape (m,): what a violation by the tolerance costs at first order
+            if it lasts all the episode, relative to a cost.
+        cost: That cost; multipliers are proportional to it.
+    """
+
+    def __init__(self, kernels: Kernels, decisions: int, count: int, last_weight: float) -> None:
+        """Prepare for so many decisions and episodes; the end counts in the cost with a weight."""
+        scene, rows = kernels.scene, penalized_rows(kernels.scene)
+        self._kernels, self._last_weight = kernels, last_weight
+        self._tolerances = np.array([row.tolerance for row in rows])
+        self._at_end = np.array([not row.has_input for row in rows])
+        self._is_penalized = np.array([not row.is_rate for row in path_rows(scene)])
+        self.prices, self.cost = np.full(len(rows), FIRST), 0.0
+        m = n_multipliers(scene)
+        self.parameters = np.zeros((decisions + 1, count, kernels.n_p + 2 * m), kernels.dtype)
+        self._multipliers, self._penalties = np.split(self.parameters[..., kernels.n_p :], 2, axis=-1)
+
+    def prepare(self, parameters: Array, emphasis: float) -> None:
+        """Take the scene's parameters of each decision and the end, (K + 1, B, n_p), and the end's emphasis.
+
+        The emphasis multiplies all of the terminal cost but the base's velocity: here, not the penalties.
+        """
+        self.parameters[..., : self._kernels.n_p] = parameters
+        m, at_end, penalties = len(self.prices), self._at_end, STIFFNESS / self._tolerances
+        multipliers = self.prices / self._tolerances * (self.cost / self._kernels.scene.simulation.steps)
+        self._multipliers[:-1, :, :m], self._penalties[:-1, :, :m] = multipliers, penalties
+        # Those of success, which come after the path's, stay zero.
+        n_end = int(at_end.sum())
+        self._multipliers[-1, :, :n_end] = multipliers[at_end] * (self._last_weight / emphasis)
+        self._penalties[-1, :, :n_end] = penalties[at_end]
+
+    def follow(self, states: Array, inputs: Array, parameters: Array) -> None:
+        """Let the prices follow what episodes violate after each decision's step.
+
+        Args:
+            states: Shape (K + 1, B, n_x).
+            inputs: Shape (K + 1, B, n_u).
+            parameters: Shape (K + 1, B, n_p).
+        """
+        kernels, rows = self._kernels, len(inputs[:-1]) * inputs.shape[1]
+        after, held, given = (
+            np.reshape(each, (rows, each.shape[-1])) for each in (states[1:], inputs[:-1], parameters[1:])
+        )
+        residuals = kernels.constraints(after, held, given if kernels.n_p else None)
+        violated = residuals[:, self._is_penalized] > CHARGED * self._tolerances
+        shares = violated.reshape(len(inputs) - 1, -1, len(self.prices)).any(axis=0).mean(axis=0)
+        self.prices *= np.exp(RATE * (np.minimum(shares, MOST) - ALLOWED))
