@@ -1,4 +1,4 @@
-"""Subjects that are timed: forward dynamics, steps and environments, and their times per state.
+"""Subjects that are timed: forward dynamics, steps, their gradients, environments; their times per state.
 
 Environments get random actions, each followed by its opposite, which keeps the robot from spinning up. A
 vector environment staggers the episodes of its copies evenly: resets are part of the time, and a sample
@@ -28,6 +28,7 @@ from scripts.benchmarks.harness import Row, select
 
 OURS = "dq-space-arm"
 DYNAMICS, STEP, ENVIRONMENT = "forward dynamics", "step", "environment step"
+GRADIENT, JACOBIANS = "gradient of a step", "Jacobians of a step"
 GOALS = "goal environment step"
 FLOAT64, FLOAT32 = "float64", "float32"
 COMPARED_INTEGRATORS = ("symplectic_euler", "rk4")  # integrators that other engines and solvers have as well
@@ -37,7 +38,7 @@ COMPARED_INTEGRATORS = ("symplectic_euler", "rk4")  # integrators that other eng
 class Subject:
     """A subject of timing."""
 
-    what: str  # DYNAMICS, STEP, ENVIRONMENT or GOALS
+    what: str  # DYNAMICS, STEP, GRADIENT, JACOBIANS, ENVIRONMENT or GOALS
     engine: str
     way: str  # of calling it
     integrator: str = ""
@@ -100,7 +101,13 @@ VARIANTS = (PLAIN, Variant(FLOAT32), Variant(threads=2), Variant(FLOAT32, 2))
 
 
 SCALAR, VECTOR = "scalar kernel", "vector kernel"
-PROGRAMS = {DYNAMICS: "forward_dynamics", STEP: "step", ENVIRONMENT: "environment_step"}
+PROGRAMS = {
+    DYNAMICS: "forward_dynamics",
+    STEP: "step",
+    GRADIENT: "vjp",
+    JACOBIANS: "linearize",
+    ENVIRONMENT: "environment_step",
+}
 
 
 def finite_limits(kernels: Kernels) -> FloatArray:
@@ -110,7 +117,10 @@ def finite_limits(kernels: Kernels) -> FloatArray:
 
 
 def kernel_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
-    """All timed kernels of a scene for each batch size: scalar code, and vector code in each variant."""
+    """All timed kernels of a scene for each batch size: scalar code, and vector code in each variant.
+
+    Gradients, by reverse mode and by Jacobians, are timed in double precision on one thread alone.
+    """
     chosen = scene.simulation.integrator
     programs = [(DYNAMICS, ""), *((STEP, name) for name in COMPARED_INTEGRATORS), (ENVIRONMENT, chosen)]
     cases = []
@@ -118,7 +128,8 @@ def kernel_cases(scene: Scene, batch_sizes: Sequence[int]) -> list[Case]:
         for variant, way in ((PLAIN, SCALAR), *((variant, VECTOR) for variant in VARIANTS)):
             for batch in batch_sizes:
                 cases.append(kernel_case(scene, what, integrator, batch, variant, way))
-    return cases
+    gradients = [(what, batch) for what in (GRADIENT, JACOBIANS) for batch in batch_sizes]
+    return cases + [kernel_case(scene, what, chosen, batch) for what, batch in gradients]
 
 
 def kernel_case(
@@ -130,6 +141,7 @@ def kernel_case(
     kernel = kernels.kernel(PROGRAMS[what], integrator=integrator or None, lanes=lanes)
     x, u = moving_states(kernels, batch)
     inputs = {"x": x, "u": u, "action": u / finite_limits(kernels), "h": np.array([scene.simulation.dt])}
+    inputs["v"] = np.ones((batch, kernels.n_t))
     inputs["parameters"] = np.tile(kernels.parameters.nominal, (batch, 1))
     if what == ENVIRONMENT:
         inputs |= _episodes(kernels, batch)

@@ -20,6 +20,8 @@ from scripts.benchmarks.subjects import (
     ENVIRONMENT,
     FLOAT64,
     GOALS,
+    GRADIENT,
+    JACOBIANS,
     MAKE,
     MAKE_VEC,
     OURS,
@@ -158,6 +160,7 @@ def _pairs(timings: Sequence[Row]) -> Iterator[tuple[str, Row | None, Row | None
         yield "dynamics, one state", single, fastest(theirs, batch=1)
         batches = [timing for timing in theirs if timing["batch"] > 1]
         yield "dynamics, batch", fastest(ours, what=DYNAMICS, way=VECTOR), fastest(batches)
+    yield "gradient, and Jacobians", fastest(ours, what=GRADIENT), fastest(ours, what=JACOBIANS)
     goals = select(ours, what=GOALS)
     for batch in (SYNCHRONOUS_COPIES, TRAINING_COPIES):
         many = fastest(goals, way=MAKE_VEC, batch=batch)
