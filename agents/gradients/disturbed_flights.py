@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -72,8 +73,11 @@ class Arrival(NamedTuple):
         by_output[self.before, self.rows] -= ahead * cotangent
 
 
-def arrivals(times: Array, delays: Array | None = None) -> list[Arrival]:
-    """What acts halfway through each decision, by the times of decisions (K + 1,) and delays (B,), s."""
+def arrivals(times: Array, firsts: Sequence[int], delays: Array | None = None) -> list[Arrival]:
+    """What acts halfway through each decision, by the times of decisions (K + 1,) and delays (B,), s.
+
+    Without delays, the first decisions of phases extrapolate nothing.
+    """
     middles, found = 0.5 * (times[:-1] + times[1:]), []
     for k, middle in enumerate(middles):
         if delays is None:
@@ -81,12 +85,12 @@ def arrivals(times: Array, delays: Array | None = None) -> list[Arrival]:
         else:
             wanted = middle - delays
             newest = np.minimum(np.searchsorted(times, wanted), k)
-        before = np.maximum(newest - 1, 0)
+        before = np.maximum(newest - (delays is not None or k not in firsts), 0)
         between = times[newest] - times[before]
         ahead = np.where(between > 0.0, wanted - times[newest], 0.0) / np.where(between > 0.0, between, 1.0)
         ahead = ahead.astype(np.float32)
         if delays is None:
-            found.append(Arrival(k, max(k - 1, 0), np.float32(ahead), 1.0, slice(None)))
+            found.append(Arrival(k, int(before), np.float32(ahead), 1.0, slice(None)))
         else:
             arrived = (wanted >= 0.0).astype(np.float64)[:, None]
             found.append(Arrival(newest, before, ahead[:, None], arrived, np.arange(len(delays))))

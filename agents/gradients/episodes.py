@@ -4,12 +4,14 @@ An episode is divided into K decisions, at t_0 = 0, ..., t_K = T, instead of its
 more. Between two times the input is constant: what the network would give at their middle, extrapolated from
 its last two outputs, or, where actions act late, interpolated between earlier ones. The cost is summed by the
 trapezoidal rule. Both err with the square of the steps, so that a policy flies at every time step as it was
-trained.
+trained. Where the integration of a decision errs, it is divided into substeps; where phases change
+parameters, a decision ends.
 """
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -35,16 +37,35 @@ USUAL_DISTURBED = 0.9  # where a push just before the end is as usual as none, a
 
 
 def decision_times(scene: Scene, decisions: int, crowding: float) -> Array:
-    """Times of decisions and end, s, (K + 1,); closer at both ends by a share of a cosine's spacing."""
-    even = np.linspace(0.0, 1.0, decisions + 1)
-    ends = 0.5 * (1.0 - np.cos(np.pi * even))
-    return scene.simulation.steps * scene.simulation.dt * (even + crowding * (ends - even))
+    """Times of decisions and end, s, (K + 1,); closer at both ends by a share of a cosine's spacing.
+
+    Every phase has its share of them; before another one its last decision is a single time step, as the sum
+    of costs has it.
+    """
+    dt, steps = scene.simulation.dt, scene.simulation.steps
+    starts = scene.staged.starts if scene.phases else (0,)
+    times = [np.zeros(1)]
+    for start, end in pairwise((*starts, steps)):
+        begun, due = sum(map(len, times)) - 1, max(1, round(decisions * end / steps))
+        count, single = max(1, due - begun), end < steps
+        even = np.linspace(0.0, 1.0, count - single + 1)
+        ends = 0.5 * (1.0 - np.cos(np.pi * even))
+        spread = (end - single - start) * dt * (even + crowding * (ends - even))
+        times += [start * dt + spread[1:], *([np.array([end * dt])] if single else [])]
+    return np.concatenate(times)
+
+
+def first_decisions(scene: Scene, times: Array) -> list[int]:
+    """Index of the first decision of each phase, of all at given times; [0] without phases."""
+    starts = scene.staged.starts if scene.phases else (0,)
+    return [int(each) for each in np.searchsorted(times, (np.array(starts) - 0.5) * scene.simulation.dt)]
 
 
 class Episodes:
     """B episodes of K decisions: their arrays, and kernels bound to these.
 
     Attributes:
+        substeps: Equal integration steps of each decision, shape (K,); see `divide`.
         parameters: Parameters of each decision and of the end, shape (K + 1, B, n_p).
         units: Inputs of an output of 1, fractions of the limits, shape (n_u,).
         penalties: Those of the scene's constraints in the cost; None without.
@@ -56,14 +77,20 @@ class Episodes:
         """Prepare episodes whose network gives its outputs in some units, alike or not for all inputs."""
         self._kernels = kernels = compile_scene(scene)
         self._layers, (decisions, count, n_obs) = layers, layers.values[0].shape
+        self.substeps, self._times = np.ones(decisions, int), times
         dtype, layout = kernels.dtype, kernels.layout
         self.units, self._efforts = np.full(kernels.n_u, units, np.float64), layout.control_weight
+        self._relative = self.units / self.units.max()  # of the inputs of one actuator
         actuators = (getattr(layout.control, name) for name in CONTROL_UNITS)
         self._actuators = [entries for entries in actuators if entries.start < entries.stop]
         steps, dt = np.diff(times), scene.simulation.dt
-        self._weights = 0.5 * (np.append(0.0, steps) + np.append(steps, 0.0)) / dt
-        # The sum over time steps has the first one's state whole, and the last one's not at all.
-        self._weights += 0.5 * (np.arange(decisions + 1) == 0) - 0.5 * (np.arange(decisions + 1) == decisions)
+        self._weights, firsts = np.zeros(decisions + 1), first_decisions(scene, times)
+        for first, end in pairwise((*firsts, decisions + 1)):
+            inside, last = steps[first : end - 1], end > decisions
+            self._weights[first:end] = 0.5 * (np.append(0.0, inside) + np.append(inside, 0.0)) / dt
+            # The sum over time steps has a phase's first and last state whole, but not that at the very end.
+            self._weights[first] += 0.5
+            self._weights[end - 1] += -0.5 if last else 0.5
         self._held = steps / dt - self._weights[:-1]  # of the input's cost, which is not of a point in time
         self.parameters = np.zeros((decisions + 1, count, kernels.n_p), dtype)
         self.penalties: Penalties | None = None
@@ -77,31 +104,68 @@ class Episodes:
         self._costs = np.zeros((decisions + 1, count, 1), dtype)
         self._terminal, self._emphasis = np.zeros((2, count, 1), dtype)
         self._cotangents = np.zeros((decisions + 1, count, kernels.n_t), dtype)
-        self._by_input = np.zeros((count, kernels.n_u), dtype)
+        self._by_input, self._by_held = np.zeros((2, count, kernels.n_u), dtype)
         self._by_output = np.zeros((decisions, count, kernels.n_u))
         self._by_observation = np.zeros((count, n_obs), dtype)
         self._by_state = np.zeros((count, kernels.n_t), dtype)
         self._cost_weights = np.repeat(self._weights[:, None, None], count, axis=1).astype(dtype)
-        self._calls = [self._bind(index, times) for index in range(decisions)]
+        self._calls: list[dict[str, KernelCall]] = []
+        self._further: list[list[tuple[KernelCall, KernelCall]]] = []
+        self.divide(self.substeps)
         self._end = self._bind_end()
-        self._times, self._met, self._usual = times, Met(), USUAL
-        self._arrivals: list[Arrival] = arrivals(times)
+        self._met, self._usual, self._firsts = Met(), USUAL, firsts
+        self._arrivals: list[Arrival] = arrivals(times, firsts)
 
-    def _bind(self, k: int, times: Array) -> dict[str, KernelCall]:
-        """The calls of a decision."""
+    def divide(self, substeps: Array) -> None:
+        """Divide decisions into equal integration steps, (K,), that hold the input."""
+        self.substeps = substeps
+        chains = [self._chain(k) for k in range(len(substeps))]
+        self._calls = [self._bind(k, states, slopes) for k, (states, slopes) in enumerate(chains)]
+        self._further = [self._bind_further(k, states, slopes) for k, (states, slopes) in enumerate(chains)]
+
+    def _chain(self, k: int) -> tuple[list[Array], list[Array]]:
+        """States of a decision's substeps, first and last included, and their cotangents."""
+        between = self.substeps[k] - 1
         count, dtype = self._states.shape[1], self._kernels.dtype
+        pairs = ((self._states, self._kernels.n_x), (self._cotangents, self._kernels.n_t))
+        states, slopes = (
+            [each[k], *np.zeros((between, count, size), dtype), each[k + 1]] for each, size in pairs
+        )
+        return states, slopes
+
+    def _substep(self, k: int) -> Array:
+        """Length of a decision's substeps, s, (1,)."""
+        length = (self._times[k + 1] - self._times[k]) / self.substeps[k]
+        return np.array([length], self._kernels.dtype)
+
+    def _bind_further(
+        self, k: int, states: list[Array], slopes: list[Array]
+    ) -> list[tuple[KernelCall, KernelCall]]:
+        """The calls of a decision's substeps after the first, forward and back."""
+        given = {"u": self._inputs[k], "h": self._substep(k), "parameters": self.parameters[k]}
+        found = []
+        for index in range(1, self.substeps[k]):
+            arrays = {**given, "x": states[index], "x_next": states[index + 1], "v": slopes[index + 1]}
+            arrays |= {"x_cotangent": slopes[index], "u_cotangent": self._by_held}
+            step, back = (KernelCall(self._kernels.kernel(name), arrays) for name in ("step", "vjp"))
+            found.append((step, back))
+        return found
+
+    def _bind(self, k: int, states: list[Array], slopes: list[Array]) -> dict[str, KernelCall]:
+        """The calls of a decision, those of further substeps left out."""
+        count, dtype, times = self._states.shape[1], self._kernels.dtype, self._times
         given = {
-            "x": self._states[k],
+            "x": states[0],
             "u": self._inputs[k],
-            "h": np.array([times[k + 1] - times[k]], dtype),
+            "h": self._substep(k),
             "parameters": self.parameters[k],
             "time_left": np.full((count, 1), times[-1] - times[k], dtype),
         }
-        after = {"x_next": self._states[k + 1], "cost": self._costs[k]}
+        after = {"x_next": states[1], "cost": self._costs[k]}
         seen = {"x": self._measured[k], "observation": self._observations[k]}
         seen |= {"errors": np.zeros((count, 2), dtype)}
-        back = {"v": self._cotangents[k + 1], "v_cost": self._cost_weights[k]}
-        back |= {"x_cotangent": self._cotangents[k], "u_cotangent": self._by_input}
+        back = {"v": slopes[1], "v_cost": self._cost_weights[k]}
+        back |= {"x_cotangent": slopes[0], "u_cotangent": self._by_input}
         by_observation = {"x": self._measured[k], "v": self._by_observation, "x_cotangent": self._by_state}
         arrays = {
             "observation": seen,
@@ -136,7 +200,7 @@ class Episodes:
 
     def meet(self, met: Met) -> None:
         """Let delays, jumps and noise disturb the next flights."""
-        self._met, self._arrivals = met, arrivals(self._times, met.delays)
+        self._met, self._arrivals = met, arrivals(self._times, self._firsts, met.delays)
         self._usual = USUAL_DISTURBED
 
     def fly(self, starts: Array, mean: Array, scale: Array, emphasis: float) -> Array:
@@ -148,8 +212,11 @@ class Episodes:
         if self.penalties is not None:
             self.penalties.prepare(self.parameters, emphasis)
         rows, layout = len(starts), self._kernels.layout
-        units, high = self.units * layout.control_limit, layout.limits_with(self.parameters[0])
-        self._low, self._high = layout.lower_limits(high), high
+        # Phases change limits.
+        high = layout.limits_with(self.parameters if self._kernels.parameters.staged else self.parameters[:1])
+        every = len(self.parameters), *high.shape[1:]
+        self._low, self._high = (np.broadcast_to(each, every) for each in (layout.lower_limits(high), high))
+        units = np.broadcast_to(self.units * high, every)
         for k, calls in enumerate(self._calls):
             self._disturb(k)
             calls["observation"](rows)
@@ -157,9 +224,11 @@ class Episodes:
                 self._layers.values[0][k] = (self._observations[k] - mean) * scale
                 self._layers.forward(k)
             arrival = self._arrivals[k]
-            np.multiply(arrival.of(self._layers.values[-1]), units * arrival.arrived, out=self._wanted[k])
-            np.clip(self._wanted[k], self._low, self._high, out=self._inputs[k])
+            np.multiply(arrival.of(self._layers.values[-1]), units[k] * arrival.arrived, out=self._wanted[k])
+            np.clip(self._wanted[k], self._low[k], self._high[k], out=self._inputs[k])
             calls["step_with_cost"](rows)
+            for step, _ in self._further[k]:
+                step(rows)
         self._end["cost"](rows)
         self._end["emphasized_terminal_cost"](rows)
         efforts = np.square(self._inputs[:-1]) @ self._efforts
@@ -196,16 +265,20 @@ class Episodes:
         self._cotangents[-1] += self._by_state
         self._cotangents[-1][lost] = 0.0
         self._by_output[:] = 0.0
-        by_unit = self.units * self._kernels.layout.control_limit / kept
         for k in range(len(self._calls) - 1, -1, -1):
+            further = np.zeros_like(self._by_input)
+            for _, reverse in reversed(self._further[k]):
+                reverse(rows)
+                further += self._by_held
             self._calls[k]["step_with_cost_vjp"](rows)
-            slope = self._by_input + 2.0 * self._held[k] * self._efforts * self._inputs[k]
+            slope = self._by_input + further + 2.0 * self._held[k] * self._efforts * self._inputs[k]
             # Beyond a limit only what leads back counts.
             wanted = self._wanted[k]
-            slope[((wanted > self._high) & (slope < 0.0)) | ((wanted < self._low) & (slope > 0.0))] = 0.0
+            low, high = self._low[k], self._high[k]
+            slope[((wanted > high) & (slope < 0.0)) | ((wanted < low) & (slope > 0.0))] = 0.0
             slope[lost] = 0.0
             self._arrivals[k].back(slope, self._by_output)
-            back = self._layers.backward(k, self._by_output[k] * by_unit)
+            back = self._layers.backward(k, self._by_output[k] * (self.units * high / kept))
             np.multiply(back, scale * kept, out=self._by_observation)
             self._calls[k]["observation_vjp"](rows)
             self._cotangents[k] += self._by_state
@@ -220,6 +293,26 @@ class Episodes:
             self.penalties.cost = cost
             self.penalties.follow(self._states, self._inputs, self.parameters)
 
+    def errors(self) -> Array:
+        """How much each decision's integration changes the cost of the episodes of the last `gradient`, (K,).
+
+        Errors of the steps, by steps half as long, times the slope of the cost behind them; infinite where
+        no episode comes through.
+        """
+        kernels, found = self._kernels, np.full(len(self._calls), math.inf)
+        for k, count in enumerate(2 * self.substeps):
+            states, p = self._states[k], self.parameters[k] if kernels.n_p else None
+            for _ in range(count):
+                states = kernels.step(states, self._inputs[k], float(self._substep(k)[0]) / 2.0, p=p)
+            errors = kernels.difference(states, self._states[k + 1]) * self._cotangents[k + 1]
+            with np.errstate(invalid="ignore"):  # of episodes that diverge
+                sizes = np.abs(errors.sum(axis=1))
+            if self._met.jumps is not None and k + 1 < len(self._calls):
+                sizes[self._met.jumps[k + 1].any(axis=1)] = math.nan
+            if np.isfinite(sizes).any():
+                found[k] = sizes[np.isfinite(sizes)].mean()
+        return found
+
     def misses(self) -> Array:
         """Largest error of the tip at the end of each episode flown last, relative to its tolerance, (B,)."""
         with np.errstate(invalid="ignore"):  # of episodes that diverged
@@ -229,10 +322,10 @@ class Episodes:
         """Root mean squares of the inputs flown last, by actuator, fractions of the limits, (n_u,)."""
         squares = np.square(self._inputs[:-1]).mean(axis=0)
         squares = squares[np.isfinite(squares).all(axis=1)].mean(axis=0)
-        squares /= np.square(self._kernels.layout.control_limit)
+        squares /= np.square(self._relative * self._kernels.layout.control_limit)
         for entries in self._actuators:
             squares[entries] = squares[entries].mean()
-        return np.asarray(np.sqrt(squares))
+        return np.asarray(self._relative * np.sqrt(squares))
 
 
 def _shorten(slopes: Array, steep: float, share: float) -> None:

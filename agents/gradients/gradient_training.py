@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from agents.configuration.gradients import GradientConfiguration
-from agents.configuration.schema import RESERVED_SEED
 from agents.gradients.disturbed_flights import Met, calm
 from agents.gradients.episodes import Episodes, decision_times
-from agents.gradients.layers import Layers, random_weights
+from agents.gradients.layers import FIRST_OUTPUTS, Layers, random_weights
 from agents.gradients.soap import SOAP
+from agents.gradients.starts import Starts, motions
 from agents.policies import ExportedPolicy
 from agents.policies.exported import units_of
 from agents.run_folder import (
@@ -35,13 +35,13 @@ from agents.run_folder import (
     validation_seeds,
 )
 from agents.zoo.starting import load_start, spent_before
-from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, compile_scene, load_scene
+from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, load_scene
 from dq_space_arm_env.common.bounded_formats import read_arrays
 from dq_space_arm_env.common.bounded_reading import UnreadableError
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import Advance, Status
-from dq_space_arm_env.environment.disturbances import with_loads
-from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene import INTEGRATORS, StateLayout
+from dq_space_arm_env.task.step_report import STATE_LIMIT
 
 Array = NDArray[Any]
 
@@ -52,15 +52,20 @@ UNITS_PER_SIZE = 4.0  # units that they become, relative to the root mean square
 FASTEST_UNITS = 1.03  # largest factor by which units change in an update
 TRAVELLED = 0.3  # share of the updates after which the end weight may rise
 ENOUGH = 0.98  # share of successful episodes at which it does not
-STRICTER = 1.01  # its factor in an update
+STRICTER = 1.02  # its factor in an update
 STRICTEST = 1000.0  # largest end weight, relative to its first value
 TRIAL_ACTIONS = 0.005  # standard deviation of the actions that measure the spread of observations
+COARSE = 1e-4  # tolerance of methods that adapt their steps, rad and m; at least the scene's
+PART = 0.1  # least deviation of an observation, of that in motions over a radian or a meter
 SEEN = 128  # episodes of that
+FARTHEST = 5.0  # motion [rad, m] by the first outputs over an episode; units are smaller beyond
 WORSE = 2.0  # median cost relative to recent ones, above which the weights go back to what they were
 FORGETTING = 0.05  # share of the newest in the mean of recent costs
 BETWEEN_COPIES = 50  # updates between copies of the weights to go back to
 MOST_CAUTION = 1e-3  # factor of the learning rate at which the training gives up
 CAUTION = 0.7  # factor of the learning rate when they do
+BETWEEN_DIVISIONS = 20  # updates between measurements of the integration's errors
+TOLERATED = 1e-3  # share of the cost by which the integration may change it, over all decisions
 BETWEEN_MESSAGES = 20  # updates
 CHECKPOINT = "checkpoint.npz"
 _NUMBERS = ("_seconds", "_typical", "_caution", "_growth", "_end_weight")  # of a checkpoint
@@ -80,11 +85,6 @@ def train_by_gradients(
 ) -> Learned:
     """Train an agent in a run folder, resuming from its last checkpoint."""
     scene = load_scene(configuration.scene)
-    if scene.phases:
-        raise ValueError(
-            f"scene {scene.name!r} has phases, which analytic policy gradients do not cross: train on a "
-            "scene without, or by imitation"
-        )
     folder = RunFolder(Path(out), configuration)
     learner = _Learner(configuration, scene)
     learner.resume(folder)
@@ -96,31 +96,12 @@ def train_by_gradients(
     return Learned(folder.path, policy)
 
 
-class Starts(NamedTuple):
-    """States (n, n_x) that episodes begin at, and parameters of each decision and the end.
-
-    Those have the shape (K + 1, n, n_p), or (1, n, n_p) where nothing moves.
-    """
-
-    states: Array
-    parameters: Array
-
-    @classmethod
-    def draw(
-        cls, scene: Scene, count: int, times: Array, seed: int, mass_factors: Sequence[float]
-    ) -> tuple[Scene, Starts]:
-        """Draw starts with a seed, and their parameters at some times; first the scene that has them."""
-        environment = DQSpaceArmVectorEnv(count, scene)
-        environment.reset(seed=int(np.random.SeedSequence([RESERVED_SEED, seed]).generate_state(1)[0] >> 2))
-        kernels, given = environment.kernels, environment.parameters
-        if set(mass_factors) != {1.0}:
-            scene, given = with_loads(scene, np.resize(mass_factors, count), given)
-            kernels = compile_scene(scene)
-        if not kernels.parameters.moving:
-            return scene, cls(environment.states, given[None])
-        rows = np.rint(times / scene.simulation.dt).astype(int)
-        stages = [kernels.stage_parameters(row)[rows] for row in given]
-        return scene, cls(environment.states, np.stack(stages, axis=1))
+def coarser(scene: Scene) -> Scene:
+    """The scene, with larger tolerances where its integrator adapts its steps: reverse mode takes long."""
+    simulation = scene.simulation
+    coarse = INTEGRATORS[simulation.integrator].within(COARSE)
+    coarse = {key: max(each, simulation.tolerance_of(key)) for key, each in coarse.items()}
+    return scene.replace(simulation=coarse) if coarse else scene
 
 
 class _Learner:
@@ -134,13 +115,16 @@ class _Learner:
         factors = (1.0,) if mismatch is None else mismatch.mass_factors
         drawn = Starts.draw(scene, settings.starts, self._times, configuration.seed, factors)
         self._flown, self._starts = drawn
-        self._mean, self._scale = units_of(self._trial(DQSpaceArmVectorEnv(SEEN, scene), rng))
+        moved = motions(scene, FIRST_UNITS * FIRST_OUTPUTS)
+        units = FIRST_UNITS * FARTHEST / np.maximum(moved, FARTHEST)
+        self._mean, self._scale = self._normalization(DQSpaceArmVectorEnv(SEEN, scene), rng, units, moved)
         sizes = [len(self._mean), *configuration.network.hidden, StateLayout.of(scene).n_u]
         self._weights = random_weights(sizes, rng)
-        self._begin_with(load_start(configuration.start_from, configuration.network, sizes[0], sizes[-1]))
-        layers = Layers(self._weights, settings.decisions, settings.copies)
+        start = load_start(configuration.start_from, configuration.network, sizes[0], sizes[-1])
+        self._begin_with(start, units)
+        layers = Layers(self._weights, len(self._times) - 1, settings.copies)
         noisy = mismatch is not None and mismatch.noise > 0.0
-        self._episodes = Episodes(self._flown, layers, self._times, FIRST_UNITS, noisy=noisy)
+        self._episodes = Episodes(coarser(self._flown), layers, self._times, units, noisy=noisy)
         self._optimizer = SOAP(self._weights)
         self._updates, self._seconds = 0, 0.0
         self._typical, self._caution = math.inf, 1.0  # recent cost; factor of the learning rate
@@ -148,31 +132,55 @@ class _Learner:
         self._end_weight = settings.end_weight
         self._kept = self._state()
 
-    def _begin_with(self, policy: ExportedPolicy | None) -> None:
-        """Take the weights and units of a policy."""
+    def _begin_with(self, policy: ExportedPolicy | None, units: Array) -> None:
+        """Take the weights of a policy, and its units; outputs have some of their own."""
         self._before = spent_before(self._configuration.start_from)
         if policy is None:
             return
         self._mean, self._scale = policy.mean, policy.scale
-        factor = (1.0 if policy.action_scale is None else policy.action_scale) / FIRST_UNITS
+        factor = (1.0 if policy.action_scale is None else policy.action_scale) / units
         for index, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
             last = factor if index == len(policy.biases) - 1 else 1.0
             self._weights[2 * index : 2 * index + 2] = [
                 np.asarray(each * last, np.float32) for each in (weight, bias)
             ]
 
-    def _trial(self, environment: DQSpaceArmVectorEnv, rng: np.random.Generator) -> Array:
-        """Observations (N, n_obs) under small random inputs, those that stay finite."""
+    def _normalization(
+        self, environment: DQSpaceArmVectorEnv, rng: np.random.Generator, units: Array, moved: Array
+    ) -> tuple[Array, Array]:
+        """Mean and inverse deviation of observations, (n_obs,).
+
+        Those under small random inputs; but where a motion over a radian or a meter varies an entry much
+        more, as velocities that friction keeps small otherwise, a part of that.
+        """
         environment.reset(seed=int(rng.integers(2**31)))
-        kernels, states = environment.kernels, environment.states
-        p = environment.parameters if kernels.n_p else None
-        spread, seen = TRIAL_ACTIONS * kernels.layout.control_limit, []
-        for here, after in zip(self._times[:-1], self._times[1:], strict=True):
-            left = np.full((SEEN, 1), self._times[-1] - here)
+        shape, turn = (len(self._times) - 1, SEEN, len(units)), len(self._times) // 2
+        limit = environment.kernels.layout.control_limit
+        small = TRIAL_ACTIONS * (units / FIRST_UNITS) * limit * rng.normal(size=shape)
+        mean, scale = units_of(self._trial(environment, small))
+        # There and back, as far as the limits allow.
+        far = limit * np.minimum(FIRST_UNITS * FIRST_OUTPUTS / moved, 1.0)
+        shares = np.random.default_rng(self._configuration.seed).uniform(-1.0, 1.0, shape[1:])
+        far = np.repeat((far * shares)[None], shape[0], axis=0)
+        far[turn:] *= -1.0
+        most = units_of(self._trial(environment, far))[1]
+        return mean, np.where(most > 0.0, np.minimum(scale, most / PART), scale)
+
+    def _trial(self, environment: DQSpaceArmVectorEnv, inputs: Array) -> Array:
+        """Observations (N, n_obs) under inputs (K, B, n_u), those of flights that have not diverged."""
+        kernels, states, seen = environment.kernels, environment.states, []
+        given = environment.parameters if kernels.n_p else None
+        stages = None
+        if kernels.parameters.staged:
+            along = Starts.of(kernels, states, environment.parameters, self._times)
+            stages = along.at(np.arange(SEEN))
+        for k, step in enumerate(np.diff(self._times)):
+            left = np.full((SEEN, 1), self._times[-1] - self._times[k])
+            p = given if stages is None else stages[k]
             seen.append(kernels.observation(states, left, p)[0])
-            states = kernels.step(states, spread * rng.normal(size=(SEEN, len(spread))), after - here, p=p)
+            states = kernels.step(states, inputs[k], step, p=p)
         samples = np.concatenate(seen)
-        return np.asarray(samples[np.isfinite(samples).all(axis=1)])
+        return np.asarray(samples[(np.abs(samples) < STATE_LIMIT).all(axis=1)])  # false for NaN
 
     def learn(self, folder: RunFolder, report: Callable[[Advance], None]) -> None:
         """Update to the end; flights and checkpoints on the way."""
@@ -201,13 +209,18 @@ class _Learner:
         # Seeded by the update, so that checkpoints need no generator's state.
         rng = np.random.default_rng([self._configuration.seed, done])
         rows = rng.integers(len(self._starts.states), size=settings.copies)
-        self._episodes.parameters[:] = self._starts.parameters[:, rows]
+        self._episodes.parameters[:] = self._starts.at(rows)
         starts = self._starts.states[rows]
         if self._mismatch is not None:
             self._episodes.meet(Met.draw(self._mismatch, self._flown, self._times, len(rows), rng))
-        gradient, costs = self._episodes.gradient(starts, self._mean, self._scale, self._end_weight)
-        median = float(np.median(costs[np.isfinite(costs)])) if np.isfinite(costs).any() else math.inf
-        if math.isinf(median) or (done > WARM_UP and median > WORSE * self._typical):
+        gradient, median = self._fly(starts)
+        unstable = math.isinf(median) or (done > WARM_UP and median > WORSE * self._typical)
+        if (unstable or done % BETWEEN_DIVISIONS == 0) and self._divide(median):
+            if unstable:
+                self._restore(self._kept)
+            gradient, median = self._fly(starts)
+            unstable = math.isinf(median)
+        if unstable:
             # The motion has become unstable: take the weights from before, and smaller steps.
             self._restore(self._kept)
             self._caution *= CAUTION
@@ -222,6 +235,27 @@ class _Learner:
             )
         self._updates += 1
         return median
+
+    def _fly(self, starts: Array) -> tuple[list[Array], float]:
+        """The gradient of episodes, and their median cost; infinite where all diverge."""
+        gradient, costs = self._episodes.gradient(starts, self._mean, self._scale, self._end_weight)
+        finite = costs[np.isfinite(costs)]
+        return [*gradient], float(np.median(finite)) if len(finite) else math.inf
+
+    def _divide(self, median: float) -> bool:
+        """Divide decisions whose integration errs too much, down to time steps; whether there were any.
+
+        Otherwise the policy would learn to profit from errors that it does not meet in flight.
+        """
+        episodes, dt = self._episodes, self._scene.simulation.dt
+        errors, most = episodes.errors(), np.ceil(np.diff(self._times) / dt - 1e-9).astype(int)
+        tolerated = TOLERATED * median / len(errors) if math.isfinite(median) else 0.0
+        wrong = (errors > tolerated) & (episodes.substeps < most)
+        if not wrong.any():
+            return False
+        episodes.divide(np.where(wrong, np.minimum(2 * episodes.substeps, most), episodes.substeps))
+        self._typical = math.inf  # costs are others now
+        return True
 
     def _follow(self, gradient: Sequence[Array], median: float) -> None:
         """Take a step against the gradient of episodes with a median cost."""
@@ -293,6 +327,7 @@ class _Learner:
         numbers = {name: getattr(self, name) for name in _NUMBERS}
         kept = {f"kept.{name}": each for name, each in self._kept.items()}
         arrays = {**self._state(), **kept, **{name: np.array(each) for name, each in numbers.items()}}
+        arrays["substeps"] = self._episodes.substeps
         np.savez(stream, **arrays)  # type: ignore[arg-type]
         write_atomically(path / CHECKPOINT, stream.getvalue())
 
@@ -306,6 +341,7 @@ class _Learner:
             self._restore(arrays)
             self._kept = {name.removeprefix("kept."): a for name, a in arrays.items() if "kept." in name}
             self._updates = int(place.name)
+            self._episodes.divide(arrays["substeps"])
             for name in _NUMBERS:
                 setattr(self, name, float(arrays[name]))
             if (penalties := self._episodes.penalties) is not None and math.isfinite(self._typical):

@@ -18,7 +18,7 @@ from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, pen
 
 Array = NDArray[Any]
 
-FIRST = 0.01  # price at first
+LEAST = 0.01  # price at first, and at least: one that had vanished would come back too late
 STIFFNESS = 5.0  # penalty of a row, relative to one over its tolerance
 CHARGED = 0.5  # violation that counts, relative to the tolerance: flights between decisions keep within it
 ALLOWED = 0.005  # share of the episodes that may violate a row
@@ -43,7 +43,7 @@ class Penalties:
         self._tolerances = np.array([row.tolerance for row in rows])
         self._at_end = np.array([not row.has_input for row in rows])
         self._is_penalized = np.array([not row.is_rate for row in path_rows(scene)])
-        self.prices, self.cost = np.full(len(rows), FIRST), 0.0
+        self.prices, self.cost = np.full(len(rows), LEAST), 0.0
         m = n_multipliers(scene)
         self.parameters = np.zeros((decisions + 1, count, kernels.n_p + 2 * m), kernels.dtype)
         self._multipliers, self._penalties = np.split(self.parameters[..., kernels.n_p :], 2, axis=-1)
@@ -77,4 +77,5 @@ class Penalties:
         residuals = kernels.constraints(after, held, given if kernels.n_p else None)
         violated = residuals[:, self._is_penalized] > CHARGED * self._tolerances
         shares = violated.reshape(len(inputs) - 1, -1, len(self.prices)).any(axis=0).mean(axis=0)
-        self.prices *= np.exp(RATE * (np.minimum(shares, MOST) - ALLOWED))
+        factors = np.exp(RATE * (np.minimum(shares, MOST) - ALLOWED))
+        np.maximum(self.prices * factors, LEAST, out=self.prices)

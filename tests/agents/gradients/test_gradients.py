@@ -15,6 +15,7 @@ from agents.gradients.disturbed_flights import Met
 from agents.gradients.episodes import Episodes, decision_times
 from agents.gradients.gradient_training import train_by_gradients
 from agents.gradients.layers import Layers, random_weights
+from agents.gradients.starts import Starts, motions
 from agents.policies import ExportedPolicy
 from agents.run_folder import RunFolder, RunFolderError, validation_seeds
 from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, compile_scene, load_scene
@@ -42,6 +43,9 @@ class Flown:
         layers = Layers(self.weights, decisions, COUNT)
         times = decision_times(scene, decisions, 0.4)
         self.episodes = Episodes(scene, layers, times, np.full(n_u, 0.05), noisy=noisy)
+        if (kernels := environment.kernels).n_p:
+            along = Starts.of(kernels, self.states, environment.parameters, times)
+            self.episodes.parameters[:] = along.at(np.arange(COUNT))
 
     def in_double_precision(self):
         layers = self.episodes._layers
@@ -73,13 +77,26 @@ class Flown:
 MISMATCH = FlightMismatch(mass_factors=(1.0,), noise=0.0, push=0.05, pushes=3, delay=1.0)
 
 
-@pytest.mark.parametrize("disturbed", [False, True])
-def test_gradients_agree_with_differences(small_scene, monkeypatch, disturbed):
+def with_phases(scene):
+    """A scene whose base becomes lighter after a step in which the robot coasts, and the pose counts."""
+    coasting = {"actuators": {"base_force": None, "base_torque": None, "joint_torque": None}}
+    phases = [
+        {"name": "full", "steps": scene.simulation.steps // 2},
+        {"name": "coast", "steps": 1, "changes": {**coasting, "cost.pose": 1e4}},
+        {"name": "light", "steps": (scene.simulation.steps - 1) // 2, "changes": {"base.mass": 60}},
+    ]
+    return scene.replace(name="phased", phases=phases)
+
+
+@pytest.mark.parametrize("case", ["plain", "disturbed", "substeps", "phases"])
+def test_gradients_agree_with_differences(small_scene, monkeypatch, case):
     monkeypatch.setattr(episodes, "STEEP", math.inf)  # which shortens slopes
-    flown = Flown(small_scene)
+    flown = Flown(with_phases(small_scene) if case == "phases" else small_scene)
     flown.in_double_precision()
-    if disturbed:
+    if case == "disturbed":
         flown.meet(MISMATCH)
+    if case == "substeps":
+        flown.episodes.divide(np.arange(DECISIONS) % 3 + 1)
     gradient, costs = flown.gradient(emphasis=10.0)
     np.testing.assert_array_equal(costs, flown.costs(emphasis=10.0))
     rng = np.random.default_rng(1)
@@ -160,7 +177,11 @@ def test_prices_rise_where_an_episode_violates(limited):
     shares = (found > 0.5 * tolerances).any(axis=0).mean(axis=0)
     assert len(set(shares)) > 3
     flown.episodes.price_violations(1500.0)
-    np.testing.assert_allclose(penalties.prices, 0.01 * np.exp(0.5 * (np.minimum(shares, 0.1) - 0.005)))
+    factors = np.exp(0.5 * (np.minimum(shares, 0.1) - 0.005))
+    np.testing.assert_allclose(penalties.prices, 0.01 * np.maximum(factors, 1.0))  # 0.01 is the least
+    penalties.prices[:] = 1.0
+    flown.episodes.price_violations(1500.0)
+    np.testing.assert_allclose(penalties.prices, factors)
     assert penalties.cost == 1500.0
 
 
@@ -178,9 +199,10 @@ def test_an_episode_that_diverges_does_not_count(small_scene):
         np.testing.assert_allclose(rest, whole - one, rtol=1e-3, atol=1e-4 * np.abs(whole).max())
 
 
-def test_decisions_fly_as_at_every_time_step():
+@pytest.mark.parametrize("phased", [False, True])
+def test_decisions_fly_as_at_every_time_step(phased):
     """Costs differ by the square of the time between decisions."""
-    scene = load_scene("planar")
+    scene = with_phases(load_scene("planar")) if phased else load_scene("planar")
     flights = rollout(Flown(scene).policy(), scene, SEEDS)
     errors = [np.abs(Flown(scene, n).costs() / flights.cost - 1.0).mean() for n in (20, 40)]
     assert errors[1] < 1e-3
@@ -247,6 +269,47 @@ def test_masses_are_those_of_starts(small_file, small_scene):
     learner._adapt()
 
 
+def test_substeps_are_those_of_the_integrator(small_scene):
+    flown, step = Flown(small_scene), compile_scene(small_scene).step
+    flown.episodes.divide(np.full(DECISIONS, 3))
+    flown.costs()
+    states, lengths = flown.states, np.diff(decision_times(small_scene, DECISIONS, 0.4))
+    for held, length in zip(flown.episodes._inputs, lengths, strict=False):
+        for _ in range(3):
+            states = step(states, held, length / 3.0)
+    np.testing.assert_allclose(flown.episodes._states[-1], states, rtol=1e-12, atol=1e-12)
+
+
+def test_errors_are_those_of_the_cost(small_scene, monkeypatch):
+    """To first order, the cost changes by them with half as long steps."""
+    monkeypatch.setattr(episodes, "STEEP", math.inf)
+    flown = Flown(small_scene, outputs=30.0)
+    flown.in_double_precision()
+    before = flown.gradient()[1]
+    errors = flown.episodes.errors()
+    worst = int(errors.argmax())
+    flown.episodes.divide(1 + (np.arange(DECISIONS) == worst))
+    changes = np.abs(flown.costs() - before)
+    assert errors[worst] > 1e-9 * before.mean()
+    assert changes.mean() == pytest.approx(errors[worst], rel=0.05)
+
+
+def test_decisions_are_divided_where_the_integration_errs(small_file, small_scene, monkeypatch):
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    learner._update()
+    np.testing.assert_array_equal(learner._episodes.substeps, 1)  # calm at first
+    monkeypatch.setattr(gradient_training, "TOLERATED", 1e-9)
+    lengths, starts = np.diff(learner._times), learner._starts.states[:16]
+    most = np.ceil(lengths / small_scene.simulation.dt - 1e-9)
+    while learner._divide(learner._fly(starts)[1]):
+        assert (learner._episodes.substeps <= most).all()
+        assert math.isinf(learner._typical)
+    substeps, errors = learner._episodes.substeps, learner._episodes.errors()
+    assert substeps.min() < substeps.max()
+    errs = errors > 1e-9 * learner._fly(starts)[1] / len(errors)
+    np.testing.assert_array_equal(substeps[errs], most[errs])
+
+
 def test_misses_are_those_of_the_end(small_scene):
     flown, environment, success = Flown(small_scene), DQSpaceArmEnv(small_scene), small_scene.success
     flown.costs()
@@ -272,6 +335,7 @@ def settings(small_file, **algorithm):
 
 
 def test_training_lowers_the_cost_and_resumes_to_the_bit(small_file, small_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(gradient_training, "TOLERATED", 1e-9)  # such that decisions are divided
     trained = train_by_gradients(settings(small_file), tmp_path / "whole")
     curve = [line["median_cost"] for line in trained_curve(tmp_path / "whole")]
     idle = np.median(rollout(lambda seen: np.zeros((len(seen), 6)), small_scene, validation_seeds(8)).cost)
@@ -301,7 +365,7 @@ def resume_after(updates, configuration, folder, monkeypatch):
     monkeypatch.setattr(gradient_training._Learner, "_update", stopped)
     with pytest.raises(StopError):
         train_by_gradients(configuration, folder)
-    monkeypatch.undo()
+    monkeypatch.setattr(gradient_training._Learner, "_update", update)
     return train_by_gradients(configuration, folder)
 
 
@@ -338,16 +402,55 @@ def test_units_follow_the_inputs_and_leave_the_policy(small_file, small_scene):
     assert not np.allclose(units, 4.0 * sizes, rtol=0.1)
 
 
+def test_light_joints_have_small_units(small_file, small_scene):
+    strong = small_scene.replace(actuators={"joint_torque": {"limit": 1e3}})
+    plain, light = (gradient_training._Learner(settings(small_file), each) for each in (small_scene, strong))
+    np.testing.assert_array_equal(plain._episodes.units, 0.1)
+    joints = compile_scene(small_scene).layout.control.joint_torque
+    moved = light._episodes.units[joints] / 0.1 * motions(strong, 1e-3)[joints]
+    np.testing.assert_allclose(moved, gradient_training.FARTHEST)
+    light._update()
+    sizes = light._episodes.sizes()[joints]  # in the same proportions
+    np.testing.assert_allclose(
+        sizes / sizes[0], light._episodes.units[joints] / light._episodes.units[joints][0]
+    )
+
+
+def test_observations_that_small_inputs_hardly_vary_are_scaled_by_motions(
+    small_file, small_scene, monkeypatch
+):
+    """In honey, joints turn much faster in a maneuver than under small inputs that change all the time."""
+    links = [{**link.model_dump(exclude_none=True), "damping": 0.3} for link in small_scene.links]
+    slow = small_scene.replace(links=links, spread={"joint_rates": 0})
+    scale = gradient_training._Learner(settings(small_file, decisions=150), slow)._scale
+    monkeypatch.setattr(gradient_training, "PART", 1e-9)
+    by_small_inputs = gradient_training._Learner(settings(small_file, decisions=150), slow)._scale
+    relative, rates = scale / by_small_inputs, slice(-4, -2)  # of the first two joints
+    assert (relative <= 1.0).all()
+    assert (relative > 0.0).all()
+    assert relative[rates].max() < 0.8
+
+
+def test_methods_that_adapt_their_steps_do_so_less(small_scene):
+    assert gradient_training.coarser(small_scene) is small_scene
+    stiff = small_scene.replace(simulation={"integrator": "rodas4"})
+    assert gradient_training.coarser(stiff).simulation.tolerance == 1e-4
+    rough = stiff.replace(simulation={"tolerance": 1e-3})
+    assert gradient_training.coarser(rough).simulation.tolerance == 1e-3
+    explicit = small_scene.replace(simulation={"integrator": "dormand_prince"})
+    assert gradient_training.coarser(explicit).simulation.rtol == 1e-4
+
+
 def test_end_weights_rise_where_episodes_miss(small_file, small_scene):
     learner = gradient_training._Learner(settings(small_file), small_scene)
     learner._update()
     assert learner._end_weight == 400.0  # it is too early
     learner._updates = 100
     learner._adapt()
-    assert learner._end_weight == pytest.approx(404.0)
+    assert learner._end_weight == pytest.approx(408.0)
     learner._episodes.misses = lambda: np.zeros(COUNT)
     learner._adapt()
-    assert learner._end_weight == pytest.approx(404.0)
+    assert learner._end_weight == pytest.approx(408.0)
 
 
 def test_training_starts_from_a_policy(small_file, tmp_path):
@@ -367,15 +470,12 @@ def trained_curve(folder):
     return RunFolder(folder, load_configuration(folder / "config.yaml")).evaluations()
 
 
-def test_a_damaged_checkpoint_and_phases_are_refused(small_file, tmp_path):
+def test_a_damaged_checkpoint_is_refused(small_file, tmp_path):
     train_by_gradients(settings(small_file, updates=20), tmp_path)
     (checkpoint,) = (tmp_path / "checkpoints").glob("*/checkpoint.npz")
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     with pytest.raises(RunFolderError, match=r"cannot be read .* remove it"):
         train_by_gradients(settings(small_file, updates=20), tmp_path)
-    phased = settings(small_file).model_copy(update={"scene": "release"})
-    with pytest.raises(ValueError, match="scene 'release' has phases"):
-        train_by_gradients(phased, tmp_path / "phased")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,85 @@
+"""Where episodes begin, with the parameters that they have on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.configuration.schema import RESERVED_SEED
+from dq_space_arm_env import DQSpaceArmVectorEnv, Kernels, Scene, compile_scene
+from dq_space_arm_env.environment.disturbances import with_loads
+from dq_space_arm_env.scene.parameters import CATCH
+
+Array = NDArray[Any]
+
+SMALLER = 0.01  # inputs relative to the first ones, by which their motions are measured
+
+
+class Starts(NamedTuple):
+    """States (n, n_x) that episodes begin at, and parameters of each decision and the end.
+
+    Attributes:
+        states: Shape (n, n_x).
+        parameters: Of the start, shape (n, n_p).
+        moving: Values of those that move along an episode, shape (K + 1, n, n_moving), and their indices.
+        staged: Likewise of those that phases change, alike in all episodes, shape (K + 1, 1, n_staged).
+    """
+
+    states: Array
+    parameters: Array
+    moving: tuple[Array, list[int]]
+    staged: tuple[Array, list[int]]
+
+    @classmethod
+    def draw(
+        cls, scene: Scene, count: int, times: Array, seed: int, mass_factors: Sequence[float]
+    ) -> tuple[Scene, Starts]:
+        """Draw starts with a seed, and their parameters at some times; first the scene that has them."""
+        environment = DQSpaceArmVectorEnv(count, scene)
+        environment.reset(seed=int(np.random.SeedSequence([RESERVED_SEED, seed]).generate_state(1)[0] >> 2))
+        kernels, given = environment.kernels, environment.parameters
+        if set(mass_factors) != {1.0}:
+            scene, given = with_loads(scene, np.resize(mass_factors, count), given)
+            kernels = compile_scene(scene)
+        return scene, cls.of(kernels, environment.states, given, times)
+
+    @classmethod
+    def of(cls, kernels: Kernels, states: Array, given: Array, times: Array) -> Starts:
+        """States (n, n_x) with parameters (n, n_p), and what these are at some times."""
+        entries, rows = kernels.parameters, np.rint(times / kernels.scene.simulation.dt).astype(int)
+        own = list(entries.moving) and [*entries.moving, *entries.indices(CATCH)]
+        alike = [index for index in entries.staged if index not in own]
+
+        def along(indices: list[int], starts: Array) -> tuple[Array, list[int]]:
+            taken = [kernels.stage_parameters(start)[rows][:, indices] for start in starts if indices]
+            return np.stack(taken, axis=1) if taken else np.empty((len(rows), 1, 0)), indices
+
+        return cls(states, given, along(own, given), along(alike, given[:1]))
+
+    def at(self, rows: Array) -> Array:
+        """Parameters of each decision and the end of some episodes, (K + 1, B, n_p)."""
+        (moving, own), (staged, alike) = self.moving, self.staged
+        found = np.repeat(self.parameters[None, rows], len(moving), axis=0)
+        if own:
+            found[:, :, own] = moving[:, rows]
+        found[:, :, alike] = staged
+        return found
+
+
+def motions(scene: Scene, share: float) -> Array:
+    """How far each input, at a share of its limit, moves something, (n_u,).
+
+    Largest motion of base, joints and wrist over an episode, rad and m; by much smaller inputs, linearly.
+    """
+    kernels = compile_scene(scene)
+    small = SMALLER * share * np.diag(kernels.layout.control_limit)
+    inputs = np.vstack([small, np.zeros_like(small[:1])])
+    states = np.repeat(kernels.layout.initial_state[None], len(inputs), axis=0)
+    for _ in range(scene.simulation.steps):
+        states = kernels.step(states, inputs, scene.simulation.dt)
+    entries = kernels.layout.state
+    moved = np.abs(states[:-1] - states[-1])[:, : entries.base_velocity.start]
+    return np.asarray(moved.max(axis=1) / SMALLER)
