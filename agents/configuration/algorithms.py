@@ -141,6 +141,9 @@ class SAC(_MaximumEntropy):
     """Soft actor-critic (Haarnoja et al., 2018)."""
 
     name: Literal["SAC"]
+    final_target_entropy: Finite | None = Field(
+        default=None, description="final target entropy, reached linearly; absent: target_entropy"
+    )
     layer_norm: StrictBool = Field(default=False, description="whether critics are layer-normalized")
     demonstrations: Demonstrated | None = Field(
         default=None, description="expert decisions to learn from as well; absent: none"
@@ -148,6 +151,12 @@ class SAC(_MaximumEntropy):
 
     def _problems(self) -> Iterator[Problem]:
         yield from super()._problems()
+        if self.final_target_entropy is not None and self.ent_coef != "auto":
+            yield Problem(
+                ("final_target_entropy",),
+                self.final_target_entropy,
+                f"must be absent with ent_coef = {self.ent_coef:g}: no entropy is aimed at then",
+            )
         if self.demonstrations is not None and self.hindsight is not None:
             yield Problem(
                 ("demonstrations",), "given", "must be absent with hindsight, which has its own replay buffer"

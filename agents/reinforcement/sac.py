@@ -90,17 +90,33 @@ class DemonstrationBuffer(ReplayBuffer):
 
 
 class SoftActorCritic(SAC):
-    """SAC of Stable-Baselines3 with a cloning term in the actor's loss.
+    """SAC of Stable-Baselines3 with a cloning term in the actor's loss, and exploration that ends.
 
     `cloning_weight` weighs the mean squared difference from demonstrated actions, relative to the mean size
-    of values; 0 is SAC's own loss.
+    of values; 0 is SAC's own loss. The target entropy goes linearly to `final_target_entropy`: critics learn
+    what an action is worth from actions that differ, and little noise at the end lets the actor be precise.
     """
 
-    def __init__(self, *arguments: Any, cloning_weight: float = 0.0, **options: Any) -> None:
-        self.cloning_weight = cloning_weight
+    def __init__(
+        self,
+        *arguments: Any,
+        cloning_weight: float = 0.0,
+        final_target_entropy: float | None = None,
+        **options: Any,
+    ) -> None:
+        self.cloning_weight, self.final_target_entropy = cloning_weight, final_target_entropy
         super().__init__(*arguments, **options)
 
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        assert isinstance(self.target_entropy, float)
+        self.first_target_entropy = self.target_entropy
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        if self.final_target_entropy is not None:
+            first, last = self.first_target_entropy, self.final_target_entropy
+            self.target_entropy = last + (first - last) * self._current_progress_remaining
+            self.logger.record("train/target_entropy", self.target_entropy)
         if not self.cloning_weight:
             super().train(gradient_steps, batch_size)
             return

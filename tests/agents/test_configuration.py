@@ -100,6 +100,10 @@ def test_unknown_keys_are_refused_with_a_suggestion():
             {"algorithm": {"name": "SAC", "layer_norm": True}, "network": {"hidden": []}},
             "network.hidden = []: must have a layer for algorithm.layer_norm",
         ),
+        (
+            {"algorithm": {"name": "SAC", "ent_coef": 0.1, "final_target_entropy": -9.0}},
+            "final_target_entropy = -9.0: must be absent with ent_coef = 0.1",
+        ),
         ({"algorithm": {"name": "PPO", "learning_rate": float("inf")}}, "learning_rate = inf"),
         (
             {"algorithm": {"name": "SAC", "hindsight": {}}, "environment": {"reward_scale": 0.01}},

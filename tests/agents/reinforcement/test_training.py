@@ -36,7 +36,7 @@ EVERY = {"evaluate_every": 1600, "checkpoint_every": 1600}
 OFF_POLICY = {"batch_size": 32, "learning_starts": 200, "buffer_size": 2000, "gradient_steps": 2}
 ALGORITHMS = {
     "PPO": {"name": "PPO", "n_steps": 10, "batch_size": 40, "n_epochs": 2},
-    "SAC": {"name": "SAC", **OFF_POLICY},
+    "SAC": {"name": "SAC", **OFF_POLICY, "target_entropy": 3.0, "final_target_entropy": -9.0},
     "TQC": {"name": "TQC", **OFF_POLICY},
     "TD3": {"name": "TD3", **OFF_POLICY},
     "HER": {"name": "SAC", **OFF_POLICY, "hindsight": {"n_sampled_goal": 2}},
@@ -193,6 +193,15 @@ def test_a_run_resumes_with_optimizer_and_buffer(algorithm, trained, scene_file,
 
 
 @pytest.mark.sampled
+def test_the_target_entropy_goes_linearly_to_its_end(trained):
+    model = trained("SAC").model
+    done = model.num_timesteps / 800  # decisions
+    assert done > 0.95
+    # The last update follows the last decision of all copies.
+    assert model.target_entropy == pytest.approx(3.0 - 12.0 * done, abs=1e-9)
+    assert trained("HER").model.target_entropy == -model.action_space.shape[0]
+
+
 @pytest.mark.parametrize("algorithm", ["HER", "SAC"])
 def test_a_run_resumes_in_the_middle_of_episodes(algorithm, scene_file, tmp_path):
     schedule = {"total_steps": 1920, "evaluation_episodes": 4, **EVERY, "checkpoint_every": 1296}
