@@ -49,7 +49,7 @@ class FlightMismatch(Mismatch):
 class Progression(Model):
     """Flights and checkpoints during training."""
 
-    evaluate_every: Count = Field(default=1000, description="updates between flights for the learning curve")
+    evaluate_every: Count = Field(default=200, description="updates between flights for the learning curve")
     evaluation_episodes: Many = Field(default=64, description="flights, always from the same starts")
     checkpoint_every: Count = Field(default=500, description="updates between checkpoints")
 

@@ -19,11 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.gradients.disturbed_flights import Arrival, Met, arrivals
 from agents.gradients.layers import Layers, SingleArray
-from agents.gradients.penalties import Penalties
+from agents.gradients.penalties import Penalties, priced_rows
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.kernels.library import PENALIZED
-from dq_space_arm_env.scene.constraint_rows import penalized_rows
 from dq_space_arm_env.scene.parameters import CONTROL_UNITS
 from experts.problems.arm_problem import misses
 
@@ -94,7 +93,7 @@ class Episodes:
         self._held = steps / dt - self._weights[:-1]  # of the input's cost, which is not of a point in time
         self.parameters = np.zeros((decisions + 1, count, kernels.n_p), dtype)
         self.penalties: Penalties | None = None
-        if penalized_rows(scene):
+        if priced_rows(scene).any():
             self.penalties = Penalties(kernels, decisions, count, self._weights[-1])
         self._states = np.zeros((decisions + 1, count, kernels.n_x), dtype)
         self._measured = np.zeros_like(self._states) if noisy else self._states

@@ -57,6 +57,7 @@ STRICTEST = 1000.0  # largest end weight, relative to its first value
 TRIAL_ACTIONS = 0.005  # standard deviation of the actions that measure the spread of observations
 COARSE = 1e-4  # tolerance of methods that adapt their steps, rad and m; at least the scene's
 PART = 0.1  # least deviation of an observation, of that in motions over a radian or a meter
+TINY = 1e-12  # motion [rad, m] that is none
 SEEN = 128  # episodes of that
 FARTHEST = 5.0  # motion [rad, m] by the first outputs over an episode; units are smaller beyond
 WORSE = 2.0  # median cost relative to recent ones, above which the weights go back to what they were
@@ -159,7 +160,7 @@ class _Learner:
         small = TRIAL_ACTIONS * (units / FIRST_UNITS) * limit * rng.normal(size=shape)
         mean, scale = units_of(self._trial(environment, small))
         # There and back, as far as the limits allow.
-        far = limit * np.minimum(FIRST_UNITS * FIRST_OUTPUTS / moved, 1.0)
+        far = limit * np.minimum(FIRST_UNITS * FIRST_OUTPUTS / np.maximum(moved, TINY), 1.0)
         shares = np.random.default_rng(self._configuration.seed).uniform(-1.0, 1.0, shape[1:])
         far = np.repeat((far * shares)[None], shape[0], axis=0)
         far[turn:] *= -1.0
@@ -214,15 +215,14 @@ class _Learner:
         if self._mismatch is not None:
             self._episodes.meet(Met.draw(self._mismatch, self._flown, self._times, len(rows), rng))
         gradient, median = self._fly(starts)
-        unstable = math.isinf(median) or (done > WARM_UP and median > WORSE * self._typical)
-        if (unstable or done % BETWEEN_DIVISIONS == 0) and self._divide(median):
-            if unstable:
-                self._restore(self._kept)
+        if done % BETWEEN_DIVISIONS == 0 and self._divide(median):
             gradient, median = self._fly(starts)
-            unstable = math.isinf(median)
-        if unstable:
+        if math.isinf(median) or (done > WARM_UP and median > WORSE * self._typical):
             # The motion has become unstable: take the weights from before, and smaller steps.
             self._restore(self._kept)
+            before = self._fly(starts)[1]
+            if not self._divide(before) and before > WORSE * self._typical:
+                self._typical = before  # those were no better
             self._caution *= CAUTION
             self._growth = 1.0
         else:

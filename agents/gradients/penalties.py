@@ -3,7 +3,8 @@
 The slopes of an episode's cost are then those of the augmented Lagrangian of `task.augmented_lagrangian`. A
 policy has to keep to a row from all starts: dual ascent lets the price of a violation rise while too many
 episodes have one, however large, and else fall slowly. Since the penalty is a barrier inside, a higher price
-keeps flights at a larger distance. Rates of controls, and what is exact at the end, have no penalty.
+keeps flights at a larger distance. Rates of controls, and what is exact at the end, have no penalty, nor have
+the torques of motors at speed, to which environments clip.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dq_space_arm_env import Kernels
+from dq_space_arm_env import Kernels, Scene
 from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows, penalized_rows
+from dq_space_arm_env.scene.constraints import TorqueSpeed
 
 Array = NDArray[Any]
 
@@ -24,6 +26,12 @@ CHARGED = 0.5  # violation that counts, relative to the tolerance: flights betwe
 ALLOWED = 0.005  # share of the episodes that may violate a row
 MOST = 0.1  # share beyond which a price rises no faster
 RATE = 0.5  # of change of a price's logarithm in an update, for all episodes
+
+
+def priced_rows(scene: Scene) -> NDArray[np.bool_]:
+    """Which of `penalized_rows` have a price: not the torques to which environments clip by themselves."""
+    clipped = {each.name for each in scene.constraints if isinstance(each, TorqueSpeed)}
+    return np.array([row.name.partition(":")[0] not in clipped for row in penalized_rows(scene)], np.bool_)
 
 
 class Penalties:
@@ -43,7 +51,8 @@ class Penalties:
         self._tolerances = np.array([row.tolerance for row in rows])
         self._at_end = np.array([not row.has_input for row in rows])
         self._is_penalized = np.array([not row.is_rate for row in path_rows(scene)])
-        self.prices, self.cost = np.full(len(rows), LEAST), 0.0
+        self._priced = priced_rows(scene)
+        self.prices, self.cost = np.where(self._priced, LEAST, 0.0), 0.0
         m = n_multipliers(scene)
         self.parameters = np.zeros((decisions + 1, count, kernels.n_p + 2 * m), kernels.dtype)
         self._multipliers, self._penalties = np.split(self.parameters[..., kernels.n_p :], 2, axis=-1)
@@ -78,4 +87,4 @@ class Penalties:
         violated = residuals[:, self._is_penalized] > CHARGED * self._tolerances
         shares = violated.reshape(len(inputs) - 1, -1, len(self.prices)).any(axis=0).mean(axis=0)
         factors = np.exp(RATE * (np.minimum(shares, MOST) - ALLOWED))
-        np.maximum(self.prices * factors, LEAST, out=self.prices)
+        self.prices[:] = np.where(self._priced, np.maximum(self.prices * factors, LEAST), 0.0)
