@@ -109,8 +109,7 @@ class SoftActorCritic(SAC):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        assert isinstance(self.target_entropy, float)
-        self.first_target_entropy = self.target_entropy
+        self.first_target_entropy = float(vars(self)["target_entropy"])
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         if self.final_target_entropy is not None:
