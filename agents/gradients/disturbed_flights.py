@@ -28,23 +28,22 @@ class Met(NamedTuple):
     ) -> Self:
         """Draw for episodes of which the first half meets nothing."""
         layout, steps = StateLayout.of(scene), np.diff(times)
-        shape, velocity = (len(steps), count, layout.n_t), layout.tangent.base_velocity
-        met = np.arange(count) >= calm(count)
-        delays = mismatch.delay * rng.random(count) * met
-        strength = mismatch.push * rng.random(count) * met
-        struck = rng.random(shape[:2]) < mismatch.pushes * steps[:, None] / times[-1]
-        jumps = np.zeros(shape)
-        jumps[..., velocity] = rng.standard_normal(jumps[..., velocity].shape)
-        jumps *= (struck * strength)[..., None]
-        deviation = mismatch.noise * rng.random(count) * met
-        # A decision's measurement stands for one in each of its time steps: it has the noise of their mean.
-        means = np.sqrt(scene.simulation.dt / steps)
-        noise = rng.standard_normal(shape) * (means[:, None] * deviation)[..., None]
-        return cls(
-            delays if mismatch.delay else None,
-            jumps if mismatch.push else None,
-            noise if mismatch.noise else None,
-        )
+        shape, met = (len(steps), count, layout.n_t), np.arange(count) >= calm(count)
+        delays = jumps = noise = None
+        if mismatch.delay:
+            delays = mismatch.delay * rng.random(count) * met
+        if mismatch.push:
+            strength = mismatch.push * rng.random(count) * met
+            struck = rng.random(shape[:2]) < mismatch.pushes * steps[:, None] / times[-1]
+            jumps, velocity = np.zeros(shape), layout.tangent.base_velocity
+            jumps[..., velocity] = rng.standard_normal(jumps[..., velocity].shape)
+            jumps *= (struck * strength)[..., None]
+        if mismatch.noise:
+            deviation = mismatch.noise * rng.random(count) * met
+            # A decision's measurement stands for one in each of its time steps: it has their mean's noise.
+            means = np.sqrt(scene.simulation.dt / steps)
+            noise = rng.standard_normal(shape) * (means[:, None] * deviation)[..., None]
+        return cls(delays, jumps, noise)
 
 
 def calm(count: int) -> int:

@@ -109,6 +109,7 @@ class SoftActorCritic(SAC):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        # "auto" until here, a number now; Stable-Baselines3 types it as either.
         self.first_target_entropy = float(vars(self)["target_entropy"])
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:

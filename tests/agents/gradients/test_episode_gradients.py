@@ -1,4 +1,4 @@
-"""Analytic policy gradients: exact slopes of whole episodes, and a training that resumes to the bit."""
+"""Exact slopes of whole episodes, and what these cost when they are flown at every time step."""
 
 import math
 
@@ -7,17 +7,14 @@ import pytest
 
 pytest.importorskip("threadpoolctl")
 
-from agents.configuration import ConfigurationError, load_configuration
 from agents.configuration.gradients import FlightMismatch
-from agents.configuration.schema import Network
-from agents.gradients import episodes, gradient_training
+from agents.gradients import episodes
 from agents.gradients.disturbed_flights import Met
 from agents.gradients.episodes import Episodes, decision_times
-from agents.gradients.gradient_training import train_by_gradients
 from agents.gradients.layers import Layers, random_weights
-from agents.gradients.starts import Starts, motions
+from agents.gradients.penalties import priced_rows
+from agents.gradients.starts import Starts
 from agents.policies import ExportedPolicy
-from agents.run_folder import RunFolder, RunFolderError, validation_seeds
 from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.environment.disturbances import Disturbance
 from dq_space_arm_env.environment.rollouts import rollout
@@ -112,20 +109,6 @@ def test_gradients_agree_with_differences(small_scene, monkeypatch, case):
         assert expected == pytest.approx(float((slope * direction).sum()), rel=1e-6)
 
 
-@pytest.fixture(scope="session")
-def limited(small_scene):
-    """The small scene with limits of its joints and of its momentum."""
-    limits = {
-        "kind": "joint_limits",
-        "name": "joints",
-        "lower": -0.9,
-        "upper": 0.9,
-        "rate": 0.3,
-    }  # rad, rad/s
-    momentum = {"kind": "momentum", "name": "whole", "linear": 2.0, "margin": 0.1, "tolerance": 0.1}  # N s
-    return small_scene.replace(name="limited", constraints=[limits, momentum])
-
-
 def penalty(t, slope_at_zero):
     """That of Ben-Tal & Zibulevsky with a penalty of 1."""
     inside = -0.25 * np.log(-2.0 * np.minimum(t, -0.5)) - 0.375
@@ -165,6 +148,11 @@ def test_slopes_have_those_of_penalties(limited, monkeypatch):
             ends.append(costs()[0].mean())
         weight[:] = kept
         assert (ends[0] - ends[1]) / 2.0 == pytest.approx(float((slope * direction).sum()), rel=1e-5)
+
+
+def test_torques_to_which_environments_clip_have_no_price():
+    assert not priced_rows(load_scene("motors")).any()
+    assert priced_rows(load_scene("servicing")).tolist() == [True] * 4
 
 
 def test_prices_rise_where_an_episode_violates(limited):
@@ -255,20 +243,6 @@ def test_noise_is_that_of_means_over_decisions(small_scene):
     assert (costs[COUNT // 2 :] != exact.costs()[COUNT // 2 :]).all()
 
 
-def test_masses_are_those_of_starts(small_file, small_scene):
-    factors = (0.5, 2.0)
-    given = settings(small_file).model_copy(
-        update={"mismatch": MISMATCH.model_copy(update={"mass_factors": factors})}
-    )
-    learner = gradient_training._Learner(given, small_scene)
-    assert learner._mean.shape == DQSpaceArmVectorEnv(1, small_scene).single_observation_space.shape
-    entry = learner._episodes._kernels.parameters.names.index("links.2.mass")
-    learner._update()
-    masses = learner._episodes.parameters[0, :, entry] / small_scene.links[2].mass
-    assert set(masses.tolist()) == set(factors)
-    learner._adapt()
-
-
 def test_substeps_are_those_of_the_integrator(small_scene):
     flown, step = Flown(small_scene), compile_scene(small_scene).step
     flown.episodes.divide(np.full(DECISIONS, 3))
@@ -294,22 +268,6 @@ def test_errors_are_those_of_the_cost(small_scene, monkeypatch):
     assert changes.mean() == pytest.approx(errors[worst], rel=0.05)
 
 
-def test_decisions_are_divided_where_the_integration_errs(small_file, small_scene, monkeypatch):
-    learner = gradient_training._Learner(settings(small_file), small_scene)
-    learner._update()
-    np.testing.assert_array_equal(learner._episodes.substeps, 1)  # calm at first
-    monkeypatch.setattr(gradient_training, "TOLERATED", 1e-9)
-    lengths, starts = np.diff(learner._times), learner._starts.states[:16]
-    most = np.ceil(lengths / small_scene.simulation.dt - 1e-9)
-    while learner._divide(learner._fly(starts)[1]):
-        assert (learner._episodes.substeps <= most).all()
-        assert math.isinf(learner._typical)
-    substeps, errors = learner._episodes.substeps, learner._episodes.errors()
-    assert substeps.min() < substeps.max()
-    errs = errors > 1e-9 * learner._fly(starts)[1] / len(errors)
-    np.testing.assert_array_equal(substeps[errs], most[errs])
-
-
 def test_misses_are_those_of_the_end(small_scene):
     flown, environment, success = Flown(small_scene), DQSpaceArmEnv(small_scene), small_scene.success
     flown.costs()
@@ -319,173 +277,3 @@ def test_misses_are_those_of_the_end(small_scene):
         angle = info["attitude_error"] / success.attitude_error_deg
         expected.append(max(angle, info["position_error"] / success.position_error))
     np.testing.assert_allclose(flown.episodes.misses(), expected, rtol=1e-9)
-
-
-def settings(small_file, **algorithm):
-    changes = {"updates": 120, "copies": 16, "decisions": 40, "starts": 256, **algorithm}
-    return load_configuration(
-        {
-            "name": "small",
-            "scene": str(small_file),
-            "network": {"hidden": [16, 16]},
-            "algorithm": {"name": "APG", **changes},
-            "progression": {"evaluate_every": 60, "evaluation_episodes": 8, "checkpoint_every": 60},
-        }
-    )
-
-
-def test_training_lowers_the_cost_and_resumes_to_the_bit(small_file, small_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(gradient_training, "TOLERATED", 1e-9)  # such that decisions are divided
-    trained = train_by_gradients(settings(small_file), tmp_path / "whole")
-    curve = [line["median_cost"] for line in trained_curve(tmp_path / "whole")]
-    idle = np.median(rollout(lambda seen: np.zeros((len(seen), 6)), small_scene, validation_seeds(8)).cost)
-    assert curve[-1] < 0.2 * idle
-    assert trained.policy.metadata["training"]["updates"] == 120
-
-    resumed = resume_after(77, settings(small_file), tmp_path / "halves", monkeypatch)
-    for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert len(trained_curve(tmp_path / "halves")) == 2
-
-
-def resume_after(updates, configuration, folder, monkeypatch):
-    """Train with an interruption."""
-
-    class StopError(Exception):
-        """As if the process were killed."""
-
-    update, done = gradient_training._Learner._update, []
-
-    def stopped(learner):
-        if len(done) == updates:
-            raise StopError
-        done.append(learner)
-        return update(learner)
-
-    monkeypatch.setattr(gradient_training._Learner, "_update", stopped)
-    with pytest.raises(StopError):
-        train_by_gradients(configuration, folder)
-    monkeypatch.setattr(gradient_training._Learner, "_update", update)
-    return train_by_gradients(configuration, folder)
-
-
-def test_constraints_are_learned_and_prices_resumed(limited, small_file, tmp_path, monkeypatch):
-    limited.to_yaml(tmp_path / "limited.yaml")
-    constrained = settings(tmp_path / "limited.yaml")
-    trained = train_by_gradients(constrained, tmp_path / "whole")
-    resumed = resume_after(77, constrained, tmp_path / "halves", monkeypatch)
-    for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
-        np.testing.assert_array_equal(one, other)
-    prices = []
-    for folder in ("whole", "halves"):
-        last = max((tmp_path / folder / "checkpoints").glob("*/checkpoint.npz"))
-        with np.load(last) as arrays:
-            prices.append(arrays["prices"])
-    np.testing.assert_array_equal(*prices)
-    unaware = train_by_gradients(settings(small_file), tmp_path / "unaware").policy
-    policies = trained.policy, unaware
-    violated = [rollout(each, limited, SEEDS).constraint_violations.mean() for each in policies]
-    assert violated[0] < 0.5 * violated[1], violated  # some starts violate
-
-
-def test_units_follow_the_inputs_and_leave_the_policy(small_file, small_scene):
-    learner = gradient_training._Learner(settings(small_file), small_scene)
-    seen = DQSpaceArmVectorEnv(COUNT, small_scene).reset(seed=SEEDS)[0]
-    for _ in range(60):
-        learner._update()
-    before, units = learner.export({})(seen), learner._episodes.units.copy()
-    for _ in range(300):
-        learner._adapt()
-    np.testing.assert_allclose(learner.export({})(seen), before, atol=1e-6)
-    sizes = learner._episodes.sizes()
-    np.testing.assert_allclose(learner._episodes.units, 4.0 * sizes, rtol=1e-9)
-    assert not np.allclose(units, 4.0 * sizes, rtol=0.1)
-
-
-def test_light_joints_have_small_units(small_file, small_scene):
-    strong = small_scene.replace(actuators={"joint_torque": {"limit": 1e3}})
-    plain, light = (gradient_training._Learner(settings(small_file), each) for each in (small_scene, strong))
-    np.testing.assert_array_equal(plain._episodes.units, 0.1)
-    joints = compile_scene(small_scene).layout.control.joint_torque
-    moved = light._episodes.units[joints] / 0.1 * motions(strong, 1e-3)[joints]
-    np.testing.assert_allclose(moved, gradient_training.FARTHEST)
-    light._update()
-    sizes = light._episodes.sizes()[joints]  # in the same proportions
-    np.testing.assert_allclose(
-        sizes / sizes[0], light._episodes.units[joints] / light._episodes.units[joints][0]
-    )
-
-
-def test_observations_that_small_inputs_hardly_vary_are_scaled_by_motions(
-    small_file, small_scene, monkeypatch
-):
-    """In honey, joints turn much faster in a maneuver than under small inputs that change all the time."""
-    links = [{**link.model_dump(exclude_none=True), "damping": 0.3} for link in small_scene.links]
-    slow = small_scene.replace(links=links, spread={"joint_rates": 0})
-    scale = gradient_training._Learner(settings(small_file, decisions=150), slow)._scale
-    monkeypatch.setattr(gradient_training, "PART", 1e-9)
-    by_small_inputs = gradient_training._Learner(settings(small_file, decisions=150), slow)._scale
-    relative, rates = scale / by_small_inputs, slice(-4, -2)  # of the first two joints
-    assert (relative <= 1.0).all()
-    assert (relative > 0.0).all()
-    assert relative[rates].max() < 0.8
-
-
-def test_methods_that_adapt_their_steps_do_so_less(small_scene):
-    assert gradient_training.coarser(small_scene) is small_scene
-    stiff = small_scene.replace(simulation={"integrator": "rodas4"})
-    assert gradient_training.coarser(stiff).simulation.tolerance == 1e-4
-    rough = stiff.replace(simulation={"tolerance": 1e-3})
-    assert gradient_training.coarser(rough).simulation.tolerance == 1e-3
-    explicit = small_scene.replace(simulation={"integrator": "dormand_prince"})
-    assert gradient_training.coarser(explicit).simulation.rtol == 1e-4
-
-
-def test_end_weights_rise_where_episodes_miss(small_file, small_scene):
-    learner = gradient_training._Learner(settings(small_file), small_scene)
-    learner._update()
-    assert learner._end_weight == 400.0  # it is too early
-    learner._updates = 100
-    learner._adapt()
-    assert learner._end_weight == pytest.approx(408.0)
-    learner._episodes.misses = lambda: np.zeros(COUNT)
-    learner._adapt()
-    assert learner._end_weight == pytest.approx(408.0)
-
-
-def test_training_starts_from_a_policy(small_file, tmp_path):
-    first = train_by_gradients(settings(small_file), tmp_path / "first").policy
-    start = {"start_from": str(tmp_path / "first")}
-    going_on = settings(small_file, updates=2, learning_rate=1e-9).model_copy(update=start)
-    after = train_by_gradients(going_on, tmp_path / "second").policy
-    for one, other in zip(first.weights, after.weights, strict=True):
-        np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-6)
-    assert after.metadata["training"]["seconds"] > first.metadata["training"]["seconds"]
-    wider = {**start, "network": Network(hidden=[8])}
-    with pytest.raises(ConfigurationError, match=r"start_from: .* not fit: network.hidden is \[16, 16\]"):
-        train_by_gradients(settings(small_file).model_copy(update=wider), tmp_path / "third")
-
-
-def trained_curve(folder):
-    return RunFolder(folder, load_configuration(folder / "config.yaml")).evaluations()
-
-
-def test_a_damaged_checkpoint_is_refused(small_file, tmp_path):
-    train_by_gradients(settings(small_file, updates=20), tmp_path)
-    (checkpoint,) = (tmp_path / "checkpoints").glob("*/checkpoint.npz")
-    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
-    with pytest.raises(RunFolderError, match=r"cannot be read .* remove it"):
-        train_by_gradients(settings(small_file, updates=20), tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"crowding": 1.5}, "algorithm.*crowding = 1.5: must be at most 1"),
-        ({"decisions": 1}, "algorithm.*decisions = 1: must be at least 2"),
-        ({"copies": 10_000_000}, "algorithm.copies = 10000000: all copies take 400,000,000 decisions"),
-    ],
-)
-def test_mistakes_are_named(small_file, changes, message):
-    with pytest.raises(ConfigurationError, match=message):
-        settings(small_file, **changes)

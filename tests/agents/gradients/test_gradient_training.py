@@ -1,0 +1,237 @@
+"""Training by analytic policy gradients: its rules, its constraints, and that it resumes to the bit."""
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("threadpoolctl")
+
+from agents.configuration import ConfigurationError, load_configuration
+from agents.configuration.gradients import FlightMismatch
+from agents.configuration.schema import Network
+from agents.gradients import gradient_training
+from agents.gradients.gradient_training import train_by_gradients
+from agents.gradients.starts import motions
+from agents.run_folder import RunFolder, RunFolderError, validation_seeds
+from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene
+from dq_space_arm_env.environment.rollouts import rollout
+
+pytestmark = pytest.mark.agents
+
+COUNT, SEEDS = 16, list(range(16))
+
+
+def test_masses_are_those_of_starts(small_file, small_scene):
+    factors = (0.5, 2.0)
+    given = settings(small_file).model_copy(
+        update={"mismatch": FlightMismatch(mass_factors=factors, noise=0.0, push=0.05, pushes=3, delay=1.0)}
+    )
+    learner = gradient_training._Learner(given, small_scene)
+    assert learner._mean.shape == DQSpaceArmVectorEnv(1, small_scene).single_observation_space.shape
+    entry = learner._episodes._kernels.parameters.names.index("links.2.mass")
+    learner._update()
+    masses = learner._episodes.parameters[0, :, entry] / small_scene.links[2].mass
+    assert set(masses.tolist()) == set(factors)
+    learner._adapt()
+
+
+def test_decisions_are_divided_where_the_integration_errs(small_file, small_scene, monkeypatch):
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    learner._update()
+    np.testing.assert_array_equal(learner._episodes.substeps, 1)  # calm at first
+    monkeypatch.setattr(gradient_training, "TOLERATED", 1e-9)
+    lengths, starts = np.diff(learner._times), learner._starts.states[:16]
+    most = np.ceil(lengths / small_scene.simulation.dt - 1e-9)
+    while learner._divide(learner._fly(starts)[1]):
+        assert (learner._episodes.substeps <= most).all()
+        assert math.isinf(learner._typical)
+    substeps, errors = learner._episodes.substeps, learner._episodes.errors()
+    assert substeps.min() < substeps.max()
+    errs = errors > 1e-9 * learner._fly(starts)[1] / len(errors)
+    np.testing.assert_array_equal(substeps[errs], most[errs])
+
+
+def settings(small_file, **algorithm):
+    changes = {"updates": 120, "copies": 16, "decisions": 40, "starts": 256, **algorithm}
+    return load_configuration(
+        {
+            "name": "small",
+            "scene": str(small_file),
+            "network": {"hidden": [16, 16]},
+            "algorithm": {"name": "APG", **changes},
+            "progression": {"evaluate_every": 60, "evaluation_episodes": 8, "checkpoint_every": 60},
+        }
+    )
+
+
+def test_training_lowers_the_cost_and_resumes_to_the_bit(small_file, small_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(gradient_training, "TOLERATED", 1e-9)  # such that decisions are divided
+    trained = train_by_gradients(settings(small_file), tmp_path / "whole")
+    curve = [line["median_cost"] for line in trained_curve(tmp_path / "whole")]
+    idle = np.median(rollout(lambda seen: np.zeros((len(seen), 6)), small_scene, validation_seeds(8)).cost)
+    assert curve[-1] < 0.2 * idle
+    assert trained.policy.metadata["training"]["updates"] == 120
+
+    resumed = resume_after(77, settings(small_file), tmp_path / "halves", monkeypatch)
+    for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert len(trained_curve(tmp_path / "halves")) == 2
+
+
+def resume_after(updates, configuration, folder, monkeypatch):
+    """Train with an interruption."""
+
+    class StopError(Exception):
+        """As if the process were killed."""
+
+    update, done = gradient_training._Learner._update, []
+
+    def stopped(learner):
+        if len(done) == updates:
+            raise StopError
+        done.append(learner)
+        return update(learner)
+
+    monkeypatch.setattr(gradient_training._Learner, "_update", stopped)
+    with pytest.raises(StopError):
+        train_by_gradients(configuration, folder)
+    monkeypatch.setattr(gradient_training._Learner, "_update", update)
+    return train_by_gradients(configuration, folder)
+
+
+def test_constraints_are_learned_and_prices_resumed(limited, small_file, tmp_path, monkeypatch):
+    limited.to_yaml(tmp_path / "limited.yaml")
+    constrained = settings(tmp_path / "limited.yaml")
+    trained = train_by_gradients(constrained, tmp_path / "whole")
+    resumed = resume_after(77, constrained, tmp_path / "halves", monkeypatch)
+    for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+    prices = []
+    for folder in ("whole", "halves"):
+        last = max((tmp_path / folder / "checkpoints").glob("*/checkpoint.npz"))
+        with np.load(last) as arrays:
+            prices.append(arrays["prices"])
+    np.testing.assert_array_equal(*prices)
+    unaware = train_by_gradients(settings(small_file), tmp_path / "unaware").policy
+    policies = trained.policy, unaware
+    violated = [rollout(each, limited, SEEDS).constraint_violations.mean() for each in policies]
+    assert violated[0] < 0.5 * violated[1], violated  # some starts violate
+
+
+def test_units_follow_the_inputs_and_leave_the_policy(small_file, small_scene):
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    seen = DQSpaceArmVectorEnv(COUNT, small_scene).reset(seed=SEEDS)[0]
+    for _ in range(60):
+        learner._update()
+    before, units = learner.export({})(seen), learner._episodes.units.copy()
+    for _ in range(300):
+        learner._adapt()
+    np.testing.assert_allclose(learner.export({})(seen), before, atol=1e-6)
+    sizes = learner._episodes.sizes()
+    np.testing.assert_allclose(learner._episodes.units, 4.0 * sizes, rtol=1e-9)
+    assert not np.allclose(units, 4.0 * sizes, rtol=0.1)
+
+
+def test_light_joints_have_small_units(small_file, small_scene):
+    strong = small_scene.replace(actuators={"joint_torque": {"limit": 1e3}})
+    plain, light = (gradient_training._Learner(settings(small_file), each) for each in (small_scene, strong))
+    np.testing.assert_array_equal(plain._episodes.units, 0.1)
+    joints = compile_scene(small_scene).layout.control.joint_torque
+    moved = light._episodes.units[joints] / 0.1 * motions(strong, 1e-3)[joints]
+    np.testing.assert_allclose(moved, gradient_training.FARTHEST)
+    light._update()
+    sizes = light._episodes.sizes()[joints]  # in the same proportions
+    np.testing.assert_allclose(
+        sizes / sizes[0], light._episodes.units[joints] / light._episodes.units[joints][0]
+    )
+
+
+def test_observations_that_small_inputs_hardly_vary_are_scaled_by_motions(
+    small_file, small_scene, monkeypatch
+):
+    """In honey, joints turn much faster in a maneuver than under small inputs that change all the time."""
+    links = [{**link.model_dump(exclude_none=True), "damping": 0.3} for link in small_scene.links]
+    slow = small_scene.replace(links=links, spread={"joint_rates": 0})
+    scale = gradient_training._Learner(settings(small_file, decisions=150), slow)._scale
+    monkeypatch.setattr(gradient_training, "PART", 1e-9)
+    by_small_inputs = gradient_training._Learner(settings(small_file, decisions=150), slow)._scale
+    relative, rates = scale / by_small_inputs, slice(-4, -2)  # of the first two joints
+    assert (relative <= 1.0).all()
+    assert (relative > 0.0).all()
+    assert relative[rates].max() < 0.8
+
+
+def test_methods_that_adapt_their_steps_do_so_less(small_scene):
+    assert gradient_training.coarser(small_scene) is small_scene
+    stiff = small_scene.replace(simulation={"integrator": "rodas4"})
+    assert gradient_training.coarser(stiff).simulation.tolerance == 1e-4
+    rough = stiff.replace(simulation={"tolerance": 1e-3})
+    assert gradient_training.coarser(rough).simulation.tolerance == 1e-3
+    explicit = small_scene.replace(simulation={"integrator": "dormand_prince"})
+    assert gradient_training.coarser(explicit).simulation.rtol == 1e-4
+
+
+def test_end_weights_rise_where_episodes_miss(small_file, small_scene):
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    learner._update()
+    assert learner._end_weight == 400.0  # it is too early
+    learner._updates = 100
+    learner._adapt()
+    assert learner._end_weight == pytest.approx(408.0)
+    learner._episodes.misses = lambda: np.zeros(COUNT)
+    learner._adapt()
+    assert learner._end_weight == pytest.approx(408.0)
+
+
+def test_unstable_motions_go_back_to_the_last_copy(small_file, small_scene):
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    for _ in range(60):
+        learner._update()
+    kept, caution = learner._kept["weight0"].copy(), learner._caution
+    learner._weights[0][:] += 0.1
+    learner._typical = 1e-3  # even the copy is no better: training goes on from its cost
+    cost = learner._update()
+    np.testing.assert_array_equal(learner._weights[0], kept)
+    assert learner._caution < caution
+    assert 1e-3 < learner._typical < 2.0 * cost
+    learner._update()
+    assert not np.array_equal(learner._weights[0], kept)
+
+
+def test_training_starts_from_a_policy(small_file, tmp_path):
+    first = train_by_gradients(settings(small_file), tmp_path / "first").policy
+    start = {"start_from": str(tmp_path / "first")}
+    going_on = settings(small_file, updates=2, learning_rate=1e-9).model_copy(update=start)
+    after = train_by_gradients(going_on, tmp_path / "second").policy
+    for one, other in zip(first.weights, after.weights, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-6)
+    assert after.metadata["training"]["seconds"] > first.metadata["training"]["seconds"]
+    wider = {**start, "network": Network(hidden=[8])}
+    with pytest.raises(ConfigurationError, match=r"start_from: .* not fit: network.hidden is \[16, 16\]"):
+        train_by_gradients(settings(small_file).model_copy(update=wider), tmp_path / "third")
+
+
+def trained_curve(folder):
+    return RunFolder(folder, load_configuration(folder / "config.yaml")).evaluations()
+
+
+def test_a_damaged_checkpoint_is_refused(small_file, tmp_path):
+    train_by_gradients(settings(small_file, updates=20), tmp_path)
+    (checkpoint,) = (tmp_path / "checkpoints").glob("*/checkpoint.npz")
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    with pytest.raises(RunFolderError, match=r"cannot be read .* remove it"):
+        train_by_gradients(settings(small_file, updates=20), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"crowding": 1.5}, "algorithm.*crowding = 1.5: must be at most 1"),
+        ({"decisions": 1}, "algorithm.*decisions = 1: must be at least 2"),
+        ({"copies": 10_000_000}, "algorithm.copies = 10000000: all copies take 400,000,000 decisions"),
+    ],
+)
+def test_mistakes_are_named(small_file, changes, message):
+    with pytest.raises(ConfigurationError, match=message):
+        settings(small_file, **changes)
