@@ -38,7 +38,7 @@ from agents.evaluation.training_runs import (
     validation_episodes,
 )
 from agents.policies.flying import time_per_action
-from agents.zoo.finding import as_policy, check_fit, policy_path
+from agents.zoo.finding import ActingPolicy, as_policy, check_fit, policy_path
 from agents.zoo.shelf import file_hash
 from dq_space_arm_env import Scene, load_scene
 from experts.demonstrations.settings import software
@@ -113,7 +113,7 @@ class Comparison:
 
 
 def compare(
-    policies: Sequence[str | Path] = (),
+    policies: Sequence[str | Path | ActingPolicy] = (),
     scene: Scene | str | Path = "paper",
     n: int = EVALUATION_SEEDS,
     *,
@@ -125,6 +125,7 @@ def compare(
     executor: Executor | None = None,
     trust: bool = False,
     normalize: Mapping[str, str | Path] = MappingProxyType({}),
+    learning_curves: bool = True,
     progress: Callable[[Advance], None] = lambda advance: None,
 ) -> Comparison:
     """Compare agents with the expert's controllers, from the fixed evaluation starts of a scene.
@@ -134,7 +135,8 @@ def compare(
     scene that is flown in.
 
     Args:
-        policies: Names of policies of the zoo, or paths, as for `evaluate`.
+        policies: Names of policies of the zoo, or paths, as for `evaluate`; or policies in memory, whose rows
+            are not kept.
         scene: A scene, the name of a shipped one, or a path to a YAML file.
         n: Number of starts, the first ones of the 500.
         controllers: Some of `CONTROLLERS`.
@@ -147,6 +149,7 @@ def compare(
         trust: Whether to execute the code in a model's file (.zip) where its tensors do not suffice.
         normalize: Files of the `VecNormalize` that models (.zip) were trained in, as for `evaluate`, by the
             models' paths, as they are among the policies.
+        learning_curves: Whether to read them, and to find the optima that they are drawn against.
         progress: Called now and then.
 
     Returns:
@@ -176,9 +179,10 @@ def compare(
         KeptRows(out),
         executor or local_executor(workers),
         trust,
+        learning_curves,
         progress,
     )
-    files = [policy_path(policy) for policy in policies]
+    files = [policy if isinstance(policy, ActingPolicy) else policy_path(policy) for policy in policies]
     if unknown := set(normalize) - {str(policy) for policy in policies}:
         raise ValueError(f"normalize: {min(unknown)} is not among the policies")
     statistics = [normalize.get(str(policy)) for policy in policies]
@@ -205,9 +209,12 @@ class _Work:
     kept: KeptRows
     executor: Executor
     trust: bool
+    learning_curves: bool
     progress: Callable[[Advance], None]
 
-    def agent(self, file: Path, name: str, normalize: str | Path | None, condition: str) -> Row:
+    def agent(
+        self, file: Path | ActingPolicy, name: str, normalize: str | Path | None, condition: str
+    ) -> Row:
         """Evaluate an agent, or read its finished row."""
 
         def fly() -> tuple[Evaluation, float]:
@@ -224,19 +231,22 @@ class _Work:
             )
             return evaluation, 0.0
 
-        content = {"policy": file_hash(file) if file.is_file() else None, **self._common(condition, self.n)}
+        path = file if isinstance(file, Path) else None
+        content = {"policy": file_hash(path) if path and path.is_file() else None}
+        content |= self._common(condition, self.n)
         if normalize is not None:
             content["normalize"] = file_hash(Path(normalize))
-        evaluation, _ = finished(self.kept, f"{name}-{condition}", content, fly)
+        kept = self.kept if path else KeptRows(None)
+        evaluation, _ = finished(kept, f"{name}-{condition}", content, fly)
         solves = evaluation.summary()["expert_solves"]
-        command = evaluation_command(file, self.scene_name, self.n, normalize)
+        command = evaluation_command(path, self.scene_name, self.n, normalize) if path else None
         facts = {
             "is_agent": True,
             "planning_seconds": 0.0,
             "solves": "-" if solves is None else f"{solves:,}",
-            "training_command": training_command(evaluation.metadata, file),
-            "evaluation_command": f"{command} {condition}",
-            "learning_curve": learning_curve(file),
+            "training_command": training_command(evaluation.metadata, path),
+            "evaluation_command": f"{command} {condition}" if command else None,
+            "learning_curve": learning_curve(path) if path and self.learning_curves else [],
             "validation_optimum": None,
         }
         if facts["learning_curve"] and evaluation.same_scene is not False:
@@ -362,13 +372,19 @@ def finished(
     return evaluation, planning_seconds
 
 
-def distinct_names(files: Sequence[Path]) -> list[str]:
+def distinct_names(files: Sequence[Path | ActingPolicy]) -> list[str]:
     """Name policies by the folders of their runs, or by their files, all different."""
-    names = [file.resolve().parent.name if file.stem == "policy" else file.stem for file in files]
+    names = [_name(file) for file in files]
     return [
         name if names.count(name) == 1 else f"{name} ({names[: i + 1].count(name)})"
         for i, name in enumerate(names)
     ]
+
+
+def _name(file: Path | ActingPolicy) -> str:
+    if isinstance(file, ActingPolicy):
+        return file.label
+    return file.resolve().parent.name if file.stem == "policy" else file.stem
 
 
 def _notes(controllers: Sequence[str], conditions: Sequence[str]) -> Iterator[str]:
@@ -388,8 +404,9 @@ def _commands(rows: Sequence[Row]) -> Iterator[str]:
     for row in rows:
         if row.facts["training_command"] is not None:
             found.setdefault(row.facts["training_command"], [])
-        flying, _, condition = row.facts["evaluation_command"].rpartition(" ")
-        found.setdefault(flying, []).append(condition)
+        if row.facts["evaluation_command"] is not None:
+            flying, _, condition = row.facts["evaluation_command"].rpartition(" ")
+            found.setdefault(flying, []).append(condition)
     for command, conditions in found.items():
         yield " ".join([command, *conditions])
 

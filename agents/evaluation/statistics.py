@@ -122,14 +122,23 @@ def compare_runs(successes: Sequence[ArrayLike], gaps: Sequence[ArrayLike]) -> R
     lengths = {len(np.asarray(run)) for run in (*successes, *gaps)}
     if len(lengths) != 1:
         raise ValueError(f"runs have {sorted(lengths)} episodes: evaluate all of them on the same starts")
-    success_rate, gap = rate_over_runs(np.array(successes)), _known(gaps)
+    return Runs(rate_over_runs(np.array(successes)), gap_over_runs(gaps))
+
+
+def gap_over_runs(gaps: Sequence[ArrayLike]) -> Interval:
+    """Interquartile mean of cost gaps over runs and starts, with an interval for other runs and starts.
+
+    Args:
+        gaps: Cost gaps of each run, shape (n,), the same starts in all runs; NaN where unknown.
+    """
+    gap = _known(gaps)
     if gap.size == 0:
-        return Runs(success_rate, Interval(math.nan, math.nan, math.nan))
+        return Interval(math.nan, math.nan, math.nan)
     # The variance of a trimmed mean is that of its winsorized values (Tukey and McLaughlin, Sankhya 1963).
     middle = interquartile_mean(gap)
     _, variance, quantile = _crossed(2.0 * np.clip(gap, *np.quantile(gap, [0.25, 0.75])))
     half = quantile * math.sqrt(variance)
-    return Runs(success_rate, Interval(middle, middle - half, middle + half))
+    return Interval(middle, middle - half, middle + half)
 
 
 def probability_of_improvement(costs: ArrayLike, others: ArrayLike) -> Interval:

@@ -67,6 +67,8 @@ def as_policy(
         PolicyFileError: If an exported policy cannot be read.
         ImportError: If a model is given and the extra `agents` is not installed.
     """
+    if isinstance(policy, ActingPolicy):
+        return policy if label is None else policy._replace(label=label)
     if isinstance(policy, str | Path):
         path, name = policy_path(policy), label or _label(policy)
         if normalize is None:

@@ -1,0 +1,291 @@
+"""Fly entrants in all tasks of a suite: controllers of the expert, agents trained for it, policies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agents.configuration import AgentConfiguration, list_configurations
+from agents.evaluation.comparing import Row, compare
+from agents.evaluation.evaluating import Advance as Step
+from agents.evaluation.evaluating import known_interval
+from agents.evaluation.plan_followers import CONTROLLERS
+from agents.evaluation.statistics import Interval, gap_over_runs, performance_profile, rate_over_runs
+from agents.experiments.many_trainings import train_seeds, training_executor, training_task
+from agents.experiments.training_task import FAILED
+from agents.run_folder import POLICY
+from agents.suite.tasks import Limits, Suite, SuiteError, load_suite
+from agents.zoo.finding import ActingPolicy, PolicyError, as_policy, check_fit, policy_path
+from agents.zoo.shelf import list_policies, load_policy
+from dq_space_arm_env import Scene
+from dq_space_arm_env.common.progress import Advance
+from experts.executors import Executor, local_executor
+
+ZOO = "zoo"
+"""Entrant: the policies that ship with the package, each in the scene that it was trained in."""
+TASK = "{task}"
+"""In the path of a policy: the name of a task."""
+TRAININGS = "trainings"
+Report = Callable[[Advance], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """An entrant in a task under a condition."""
+
+    task: str
+    condition: str
+    entrant: str
+    rows: tuple[Row, ...]  # one for each training, from the same starts
+
+    @cached_property
+    def success_rate(self) -> Interval:
+        """Share of the flights that reach the target."""
+        return rate_over_runs([row.evaluation.flights.is_success for row in self.rows])
+
+    @cached_property
+    def violating(self) -> Interval | None:
+        """Share of the flights that violate a constraint at some step; None in a scene without."""
+        return rate_over_runs(self._violates) if np.isfinite(self._shares).all() else None
+
+    @cached_property
+    def cost_gap(self) -> Interval:
+        """Interquartile mean of J / J_expert - 1 over trainings and starts; NaN if it is not known."""
+        return gap_over_runs([row.evaluation.cost_gaps for row in self.rows])
+
+    def within(self, gaps: ArrayLike) -> list[Interval]:
+        """Shares of the flights that reach the target within cost gaps and violate nothing."""
+        valid = np.array([row.evaluation.flights.is_success for row in self.rows]) & ~self._violates
+        found = np.array([row.evaluation.cost_gaps for row in self.rows])
+        return performance_profile(list(np.where(valid | np.isnan(found), found, np.inf)), gaps)
+
+    def solves(self, limits: Limits) -> bool:
+        """Whether the entrant keeps to the limits of the suite; estimates count, not their intervals."""
+        violating = 0.0 if self.violating is None else self.violating.value
+        return bool(
+            self.success_rate.value >= limits.success
+            and violating <= limits.violating
+            and self.cost_gap.value <= limits.cost_gap
+        )
+
+    def record(self, limits: Limits) -> dict[str, Any]:
+        """The score as a row of JSON values."""
+        summaries = [row.evaluation.summary() for row in self.rows]
+
+        def mean(name: str) -> float | None:
+            known = [each[name] for each in summaries if each[name] is not None]
+            return float(np.mean(known)) if known else None
+
+        tails = np.concatenate([row.evaluation.cost_gaps for row in self.rows])
+        return {
+            "task": self.task,
+            "condition": self.condition,
+            "entrant": self.entrant,
+            "runs": len(self.rows),
+            "episodes": summaries[0]["episodes"],
+            "solved": self.solves(limits),
+            "success_rate": list(self.success_rate),
+            "interquartile_mean_cost_gap": known_interval(self.cost_gap),
+            "tail": None if np.isnan(tails).all() else float(np.nanpercentile(tails, 95.0)),
+            "violating_episodes": None if self.violating is None else list(self.violating),
+            "action_seconds": float(np.median([each["action_seconds"] for each in summaries])),
+            "planning_seconds": self.rows[0].facts["planning_seconds"],
+            "training_seconds": mean("training_seconds"),
+            "commands": [row.facts["evaluation_command"] for row in self.rows],
+        }
+
+    @property
+    def _shares(self) -> NDArray[np.float64]:
+        return np.array([row.evaluation.flights.constraint_violations for row in self.rows])
+
+    @property
+    def _violates(self) -> NDArray[np.bool_]:
+        return np.nan_to_num(self._shares) > 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class SuiteRun:
+    """Entrants in the tasks of a suite."""
+
+    suite: Suite
+    scores: tuple[Score, ...]  # task by task
+    descriptions: Mapping[str, str]  # of the tasks
+    notes: tuple[str, ...]  # what is missing, and why
+
+    @property
+    def entrants(self) -> tuple[str, ...]:
+        """Names of the entrants."""
+        return tuple(dict.fromkeys(score.entrant for score in self.scores))
+
+    def of(self, entrant: str, condition: str) -> tuple[Score, ...]:
+        """Scores of an entrant under a condition, task by task."""
+        return tuple(each for each in self.scores if (each.entrant, each.condition) == (entrant, condition))
+
+
+def run_suite(
+    entrants: Sequence[str] = (),
+    suite: str | Path | Suite = "v1",
+    *,
+    policies: Mapping[str, Callable[[Scene], Any]] = MappingProxyType({}),
+    tasks: Sequence[str] = (),
+    seeds: int | None = None,
+    out: Path = Path("results") / "suite",
+    workers: int | None = None,
+    executor: Executor | None = None,
+    trust: bool = False,
+    progress: Report = lambda advance: None,
+) -> SuiteRun:
+    """Train and fly entrants in the tasks of a suite, and compare all flights with the expert's optima.
+
+    Args:
+        entrants: Any of these. A controller of the expert, one of `CONTROLLERS`. An agent that is trained for
+            each task: one of the suite's, the name of a shipped configuration, or a YAML file. "zoo". The
+            path of a policy, as for `evaluate`, with "{task}" in it where each task has its own; others fly
+            where they fit. All that ship with the package by default, unless policies are given.
+        suite: A version of the suite, or a YAML file.
+        policies: Further policies by name: a function that gives, for the scene of a task, what `evaluate`
+            takes, such as a function from observations, shape (B, n_obs), to actions, shape (B, n_u).
+        tasks: Some of its tasks; all by default.
+        seeds: Trainings of each agent and task; as the suite says by default.
+        out: Folder of trainings and finished rows; those found there are not made again.
+        workers: Number of processes; one per processor by default.
+        executor: Used instead of local processes.
+        trust: Whether to execute the code in a model's file (.zip) where its tensors do not suffice.
+        progress: Called now and then.
+
+    Returns:
+        The scores.
+
+    Raises:
+        SuiteError: If the suite or a task is not what it should be, or nobody can fly.
+        ConfigurationError, PolicyError, PolicyFileError: If an entrant cannot be used.
+        DemonstrationsError: If processes of the expert are killed again and again; finished rows remain.
+        KeyboardInterrupt: If the user interrupts it; likewise.
+    """
+    chosen = load_suite(suite)
+    scenes = {task: chosen.scene(task) for task in tasks or chosen.tasks}
+    if not entrants and not policies:
+        entrants = (*CONTROLLERS, *chosen.agents, ZOO)
+    controllers, agents, files = _sorted_out(entrants, chosen)
+    notes: list[str] = []
+    fliers = {task: [*_from_files(files, task, scenes[task], trust)] for task in scenes}
+    for task, scene in scenes.items():
+        fliers[task] += [(name, as_policy(make(scene), name)) for name, make in policies.items()]
+    fitting = {name for found in fliers.values() for name, _ in found}
+    for name in files:
+        if name not in fitting and name != ZOO:
+            raise SuiteError(f"{name}: fits no task, or there is no such file")
+    plans = {(agent, task): chosen.training(agent, task) for agent in agents for task in scenes}
+    count = chosen.seeds if seeds is None else seeds
+    trained = _train(plans, count, out / TRAININGS, executor, workers, progress, notes)
+    scores: list[Score] = []
+    for number, task in enumerate(scenes, 1):
+
+        def announce(step: Step, task: str = task, number: int = number) -> None:
+            progress(step._replace(stage=f"{task} ({number} of {len(scenes)}), {step.stage}"))
+
+        flying: list[tuple[str, Any]] = [
+            (agent_name(agent), path) for agent in agents for path in trained[agent, task]
+        ]
+        flying += fliers[task]
+        if not (flying or controllers):
+            continue
+        found = compare(
+            [policy for _, policy in flying],
+            task,
+            chosen.starts,
+            controllers=controllers,
+            conditions=chosen.conditions,
+            receding_starts=min(chosen.receding_starts, chosen.starts),
+            out=out / task,
+            learning_curves=False,
+            executor=executor or local_executor(workers),
+            trust=trust,
+            progress=announce,
+        )
+        names = [*(CONTROLLERS[each] for each in controllers), *(name for name, _ in flying)]
+        for condition in chosen.conditions:
+            flown = list(zip(names, found.under(condition), strict=True))
+            scores += [
+                Score(task, condition, name, tuple(row for each, row in flown if each == name))
+                for name in dict.fromkeys(names)
+            ]
+    described = {task: scene.description for task, scene in scenes.items()}
+    return SuiteRun(chosen, tuple(scores), described, tuple(notes))
+
+
+def agent_name(agent: str) -> str:
+    """Name of a trained agent in tables."""
+    return Path(agent).stem if agent.endswith((".yaml", ".yml")) else agent
+
+
+def _sorted_out(entrants: Sequence[str], suite: Suite) -> tuple[list[str], list[str], list[str]]:
+    """Controllers, agents to train, and policies among the entrants."""
+    controllers: list[str] = []
+    agents: list[str] = []
+    files: list[str] = []
+    for entrant in dict.fromkeys(map(str, entrants)):
+        if entrant in CONTROLLERS:
+            controllers.append(entrant)
+        elif entrant in (*suite.agents, *list_configurations()) or entrant.endswith((".yaml", ".yml")):
+            agents.append(entrant)
+        else:
+            files.append(entrant)
+    return controllers, agents, files
+
+
+def _from_files(
+    files: Sequence[str], task: str, scene: Scene, trust: bool
+) -> Iterator[tuple[str, str | Path | ActingPolicy]]:
+    """Names and policies that fly in a task."""
+    for file in files:
+        if file == ZOO:
+            for name in list_policies():
+                if load_policy(name).metadata.get("scene_hash") == scene.content_hash():
+                    yield f"{name} ({ZOO})", name
+            continue
+        path = policy_path(file.replace(TASK, task))
+        if TASK in file and not path.exists():
+            continue
+        acting = as_policy(path, trust=trust)
+        try:
+            check_fit(acting, scene)
+        except PolicyError:
+            if TASK in file:
+                raise
+            continue
+        yield file, path
+
+
+def _train(
+    plans: Mapping[tuple[str, str], AgentConfiguration],
+    count: int,
+    out: Path,
+    executor: Executor | None,
+    workers: int | None,
+    progress: Report,
+    notes: list[str],
+) -> dict[tuple[str, str], list[Path]]:
+    """Train all agents for all tasks; the policies of each, and a note on each training that failed."""
+    configurations = list(plans.values())
+    if not configurations:
+        return {}
+    running = executor or training_executor(configurations, workers)
+    rows = train_seeds(configurations, count, out, executor=running, report=progress)
+    for row in rows:
+        if row["outcome"] == FAILED:
+            notes.append(f"The training of {row['agent']}, seed {row['seed']}, failed: {row['failure']}")
+    made = {row["folder"] for row in rows if row["outcome"] != FAILED}
+    found: dict[tuple[str, str], list[Path]] = {}
+    for key, plan in plans.items():
+        seeds = range(plan.seed, plan.seed + count)
+        folders = [training_task(plan.model_copy(update={"seed": seed}), out).folder for seed in seeds]
+        found[key] = [folder / POLICY for folder in folders if str(folder) in made]
+    return found

@@ -1,0 +1,134 @@
+"""Suites: tasks with the scenes as they were when a version was published, and what counts as solving one."""
+
+from __future__ import annotations
+
+import importlib.resources
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, StrictStr, ValidationError
+
+from agents.configuration import AgentConfiguration, load_configuration
+from agents.configuration.schema import Few
+from agents.evaluation.conditions import CONDITIONS
+from agents.evaluation.expert_costs import EVALUATION_SEEDS
+from agents.evaluation.plan_followers import CONTROLLERS
+from dq_space_arm_env import Scene, load_scene
+from dq_space_arm_env.common.bounded_reading import UnreadableError
+from dq_space_arm_env.validation import (
+    Fraction,
+    Model,
+    NonNegative,
+    Problem,
+    YAMLError,
+    count_up_to,
+    did_you_mean,
+    problem_list,
+    read_yaml,
+    yaml_problem,
+)
+
+_Starts = Annotated[int, count_up_to(EVALUATION_SEEDS)]
+_Hash = Annotated[StrictStr, Field(pattern="^[0-9a-f]{16,64}$")]
+
+
+class SuiteError(ValueError):
+    """An unusable suite; the message says what is wrong, and what would be right."""
+
+
+class Limits(Model):
+    """What a controller has to keep to solve a task."""
+
+    success: Fraction = Field(description="least share of flights that reach the target")
+    violating: Fraction = Field(description="largest share of flights that violate a constraint")
+    cost_gap: NonNegative = Field(description="largest interquartile mean of J / J_expert - 1")
+
+
+class Suite(Model):
+    """A version of the suite."""
+
+    name: StrictStr = Field(min_length=1, description="name with its version")
+    description: StrictStr = Field(default="", description="what its tasks are")
+    starts: _Starts = Field(description="evaluation starts of each task, the first ones")
+    receding_starts: _Starts = Field(description="the same of the receding-horizon expert")
+    conditions: tuple[StrictStr, ...] = Field(
+        default=("training",), min_length=1, description="conditions of the flights, see `scene_under`"
+    )
+    limits: Limits = Field(description="what solving a task asks for")
+    agents: Mapping[StrictStr, Mapping[str, Any]] = Field(
+        default_factory=dict, description="configurations without name and scene, trained for each task"
+    )
+    seeds: Few = Field(default=5, description="trainings of each agent and task")
+    tasks: Mapping[StrictStr, _Hash] = Field(
+        min_length=1, description="scenes, by the first digits of the hash of their content"
+    )
+
+    def _problems(self) -> Iterator[Problem]:
+        for name in self.conditions:
+            if name not in CONDITIONS:
+                yield Problem(("conditions",), name, f"must be one of {', '.join(CONDITIONS)}")
+        for name in self.agents:
+            if name in (*CONTROLLERS, "zoo"):
+                yield Problem(("agents",), name, "is the name of a controller: choose another")
+
+    def scene(self, task: str) -> Scene:
+        """The scene of a task; SuiteError if it is not what the suite was made of."""
+        if task not in self.tasks:
+            suggestion = did_you_mean(task, self.tasks)
+            raise SuiteError(f"task: {task!r} is unknown; {suggestion}Choose from {', '.join(self.tasks)}")
+        scene, expected = load_scene(task), self.tasks[task]
+        found = scene.content_hash()
+        if not found.startswith(expected):
+            raise SuiteError(
+                f"{self.name}: scene {task} has the hash {found[: len(expected)]}, should be {expected}: the "
+                "scene has changed, and results would not compare; use the release that the suite came with"
+            )
+        return scene
+
+    def training(self, agent: str | Path, task: str) -> AgentConfiguration:
+        """Configuration of an agent for a task: one of the suite's, a shipped one, or a YAML file's."""
+        if agent in self.agents:
+            content, name = dict(self.agents[str(agent)]), str(agent)
+        else:
+            given = load_configuration(agent)
+            content, name = given.model_dump(exclude_none=True, exclude={"description"}), given.name
+        return load_configuration({**content, "name": f"{name}-{task}", "scene": task})
+
+
+def list_suites() -> list[str]:
+    """Versions of the suite that ship with the package, sorted."""
+    return sorted(path.stem for path in _directory().glob("*.yaml"))
+
+
+def load_suite(source: str | Path | Suite = "v1") -> Suite:
+    """Load a suite.
+
+    Args:
+        source: A version that ships with the package, the path of a YAML file, or a suite.
+
+    Returns:
+        The suite; its scenes are checked when they are loaded.
+
+    Raises:
+        SuiteError: If it cannot be found, read or validated; the message lists every problem.
+    """
+    if isinstance(source, Suite):
+        return source
+    shipped = list_suites()
+    path = _directory() / f"{source}.yaml" if source in shipped else Path(source)
+    if source not in shipped and path.suffix not in (".yaml", ".yml"):
+        raise SuiteError(f"suite: {str(source)!r}, should be one of {', '.join(shipped)}, or a YAML file")
+    try:
+        return Suite.model_validate(read_yaml(path))
+    except UnreadableError as error:
+        raise SuiteError(str(error)) from error
+    except YAMLError as error:
+        raise SuiteError(f"{path}: not valid YAML: {yaml_problem(error)}") from error
+    except ValidationError as error:
+        raise SuiteError(problem_list(str(path), error)) from error
+
+
+def _directory() -> Path:
+    installed = Path(str(importlib.resources.files("agents"))) / "suites"
+    return installed if installed.is_dir() else Path(__file__).resolve().parents[2] / "configs" / "suites"
