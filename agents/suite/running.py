@@ -204,7 +204,7 @@ def run_suite(
             controllers=controllers,
             conditions=chosen.conditions,
             receding_starts=min(chosen.receding_starts, chosen.starts),
-            out=out / task,
+            out=out / Path(task).stem,
             learning_curves=False,
             executor=executor or local_executor(workers),
             trust=trust,
@@ -251,7 +251,7 @@ def _from_files(
                 if load_policy(name).metadata.get("scene_hash") == scene.content_hash():
                     yield f"{name} ({ZOO})", name
             continue
-        path = policy_path(file.replace(TASK, task))
+        path = policy_path(file.replace(TASK, Path(task).stem))
         if TASK in file and not path.exists():
             continue
         acting = as_policy(path, trust=trust)

@@ -61,7 +61,8 @@ class Suite(Model):
     )
     seeds: Few = Field(default=5, description="trainings of each agent and task")
     tasks: Mapping[StrictStr, _Hash] = Field(
-        min_length=1, description="scenes, by the first digits of the hash of their content"
+        min_length=1,
+        description="scenes, names or YAML files, by the first digits of the hash of their content",
     )
 
     def _problems(self) -> Iterator[Problem]:
@@ -93,7 +94,7 @@ class Suite(Model):
         else:
             given = load_configuration(agent)
             content, name = given.model_dump(exclude_none=True, exclude={"description"}), given.name
-        return load_configuration({**content, "name": f"{name}-{task}", "scene": task})
+        return load_configuration({**content, "name": f"{name}-{Path(task).stem}", "scene": task})
 
 
 def list_suites() -> list[str]:

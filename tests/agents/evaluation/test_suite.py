@@ -1,0 +1,223 @@
+"""The suite: pinned scenes, entrants of all kinds, scores by hand, resuming, the check of others' results."""
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from agents import evaluate
+from agents.command_line.suite import suite as suite_verb
+from agents.configuration import ConfigurationError
+from agents.evaluation.comparing import Row
+from agents.evaluation.evaluating import Evaluation
+from agents.evaluation.expert_costs import OptimalCosts
+from agents.policies.flying import Flights
+from agents.suite import Score, Suite, SuiteError, SuiteRun, list_suites, load_suite, run_suite
+from agents.suite.suite_page import check, overall_rows, suite_page
+from agents.zoo.finding import PolicyError
+from dq_space_arm_env import load_scene
+from experts.demonstrations import SerialExecutor
+
+LIMITS = {"success": 0.9, "violating": 0.1, "cost_gap": 0.05}
+TINY = {"network": {"hidden": [4]}, "algorithm": {"name": "APG", "updates": 1, "copies": 2, "decisions": 10}}
+N = 3
+
+
+@pytest.fixture
+def content(quick, tmp_path):
+    """A suite of two scenes in files."""
+    tasks = {}
+    for number in (1, 2):
+        scene = quick.replace(
+            name=f"task-{number}", target={"pose": {"position": [1.0 + 0.1 * number, 0.3, 0.0]}}
+        )
+        file = tmp_path / f"task-{number}.yaml"
+        scene.to_yaml(file)
+        tasks[str(file)] = scene.content_hash()[:16]
+    return {
+        "name": "two tasks",
+        "starts": N,
+        "receding_starts": 1,
+        "limits": LIMITS,
+        "agents": {"tiny": TINY},
+        "seeds": 2,
+        "tasks": tasks,
+    }
+
+
+def test_scenes_of_the_shipped_suites_are_what_they_were():
+    for name in list_suites():
+        suite = load_suite(name)
+        for task in suite.tasks:
+            assert suite.scene(task).spread is not None
+            for agent in suite.agents:
+                assert suite.training(agent, task).scene == task
+
+
+def test_a_scene_that_has_changed_is_refused(content):
+    task = next(iter(content["tasks"]))
+    suite = Suite.model_validate({**content, "tasks": {task: "0" * 16}})
+    with pytest.raises(
+        SuiteError, match=r"has the hash .*, should be 0000000000000000: the scene has changed"
+    ):
+        suite.scene(task)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"starts": 501}, "starts = 501"),
+        ({"limits": {**LIMITS, "success": 2.0}}, "limits.success = 2"),
+        ({"conditions": ["storm"]}, "must be one of training"),
+        ({"agents": {"gains": TINY}}, "is the name of a controller"),
+        ({"tasks": {"paper": "xyz"}}, "tasks.paper = 'xyz'"),
+        ({"color": "red"}, "color"),
+    ],
+)
+def test_wrong_files_are_refused_in_words(content, tmp_path, change, sentence):
+    file = tmp_path / "wrong.yaml"
+    file.write_text(json.dumps({**content, **change}))  # JSON is YAML
+    with pytest.raises(SuiteError, match=sentence):
+        load_suite(file)
+
+
+def test_unknown_names_are_refused(content):
+    suite = Suite.model_validate(content)
+    with pytest.raises(SuiteError, match="should be one of v1, or a YAML file"):
+        load_suite("v0")
+    with pytest.raises(SuiteError, match="task: 'nowhere' is unknown"):
+        run_suite(["gains"], suite, tasks=["nowhere"])
+    with pytest.raises(PolicyError, match="zoo has no policy 'magic'"):
+        run_suite(["magic"], suite)
+    with pytest.raises(SuiteError, match="fits no task, or there is no such file"):
+        run_suite(["nowhere/{task}.npz"], suite)
+    with pytest.raises(ConfigurationError, match=r"algorithm\.name"):
+        Suite.model_validate({**content, "agents": {"tiny": {}}}).training(
+            "tiny", next(iter(content["tasks"]))
+        )
+
+
+def still(scene):
+    """A policy that does nothing, for a scene."""
+    assert scene.spread is not None
+    return lambda observations: np.zeros((len(observations), 6))
+
+
+@pytest.mark.slow
+def test_entrants_of_all_kinds_fly_and_finished_ones_are_kept(
+    content, cache, counting, tmp_path, monkeypatch
+):
+    suite, out, executor = Suite.model_validate(content), tmp_path / "out", counting()
+    fly = partial(run_suite, suite=suite, policies={"still": still}, out=out, executor=executor)
+    run = fly(["open-loop", "gains", "tiny"])
+    names = ["open-loop plan", "plan with gains", "tiny", "still"]
+    assert [score.entrant for score in run.scores[:4]] == names
+    assert len(run.scores) == 8
+    assert not run.notes
+    for score in run.scores:
+        if score.entrant == "tiny":
+            folders = [out / "trainings" / f"tiny-{task_name(score)}-{seed}" for seed in (0, 1)]
+            alone = [evaluate(folder, score.task, N, executor=executor) for folder in folders]
+            together = np.concatenate([each.flights.cost for each in alone])
+            found = np.concatenate([row.evaluation.flights.cost for row in score.rows])
+            np.testing.assert_array_equal(found, together)
+        if score.entrant == "plan with gains":
+            np.testing.assert_allclose(score.cost_gap.value, 0.0, atol=1e-9)
+            assert score.solves(suite.limits)
+    done = executor.tasks
+    monkeypatch.setattr("agents.experiments.training_task.train", lambda *_: pytest.fail("trained again"))
+    pattern = str(out / "trainings" / "tiny-{task}-0")
+    again = fly(["open-loop", "gains", "tiny", pattern])
+    for task in suite.tasks:
+        first, copy = (
+            next(each for each in again.scores if (each.task, each.entrant) == (task, name))
+            for name in ("tiny", pattern)
+        )
+        np.testing.assert_array_equal(copy.rows[0].evaluation.cost_gaps, first.rows[0].evaluation.cost_gaps)
+    assert executor.tasks == done + 4  # trainings, which find their policies
+    mine, other = suite_page(again, picture=False).record, tmp_path / "other.json"
+    other.write_text(json.dumps(mine))
+    assert {row["verdict"] for row in check(again, other)} == {"equal"}
+
+
+def task_name(score):
+    return load_scene(score.task).name
+
+
+def made(success, gaps, violations=None, task="a", entrant="x"):
+    """A score of given flights, shape (runs, starts)."""
+    rows = []
+    for run, (reached, gap) in enumerate(zip(success, gaps, strict=True)):
+        n = len(reached)
+        zeros = np.zeros(n)
+        shares = np.full(n, np.nan) if violations is None else np.array(violations[run])
+        flights = Flights(
+            1.0 + np.array(gap),
+            np.array(reached),
+            *(np.zeros(n, bool),) * 2,
+            np.full(n, 9),
+            *(zeros,) * 4,
+            shares,
+        )
+        optimal = OptimalCosts(np.arange(n), np.ones(n), np.ones(n, bool), zeros)
+        evaluation = Evaluation("x", "s", "training", np.arange(n), flights, optimal, 1e-6, 1.0, {})
+        rows.append(Row(evaluation, {"planning_seconds": 0.0, "evaluation_command": None}))
+    return Score(task, "training", entrant, tuple(rows))
+
+
+def test_scores_by_hand(content):
+    suite = Suite.model_validate(content)
+    first = made([[True] * 4, [True, True, True, False]], [[0.0, 0.009, 0.02, 0.03], [0.04, 0.0, 0.009, 9.0]])
+    assert first.success_rate.value == 7 / 8
+    # The interquartile mean of 0, 0, .009, .009, .02, .03, .04, 9.
+    assert first.cost_gap.value == pytest.approx((0.009 + 0.009 + 0.02 + 0.03) / 4)
+    assert [share.value for share in first.within((0.005, 0.025, 10.0))] == [2 / 8, 5 / 8, 7 / 8]
+    assert not first.solves(suite.limits)  # 87.5 % of 90 %
+    second = made([[True] * 10], [[0.04] * 10], [[0.0] * 9 + [0.2]], task="b")
+    assert second.violating is not None
+    assert second.violating.value == 0.1
+    assert second.solves(suite.limits)
+    assert second.within((0.05,))[0].value == 0.9
+    run = SuiteRun(suite, (first, second), {"a": "", "b": ""}, ())
+    (row,) = overall_rows(run, "training")
+    assert (row["tasks"], row["solved"]) == (2, 1)
+    assert row["success_rate"][0] == pytest.approx((7 / 8 + 1.0) / 2)
+    assert row["within_0.01"][0] == pytest.approx((4 / 8 + 0.0) / 2)
+
+
+def test_a_check_tells_equal_from_like_and_other(content, tmp_path):
+    suite, file = Suite.model_validate(content), tmp_path / "theirs.json"
+
+    def of(*scores):
+        return SuiteRun(suite, scores, {"a": ""}, ())
+
+    fine = made([[True] * 50], [[0.01] * 25 + [0.03] * 25])
+    file.write_text(json.dumps(suite_page(of(fine), picture=False).record))
+    near, far = made([[True] * 50], [[0.01] * 24 + [0.03] * 26]), made([[False] * 50], [[0.5] * 50])
+    found = [check(of(score), file)[0]["verdict"] for score in (fine, near, far)]
+    assert found == ["equal", "agrees", "differs"]
+    with pytest.raises(SuiteError, match="has no score of y"):
+        check(of(made([[True]], [[0.0]], entrant="y")), file)
+    file.write_text("{}")
+    with pytest.raises(SuiteError, match="is not the JSON file of a suite"):
+        check(of(fine), file)
+
+
+@pytest.mark.slow
+def test_the_verb_writes_page_and_json_and_tells_a_failed_training(content, cache, tmp_path, monkeypatch):
+    monkeypatch.setattr("agents.evaluation.expert_costs.local_executor", lambda workers: SerialExecutor())
+    broken = {**TINY, "demonstrations": 3}
+    file, out = tmp_path / "suite.yaml", tmp_path / "out"
+    file.write_text(json.dumps(content))
+    verb = ["--suite", str(file), "--out", str(out), "--seeds", "1", "--workers", "1"]
+    done = CliRunner().invoke(suite_verb, ["tiny", *verb], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert {path.name for path in out.glob("suite.*")} == {"suite.html", "suite.json", "suite.md"}
+    record = json.loads((out / "suite.json").read_text())
+    assert len(record["parts"]["tasks"]["scores"]) == 2
+    assert "plan with gains" not in (out / "suite.md").read_text()
+    file.write_text(json.dumps({**content, "agents": {"tiny": broken}}))
+    with pytest.raises(ConfigurationError, match="demonstrations"):
+        CliRunner().invoke(suite_verb, ["tiny", *verb], catch_exceptions=False)
