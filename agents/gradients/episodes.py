@@ -270,11 +270,11 @@ class Episodes:
         decisions = len(self._calls)
         by_effort = 2.0 * self._held[:, None, None] * self._efforts * self._inputs[:-1]
         above, below = (self._wanted > self._high[:decisions]), (self._wanted < self._low[:decisions])
-        is_limited = (above | below).any(axis=(1, 2))
+        is_limited: Array = np.any(above | below, axis=(1, 2))
         units = self.units * self._high / kept
         steep = STEEP if self.penalties is None else STEEP_PENALTIES
         for k in range(decisions - 1, -1, -1):
-            further = 0.0
+            further: Array | float = 0.0
             for _, reverse in reversed(self._further[k]):
                 reverse(rows)
                 further = further + self._by_held
