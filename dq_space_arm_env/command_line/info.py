@@ -12,7 +12,7 @@ from dq_space_arm_env.command_line.names import package_folder, scene_files
 from dq_space_arm_env.command_line.policy_sources import policy_names
 from dq_space_arm_env.command_line.verb import json_option, print_document
 from dq_space_arm_env.common.console import table_console
-from dq_space_arm_env.common.entry_points import entry_points
+from dq_space_arm_env.common.entry_points import entry_points, load
 
 VARIABLES = (
     "DQ_SPACE_ARM_CACHE",
@@ -57,13 +57,18 @@ version_option = click.option(
     short_help="Show versions, machine and caches, for a bug report.",
     epilog="""\b
         Examples:
-          dq-space-arm info         # for people
-          dq-space-arm info --json  # for programs
+          dq-space-arm info          # for people
+          dq-space-arm info --json   # for programs
+          dq-space-arm info --speed  # how fast this machine is
     """,
 )
+@click.option("--speed", is_flag=True, help="Measure steps and solutions, beside a reference, in seconds.")
 @json_option
-def info(as_json: bool) -> None:
-    """Show versions, machine and caches, to paste into a bug report."""
+def info(speed: bool, as_json: bool) -> None:
+    """Show versions, machine and caches, to paste into a bug report; or how fast the machine is."""
+    if speed:
+        _show_speed(as_json)
+        return
     found = gather()
     if as_json:
         print_document(found)
@@ -74,6 +79,36 @@ def info(as_json: bool) -> None:
     for title, values in found.items():
         rows = [(name, _text(value)) for name, value in values.items()]
         console.print(plain_table(title, ("", ""), rows))
+
+
+def _show_speed(as_json: bool) -> None:
+    """Measure what packages offer to measure."""
+    from dq_space_arm_env.common.provenance import provenance
+    from dq_space_arm_env.common.tables import Column, tabulate
+
+    rows = [row for reference in entry_points("dq_space_arm.speeds").values() for row in load(reference)()]
+    if as_json:
+        print_document({"speed": rows, "machine": provenance()["machine"]})
+        return
+    columns = (
+        Column("measured", ""),
+        Column("seconds", "here", _duration),
+        Column("reference_seconds", "reference", _duration),
+        Column("ratio", "ratio", ".2f"),
+        Column("per_second", "a second", lambda rate: f"{rate:,.0f}"),
+    )
+    machine = provenance()["machine"]["processor_name"]
+    title = (
+        f"Scene paper, one core of {machine}\nThe best of some samples; the reference is the documentation's."
+    )
+    table_console().print(tabulate(title, rows, columns).for_terminal())
+
+
+def _duration(seconds: float) -> str:
+    """A time with its unit."""
+    units = (("ns", 1e9), ("us", 1e6), ("ms", 1e3), ("s", 1.0))
+    unit, scale = next((each for each in units if seconds * each[1] < 1e3), units[-1])
+    return f"{seconds * scale:.3g} {unit}"
 
 
 def gather() -> dict[str, dict[str, Any]]:
