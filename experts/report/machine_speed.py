@@ -1,4 +1,4 @@
-"""What this machine does in a second, beside the machine of the documentation: `dq-space-arm info --speed`."""
+"""What this machine does in a second, beside a reference: `dq-space-arm info --speed`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def machine_speed() -> Iterator[Row]:
     """Measure one core on the scene `paper`, compiled before.
 
     Yields:
-        Rows: what is `measured`, `seconds` here, the best of some samples, `reference_seconds`, their `ratio`,
+        Rows: what is `measured`, `seconds` here (best sample), `reference_seconds`, their `ratio`,
         and how many a second.
     """
     for (measured, reference), seconds in zip(REFERENCE.items(), _measure(), strict=True):
