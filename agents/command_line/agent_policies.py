@@ -31,11 +31,11 @@ def policy_names() -> dict[str, str]:
 
 
 def owns_policy(policy: str) -> bool:
-    """Recognize names of the zoo, exported policies, models of Stable-Baselines3, and training runs."""
+    """Recognize names of the zoo, exported policies, networks, models of Stable-Baselines3, and runs."""
     path = Path(policy)
     if path.is_dir():
         return (path / "policy.npz").is_file()
-    if path.suffix == ".zip":
+    if path.suffix in (".zip", ".onnx"):
         return path.is_file()
     return policy in policy_files() or "weight_0" in archive_members(path)
 

@@ -205,9 +205,10 @@ def evaluate(
     """Evaluate a policy from the fixed evaluation starts of a scene.
 
     Args:
-        policy: Name of a policy of the zoo; path of an exported policy (.npz), of a Stable-Baselines3 model
-            (.zip), or of the folder of a training run; an `ExportedPolicy`; a model; or a function from
-            observations, shape (B, n_obs), to actions, fractions of the limits, shape (B, n_u).
+        policy: Name of a policy of the zoo; path of an exported policy (.npz), of a network (.onnx), of a
+            Stable-Baselines3 model (.zip), or of the folder of a training run; an `ExportedPolicy`; a model;
+            or a function from observations, shape (B, n_obs), to actions, fractions of the limits, shape
+            (B, n_u).
         scene: A scene, the name of a shipped one, or a path to a YAML file.
         n: Number of starts, the first ones of the 500.
         condition: Variant of the scene, one of `CONDITIONS`.

@@ -19,6 +19,7 @@ from agents.zoo.model_archive import (
     read_model,
 )
 from agents.zoo.normalization import ObservationStatistics, StatisticsError, read_statistics, statistics_of
+from agents.zoo.onnx_model import OnnxModel, OnnxModelError
 from agents.zoo.shelf import ZooError, policy_file
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
@@ -51,9 +52,9 @@ def as_policy(
     Stable-Baselines3 and those of this package are read by their tensors.
 
     Args:
-        policy: Name in the zoo; path of an exported policy (.npz), of a model of Stable-Baselines3 (.zip), or
-            of a run folder; an `ExportedPolicy`; a model; or a function from observations, shape (B, n_obs),
-            to actions, shape (B, n_u).
+        policy: Name in the zoo; path of an exported policy (.npz), of a network (.onnx), of a model of
+            Stable-Baselines3 (.zip), or of a run folder; an `ExportedPolicy`; a model; or a function from
+            observations, shape (B, n_obs), to actions, shape (B, n_u).
         label: Its name in tables; the file or class by default.
         trust: Whether to execute the code in a model's file where its tensors do not suffice.
         normalize: File of the `VecNormalize` that a model's file (.zip) was trained in, as its `save` writes
@@ -65,7 +66,7 @@ def as_policy(
     Raises:
         PolicyError: If it is none of these, or cannot be read, or normalization is missing or of no use.
         PolicyFileError: If an exported policy cannot be read.
-        ImportError: If a model is given and the extra `agents` is not installed.
+        ImportError: If a model is given and the extra `agents`, or `onnx`, is not installed.
     """
     if isinstance(policy, ActingPolicy):
         return policy if label is None else policy._replace(label=label)
@@ -83,6 +84,8 @@ def as_policy(
             act = _on_goals(policy, joined=True)
             return ActingPolicy(name, act, act, True, policy.metadata, sizes)
         return ActingPolicy(name, policy, policy, False, policy.metadata, sizes)
+    if isinstance(policy, OnnxModel):
+        return ActingPolicy(label or "ONNX model", policy, policy, True, {}, policy.sizes)
     if callable(getattr(policy, "predict", None)):
         predict = _predictor(policy, _own_statistics(policy))
         return ActingPolicy(label or type(policy).__name__, predict, predict, True, {})
@@ -216,7 +219,7 @@ def _on_goals(act: Callable[[Any], NDArray[Any]], *, joined: bool) -> StateFeedb
 
 
 def read_policy(path: Path, *, trust: bool = False, normalized: bool = False) -> Any:
-    """Read an exported policy or a model of Stable-Baselines3; only a trusted file's code is executed.
+    """Read a policy, or a model of Stable-Baselines3; only a trusted file's code is executed.
 
     A model that was trained on normalized observations is refused unless the caller normalizes them.
     """
@@ -226,9 +229,14 @@ def read_policy(path: Path, *, trust: bool = False, normalized: bool = False) ->
         return ExportedPolicy.load(path)
     if path.suffix == ".zip":
         return _read_model(path, trust=trust, normalized=normalized)
+    if path.suffix == ".onnx":
+        try:
+            return OnnxModel(path)
+        except OnnxModelError as error:
+            raise PolicyError(str(error)) from error
     raise PolicyError(
-        f"{path}: should be an exported policy (.npz), a model of Stable-Baselines3 (.zip), a run folder, "
-        "or a name in the zoo"
+        f"{path}: should be an exported policy (.npz), a network (.onnx), a model of Stable-Baselines3 "
+        "(.zip), a run folder, or a name in the zoo"
     )
 
 

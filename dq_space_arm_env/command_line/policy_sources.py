@@ -58,12 +58,13 @@ def load_policy(
     known = list(policy_names())
     if Path(policy).exists():
         raise ValueError(
-            f"{policy} is not a policy: give a solution (.npz), an exported policy (.npz), a model (.zip), "
-            f"the folder of a training run, or one of {', '.join(known)}"
+            f"{policy} is not a policy: give a solution (.npz), an exported policy (.npz, .onnx), a model "
+            f"(.zip), the folder of a training run, or one of {', '.join(known)}"
         )
     raise ValueError(
         f"no policy is named {policy!r}, and there is no such file; {did_you_mean(policy, known)}The "
-        f"policies are {', '.join(known)}; give your own as a file (.npz, .zip) or the folder of its run"
+        f"policies are {', '.join(known)}; give your own as a file (.npz, .onnx, .zip) or the folder of "
+        "its run"
     )
 
 

@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     show_default=True,
     help="zero: no input; random: random inputs; plan: the expert's plan from this start, open loop; gains: "
     "the plan with its feedback gains; receding: the expert, replanning at every step; or the name of a "
-    "policy of the zoo, a solution (.npz), an exported policy (.npz), a model (.zip), or the folder of a "
-    "training run.",
+    "policy of the zoo, a solution (.npz), an exported policy (.npz, .onnx), a model (.zip), or the folder "
+    "of a training run.",
 )
 @start_option
 @seed_option
