@@ -12,6 +12,7 @@ from dq_space_arm_env.scene.shapes import Shape, geometry_field
 from dq_space_arm_env.validation.fields import (
     INERTIAS,
     Angle,
+    ControlWeight,
     Finite,
     Limit,
     Mass,
@@ -135,6 +136,12 @@ class Link(Model):
         description="largest motor torque of this joint, N m (prismatic: force, N); absent: the limit of "
         "actuators.joint_torque",
     )
+    torque_weight: ControlWeight | None = Field(
+        default=None,
+        exclude_if=lambda weight: weight is None,
+        description="weight on the motor torque of this joint, 1/(N m)^2 (prismatic: force, 1/N^2); absent: "
+        "cost.joint_torque",
+    )
     stiffness: NonNegative = Field(default=0.0, description="stiffness of the joint spring, N m/rad (N/m)")
     rest_angle: Angle = Field(default=0.0, description="joint angle at which the spring is at rest, rad (m)")
     damping: NonNegative = Field(default=0.0, description="viscous damping of the joint, N m s/rad (N s/m)")
@@ -196,7 +203,7 @@ class Link(Model):
         if self.is_spherical:
             without = ("rest_angle", "motor")
         elif self.is_fixed:
-            without = ("torque_limit", "stiffness", "rest_angle", "damping", "motor")
+            without = ("torque_limit", "torque_weight", "stiffness", "rest_angle", "damping", "motor")
         for name in without:
             if getattr(self, name):
                 yield Problem((name,), getattr(self, name), f"a {self.joint_type} joint has none: remove it")

@@ -306,6 +306,8 @@ def _joint_controls(scene: Scene) -> Iterator[ControlNumbers]:
         limit = _number("actuators.joint_torque.limit", link.effort_unit, motors.limit)
         if link.torque_limit is not None:
             limit = _number(f"links.{index}.torque_limit", link.effort_unit, link.torque_limit)
+        if link.torque_weight is not None:
+            weight = _number(f"links.{index}.torque_weight", f"({link.effort_unit})^-2", link.torque_weight)
         yield ControlNumbers(f"{link.name} {'torque' if link.turns else 'force'}{axis}", limit, weight)
 
 

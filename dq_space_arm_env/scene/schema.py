@@ -231,15 +231,17 @@ class Scene(Model):
             sentence = "the scene has no links: remove it or add links"
             yield Problem(("actuators", "joint_torque"), joint_torque, sentence)
         for index, link in enumerate(self.links):
-            location = ("links", index, "torque_limit")
-            if link.torque_limit is not None and not joint_torque:
-                sentence = (
-                    "without actuators.joint_torque all joints are passive: add it or remove this limit"
-                )
-                yield Problem(location, link.torque_limit, sentence)
-            elif link.torque_limit is not None and not link.actuated:
-                sentence = "the joint is not actuated: remove this limit or actuated: false"
-                yield Problem(location, link.torque_limit, sentence)
+            for field, what in (("torque_limit", "limit"), ("torque_weight", "weight")):
+                if (value := getattr(link, field)) is None:
+                    continue
+                if not joint_torque:
+                    sentence = (
+                        f"without actuators.joint_torque all joints are passive: add it or remove this {what}"
+                    )
+                    yield Problem(("links", index, field), value, sentence)
+                elif not link.actuated:
+                    sentence = f"the joint is not actuated: remove this {what} or actuated: false"
+                    yield Problem(("links", index, field), value, sentence)
 
     def _part_problems(self) -> Iterator[Problem]:
         """Find parts that contradict each other."""

@@ -162,6 +162,14 @@ class TestParts:
         layout = StateLayout.of(Scene.model_validate(change(data, "links.1.torque_limit", 0.25)))
         assert layout.control_limit.tolist() == [float("inf")] * 3 + [1, 2, 3, 2, 0.25, 0.5, 0.5, 0.5]
 
+    def test_a_link_sets_its_own_weight(self, data: dict[str, Any], change: Change) -> None:
+        change(data, "cost.joint_torque", 0.5)
+        scene = Scene.model_validate(change(data, "links.1.torque_weight", 40.0))
+        layout = StateLayout.of(scene)
+        assert layout.control_weight[layout.control.joint_torque].tolist() == [0.5, 40.0]
+        varying = StateLayout.of(scene.replace(parameters=["links.1.torque_weight"])).parameters
+        assert (varying.names, varying.units) == (("links.1.torque_weight",), ("(N m)^-2",))
+
     def test_planar(self, planar_data: dict[str, Any], change: Change) -> None:
         turned = {"axis": [0, 0, 1], "angle": 60}
         change(planar_data, "initial_state.base_pose", {"position": [2, 4, 0], "rotation": turned})

@@ -71,6 +71,7 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
     }
     if motors:
         link["torque_limit"] = limits
+        link["torque_weight"] = positive
     actuators: dict[str, st.SearchStrategy[Any]] = {}
     for kind in ("base_force", "base_torque"):
         if draw(st.booleans()):

@@ -106,6 +106,10 @@ def test_one_mistake_gives_one_sentence(
         ),
         ([("links.1.torque_limit", 3), ("links.1.actuated", False)], ".* = 3.0: the joint is not actuated"),
         (
+            [("links.1.torque_weight", 3), ("links.1.actuated", False)],
+            r"links\[1\].torque_weight = 3.0: the joint is not actuated: remove this weight",
+        ),
+        (
             [("wrist",), ("actuators.wrist_rate",), ("initial_state.wrist_angles", [0, 0, 0])],
             r".*must be 0 numbers \(the scene has no wrist\); it has 3",
         ),
