@@ -95,11 +95,14 @@ def with_changes(
     seed: int | None = None,
     total_steps: int | None = None,
     minutes: float | None = None,
+    scene: str | None = None,
 ) -> AgentConfiguration:
-    """Replace settings by those of the command line, minutes being the time limit."""
+    """Replace settings by those of the command line, minutes being the time limit; a scene adds its name."""
     content = configuration.model_dump(exclude_none=True)
     if seed is not None:
         content["seed"] = seed
+    if scene is not None:
+        content |= {"scene": scene, "name": f"{configuration.name}-{Path(scene).stem}"}
     for name, value in (("total_steps", total_steps), ("minutes", minutes)):
         if value is not None:
             if "schedule" not in content:

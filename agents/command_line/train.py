@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agents.command_line.agent_policies import CONFIGURATION, configuration_files
-from dq_space_arm_env.command_line.names import given
+from dq_space_arm_env.command_line.names import SCENE, given
 from dq_space_arm_env.command_line.verb import json_option, keeping, print_document
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, complain, message_console, table_console
 from dq_space_arm_env.common.files import check_writable
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         Examples:
           dq-space-arm train ppo                                  # a configuration that ships
           dq-space-arm train my.yaml --seed 1 --out results/mine  # your own
+          dq-space-arm train apg --scene my-scene.yaml            # in a scene of your own
           dq-space-arm train sac --minutes 30                     # stop after half an hour; repeat to resume
           dq-space-arm train apg ppo --seeds 10                   # twenty runs, on all cores, one table
           dq-space-arm train apg ppo --seeds 10 --ray             # the machines of a Ray cluster
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     type=click.Path(file_okay=False, path_type=Path),
     help="Folder of the run; with several, of their folders.  [default: results/agents/<name>-<seed>]",
 )
+@click.option("--scene", type=SCENE, help="Name or YAML file; replaces the configuration's.")
 @click.option("--seed", type=int, help="Replaces the configuration's; with --seeds, the first one.")
 @click.option("--seeds", type=int, help="Train with so many seeds, each in a folder of its own.")
 @click.option("--total-steps", type=int, help="Environment steps; replaces the configuration's.")
@@ -47,6 +49,7 @@ def train(
     configurations: tuple[str, ...],
     config: str | None,
     out: Path | None,
+    scene: str | None,
     seed: int | None,
     seeds: int | None,
     total_steps: int | None,
@@ -78,7 +81,7 @@ def train(
     from agents import training
     from agents.configuration import load_configuration
 
-    changes = given(total_steps=total_steps, minutes=minutes)
+    changes = given(total_steps=total_steps, minutes=minutes, scene=scene)
     checked = [training.with_changes(load_configuration(each), **changes) for each in chosen]
     if several:
         return _train_several(checked, 1 if seeds is None else seeds, seed, out, workers, ray, as_json)

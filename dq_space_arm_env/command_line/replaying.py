@@ -1,5 +1,6 @@
 """Flights to show side by side: recorded ones, and episodes that policies fly for the occasion."""
 
+import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from dq_space_arm_env.command_line.simulated_episode import (
     fly,
 )
 from dq_space_arm_env.common.bounded_reading import archive_members
-from dq_space_arm_env.viewing.replay import Trajectory, common_scene, read_flight
+from dq_space_arm_env.viewing.replay import Trajectory, common_scene, read_flight, write_replay
 
 
 def collect_flights(
@@ -49,6 +50,19 @@ def collect_flights(
                 pilot = load_policy(source, begun, console, seed, trust=trust, normalize=given)
                 recordings[place] = fly(scene, begun, pilot, seed=seed, label=label)
     return common_scene([recordings[place] for place in range(len(sources))], scene)
+
+
+def show_maneuver(scene: Scene, page: Path, console: Console) -> str:
+    """Solve and fly a scene's maneuver, open its page in the browser, and say how it ended."""
+    shown, robot = collect_flights([("the first maneuver", "plan")], scene, console)
+    write_replay(page, shown, robot)
+    webbrowser.open(page.resolve().as_uri())
+    flight = shown[0]
+    verdict = "reaches the target" if flight.is_success else "MISSES the target"
+    return (
+        f"{page}: the first maneuver {verdict}, {flight.attitude_error:.2g} degrees and "
+        f"{flight.position_error:.2g} m off; open it in a browser"
+    )
 
 
 def _is_policy(source: str) -> bool:

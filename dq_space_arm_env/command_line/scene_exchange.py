@@ -15,10 +15,14 @@ from typing import Any, Literal
 import numpy as np
 
 from dq_space_arm_env import Scene, SceneError, load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
-from dq_space_arm_env.algebra import dual_quaternion, poses
+from dq_space_arm_env.algebra import dual_quaternion, poses, rotations
+from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
+from dq_space_arm_env.dynamics.step_stability import joint_motion
+from dq_space_arm_env.interoperability.bus_actuators import with_jets, with_wheels
 from dq_space_arm_env.interoperability.exporting import joint_limits
+from dq_space_arm_env.interoperability.step_choice import StepTrial, measured_steps
 from dq_space_arm_env.interoperability.urdf_elements import read_robot
 from dq_space_arm_env.scene import Simulation
 from dq_space_arm_env.scene.path import shown_target
@@ -34,9 +38,20 @@ _OPTIONS = {
     r"in passive$": "with --passive",
     r"^(tip|base|passive)(?=: )": r"--\1",
     r"^joint_torque(?= = )": "--joint-torque",
+    r"balance_inertias=True": "--balance-inertias",
     r"as base$": "as --base",
 }
 """Options for the Python arguments that messages mention."""
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """What the import adds to the robot of a file."""
+
+    wheels: str = "ideal"  # or an arrangement of reaction wheels
+    thrusters: str = "ideal"  # or jets
+    spread: float = 0.0  # half-width of the starts, rad and m
+    measured: bool = False  # whether integrator and time step are chosen by measuring
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +60,10 @@ class Imported:
 
     scene: Scene
     warnings: tuple[str, ...]
+    efforts: tuple[
+        float | None, ...
+    ]  # the robot's own limits of the torques, base to tip, N m; passive: None
+    steps: tuple[StepTrial, ...] = ()  # integrators and time steps that were measured
 
 
 @contextmanager
@@ -59,7 +78,9 @@ def in_options() -> Iterator[None]:
         raise SceneError(message) from error
 
 
-def import_urdf(file: str, tip: str | None, arguments: Mapping[str, Any]) -> Imported:
+def import_urdf(
+    file: str, tip: str | None, arguments: Mapping[str, Any], proposals: Proposals = Proposals()
+) -> Imported:
     """Make a scene of a URDF file; `arguments` are those of `scene_from_urdf`."""
     path = Path(file)
     if tip is None:
@@ -67,7 +88,37 @@ def import_urdf(file: str, tip: str | None, arguments: Mapping[str, Any]) -> Imp
     with warnings.catch_warnings(record=True) as caught, in_options():
         warnings.simplefilter("always")
         scene = scene_from_urdf(path, tip, **arguments)
-    return Imported(scene, tuple(str(each.message).removeprefix("URDF: ") for each in caught))
+        own = scene_from_urdf(path, tip, **{**arguments, "scaled_efforts": False})
+    if proposals.wheels != "ideal":
+        scene = with_wheels(scene, proposals.wheels)
+    if proposals.thrusters != "ideal" and scene.actuators.base_force is not None:
+        scene = with_jets(scene, 0.5 * max(scene.actuators.base_force.limit))
+    scene = scene.replace(spread=_spread(scene, proposals.spread))
+    steps = tuple(measured_steps(scene)) if proposals.measured else ()
+    messages = dict.fromkeys(str(each.message).removeprefix("URDF: ") for each in caught)
+    efforts = tuple(link.torque_limit for link in own.links)
+    return Imported(steps[-1].of(scene) if steps else scene, tuple(messages), efforts, steps)
+
+
+def _spread(scene: Scene, width: float) -> dict[str, float]:
+    """Draws of the start: the joints within their limits, the base where thrusters can bring it back."""
+    angles = scene.initial_state.joint_angles
+    room = [
+        min(angle - lower, upper - angle)
+        for angle, (lower, upper, _) in zip(angles, joint_limits(scene), strict=True)
+    ]
+    pushed = scene.actuators.base_force or scene.actuators.thrusters
+    return {
+        "joint_angles": float(f"{min([width, *room]):.2g}"),
+        "base_rotation": width,
+        "base_position": width if pushed else 0.0,
+    }
+
+
+def mounted(position: tuple[float, ...] | None, degrees: tuple[float, ...] | None) -> dict[str, Any]:
+    """Pose of the base link on the spacecraft; `degrees` are roll, pitch and yaw."""
+    roll, pitch, yaw = (math.radians(angle) for angle in degrees or (0.0, 0.0, 0.0))
+    return {"position": position or (0.0, 0.0, 0.0), "rotation": rotations.from_euler_321(yaw, pitch, roll)}
 
 
 def _tips(path: Path) -> str:
@@ -90,6 +141,9 @@ def record(imported: Imported, file: str, source: str) -> dict[str, Any]:
         "links": [link.name for link in scene.links],
         "start_attitude_error_deg": degrees,
         "start_position_error_m": meters,
+        "efforts": list(imported.efforts),
+        "torque_limits": [link.torque_limit for link in scene.links],
+        "steps": [json_value(each._asdict()) for each in imported.steps],
         "warnings": list(imported.warnings),
     }
 
@@ -105,17 +159,66 @@ def summary(imported: Imported, file: str, added: bool) -> Iterator[str]:
     yield f"  base    {scene.base.mass:.4g} kg{more}"
     yield f"  links   {links}"
     yield f"  limits  {'; '.join(_limits(scene)) or 'no motors'}; edit actuators and links"
+    yield from _scaled(imported)
     limits_of_joints = joint_limits(scene)
     ranges = sum(math.isfinite(lower) or math.isfinite(upper) for lower, upper, _ in limits_of_joints)
     rates = sum(math.isfinite(rate) for *_, rate in limits_of_joints)
     yield f"  joints  {ranges} with limits of the angle, {rates} of the rate; edit constraints"
     yield f"  start   at rest, joints at {_numbers(scene.initial_state.joint_angles)} rad; edit initial_state"
     yield f"  target  {degrees:.3g} degrees and {meters:.3g} m from the start; edit target"
-    if scene.simulation.integrator != Simulation().integrator:
-        yield f"  steps   by {scene.simulation.integrator}: the joints' dampers are too stiff for others"
-    yield "  spread  every episode is the same; edit spread before an agent is trained"
+    yield from _steps(imported)
+    spread = scene.spread
+    if any(each for each in spread.model_dump().values()):
+        yield (
+            f"  spread  starts within {spread.joint_angles:.3g} rad of the joints, "
+            f"{spread.base_rotation:.3g} rad and {spread.base_position:.3g} m of the base; edit spread"
+        )
+    else:
+        yield "  spread  every episode is the same; edit spread before an agent is trained"
     word = quote(file)
     yield f"Next: `dq-space-arm solve {word}`; after edits first `dq-space-arm scenes validate {word}`"
+
+
+def _scaled(imported: Imported) -> Iterator[str]:
+    """Say which limits of torques were lowered, and why."""
+    own = imported.efforts
+    pairs = [
+        (before, link.torque_limit)
+        for before, link in zip(own, imported.scene.links, strict=True)
+        if before is not None and link.torque_limit is not None and before > link.torque_limit
+    ]
+    if pairs:
+        most = max(before / after for before, after in pairs)
+        efforts = tuple(before for before in own if before is not None)
+        yield (
+            "          scaled for free flight to three times what a swing by 1 rad in seconds takes: the "
+            "file's efforts,"
+        )
+        yield (
+            f"          {_numbers(efforts)} N m, work against gravity and are up to {most:,.0f} times as "
+            "large; --full-efforts keeps them"
+        )
+
+
+def _steps(imported: Imported) -> Iterator[str]:
+    """Say what was measured of integrators and time steps, and what stiff dampers mean."""
+    scene, simulation = imported.scene, imported.scene.simulation
+    if imported.steps:
+        dt = simulation.dt * imported.steps[-1].division
+        words = [
+            f"{each.integrator} of {1e3 * dt / each.division:.3g} ms "
+            + (f"ends {each.error:.0e} m or rad off" if math.isfinite(each.error) else "diverges")
+            for each in imported.steps
+        ]
+        yield f"  steps   a swing by {'; by '.join(words)}: the last one is taken"
+    elif simulation.integrator != Simulation().integrator:
+        yield f"  steps   by {simulation.integrator}: the joints' dampers are too stiff for others"
+    if (decay := joint_motion(scene).decay) * Simulation().dt > 1.0:
+        yield (
+            f"          dampers stop joints within {1e3 / decay:.2g} ms: solving and training take many times "
+            "as long; many files'"
+        )
+        yield "          dampers are guesses: --no-dampers leaves them out"
 
 
 def _numbers(values: tuple[float, ...]) -> str:
@@ -127,6 +230,12 @@ def _limits(scene: Scene) -> Iterator[str]:
     actuators = scene.actuators
     if actuators.base_force is not None:
         yield f"thrusters {_numbers(actuators.base_force.limit)} N"
+    if actuators.thrusters is not None:
+        yield f"{len(actuators.thrusters)} jets of {actuators.thrusters[0].force:.3g} N"
+    if actuators.wheels is not None:
+        wheel = actuators.wheels[0]
+        stored = f"{wheel.inertia * wheel.speed:.3g} N m s"
+        yield f"{len(actuators.wheels)} wheels of {wheel.torque:.3g} N m and {stored}"
     if actuators.base_torque is not None:
         yield f"wheels {_numbers(actuators.base_torque.limit)} N m"
     if actuators.joint_torque is not None:

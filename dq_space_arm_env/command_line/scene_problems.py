@@ -40,6 +40,13 @@ def step_advice(source: str) -> str | None:
     return advice(load_scene(source))
 
 
+def warnings(source: str) -> list[str]:
+    """What is unwise in a valid scene, a sentence each."""
+    from dq_space_arm_env.command_line.scene_warnings import warnings_of
+
+    return warnings_of(load_scene(source))
+
+
 def _located(error: ValidationError, file: Path) -> list[LocatedProblem]:
     text = read_text(file) if file.is_file() else None
     found = []

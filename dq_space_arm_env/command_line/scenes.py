@@ -86,15 +86,21 @@ def show(scene: str, as_json: bool) -> None:
 @click.argument("files", nargs=-1, required=True, type=SCENE, metavar="FILE...")
 @json_option
 def validate(files: tuple[str, ...], as_json: bool) -> int:
-    """Check scene files; list every problem with its line and field. Exit status 1: problems found."""
-    from dq_space_arm_env.command_line.scene_problems import check, step_advice
+    """Check scene files; list every problem with its line and field. Exit status 1: problems found.
+
+    Warnings say what is valid and unwise: joints too stiff for the integrator, targets out of reach, limits
+    of torques out of proportion, numbers that look like grams, millimeters or degrees.
+    """
+    from dq_space_arm_env.command_line.scene_problems import check, step_advice, warnings
 
     found: list[dict[str, Any]] = []
     for file in files:
         problems = check(file)
         advice = None if problems else step_advice(file)
         listed = [each._asdict() for each in problems]
-        found.append({"file": file, "valid": not problems, "problems": listed, "advice": advice})
+        unwise = [] if problems else warnings(file)
+        facts = {"valid": not problems, "problems": listed, "advice": advice, "warnings": unwise}
+        found.append({"file": file, **facts})
         if as_json:
             continue
         for problem in problems:
@@ -104,6 +110,8 @@ def validate(files: tuple[str, ...], as_json: bool) -> int:
             say(f"{file}: valid")
         if advice is not None:
             say(f"{file}: {advice}")
+        for sentence in unwise:
+            say(f"{file}: warning: {sentence}")
     if as_json:
         print_document(found)
     return SUCCESS if all(each["valid"] for each in found) else FAILURE
@@ -178,6 +186,8 @@ def _write(path: Path, text: str) -> None:
           dq-space-arm scenes import arm.urdf --tip tool0 --spacecraft-mass 80 --spacecraft-inertia 8 8 6
           dq-space-arm scenes import robot.urdf             # which links there are
           dq-space-arm scenes import panda.urdf --tip panda_hand --lock-branches --out free-panda.yaml
+          dq-space-arm scenes import arm.urdf --tip tool0 --spacecraft-mass 80 --spacecraft-inertia 8 8 6 \
+            --mount 0 0 0.4 --wheels pyramid --replay         # on the bus, first maneuver in the browser
     """,
 )
 @click.argument("robot", type=click.Path())
@@ -194,14 +204,79 @@ def _write(path: Path, text: str) -> None:
     help="Its inertia about its center of mass, which is the base link's origin, kg m^2.",
 )
 @click.option(
-    "--base-force", type=float, default=10.0, show_default=True, help="Limit of the thrusters, N; 0 for none."
+    "--mount",
+    type=float,
+    nargs=3,
+    metavar="X Y Z",
+    help="Where the base link is on that body, from its center of mass, m.  [default: there]",
 )
 @click.option(
-    "--base-torque", type=float, default=5.0, show_default=True, help="Limit of the wheels, N m; 0 for none."
+    "--mount-rotation",
+    type=float,
+    nargs=3,
+    metavar="ROLL PITCH YAW",
+    help="How it is turned there, degrees, in the order of URDF's rpy.",
+)
+@click.option(
+    "--thrusters",
+    type=click.Choice(["ideal", "jets"]),
+    default="ideal",
+    show_default=True,
+    help="ideal: a force; jets: eight jets at the corners of the spacecraft, which only push.",
+)
+@click.option(
+    "--base-force",
+    type=float,
+    default=10.0,
+    show_default=True,
+    help="Limit of the thrusters, N, jets have half of it each; 0 for none.",
+)
+@click.option(
+    "--wheels",
+    type=click.Choice(["ideal", "pyramid", "orthogonal"]),
+    default="ideal",
+    show_default=True,
+    help="ideal: a torque; else four or three reaction wheels with momenta and limits, in size for the "
+    "mass of the base.",
+)
+@click.option(
+    "--base-torque",
+    type=float,
+    default=5.0,
+    show_default=True,
+    help="Limit of ideal wheels, N m; 0 for none.",
 )
 @click.option("--joint-torque", type=float, help="Limit of joints without an effort in ROBOT, N m.")
 @click.option(
     "--passive", type=PartOf("joint", "robot"), multiple=True, help="Joint without a motor; may be repeated."
+)
+@click.option(
+    "--full-efforts",
+    is_flag=True,
+    help="Keep the efforts in ROBOT as limits of the torques, for work against gravity.",
+)
+@click.option("--no-dampers", is_flag=True, help="Leave out the viscous damping of the joints.")
+@click.option(
+    "--balance-inertias",
+    is_flag=True,
+    help="Mend inertias that violate the triangle inequality: raise the smallest moment.",
+)
+@click.option(
+    "--spread",
+    type=click.FloatRange(min=0.0),
+    default=0.1,
+    show_default=True,
+    help="Half-width of random starts: rad of joints and base, m of the base; 0 for none.",
+)
+@click.option(
+    "--measure/--no-measure",
+    default=True,
+    help="Choose integrator and time step by measuring the error of a swing.  [default: measure]",
+)
+@click.option(
+    "--replay",
+    is_flag=True,
+    help="Solve and fly the first maneuver, and open its replay in the browser: as the scene, .html.",
 )
 @click.option("--lock-branches", is_flag=True, help="Hold all joints beside the arm at zero.")
 @click.option(
@@ -218,8 +293,17 @@ def import_(
     out: str | None,
     spacecraft_mass: float | None,
     spacecraft_inertia: tuple[float, float, float] | None,
+    mount: tuple[float, float, float] | None,
+    mount_rotation: tuple[float, float, float] | None,
+    thrusters: str,
     base_force: float,
+    wheels: str,
     base_torque: float,
+    full_efforts: bool,
+    no_dampers: bool,
+    spread: float,
+    measure: bool,
+    replay: bool,
     lock_branches: bool,
     lock: tuple[str, ...],
     force: bool,
@@ -231,13 +315,16 @@ def import_(
     Other joints that move a mass are part of the scene too, unless they are locked.
 
     The default target is the tip's pose with every joint 0.3 rad further, or back where its
-    limits ask for it. Limits of angles and rates become a constraint. The file has a comment
+    limits ask for it. Limits of angles and rates become a constraint. Limits of torques are
+    lowered to what free flight takes, and each has a weight of its own. The file has a comment
     at every key.
     """
     from dq_space_arm_env.command_line import scene_exchange
     from dq_space_arm_env.command_line.scene_template import commented_yaml
 
     path = _scene_file(out or f"{Path(robot).stem}.yaml", force)
+    if replay:
+        check_writable_file(path.with_suffix(".html"))
     spacecraft = given(mass=spacecraft_mass, inertia=spacecraft_inertia)
     if len(spacecraft) == 1:
         raise click.UsageError(
@@ -245,21 +332,37 @@ def import_(
             "kg m^2, about each axis",
             click.get_current_context(),
         )
+    if (mount or mount_rotation) and not spacecraft:
+        raise click.UsageError(
+            "--mount places the arm on a spacecraft: give --spacecraft-mass and --spacecraft-inertia",
+            click.get_current_context(),
+        )
+    if spacecraft:
+        spacecraft["mount"] = scene_exchange.mounted(mount, mount_rotation)
     arguments |= {
         "spacecraft": spacecraft or None,
+        "dampers": not no_dampers,
+        "scaled_efforts": not full_efforts,
         "base_force": base_force or None,
         "base_torque": base_torque or None,
         "lock_branches": lock_branches or lock,
     }
-    imported = scene_exchange.import_urdf(robot, tip, arguments)
+    proposals = scene_exchange.Proposals(wheels, thrusters, spread, measure)
+    imported = scene_exchange.import_urdf(robot, tip, arguments, proposals)
     _write(path, commented_yaml(imported.scene))
     for warning in imported.warnings:
         complain(warning, label="Warning: ")
+    if replay:
+        from dq_space_arm_env.command_line.replaying import show_maneuver
+
+        page = show_maneuver(imported.scene, path.with_suffix(".html"), message_console())
     if as_json:
         print_document(scene_exchange.record(imported, str(path), robot))
         return
     for line in scene_exchange.summary(imported, str(path), bool(spacecraft)):
         say(line)
+    if replay:
+        say(page)
 
 
 @scenes.command(

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
           dq-space-arm simulate paper                                         # the expert's plan
           dq-space-arm simulate paper --policy gains --noise 0.05 --out a.npz  # disturbed inputs, feedback
           dq-space-arm simulate paper --policy receding --noise 0.05          # replanned at every step
+          dq-space-arm simulate paper --noise joint_torque=0.02 --noise base_force=0.1  # N m, N
           dq-space-arm simulate paper --policy results/agents/ppo-0 --seed 3  # a trained agent
           dq-space-arm simulate my.yaml --policy results/solutions/my/solution.npz
     """,
@@ -53,10 +54,10 @@ if TYPE_CHECKING:
 @seed_option
 @click.option(
     "--noise",
-    type=float,
-    default=0.0,
-    show_default=True,
-    help="Standard deviation of the disturbance of the inputs, as a fraction of their limits.",
+    multiple=True,
+    metavar="SIGMA",
+    help="Standard deviation of the disturbance of the inputs: a fraction of their limits, or "
+    "ACTUATOR=NUMBER in N, N m or rad/s, such as joint_torque=0.05; may be repeated.  [default: none]",
 )
 @click.option(
     "--out",
@@ -72,7 +73,7 @@ def simulate(
     policy: str,
     start: str | None,
     seed: int | None,
-    noise: float,
+    noise: tuple[str, ...],
     out: Path | None,
     label: str | None,
     normalize: Path | None,
@@ -89,14 +90,16 @@ def simulate(
         begin,
         fly,
         numerical_error,
+        read_noise,
     )
 
     loaded = load_scene(scene)
     if out is not None:
         check_writable_file(out)
+    disturbance = read_noise(noise, loaded)
     begun = begin(loaded, seed, start)
     pilot = load_policy(policy, begun, message_console(), seed, trust=trust, normalize=normalize)
-    flight = fly(loaded, begun, pilot, seed=seed, noise=noise, label=label)
+    flight = fly(loaded, begun, pilot, seed=seed, noise=disturbance, label=label)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         flight.save(out)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.bounded_formats import read_array, read_arrays
 from dq_space_arm_env.common.bounded_reading import read_json
+from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.environment import DQSpaceArmEnv
 from dq_space_arm_env.environment.disturbances import Disturbances
 from dq_space_arm_env.environment.rollouts import Policy, StateFeedback, rollout
@@ -75,18 +77,51 @@ def fly(
     pilot: Pilot,
     *,
     seed: int | None,
-    noise: float = 0.0,
+    noise: ArrayLike = 0.0,
     label: str | None = None,
 ) -> Trajectory:
-    """Fly from a start; `noise` is the standard deviation of the inputs, as a fraction of their limits."""
-    if not 0.0 <= noise < math.inf:
-        raise ValueError(f"--noise is {noise}; it must be at least 0, a fraction of the limits")
+    """Fly from a start.
+
+    `noise` is the standard deviation of the inputs, as a fraction of their limits, shape () or (n_u,).
+    """
     seeds, starts = (None, start.state[None]) if seed is None else ([seed], None)
     disturbances = None
-    if noise:
-        disturbances = Disturbances(scene, np.random.default_rng([seed or 0, _NOISE]), inputs=noise)
+    if np.any(noise):
+        generator = np.random.default_rng([seed or 0, _NOISE])
+        disturbances = Disturbances(scene, generator, inputs=np.atleast_2d(noise))
     flown = rollout(pilot.policy, scene, seeds, starts=starts, disturbances=disturbances, record=True)
     return flown.trajectory(0, label or pilot.label, start.title)
+
+
+def read_noise(texts: Sequence[str], scene: Scene) -> NDArray[np.float64]:
+    """Read the noise of the inputs, shape (n_u,), as fractions of their limits.
+
+    Texts are a fraction, for all inputs, or ACTUATOR=SIGMA in the actuator's unit, which counts for its own.
+    """
+    layout = StateLayout.of(scene)
+    fractions = np.zeros(layout.n_u)
+    parts = {name: part for name, part in vars(layout.control).items() if isinstance(part, slice)}
+    present = {name: part for name, part in parts.items() if part.stop > part.start}
+    for text in sorted(texts, key=lambda each: "=" in each):  # the fraction first
+        name, mark, number = text.rpartition("=")
+        if mark and name not in present:
+            known = ", ".join(f"{each} [{_units(layout, each)}]" for each in present)
+            hint = did_you_mean(name, present)
+            raise ValueError(f"--noise {text}: {hint}the actuators of scene {scene.name} are {known}")
+        unit = f"standard deviation, {_units(layout, name)}" if mark else "fraction of the limits"
+        try:
+            sigma = float(number)
+        except ValueError:
+            raise ValueError(f"--noise {text}: should be a number, or ACTUATOR=NUMBER") from None
+        if not 0.0 <= sigma < math.inf:
+            raise ValueError(f"--noise is {name}{mark}{sigma}; it must be at least 0, a {unit}")
+        part = present[name] if mark else slice(None)
+        fractions[part] = sigma / layout.control_limit[part] if mark else sigma
+    return fractions
+
+
+def _units(layout: StateLayout, actuator: str) -> str:
+    return ", ".join(dict.fromkeys(layout.control.units[getattr(layout.control, actuator)]))
 
 
 def numerical_error(start: Start, flight: Trajectory) -> float:

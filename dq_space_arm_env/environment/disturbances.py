@@ -37,8 +37,8 @@ class Disturbances:
         evenly: Whether pushes come at even intervals instead of at random times.
         measurement: Standard deviation of the noise on every tangent coordinate, shape () or (B,), rad, m,
             rad/s and m/s; None for no noise.
-        inputs: Standard deviation of the noise on the inputs, shape () or (B,), fractions of the limits; None
-            for no noise.
+        inputs: Standard deviation of the noise on the inputs, shape (), (B,) or (B, n_u), fractions of the
+            limits; None for no noise.
         count: B, if no standard deviation tells it.
     """
 
@@ -57,7 +57,7 @@ class Disturbances:
         layout, steps = StateLayout.of(scene), scene.simulation.steps
         self._rng, self._step = rng, 0
         self._n_t, self._n_u, self._velocity = layout.n_t, layout.n_u, layout.tangent.base_velocity
-        sizes = [np.size(sigma) for sigma in (push, measurement, inputs) if sigma is not None]
+        sizes = [len(np.atleast_1d(sigma)) for sigma in (push, measurement, inputs) if sigma is not None]
         self.count = max([count, *sizes])
         self._push, self._measurement, self._inputs = (
             None if sigma is None else self._column(sigma) for sigma in (push, measurement, inputs)
@@ -66,8 +66,10 @@ class Disturbances:
         self._interval = max(steps // int(pushes + 1), 1) if evenly else 0
 
     def _column(self, sigma: ArrayLike) -> FloatArray:
-        """A standard deviation for each episode, shape (B, 1)."""
-        return np.broadcast_to(np.asarray(sigma, dtype=np.float64), (self.count,))[:, None]
+        """A standard deviation for each episode, shape (B, 1), or for each of its numbers, (B, n)."""
+        given = np.asarray(sigma, dtype=np.float64)
+        column = given if given.ndim == 2 else np.atleast_1d(given)[:, None]
+        return np.broadcast_to(column, (self.count, column.shape[1]))
 
     def draw(self) -> Disturbance:
         """Draw the disturbances of the next step."""

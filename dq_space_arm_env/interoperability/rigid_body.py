@@ -41,6 +41,14 @@ def lumped(bodies: Sequence[Body]) -> Body | None:
     return Body(mass, center, 0.5 * (inertia + inertia.T))
 
 
+def balanced(inertia: Array) -> Array:
+    """Raise the smallest principal moment until it and the middle one add up to the largest."""
+    moments, axes = np.linalg.eigh(inertia)
+    moments[0] = max(moments[0], moments[2] - moments[1])
+    mended: Array = axes @ np.diag(moments) @ axes.T
+    return 0.5 * (mended + mended.T)
+
+
 def tidied(numbers: Array) -> Array:
     """Round to 15 digits of the largest number, against residues of rotations and translations."""
     largest = float(np.abs(numbers).max())

@@ -15,14 +15,15 @@ import numpy as np
 
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.algebra.quaternion import normalize
-from dq_space_arm_env.interoperability.rigid_body import Array, Body, lumped
+from dq_space_arm_env.interoperability.rigid_body import Array, Body, balanced, lumped
 from dq_space_arm_env.interoperability.urdf_elements import MOVABLE, Pose, UrdfJoint, UrdfRobot
 from dq_space_arm_env.scene import SceneError
 from dq_space_arm_env.scene.bodies import flaw_of
 from dq_space_arm_env.validation import did_you_mean
 
-_HERE: Pose = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+HERE: Pose = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _MANY = 60
+_MADE_UP_FOR = "it is used as it is: the bodies that the link is fixed to make up for it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +40,13 @@ class ArmJoint:
 class Arm:
     """A free base with joints that branch from it."""
 
-    base: Body  # in e0: origin at the center of mass, axes of the base link
+    base: Body  # in e0: origin at the center of mass, axes of the spacecraft or, without one, the base link
     base_link: str
-    base_center: Array  # origin of e0 in the base link's frame, shape (3,), m
+    base_center: Array  # origin of e0 in the frame of the spacecraft or, without one, the base link, (3,), m
     joints: tuple[ArmJoint, ...]  # base to tip, then those of branches, each after its parent
     way: int  # number of joints from base to tip
     tip: Pose  # of the tip link in the frame of the last of these, 8 numbers, m
-    flaws: tuple[str, ...]  # impossible inertias of links that fixed neighbors make up for
+    flaws: tuple[str, ...]  # of the robot's inertias, with what was done about them
 
 
 class UrdfTree:
@@ -237,24 +238,35 @@ class UrdfTree:
 
 
 def arm_of(
-    robot: UrdfRobot, tip: str, base: str | None, lock_branches: bool | Collection[str], extra: Body | None
+    robot: UrdfRobot,
+    tip: str,
+    base: str | None,
+    lock_branches: bool | Collection[str],
+    extra: Body | None,
+    mount: Pose = HERE,
+    balance: bool = False,
 ) -> Arm:
-    """Free a robot at its base link, to which `extra` is fixed; the chain from base to tip comes first."""
+    """Free a robot at its base link, to which `extra` is fixed; the chain from base to tip comes first.
+
+    `mount` is the pose of the base link in the frame of `extra`; `balance` mends inertias that violate the
+    triangle inequality.
+    """
     tree = UrdfTree(robot)
     base = tree.root if base is None else base
     chain = tree.chain(tip, base)
     moving = chain
     if lock_branches is not True:
         moving = [*chain, *tree.branches(base, chain, lock_branches or ())]
-    placed = tree.carried(base, _HERE, moving)
+    placed = tree.carried(base, mount, moving)
     bodies = [*_bodies(robot, placed), *([] if extra is None else [extra])]
     body = lumped(bodies)
+    flaws: list[str] = []
     if body is None:
         raise SceneError(
             f"URDF: base link {base!r} has no mass, nor has anything fixed to it: the arm is made to stand "
             "on the ground; give the spacecraft that carries it, spacecraft={'mass': ..., 'inertia': ...}"
         )
-    flaws = _checked(robot, placed, body, base)
+    body = _checked(robot, placed, body, base, balance, flaws)
     center = body.center_of_mass
     to_center = poses.from_rotation_and_position((1.0, 0.0, 0.0, 0.0), tuple((-center).tolist()))
     of_bodies: list[dict[str, Pose]] = [
@@ -274,27 +286,49 @@ def arm_of(
                 f"URDF: link {joint.child!r}, moved by joint {joint.name!r}, has no mass, nor has anything "
                 "fixed to it: its accelerations would be infinite; give it a mass and an inertia"
             )
-        flaws += _checked(robot, placed, moved, joint.child)
+        moved = _checked(robot, placed, moved, joint.child, balance, flaws)
         joints.append(ArmJoint(joint, parent, pose, moved))
     at_center = Body(body.mass, np.zeros(3), body.inertia)
     way = len(chain)
     return Arm(at_center, base, center, tuple(joints), way, of_bodies[way][tip], tuple(flaws))
 
 
-def _checked(robot: UrdfRobot, placed: dict[str, Pose], body: Body, link: str) -> list[str]:
-    """Refuse an impossible inertia of bodies that move as one; list flaws of parts that others hide."""
+def _checked(
+    robot: UrdfRobot, placed: dict[str, Pose], body: Body, link: str, balance: bool, flaws: list[str]
+) -> Body:
+    """Refuse or mend an impossible inertia of bodies that move as one; add flaws that are no obstacle."""
     parts = {name: part for name in placed if (part := robot.links[name].body) is not None}
-    flaws = [
+    flaws += [
+        f"link {name!r}: its mass is 0: its inertia is left out"
+        for name in placed
+        if robot.links[name].stands
+    ]
+    hidden = [
         f"link {name!r}, <inertia>: {flaw}"
         for name, part in parts.items()
         if (flaw := flaw_of(part.inertia, rods=True))
     ]
-    if flaw := flaw_of(body.inertia, rods=False):
-        others = [name for name in parts if name != link]
-        title = f"link {link!r}, with {_some(others)} fixed to it" if others else f"link {link!r}"
-        of_parts = [f"; {part}" for part in flaws if others]
-        raise SceneError(f"URDF: {title}, <inertia>: {flaw}{''.join(of_parts)}")
-    return flaws
+    flaw = flaw_of(body.inertia, rods=False)
+    if not flaw:
+        flaws += [f"{each}; {_MADE_UP_FOR}" for each in hidden]
+        return body
+    others = [name for name in parts if name != link]
+    title = f"link {link!r}, with {_some(others)} fixed to it" if others else f"link {link!r}"
+    least, middle, largest = np.linalg.eigvalsh(body.inertia)
+    mended = Body(body.mass, body.center_of_mass, balanced(body.inertia))
+    if least <= 0 or flaw_of(mended.inertia, rods=False):
+        raise SceneError(f"URDF: {title}, <inertia>: {flaw}{_listed(hidden if others else [])}")
+    if not balance:
+        raise SceneError(
+            f"URDF: {title}, <inertia>: {flaw}; balance_inertias=True raises the smallest to "
+            f"{largest - middle:.6g} kg m^2{_listed(hidden if others else [])}"
+        )
+    flaws.append(f"{title}, <inertia>: {flaw}; the smallest was raised to {largest - middle:.6g} kg m^2")
+    return mended
+
+
+def _listed(flaws: Collection[str]) -> str:
+    return "".join(f"; {flaw}" for flaw in flaws)
 
 
 def _some(names: Collection[str]) -> str:

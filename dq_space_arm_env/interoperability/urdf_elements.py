@@ -43,6 +43,7 @@ class UrdfLink:
 
     name: str
     body: Body | None  # in the link's frame; None for a link without mass
+    stands: bool = False  # whether it has an inertia without a mass, many files' word for a fixed base
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,9 +165,7 @@ def _read_link(element: Element) -> UrdfLink:
     if mass < 0:
         raise SceneError(f"URDF: {where}: mass = {mass:g} kg, it must be 0 or greater")
     if mass == 0:
-        if inertia.any():
-            raise SceneError(f"URDF: {where}: the mass is 0 and the inertia is not: give it a mass")
-        return UrdfLink(name, None)
+        return UrdfLink(name, None, stands=bool(inertia.any()))
     return UrdfLink(name, Body(mass, np.zeros(3), inertia).seen_from(_origin(inertial, where)))
 
 

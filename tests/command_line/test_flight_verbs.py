@@ -1,6 +1,7 @@
 """The verbs `solve` and `simulate`: what they print, write, and how they end."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from rich.console import Console
 from dq_space_arm_env import DQSpaceArmEnv, Scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.command_line.policy_sources import load_policy
-from dq_space_arm_env.command_line.simulated_episode import begin, fly, read_state
+from dq_space_arm_env.command_line.simulated_episode import begin, fly, read_noise, read_state
 from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, UNUSABLE
 from dq_space_arm_env.task.trajectory import Trajectory
 from experts import Solution
@@ -138,6 +139,40 @@ def test_noise_is_recorded_and_feedback_makes_up_for_it(scene: Scene) -> None:
         assert env.state == pytest.approx(reached, abs=1e-9)
     assert gains.cost < plan.cost
     assert receding.cost < plan.cost
+
+
+def test_noise_in_units_of_the_actuators() -> None:
+    scene = load_scene("no-wrist").replace({"links.1.torque_limit": 0.5})
+    assert read_noise([], scene).tolist() == [0.0] * 9
+    assert read_noise(["0.1"], scene).tolist() == [0.1] * 9
+    found = read_noise(
+        ["joint_torque=0.02", "0.1", "base_force=2.5"], scene
+    )  # N m and N, of 2, 0.5, 2 and 10
+    assert found == pytest.approx([0.25] * 3 + [0.1] * 3 + [0.01, 0.04, 0.01])
+    start = begin(scene.replace(simulation={"steps": 200}))
+    flown = fly(
+        start.scene, start, load_policy("zero", start, Console(quiet=True), 0), seed=None, noise=found
+    )
+    assert flown.noise is not None
+    assert flown.noise.std(axis=0) == pytest.approx([2.5] * 3 + [0.5] * 3 + [0.02] * 3, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (
+            "joint_torques=1",
+            "did you mean 'joint_torque'.* are base_force .N., base_torque .N m., joint_torque",
+        ),
+        ("wheel_torque=1", "the actuators of scene planar are"),
+        ("joint_torque=-1", "--noise is joint_torque=-1.0; it must be at least 0, a standard deviation, N m"),
+        ("base_force=1N", "should be a number, or ACTUATOR=NUMBER"),
+        ("nan", "--noise is nan; it must be at least 0, a fraction of the limits"),
+    ],
+)
+def test_noise_that_means_nothing(text: str, sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "planar", "--policy", "zero", "--noise", text]) == UNUSABLE
+    assert re.search(sentence, capsys.readouterr().err)
 
 
 def test_a_solution_of_another_length_is_refused(

@@ -1,21 +1,27 @@
 """`scenes import` and `scenes export`: what they write can be flown, and mistakes are told in options."""
 
 import json
+import math
 import re
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 
 from dq_space_arm_env import load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.command_line.names import PartOf
 from dq_space_arm_env.common.console import SUCCESS, UNUSABLE
+from dq_space_arm_env.dynamics.step_stability import joint_motion
+from dq_space_arm_env.interoperability.swing_efforts import swing_efforts
+from dq_space_arm_env.scene.thrusters import allocate
 from experts import Solution
 
 ARM = str(Path(__file__).parents[2] / "scripts" / "examples" / "small-arm.urdf")
 HAND = ["import", ARM, "--tip", "hand"]
+AS_IT_IS = ["--full-efforts", "--spread", "0", "--no-measure"]
 ARMS = Path(__file__).parents[1] / "interoperability" / "arms"
 CARRIED = ["--spacecraft-mass", "80", "--spacecraft-inertia", "8", "8", "6"]
 SPACECRAFT = {"mass": 80, "inertia": [8, 8, 6]}
@@ -28,7 +34,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_an_imported_file_is_the_scene_with_comments(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["scenes", *HAND, *CARRIED]) == SUCCESS
+    assert main(["scenes", *HAND, *CARRIED, *AS_IT_IS]) == SUCCESS
     printed = capsys.readouterr().out
     assert load_scene("small-arm.yaml") == scene_from_urdf(ARM, "hand", spacecraft=SPACECRAFT)
     assert "# mass of the base, kg" in (here / "small-arm.yaml").read_text(encoding="utf-8")
@@ -39,10 +45,98 @@ def test_an_imported_file_is_the_scene_with_comments(here: Path, capsys: pytest.
 def test_every_argument_has_an_option(here: Path) -> None:
     options = ["--base-force", "0", "--base-torque", "3", "--passive", "elbow", "--joint-torque", "7"]
     words = ["--name", "mine", "--out", "deep/mine.yaml", *options, *CARRIED]
+    words += AS_IT_IS
     assert main(["scenes", "import", ARM, "--tip", "forearm", "--base", "mount", *words]) == SUCCESS
     forces = {"base_force": None, "base_torque": 3, "joint_torque": 7, "passive": ["elbow"]}
     expected = scene_from_urdf(ARM, "forearm", "mount", name="mine", spacecraft=SPACECRAFT, **forces)
     assert load_scene("deep/mine.yaml") == expected
+
+
+def test_the_import_proposes_what_free_flight_takes(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = Path(ARM).read_text(encoding="utf-8").replace('effort="2"', 'effort="870"')
+    Path("strong.urdf").write_text(text, encoding="utf-8")
+    words = ["scenes", "import", "strong.urdf", "--tip", "hand", *CARRIED, "--mount", "0.1", "0", "0.5"]
+    assert main([*words, "--mount-rotation", "0", "0", "90"]) == SUCCESS
+    printed = " ".join(capsys.readouterr().out.split())
+    rotation = [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+    mount = {"position": [0.1, 0.0, 0.5], "rotation": rotation}
+    scene, found = (
+        scene_from_urdf(text, "hand", spacecraft=SPACECRAFT | {"mount": mount}),
+        load_scene("strong.yaml"),
+    )
+    for link, own, effort in zip(found.links, scene.links, swing_efforts(scene), strict=True):
+        assert link.torque_limit == pytest.approx(min(3.0 * effort, own.torque_limit), rel=0.05)
+    assert found.links[0].joint.position == pytest.approx(scene.links[0].joint.position)
+    assert "scaled for free flight to three times what a swing by 1 rad in seconds takes" in printed
+    assert "870 N m" in printed
+    assert "--full-efforts keeps them" in printed
+    assert found.spread.joint_angles == found.spread.base_rotation == found.spread.base_position == 0.1
+    assert "a swing by rk4 of 15 ms ends" in printed
+    assert main(["scenes", "validate", "strong.yaml"]) == SUCCESS
+    assert capsys.readouterr().out == "strong.yaml: valid\n"
+    assert main([*words, "--full-efforts", "--force"]) == SUCCESS
+    assert main(["scenes", "validate", "strong.yaml"]) == SUCCESS
+    assert "warning: torque limits: " in capsys.readouterr().out
+
+
+def test_wheels_and_jets_are_in_size_for_the_spacecraft(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [*CARRIED, "--wheels", "pyramid", "--thrusters", "jets", "--base-force", "4", "--no-measure"]
+    assert main(["scenes", *HAND, *words]) == SUCCESS
+    assert "8 jets of 2 N; 4 wheels of 0.15" in capsys.readouterr().out
+    scene = load_scene("small-arm.yaml")
+    assert scene.actuators.base_force is scene.actuators.base_torque is None
+    for axis in np.vstack([np.eye(6), -np.eye(6)]):
+        forces = allocate(scene, axis[:3], axis[3:])
+        wrench = sum(
+            force * np.array([*jet.unit_direction, *jet.moment])
+            for force, jet in zip(forces, scene.actuators.thrusters, strict=True)
+        )
+        assert wrench == pytest.approx(axis, abs=1e-9)
+    share = scene.base.mass / 105.0
+    assert scene.actuators.wheels[0].inertia == pytest.approx(0.0075 * share, rel=0.01)
+    assert [each.kind for each in scene.constraints][-1] == "wheel_limits"
+    assert main(["scenes", "validate", "small-arm.yaml"]) == SUCCESS
+
+
+def test_stiff_dampers_take_short_steps_or_a_stiff_method(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """rk4 follows dampers in steps of 2.785 of their time constant."""
+    text = Path(ARM).read_text(encoding="utf-8")
+    for damping, method, parts in ((0.0, "rk4", 1), (9.0, "rk4", None), (3000.0, "rodas4", 1)):
+        damped = text.replace("<limit", f'<dynamics damping="{damping}"/><limit')
+        Path("arm.urdf").write_text(damped, encoding="utf-8")
+        words = ["scenes", "import", "arm.urdf", "--tip", "hand", *CARRIED, "--force"]
+        assert main(words) == SUCCESS
+        found = load_scene("arm.yaml")
+        simulation = found.simulation
+        assert simulation.integrator == method
+        assert simulation.steps * simulation.dt == pytest.approx(15.0)
+        division = round(0.015 / simulation.dt)
+        assert division == parts or (parts is None and division > 1)
+        printed = capsys.readouterr().out
+        assert ("--no-dampers leaves them out" in printed) == (damping > 0)
+        if method == "rk4" and damping:
+            used = simulation.dt * joint_motion(found).decay
+            assert used < 2.785 < 2.0 * used
+    assert main([*words, "--no-dampers", "--json"]) == SUCCESS
+    record = json.loads(capsys.readouterr().out)
+    assert [(each["integrator"], each["division"]) for each in record["steps"]] == [("rk4", 1)]
+    assert record["steps"][0]["error"] < 1e-4
+
+
+@pytest.mark.slow
+def test_the_first_maneuver_opens_in_the_browser(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    assert main(["scenes", *HAND, *CARRIED, "--replay"]) == SUCCESS
+    assert opened == [(here / "small-arm.html").resolve().as_uri()]
+    assert "small-arm.html: the first maneuver reaches the target" in capsys.readouterr().out
+    assert "<html" in (here / "small-arm.html").read_text(encoding="utf-8")
 
 
 def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -68,6 +162,7 @@ def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -
         (HAND, "give the spacecraft .*, --spacecraft-mass and --spacecraft-inertia$"),
         ([*HAND, "--spacecraft-mass", "80"], "--spacecraft-inertia need each other"),
         ([*HAND, *CARRIED, "--passive", "j"], "--passive: 'j' is not .* shoulder, elbow"),
+        ([*HAND, "--mount", "0", "0", "1"], "--mount places the arm on a spacecraft: give --spacecraft-mass"),
         ([*HAND, *CARRIED, "--joint-torque", "0"], "--joint-torque = 0.0: must be a number"),
         (["import", ARM, "--tip", "mount", "--base", "hand"], "choose link '.*', or .* above it, as --base$"),
         (["import", "nowhere.urdf", "--tip", "hand"], "nowhere.urdf: there is no such file"),

@@ -1,6 +1,7 @@
 """The verb `scenes`: lists, summaries, problems with their lines, and new files that are valid."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from dq_space_arm_env.command_line import main
 from dq_space_arm_env.command_line.scene_problems import check
 from dq_space_arm_env.command_line.scene_summary import left_out
 from dq_space_arm_env.command_line.scene_template import commented_yaml
+from dq_space_arm_env.command_line.scene_warnings import warnings_of
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, UNUSABLE
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.validation import parse_yaml
@@ -87,7 +89,7 @@ def test_problems_come_with_their_lines(tmp_path: Path, capsys: pytest.CaptureFi
     broken, paper = json.loads(capsys.readouterr().out)
     assert not broken["valid"]
     assert len(broken["problems"]) == len(found)
-    assert paper == {"file": "paper", "valid": True, "problems": [], "advice": None}
+    assert paper == {"file": "paper", "valid": True, "problems": [], "advice": None, "warnings": []}
 
 
 def test_a_valid_scene_whose_steps_blow_up_is_told_what_to_take(
@@ -106,7 +108,54 @@ def test_a_valid_scene_whose_steps_blow_up_is_told_what_to_take(
         scene.replace(links=links, simulation={"integrator": "rodas4"}).to_yaml(), encoding="utf-8"
     )
     assert main(["scenes", "validate", str(file)]) == SUCCESS
-    assert capsys.readouterr().out == f"{file}: valid\n"
+    first, second = capsys.readouterr().out.splitlines()
+    assert first == f"{file}: valid"
+    assert second.startswith(f"{file}: warning: torque limits: 3 are out of proportion")
+
+
+def test_shipped_scenes_come_without_warnings_but_for_light_hands() -> None:
+    """The hands of `dual-arm` weigh 1 kg, and have 10 N m: they whirl under random inputs."""
+    assert [name for name in list_scenes() if warnings_of(load_scene(name))] == ["dual-arm"]
+    (sentence,) = warnings_of(load_scene("dual-arm"))
+    assert re.search(
+        "torque limits: 2 are out of proportion, the most 10 N m of '.* hand', 2,377 times", sentence
+    )
+
+
+MANY = {"name": "l", "kind": "joint_limits", "lower": -170, "upper": [170, 0.5, 1]}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"links.1.joint.position": [0, 0, 200]}, r"links\[1\].joint.position: 200 m .*: millimeters\?"),
+        ({"tip.position": [850, 0, 0]}, r"tip.position: 850 m from the last joint: millimeters\?"),
+        ({"initial_state.joint_angles": [-30, 50, -90]}, r"initial_state.joint_angles: -30 rad: degrees\?"),
+        ({"initial_state.joint_rates": [0, 90, 0]}, r"initial_state.joint_rates: 90 rad/s: degrees\?"),
+        ({"constraints": [MANY]}, r"constraints: limits of 'link 2': -170 rad: degrees\?"),
+        ({"spread.joint_angles": 10}, r"spread: draws of angles by more than half a turn, rad: degrees\?"),
+        ({"links.0.mass": 0.004}, r"links\[0\].mass: 4 g: was it meant in other units than kg\?"),
+        ({"links.0.mass": 5e9}, r"links\[0\].inertia: .* 5e\+09 kg that is 0.0039 mm wide: a mass in grams"),
+        ({"links.0.inertia": [5e4, 5e4, 5e4]}, r"links\[0\].inertia: .* 5 kg that is 122 m wide, .*kg mm\^2"),
+        ({"links.2.torque_limit": 900}, "torque limits: 900 N m of 'link 3', [0-9]+ times what a swing"),
+        ({"links.0.torque_limit": 0.01}, "torque limits: 0.01 N m of 'link 1', 0.00[0-9]+ of what .* crawl"),
+        (
+            {"constraints": [{"name": "l", "kind": "joint_limits", "lower": 0.0}]},
+            "initial_state.joint_angles: 'link 1' starts at -0.6 rad, beyond its limits of 0 to inf",
+        ),
+        (
+            {"actuators.base_force": None, "target.pose.position": [9, 0, 0]},
+            r"target: [0-9.]+ m from the center of mass, from which the arm reaches 2.96 m: it is out of",
+        ),
+        (
+            {"target.pose.position": [900, 0, 0]},
+            r"target: 90[0-9] m .*, thrusters move it by [0-9.]+ m in 15 s: it is out of reach",
+        ),
+    ],
+)
+def test_the_unwise_is_warned_of(change: dict[str, object], sentence: str) -> None:
+    found = warnings_of(load_scene("no-wrist").replace(change))
+    assert any(re.match(sentence, each) for each in found), found
 
 
 @pytest.mark.parametrize(

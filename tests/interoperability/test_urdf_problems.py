@@ -56,7 +56,7 @@ MIMIC = '<mimic joint="j1"/>'
         (robot(link("a"), link("a")), "two links are named 'a'"),
         (robot(link("a", "<inertial/>")), "link 'a', <inertial>: <mass> is missing"),
         (robot(link("a", body("-1"))), "link 'a', <inertial>: mass = -1 kg, it must be 0 or greater"),
-        (robot(link("a", body("0"))), "link 'a', <inertial>: the mass is 0 and the inertia is not"),
+        (robot(BASE, joint("j1", "base", "arm"), link("arm", body("0"))), "moved by joint 'j1', has no mass"),
         (robot(link("a", body("heavy"))), "<inertial>, <mass>: value = 'heavy', it must be a finite number"),
         (robot(*GOOD, joint("j2", "arm", "b", "hinge"), B), "joint 'j2': type = 'hinge', it must be"),
         (arm(content='<axis xyz="0 0 0"/>'), "joint 'j1': the axis has zero length"),
@@ -192,6 +192,66 @@ def test_a_long_file_is_read_in_a_moment():
     assert process_time() - began < 10.0
 
 
+def test_an_inertia_that_violates_the_triangle_inequality_is_mended_if_asked():
+    text = robot(BASE, joint("j1", "base", "arm"), link("arm", body(ixx=0.2, izz=1.4)))
+    with pytest.raises(SceneError, match=r"balance_inertias=True raises the smallest to 0.4 kg m"):
+        scene_from_urdf(text, "arm")
+    with pytest.warns(UserWarning, match="link 'arm', <inertia>: .* the smallest was raised to 0.4 kg m"):
+        (part,) = scene_from_urdf(text, "arm", balance_inertias=True).links
+    np.testing.assert_allclose(np.linalg.eigvalsh(part.inertia), [0.4, 1.0, 1.4], rtol=1e-12)
+    with pytest.raises(SceneError, match=r"all must be greater than 0$"):
+        scene_from_urdf(text.replace('ixx="0.2"', 'ixx="-0.2"'), "arm", balance_inertias=True)
+
+
+def test_a_base_link_without_mass_is_a_frame_whatever_its_inertia():
+    """Simulators that hold the base write it so."""
+    text = robot(link("base", body("0")), *GOOD[1:])
+    with pytest.warns(UserWarning, match="link 'base': its mass is 0: its inertia is left out"):
+        scene = scene_from_urdf(text, "arm", spacecraft={"mass": 50, "inertia": [5, 6, 7]})
+    assert scene.base.mass == 50.0
+    assert np.diag(scene.base.inertia).tolist() == [5.0, 6.0, 7.0]
+
+
+def test_the_arm_is_mounted_on_the_spacecraft():
+    """As if the file had the spacecraft as its base link, with the mount as a fixed joint."""
+    inertia = '<inertia ixx="5" ixy="0.1" ixz="0.2" iyy="6" iyz="0.3" izz="7"/>'
+    bus = link("bus", f'<inertial><mass value="50"/>{inertia}</inertial>')
+    origin = '<origin xyz="0.1 0.2 0.5" rpy="0 0 0.3"/>'
+    expected = scene_from_urdf(robot(bus, joint("m", "bus", "base", "fixed", origin), *GOOD), "arm", "bus")
+    half = 0.15  # of the yaw
+    mount = {"position": [0.1, 0.2, 0.5], "rotation": [math.cos(half), 0, 0, math.sin(half)]}
+    tensor = [[5, 0.1, 0.2], [0.1, 6, 0.3], [0.2, 0.3, 7]]
+    found = scene_from_urdf(robot(*GOOD), "arm", spacecraft={"mass": 50, "inertia": tensor, "mount": mount})
+    x, u = drawn(expected, np.random.default_rng(0))
+    assert relative_error(accelerations(found, x, u), accelerations(expected, x, u)) < 1e-14
+    np.testing.assert_allclose(found.links[0].joint.position, expected.links[0].joint.position, atol=1e-15)
+    np.testing.assert_allclose(found.target.pose.position, expected.target.pose.position, atol=1e-15)
+
+
+def test_limits_are_scaled_for_free_flight_and_never_raised():
+    """Three times omega^2 I: 1.47 N m of an inertia of 1 kg m^2."""
+    strong = robot(*GOOD).replace('effort="1"', 'effort="87"')
+    assert scene_from_urdf(strong, "arm").links[0].torque_limit == 87.0
+    scene = scene_from_urdf(strong, "arm", scaled_efforts=True)
+    assert scene.links[0].torque_limit == scene.actuators.joint_torque.limit == 1.5
+    assert scene_from_urdf(robot(*GOOD), "arm", scaled_efforts=True).links[0].torque_limit == 1.0
+    damped = strong.replace("<limit", '<dynamics damping="30"/><limit')
+    assert scene_from_urdf(damped, "arm", scaled_efforts=True).links[0].torque_limit == 63.0
+    undamped = scene_from_urdf(damped, "arm", dampers=False, scaled_efforts=True)
+    assert undamped.links == scene.links
+
+
+def test_every_joint_has_a_weight_in_its_own_unit():
+    """A slide's is per N^2, of the mass that it moves: a / (omega^2 m)^2 with a = w / 4."""
+    slide = joint("j2", "arm", "hand", "prismatic", '<axis xyz="1 0 0"/><limit effort="1"/>')
+    scene = scene_from_urdf(robot(*GOOD, slide, link("hand")), "hand")
+    layout = StateLayout.of(scene)
+    assert layout.control.units[layout.control.joint_torque] == ("N m", "N")
+    turning, sliding = layout.control_weight[layout.control.joint_torque]
+    assert sliding == pytest.approx(15 / 4 / (0.7**2 * 2.0) ** 2, rel=0.03)
+    assert turning == pytest.approx(15 / 4 / (0.7**2 * 2.0) ** 2, rel=0.03)  # of two bodies of 1 kg m^2
+
+
 def test_the_weight_of_the_torques_makes_arms_of_any_size_move_alike():
     """a / b = omega^2 (I^2 omega^2 + c^2) of an inertia I with the damping c, a = w (1 + d^2) / 4."""
     fixed = joint("f", "arm", "hand", "fixed", '<origin xyz="0 2 0"/>')
@@ -199,7 +259,7 @@ def test_the_weight_of_the_torques_makes_arms_of_any_size_move_alike():
     heavy = text.replace('ixx="1"', 'ixx="100"').replace('iyy="1"', 'iyy="100"')
     damped = text.replace("<limit", '<dynamics damping="3"/><limit')
     for urdf, inertia, damping in ((text, 1.0, 0.0), (heavy, 100.0, 0.0), (damped, 1.0, 3.0)):
-        weight = scene_from_urdf(urdf, "hand").cost.joint_torque
+        weight = scene_from_urdf(urdf, "hand").links[0].torque_weight
         ratio = 0.7**2 * (inertia**2 * 0.7**2 + damping**2)
         assert 15 * (1 + 2**2) / (4 * weight) == pytest.approx(ratio, rel=0.03)
 

@@ -1,0 +1,175 @@
+"""What is valid in a scene and probably not meant: units, masses, limits, targets out of reach."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.dynamics import kinematics
+from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
+from dq_space_arm_env.interoperability.exporting import joint_limits
+from dq_space_arm_env.interoperability.swing_efforts import swing_efforts
+from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.bodies import freedoms
+from dq_space_arm_env.scene.path import shown_target
+
+_FAR = 50.0  # m, between a joint and the next: no arm in space is as long
+_ROUNDS = 4.0 * math.pi  # rad, of angles and their limits
+_FAST = 50.0  # rad/s
+_LIGHT = 0.005  # kg
+_GYRATION = 3.0  # radius of gyration of a body relative to the reach of the arm, or 1 m
+_THIN = 1e-3  # m, smallest radius of gyration
+_TOO_STRONG, _TOO_WEAK = 100.0, 0.03  # limits of torques, relative to the efforts of a swing
+
+
+def warnings_of(scene: Scene) -> list[str]:
+    """List what is unwise in a valid scene, a sentence each, which names the key and says what would help."""
+    return [*_units(scene), *_masses(scene), *_limits(scene), *_start(scene), *_reach(scene)]
+
+
+def _units(scene: Scene) -> Iterator[str]:
+    """Lengths that look like millimeters, angles that look like degrees."""
+    for index, link in enumerate(scene.links):
+        if math.hypot(*link.joint.position) > _FAR:
+            length = f"{math.hypot(*link.joint.position):g} m"
+            yield f"links[{index}].joint.position: {length} from {link.name!r} to its parent: millimeters?"
+    if math.hypot(*scene.tip.position) > _FAR:
+        yield f"tip.position: {math.hypot(*scene.tip.position):g} m from the last joint: millimeters?"
+    start = scene.initial_state
+    turning = [scene.links[index].turns for index, _ in freedoms(scene.links)]
+    for name, unit, most in (("joint_angles", "rad", _ROUNDS), ("joint_rates", "rad/s", _FAST)):
+        for value, turns in zip(getattr(start, name), turning, strict=False):
+            if turns and abs(value) > most:
+                yield f"initial_state.{name}: {value:g} {unit}: degrees?"
+                break
+    for link, (lower, upper, rate) in zip(scene.links, joint_limits(scene), strict=True):
+        wide = [bound for bound in (lower, upper) if _ROUNDS < abs(bound) < math.inf]
+        if link.turns and (wide or _FAST < rate < math.inf):
+            found = f"{wide[0]:g} rad" if wide else f"{rate:g} rad/s"
+            yield f"constraints: limits of {link.name!r}: {found}: degrees?"
+    if max(scene.spread.joint_angles, scene.spread.base_rotation, scene.spread.wrist_angles) > math.pi:
+        yield "spread: draws of angles by more than half a turn, rad: degrees?"
+
+
+def _masses(scene: Scene) -> Iterator[str]:
+    """Masses of grams, and inertias that do not fit mass and size."""
+    reach = max(min(_length(scene), _FAR), 1.0)
+    bodies = [("base", scene.base)] + [(f"links[{i}]", link) for i, link in enumerate(scene.links)]
+    for place, body in bodies:
+        if body.mass < _LIGHT:
+            yield f"{place}.mass: {1e3 * body.mass:g} g: was it meant in other units than kg?"
+        gyration = math.sqrt(np.trace(np.array(body.inertia)) / (2.0 * body.mass))
+        if gyration > _GYRATION * reach:
+            yield (
+                f"{place}.inertia: of a body of {body.mass:g} kg that is {gyration:.3g} m wide, where the "
+                f"arm is {reach:.3g} m long: kg mm^2 or kg cm^2, or a mass in tons?"
+            )
+        elif gyration < _THIN:
+            yield (
+                f"{place}.inertia: of a body of {body.mass:g} kg that is {1e3 * gyration:.2g} mm wide: a "
+                "mass in grams, or inertia in other units?"
+            )
+
+
+def _limits(scene: Scene) -> Iterator[str]:
+    """Torques that are out of proportion to what free flight takes."""
+    motors = scene.actuators.joint_torque
+    if motors is None:
+        return
+    strong, weak = [], []
+    for (index, _), effort in zip(freedoms(scene.links), swing_efforts(scene), strict=True):
+        link = scene.links[index]
+        limit = motors.limit if link.torque_limit is None else link.torque_limit
+        if link.actuated and not math.isinf(limit) and not link.stiffness:
+            share = limit / effort, f"{limit:g} {link.effort_unit} of {link.name!r}", effort
+            strong += [share] if share[0] > _TOO_STRONG else []
+            weak += [share] if share[0] < _TOO_WEAK else []
+    swing = "what a swing of all joints by 1 rad in seconds takes"
+    if strong:
+        times, where, effort = max(strong)
+        yield (
+            f"torque limits: {_several(where, strong)}, {times:,.0f} times {swing}: actions and noise, which "
+            f"are fractions of the limits, mean little; {3.0 * effort:.2g} would do there"
+        )
+    if weak:
+        times, where, _ = min(weak)
+        yield f"torque limits: {_several(where, weak)}, {times:.2g} of {swing}: the arm will crawl"
+
+
+def _several(where: str, found: list[tuple[float, str, float]]) -> str:
+    return where if len(found) == 1 else f"{len(found)} are out of proportion, the most {where}"
+
+
+def _start(scene: Scene) -> Iterator[str]:
+    """A start beyond the limits of the joints."""
+    coordinates = iter(scene.initial_state.joint_angles or [0.0] * len(freedoms(scene.links)))
+    for link, (lower, upper, _) in zip(scene.links, joint_limits(scene), strict=True):
+        angles = [next(coordinates) for _ in range(link.freedoms)]
+        if len(angles) == 1 and not lower <= angles[0] <= upper:
+            yield (
+                f"initial_state.joint_angles: {link.name!r} starts at {angles[0]:g} {link.unit}, beyond its "
+                f"limits of {lower:g} to {upper:g}"
+            )
+
+
+def _reach(scene: Scene) -> Iterator[str]:
+    """A target too far from the center of mass, which only thrusters move."""
+    start, simulation = scene.initial_state, scene.simulation
+    if any(start.base_velocity) or any(start.joint_rates):
+        return  # it drifts
+    masses, centers = _mass_points(scene)
+    center, total = np.average(centers, axis=0, weights=masses), sum(masses)
+    last = np.atleast_2d(shown_target(scene)[0])[-1]
+    goal = poses.to_rotation_and_position(tuple(last.tolist()))[1]
+    seconds = simulation.steps * simulation.dt
+    pushed = 0.25 * _force(scene) / total * seconds**2  # there and to rest, by the largest force
+    # From the center of mass the base is at most the arm's share of the mass times its length.
+    reach = _length(scene) * (2.0 - scene.base.mass / total) + scene.success.position_error
+    distance = math.dist(goal, center)
+    if distance > reach + pushed:
+        by = f", thrusters move it by {pushed:.3g} m in {seconds:g} s" if pushed else ""
+        yield (
+            f"target: {distance:.3g} m from the center of mass, from which the arm reaches {reach:.3g} m{by}"
+            ": it is out of reach"
+        )
+
+
+def _mass_points(scene: Scene) -> tuple[list[float], list[tuple[float, ...]]]:
+    """Masses of all bodies, kg, and where their centers are at the start, m."""
+    tree, layout, start = KinematicTree.from_scene(scene), StateLayout.of(scene), scene.initial_state
+    angles = tree.coordinates(layout.initial_state[layout.state.joint_angles].tolist())
+    wrist = start.wrist_angles or (0.0, 0.0, 0.0)
+    frames = kinematics.frame_poses(tree, start.base_pose.dual_quaternion, angles, wrist)
+    bodies = [(scene.base.mass, (0.0, 0.0, 0.0), frames[0])]
+    bodies += [(each.mass, each.center_of_mass, frames[i]) for i, each in enumerate(scene.links, 1)]
+    if scene.payload is not None:
+        bodies.append((scene.payload.mass, scene.payload.center_of_mass, frames[-1]))
+    centers = []
+    for _, center, frame in bodies:
+        rotation, position = poses.to_matrix(tuple(frame))
+        centers.append(tuple((np.array(position) + np.array(rotation) @ np.array(center)).tolist()))
+    return [mass for mass, *_ in bodies], centers
+
+
+def _force(scene: Scene) -> float:
+    """Largest force on the base, N."""
+    force, jets = scene.actuators.base_force, scene.actuators.thrusters or ()
+    return (math.hypot(*force.limit) if force is not None else 0.0) + sum(jet.force for jet in jets)
+
+
+def _length(scene: Scene) -> float:
+    """Length of the stretched arm from the base's center of mass to the tip, m."""
+    length = math.hypot(*scene.tip.position)
+    if scene.wrist is not None:
+        length += math.hypot(*scene.wrist.frame.position)
+    limits, body = joint_limits(scene), scene.tip_body
+    while body:
+        link = scene.links[body - 1]
+        length += math.hypot(*link.joint.position)
+        if link.joint_type in ("prismatic", "screw"):
+            length += max(abs(bound) for bound in limits[body - 1][:2])  # infinite for no limit
+        body = scene.parent_bodies[body - 1]
+    return length
