@@ -215,8 +215,8 @@ def _steps(imported: Imported) -> Iterator[str]:
         yield f"  steps   by {simulation.integrator}: the joints' dampers are too stiff for others"
     if (decay := joint_motion(scene).decay) * Simulation().dt > 1.0:
         yield (
-            f"          dampers stop joints within {1e3 / decay:.2g} ms: solving and training take many times "
-            "as long; many files'"
+            f"          dampers stop joints within {1e3 / decay:.2g} ms: solving and training take many "
+            "times as long; many files'"
         )
         yield "          dampers are guesses: --no-dampers leaves them out"
 

@@ -352,17 +352,19 @@ def import_(
     _write(path, commented_yaml(imported.scene))
     for warning in imported.warnings:
         complain(warning, label="Warning: ")
+    if as_json:
+        print_document(scene_exchange.record(imported, str(path), robot))
+    else:
+        for line in scene_exchange.summary(imported, str(path), bool(spacecraft)):
+            say(line)
     if replay:
         from dq_space_arm_env.command_line.replaying import show_maneuver
 
-        page = show_maneuver(imported.scene, path.with_suffix(".html"), message_console())
-    if as_json:
-        print_document(scene_exchange.record(imported, str(path), robot))
-        return
-    for line in scene_exchange.summary(imported, str(path), bool(spacecraft)):
-        say(line)
-    if replay:
-        say(page)
+        message_console().print(
+            show_maneuver(imported.scene, path.with_suffix(".html"), message_console()),
+            markup=False,
+            soft_wrap=True,
+        )
 
 
 @scenes.command(

@@ -9,7 +9,7 @@ import numpy as np
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics.step_stability import STIFF
-from dq_space_arm_env.interoperability.swing_efforts import swing_efforts
+from dq_space_arm_env.interoperability.swing_efforts import FloatArray, swing_torques
 from dq_space_arm_env.kernels import Kernels, compile_scene
 from dq_space_arm_env.scene import Scene
 
@@ -17,7 +17,7 @@ ACCURACY = 1e-4
 """Error of the tip at the end of the swing that is small enough, m and rad."""
 DIVISIONS = (1, 2, 4, 8)
 """Numbers of steps of `rk4` in a time step. More would take as long as a step of the stiff method."""
-_AMPLITUDE = 0.1  # of the efforts of a swing: tenths of a radian in an episode
+_AMPLITUDE = 0.5  # rad, m: of the swing
 
 
 class StepTrial(NamedTuple):
@@ -37,9 +37,9 @@ class StepTrial(NamedTuple):
 def measured_steps(scene: Scene) -> list[StepTrial]:
     """Try integrators and time steps, the cheapest first, until one follows a swing of the arm.
 
-    Every joint is driven there and back by a cosine of a tenth of its swing's effort, for as long as an
-    episode lasts, held for a time step of the scene each. The error is the distance from the end of the same
-    motion in steps half as long.
+    All joints swing together by some half a radian there and back, in the time of an episode, each torque
+    held for a time step of the scene. The error is the distance from the end of the same motion in steps half
+    as long.
 
     Args:
         scene: A scene with joints, driven or not.
@@ -68,13 +68,12 @@ def _tried(kernels: Kernels, integrator: str, division: int) -> StepTrial:
     return StepTrial(integrator, division, error, 1e6 * seconds / (simulation.steps * simulation.dt))
 
 
-def _end(kernels: Kernels, integrator: str, division: int) -> tuple[np.ndarray, float]:
+def _end(kernels: Kernels, integrator: str, division: int) -> tuple[FloatArray, float]:
     """State at the end of the swing, shape (n_x,), and the time that it took, s."""
     layout, simulation = kernels.layout, kernels.scene.simulation
-    efforts = np.array(swing_efforts(kernels.scene))[list(layout.actuated_joints)]
-    phases = 2.0 * np.pi * (np.arange(simulation.steps) + 0.5) / simulation.steps
     held = np.zeros((simulation.steps, layout.n_u))
-    held[:, layout.control.joint_torque] = _AMPLITUDE * np.cos(phases)[:, None] * efforts
+    torques = swing_torques(kernels.scene, _AMPLITUDE)
+    held[:, layout.control.joint_torque] = torques[:, list(layout.actuated_joints)]
     controls = np.repeat(held, division, axis=0)
     began = perf_counter()
     with np.errstate(all="ignore"):

@@ -135,7 +135,7 @@ def test_the_first_maneuver_opens_in_the_browser(
     monkeypatch.setattr("webbrowser.open", opened.append)
     assert main(["scenes", *HAND, *CARRIED, "--replay"]) == SUCCESS
     assert opened == [(here / "small-arm.html").resolve().as_uri()]
-    assert "small-arm.html: the first maneuver reaches the target" in capsys.readouterr().out
+    assert "small-arm.html: the first maneuver reaches the target" in capsys.readouterr().err
     assert "<html" in (here / "small-arm.html").read_text(encoding="utf-8")
 
 
