@@ -17,7 +17,7 @@ from dq_space_arm_env.command_line.names import (
 )
 from dq_space_arm_env.command_line.policy_sources import POLICY, load_policy
 from dq_space_arm_env.command_line.verb import json_option, print_document
-from dq_space_arm_env.common.console import message_console, table_console
+from dq_space_arm_env.common.console import complain, message_console, table_console
 from dq_space_arm_env.common.files import check_writable_file
 
 if TYPE_CHECKING:
@@ -88,6 +88,7 @@ def simulate(
     from dq_space_arm_env import load_scene
     from dq_space_arm_env.command_line.simulated_episode import (
         begin,
+        drowned_inputs,
         fly,
         numerical_error,
         read_noise,
@@ -97,6 +98,8 @@ def simulate(
     if out is not None:
         check_writable_file(out)
     disturbance = read_noise(noise, loaded)
+    if (drowned := drowned_inputs(disturbance, loaded)) is not None:
+        complain(drowned, label="Warning: ")
     begun = begin(loaded, seed, start)
     pilot = load_policy(policy, begun, message_console(), seed, trust=trust, normalize=normalize)
     flight = fly(loaded, begun, pilot, seed=seed, noise=disturbance, label=label)

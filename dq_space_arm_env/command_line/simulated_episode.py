@@ -120,6 +120,19 @@ def read_noise(texts: Sequence[str], scene: Scene) -> NDArray[np.float64]:
     return fractions
 
 
+def drowned_inputs(noise: NDArray[np.float64], scene: Scene) -> str | None:
+    """Say which inputs drown in noise beyond their limits; None if none does."""
+    layout = StateLayout.of(scene)
+    found = [
+        f"{name} ({limit:.2g} {unit})"
+        for name, limit, unit, share in zip(
+            layout.control.names, layout.control_limit, layout.control.units, noise, strict=True
+        )
+        if share > 1.0
+    ]
+    return f"the noise is larger than the limits of {', '.join(found)}" if found else None
+
+
 def _units(layout: StateLayout, actuator: str) -> str:
     return ", ".join(dict.fromkeys(layout.control.units[getattr(layout.control, actuator)]))
 

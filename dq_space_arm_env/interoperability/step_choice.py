@@ -15,8 +15,8 @@ from dq_space_arm_env.scene import Scene
 
 ACCURACY = 1e-4
 """Error of the tip at the end of the swing that is small enough, m and rad."""
-DIVISIONS = (1, 2, 4, 8)
-"""Numbers of steps of `rk4` in a time step. More would take as long as a step of the stiff method."""
+DIVISIONS = (1, 2, 4)
+"""Numbers of steps of `rk4` in a time step. More would make episodes of too many steps."""
 _AMPLITUDE = 0.5  # rad, m: of the swing
 
 

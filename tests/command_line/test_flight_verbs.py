@@ -12,7 +12,7 @@ from rich.console import Console
 from dq_space_arm_env import DQSpaceArmEnv, Scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.command_line.policy_sources import load_policy
-from dq_space_arm_env.command_line.simulated_episode import begin, fly, read_noise, read_state
+from dq_space_arm_env.command_line.simulated_episode import begin, drowned_inputs, fly, read_noise, read_state
 from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, UNUSABLE
 from dq_space_arm_env.task.trajectory import Trajectory
 from experts import Solution
@@ -149,6 +149,9 @@ def test_noise_in_units_of_the_actuators() -> None:
         ["joint_torque=0.02", "0.1", "base_force=2.5"], scene
     )  # N m and N, of 2, 0.5, 2 and 10
     assert found == pytest.approx([0.25] * 3 + [0.1] * 3 + [0.01, 0.04, 0.01])
+    assert drowned_inputs(found, scene) is None
+    drowned = drowned_inputs(read_noise(["joint_torque=0.6"], scene), scene)
+    assert drowned == "the noise is larger than the limits of link 2 torque (0.5 N m)"
     start = begin(scene.replace(simulation={"steps": 200}))
     flown = fly(
         start.scene, start, load_policy("zero", start, Console(quiet=True), 0), seed=None, noise=found

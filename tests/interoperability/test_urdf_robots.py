@@ -272,8 +272,10 @@ FLOWN = {
     "g1": (["right_shoulder_pitch_joint", "right_elbow_joint"], SHORT),
     "tiago-dual": (
         ["arm_right_1_joint", "arm_right_4_joint"],
-        # The weight that suits the dampers of its sliding torso would let the arms fling.
-        {"simulation": {"dt": 0.01, "steps": 1000, "integrator": "rk4"}, "cost.joint_torque": 1.0},
+        {
+            "simulation": {"dt": 0.01, "steps": 1000, "integrator": "rk4"},
+            **{f"links.{joint}.torque_weight": 1.0 for joint in range(10)},
+        },
     ),
 }
 
