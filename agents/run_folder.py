@@ -163,13 +163,18 @@ def validation_seeds(episodes: int) -> list[int]:
 
 
 def validate(policy: Policy | StateFeedback, scene: Scene, seeds: Sequence[int]) -> dict[str, float]:
-    """Fly a policy for the learning curve: success rate, and medians of cost and final errors (deg, m)."""
+    """Fly a policy for the learning curve: success rate, and medians of cost and final errors (deg, m).
+
+    In scenes with constraints also the share of flights that violate them.
+    """
     flights = rollout(policy, scene, seeds)
+    shares = flights.constraint_violations
     return {
         "success_rate": float(np.mean(flights.is_success)),
         "median_cost": float(np.median(flights.cost)),
         "attitude_error": float(np.median(flights.attitude_error)),
         "position_error": float(np.median(flights.position_error)),
+        **({} if shares is None else {"violating_episodes": float(np.mean(shares > 0.0))}),
     }
 
 

@@ -27,6 +27,17 @@ class _Common(Model):
     gamma: Fraction = Field(default=0.98, description="discount per decision")
 
 
+class Lagrangian(Model):
+    """Price of violating the scene's constraints, by dual ascent (PPO-Lagrangian, Ray et al., 2019)."""
+
+    limit: Fraction = Field(default=0.01, description="share of the episodes that may violate constraints")
+    learning_rate: Positive = Field(
+        default=1.0,
+        description="growth of the multiplier in an update, over the excess of the share of episodes that "
+        "violate; the excess counts up to 0.1",
+    )
+
+
 class PPO(_Common):
     """Proximal policy optimization (Schulman et al., 2017)."""
 
@@ -56,6 +67,9 @@ class PPO(_Common):
     )
     log_std_init: Finite = Field(
         default=-0.7, description="log of the initial standard deviation of actions, in action scales"
+    )
+    lagrangian: Lagrangian | None = Field(
+        default=None, description="charge violations of the scene's constraints; absent: rewards alone count"
     )
 
     def _problems(self) -> Iterator[Problem]:

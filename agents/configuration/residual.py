@@ -80,7 +80,7 @@ class ResidualConfiguration(AgentConfiguration):
                 copies,
                 f"must be at least {len(factors)}, one for each mass factor",
             )
-        for name in ("hindsight", "demonstrations"):
+        for name in ("hindsight", "demonstrations", "lagrangian"):
             if getattr(self.algorithm, name, None) is not None:
                 yield Problem(
                     ("algorithm", name), "given", "must be left out: corrections are learned without it"

@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from agents.configuration import Configuration
 from agents.policies import ExportedPolicy
 from agents.reinforcement.checkpoint import write_checkpoint
+from agents.reinforcement.lagrangian import Lagrangian
 from agents.reinforcement.networks import export_policy
 from agents.reinforcement.training_progress import Progress
 from agents.run_folder import BEST, DivergedError, RunFolder, validate, validation_seeds
@@ -46,6 +47,8 @@ class Advance(NamedTuple):
                 f"; success {curve['success_rate']:.0%}, cost {curve['median_cost']:.4g}, "
                 f"{curve['attitude_error']:.1f} deg, {curve['position_error']:.3f} m"
             )
+            if "multiplier" in curve:
+                line += f", {curve['violating_episodes']:.0%} violate at a price of {curve['multiplier']:.3g}"
         return line
 
 
@@ -144,6 +147,9 @@ class TrainingCallback(BaseCallback):
     def evaluate(self) -> None:
         """Add a line to the learning curve, and keep the policy if it is the best so far."""
         found = validate(as_policy(self.model).act, self._scene, self._seeds)
+        environment = self.model.get_env()
+        if isinstance(environment, Lagrangian):
+            found["multiplier"] = environment.multiplier
         line = self._add_to_curve(found)
         if self._best is None or _score(line) > self._best:
             self._best = _score(line)
@@ -182,8 +188,9 @@ def gradient_steps(model: BaseAlgorithm) -> int:
 
 
 def _score(line: dict[str, Any]) -> tuple[float, float]:
-    """More successes win; a tie goes to the lower cost."""
-    return line["success_rate"], -line["median_cost"]
+    """More successes win, less the violations if they are charged; a tie goes to the lower cost."""
+    violating = line["violating_episodes"] if "multiplier" in line else 0.0
+    return line["success_rate"] - violating, -line["median_cost"]
 
 
 def _next(steps: int, every: int) -> int:

@@ -8,6 +8,8 @@ from stable_baselines3.common.utils import explained_variance
 from torch import nn
 from torch.optim import Optimizer
 
+from agents.reinforcement.lagrangian import Lagrangian
+
 GROWTH = 1.3  # largest change of the step size from one update to the next, a factor
 LEAST, MOST = 0.01, 1.0  # bounds of the step size, as fractions of the schedule's
 
@@ -38,6 +40,10 @@ class ProximalPolicyOptimization(PPO):
         super().__init__(*arguments, **options)
 
     def train(self) -> None:
+        if isinstance(self.env, Lagrangian):
+            self.env.ascend()
+            self.logger.record("lagrangian/multiplier", self.env.multiplier)
+            self.logger.record("lagrangian/violating_episodes", self.env.violating_episodes)
         # SB3 counts passes over the data; none is cut short while the critic warms up.
         if self._n_updates < self.critic_warm_up * self.n_epochs:
             self._train_critic()

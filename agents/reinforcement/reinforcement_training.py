@@ -145,7 +145,15 @@ def make_learner(
     """
     algorithm, network = configuration.algorithm, configuration.network
     options = algorithm.model_dump(
-        exclude={"name", "final_learning_rate", "hindsight", "log_std_init", "layer_norm", "demonstrations"}
+        exclude={
+            "name",
+            "final_learning_rate",
+            "hindsight",
+            "lagrangian",
+            "log_std_init",
+            "layer_norm",
+            "demonstrations",
+        }
     )
     first, last = algorithm.learning_rate, algorithm.final_learning_rate
     options["learning_rate"] = LinearSchedule(first, first if last is None else last, 1.0)

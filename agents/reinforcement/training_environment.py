@@ -10,17 +10,19 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents import configuration as c
+from agents.reinforcement.lagrangian import Lagrangian
 from agents.vec_env import SB3VecEnv
 from agents.wrappers import vector
 from dq_space_arm_env import DQSpaceArmGoalVectorEnv, DQSpaceArmVectorEnv, Scene
 
 
-def make_environment(configuration: c.Configuration, scene: Scene) -> SB3VecEnv:
-    """Make the training environment, with held actions and shaped rewards."""
+def make_environment(configuration: c.Configuration, scene: Scene) -> SB3VecEnv | Lagrangian:
+    """Make the training environment, with held actions, shaped rewards, and violations charged if asked."""
     _check_lengths(configuration, scene)
     practice, hindsight = configuration.environment, configuration.hindsight
     if hindsight is None:
-        return native_environment(configuration, scene, practice.copies)
+        environment = native_environment(configuration, scene, practice.copies)
+        return _charged(configuration.algorithm, environment, scene)
     native = DQSpaceArmGoalVectorEnv(practice.copies, scene, hindsight.reward_type, AutoresetMode.SAME_STEP)
     held = vector.RepeatAction(native, practice.action_repeat, reward="last")
     return SB3VecEnv(vector.ShrinkActionSpace(held, dict(practice.action_scale)))
@@ -39,6 +41,19 @@ def native_environment(configuration: c.Configuration, scene: Scene, copies: int
         end_error_cost=practice.end_error_cost,
     )
     return SB3VecEnv(shaped)
+
+
+def _charged(algorithm: c.Algorithm, environment: SB3VecEnv, scene: Scene) -> SB3VecEnv | Lagrangian:
+    """Charge violations of the scene's constraints where the algorithm has a Lagrangian."""
+    asked = algorithm.lagrangian if isinstance(algorithm, c.PPO) else None
+    if asked is None:
+        return environment
+    if not scene.constraints:
+        raise c.ConfigurationError(
+            f"algorithm.lagrangian: given, must be left out: scene {scene.name!r} has no constraints that "
+            "could be violated"
+        )
+    return Lagrangian(environment, asked.limit, asked.learning_rate)
 
 
 def held_environment(env: VectorEnv[Any, Any, Any], repeat: int) -> vector.RepeatAction:

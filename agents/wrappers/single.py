@@ -25,6 +25,8 @@ class RepeatAction(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
     Attributes:
         repeat: Number of time steps for which an action is held.
         steps_taken: Number of time steps of the last decision; fewer where its episode ended.
+        largest_cost: Largest constraint cost of these time steps, `info["cost"]`, dimensionless; 0 without
+            constraints.
     """
 
     def __init__(
@@ -55,7 +57,7 @@ class RepeatAction(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
             self, repeat=int(repeat), reward=reward, discount=discount, step_infos=step_infos
         )
         gymnasium.Wrapper.__init__(self, env)
-        self.repeat, self.steps_taken = int(repeat), 0
+        self.repeat, self.steps_taken, self.largest_cost = int(repeat), 0, 0.0
         self._sum, self._discount, self._step_infos = reward == "sum", discount, step_infos
 
     def step(self, action: Any) -> Result:
@@ -69,6 +71,8 @@ class RepeatAction(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
             if terminated or truncated:
                 break
         self.steps_taken = len(infos)
+        # NaN, of a simulation that has diverged, does not count.
+        self.largest_cost = float(np.fmax.reduce([each.get("cost", 0.0) for each in infos], initial=0.0))
         if self._step_infos:
             info = {**info, "step_infos": infos}
         return observation, total, terminated, truncated, info

@@ -40,6 +40,8 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         steps_taken: Number of time steps of the last decision in each sub-environment, shape (num_envs,);
             fewer where its episode ended, 0 where the step was a reset.
         collected: Sum of the rewards of these time steps, of whatever reward the decision has.
+        largest_cost: Largest constraint cost of these time steps, `info["cost"]`, dimensionless, shape
+            (num_envs,); 0 where the step was a reset, and without constraints.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         super().__init__(env)
         _check_restorable(env)
         self.repeat, self.steps_taken = int(repeat), np.zeros(env.num_envs, dtype=np.int64)
-        self.collected = np.zeros(env.num_envs)
+        self.collected, self.largest_cost = np.zeros(env.num_envs), np.zeros(env.num_envs)
         self._sum, self._discount, self._step_infos = reward == "sum", discount, step_infos
 
     def step(self, actions: Any) -> Result:
@@ -80,7 +82,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         mode, none = self.env.metadata["autoreset_mode"], np.zeros(self.num_envs, dtype=np.bool_)
         # In this mode the first step of those that are over is their reset.
         resetting = home.get_state()["over"] if mode is AutoresetMode.NEXT_STEP else none
-        total, collected = np.zeros(self.num_envs), np.zeros(self.num_envs)
+        total, collected, largest = np.zeros((3, self.num_envs))
         taken, resting, weight = np.zeros(self.num_envs, np.int64), none, 1.0
         finished: list[_Finished] = []
         infos: list[list[Info]] = [[] for _ in range(self.num_envs)]
@@ -89,6 +91,8 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
             total = np.where(resting, total, total + weight * rewards if self._sum else rewards)
             collected = np.where(resting, collected, collected + rewards)
             weight *= self._discount
+            cost = _constraint_cost(info, terminated | truncated)
+            largest = np.where(resting | resetting, largest, np.fmax(largest, cost))
             taken += ~(resting | resetting)
             if self._step_infos:
                 _collect(infos, info, ~(resting | resetting), terminated | truncated)
@@ -108,7 +112,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
             truncated = with_rows(truncated, each.truncated, each.rows)
             info = merged(info, each.info, each.rows)
             home.set_state(each.state, each.rows)
-        self.steps_taken, self.collected = taken, collected
+        self.steps_taken, self.collected, self.largest_cost = taken, collected, largest
         if self._step_infos:
             info = _with_step_infos(info, infos, taken > 0, terminated | truncated, mode)
         return observations, total, terminated, truncated, info
@@ -128,6 +132,12 @@ def _check_restorable(env: Env) -> None:
                 "has ended waits for the others: put it around RepeatAction"
             )
         env = env.env
+
+
+def _constraint_cost(info: Info, over: Mask) -> Any:
+    """Constraint costs of a time step, shape (num_envs,) or 0; where an episode ended, those of its end."""
+    cost, final = info.get("cost", 0.0), info.get("final_info", {}).get("cost")
+    return cost if final is None else np.where(over, final, cost)
 
 
 def _collect(infos: list[list[Info]], info: Info, moving: Mask, over: Mask) -> None:

@@ -335,6 +335,10 @@ MINIMAL = {"name": "small", "algorithm": {"name": "residual-PPO"}, "schedule": {
         ({"environment": {"copies": 2}}, "must be at least 5, one for each mass factor"),
         ({"algorithm": {"name": "residual-TD3"}}, "TD3, APG, cloning, dagger, residual-PPO, residual-SAC"),
         ({"algorithm": {"name": "residual-SAC", "hindsight": {}}}, "must be left out"),
+        (
+            {"algorithm": {"name": "residual-PPO", "lagrangian": {}}},
+            "algorithm.lagrangian = 'given': must be left out",
+        ),
     ],
 )
 def test_what_is_wrong_in_a_configuration_is_named(changes, sentence):

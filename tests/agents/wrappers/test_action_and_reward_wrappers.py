@@ -17,7 +17,12 @@ from dq_space_arm_env import load_scene
 PAPER = load_scene("paper")
 EIGHT_STEPS = PAPER.replace(simulation={"steps": 8})
 LINKS = [link.model_dump() | {"stiffness": 200.0} for link in PAPER.links]
-UNEVEN = PAPER.replace(links=LINKS, simulation={"dt": 0.1, "steps": 7, "integrator": "symplectic_euler"})
+BOUNDS = {"kind": "joint_limits", "name": "bounds", "upper": [0.0, 1.5, 0.0]}
+UNEVEN = PAPER.replace(
+    links=LINKS,
+    constraints=[BOUNDS],
+    simulation={"dt": 0.1, "steps": 7, "integrator": "symplectic_euler"},
+)
 """Most episodes blow up, after five to seven steps; the others last seven."""
 STILL = np.zeros(12, dtype=np.float32)
 
@@ -55,17 +60,24 @@ def test_vector_wrappers_are_bit_equal_to_single_ones(mode):
     sync = SyncVectorEnv([single] * 6, autoreset_mode=mode)
     assert native.action_space == sync.action_space
     assert_same(native.reset(seed=3), sync.reset(seed=3))
-    rng, lengths = np.random.default_rng(0), set()
+    rng, lengths, costs = np.random.default_rng(0), set(), set()
     for step in range(10):
         actions = rng.uniform(-1.2, 1.2, (6, 12)).astype(np.float32)
         result, expected = native.step(actions), sync.step(actions)
         over = result[2] | result[3]
         assert_same((result[0], result[1].astype(float), *result[2:]), expected, f"step {step}")
-        lengths |= {tuple(native.env.env.steps_taken.tolist())}
+        repeater = native.env.env
+        lengths |= {tuple(repeater.steps_taken.tolist())}
+        moved = repeater.steps_taken > 0  # and were not reset
+        costs |= set(repeater.largest_cost.tolist())
+        np.testing.assert_array_equal(
+            repeater.largest_cost[moved], np.array(sync.get_attr("largest_cost"))[moved]
+        )
         if mode is AutoresetMode.DISABLED and over.any():
             for env in (native, sync):
                 env.reset(options={"reset_mask": over.copy()})
     assert {1, 2, 3} <= {taken for each in lengths for taken in each}
+    assert max(costs) > 0.0
 
 
 def test_a_decision_is_the_sum_of_its_steps_and_ends_with_its_episode():
@@ -80,6 +92,7 @@ def test_a_decision_is_the_sum_of_its_steps_and_ends_with_its_episode():
         np.testing.assert_array_equal(observation, flown[-1][0])
         assert reward == pytest.approx(sum(each[1] for each in flown), rel=1e-12)
         assert (terminated, truncated, env.steps_taken) == (steps == 2, False, steps)
+        assert env.largest_cost == 0.0  # there are no constraints
         assert_same(info.pop("step_infos"), [each[4] for each in flown])
         assert_same(info, flown[-1][4])
 
