@@ -31,10 +31,13 @@ class Lagrangian(Model):
     """Price of violating the scene's constraints, by dual ascent (PPO-Lagrangian, Ray et al., 2019)."""
 
     limit: Fraction = Field(default=0.01, description="share of the episodes that may violate constraints")
+    initial: Positive = Field(
+        default=1e-3, description="multiplier at first and at least: a price in units of the shaped rewards"
+    )
     learning_rate: Positive = Field(
-        default=1.0,
-        description="growth of the multiplier in an update, over the excess of the share of episodes that "
-        "violate; the excess counts up to 0.1",
+        default=0.25,
+        description="growth of the multiplier's logarithm in an update, over the excess of the share of "
+        "episodes that violate; the excess counts up to 0.1",
     )
 
 

@@ -2,15 +2,17 @@
 
 After Ray, Achiam & Amodei ("Benchmarking safe exploration in deep reinforcement learning", 2019): the learner
 maximizes (r - m c) / (1 + m), with the reward r of a decision, its constraint cost c and the multiplier m.
-The cost is min(max info["cost"], 1) over the decision's time steps: 0 where constraints hold, 1 where one is
-violated by more than its tolerance, and in between the largest violation over the tolerance. It is bounded,
-so that a deep violation does not dominate the critic.
+The cost is log(1 + v) for the largest violation v during the decision, `info["cost"]`, which is relative to
+the tolerance: continuous, at first linear, and the larger the deeper, so that a path through an obstacle has
+a way out; of a violation a hundred times the tolerance it is 4.6, so that no flight dominates the critic.
 
-What is limited is the share of episodes with a violation, as `evaluate` counts it, not the mean cost, which
-depends on how decisions are cut: the cost stands in for that share where the policy is improved, and the
-multiplier follows the share itself (a proxy Lagrangian, Cotter et al., JMLR 2019).
+What is limited is the share of episodes in which v exceeds 1 at a step, as `evaluate` counts it: the cost
+stands in for that share where the policy is improved, and the multiplier follows the share itself (a proxy
+Lagrangian, Cotter et al., JMLR 2019). It rises exponentially, from a price so small that the task is learned
+first: a price that is high from the start teaches to stay away from obstacles and target alike.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -31,17 +33,18 @@ class Lagrangian(VecEnvWrapper):
         violating_episodes: Share of the episodes with a violation, of those before the last ascent.
     """
 
-    def __init__(self, venv: SB3VecEnv, limit: float, learning_rate: float) -> None:
+    def __init__(self, venv: SB3VecEnv, limit: float, initial: float, learning_rate: float) -> None:
         """Charge violations in copies whose actions are held by `agents.wrappers.vector.RepeatAction`.
 
         Args:
             venv: The copies, of a scene with constraints.
             limit: Share of the episodes that may violate.
-            learning_rate: Growth of the multiplier per ascent, over the excess of the share.
+            initial: Multiplier at first, and at least.
+            learning_rate: Growth of the multiplier's logarithm per ascent, over the excess of the share.
         """
         super().__init__(venv)
-        self.limit, self.learning_rate = limit, learning_rate
-        self.multiplier, self.violating_episodes = 0.0, 0.0
+        self.limit, self.initial, self.learning_rate = limit, initial, learning_rate
+        self.multiplier, self.violating_episodes = initial, 0.0
         self._violated = np.zeros(self.num_envs, dtype=np.bool_)  # in the running episodes
         self._ended = self._violating = 0  # episodes since the last ascent
 
@@ -55,7 +58,7 @@ class Lagrangian(VecEnvWrapper):
         """Return what the copies do, with rewards (r - m c) / (1 + m), shape (num_envs,)."""
         observations, rewards, dones, infos = self.venv.step_wait()
         largest: NDArray[np.float64] = self.venv.get_attr("largest_cost", 0)[0]
-        charged = (rewards - self.multiplier * np.minimum(largest, 1.0)) / (1.0 + self.multiplier)
+        charged = (rewards - self.multiplier * np.log1p(largest)) / (1.0 + self.multiplier)
         self._violated |= largest > 1.0
         self._ended += int(dones.sum())
         self._violating += int((dones & self._violated).sum())
@@ -68,7 +71,7 @@ class Lagrangian(VecEnvWrapper):
             return
         self.violating_episodes = self._violating / self._ended
         excess = min(self.violating_episodes - self.limit, MOST)
-        self.multiplier = max(0.0, self.multiplier + self.learning_rate * excess)
+        self.multiplier = max(self.initial, self.multiplier * math.exp(self.learning_rate * excess))
         self._ended = self._violating = 0
 
     def get_state(self) -> dict[str, NDArray[Any]]:

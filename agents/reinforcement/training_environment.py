@@ -53,7 +53,7 @@ def _charged(algorithm: c.Algorithm, environment: SB3VecEnv, scene: Scene) -> SB
             f"algorithm.lagrangian: given, must be left out: scene {scene.name!r} has no constraints that "
             "could be violated"
         )
-    return Lagrangian(environment, asked.limit, asked.learning_rate)
+    return Lagrangian(environment, asked.limit, asked.initial, asked.learning_rate)
 
 
 def held_environment(env: VectorEnv[Any, Any, Any], repeat: int) -> vector.RepeatAction:

@@ -71,8 +71,7 @@ class RepeatAction(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
             if terminated or truncated:
                 break
         self.steps_taken = len(infos)
-        # NaN, of a simulation that has diverged, does not count.
-        self.largest_cost = float(np.fmax.reduce([each.get("cost", 0.0) for each in infos], initial=0.0))
+        self.largest_cost = max(each.get("cost", 0.0) for each in infos)
         if self._step_infos:
             info = {**info, "step_infos": infos}
         return observation, total, terminated, truncated, info

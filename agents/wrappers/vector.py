@@ -92,7 +92,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
             collected = np.where(resting, collected, collected + rewards)
             weight *= self._discount
             cost = _constraint_cost(info, terminated | truncated)
-            largest = np.where(resting | resetting, largest, np.fmax(largest, cost))
+            largest = np.where(resting | resetting, largest, np.maximum(largest, cost))
             taken += ~(resting | resetting)
             if self._step_infos:
                 _collect(infos, info, ~(resting | resetting), terminated | truncated)

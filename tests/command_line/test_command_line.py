@@ -85,7 +85,7 @@ def test_completion_loads_nothing_heavy_and_knows_the_names() -> None:
     assert "plain,gains" in completed("dq-space-arm simulate paper --policy ", 4)
     assert (
         completed("dq-space-arm train pp", 2)
-        == "plain,ppo\nplain,ppo-from-clone\nplain,ppo-tumbling-target\n"
+        == "plain,ppo\nplain,ppo-from-clone\nplain,ppo-lagrangian\nplain,ppo-tumbling-target\n"
     )
     assert completed("dq-space-arm evaluate --scene plan", 3) == "plain,planar\n"
 

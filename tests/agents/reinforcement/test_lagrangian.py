@@ -1,6 +1,7 @@
 """PPO with a Lagrangian: what violations cost, the price that follows them, and checkpoints of both."""
 
 import json
+import math
 from pathlib import Path
 
 import gymnasium
@@ -64,8 +65,7 @@ def configuration(scene, **algorithm):
 
 def test_rewards_are_charged_for_the_largest_violation_of_a_decision():
     native = DQSpaceArmVectorEnv(COPIES, SCENE, autoreset_mode=AutoresetMode.SAME_STEP)
-    charged = Lagrangian(SB3VecEnv(RepeatAction(native, REPEAT)), limit=0.0, learning_rate=1.0)
-    charged.multiplier = 0.7
+    charged = Lagrangian(SB3VecEnv(RepeatAction(native, REPEAT)), limit=0.0, initial=0.7, learning_rate=1.0)
     singles = [DQSpaceArmEnv(SCENE) for _ in range(COPIES)]
     charged.seed(3)
     charged.reset()
@@ -79,7 +79,7 @@ def test_rewards_are_charged_for_the_largest_violation_of_a_decision():
         for i, env in enumerate(singles):
             flown = [env.step(actions[i]) for _ in range(REPEAT)]
             largest = max(result[4]["cost"] for result in flown)
-            expected = (sum(result[1] for result in flown) - 0.7 * min(largest, 1.0)) / 1.7
+            expected = (sum(result[1] for result in flown) - 0.7 * math.log(1.0 + largest)) / 1.7
             assert rewards[i] == pytest.approx(expected, rel=1e-6)
             assert dones[i] == flown[-1][2]
             violated[i] |= largest > 1.0
@@ -117,8 +117,9 @@ class Scripted(gymnasium.Env):
 
 
 def test_the_multiplier_follows_the_share_of_violating_episodes():
-    costs = [0, 0, 1, 0, 5, 0, 0, 2, *[0] * 4]  # two of the first four episodes violate
-    charged = Lagrangian(DummyVecEnv([lambda: Scripted(costs)]), limit=0.05, learning_rate=2.0)
+    costs = [0, 0, 1, 0, 5, 0, 0, 2, *[0] * 6]  # two of the first four episodes violate
+    copies = DummyVecEnv([lambda: Scripted(costs)])
+    charged = Lagrangian(copies, limit=0.05, initial=0.25, learning_rate=2.0)
     charged.reset()
 
     def fly(decisions):
@@ -126,17 +127,18 @@ def test_the_multiplier_follows_the_share_of_violating_episodes():
         charged.ascend()
         return rewards
 
-    assert fly(8) == [1.0] * 8
+    assert fly(8) == pytest.approx([(1.0 - 0.25 * math.log(1.0 + cost)) / 1.25 for cost in costs[:8]])
     assert charged.violating_episodes == 0.5
-    assert charged.multiplier == pytest.approx(2.0 * 0.1)  # the excess counts up to 0.1
-    assert fly(1) == pytest.approx([1.0 / 1.2])
-    assert charged.multiplier == pytest.approx(0.2)  # no episode has ended
+    risen = 0.25 * math.exp(2.0 * 0.1)  # the excess of 0.45 counts up to 0.1
+    assert charged.multiplier == pytest.approx(risen)
+    assert fly(1) == pytest.approx([1.0 / (1.0 + risen)])
+    assert charged.multiplier == pytest.approx(risen)  # no episode has ended
     fly(1)
     assert charged.violating_episodes == 0.0
-    assert charged.multiplier == pytest.approx(0.2 - 2.0 * 0.05)
-    charged.multiplier = 0.04
-    fly(2)
-    assert charged.multiplier == 0.0
+    assert charged.multiplier == pytest.approx(risen * math.exp(-2.0 * 0.05))
+    for _ in range(2):
+        fly(2)
+    assert charged.multiplier == 0.25  # at least the initial one
 
 
 def kept(path):
@@ -152,7 +154,7 @@ def kept(path):
 
 
 def test_a_run_resumes_with_its_multiplier_in_the_middle_of_episodes(limited, tmp_path):
-    settings = configuration(limited, lagrangian={"limit": 0.1, "learning_rate": 3.0})
+    settings = configuration(limited, lagrangian={"limit": 0.1, "initial": 0.1, "learning_rate": 3.0})
 
     def kill(advance):
         if advance.environment_steps > 450:
@@ -161,7 +163,7 @@ def test_a_run_resumes_with_its_multiplier_in_the_middle_of_episodes(limited, tm
     with pytest.raises(KeyboardInterrupt):
         train(settings, tmp_path / "run", report=kill)
     arrays, *_ = kept(tmp_path / "run")
-    assert arrays["environment.multiplier"][0] > 0.0
+    assert arrays["environment.multiplier"][0] > 0.1
     assert 0 < arrays["environment.memory"][0, 0] < STEPS  # steps taken of the episode
     assert arrays["environment.violated"].any()
     for name in ("run", "whole"):
