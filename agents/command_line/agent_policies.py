@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from dq_space_arm_env.command_line.simulated_episode import Pilot, Start
 
 
+_MARKS = {"weight_0", "chunk_format"}  # arrays in the files of exported policies
+
+
 def configuration_files() -> dict[str, Path]:
     """List the configurations that ship with the package, paths by name."""
     return shipped_files("agents", "configs", "configs/agents")
@@ -37,7 +40,7 @@ def owns_policy(policy: str) -> bool:
         return (path / "policy.npz").is_file()
     if path.suffix in (".zip", ".onnx"):
         return path.is_file()
-    return policy in policy_files() or "weight_0" in archive_members(path)
+    return policy in policy_files() or bool(_MARKS & archive_members(path))
 
 
 def load_policy(

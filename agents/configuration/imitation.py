@@ -8,10 +8,22 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool, StrictInt
 
-from agents.configuration.schema import AgentConfiguration, DemonstrationSource, Few, Many
-from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
+from agents.configuration.schema import (
+    MOST_LAYERS,
+    AgentConfiguration,
+    DemonstrationSource,
+    Few,
+    Many,
+    Width,
+)
+from dq_space_arm_env.validation import Count, Finite, Model, NonNegative, Positive, Problem, count_up_to
 
 SMOOTH_ACTIVATIONS = ("tanh", "silu")  # differentiable everywhere, as matching gains needs
+
+LONGEST_CHUNK = 10_000
+"""Largest number of time steps of a chunk: flights remember as many actions."""
+STRONGEST = 600.0
+"""Exponent of the largest ratio of two weights of a temporal ensemble: no double overflows."""
 
 WholeNumber = Annotated[StrictInt, Field(ge=0)]
 
@@ -49,17 +61,11 @@ class Optimization(Model):
     gradient_limit: Positive = Field(default=1.0, description="norm at which gradients are clipped")
 
 
-class Cloning(Model):
-    """Behavior cloning: plain, with gains, or with augmentation, by the weights of its objective."""
+class Fit(Model):
+    """Settings of a training on demonstrations alone."""
 
-    name: Literal["cloning"] = "cloning"
-    objective: ObjectiveWeights = Field(default_factory=ObjectiveWeights, description="the loss")
+    name: str
     optimization: Optimization = Field(default_factory=Optimization, description="the optimizer")
-    stationary: StrictBool = Field(
-        default=False,
-        description="whether the policy does without the time left: to the end it acts as in the middle of "
-        "an episode, where an expert with a finite horizon lets go",
-    )
     validation_share: NonNegative = Field(
         default=0.05,
         description="share of the demonstrations to validate on, less than 1; the weights with the lowest "
@@ -69,9 +75,61 @@ class Cloning(Model):
         default=1000, description="updates between validations, each with a checkpoint"
     )
 
+    @property
+    def needs_gains(self) -> bool:
+        return False
+
     def _problems(self) -> Iterator[Problem]:
         if self.validation_share >= 1.0:
             yield Problem(("validation_share",), self.validation_share, "must be less than 1")
+
+
+class Cloning(Fit):
+    """Behavior cloning: plain, with gains, or with augmentation, by the weights of its objective."""
+
+    name: Literal["cloning"] = "cloning"
+    objective: ObjectiveWeights = Field(default_factory=ObjectiveWeights, description="the loss")
+    stationary: StrictBool = Field(
+        default=False,
+        description="whether the policy does without the time left: to the end it acts as in the middle of "
+        "an episode, where an expert with a finite horizon lets go",
+    )
+
+    @property
+    def needs_gains(self) -> bool:
+        return self.objective.needs_gains
+
+
+class ActionChunking(Fit):
+    """ACT: a transformer predicts the expert's next actions, a chunk; a flight averages its predictions."""
+
+    name: Literal["act"] = "act"
+    chunk: Few = Field(default=16, description="actions of a chunk")
+    spacing: Few = Field(
+        default=10, description="time steps between them, at least 1; a flight interpolates linearly"
+    )
+    weighting: Finite = Field(
+        default=0.0,
+        description="m of the temporal ensemble: a prediction made a time steps ago counts exp(m a); 0: all "
+        "alike; negative: newer ones count more",
+    )
+    width: Width = Field(default=64, description="size of a token, a multiple of `heads`")
+    layers: Annotated[int, count_up_to(MOST_LAYERS)] = Field(
+        default=2, description="layers of the transformer; `network` embeds the observation"
+    )
+    heads: Few = Field(default=4, description="heads of the attention")
+
+    def _problems(self) -> Iterator[Problem]:
+        yield from super()._problems()
+        if self.width % self.heads:
+            yield Problem(("heads",), self.heads, f"must divide width, {self.width}")
+        steps = (self.chunk - 1) * self.spacing + 1
+        if steps > LONGEST_CHUNK:
+            sentence = f"{self.chunk} actions are {steps:,} time steps, must be at most {LONGEST_CHUNK:,}"
+            yield Problem(("spacing",), self.spacing, sentence)
+        if not abs(self.weighting) * steps <= STRONGEST:
+            bound = STRONGEST / steps
+            yield Problem(("weighting",), self.weighting, f"must be between {-bound:.3g} and {bound:.3g}")
 
 
 class Dagger(Model):
@@ -118,14 +176,16 @@ class ImitationConfiguration(AgentConfiguration):
     demonstrations: DemonstrationSource = Field(
         default_factory=DemonstrationSource, description="the demonstrations to learn from"
     )
-    algorithm: Cloning | Dagger = Field(
+    algorithm: Cloning | Dagger | ActionChunking = Field(
         discriminator="name", description="the algorithm, with its hyperparameters"
     )
     curve: LearningCurve = Field(default_factory=LearningCurve, description="flights during training")
 
     @property
     def cloning(self) -> Cloning:
-        """Settings of the cloning, DAgger's first stage included."""
+        """Settings of the cloning, DAgger's first stage included; ValueError for chunks of actions."""
+        if isinstance(self.algorithm, ActionChunking):
+            raise ValueError(f"configuration {self.name!r} clones chunks of actions, should be single ones")
         return self.algorithm if isinstance(self.algorithm, Cloning) else self.algorithm.cloning
 
     def _problems(self) -> Iterator[Problem]:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from agents.configuration.algorithms import Algorithm
 from agents.configuration.gradients import AnalyticPolicyGradient, GradientConfiguration
-from agents.configuration.imitation import Cloning, Dagger, ImitationConfiguration
+from agents.configuration.imitation import ActionChunking, Cloning, Dagger, ImitationConfiguration
 from agents.configuration.reinforcement import Configuration
 from agents.configuration.residual import ResidualConfiguration, ResidualPPO, ResidualSAC
 from agents.configuration.schema import AgentConfiguration
@@ -37,7 +37,7 @@ _CLASSES: dict[str, type[AgentConfiguration]] = {
     for kind, algorithms in (
         (Configuration, get_args(get_args(Algorithm)[0])),
         (GradientConfiguration, (AnalyticPolicyGradient,)),
-        (ImitationConfiguration, (Cloning, Dagger)),
+        (ImitationConfiguration, (Cloning, Dagger, ActionChunking)),
         (ResidualConfiguration, (ResidualPPO, ResidualSAC)),
     )
     for algorithm in algorithms

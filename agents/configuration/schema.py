@@ -26,7 +26,7 @@ StartFrom = Annotated[
 ]
 MOST_IN_MEMORY = 100_000_000
 """Largest number of decisions in memory, some ten gigabytes."""
-_MOST_LAYERS = 32
+MOST_LAYERS = 32
 _Part = TypeVar("_Part", bound=Model)
 
 
@@ -34,7 +34,7 @@ class Network(Model):
     """The network of the policy, and of its critics."""
 
     hidden: tuple[Width, ...] = Field(
-        default=(128, 128), max_length=_MOST_LAYERS, description="sizes of the hidden layers"
+        default=(128, 128), max_length=MOST_LAYERS, description="sizes of the hidden layers"
     )
     activation: Literal["tanh", "relu", "silu"] = Field(default="tanh", description="between the layers")
 

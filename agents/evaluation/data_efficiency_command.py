@@ -39,8 +39,10 @@ class Options:
 def run(destination: Destination, options: Options) -> None:
     """Measure, print the table and the verdict, and write the files; finished trainings are kept."""
     configuration = load_configuration(options.configuration)
-    if not isinstance(configuration, ImitationConfiguration):
-        raise ValueError(f"configuration {configuration.name!r} does not imitate: use cloning-with-gains")
+    if not isinstance(configuration, ImitationConfiguration) or configuration.algorithm.name == "act":
+        raise ValueError(
+            f"configuration {configuration.name!r} clones no single actions: use cloning-with-gains"
+        )
     try:
         from agents.evaluation.data_efficiency import Effort, measure, points
     except ModuleNotFoundError as error:

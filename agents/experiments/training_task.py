@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 from agents.configuration import AgentConfiguration, load_configuration
 from agents.evaluation.planned_flights import agents_source
-from agents.policies import ExportedPolicy, PolicyFileError
+from agents.policies import PolicyFileError
+from agents.policies.chunking import load_exported
 from agents.run_folder import CONFIGURATION, EVALUATIONS, LOCK, POLICY, DivergedError, RunFolderError, learned
 from agents.training import train
 from dq_space_arm_env import DQSpaceArmVectorEnv, SceneError, load_scene
@@ -100,7 +101,7 @@ class TrainingTask(NamedTuple):
     def is_trained(self) -> bool:
         """Whether the folder holds the policy that this training would end with."""
         try:
-            kept = ExportedPolicy.load(self.folder / POLICY).metadata
+            kept = load_exported(self.folder / POLICY).metadata
             there = load_configuration(kept["configuration"])
             scene_hash = load_scene(self.configuration.scene).content_hash()
         except (PolicyFileError, KeyError, TypeError, ValueError):

@@ -3,7 +3,8 @@
 `clone` trains a network on the expert's actions (behavior cloning), on its feedback gains (the policy's
 derivative should match them), and on states around the demonstrations with actions extrapolated by the gains
 (augmentation), each weighted by the settings. `aggregate` flies the network, has the expert label the states
-it visits, and keeps training (DAgger). Importing this package loads no PyTorch; training does.
+it visits, and keeps training (DAgger). `action_chunking` trains a transformer on the actions that follow a
+time step (ACT). Importing this package loads no PyTorch; training does.
 """
 
 from __future__ import annotations

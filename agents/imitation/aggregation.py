@@ -67,7 +67,7 @@ class Aggregated:
 
 
 def aggregate(
-    cloned: Cloned,
+    cloned: Cloned[PolicyNetwork],
     demonstrations: Demonstrations,
     settings: Dagger | None = None,
     folder: str | os.PathLike[str] | None = None,

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic
 
 import torch
 
-from agents.configuration.imitation import Cloning
+from agents.configuration.imitation import Cloning, Fit
 from agents.configuration.schema import Network
 from agents.demonstrations import check_scene
 from agents.imitation.objective import Objective
 from agents.imitation.samples import Statistics
-from agents.imitation.trainer import Progress, Record, Trainer, Watch, torch_threads
-from agents.policies.exported import ExportedPolicy
+from agents.imitation.trainer import N, Progress, Record, Trainer, Watch, torch_threads
+from agents.policies.chunking import Exported
 from agents.policies.network import PolicyNetwork
 from dq_space_arm_env import Scene
 from experts.demonstrations import Demonstrations
@@ -32,14 +33,14 @@ class Making:
 
 
 @dataclass(frozen=True, eq=False)
-class Cloned:
+class Cloned(Generic[N]):
     """A cloned network."""
 
-    network: PolicyNetwork  # with the weights of the lowest validation loss
+    network: N  # with the weights of the lowest validation loss
     history: list[Record]  # losses at every validation, see `Trainer`
     facts: dict[str, Any]  # metadata of the exported policy, JSON values
 
-    def export(self) -> ExportedPolicy:
+    def export(self) -> Exported:
         """Export the policy, which needs NumPy alone."""
         return self.network.export(self.facts)
 
@@ -53,7 +54,7 @@ def clone(
     scene: Scene | None = None,
     progress: Progress | None = None,
     watch: Watch | None = None,
-) -> Cloned:
+) -> Cloned[PolicyNetwork]:
     """Train a network on demonstrations; the same call resumes an interrupted run, with the same result.
 
     Args:
@@ -76,8 +77,8 @@ def clone(
     settings, making = settings or Cloning(), making or Making()
     intended = scene or demonstrations.scene
     check_scene(demonstrations, intended)
-    training, validation = _divide(demonstrations, settings, making.seed)
-    facts = _facts(demonstrations, settings, making, intended)
+    training, validation = divide(demonstrations, settings, making.seed)
+    facts = facts_of(demonstrations, settings, making, intended)
     with torch_threads(making.threads):
         statistics = Statistics.of(training)
         network = new_network(statistics, making)
@@ -98,10 +99,17 @@ def clone(
 
 def new_network(statistics: Statistics, making: Making) -> PolicyNetwork:
     """An untrained network that knows the units of its data."""
+    hidden, activation = making.network.hidden, making.network.activation
+    return with_units(
+        lambda seen, taken: PolicyNetwork(seen, taken, hidden, activation), statistics, making.seed
+    )
+
+
+def with_units(make: Callable[[int, int], N], statistics: Statistics, seed: int) -> N:
+    """Make a network for numbers of observations and actions, and tell it the units of its data."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(making.seed)
-        sizes = len(statistics.observation_mean), len(statistics.action_mean)
-        network = PolicyNetwork(*sizes, making.network.hidden, making.network.activation)
+        torch.manual_seed(seed)
+        network = make(len(statistics.observation_mean), len(statistics.action_mean))
     network.normalize(
         statistics.observation_mean,
         statistics.observation_deviation,
@@ -111,7 +119,7 @@ def new_network(statistics: Statistics, making: Making) -> PolicyNetwork:
     return network
 
 
-def _facts(demonstrations: Demonstrations, settings: Cloning, making: Making, scene: Scene) -> dict[str, Any]:
+def facts_of(demonstrations: Demonstrations, settings: Fit, making: Making, scene: Scene) -> dict[str, Any]:
     """Metadata that identifies a training, JSON values."""
     return {
         "scene": scene.name,
@@ -134,11 +142,11 @@ def fingerprint(demonstrations: Demonstrations) -> str:
     return hashlib.sha256(demonstrations.column("index").tobytes()).hexdigest()[:16]
 
 
-def _divide(
-    demonstrations: Demonstrations, settings: Cloning, seed: int
+def divide(
+    demonstrations: Demonstrations, settings: Fit, seed: int
 ) -> tuple[Demonstrations, Demonstrations | None]:
     """Split into demonstrations to train on and to validate on."""
-    count, share, gains = len(demonstrations), settings.validation_share, settings.objective.needs_gains
+    count, share, gains = len(demonstrations), settings.validation_share, settings.needs_gains
     aside = max(1, round(share * count)) if share else 0
     if count - aside < 1 or (gains and count - aside < 2):
         raise ValueError(

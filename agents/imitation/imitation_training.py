@@ -3,17 +3,18 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch.utils.tensorboard import SummaryWriter
 
-from agents.configuration.imitation import Dagger, ImitationConfiguration
+from agents.configuration.imitation import ActionChunking, Dagger, ImitationConfiguration
 from agents.demonstrations import expert_seconds, prepare_demonstrations
-from agents.imitation.aggregation import Aggregated, aggregate
-from agents.imitation.cloning import Cloned, Making, clone
+from agents.imitation.action_chunking import clone_chunks
+from agents.imitation.aggregation import aggregate
+from agents.imitation.cloning import Making, clone
 from agents.imitation.trainer import Record
-from agents.policies import ExportedPolicy
-from agents.policies.network import PolicyNetwork
+from agents.policies.chunking import Exported
+from agents.policies.network import NormalizedNetwork
 from agents.run_folder import (
     CHECKPOINTS,
     DEMONSTRATIONS,
@@ -31,8 +32,8 @@ class Imitated(NamedTuple):
     """Result of a training run: its folder, the network, and the exported policy."""
 
     folder: Path
-    network: PolicyNetwork
-    policy: ExportedPolicy
+    network: NormalizedNetwork
+    policy: Exported
 
 
 def train_by_imitation(
@@ -51,22 +52,19 @@ def train_by_imitation(
     solved_in, solves = expert_seconds(demonstrations), demonstrations.settings["problems"]
     with SummaryWriter(str(folder.path / TENSORBOARD)) as writer:
         watch = _Curve(configuration, scene, folder, solved_in, writer).add
-        cloned = clone(
-            demonstrations,
-            configuration.cloning,
-            place / "cloning",
-            making=making,
-            scene=scene,
-            progress=report,
-            watch=watch,
-        )
-        learned: Cloned | Aggregated = cloned
-        if isinstance(algorithm, Dagger):
-            learned = aggregate(
-                cloned, demonstrations, algorithm, place, making=making, progress=report, watch=watch
-            )
-            solves += sum(each.solves for each in learned.rounds)
-    spent = learned.history[-1]
+        network: NormalizedNetwork
+        common: dict[str, Any] = {"making": making, "progress": report, "watch": watch}
+        if isinstance(algorithm, ActionChunking):
+            chunked = clone_chunks(demonstrations, algorithm, place / "act", scene=scene, **common)
+            network, history = chunked.network, chunked.history
+        else:
+            cloned = clone(demonstrations, configuration.cloning, place / "cloning", scene=scene, **common)
+            network, history = cloned.network, cloned.history
+            if isinstance(algorithm, Dagger):
+                corrected = aggregate(cloned, demonstrations, algorithm, place, **common)
+                network, history = corrected.network, corrected.history
+                solves += sum(each.solves for each in corrected.rounds)
+    spent = history[-1]
     effort = {
         "environment_steps": int(spent["environment_steps"]),
         "updates": int(spent["updates"]),
@@ -74,9 +72,9 @@ def train_by_imitation(
         "expert_solves": solves,
         "demonstrations": len(demonstrations),
     }
-    policy = learned.network.export(folder.metadata(configuration, scene, effort))
+    policy = network.export(folder.metadata(configuration, scene, effort))
     policy.save(folder.path / POLICY)
-    return Imitated(folder.path, learned.network, policy)
+    return Imitated(folder.path, network, policy)
 
 
 class _Curve:
@@ -94,7 +92,7 @@ class _Curve:
         self._seeds = validation_seeds(configuration.curve.episodes)
         self._solved_in, self._writer = solved_in, writer
 
-    def add(self, network: PolicyNetwork, record: Record, is_last: bool) -> Record:
+    def add(self, network: NormalizedNetwork, record: Record, is_last: bool) -> Record:
         """Fly if it is time to, add a line to the curve, and return the results of the flights."""
         # A resumed run repeats what came after its checkpoint.
         lines = [line for line in self._folder.evaluations() if line["updates"] < record["updates"]]

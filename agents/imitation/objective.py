@@ -21,7 +21,7 @@ from torch import Tensor
 
 from agents.configuration.imitation import ObjectiveWeights
 from agents.imitation.samples import COLUMNS, NAMES, Statistics
-from agents.policies.network import PolicyNetwork
+from agents.policies.network import NormalizedNetwork, PolicyNetwork
 from dq_space_arm_env.kernels import Kernels
 from experts.demonstrations.reading import Batch
 from experts.demonstrations.shard import PARAMETERS
@@ -32,7 +32,7 @@ STEP = 1e-5  # of central differences, relative to the direction: truncation and
 
 @dataclass(frozen=True)
 class Losses:
-    """Mean squared errors, in units of the demonstrations' spread; 0 without weight."""
+    """Mean errors, squared but in chunks, in units of the demonstrations' spread; 0 without weight."""
 
     total: Tensor  # the weighted sum, which is minimized
     action: Tensor
@@ -70,7 +70,7 @@ class Objective:
             gain = self._gain_error(network, slopes, batch, directions)
         else:
             outputs = network(normalized)
-        action = _action_error(network, outputs, arrays["actions"])
+        action = action_errors(network, outputs, arrays["actions"]).square().mean()
         if weights.augmentation_weight:
             augmentation = self._augmentation_error(network, batch, rng)
         total = action + weights.gain_weight * gain + weights.augmentation_weight * augmentation
@@ -96,7 +96,7 @@ class Objective:
         time_left, parameters = arrays["observations"][:, -1:], arrays.get(PARAMETERS)
         observations = self._kernels.observation(states, time_left, p=parameters)[0]
         wanted = np.clip(arrays["actions"] + _times(arrays["feedback_gains"], directions), -1.0, 1.0)
-        return _action_error(network, network(network.normalized(observations)), wanted)
+        return action_errors(network, network(network.normalized(observations)), wanted).square().mean()
 
 
 def observation_change(
@@ -120,9 +120,9 @@ def _times(gains: NDArray[np.float32], directions: FloatArray) -> FloatArray:
     return np.asarray(np.matmul(gains, directions[:, :, None].astype(np.float32))[:, :, 0])
 
 
-def _action_error(network: PolicyNetwork, outputs: Tensor, actions: FloatArray) -> Tensor:
-    """Error of actions; one that is at a limit may be wanted beyond it, which clipping undoes."""
+def action_errors(network: NormalizedNetwork, outputs: Tensor, actions: FloatArray) -> Tensor:
+    """Errors of actions; one that is at a limit may be wanted beyond it, which clipping undoes."""
     wanted = torch.from_numpy(actions)
     errors = network.action_mean + network.action_scale * outputs - wanted
     beyond = ((wanted >= 1.0) & (errors > 0.0)) | ((wanted <= -1.0) & (errors < 0.0))
-    return (torch.where(beyond, 0.0, errors) / network.action_scale).float().square().mean()
+    return (torch.where(beyond, 0.0, errors) / network.action_scale).float()

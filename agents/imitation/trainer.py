@@ -11,20 +11,21 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
 
 from agents.configuration.imitation import Optimization
-from agents.imitation.objective import Losses, Objective
+from agents.imitation.objective import Losses
 from agents.imitation.samples import Source
-from agents.policies.network import PolicyNetwork
+from agents.policies.network import NormalizedNetwork
 from agents.policies.tensor_files import read_tensors
 from agents.run_folder import RunFolderError
 from dq_space_arm_env.common.bounded_reading import read_bytes
 from dq_space_arm_env.common.files import differences, write_atomically
 from dq_space_arm_env.common.progress import Advance
+from experts.demonstrations.reading import Batch
 
 CHECKPOINT = "checkpoint.pt"
 MOST_BYTES = 1 << 30  # of a checkpoint that is read
@@ -34,8 +35,23 @@ FINAL_RATE = 1e-3  # learning rate at the end, relative to its peak
 
 Record = dict[str, float]
 Progress = Callable[[Advance], None]
-Watch = Callable[[PolicyNetwork, Record, bool], Record]
+Watch = Callable[[NormalizedNetwork, Record, bool], Record]
 """Called with the network, the record of a validation, and whether it is the last; returns what to add."""
+
+
+N = TypeVar("N", bound=NormalizedNetwork)
+_N_contra = TypeVar("_N_contra", bound=NormalizedNetwork, contravariant=True)
+
+
+class Loss(Protocol[_N_contra]):
+    """What a training minimizes."""
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the arrays that a batch must have."""
+
+    def __call__(self, network: _N_contra, batch: Batch, rng: np.random.Generator) -> Losses:
+        """Evaluate the losses, with gradients, on a batch."""
 
 
 class CheckpointError(RunFolderError):
@@ -87,13 +103,13 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class Trainer:
+class Trainer(Generic[N]):
     """Trains a network with Adam on an objective; `history` holds a record per validation."""
 
     def __init__(
         self,
-        network: PolicyNetwork,
-        objective: Objective,
+        network: N,
+        objective: Loss[N],
         optimization: Optimization,
         *,
         validate_every: int,

@@ -27,8 +27,9 @@ from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
 
 FORMAT = 1  # version of the files
+CHUNKS = "chunk_format"  # instead of `format` in the files of `ChunkingPolicy`
 
-_MOST_BYTES = 64 * 2**20  # 8 million weights, hundreds of times those of a policy of the zoo
+MOST_BYTES = 64 * 2**20  # 8 million weights, hundreds of times those of a policy of the zoo
 _LONGEST = 200  # characters of a list of names
 
 _LARGEST_VALUE = 1e300  # of anything that an observation leads to: next to no double overflows
@@ -275,10 +276,15 @@ class ExportedPolicy:
             PolicyFileError: If the file is missing, damaged, or of another format.
         """
         try:
-            arrays = read_arrays(path, most=_MOST_BYTES)
+            arrays = read_arrays(path, most=MOST_BYTES)
         except UnreadableError as error:
             raise PolicyFileError(f"{path} cannot be read as a policy ({error})") from error
         found = arrays.get("format")
+        if CHUNKS in arrays:
+            raise PolicyFileError(
+                f"{path} holds a policy of chunks of actions, which flies, but nothing else starts from it; "
+                "give a policy of single actions, such as cloning-with-gains"
+            )
         if found is None:
             raise PolicyFileError(f"{path} holds no policy but {', '.join(arrays)[:_LONGEST] or 'nothing'}")
         if found.shape != () or found != FORMAT:

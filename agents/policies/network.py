@@ -13,14 +13,15 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from agents.configuration.imitation import SMOOTH_ACTIVATIONS
+from agents.policies.chunking import Exported
 from agents.policies.exported import ExportedPolicy, FloatArray
 
 CONSTANT = 1e-9  # standard deviation below which an entry of the observation is constant, in its unit
 FIRST_OUTPUTS = 0.1  # initial size of the last layer relative to PyTorch's, to start near the mean action
 
 
-class PolicyNetwork(nn.Module):
-    """Layers from normalized observations to normalized actions, before clipping.
+class NormalizedNetwork(nn.Module):
+    """A network from normalized observations to normalized actions, before clipping.
 
     Both are in units of their spread in the training data, so that a loss weighs each input relative to how
     much it is used, however small a fraction of its limit that is.
@@ -31,22 +32,9 @@ class PolicyNetwork(nn.Module):
     action_mean: Tensor
     action_scale: Tensor
 
-    def __init__(
-        self, n_observation: int, n_action: int, hidden: Sequence[int] = (256, 256), activation: str = "tanh"
-    ) -> None:
-        """Make a network with random weights from PyTorch's generator, without normalization."""
+    def __init__(self, n_observation: int, n_action: int) -> None:
+        """Make a network without normalization."""
         super().__init__()
-        sizes = [n_observation, *hidden, n_action]
-        if min(sizes) < 1:
-            raise ValueError(f"sizes of the layers: {sizes}, should be at least 1")
-        if activation not in SMOOTH_ACTIVATIONS:
-            raise ValueError(f"activation: {activation!r}, should be one of {', '.join(SMOOTH_ACTIVATIONS)}")
-        self.activation, self.hidden = activation, tuple(hidden)
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
-        last = self._linear[-1]
-        with torch.no_grad():
-            last.weight.mul_(FIRST_OUTPUTS)
-            last.bias.zero_()
         for name, value, size in (
             ("observation_mean", 0.0, n_observation),
             ("observation_scale", 1.0, n_observation),
@@ -54,10 +42,6 @@ class PolicyNetwork(nn.Module):
             ("action_scale", 1.0, n_action),
         ):
             self.register_buffer(name, torch.full((size,), value, dtype=torch.float64))
-
-    @property
-    def _linear(self) -> list[nn.Linear]:
-        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def normalize(
         self,
@@ -82,6 +66,35 @@ class PolicyNetwork(nn.Module):
         """Observations in the units of the network, float32."""
         difference = np.asarray(observation, dtype=np.float64) - self.observation_mean.numpy()
         return torch.from_numpy((difference * self.observation_scale.numpy()).astype(np.float32))
+
+    def export(self, metadata: Mapping[str, Any]) -> Exported:
+        """Export the network for NumPy alone, with metadata of JSON values."""
+        raise NotImplementedError
+
+
+class PolicyNetwork(NormalizedNetwork):
+    """Layers of a perceptron."""
+
+    def __init__(
+        self, n_observation: int, n_action: int, hidden: Sequence[int] = (256, 256), activation: str = "tanh"
+    ) -> None:
+        """Make a network with random weights from PyTorch's generator, without normalization."""
+        super().__init__(n_observation, n_action)
+        sizes = [n_observation, *hidden, n_action]
+        if min(sizes) < 1:
+            raise ValueError(f"sizes of the layers: {sizes}, should be at least 1")
+        if activation not in SMOOTH_ACTIVATIONS:
+            raise ValueError(f"activation: {activation!r}, should be one of {', '.join(SMOOTH_ACTIVATIONS)}")
+        self.activation, self.hidden = activation, tuple(hidden)
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+        last = self._linear[-1]
+        with torch.no_grad():
+            last.weight.mul_(FIRST_OUTPUTS)
+            last.bias.zero_()
+
+    @property
+    def _linear(self) -> list[nn.Linear]:
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def forward(self, normalized: Tensor) -> Tensor:
         values = normalized

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.policies import ExportedPolicy
+from agents.policies.chunking import ChunkingPolicy, load_exported
 from agents.policies.flying import Policy
 from agents.zoo.model_archive import (
     ModelArchiveError,
@@ -77,10 +78,10 @@ def as_policy(
         return _as_normalized(path, name, trust, Path(normalize))
     if normalize is not None:
         raise PolicyError("normalize: is for the file of a model (.zip); a model in memory has its own")
-    if isinstance(policy, ExportedPolicy):
+    if isinstance(policy, ExportedPolicy | ChunkingPolicy):
         name = label or str(policy.metadata.get("agent", "exported policy"))
         sizes = policy.n_observation, policy.n_action
-        if sees_goals(policy):
+        if isinstance(policy, ExportedPolicy) and sees_goals(policy):
             act = _on_goals(policy, joined=True)
             return ActingPolicy(name, act, act, True, policy.metadata, sizes)
         return ActingPolicy(name, policy, policy, False, policy.metadata, sizes)
@@ -226,7 +227,7 @@ def read_policy(path: Path, *, trust: bool = False, normalized: bool = False) ->
     if not path.exists():
         raise PolicyError(f"{path}: there is no such file or folder")
     if path.suffix == ".npz":
-        return ExportedPolicy.load(path)
+        return load_exported(path)
     if path.suffix == ".zip":
         return _read_model(path, trust=trust, normalized=normalized)
     if path.suffix == ".onnx":

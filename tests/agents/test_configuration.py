@@ -33,7 +33,7 @@ def test_shipped_configurations_are_named_like_their_files_and_have_scenes(name)
 
 def test_every_algorithm_ships():
     configurations = [load_configuration(name) for name in list_configurations()]
-    names = {"APG", "PPO", "SAC", "TQC", "TD3", "cloning", "dagger", "residual-PPO"}
+    names = {"APG", "PPO", "SAC", "TQC", "TD3", "cloning", "dagger", "act", "residual-PPO"}
     assert {each.algorithm.name for each in configurations} == names
     assert any(getattr(each.algorithm, "hindsight", None) for each in configurations)
 
@@ -81,7 +81,7 @@ def test_unknown_keys_are_refused_with_a_suggestion():
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"algorithm": {"name": "DQN"}}, "it must be one of PPO, SAC, TQC, TD3, APG, cloning, dagger"),
+        ({"algorithm": {"name": "DQN"}}, "it must be one of PPO, SAC, TQC, TD3, APG, cloning, dagger, act"),
         ({"algorithm": {"name": "PPO", "gamma": 1.5}}, "gamma = 1.5: must be a fraction"),
         (
             {"algorithm": {"name": "SAC", "buffer_size": 10, "learning_starts": 20}},
@@ -139,6 +139,13 @@ def test_the_algorithm_decides_about_the_class():
         ({"algorithm": {"name": "clonin"}}, "algorithm.name = 'clonin': did you mean 'cloning'"),
         ({"algorithm": {"name": ["cloning"]}}, "algorithm.name = ['cloning']: it must be one of PPO"),
         ({"algorithm": {"name": "dagger", "share": 1.0}}, "share = 1.0: must be less than 1"),
+        ({"algorithm": {"name": "act", "width": 50}}, "heads = 4: must divide width, 50"),
+        ({"algorithm": {"name": "act", "chunk": 1002, "spacing": 10}}, "1002 actions are 10,011 time steps"),
+        (
+            {"algorithm": {"name": "act", "chunk": 21, "spacing": 5, "weighting": 6}},
+            "weighting = 6.0: must be between -5.94 and 5.94",
+        ),
+        ({"algorithm": {"name": "act", "validation_share": 1}}, "validation_share = 1.0: must be less"),
         ({"algorithm": {"name": "cloning", "optimization": {"update": 5}}}, "did you mean 'updates'"),
         ({"demonstrations": {"tolerance_scale": 2}}, "tolerance_scale = 2.0: must be at most 1"),
     ],

@@ -79,7 +79,8 @@ def test_what_cannot_be_measured_is_refused(arguments, demonstrations, tmp_path,
     (tmp_path / "other" / LINES).write_text('{"updates": 7}\n')
     refused = (
         (["--counts", "100"], "100 demonstrations are requested, there are 24"),
-        (["--config", "ppo"], "configuration 'ppo' does not imitate: use cloning-with-gains"),
+        (["--config", "ppo"], "configuration 'ppo' clones no single actions: use cloning-with-gains"),
+        (["--config", "act"], "configuration 'act' clones no single actions: use cloning-with-gains"),
         (["--test-demonstrations", str(demonstrations.path), "--counts", "3"], "share starts"),
         (["--out", str(tmp_path / "other"), "--counts", "3"], "is of another measurement"),
     )

@@ -12,7 +12,9 @@ pytest.importorskip("tensorboard")
 
 import agents  # noqa: E402
 from agents import ExportedPolicy  # noqa: E402
+from agents.imitation.action_chunking import Chunks  # noqa: E402
 from agents.imitation.trainer import TrainingAdvance  # noqa: E402
+from agents.policies.chunking import load_exported  # noqa: E402
 from agents.run_folder import validate, validation_seeds  # noqa: E402
 from agents.training import train  # noqa: E402
 from dq_space_arm_env.command_line import main  # noqa: E402
@@ -24,6 +26,7 @@ STEPS = {"batch_size": 64, "warm_up": 10}
 CLONING = {"optimization": {"updates": 120, "learning_rate": 1e-2, **STEPS}, "validate_every": 40}
 ALGORITHMS = {
     "cloning": {"name": "cloning", **CLONING},
+    "act": {"name": "act", **CLONING, "chunk": 4, "spacing": 5, "width": 16, "layers": 1, "heads": 2},
     "dagger": {
         "name": "dagger",
         "cloning": CLONING,
@@ -88,7 +91,7 @@ def test_corrections_go_on_where_cloning_ends(runs):
     assert (training["environment_steps"], training["updates"]) == (1200, 180)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", ["cloning", "dagger"])
 def test_the_exported_policy_acts_like_the_network(algorithm, runs, demonstrations):
     observations = np.concatenate([each.observations for each in demonstrations])
     expected = runs[algorithm].network.act(observations)
@@ -96,7 +99,41 @@ def test_the_exported_policy_acts_like_the_network(algorithm, runs, demonstratio
     np.testing.assert_allclose(policy(observations), expected, rtol=0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize(("algorithm", "stop"), [("cloning", 100), ("dagger", 150)])
+def test_a_transformer_learns_chunks_that_fly(runs, demonstrations, small_file, capsys):
+    run = runs["act"]
+    lines = curve(run.folder)
+    assert [line["updates"] for line in lines] == [80, 120]
+    assert lines[-1]["validation_action"] < 0.6  # of the spread; 0.8 for the mean action
+    observations = np.concatenate([each.observations for each in demonstrations])
+    policy = load_exported(run.folder / "policy.npz")
+    np.testing.assert_allclose(
+        policy.chunks(observations), run.network.chunks(observations), rtol=0.0, atol=1e-6
+    )
+    found = validate(policy, demonstrations.scene, validation_seeds(3))
+    assert found["median_cost"] == pytest.approx(lines[-1]["median_cost"], rel=1e-6)
+    assert policy.metadata["configuration"]["algorithm"]["chunk"] == 4
+    assert main(["simulate", str(small_file), "--policy", str(run.folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["steps"] == 150
+
+
+def test_chunks_are_the_actions_that_follow(demonstrations):
+    source = Chunks(demonstrations, 4, 50)
+    (batch,) = source.batches(10**6, (), seed=1, drop_last=False)
+    assert batch.arrays["actions"].shape == (24 * 150, 4, demonstrations[0].actions.shape[1])
+    assert len({*zip(batch.demonstration, batch.stage, strict=True)}) == 24 * 150
+    for row in range(0, len(batch.stage), 97):
+        shown, stage = demonstrations[int(batch.demonstration[row])], int(batch.stage[row])
+        np.testing.assert_allclose(batch.arrays["observations"][row], shown.observations[stage], rtol=1e-6)
+        # Behind the end, stage 149, the last action repeats.
+        wanted = shown.actions[[min(stage + ahead, 149) for ahead in (0, 50, 100, 150)]]
+        np.testing.assert_allclose(batch.arrays["actions"][row], wanted, rtol=1e-6)
+    sizes = [
+        [len(each.stage) for each in source.batches(1700, (), seed=1, drop_last=d)] for d in (False, True)
+    ]
+    assert sizes == [[1700, 1700, 200], [1700, 1700]]
+
+
+@pytest.mark.parametrize(("algorithm", "stop"), [("cloning", 100), ("act", 100), ("dagger", 150)])
 def test_a_killed_run_ends_as_if_nothing_had_happened(algorithm, stop, runs, settings, tmp_path):
     done = []
 
@@ -111,8 +148,8 @@ def test_a_killed_run_ends_as_if_nothing_had_happened(algorithm, stop, runs, set
         train(settings(algorithm), tmp_path, report=interrupt)
     assert not (tmp_path / "policy.npz").exists()
     resumed = train(settings(algorithm), tmp_path)
-    for one, other in zip(resumed.policy.weights, runs[algorithm].policy.weights, strict=True):
-        np.testing.assert_array_equal(one, other)
+    weights, expected = (each.network.state_dict() for each in (resumed, runs[algorithm]))
+    assert all(torch.equal(weights[name], expected[name]) for name in expected)
     assert curve(tmp_path) == curve(runs[algorithm].folder)
     assert len(json.loads((tmp_path / "provenance.json").read_text())) == 2
 

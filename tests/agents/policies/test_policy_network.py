@@ -6,6 +6,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from agents.policies import PolicyNetwork  # noqa: E402
+from agents.policies.chunk_network import ChunkNetwork  # noqa: E402
 
 pytestmark = pytest.mark.agents
 
@@ -57,3 +58,24 @@ def test_entries_that_did_not_vary_are_ignored():
     np.testing.assert_array_equal(made.act(changed), made.act(observations()))
     policy = made.export({})
     np.testing.assert_array_equal(policy(changed), policy(observations()))
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_the_exported_transformer_predicts_the_same_chunks(activation):
+    torch.manual_seed(0)
+    sizes = {"hidden": (32, 16), "chunk": 5, "width": 24, "layers": 3, "heads": 4}
+    made = ChunkNetwork(N_OBS, N_U, activation=activation, spacing=2, weighting=0.0, **sizes)
+    rng = np.random.default_rng(0)
+    made.normalize(
+        rng.normal(size=N_OBS), rng.uniform(1.0, 5.0, N_OBS), rng.normal(size=N_U) / 3, np.ones(N_U)
+    )
+    with torch.no_grad():
+        for each in made.parameters():  # normalizations begin as ones, biases as zeros
+            each.add_(0.3 * torch.randn(each.shape))
+    chunks, policy = made.chunks(observations()), made.export({"scene": "none"})
+    assert chunks.shape == (100, 5, N_U)
+    assert 0.02 < np.mean(np.abs(chunks) == 1.0) < 0.98
+    assert np.abs(np.diff(chunks, axis=1)).mean() > 0.05
+    # The last layer is rounded to single precision with the units of the actions in it.
+    np.testing.assert_allclose(policy.chunks(observations()), chunks, rtol=0.0, atol=1e-6)
+    assert (policy.n_observation, policy.n_action, policy.metadata) == (N_OBS, N_U, {"scene": "none"})
