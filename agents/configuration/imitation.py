@@ -104,12 +104,12 @@ class ActionChunking(Fit):
     """ACT: a transformer predicts the expert's next actions, a chunk; a flight averages its predictions."""
 
     name: Literal["act"] = "act"
-    chunk: Few = Field(default=16, description="actions of a chunk")
+    chunk: Few = Field(default=8, description="actions of a chunk")
     spacing: Few = Field(
-        default=10, description="time steps between them, at least 1; a flight interpolates linearly"
+        default=5, description="time steps between them, at least 1; a flight interpolates linearly"
     )
     weighting: Finite = Field(
-        default=0.0,
+        default=-1.0,
         description="m of the temporal ensemble: a prediction made a time steps ago counts exp(m a); 0: all "
         "alike; negative: newer ones count more",
     )

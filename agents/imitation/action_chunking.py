@@ -29,8 +29,7 @@ from experts.demonstrations.reading import Batch
 class Chunks:
     """Time steps with the actions that follow them, in memory in single precision; a `Source`.
 
-    All of them are shuffled together. In the order of `Demonstrations.batches`, which mixes some dozens of
-    maneuvers at a time, a transformer forgets the others meanwhile.
+    All of them are shuffled together; `Demonstrations.batches` mixes some dozens of maneuvers at a time.
     """
 
     def __init__(self, demonstrations: Demonstrations, chunk: int, spacing: int) -> None:
