@@ -64,7 +64,7 @@ def read_from_minari(dataset_id: str, folder: Path) -> Demonstrations:
     shutil.rmtree(folder / SHARDS, ignore_errors=True)  # of an interrupted run
     (folder / SHARDS).mkdir(parents=True)
     kernels = Demonstrations(folder, settings, {"shards": [], "demonstrations": 0}).kernels
-    shapes = _shapes(kernels), kernels.parameters.moving
+    shapes = _shapes(kernels), (*kernels.parameters.moving, *kernels.parameters.staged)
     shards = []
     with closing(WorkerProcess(quiet=True)) as worker:
         for number, first in enumerate(range(0, count, SHARD_SIZE)):
