@@ -17,14 +17,14 @@ COPIES = 1024
 _REPEATS, _SAMPLE_SECONDS = 7, 0.05
 _SOLVES = 3
 REFERENCE = {
-    "environment's step": 2.5e-6,
-    f"step of {COPIES} environments, each": 1.7e-7,
-    f"integration step of {COPIES} states, each": 1.1e-7,
-    f"its derivatives for {COPIES} states, each": 4.8e-7,
-    "iteration of the expert": 1.0e-2,
-    "the paper's maneuver, solved": 1.5e-1,
+    "environment's step": 2.6e-6,
+    f"step of {COPIES} environments, each": 2.0e-7,
+    f"integration step of {COPIES} states, each": 1.4e-7,
+    f"its derivatives for {COPIES} states, each": 1.4e-6,
+    "iteration of the expert": 1.2e-2,
+    "the paper's maneuver, solved": 1.7e-1,
 }
-"""Times on one core of an AMD EPYC of 2024 (Linux, Python 3.11), s."""
+"""Times of one run on one core of an AMD EPYC (virtual machine, Linux, Python 3.11, 2026), s."""
 
 
 def machine_speed() -> Iterator[Row]:
