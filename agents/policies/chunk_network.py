@@ -106,7 +106,8 @@ class ChunkNetwork(NormalizedNetwork):
 
 
 def _array(tensor: Tensor) -> FloatArray:
-    return tensor.detach().double().numpy()
+    array: FloatArray = tensor.detach().double().numpy()
+    return array
 
 
 def _of_linear(name: str, end: str, layer: Any) -> dict[str, FloatArray]:
