@@ -10,7 +10,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from agents.policies.chunking import ChunkingPolicy
-from agents.policies.exported import ExportedPolicy, PolicyFileError
+from agents.policies.exported import ExportedPolicy
+from agents.policies.policy_files import PolicyFileError
 
 if TYPE_CHECKING:
     from agents.policies.network import PolicyNetwork

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from agents.policies.chunking import ChunkingPolicy
@@ -66,15 +64,6 @@ class ChunkNetwork(NormalizedNetwork):
         tokens = self.embed[-1](values)[:, None] + self.positions
         result: Tensor = self.out(self.transformer(tokens))
         return result
-
-    def chunks(self, observation: ArrayLike) -> FloatArray:
-        """Chunks of actions without gradients, in double precision like those of the exported policy."""
-        inputs = torch.from_numpy(np.array(observation, dtype=np.float64))
-        twin = copy.deepcopy(self).double()
-        with torch.no_grad():
-            outputs = twin((inputs - self.observation_mean) * self.observation_scale)
-            actions = (self.action_mean + self.action_scale * outputs).clamp(-1.0, 1.0)
-        return np.asarray(actions.numpy())
 
     def export(self, metadata: Mapping[str, Any]) -> ChunkingPolicy:
         """Export the network, with the units of its actions folded into the last layer."""

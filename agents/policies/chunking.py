@@ -7,8 +7,6 @@ temporal ensemble. The actions of a chunk are some time steps apart, linear in b
 
 from __future__ import annotations
 
-import io
-import json
 import os
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
@@ -23,19 +21,23 @@ from agents.configuration.imitation import LONGEST_CHUNK, STRONGEST
 from agents.policies.exported import (
     ACTIVATIONS,
     CHUNKS,
-    MOST_BYTES,
     ExportedPolicy,
     FloatArray,
-    PolicyFileError,
     SingleArray,
 )
-from dq_space_arm_env.common.bounded_formats import read_arrays
-from dq_space_arm_env.common.bounded_reading import UnreadableError, archive_members, parse_json
-from dq_space_arm_env.common.files import write_atomically
+from agents.policies.policy_files import (
+    PolicyFileError,
+    building,
+    check_version,
+    metadata_text,
+    policy_arrays,
+    read_metadata,
+    write_policy,
+)
+from dq_space_arm_env.common.bounded_reading import archive_members
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.common.shown_text import shortened
 
-FORMAT = 1  # version of the files
 NORM_EPSILON = 1e-5
 """Added to the variance in a layer normalization, PyTorch's default."""
 
@@ -219,23 +221,17 @@ class ChunkingPolicy:
         Args:
             path: The file, `.npz` by convention.
         """
-        content = io.BytesIO()
-        np.savez_compressed(
-            content,
-            allow_pickle=False,
-            **{
-                CHUNKS: np.array(FORMAT),
-                "activation": np.array(self.activation),
-                "heads": np.array(self.heads),
-                "spacing": np.array(self.spacing),
-                "weighting": np.array(self.weighting),
-                "mean": self.mean,
-                "scale": self.scale,
-                "metadata": np.array(json.dumps(dict(self.metadata), sort_keys=True)),
-                **self.tensors,
-            },
-        )
-        write_atomically(Path(path), content.getvalue())
+        arrays: dict[str, NDArray[Any]] = {
+            "activation": np.array(self.activation),
+            "heads": np.array(self.heads),
+            "spacing": np.array(self.spacing),
+            "weighting": np.array(self.weighting),
+            "mean": self.mean,
+            "scale": self.scale,
+            "metadata": metadata_text(self.metadata),
+            **self.tensors,
+        }
+        write_policy(path, CHUNKS, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -250,24 +246,13 @@ class ChunkingPolicy:
         Raises:
             PolicyFileError: If the file is missing, damaged, or of another format.
         """
-        try:
-            arrays = read_arrays(path, most=MOST_BYTES)
-        except UnreadableError as error:
-            raise PolicyFileError(f"{path} cannot be read as a policy ({error})") from error
+        arrays = policy_arrays(path)
         found = arrays.pop(CHUNKS, None)
         if found is None:
             raise PolicyFileError(f"{path} holds no policy of chunks of actions: it has no {CHUNKS}")
-        if found.shape != () or found != FORMAT:
-            raise PolicyFileError(
-                f"{path} has {CHUNKS} {shortened(found.tolist())}, this version reads {FORMAT}: export the "
-                "policy again"
-            )
-        try:
+        check_version(path, CHUNKS, found)
+        with building(path):
             return cls(**_fields(arrays))
-        except KeyError as error:
-            raise PolicyFileError(f"{path} is not a policy: it has no {error.args[0]}") from error
-        except (ValueError, TypeError) as error:
-            raise PolicyFileError(f"{path} is not a policy: {error}") from error
 
 
 Exported = ExportedPolicy | ChunkingPolicy
@@ -334,9 +319,6 @@ def _fields(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
                 "f": "one number" if name in named else "numbers",
             }
             raise ValueError(f"{name}: shape {array.shape} of {array.dtype}, should be {wanted[kinds]}")
-    metadata = parse_json(str(named["metadata"]), "metadata")
-    if not isinstance(metadata, dict):
-        raise ValueError("metadata: should be a mapping")
     others = (*named, "mean", "scale")
     return {
         "tensors": {name: array for name, array in arrays.items() if name not in others},
@@ -346,7 +328,7 @@ def _fields(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         "weighting": float(named["weighting"]),
         "mean": arrays["mean"],
         "scale": arrays["scale"],
-        "metadata": metadata,
+        "metadata": read_metadata(arrays),
     }
 
 

@@ -7,29 +7,30 @@ costs little at this size: sums of some hundred terms would be off by more than 
 
 from __future__ import annotations
 
-import io
-import json
 import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.common.bounded_formats import read_arrays
-from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json
-from dq_space_arm_env.common.files import write_atomically
+from agents.policies.policy_files import (
+    PolicyFileError,
+    building,
+    check_version,
+    metadata_text,
+    policy_arrays,
+    read_metadata,
+    write_policy,
+)
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
 
-FORMAT = 1  # version of the files
 CHUNKS = "chunk_format"  # instead of `format` in the files of `ChunkingPolicy`
 
-MOST_BYTES = 64 * 2**20  # 8 million weights, hundreds of times those of a policy of the zoo
 _LONGEST = 200  # characters of a list of names
 
 _LARGEST_VALUE = 1e300  # of anything that an observation leads to: next to no double overflows
@@ -40,10 +41,6 @@ SingleArray = NDArray[np.float32]
 
 CONSTANT = 1e-6
 """Standard deviation below which an entry of the observation is constant, in its unit."""
-
-
-class PolicyFileError(Exception):
-    """A file is not a policy that this version can read."""
 
 
 def units_of(observations: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -246,21 +243,18 @@ class ExportedPolicy:
             path: The file, `.npz` by convention.
         """
         arrays: dict[str, NDArray[Any]] = {
-            "format": np.array(FORMAT),
             "activation": np.array(self.activation),
             "squash": np.array(self.squash),
             "mean": self.mean,
             "scale": self.scale,
             "normalized_limit": np.array(self.normalized_limit),
-            "metadata": np.array(json.dumps(dict(self.metadata), sort_keys=True)),
+            "metadata": metadata_text(self.metadata),
         }
         if self.action_scale is not None:
             arrays["action_scale"] = self.action_scale
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays[f"weight_{i}"], arrays[f"bias_{i}"] = weight, bias
-        content = io.BytesIO()
-        np.savez_compressed(content, allow_pickle=False, **arrays)
-        write_atomically(Path(path), content.getvalue())
+        write_policy(path, "format", arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -275,10 +269,7 @@ class ExportedPolicy:
         Raises:
             PolicyFileError: If the file is missing, damaged, or of another format.
         """
-        try:
-            arrays = read_arrays(path, most=MOST_BYTES)
-        except UnreadableError as error:
-            raise PolicyFileError(f"{path} cannot be read as a policy ({error})") from error
+        arrays = policy_arrays(path)
         found = arrays.get("format")
         if CHUNKS in arrays:
             raise PolicyFileError(
@@ -287,17 +278,9 @@ class ExportedPolicy:
             )
         if found is None:
             raise PolicyFileError(f"{path} holds no policy but {', '.join(arrays)[:_LONGEST] or 'nothing'}")
-        if found.shape != () or found != FORMAT:
-            raise PolicyFileError(
-                f"{path} has format {shortened(found.tolist())}, this version reads {FORMAT}: export the "
-                "policy again"
-            )
-        try:
+        check_version(path, "format", found)
+        with building(path):
             return cls(**_fields(arrays))
-        except KeyError as error:
-            raise PolicyFileError(f"{path} is not a policy: it has no {error.args[0]}") from error
-        except (ValueError, TypeError) as error:
-            raise PolicyFileError(f"{path} is not a policy: {error}") from error
 
 
 _TEXTS, _SINGLE = (
@@ -308,9 +291,7 @@ _TEXTS, _SINGLE = (
 
 def _fields(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     layers = range(sum(name.startswith("weight_") for name in arrays))
-    metadata = parse_json(str(arrays["metadata"]), "metadata")
-    if not isinstance(metadata, dict):
-        raise ValueError("metadata: should be a mapping")
+    metadata = read_metadata(arrays)
     for name, array in arrays.items():
         if (array.dtype.kind in "biuf") is (name in _TEXTS) or (name in _SINGLE and array.shape):
             kind = "a text" if name in _TEXTS else "one number" if name in _SINGLE else "numbers"

@@ -67,6 +67,15 @@ class NormalizedNetwork(nn.Module):
         difference = np.asarray(observation, dtype=np.float64) - self.observation_mean.numpy()
         return torch.from_numpy((difference * self.observation_scale.numpy()).astype(np.float32))
 
+    def act(self, observation: ArrayLike) -> FloatArray:
+        """Actions without gradients, clipped, in double precision like those of the exported policy."""
+        inputs = torch.from_numpy(np.array(observation, dtype=np.float64))
+        twin = copy.deepcopy(self).double()
+        with torch.no_grad():
+            outputs = twin((inputs - self.observation_mean) * self.observation_scale)
+            actions = (self.action_mean + self.action_scale * outputs).clamp(-1.0, 1.0)
+        return np.asarray(actions.numpy())
+
     def export(self, metadata: Mapping[str, Any]) -> Exported:
         """Export the network for NumPy alone, with metadata of JSON values."""
         raise NotImplementedError
@@ -122,15 +131,6 @@ class PolicyNetwork(NormalizedNetwork):
             tangent = slope * tangent
         last = self._linear[-1]
         return last(values), tangent @ last.weight.T
-
-    def act(self, observation: ArrayLike) -> FloatArray:
-        """Choose actions without gradients, in double precision like the exported policy."""
-        inputs = torch.from_numpy(np.array(observation, dtype=np.float64))
-        twin = copy.deepcopy(self).double()
-        with torch.no_grad():
-            outputs = twin((inputs - self.observation_mean) * self.observation_scale)
-            actions = (self.action_mean + self.action_scale * outputs).clamp(-1.0, 1.0)
-        return np.asarray(actions.numpy())
 
     def export(self, metadata: Mapping[str, Any]) -> ExportedPolicy:
         """Export the network, with the units of its actions folded into the last layer."""

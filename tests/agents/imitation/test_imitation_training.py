@@ -107,7 +107,7 @@ def test_a_transformer_learns_chunks_that_fly(runs, demonstrations, small_file, 
     observations = np.concatenate([each.observations for each in demonstrations])
     policy = load_exported(run.folder / "policy.npz")
     np.testing.assert_allclose(
-        policy.chunks(observations), run.network.chunks(observations), rtol=0.0, atol=1e-6
+        policy.chunks(observations), run.network.act(observations), rtol=0.0, atol=1e-6
     )
     found = validate(policy, demonstrations.scene, validation_seeds(3))
     assert found["median_cost"] == pytest.approx(lines[-1]["median_cost"], rel=1e-6)

@@ -72,7 +72,7 @@ def test_the_exported_transformer_predicts_the_same_chunks(activation):
     with torch.no_grad():
         for each in made.parameters():  # normalizations begin as ones, biases as zeros
             each.add_(0.3 * torch.randn(each.shape))
-    chunks, policy = made.chunks(observations()), made.export({"scene": "none"})
+    chunks, policy = made.act(observations()), made.export({"scene": "none"})
     assert chunks.shape == (100, 5, N_U)
     assert 0.02 < np.mean(np.abs(chunks) == 1.0) < 0.98
     assert np.abs(np.diff(chunks, axis=1)).mean() > 0.05

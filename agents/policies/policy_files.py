@@ -1,0 +1,74 @@
+"""Files of exported policies: arrays and JSON in one `.npz`, of which nothing is executed."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dq_space_arm_env.common.bounded_formats import read_arrays
+from dq_space_arm_env.common.bounded_reading import UnreadableError, parse_json
+from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.shown_text import shortened
+
+FORMAT = 1  # version of the files
+MOST_BYTES = 64 * 2**20  # 8 million weights, hundreds of times those of a policy of the zoo
+
+
+class PolicyFileError(Exception):
+    """A file is not a policy that this version can read."""
+
+
+def metadata_text(metadata: Mapping[str, Any]) -> NDArray[Any]:
+    """Metadata of JSON values as an array, for `write_policy`."""
+    return np.array(json.dumps(dict(metadata), sort_keys=True))
+
+
+def write_policy(path: str | os.PathLike[str], kind: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write the version of a kind of files, and arrays, atomically."""
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **{kind: np.array(FORMAT), **arrays})
+    write_atomically(Path(path), content.getvalue())
+
+
+def policy_arrays(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
+    """Read the arrays of a file; PolicyFileError if it is missing or damaged."""
+    try:
+        return read_arrays(path, most=MOST_BYTES)
+    except UnreadableError as error:
+        raise PolicyFileError(f"{path} cannot be read as a policy ({error})") from error
+
+
+def check_version(path: str | os.PathLike[str], kind: str, found: NDArray[Any]) -> None:
+    """Refuse another version of a kind of files."""
+    if found.shape != () or found != FORMAT:
+        raise PolicyFileError(
+            f"{path} has {kind} {shortened(found.tolist())}, this version reads {FORMAT}: "
+            "export the policy again"
+        )
+
+
+def read_metadata(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """The metadata among the arrays of a file; KeyError or ValueError if there are none."""
+    metadata = parse_json(str(arrays["metadata"]), "metadata")
+    if not isinstance(metadata, dict):
+        raise ValueError("metadata: should be a mapping")
+    return metadata
+
+
+@contextmanager
+def building(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Name the file where what it holds makes no policy."""
+    try:
+        yield
+    except KeyError as error:
+        raise PolicyFileError(f"{path} is not a policy: it has no {error.args[0]}") from error
+    except (ValueError, TypeError) as error:
+        raise PolicyFileError(f"{path} is not a policy: {error}") from error
