@@ -38,16 +38,18 @@ _SUITE, _TASK = Named("suite", _suites), OneOf("task", _tasks)
     short_help="Fly any controller in all tasks of the benchmark suite.",
     epilog="""\b
         Examples:
-          dq-space-arm suite                                    # all that ships, in two hours
-          dq-space-arm suite gains 'mine/{task}.npz'            # your policies, one for each task
+          dq-space-arm suite                                    # all that ships, in hours
+          dq-space-arm suite gains 'mine=runs/{task}.npz'       # your policies, one for each task
           dq-space-arm suite my.yaml --seeds 3 --task paper     # your configuration, trained for a task
-          dq-space-arm suite 'mine/{task}.npz' --check mine.json  # whether a published result is right
+          dq-space-arm suite 'mine=runs/{task}.npz' --check mine.json  # whether a published result is right
     """,
 )
 @click.argument("entrants", nargs=-1, type=Named("entrant", _entrants), metavar="[ENTRANT]...")
 @click.option("--suite", "version", type=_SUITE, default="v1", show_default=True, help="Version.")
 @click.option("--task", "tasks", type=_TASK, multiple=True, help="Some of its tasks, several.")
-@click.option("--seeds", type=click.IntRange(min=1), help="Trainings of an agent for a task.  [default: 5]")
+@click.option(
+    "--seeds", type=click.IntRange(min=1), help="Trainings of an agent for a task.  [default: the suite's]"
+)
 @click.option("--workers", type=int, help="Processes.  [default: one per processor]")
 @ray_option
 @click.option(
@@ -75,7 +77,8 @@ def suite(
 
     An ENTRANT is a controller of the expert (open-loop, gains, receding); an agent that is trained for each
     task (a configuration's name or YAML file); zoo, the policies that ship with the package; or the path of a
-    policy, with {task} in it where each task has its own. All that ship with the package by default.
+    policy, with {task} in it where each task has its own, and with NAME= before it for the tables. All that
+    ship with the package by default.
 
     The output folder receives the page, suite.html and suite.md, suite.json, pictures, trainings, and
     finished rows. Re-run the command to resume. Exit status 1: a training failed, or --check found a

@@ -32,7 +32,7 @@ class Lagrangian(Model):
 
     limit: Fraction = Field(default=0.01, description="share of the episodes that may violate constraints")
     initial: Positive = Field(
-        default=1e-3, description="multiplier at first and at least: a price in units of the shaped rewards"
+        default=5e-4, description="multiplier at first and at least: a price in units of the shaped rewards"
     )
     learning_rate: Positive = Field(
         default=0.25,

@@ -129,6 +129,7 @@ def train_seeds(
         ConfigurationError: If two configurations share a name, or there is no seed.
         SceneError: If a scene cannot be loaded.
         ExecutorError: If the cluster cannot be used.
+        ImportError: If an extra is not installed; finished runs remain.
     """
     if count < 1:
         raise ConfigurationError(f"seeds: {count}, should be at least 1")

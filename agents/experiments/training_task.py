@@ -35,7 +35,7 @@ PRUNE = "prune"
 """File in a run folder, whose existence stops the training."""
 BETWEEN_NOTES, PATIENCE = 1.0, 10.0  # s
 _PACKAGES = ("sb3-contrib", "stable-baselines3", "torch")
-_EXPECTED = (DemonstrationsError, DivergedError, ImportError, OSError, RunFolderError, ValueError)
+_EXPECTED = (DemonstrationsError, DivergedError, OSError, RunFolderError, ValueError)
 _MEASURED = ("success_rate", "median_cost", "environment_steps", "seconds")
 
 
@@ -63,7 +63,7 @@ class TrainingTask(NamedTuple):
     def run(self) -> Row:
         """Train, or find the trained policy.
 
-        An error is a result: the other trainings do not depend on this one.
+        An error is a result: the other trainings do not depend on this one. ImportError is raised.
         """
         try:
             if not self.folder.is_dir() or not self.place.is_dir():
@@ -79,6 +79,8 @@ class TrainingTask(NamedTuple):
             return self.row(TRAINED)
         except _Pruned:
             return self.row(PRUNED)
+        except ImportError:
+            raise  # an extra is not installed: the others would fail likewise
         except _EXPECTED as error:
             return self.row(FAILED, failure=str(error))
         except Exception as error:

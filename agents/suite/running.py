@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,18 +22,17 @@ from agents.evaluation.statistics import Interval, gap_over_runs, performance_pr
 from agents.experiments.many_trainings import train_seeds, training_executor, training_task
 from agents.experiments.training_task import FAILED
 from agents.run_folder import POLICY
-from agents.suite.tasks import Limits, Suite, SuiteError, load_suite
+from agents.suite.tasks import ZOO, Limits, Suite, SuiteError, load_suite
 from agents.zoo.finding import ActingPolicy, PolicyError, as_policy, check_fit, policy_path
 from agents.zoo.shelf import list_policies, load_policy
 from dq_space_arm_env import Scene
 from dq_space_arm_env.common.progress import Advance
 from experts.executors import Executor, local_executor
 
-ZOO = "zoo"
-"""Entrant: the policies that ship with the package, each in the scene that it was trained in."""
 TASK = "{task}"
 """In the path of a policy: the name of a task."""
 TRAININGS = "trainings"
+_NAMED = re.compile(r"([\w.-]+)=(.+)")
 Report = Callable[[Advance], None]
 
 
@@ -147,8 +147,9 @@ def run_suite(
     Args:
         entrants: Any of these. A controller of the expert, one of `CONTROLLERS`. An agent that is trained for
             each task: one of the suite's, the name of a shipped configuration, or a YAML file. "zoo". The
-            path of a policy, as for `evaluate`, with "{task}" in it where each task has its own; others fly
-            where they fit. All that ship with the package by default, unless policies are given.
+            path of a policy, as for `evaluate`, with "{task}" in it where each task has its own, and with
+            "name=" before it for the tables; others fly where they fit. All that ship with the package by
+            default, unless policies are given.
         suite: A version of the suite, or a YAML file.
         policies: Further policies by name: a function that gives, for the scene of a task, what `evaluate`
             takes, such as a function from observations, shape (B, n_obs), to actions, shape (B, n_u).
@@ -174,51 +175,62 @@ def run_suite(
     if not entrants and not policies:
         entrants = (*CONTROLLERS, *chosen.agents, ZOO)
     controllers, agents, files = _sorted_out(entrants, chosen)
-    notes: list[str] = []
-    fliers = {task: [*_from_files(files, task, scenes[task], trust)] for task in scenes}
+    fliers = {task: [*_from_files(files, task, scene, trust)] for task, scene in scenes.items()}
     for task, scene in scenes.items():
         fliers[task] += [(name, as_policy(make(scene), name)) for name, make in policies.items()]
     fitting = {name for found in fliers.values() for name, _ in found}
-    for name in files:
+    for name, path in files.items():
         if name not in fitting and name != ZOO:
-            raise SuiteError(f"{name}: fits no task, or there is no such file")
+            raise SuiteError(f"{path}: fits no task, or there is no such file")
     plans = {(agent, task): chosen.training(agent, task) for agent in agents for task in scenes}
-    count = chosen.seeds if seeds is None else seeds
-    trained = _train(plans, count, out / TRAININGS, executor, workers, progress, notes)
+    notes: list[str] = []
+    trained = _train(
+        plans, chosen.seeds if seeds is None else seeds, out / TRAININGS, executor, workers, progress, notes
+    )
     scores: list[Score] = []
     for number, task in enumerate(scenes, 1):
 
         def announce(step: Step, task: str = task, number: int = number) -> None:
             progress(step._replace(stage=f"{task} ({number} of {len(scenes)}), {step.stage}"))
 
-        flying: list[tuple[str, Any]] = [
-            (agent_name(agent), path) for agent in agents for path in trained[agent, task]
-        ]
-        flying += fliers[task]
-        if not (flying or controllers):
-            continue
-        found = compare(
-            [policy for _, policy in flying],
-            task,
-            chosen.starts,
-            controllers=controllers,
-            conditions=chosen.conditions,
-            receding_starts=min(chosen.receding_starts, chosen.starts),
-            out=out / Path(task).stem,
-            learning_curves=False,
-            executor=executor or local_executor(workers),
-            trust=trust,
-            progress=announce,
-        )
-        names = [*(CONTROLLERS[each] for each in controllers), *(name for name, _ in flying)]
-        for condition in chosen.conditions:
-            flown = list(zip(names, found.under(condition), strict=True))
-            scores += [
-                Score(task, condition, name, tuple(row for each, row in flown if each == name))
-                for name in dict.fromkeys(names)
-            ]
+        own = [(agent_name(agent), path) for agent in agents for path in trained[agent, task]]
+        place, working = out / Path(task).stem, executor or local_executor(workers)
+        scores += _fly(chosen, task, controllers, [*own, *fliers[task]], place, working, trust, announce)
     described = {task: scene.description for task, scene in scenes.items()}
     return SuiteRun(chosen, tuple(scores), described, tuple(notes))
+
+
+def _fly(
+    suite: Suite,
+    task: str,
+    controllers: Sequence[str],
+    policies: Sequence[tuple[str, Any]],
+    out: Path,
+    executor: Executor,
+    trust: bool,
+    progress: Callable[[Step], None],
+) -> Iterator[Score]:
+    """Fly controllers and policies by name in a task, under all conditions; runs of a name together."""
+    if not (policies or controllers):
+        return
+    found = compare(
+        [policy for _, policy in policies],
+        task,
+        suite.starts,
+        controllers=controllers,
+        conditions=suite.conditions,
+        receding_starts=min(suite.receding_starts, suite.starts),
+        out=out,
+        learning_curves=False,
+        executor=executor,
+        trust=trust,
+        progress=progress,
+    )
+    names = [*(CONTROLLERS[each] for each in controllers), *(name for name, _ in policies)]
+    for condition in suite.conditions:
+        flown = list(zip(names, found.under(condition), strict=True))
+        for name in dict.fromkeys(names):
+            yield Score(task, condition, name, tuple(row for each, row in flown if each == name))
 
 
 def agent_name(agent: str) -> str:
@@ -226,30 +238,31 @@ def agent_name(agent: str) -> str:
     return Path(agent).stem if agent.endswith((".yaml", ".yml")) else agent
 
 
-def _sorted_out(entrants: Sequence[str], suite: Suite) -> tuple[list[str], list[str], list[str]]:
-    """Controllers, agents to train, and policies among the entrants."""
+def _sorted_out(entrants: Sequence[str], suite: Suite) -> tuple[list[str], list[str], dict[str, str]]:
+    """Controllers, agents to train, and paths of policies by name among the entrants."""
     controllers: list[str] = []
     agents: list[str] = []
-    files: list[str] = []
+    files: dict[str, str] = {}
     for entrant in dict.fromkeys(map(str, entrants)):
         if entrant in CONTROLLERS:
             controllers.append(entrant)
         elif entrant in (*suite.agents, *list_configurations()) or entrant.endswith((".yaml", ".yml")):
             agents.append(entrant)
         else:
-            files.append(entrant)
+            named = _NAMED.fullmatch(entrant)
+            files |= {named[1]: named[2]} if named else {entrant: entrant}
     return controllers, agents, files
 
 
 def _from_files(
-    files: Sequence[str], task: str, scene: Scene, trust: bool
+    files: Mapping[str, str], task: str, scene: Scene, trust: bool
 ) -> Iterator[tuple[str, str | Path | ActingPolicy]]:
     """Names and policies that fly in a task."""
-    for file in files:
-        if file == ZOO:
-            for name in list_policies():
-                if load_policy(name).metadata.get("scene_hash") == scene.content_hash():
-                    yield f"{name} ({ZOO})", name
+    for name, file in files.items():
+        if name == ZOO:
+            for each in list_policies():
+                if load_policy(each).metadata.get("scene_hash") == scene.content_hash():
+                    yield f"{each} ({ZOO})", each
             continue
         path = policy_path(file.replace(TASK, Path(task).stem))
         if TASK in file and not path.exists():
@@ -261,7 +274,7 @@ def _from_files(
             if TASK in file:
                 raise
             continue
-        yield file, path
+        yield name, path
 
 
 def _train(

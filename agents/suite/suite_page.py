@@ -90,7 +90,7 @@ def check(run: SuiteRun, file: str | Path) -> list[Row]:
     except (UnreadableError, KeyError, TypeError) as error:
         raise SuiteError(f"{file}: is not the JSON file of a suite: {error}") from error
     mine = run.suite.model_dump(mode="json", include={"name", "starts", "tasks"})
-    if any(suite.get(key) != mine[key] for key in ("name", "starts")):
+    if any(suite.get(key) != mine[key] for key in ("name", "starts", "tasks")):
         raise SuiteError(f"{file}: is of {suite.get('name')!r}, should be of {run.suite.name!r}")
     rows: list[Row] = []
     for score in run.scores:

@@ -29,6 +29,8 @@ from dq_space_arm_env.validation import (
     yaml_problem,
 )
 
+ZOO = "zoo"
+"""Entrant: the policies that ship with the package, each in the scene that it was trained in."""
 _Starts = Annotated[int, count_up_to(EVALUATION_SEEDS)]
 _Hash = Annotated[StrictStr, Field(pattern="^[0-9a-f]{16,64}$")]
 
@@ -70,7 +72,7 @@ class Suite(Model):
             if name not in CONDITIONS:
                 yield Problem(("conditions",), name, f"must be one of {', '.join(CONDITIONS)}")
         for name in self.agents:
-            if name in (*CONTROLLERS, "zoo"):
+            if name in (*CONTROLLERS, ZOO):
                 yield Problem(("agents",), name, "is the name of a controller: choose another")
 
     def scene(self, task: str) -> Scene:

@@ -91,8 +91,9 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
             total = np.where(resting, total, total + weight * rewards if self._sum else rewards)
             collected = np.where(resting, collected, collected + rewards)
             weight *= self._discount
-            cost = _constraint_cost(info, terminated | truncated)
-            largest = np.where(resting | resetting, largest, np.maximum(largest, cost))
+            if "cost" in info:  # of a scene with constraints
+                cost = _constraint_cost(info, terminated | truncated)
+                largest = np.where(resting | resetting, largest, np.maximum(largest, cost))
             taken += ~(resting | resetting)
             if self._step_infos:
                 _collect(infos, info, ~(resting | resetting), terminated | truncated)
@@ -135,8 +136,8 @@ def _check_restorable(env: Env) -> None:
 
 
 def _constraint_cost(info: Info, over: Mask) -> Any:
-    """Constraint costs of a time step, shape (num_envs,) or 0; where an episode ended, those of its end."""
-    cost, final = info.get("cost", 0.0), info.get("final_info", {}).get("cost")
+    """Constraint costs of a time step, shape (num_envs,); where an episode ended, those of its end."""
+    cost, final = info["cost"], info.get("final_info", {}).get("cost")
     return cost if final is None else np.where(over, final, cost)
 
 

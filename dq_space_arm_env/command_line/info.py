@@ -99,7 +99,7 @@ def _show_speed(as_json: bool) -> None:
     )
     machine = provenance()["machine"]["processor_name"]
     title = (
-        f"Scene paper, one core of {machine}\nThe best of some samples; the reference is the documentation's."
+        f"Scene paper, one core of {machine}\nThe best of some samples; the reference is a virtual AMD EPYC."
     )
     table_console().print(tabulate(title, rows, columns).for_terminal())
 

@@ -22,6 +22,7 @@ from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.step_stability import joint_motion
 from dq_space_arm_env.interoperability.bus_actuators import with_jets, with_wheels
 from dq_space_arm_env.interoperability.exporting import joint_limits
+from dq_space_arm_env.interoperability.first_maneuver import with_scaled_limits
 from dq_space_arm_env.interoperability.step_choice import StepTrial, measured_steps
 from dq_space_arm_env.interoperability.urdf_elements import read_robot
 from dq_space_arm_env.scene import Simulation
@@ -51,6 +52,7 @@ class Proposals:
     wheels: str = "ideal"  # or an arrangement of reaction wheels
     thrusters: str = "ideal"  # or jets
     spread: float = 0.0  # half-width of the starts, rad and m
+    scaled_efforts: bool = False  # whether limits of torques are lowered to what free flight takes
     measured: bool = False  # whether integrator and time step are chosen by measuring
 
 
@@ -60,9 +62,8 @@ class Imported:
 
     scene: Scene
     warnings: tuple[str, ...]
-    efforts: tuple[
-        float | None, ...
-    ]  # the robot's own limits of the torques, base to tip, N m; passive: None
+    # The robot's own limits of the torques, base to tip, N m; passive: None.
+    efforts: tuple[float | None, ...]
     steps: tuple[StepTrial, ...] = ()  # integrators and time steps that were measured
 
 
@@ -87,15 +88,15 @@ def import_urdf(
         raise SceneError(f"--tip LINK is missing, the link that is to reach the target; {_tips(path)}")
     with warnings.catch_warnings(record=True) as caught, in_options():
         warnings.simplefilter("always")
-        scene = scene_from_urdf(path, tip, **arguments)
-        own = scene_from_urdf(path, tip, **{**arguments, "scaled_efforts": False})
+        own = scene_from_urdf(path, tip, **arguments)
+    scene = with_scaled_limits(own) if proposals.scaled_efforts else own
     if proposals.wheels != "ideal":
         scene = with_wheels(scene, proposals.wheels)
     if proposals.thrusters != "ideal" and scene.actuators.base_force is not None:
         scene = with_jets(scene, 0.5 * max(scene.actuators.base_force.limit))
     scene = scene.replace(spread=_spread(scene, proposals.spread))
     steps = tuple(measured_steps(scene)) if proposals.measured else ()
-    messages = dict.fromkeys(str(each.message).removeprefix("URDF: ") for each in caught)
+    messages = (str(each.message).removeprefix("URDF: ") for each in caught)
     efforts = tuple(link.torque_limit for link in own.links)
     return Imported(steps[-1].of(scene) if steps else scene, tuple(messages), efforts, steps)
 

@@ -342,12 +342,11 @@ def import_(
     arguments |= {
         "spacecraft": spacecraft or None,
         "dampers": not no_dampers,
-        "scaled_efforts": not full_efforts,
         "base_force": base_force or None,
         "base_torque": base_torque or None,
         "lock_branches": lock_branches or lock,
     }
-    proposals = scene_exchange.Proposals(wheels, thrusters, spread, measure)
+    proposals = scene_exchange.Proposals(wheels, thrusters, spread, not full_efforts, measure)
     imported = scene_exchange.import_urdf(robot, tip, arguments, proposals)
     _write(path, commented_yaml(imported.scene))
     for warning in imported.warnings:

@@ -25,7 +25,7 @@ _BEND = 0.5
 _SINGULAR = 0.01
 # Limit of a torque that is scaled for free flight, relative to the effort of a swing by 1 rad.
 _HEADROOM = 3.0
-_ANY_ANGLE = (-math.inf, math.inf)
+ANY_ANGLE = (-math.inf, math.inf)
 
 
 def start_angles(arm: Arm) -> list[float]:
@@ -41,14 +41,14 @@ def start_angles(arm: Arm) -> list[float]:
 
 def _at_rest(joint: UrdfJoint) -> float:
     """Zero where the limits allow it, or midway between them; at the one that there is."""
-    lower, upper = joint.limits or _ANY_ANGLE
+    lower, upper = joint.limits or ANY_ANGLE
     middle = 0.5 * (lower + upper)
     return min(max(0.0, lower), upper) if lower <= 0.0 <= upper or math.isinf(middle) else middle
 
 
 def _moved(joint: UrdfJoint, angle: float, step: float) -> float | None:
     """An angle and a step, upward where the limits allow it; None if they allow neither."""
-    lower, upper = joint.limits or _ANY_ANGLE
+    lower, upper = joint.limits or ANY_ANGLE
     return next((turned for turned in (angle + step, angle - step) if lower <= turned <= upper), None)
 
 
@@ -90,7 +90,7 @@ def default_target(scene: Scene, arm: Arm) -> dict[str, Any]:
     for part, angle in zip(arm.joints, start.joint_angles, strict=True):
         moved = _moved(part.joint, angle, _TARGET_OFFSET)
         if moved is None:
-            farther = max(part.joint.limits or _ANY_ANGLE, key=lambda limit: abs(limit - angle))
+            farther = max(part.joint.limits or ANY_ANGLE, key=lambda limit: abs(limit - angle))
             moved = 0.5 * (angle + farther)
         angles.append(moved)
     pose = kinematics.tip_pose(KinematicTree.from_scene(scene), start.base_pose.dual_quaternion, angles, ())

@@ -13,6 +13,7 @@ from pydantic import Field, ValidationError
 
 from dq_space_arm_env.dynamics.step_stability import stable
 from dq_space_arm_env.interoperability.first_maneuver import (
+    ANY_ANGLE,
     default_target,
     joint_type,
     start_angles,
@@ -26,8 +27,6 @@ from dq_space_arm_env.interoperability.urdf_elements import read_robot
 from dq_space_arm_env.scene import Pose, Scene, SceneError
 from dq_space_arm_env.scene.bodies import BASE, Inertia
 from dq_space_arm_env.validation import Model, Positive, Vector3
-
-_ANY_ANGLE = (-math.inf, math.inf)
 
 
 def scene_from_urdf(
@@ -225,7 +224,7 @@ def _joint_limits(arm: Arm) -> list[dict[str, Any]]:
                 f"URDF: joint {joint.name!r}: lower = upper = {joint.limits[0]:g} {joint.unit}, it cannot "
                 "move: make it fixed, or give it a range"
             )
-    lower, upper = zip(*(joint.limits or _ANY_ANGLE for joint in joints), strict=True)
+    lower, upper = zip(*(joint.limits or ANY_ANGLE for joint in joints), strict=True)
     bounds = {"lower": lower, "upper": upper, "rate": tuple(joint.rate for joint in joints)}
     finite = {name: limits for name, limits in bounds.items() if any(map(math.isfinite, limits))}
     return [{"name": "joint limits", "kind": "joint_limits", **finite}] if finite else []

@@ -106,9 +106,11 @@ def still(scene):
 
 
 @pytest.mark.slow
+@pytest.mark.agents
 def test_entrants_of_all_kinds_fly_and_finished_ones_are_kept(
     content, cache, counting, tmp_path, monkeypatch
 ):
+    pytest.importorskip("threadpoolctl")
     suite, out, executor = Suite.model_validate(content), tmp_path / "out", counting()
     fly = partial(run_suite, suite=suite, policies={"still": still}, out=out, executor=executor)
     run = fly(["open-loop", "gains", "tiny"])
@@ -128,12 +130,11 @@ def test_entrants_of_all_kinds_fly_and_finished_ones_are_kept(
             assert score.solves(suite.limits)
     done = executor.tasks
     monkeypatch.setattr("agents.experiments.training_task.train", lambda *_: pytest.fail("trained again"))
-    pattern = str(out / "trainings" / "tiny-{task}-0")
-    again = fly(["open-loop", "gains", "tiny", pattern])
+    again = fly(["open-loop", "gains", "tiny", f"copy={out}/trainings/tiny-{{task}}-0"])
     for task in suite.tasks:
         first, copy = (
             next(each for each in again.scores if (each.task, each.entrant) == (task, name))
-            for name in ("tiny", pattern)
+            for name in ("tiny", "copy")
         )
         np.testing.assert_array_equal(copy.rows[0].evaluation.cost_gaps, first.rows[0].evaluation.cost_gaps)
     assert executor.tasks == done + 4  # trainings, which find their policies
@@ -206,7 +207,9 @@ def test_a_check_tells_equal_from_like_and_other(content, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.agents
 def test_the_verb_writes_page_and_json_and_tells_a_failed_training(content, cache, tmp_path, monkeypatch):
+    pytest.importorskip("threadpoolctl")
     monkeypatch.setattr("agents.evaluation.expert_costs.local_executor", lambda workers: SerialExecutor())
     broken = {**TINY, "demonstrations": 3}
     file, out = tmp_path / "suite.yaml", tmp_path / "out"

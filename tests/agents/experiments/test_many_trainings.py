@@ -138,6 +138,17 @@ def test_a_training_whose_processes_end_again_and_again_is_a_failed_row(
     )
 
 
+def test_a_missing_extra_ends_all_with_its_sentence(
+    configuration: AgentConfiguration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(*arguments: object, **options: object) -> None:
+        raise ImportError('training needs torch: pip install "dq-space-arm[agents]"')
+
+    monkeypatch.setattr("agents.experiments.training_task.train", train)
+    with pytest.raises(ImportError, match=r"training needs torch: pip install"):
+        train_seeds([configuration], 2, tmp_path, executor=SerialExecutor())
+
+
 def test_a_machine_without_the_folder_says_so(configuration: AgentConfiguration, tmp_path: Path) -> None:
     row = training_task(configuration, tmp_path / "nowhere").run()
     assert row["outcome"] == "failed"
