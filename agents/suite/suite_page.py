@@ -20,7 +20,7 @@ from dq_space_arm_env.common.tables import Column, Row, tabulate
 
 WITHIN = (0.001, 0.01, 0.1)
 """Cost gaps of the profile in the table."""
-_PROFILE = tuple(np.geomspace(1e-4, 1.0, 60).tolist())
+_PROFILE = tuple(np.geomspace(1e-4, 1.0, 25).tolist())
 _EQUAL = 1e-9  # relative difference
 _ENTRANT = Column("entrant", "")
 _TIMES = (COLUMNS["action_seconds"], COLUMNS["planning_seconds"], COLUMNS["training_seconds"])
@@ -129,7 +129,8 @@ def _together(run: SuiteRun, picture: bool) -> Section:
     section = Section(
         "together",
         "All tasks together",
-        f"{run.suite.description} Each entrant flies from the first {run.suite.starts} evaluation starts of "
+        f"{run.suite.description} {len(run.descriptions)} of them are here. Each entrant flies from the "
+        f"first {run.suite.starts} evaluation starts of "
         f"each task; the receding-horizon expert, which takes a second a flight, from "
         f"{run.suite.receding_starts}. Rates are means over tasks; brackets are 95 % intervals.",
         shortcomings=list(run.notes),
