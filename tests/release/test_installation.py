@@ -73,6 +73,7 @@ def test_distributions_have_their_files(distributions: Path) -> None:
     expected = {
         **{package: package for package in ("agents", "dq_space_arm_env", "experts")},
         "configs/agents": "agents/configs",
+        "configs/suites": "agents/suites",
         "configs/scenes": "dq_space_arm_env/configs/scenes",
     }
     files = {
