@@ -277,7 +277,7 @@ class _Work:
         def fly() -> tuple[Evaluation, float]:
             started = perf_counter()
             if name == RECEDING:
-                planned = fly_receding(self.scene, condition, n, self.progress)
+                planned = fly_receding(self.scene, condition, n, self.executor, self.progress)
             else:
                 planned = self._plans(name, condition, conditions, controllers)
             wall_seconds = perf_counter() - started

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ from agents.evaluation.kept_results import CachedGroups, Row
 from agents.evaluation.plan_followers import FEEDBACK, RECEDING, RecedingHorizon, follower, plans_of
 from agents.policies.flying import Flights, FloatArray
 from dq_space_arm_env import Scene
+from experts.demonstrations import DemonstrationsError
 from experts.demonstrations.settings import Settings, software
 from experts.demonstrations.shard import Task, draw_starts
 from experts.executors import Executor
@@ -38,8 +39,6 @@ _SOURCES = (
     *(f"evaluation/{name}.py" for name in ("conditions", "evaluating", "expert_costs", "plan_followers")),
     *("evaluation/planned_flights.py", "evaluation/plans.py", "policies"),
 )
-_FEW = 5
-"""Flights of a group of the receding-horizon expert, about a second each."""
 
 
 class PlannedFlights(NamedTuple):
@@ -115,26 +114,61 @@ def fly_receding(
     scene: Scene,
     condition: str,
     n: int,
+    executor: Executor,
     progress: Callable[[Advance], None] = lambda advance: None,
 ) -> PlannedFlights:
     """Fly the receding-horizon expert from the first n evaluation starts."""
     settings = evaluation_settings(as_known(scene, condition))
-    files = _files(RECEDING, settings.scene, scene, condition, group_seeds(settings, n, _FEW))
-    stage, done, total = f"receding horizon, {condition}", len(files.rows), len(files.rows)
-    total += _FEW * len(files.missing)
+    files = _files(RECEDING, settings.scene, scene, condition, group_seeds(settings, n, 1))
+    stage, done, total = f"receding horizon, {condition}", len(files.rows), n
     progress(Advance(stage, done, total))
-    controller = RecedingHorizon(settings.scene) if files.missing else None
-    for group in files.missing:
-        assert controller is not None
-        rows: list[Row] = []
-        for seed in files.seeds(group):
-            told = draw_starts(settings.scene, [seed]).parameters
-            flights = fly_under(condition, controller.policy(told), scene, [seed])
-            rows += _rows([seed], flights, np.array([controller.planning_seconds]))
+    flights = (RecedingFlight(settings.scene, scene, condition, files.seeds(i)[0]) for i in files.missing)
+    numbers = {files.seeds(i)[0]: i for i in files.missing}
+    with closing(executor.run(flights)) as results:
+        for row in results:
+            files.add(numbers[row["seed"]], [row])
             done += 1
             progress(Advance(stage, done, total))
-        files.add(group, rows)
     return PlannedFlights.of(files.rows[:n])
+
+
+class RecedingFlight(NamedTuple):
+    """A flight of the receding-horizon expert: all that a worker has to know."""
+
+    known: Scene  # that it plans in
+    scene: Scene
+    condition: str
+    seed: int
+
+    @property
+    def label(self) -> str:
+        return f"the flight with seed {self.seed}"
+
+    def prepare(self) -> None:
+        """Compile the expert."""
+        _receding_horizon(self.known)
+
+    def run(self) -> Row:
+        """Fly."""
+        controller = _receding_horizon(self.known)
+        told = draw_starts(self.known, [self.seed]).parameters
+        flights = fly_under(self.condition, controller.policy(told), self.scene, [self.seed])
+        return _rows([self.seed], flights, np.array([controller.planning_seconds]))[0]
+
+    def lost(self, sentence: str) -> Row:
+        """End the run; finished flights remain."""
+        raise DemonstrationsError(sentence)
+
+    @staticmethod
+    def software() -> dict[str, Any]:
+        """Identify the code that its row follows from."""
+        return {**software(), "agents": agents_source()}
+
+
+@lru_cache(maxsize=1)
+def _receding_horizon(scene: Scene) -> RecedingHorizon:
+    """The controller of this process, ready to fly."""
+    return RecedingHorizon(scene)
 
 
 def _rows(seeds: Sequence[int], flights: Flights, seconds: FloatArray) -> list[Row]:
@@ -145,7 +179,7 @@ def _rows(seeds: Sequence[int], flights: Flights, seconds: FloatArray) -> list[R
 def _files(
     controller: str, planned_in: Scene, scene: Scene, condition: str, seeds: Sequence[int]
 ) -> CachedGroups:
-    size = _FEW if controller == RECEDING else GROUP
+    size = 1 if controller == RECEDING else GROUP  # seconds a flight
     content = {
         "controller": controller,
         "planned in": planned_in.content_hash(),

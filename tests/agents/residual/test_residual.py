@@ -333,7 +333,7 @@ MINIMAL = {"name": "small", "algorithm": {"name": "residual-PPO"}, "schedule": {
     ("changes", "sentence"),
     [
         ({"environment": {"copies": 2}}, "must be at least 5, one for each mass factor"),
-        ({"algorithm": {"name": "residual-TD3"}}, "TD3, APG, cloning, dagger, act, residual-PPO, residual-SAC"),
+        ({"algorithm": {"name": "residual-TD3"}}, "TD3, APG, cloning, dagger, act, residual-PPO"),
         ({"algorithm": {"name": "residual-SAC", "hindsight": {}}}, "must be left out"),
         (
             {"algorithm": {"name": "residual-PPO", "lagrangian": {}}},
