@@ -85,6 +85,38 @@ class DifferentiableDynamics(ABC, Generic[ArrayT]):
         """
         return self._one("terminal_cost", x, None, p)
 
+    def constraints(self, x: ArrayT, u: ArrayT, p: ArrayT | None = None) -> ArrayT:
+        """Residuals c of the rows along the path, which hold where c <= 0.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u).
+            p: Parameters, shape (n_p,) or (B, n_p); nominal ones by default.
+
+        Returns:
+            One entry per row of `dq_space_arm_env.scene.path_rows(scene)`, which has names, units and
+            tolerances, shape (n_c,) or (B, n_c); without the margins that the expert keeps.
+
+        Raises:
+            ValueError: As for `step`.
+        """
+        return self._one("constraints", x, u, p)
+
+    def terminal_constraints(self, x: ArrayT, p: ArrayT | None = None) -> ArrayT:
+        """Residuals of the rows at the end: those of the path without input, of success, and what is zero.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            p: Parameters of the end, shape (n_p,) or (B, n_p); nominal ones by default.
+
+        Returns:
+            One entry per row of `dq_space_arm_env.scene.terminal_rows(scene)`, shape (n_g,) or (B, n_g).
+
+        Raises:
+            ValueError: As for `step`.
+        """
+        return self._one("terminal_constraints", x, None, p)
+
     def rollout(self, x: ArrayT, u: ArrayT, p: ArrayT | None = None, every: int = 1) -> tuple[ArrayT, ArrayT]:
         """Take N steps in a row, and keep their states and costs.
 

@@ -14,7 +14,7 @@ import numpy as np
 from dq_space_arm_env.interoperability.differentiable_dynamics import FIRST_ONLY, DifferentiableDynamics
 from dq_space_arm_env.interoperability.differentiable_kernels import DifferentiableKernels, Operation
 from dq_space_arm_env.kernels import compile_scene
-from dq_space_arm_env.scene import Scene, load_scene
+from dq_space_arm_env.scene import Scene, load_scene, path_rows, terminal_rows
 
 Function = Callable[..., Any]
 
@@ -55,7 +55,8 @@ class _ByXLA(JaxDynamics):
         from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
 
         programs = ScenePrograms(self.scene)
-        traced = {name: programs.build(name) for name in ("cost", "terminal_cost")}
+        names = ("cost", "terminal_cost", "constraints", "terminal_constraints")
+        traced = {name: programs.build(name) for name in names}
         traced["step"] = step_of_fixed_stages(programs, self.integrator, "JAX")
         emitted = {name: xla_function(self._jax, program, self._dtype) for name, program in traced.items()}
         h = np.array([self.dt], self._dtype)
@@ -63,6 +64,8 @@ class _ByXLA(JaxDynamics):
             "step": lambda x, u, p: (emitted["step"](x=x, u=u, parameters=p, h=h),),
             "cost": lambda x, u, p: (emitted["cost"](x=x, u=u, parameters=p)[0],),
             "terminal_cost": lambda x, p: (emitted["terminal_cost"](x=x, parameters=p)[0],),
+            "constraints": lambda x, u, p: (emitted["constraints"](x=x, u=u, parameters=p),),
+            "terminal_constraints": lambda x, p: (emitted["terminal_constraints"](x=x, parameters=p),),
         }
 
     def _run(self, name: str, arrays: list[Any], every: int = 1) -> tuple[Any, ...]:
@@ -108,7 +111,12 @@ class _ByKernels(JaxDynamics):
 
     def _run(self, name: str, arrays: list[Any], every: int = 1) -> tuple[Any, ...]:
         n_x = self.layout.n_x
-        shapes: tuple[tuple[int, ...], ...] = ((n_x,),) if name == "step" else ((),)
+        sizes = {
+            "step": n_x,
+            "constraints": len(path_rows(self.scene)),
+            "terminal_constraints": len(terminal_rows(self.scene)),
+        }
+        shapes: tuple[tuple[int, ...], ...] = ((sizes[name],),) if name in sizes else ((),)
         if name == "rollout":
             steps = arrays[1].shape[1]
             shapes = ((steps // every + 1, n_x), (steps + 1,))
@@ -184,6 +192,8 @@ def _differentiable(
 
     def backward(kept: Any, cotangents: Any) -> Any:
         given, first, wanted = kept
+        if wanted is not None and given[-1].shape[-1]:
+            operation.require_parameter_products()
         sizes = [each.shape for each in given]
 
         def on_rows(*rows: Any) -> Any:
