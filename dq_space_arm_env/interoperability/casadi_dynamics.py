@@ -32,8 +32,9 @@ class CasadiDynamics:
     `layout.control_limit`. Nothing normalizes the pose q_{e0/I}: constrain a state that a solver may
     choose to |q_r| = 1, q_r . q_d = 0, which `step` and the flow of `xdot` preserve. In a scene with
     parameters, every function takes them after the state: `step` is (x, parameters, u, h). Where a target
-    moves or phases change, each stage has its own row, see `Kernels.stage_parameters`; a payload that is
-    caught is one of these numbers, and `step` ends with its impact.
+    moves or phases change, each stage has its row of `Kernels.stage_parameters`. A step whose row says that a
+    payload is caught ends with the impact. Limits of inputs that phases change are in the row, see
+    `StateLayout.limits_with`.
 
     Attributes:
         scene: The scene.

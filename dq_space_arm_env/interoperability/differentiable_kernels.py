@@ -39,12 +39,13 @@ class Operation:
     value: Callable[..., Arrays]  # of the inputs
     backward: Callable[[Sequence[Array], Array, Sequence[Array], bool], Arrays]
     n_inputs: int = 3
-    has_parameter_products: bool = True
+    by_parameters: bool = True  # whether there are products of the parameters
 
-    def require_parameter_products(self) -> None:
-        """NotImplementedError where the products have none of the parameters."""
-        if not self.has_parameter_products:
+    def check(self, with_parameters: bool, n_p: int) -> bool:
+        """Whether products of n_p parameters are wanted; NotImplementedError if there are none."""
+        if with_parameters and n_p and not self.by_parameters:
             raise NotImplementedError(NOT_BY_PARAMETERS)
+        return with_parameters and n_p > 0
 
     def products(
         self, given: Sequence[Array], first: Array, cotangents: Sequence[Array], with_parameters: bool
@@ -53,10 +54,7 @@ class Operation:
 
         Those of the parameters, the last input, are zero unless they are wanted.
         """
-        with_parameters = with_parameters and given[-1].shape[-1] > 0
-        if with_parameters:
-            self.require_parameter_products()
-        return self.backward(given, first, cotangents, with_parameters)
+        return self.backward(given, first, cotangents, self.check(with_parameters, given[-1].shape[-1]))
 
 
 class DifferentiableKernels:
@@ -70,9 +68,9 @@ class DifferentiableKernels:
         self.step = Operation(self._step, self._step_products)
         self.cost = Operation(self._cost, self._cost_products)
         self.terminal_cost = Operation(self._terminal_cost, self._terminal_cost_products, 2)
-        self.constraints = Operation(self._constraints, self._constraints_products, 3, False)
+        self.constraints = Operation(self._constraints, self._constraints_products, by_parameters=False)
         self.terminal_constraints = Operation(
-            self._terminal_constraints, self._terminal_constraints_products, 2, False
+            self._terminal_constraints, self._terminal_constraints_products, 2, by_parameters=False
         )
 
     def rollout(self, every: int) -> Operation:

@@ -110,18 +110,19 @@ class _ByKernels(JaxDynamics):
         self._calling = cache(self._call)
 
     def _run(self, name: str, arrays: list[Any], every: int = 1) -> tuple[Any, ...]:
+        results: tuple[Any, ...] = self._calling(name, self._shapes(name, arrays, every), every)(*arrays)
+        return results
+
+    def _shapes(self, name: str, arrays: list[Any], every: int) -> tuple[tuple[int, ...], ...]:
+        """Shapes of the results of one row."""
         n_x = self.layout.n_x
-        sizes = {
-            "step": n_x,
-            "constraints": len(path_rows(self.scene)),
-            "terminal_constraints": len(terminal_rows(self.scene)),
-        }
-        shapes: tuple[tuple[int, ...], ...] = ((sizes[name],),) if name in sizes else ((),)
         if name == "rollout":
             steps = arrays[1].shape[1]
-            shapes = ((steps // every + 1, n_x), (steps + 1,))
-        results: tuple[Any, ...] = self._calling(name, shapes, every)(*arrays)
-        return results
+            return (steps // every + 1, n_x), (steps + 1,)
+        if name == "step":
+            return ((n_x,),)
+        rows = {"constraints": path_rows, "terminal_constraints": terminal_rows}.get(name)
+        return ((len(rows(self.scene)),),) if rows else ((),)
 
     def _call(self, name: str, shapes: tuple[tuple[int, ...], ...], every: int) -> Function:
         of = self._operations
@@ -140,12 +141,12 @@ def jax_dynamics(
     kernels: bool = False,
     threads: int = 1,
 ) -> JaxDynamics:
-    """Make a scene's step, costs and rollouts differentiable functions of JAX.
+    """Make a scene's step, costs, constraints and rollouts differentiable functions of JAX.
 
     By default they are emitted from the trace: `jit`, `vmap`, `scan`, derivatives of any order and mode,
     and every device that XLA compiles for. With `kernels` they call the compiled kernels on the CPU, which is
     many times faster there, compiles in seconds and takes every integrator; they have gradients, and refuse
-    second derivatives and forward mode.
+    second derivatives, forward mode, and gradients of constraints by parameters.
 
     Args:
         scene: A scene, the name of a shipped one, or a path to a YAML file.
@@ -192,8 +193,7 @@ def _differentiable(
 
     def backward(kept: Any, cotangents: Any) -> Any:
         given, first, wanted = kept
-        if wanted is not None and given[-1].shape[-1]:
-            operation.require_parameter_products()
+        operation.check(wanted is not None, given[-1].shape[-1])
         sizes = [each.shape for each in given]
 
         def on_rows(*rows: Any) -> Any:
