@@ -86,7 +86,7 @@ class Demonstration:
             raise DemonstrationsError(f"demonstration {self.index} is damaged: {error}") from error
 
     def constraint_costs(self) -> FloatArray:
-        """Replay the episode for `info["cost"]`, the violations of constraints, each over its tolerance.
+        """Replay the episode from its first state for `info["cost"]`: violations, each over its tolerance.
 
         Returns:
             After each action, dimensionless, shape (N,); zeros in a scene without constraints.
