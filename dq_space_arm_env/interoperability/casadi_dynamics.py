@@ -31,7 +31,10 @@ class CasadiDynamics:
     States, inputs and units are those of `layout`. The inputs are not clipped to their limits,
     `layout.control_limit`. Nothing normalizes the pose q_{e0/I}: constrain a state that a solver may
     choose to |q_r| = 1, q_r . q_d = 0, which `step` and the flow of `xdot` preserve. In a scene with
-    parameters, every function takes them after the state: `step` is (x, parameters, u, h).
+    parameters, every function takes them after the state: `step` is (x, parameters, u, h). Where a target
+    moves or phases change, each stage has its row of `Kernels.stage_parameters`. A step whose row says that a
+    payload is caught ends with the impact. Limits of inputs that phases change are in the row, see
+    `StateLayout.limits_with`.
 
     Attributes:
         scene: The scene.
@@ -44,6 +47,10 @@ class CasadiDynamics:
         tip_pose: (x) to the pose q_{G/I} of the tip, 8 numbers, m.
         cost: (x, u) to the stage cost, without a factor dt, dimensionless.
         terminal_cost: (x) to the terminal cost, dimensionless.
+        constraints: (x, u) to the residuals c of the rows along the path, which hold where c <= 0; their
+            names, units and tolerances are those of `dq_space_arm_env.scene.path_rows(scene)`.
+        terminal_constraints: (x) to those at the end, of `dq_space_arm_env.scene.terminal_rows(scene)`: the
+            path's rows without input, success, and what is zero there.
     """
 
     scene: Scene
@@ -54,6 +61,8 @@ class CasadiDynamics:
     tip_pose: casadi.Function
     cost: casadi.Function
     terminal_cost: casadi.Function
+    constraints: casadi.Function
+    terminal_constraints: casadi.Function
 
 
 def casadi_dynamics(scene: Scene, integrator: str | None = None) -> CasadiDynamics:
@@ -81,6 +90,8 @@ def casadi_dynamics(scene: Scene, integrator: str | None = None) -> CasadiDynami
         tip_pose=_function(programs.build("tip_pose")),
         cost=_function(programs.build("cost")),
         terminal_cost=_function(programs.build("terminal_cost")),
+        constraints=_function(programs.build("constraints")),
+        terminal_constraints=_function(programs.build("terminal_constraints")),
     )
 
 

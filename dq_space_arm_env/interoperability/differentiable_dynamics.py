@@ -8,6 +8,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from dq_space_arm_env.interoperability.exporting import integrator_name
+from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene, StateLayout
 
 ArrayT = TypeVar("ArrayT")
@@ -17,7 +18,11 @@ FIRST_ONLY = "the kernels have first derivatives only: for second ones take jax_
 
 
 class DifferentiableDynamics(ABC, Generic[ArrayT]):
-    """A scene's step, costs and rollouts in another library, see `torch_dynamics` and `jax_dynamics`.
+    """A scene's functions in another library, see `torch_dynamics` and `jax_dynamics`.
+
+    Of one stage they take its parameters p: where a target moves or phases change, its row of
+    `Kernels.stage_parameters`, by default the first. A step whose row says that a payload is caught ends
+    with the impact. Limits of inputs that phases change are in the row, see `StateLayout.limits_with`.
 
     Gradients by a state are by its numbers, (n_x,), and exact along all directions in which the state can
     move: chained steps have exact gradients. Across them, where |q_r| = 1, q_r . q_d = 0 or a joint's
@@ -85,6 +90,38 @@ class DifferentiableDynamics(ABC, Generic[ArrayT]):
         """
         return self._one("terminal_cost", x, None, p)
 
+    def constraints(self, x: ArrayT, u: ArrayT, p: ArrayT | None = None) -> ArrayT:
+        """Residuals c of the rows along the path, which hold where c <= 0.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs, shape (n_u,) or (B, n_u).
+            p: Parameters, shape (n_p,) or (B, n_p); nominal ones by default.
+
+        Returns:
+            One entry per row of `dq_space_arm_env.scene.path_rows(scene)`, which has names, units and
+            tolerances, shape (n_c,) or (B, n_c); without the margins that the expert keeps.
+
+        Raises:
+            ValueError: As for `step`.
+        """
+        return self._one("constraints", x, u, p)
+
+    def terminal_constraints(self, x: ArrayT, p: ArrayT | None = None) -> ArrayT:
+        """Residuals of the rows at the end: those of the path without input, of success, and what is zero.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            p: Parameters of the end, shape (n_p,) or (B, n_p); nominal ones by default.
+
+        Returns:
+            One entry per row of `dq_space_arm_env.scene.terminal_rows(scene)`, shape (n_g,) or (B, n_g).
+
+        Raises:
+            ValueError: As for `step`.
+        """
+        return self._one("terminal_constraints", x, None, p)
+
     def rollout(self, x: ArrayT, u: ArrayT, p: ArrayT | None = None, every: int = 1) -> tuple[ArrayT, ArrayT]:
         """Take N steps in a row, and keep their states and costs.
 
@@ -95,8 +132,7 @@ class DifferentiableDynamics(ABC, Generic[ArrayT]):
             x: States at the start, shape (n_x,) or (B, n_x), units of `layout.state`.
             u: Inputs, shape (N, n_u) or (N, B, n_u), units of `layout.control`.
             p: Parameters, shape (n_p,) or (B, n_p), or (N + 1, B, n_p) for the steps and the end, where B may
-                be 1; nominal ones by default. Where a target moves or phases change, each step has its own,
-                see `Kernels.stage_parameters`.
+                be 1; nominal ones by default, where a target moves or phases change those of each stage.
             every: Number of steps between the states returned; N must be a multiple.
 
         Returns:
@@ -105,9 +141,11 @@ class DifferentiableDynamics(ABC, Generic[ArrayT]):
             the cost of the maneuver.
 
         Raises:
-            ValueError: As for `step`, or if N is not a multiple of every.
+            ValueError: As for `step`, if N is not a multiple of every, or if the stages of p by default are
+                other ones: N exceeds the scene's steps, or dt is not the scene's.
         """
-        given = {"x": self._checked("x", x), "u": self._checked("u", u), "p": self._parameters(p)}
+        given = {"x": self._checked("x", x), "u": self._checked("u", u)}
+        given["p"] = self._parameters(self._stages(len(given["u"])) if p is None else p)
         self._require(given, {"x": (1, 2), "u": (2, 3), "p": (1, 2, 3)})
         steps = len(given["u"])
         if every < 1 or steps < 1 or steps % every:
@@ -116,7 +154,7 @@ class DifferentiableDynamics(ABC, Generic[ArrayT]):
             raise ValueError(
                 f"p: {len(given['p'])} rows for {steps} steps and the end, should be {steps + 1}"
             )
-        batched = given["x"].ndim == 2 or given["u"].ndim == 3 or given["p"].ndim > 1
+        batched = given["x"].ndim == 2 or given["u"].ndim == 3 or (p is not None and given["p"].ndim > 1)
         inputs, fixed = given["u"], given["p"]
         inputs = inputs.swapaxes(0, 1) if inputs.ndim == 3 else inputs[None]
         fixed = fixed.swapaxes(0, 1) if fixed.ndim == 3 else _in_rows(fixed)[:, None]
@@ -154,6 +192,18 @@ class DifferentiableDynamics(ABC, Generic[ArrayT]):
         return [
             self._broadcast(array, (count, *times[name], array.shape[-1])) for name, array in rows.items()
         ]
+
+    def _stages(self, steps: int) -> Any:
+        """Nominal parameters of the stages, (N + 1, 1, n_p); None where they are all the same."""
+        entries, simulation = self.layout.parameters, self.scene.simulation
+        if not (entries.moving or entries.staged):
+            return None
+        if steps > simulation.steps or self.dt != simulation.dt:
+            raise ValueError(
+                f"p: the stages of scene {self.scene.name!r} are {simulation.steps} of {simulation.dt} s, "
+                f"and {steps} of {self.dt} s are asked for: give the parameters of each, (N + 1, B, n_p)"
+            )
+        return compile_scene(self.scene).stage_parameters()[: steps + 1, None]
 
     def _parameters(self, p: ArrayT | None) -> Any:
         if p is None:

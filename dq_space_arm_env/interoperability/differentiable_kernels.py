@@ -25,6 +25,12 @@ from dq_space_arm_env.scene.start import unit_quaternions
 Array = NDArray[Any]
 Arrays = tuple[Array, ...]
 
+NOT_BY_PARAMETERS = (
+    "the kernels of constraints have no derivatives by parameters: "
+    "for these take jax_dynamics without kernels"
+)
+"""Refusal of gradients of constraints by parameters."""
+
 
 @dataclass(frozen=True)
 class Operation:
@@ -33,6 +39,13 @@ class Operation:
     value: Callable[..., Arrays]  # of the inputs
     backward: Callable[[Sequence[Array], Array, Sequence[Array], bool], Arrays]
     n_inputs: int = 3
+    by_parameters: bool = True  # whether there are products of the parameters
+
+    def check(self, with_parameters: bool, n_p: int) -> bool:
+        """Whether products of n_p parameters are wanted; NotImplementedError if there are none."""
+        if with_parameters and n_p and not self.by_parameters:
+            raise NotImplementedError(NOT_BY_PARAMETERS)
+        return with_parameters and n_p > 0
 
     def products(
         self, given: Sequence[Array], first: Array, cotangents: Sequence[Array], with_parameters: bool
@@ -41,11 +54,11 @@ class Operation:
 
         Those of the parameters, the last input, are zero unless they are wanted.
         """
-        return self.backward(given, first, cotangents, with_parameters and given[-1].shape[-1] > 0)
+        return self.backward(given, first, cotangents, self.check(with_parameters, given[-1].shape[-1]))
 
 
 class DifferentiableKernels:
-    """Operations of a scene: `step` and `cost` of (x, u, p), `terminal_cost` of (x, p), and rollouts."""
+    """Operations of a scene: of (x, u, p) or, at the end, of (x, p), and rollouts."""
 
     def __init__(self, kernels: Kernels, integrator: str | None, dt: float | None) -> None:
         """Take a scene's kernels; integrator and time step [s] are the scene's by default."""
@@ -55,6 +68,10 @@ class DifferentiableKernels:
         self.step = Operation(self._step, self._step_products)
         self.cost = Operation(self._cost, self._cost_products)
         self.terminal_cost = Operation(self._terminal_cost, self._terminal_cost_products, 2)
+        self.constraints = Operation(self._constraints, self._constraints_products, by_parameters=False)
+        self.terminal_constraints = Operation(
+            self._terminal_constraints, self._terminal_constraints_products, 2, by_parameters=False
+        )
 
     def rollout(self, every: int) -> Operation:
         """A rollout of (x, u, p), shapes (B, n_x), (B, N, n_u), (B, N + 1, n_p).
@@ -101,7 +118,7 @@ class DifferentiableKernels:
         if not wanted:
             return np.zeros_like(p)
         by_p = self._kernels.linearize_parameters(x, u, **self._options(p))
-        return np.asarray(np.einsum("bi,bij->bj", v, by_p))
+        return _weighted(v, by_p)
 
     def _cost(self, x: Array, u: Array, p: Array) -> Arrays:
         return (self._kernels.cost(x, u, p=p),)
@@ -123,6 +140,27 @@ class DifferentiableKernels:
         (x, p), v = given, cotangents[0][:, None]
         by_p = self._kernels.terminal_cost_by_parameters(x, p=p) if with_parameters else np.zeros_like(p)
         return self._charts.lift(x, v * self._kernels.terminal_cost_gradient(x, p=p)), v * by_p
+
+    def _constraints(self, x: Array, u: Array, p: Array) -> Arrays:
+        return (self._kernels.constraints(x, u, p=p),)
+
+    def _constraints_products(
+        self, given: Sequence[Array], _: Array, cotangents: Sequence[Array], with_parameters: bool
+    ) -> Arrays:
+        x, u, p = given
+        products = _weighted(cotangents[0], self._kernels.constraint_jacobian(x, u, p=p))
+        n_t = self._kernels.n_t
+        return self._charts.lift(x, products[:, :n_t]), products[:, n_t:], np.zeros_like(p)
+
+    def _terminal_constraints(self, x: Array, p: Array) -> Arrays:
+        return (self._kernels.terminal_constraints(x, p=p),)
+
+    def _terminal_constraints_products(
+        self, given: Sequence[Array], _: Array, cotangents: Sequence[Array], with_parameters: bool
+    ) -> Arrays:
+        x, p = given
+        products = _weighted(cotangents[0], self._kernels.terminal_constraint_jacobian(x, p=p))
+        return self._charts.lift(x, products), np.zeros_like(p)
 
     def _call(self, name: str, rows: int) -> Callable[..., None]:
         """A kernel of a step with its cost, run on arrays by name."""
@@ -178,6 +216,11 @@ class DifferentiableKernels:
                 v, before = before, v
             v += lowered[number]
         return self._charts.lift(x, v), by_u.swapaxes(0, 1), by_p.swapaxes(0, 1)
+
+
+def _weighted(v: Array, matrices: Array) -> Array:
+    """Sums of the rows of matrices, (B, m, n), each times its entry of v, (B, m)."""
+    return np.asarray(np.einsum("bi,bij->bj", v, matrices))
 
 
 def _in_time(*arrays: Array) -> list[Array]:

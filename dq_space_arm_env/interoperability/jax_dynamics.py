@@ -14,7 +14,7 @@ import numpy as np
 from dq_space_arm_env.interoperability.differentiable_dynamics import FIRST_ONLY, DifferentiableDynamics
 from dq_space_arm_env.interoperability.differentiable_kernels import DifferentiableKernels, Operation
 from dq_space_arm_env.kernels import compile_scene
-from dq_space_arm_env.scene import Scene, load_scene
+from dq_space_arm_env.scene import Scene, load_scene, path_rows, terminal_rows
 
 Function = Callable[..., Any]
 
@@ -55,7 +55,8 @@ class _ByXLA(JaxDynamics):
         from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
 
         programs = ScenePrograms(self.scene)
-        traced = {name: programs.build(name) for name in ("cost", "terminal_cost")}
+        names = ("cost", "terminal_cost", "constraints", "terminal_constraints")
+        traced = {name: programs.build(name) for name in names}
         traced["step"] = step_of_fixed_stages(programs, self.integrator, "JAX")
         emitted = {name: xla_function(self._jax, program, self._dtype) for name, program in traced.items()}
         h = np.array([self.dt], self._dtype)
@@ -63,6 +64,8 @@ class _ByXLA(JaxDynamics):
             "step": lambda x, u, p: (emitted["step"](x=x, u=u, parameters=p, h=h),),
             "cost": lambda x, u, p: (emitted["cost"](x=x, u=u, parameters=p)[0],),
             "terminal_cost": lambda x, p: (emitted["terminal_cost"](x=x, parameters=p)[0],),
+            "constraints": lambda x, u, p: (emitted["constraints"](x=x, u=u, parameters=p),),
+            "terminal_constraints": lambda x, p: (emitted["terminal_constraints"](x=x, parameters=p),),
         }
 
     def _run(self, name: str, arrays: list[Any], every: int = 1) -> tuple[Any, ...]:
@@ -107,13 +110,19 @@ class _ByKernels(JaxDynamics):
         self._calling = cache(self._call)
 
     def _run(self, name: str, arrays: list[Any], every: int = 1) -> tuple[Any, ...]:
+        results: tuple[Any, ...] = self._calling(name, self._shapes(name, arrays, every), every)(*arrays)
+        return results
+
+    def _shapes(self, name: str, arrays: list[Any], every: int) -> tuple[tuple[int, ...], ...]:
+        """Shapes of the results of one row."""
         n_x = self.layout.n_x
-        shapes: tuple[tuple[int, ...], ...] = ((n_x,),) if name == "step" else ((),)
         if name == "rollout":
             steps = arrays[1].shape[1]
-            shapes = ((steps // every + 1, n_x), (steps + 1,))
-        results: tuple[Any, ...] = self._calling(name, shapes, every)(*arrays)
-        return results
+            return (steps // every + 1, n_x), (steps + 1,)
+        if name == "step":
+            return ((n_x,),)
+        rows = {"constraints": path_rows, "terminal_constraints": terminal_rows}.get(name)
+        return ((len(rows(self.scene)),),) if rows else ((),)
 
     def _call(self, name: str, shapes: tuple[tuple[int, ...], ...], every: int) -> Function:
         of = self._operations
@@ -132,12 +141,12 @@ def jax_dynamics(
     kernels: bool = False,
     threads: int = 1,
 ) -> JaxDynamics:
-    """Make a scene's step, costs and rollouts differentiable functions of JAX.
+    """Make a scene's step, costs, constraints and rollouts differentiable functions of JAX.
 
     By default they are emitted from the trace: `jit`, `vmap`, `scan`, derivatives of any order and mode,
     and every device that XLA compiles for. With `kernels` they call the compiled kernels on the CPU, which is
     many times faster there, compiles in seconds and takes every integrator; they have gradients, and refuse
-    second derivatives and forward mode.
+    second derivatives, forward mode, and gradients of constraints by parameters.
 
     Args:
         scene: A scene, the name of a shipped one, or a path to a YAML file.
@@ -184,6 +193,7 @@ def _differentiable(
 
     def backward(kept: Any, cotangents: Any) -> Any:
         given, first, wanted = kept
+        operation.check(wanted is not None, given[-1].shape[-1])
         sizes = [each.shape for each in given]
 
         def on_rows(*rows: Any) -> Any:

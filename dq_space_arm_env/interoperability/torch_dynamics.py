@@ -53,8 +53,8 @@ def torch_dynamics(
 ) -> TorchDynamics:
     """Make a scene's kernels differentiable functions of PyTorch, on the CPU.
 
-    The gradients are those of the kernels, by reverse mode, also by the parameters. There are first
-    derivatives only: differentiating them again is refused.
+    The gradients are those of the kernels, by reverse mode, also by the parameters, but for those of
+    constraints, which are refused. There are first derivatives only: differentiating them again is refused.
 
     Args:
         scene: A scene, the name of a shipped one, or a path to a YAML file.

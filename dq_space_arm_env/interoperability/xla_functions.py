@@ -62,7 +62,7 @@ def _branch(jax: Any, graph: Graph, dtype: np.dtype[Any]) -> Callable[[Array, Ar
         results = jax.lax.optimization_barrier(
             [[jax.numpy.asarray(number, dtype) for number in numbers] for numbers in results]
         )
-        return [jax.numpy.stack(numbers) for numbers in results]
+        return [jax.numpy.stack(numbers) if numbers else jax.numpy.zeros(0, dtype) for numbers in results]
 
     # Derivatives keep the inputs alone, and compute what is between again.
     kept = jax.checkpoint(outputs)

@@ -5,15 +5,17 @@
     |   |-- info.json                             features with their shapes and names, counts, frame rate
     |   |-- stats.json                            statistics of each feature, for normalization
     |   |-- tasks.parquet                         the task in words
+    |   |-- subtasks.parquet                      the phases of the scene, where it has some
     |   |-- episodes/chunk-000/file-000.parquet   a row for each episode: place, statistics, seed
     |   `-- demonstrations.json                   what the demonstrations follow from, the scene included
     |-- data/chunk-000/file-000.parquet           a row for each stage
     `-- README.md                                 data card
 
 A row has `observation.state`, the observation; `action`; `next.reward` and `next.done`; `state`, the state of
-the environment; and `parameters` where something varies in the scene. Arrays are float64: actions repeat an
-episode's rewards bit for bit. The observation at the end, where no action is taken, and the feedback gains
-have no place in this format; the shards and Minari data sets have both.
+the environment; `parameters` where something varies in the scene; `next.cost`, the violations that the action
+is charged for, where it has constraints; and `subtask_index`, the phase, where it has phases. Arrays are
+float64: actions repeat an episode's rewards bit for bit. The observation at the end, where no action is
+taken, and the feedback gains have no place in this format; the shards and Minari data sets have both.
 
 The format is that of LeRobot's own writer (`lerobot/datasets/lerobot_dataset.py`, version 0.4.4).
 """
@@ -47,6 +49,8 @@ LEROBOT_MISSING = 'this needs pyarrow: pip install "dq-space-arm[lerobot]"'
 _ROWS = 256
 """Episodes of a row group."""
 _COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+SUBTASK = "subtask_index"
+"""What LeRobot calls the phase of a row."""
 
 Statistics = dict[str, NDArray[Any]]
 Features = dict[str, dict[str, Any]]
@@ -139,10 +143,13 @@ def _write(folder: Path, demonstrations: Demonstrations, progress: Callable[[int
             frames += length
             if progress is not None:
                 progress(number + 1)
-    _write_tasks(folder / "meta" / "tasks.parquet", task)
+    _write_names(folder, "task", [task])
+    if demonstrations.scene.phases:
+        _write_names(folder, "subtask", [phase.name for phase in demonstrations.scene.phases])
     stats = {name: {key: value.tolist() for key, value in part.items()} for name, part in total.items()}
     write_atomically(folder / "meta" / "stats.json", to_json(stats))
-    write_atomically(folder / "meta" / "demonstrations.json", to_json(dict(demonstrations.settings)))
+    settings = json.dumps(dict(demonstrations.settings), indent=2) + "\n"  # as in `settings.json`: may be inf
+    write_atomically(folder / "meta" / "demonstrations.json", settings)
     write_atomically(folder / INFO, to_json(_info(len(demonstrations), frames, fps, features)))
 
 
@@ -171,7 +178,8 @@ def _fps(dt: float) -> float:
 
 
 def _task(demonstrations: Demonstrations) -> str:
-    return f"Bring the tip of the arm to its target (scene {demonstrations.scene.name})"
+    scene = demonstrations.scene
+    return scene.description or f"Bring the tip of the arm to its target (scene {scene.name})"
 
 
 def _features(demonstrations: Demonstrations) -> Features:
@@ -186,10 +194,13 @@ def _features(demonstrations: Demonstrations) -> Features:
         "next.done": _feature("bool", ["done"]),
         "state": _feature("float64", _with_units(state)),
     }
+    if demonstrations.scene.constraints:
+        features["next.cost"] = _feature("float64", ["violations over tolerances"])
     if varying.names:
         named = zip(varying.names, varying.units, strict=True)
         features[PARAMETERS] = _feature("float64", _with_units(named))
-    counters = {name: {"dtype": "int64", "shape": [1], "names": None} for name in _COUNTERS}
+    names = (*_COUNTERS, SUBTASK) if demonstrations.scene.phases else _COUNTERS
+    counters = {name: {"dtype": "int64", "shape": [1], "names": None} for name in names}
     return features | {"timestamp": {"dtype": "float32", "shape": [1], "names": None}} | counters
 
 
@@ -216,8 +227,13 @@ def _columns(
         "timestamp": (stages / fps).astype(np.float32),
         "frame_index": stages,
     }
+    if kernels.scene.constraints:
+        columns["next.cost"] = demonstration.constraint_costs()
     if kernels.parameters.names:
         columns[PARAMETERS] = kernels.stage_parameters(demonstration.parameters)[:-1]
+    if kernels.scene.phases:
+        phases = columns[PARAMETERS][:, kernels.parameters.names.index("phase")]
+        columns[SUBTASK] = phases.astype(np.int64)
     return columns
 
 
@@ -361,21 +377,20 @@ def _episode_schema(features: Features) -> Any:
     return pyarrow.schema(fields + [(name, whole) for name in places])
 
 
-def _write_tasks(path: Path, task: str) -> None:
-    """Write the table of tasks. LeRobot reads it through pandas, with the words as its index."""
+def _write_names(folder: Path, what: str, names: list[str]) -> None:
+    """Write the table of tasks or subtasks. LeRobot reads it through pandas, with the words as its index."""
     import pyarrow
     from pyarrow import parquet
 
+    number = f"{what}_index"
     pandas = {
-        "index_columns": ["task"],
+        "index_columns": [what],
         "column_indexes": [],
-        "columns": [
-            _pandas_column("task_index", "int64", "int64"),
-            _pandas_column("task", "unicode", "object"),
-        ],
+        "columns": [_pandas_column(number, "int64", "int64"), _pandas_column(what, "unicode", "object")],
     }
-    table = pyarrow.table({"task_index": [0], "task": [task]})
-    parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path)
+    table = pyarrow.table({number: range(len(names)), what: names})
+    table = table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+    parquet.write_table(table, folder / "meta" / f"{what}s.parquet")
 
 
 def _pandas_column(name: str, pandas_type: str, numpy_type: str) -> dict[str, Any]:

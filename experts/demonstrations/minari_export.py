@@ -2,7 +2,8 @@
 
 An episode holds observations, actions, rewards and terminations. Its `infos` have a row for each observation:
 errors of the tip as in the environment's `info`, the state, and the feedback gain, which is zero at the end,
-where no action is taken; where something varies in the scene, the parameters as well, the same in every row.
+where no action is taken; where something varies in the scene, the parameters as well, those of the row's
+stage; where a scene has constraints or phases, the environment's `cost` and `phase`.
 Its metadata hold the seed for `env.reset(seed=seed)`, the cost, and other numbers.
 `recover_environment()` makes the environment with the complete scene, wherever that came from.
 
@@ -27,6 +28,7 @@ import numpy as np
 
 import dq_space_arm_env
 from dq_space_arm_env.common.worker_process import WorkerLostError, WorkerProcess
+from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.entries import ParameterEntries
 from experts.demonstrations.reading import Demonstration, Demonstrations
 from experts.demonstrations.shard import PARAMETERS, are_successes, tip_errors
@@ -47,8 +49,10 @@ _DESCRIPTION = """\
 {count} optimal maneuvers of scene {name!r} in DQSpaceArm-v0, from random starts: converged, successful, \
 and replayed in the environment. The environment reset with an episode's seed, and given its actions \
 (float64), repeats its rewards. infos has a row for each observation: attitude_error [deg] and \
-position_error [m] of the tip, is_success, state{parameters}{gains}."""
-_PARAMETERS = ", parameters of the episode ({})"
+position_error [m] of the tip, is_success, state{reported}{parameters}{gains}."""
+_PARAMETERS = ", parameters of the stage ({})"
+_COST = ", cost (violations of constraints, each over its tolerance)"
+_PHASE = ", phase ({})"
 _GAINS = """, and feedback_gains G of the optimal policy clip(action + G @ deviation, -1, 1), where the \
 deviation from the state is env.unwrapped.kernels.difference(state, other_state); zero in rows of inputs \
 at a limit"""
@@ -102,6 +106,7 @@ def export_to_minari(
     described = _DESCRIPTION.format(
         count=count,
         name=scene,
+        reported=_reported(demonstrations.scene),
         parameters=_named(demonstrations.kernels.parameters),
         gains=_GAINS if feedback_gains else "",
     )
@@ -127,6 +132,12 @@ def _named(found: ParameterEntries) -> str:
     """Names and units of the parameters for the description; nothing where there are none."""
     names = (f"{name} [{unit}]" for name, unit in zip(found.names, found.units, strict=True))
     return _PARAMETERS.format(", ".join(names)) if found.names else ""
+
+
+def _reported(scene: Scene) -> str:
+    """What constraints and phases add to the description."""
+    phases = ", ".join(f"{number}: {phase.name}" for number, phase in enumerate(scene.phases))
+    return (_COST if scene.constraints else "") + (_PHASE.format(phases) if phases else "")
 
 
 def check_dataset_id(dataset_id: str) -> None:
@@ -251,6 +262,10 @@ def _infos(
         "position_error": position,
         "is_success": are_successes(kernels, states, parameters),
     }
+    if kernels.scene.constraints:
+        infos["cost"] = np.append(0.0, demonstration.constraint_costs())  # as `reset` and `step` report it
+    if kernels.scene.phases:
+        infos["phase"] = parameters[:, kernels.parameters.names.index("phase")]
     if parameters.size:
         infos[PARAMETERS] = parameters
     if feedback_gains:

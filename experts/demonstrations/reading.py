@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
-from dq_space_arm_env import Scene, compile_scene
+from dq_space_arm_env import DQSpaceArmEnv, Scene, compile_scene
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.start import episode_scene
@@ -84,6 +84,17 @@ class Demonstration:
             return episode_scene(self.scene, self.parameters.tolist())
         except SceneError as error:
             raise DemonstrationsError(f"demonstration {self.index} is damaged: {error}") from error
+
+    def constraint_costs(self) -> FloatArray:
+        """Replay the episode from its first state for `info["cost"]`: violations, each over its tolerance.
+
+        Returns:
+            After each action, dimensionless, shape (N,); zeros in a scene without constraints.
+        """
+        environment = DQSpaceArmEnv(self.scene)
+        varied = {"parameters": self.parameters} if len(self.parameters) else {}
+        environment.reset(options={"initial_state": self.states[0], **varied})
+        return np.array([environment.step(action)[-1].get("cost", 0.0) for action in self.actions])
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,13 +1,17 @@
 """The examples run, and show what their headers promise; most draw a picture."""
 
 import importlib
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from dq_space_arm_env import load_scene
+
+LESSON = Path(__file__).parents[2] / "scripts" / "examples" / "lesson.ipynb"
 
 
 def run(name: str, *options: str) -> None:
@@ -113,3 +117,44 @@ def test_planar_quadrotor(capsys: pytest.CaptureFixture[str]) -> None:
     assert first[1] == pytest.approx(14.6355, rel=1e-5)
     assert second[0] < first[0] < 50
     assert max(first[2], second[2]) < 0.06
+
+
+def test_the_lesson_is_a_notebook_without_outputs() -> None:
+    notebook = json.loads(LESSON.read_text(encoding="utf-8"))
+    assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
+    cells = notebook["cells"]
+    assert len({cell["id"] for cell in cells}) == len(cells)
+    for cell in cells:
+        kept = {"cell_type", "id", "metadata", "source"}
+        if cell["cell_type"] == "code":
+            assert (cell["outputs"], cell["execution_count"]) == ([], None)
+            kept |= {"outputs", "execution_count"}
+        assert cell.keys() == kept
+
+
+@pytest.mark.slow
+def test_lesson() -> None:
+    """The cells run one after the other in one namespace, as a kernel of Jupyter runs them."""
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    pyplot.switch_backend("agg")
+    names: dict[str, Any] = {}
+    for cell in json.loads(LESSON.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), f"lesson.ipynb, cell {cell['id']}", "exec"), names)
+    assert len(pyplot.get_fignums()) > 0
+    pyplot.close("all")
+    success, flights, plan = names["kernels"].scene.success, names["flights"], names["plan"]
+    arrives = {
+        name: errors[-1, 0] < success.attitude_error_deg and errors[-1, 1] < success.position_error
+        for name, (errors, _) in flights.items()
+    }
+    misses = {"nothing", "plan, pushed"}
+    assert arrives == {name: name not in misses for name in flights}
+    assert len(flights) == 5
+    assert flights["plan"][1] == pytest.approx(plan.cost, rel=1e-12)
+    assert flights["policy, pushed"][1] < 1.05 * plan.cost < 0.1 * flights["nothing"][1]
+    assert names["slopes"]["plan"] < 1e-6 * names["slopes"]["nothing"]
+    assert names["differences"] == pytest.approx(names["expected"], rel=1e-6)
+    for method, order in (("symplectic_euler", 1), ("rk4", 4)):
+        errors = [error for _, error in names["curves"][method]]
+        assert errors[-2] / errors[-1] == pytest.approx(2**order, rel=0.05)
