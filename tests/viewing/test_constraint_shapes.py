@@ -158,7 +158,7 @@ def test_what_the_tip_holds_in_a_phase_counts():
 def test_the_page_knows_shapes_and_violations(constrained, make_flight, paper):
     flight = make_flight(constrained)
     pages = [replay_page([flight], scene) for scene in (paper, constrained)]
-    text = r'<script type="application/json" id="replay-data">(.*?)</script>'
+    text = r'<script type="application/json" class="replay-data"[^>]*>(.*?)</script>'
     plain, data = (json.loads(re.search(text, page, re.DOTALL)[1]) for page in pages)
     assert "constraints" not in plain
     drawn, blob, flight = data["constraints"], b64decode(data["blob"]), make_flight(constrained)
