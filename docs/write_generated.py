@@ -1,7 +1,7 @@
 """Write the generated parts of the pages: `python docs/write_generated.py`; `make docs` runs it first.
 
-Tables of keys, help texts, docstrings of the environments and the table of policies come from the schemas,
-commands and records themselves. A test fails when a page is stale.
+Tables of keys, help texts, docstrings of the environments, the gallery and the table of policies come from
+the schemas, commands and records themselves. A test fails when a page is stale.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent)]
 
 from extensions.commands import command_pages  # noqa: E402 - the path comes first
+from extensions.gallery import gallery  # noqa: E402
 from extensions.keys import key_tables  # noqa: E402
 from extensions.policies import policy_table  # noqa: E402
 
@@ -54,6 +55,7 @@ TEXTS: Mapping[str, Callable[[], str]] = {
     "environment": partial(docstring_page, DQSpaceArmEnv),
     "goal-environment": partial(docstring_page, DQSpaceArmGoalEnv),
     "commands": command_pages,
+    "gallery": gallery,
     "zoo": policy_table,
 }
 

@@ -17,6 +17,7 @@ from dq_space_arm_env.common.files import check_writable_file
           dq-space-arm replay results/solutions/paper/solution.npz             # replay.html
           dq-space-arm replay results/solutions/paper/solution.npz flight.npz  # the second as a ghost
           dq-space-arm replay results/solutions/paper/solution.npz agent=results/agents/ppo-0
+          dq-space-arm replay results/solutions/*                              # a list of scenes
           dq-space-arm replay "results/demonstrations/paper#3" --open          # a demonstration
     """,
 )
@@ -31,7 +32,7 @@ from dq_space_arm_env.common.files import check_writable_file
 @click.option(
     "--label", "labels", multiple=True, help="Name of a flight on the page; one for each, in order."
 )
-@click.option("--scene", type=SCENE, help="Scene of flights whose file does not name one.")
+@click.option("--scene", type=SCENE, help="Scene to draw all flights in.  [default: each in its own]")
 @click.option("--seed", type=click.IntRange(min=0), help="Start policies where env.reset(seed=...) does.")
 @click.option("--open", "show", is_flag=True, help="Open the page in the browser.")
 @normalize_option
@@ -53,7 +54,8 @@ def replay(
     FLIGHT is a solution (the file or folder from `solve`), a rollout (from `simulate`), a folder of
     demonstrations, with #3 for demonstration 3, or a policy (a file, the folder of a training run, or a name
     of the zoo), which flies from where the first flight starts. LABEL=FLIGHT names it. The first flight is
-    drawn solid, the others as ghosts.
+    drawn solid, the others as ghosts. Flights of different scenes are entries of a list of scenes; --scene
+    draws them together.
     """
     if len(labels) > len(flights):
         raise click.UsageError(
@@ -68,7 +70,7 @@ def replay(
     sources = [_labeled(flight) for flight in flights]
     for place, label in enumerate(labels):
         sources[place] = label, sources[place][1]
-    shown, robot = collect_flights(
+    (shown, robot), *others = collect_flights(
         sources,
         None if scene is None else load_scene(scene),
         message_console(),
@@ -77,16 +79,18 @@ def replay(
         normalize=normalize,
     )
     out.parent.mkdir(parents=True, exist_ok=True)
-    size = write_replay(out, shown, robot).stat().st_size / 1e6
+    size = write_replay(out, shown, robot, *others).stat().st_size / 1e6
     if show:
         import webbrowser
 
         webbrowser.open(out.resolve().as_uri())
+    names = [robot.name, *(scene.name for _, scene in others)]
+    count = len(shown) + sum(len(flights) for flights, _ in others)
     if as_json:
-        print_document({"page": str(out), "scene": robot.name, "flights": len(shown)})
+        print_document({"page": str(out), "scene": robot.name, "scenes": names, "flights": count})
         return
-    noun = "flight" if len(shown) == 1 else "flights"
-    sentence = f"{out}: {len(shown)} {noun} of scene {robot.name}, {size:.1f} MB; open it in a browser"
+    noun, where = "flight" if count == 1 else "flights", "scenes" if others else "scene"
+    sentence = f"{out}: {count} {noun} of {where} {', '.join(names)}, {size:.1f} MB; open it in a browser"
     table_console().print(sentence, markup=False, soft_wrap=True)
 
 

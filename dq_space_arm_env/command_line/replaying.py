@@ -13,7 +13,7 @@ from dq_space_arm_env.command_line.simulated_episode import (
     fly,
 )
 from dq_space_arm_env.common.bounded_reading import archive_members
-from dq_space_arm_env.viewing.replay import Trajectory, common_scene, read_flight, write_replay
+from dq_space_arm_env.viewing.replay import Trajectory, by_scene, common_scene, read_flight, write_replay
 
 
 def collect_flights(
@@ -24,12 +24,13 @@ def collect_flights(
     seed: int | None = None,
     trust: bool = False,
     normalize: Path | None = None,
-) -> tuple[list[Trajectory], Scene]:
+) -> list[tuple[list[Trajectory], Scene]]:
     """Read flights, and let policies fly from where the first one starts, or where `seed` does.
 
-    `sources` are pairs of a label, or None, and a recording or a policy; `scene` is by default the first that
-    a recording names.
+    `sources` are pairs of a label, or None, and a recording or a policy. All are shown in `scene`; by default
+    each in its own, policies in the first that a recording names.
     """
+    given = scene
     sources = [(label, _file_of(source)) for label, source in sources]
     statistics = statistics_by_model([source for _, source in sources], normalize)
     recordings: dict[int, Trajectory] = {}
@@ -46,15 +47,16 @@ def collect_flights(
         begun = begin(scene, seed, state)
         for place, (label, source) in enumerate(sources):
             if place not in recordings:
-                given = statistics.get(source)
-                pilot = load_policy(source, begun, console, seed, trust=trust, normalize=given)
+                found = statistics.get(source)
+                pilot = load_policy(source, begun, console, seed, trust=trust, normalize=found)
                 recordings[place] = fly(scene, begun, pilot, seed=seed, label=label)
-    return common_scene([recordings[place] for place in range(len(sources))], scene)
+    flights = [recordings[place] for place in range(len(sources))]
+    return by_scene(flights) if given is None else [common_scene(flights, given)]
 
 
 def show_maneuver(scene: Scene, page: Path, console: Console) -> str:
     """Solve and fly a scene's maneuver, open its page in the browser, and say how it ended."""
-    shown, robot = collect_flights([("the first maneuver", "plan")], scene, console)
+    [(shown, robot)] = collect_flights([("the first maneuver", "plan")], scene, console)
     write_replay(page, shown, robot)
     webbrowser.open(page.resolve().as_uri())
     flight = shown[0]

@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from dq_space_arm_env.algebra import poses, rotations
+from dq_space_arm_env.interoperability import mjcf_looks as looks
 from dq_space_arm_env.interoperability.exporting import (
     free_name,
     joint_limits,
@@ -19,10 +20,9 @@ from dq_space_arm_env.interoperability.exporting import (
     tip_on_its_body,
     words,
 )
-from dq_space_arm_env.scene import Base, Link, Payload, Scene, Shape, StateLayout
+from dq_space_arm_env.interoperability.mjcf_looks import placed
+from dq_space_arm_env.scene import Base, Link, Payload, Scene, StateLayout
 from dq_space_arm_env.scene.bodies import freedoms
-from dq_space_arm_env.scene.shapes import COLORS, color_of
-from dq_space_arm_env.validation.fields import Three
 
 _FORCE_GEARS = ("1 0 0 0 0 0", "0 1 0 0 0 0", "0 0 1 0 0 0")
 _TORQUE_GEARS = ("0 0 0 1 0 0", "0 0 0 0 1 0", "0 0 0 0 0 1")
@@ -31,7 +31,10 @@ _TORQUE_GEARS = ("0 0 0 1 0 0", "0 0 0 0 1 0", "0 0 0 0 0 1")
 def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
     """Write a scene's robot as MJCF.
 
-    There is no gravity, and nothing collides: the scene's shapes, if it gives any, are there to be seen.
+    There is no gravity, and nothing collides. Geoms are there to be seen, and weigh nothing: the scene's
+    shapes, or boxes and rods in the proportions of the project's pictures. Camera `overview` has start and
+    target in view, light `sun` shines from over its shoulder. Body `target`, a mocap body, stands where the
+    target's does at the start, with its shapes and site `target`, where the tip should be.
     Body `base` has the frame e0 and a free joint, called `base joint`; in a planar scene it slides along x
     and y and turns about z. Each link is a body with the frame of its joint, a hinge about z or a slide along
     it or a ball, called by the link's name and " joint", with the scene's damping, spring and limits of the
@@ -68,10 +71,13 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     SubElement(root, "option", gravity="0 0 0", timestep=words([scene.simulation.dt]), integrator="RK4")
     names = [link.name for link in scene.links]
-    base = SubElement(SubElement(root, "worldbody"), "body", name=free_name("base", names))
+    world = Element("worldbody")
+    looks.add_surroundings(root, world, scene)
+    root.append(world)
+    base = SubElement(world, "body", name=free_name("base", names))
     _add_base_joint(base, scene)
     _add_inertial(base, scene.base, (0.0, 0.0, 0.0))
-    _add_shapes(base, scene.base.geometry, COLORS["foil"])
+    looks.add_base(base, scene.base)
     SubElement(base, "site", name="e0")
     bodies = [base]
     limits = joint_limits(scene)
@@ -81,13 +87,14 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
         if not link.is_fixed:
             _add_joint(body, link, lower, upper)
         _add_inertial(body, link, link.center_of_mass)
-        _add_shapes(body, link.geometry, COLORS["white"])
     tip, body = tip_on_its_body(scene), bodies[scene.tip_body]
-    SubElement(body, "site", {"name": "tip", **_placed(tip)})
+    looks.add_arm(bodies, scene)
+    looks.add_mark(body, scene, "tip", tip)
     if scene.payload is not None:
         payload = _add_body(body, free_name("payload", names), tip)
         _add_inertial(payload, scene.payload, scene.payload.center_of_mass)
-        _add_shapes(payload, scene.payload.geometry, COLORS["teal"])
+        looks.add_payload(payload, scene.payload)
+    looks.add_target(world, scene, free_name("target", [*names, base.get("name", ""), "payload"]))
     _add_actuators(root, scene)
     _add_start(root, scene)
     ElementTree.indent(root)
@@ -103,12 +110,7 @@ def _add_base_joint(base: Element, scene: Scene) -> None:
 
 
 def _add_body(parent: Element, name: str, pose: Sequence[float]) -> Element:
-    return SubElement(parent, "body", {"name": name, **_placed(pose)})
-
-
-def _placed(pose: Sequence[float]) -> dict[str, str]:
-    rotation, position = poses.to_rotation_and_position(tuple(pose))
-    return {"pos": words(position), "quat": words(rotation)}
+    return SubElement(parent, "body", {"name": name, **placed(pose)})
 
 
 def _add_inertial(parent: Element, body: Base | Link | Payload, center_of_mass: Sequence[float]) -> None:
@@ -132,16 +134,6 @@ def _add_inertial(parent: Element, body: Base | Link | Payload, center_of_mass: 
         mass=words([body.mass]),
         diaginertia=words(moments),
     )
-
-
-def _add_shapes(body: Element, shapes: Sequence[Shape], color: Three) -> None:
-    """Add shapes that collide with nothing and have no mass."""
-    for shape in shapes:
-        x, y, z = (0.5 * edge for edge in shape.edges)
-        size, kind = ((x, y, z), "box") if shape.cylinder is None else ((x, z), "cylinder")
-        look = {"type": kind, "size": words(size), "rgba": words([*color_of(shape, color), 1.0])}
-        place = _placed(shape.pose.dual_quaternion)
-        SubElement(body, "geom", {**look, **place, "contype": "0", "conaffinity": "0"})
 
 
 def _add_joint(body: Element, link: Link, lower: float, upper: float) -> None:

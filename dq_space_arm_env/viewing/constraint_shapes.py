@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.constraint_rows import pairs_that_may_touch, rows_of
 from dq_space_arm_env.scene.constraints import (
@@ -35,7 +36,11 @@ INERTIAL = -1
 GAS = -2
 """Number of the axes of which z is where the gas of the net force goes; of thruster i it is GAS - 1 - i."""
 
+REACH = 4.0
+"""Length of cones and directions over that of the axes at the tip."""
+
 _COLOR: Color = (1.0, 1.0, 1.0)  # the page tints them
+_KEPT: Color = (0.24, 0.81, 0.60)
 _SIDES = 32
 # Of a thruster that misses nothing in particular: share of the length, half angle in degrees.
 _JET = (0.3, 15.0)
@@ -109,6 +114,40 @@ def gas_of(scene: Scene, controls: FloatArray) -> FloatArray:
         largest = each.force if math.isfinite(each.force) else max(float(force.max(initial=0.0)), 1.0)
         gas[:-1, 1 + index] = -force / largest * np.array(each.unit_direction)
     return gas
+
+
+def shapes_in_space(shapes: Sequence[ConstraintShape], frames: FloatArray, gas: FloatArray) -> Iterator[Mesh]:
+    """Place shapes at an instant, transparent, in green.
+
+    Args:
+        shapes: The shapes.
+        frames: Poses of the robot's frames, the target and the target's body, shape (frames + 2, 8), m.
+        gas: A row of `gas_of`, shape (1 + thrusters, 3).
+
+    Yields:
+        Meshes in the inertial frame.
+    """
+    matrices, places = poses.to_matrix(np.vstack([frames, np.eye(8)[0]]).T)  # INERTIAL is the last
+    turns: FloatArray = np.moveaxis(np.array(matrices), 2, 0)
+    origins = np.array(places).T
+    for shape in shapes:
+        mesh, turn = shape.mesh.likeness(_KEPT), turns[shape.place]
+        if shape.axes <= GAS:
+            blown = gas[GAS - shape.axes]
+            size = float(np.linalg.norm(blown))
+            if size == 0.0:
+                continue
+            mesh, axes = replace(mesh, corners=math.sqrt(size) * mesh.corners), turn @ _along(blown / size)
+        else:
+            axes = turns[shape.axes]
+        yield mesh.moved(0, axes, origins[shape.place] + turn @ shape.nozzle)
+
+
+def _along(z: FloatArray) -> FloatArray:
+    """Some axes of which z is given, as columns."""
+    across = np.cross(z, np.eye(3)[np.abs(z).argmin()])
+    y = across / np.linalg.norm(across)
+    return np.column_stack([np.cross(y, z), y, z])
 
 
 def _largest(actuator: Any, given: FloatArray) -> float:

@@ -1,4 +1,4 @@
-"""A maneuver as an animated GIF or a strip of moments, drawn by the environment's renderer."""
+"""A maneuver as an animated GIF or WebP or a strip of moments, drawn by the environment's renderer."""
 
 from __future__ import annotations
 
@@ -12,9 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.viewing.picture_format import PictureFormat
+from dq_space_arm_env.task.trajectory import Trajectory
+from dq_space_arm_env.viewing.constraint_shapes import REACH, constraint_shapes, gas_of, shapes_in_space
+from dq_space_arm_env.viewing.picture_format import PictureFormat, View
 from dq_space_arm_env.viewing.rendering import Renderer
-from dq_space_arm_env.viewing.replay.flights import target_during
+from dq_space_arm_env.viewing.rendering.camera import Camera, camera_around
+from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
+from dq_space_arm_env.viewing.replay.flights import prepare, target_during
+from dq_space_arm_env.viewing.replay.geometry import view_of
 from experts.maneuver import Maneuver
 
 if TYPE_CHECKING:
@@ -25,21 +30,33 @@ Image = NDArray[np.uint8]
 FASTEST = 50.0
 """Pictures per second, 1/s: players slow down pictures shorter than 0.02 s."""
 
-NO_PILLOW = 'a GIF or PNG needs Pillow, which is not installed: pip install "dq-space-arm[plots]"'
+NO_PILLOW = 'a GIF, PNG or WebP needs Pillow, which is not installed: pip install "dq-space-arm[plots]"'
 _LONGEST_HOLD = 600.0  # s; the file has 16 bits for hundredths of a second
 _GAP = 4  # pixels between the pictures of a strip
+_MARGIN = 0.03  # around a whole maneuver, of its extent
 _PALETTE_PICTURES = 12  # from which the colors of all are chosen
 _PALETTE_POWER = 0.5  # of how often a color occurs, for its share of the palette
 
 
-def draw_maneuver(maneuver: Maneuver, picture: PictureFormat, fps: float, seconds: float) -> list[Image]:
-    """Draw the first seconds of a maneuver in real time: RGB pictures, shape (height, width, 3)."""
+def draw_maneuver(
+    maneuver: Maneuver, picture: PictureFormat, fps: float, seconds: float, *, whole: bool = False
+) -> list[Image]:
+    """Draw the first seconds of a maneuver in real time: RGB pictures, shape (height, width, 3).
+
+    The camera stands where the environment has it, or, for a `whole` maneuver, where a replay has it: on the
+    side that shows most, with all of the motion in view; and constraints are drawn as shapes, too.
+    """
     for name, value in (("fps", fps), ("seconds", seconds)):
         if not value > 0.0:
             raise ValueError(f"{name}: {value}, should be positive")
     if not math.isfinite(fps):
         raise ValueError(f"fps: {fps}, should be finite")
     renderer = Renderer(maneuver.scene, picture)
+    if whole:
+        renderer.camera = _camera_of_all(maneuver, picture)
+        length = REACH * SpacecraftModel(maneuver.scene).axis_length
+        shapes = [each for group in constraint_shapes(maneuver.scene, length) for each in group]
+        gas = gas_of(maneuver.scene, maneuver.controls)
     tips = np.array(poses.position(maneuver.frames[:, -1].T)).T
     times = np.arange(0.0, min(seconds, maneuver.time[-1]) + 1e-9, 1.0 / fps)
     stages = np.searchsorted(maneuver.time, times - 0.5 * maneuver.scene.simulation.dt)
@@ -52,8 +69,20 @@ def draw_maneuver(maneuver: Maneuver, picture: PictureFormat, fps: float, second
         )
         assert target is not None
         renderer.aim_at(target, body, payload)
+        if whole:
+            here = np.vstack([maneuver.frames[stage], target, target if body is None else body])
+            renderer.overlay = [*shapes_in_space(shapes, here, gas[stage])]
         pictures.append(renderer.draw(maneuver.frames[stage], tips[: stage + 1]))
     return pictures
+
+
+def _camera_of_all(maneuver: Maneuver, picture: PictureFormat) -> Camera:
+    """The replay's side and points in view; its azimuth and elevation are those of the camera."""
+    flight = Trajectory(maneuver.scene.name, maneuver.states, maneuver.controls, scene=maneuver.scene)
+    view = view_of(prepare([flight], maneuver.scene), maneuver.scene)
+    toward = View(180.0 + math.degrees(view.azimuth), -math.degrees(view.elevation))
+    margins = np.full(len(view.points), _MARGIN * float(np.ptp(view.points, axis=0).max()))
+    return camera_around(view.points, margins, toward, picture.width, picture.height)
 
 
 def encode_strip(pictures: Sequence[Image], colors: int = 192) -> bytes:
@@ -115,6 +144,32 @@ def encode_gif(pictures: Sequence[Image], fps: float, hold: float, colors: int =
         transparency=colors,
         disposal=1,
         optimize=False,
+    )
+    return file.getvalue()
+
+
+def encode_webp(pictures: Sequence[Image], fps: float, hold: float, quality: int) -> bytes:
+    """Encode RGB pictures as a WebP that loops, in half the bytes of a GIF; quality 0 to 100."""
+    check_gif(fps, hold, 2)
+    try:
+        from PIL import Image as Pillow
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(NO_PILLOW) from error
+    frames = [Pillow.fromarray(picture) for picture in pictures]
+    durations = [round(1000.0 / fps)] * (len(frames) - 1) + [round(1000.0 * hold)]
+    # A whole picture costs as much as all that follow: none but the first.
+    distances = {"kmin": len(frames), "kmax": len(frames) + 1}
+    file = io.BytesIO()
+    frames[0].save(
+        file,
+        "WEBP",
+        save_all=True,
+        append_images=frames[1:],
+        duration=durations,
+        loop=0,
+        quality=quality,
+        method=6,
+        **distances,
     )
     return file.getvalue()
 

@@ -1,5 +1,6 @@
 """The script that writes pages: what it takes for flights, and what it refuses."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, compile_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.command_line.replaying import collect_flights
 from dq_space_arm_env.scene import StateLayout
-from dq_space_arm_env.viewing.replay import Trajectory, common_scene, read_flight
+from dq_space_arm_env.viewing.replay import Trajectory, by_scene, common_scene, read_flight
 
 
 @pytest.fixture
@@ -42,7 +43,8 @@ def test_policy_flies_from_where_the_first_flight_starts(rollout: Path, scene: S
     n_obs = DQSpaceArmVectorEnv(1, scene).reset()[0].shape[1]
     policy = save_policy(tmp_path / "half.npz", n_obs)
     start = read_flight(rollout).states[0]
-    (_, flight), _ = collect_flights([(None, str(rollout)), (None, str(policy))], scene, Console(quiet=True))
+    sources = [(None, str(rollout)), (None, str(policy))]
+    [((_, flight), _)] = collect_flights(sources, scene, Console(quiet=True))
     np.testing.assert_allclose(flight.states[0], start, atol=1e-12)
     assert flight.states.shape[0] == 61
     np.testing.assert_allclose(flight.controls, np.tile([1.0, 0.25], (60, 1)))
@@ -95,3 +97,38 @@ def test_scenes_may_differ_in_masses_and_target(rollout: Path, scene: Scene) -> 
     slower = scene.replace(simulation={"dt": 0.1})
     with pytest.raises(ValueError, match=r"time steps of 0.1 s, the scene 'short' has 0.05 s"):
         common_scene([one, replace(one, scene=slower)])
+
+
+def test_flights_of_different_scenes_are_a_list_of_scenes(
+    rollout: Path, scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    swing = read_flight(rollout)
+    heavy = scene.replace({"name": "heavy", "base.mass": 30.0})
+    for name, flight in (("heavy", replace(swing, label="h", scene=heavy)), ("again", swing)):
+        flight.save(tmp_path / f"{name}.npz")
+    files = [str(rollout), str(tmp_path / "heavy.npz"), str(tmp_path / "again.npz")]
+    out = tmp_path / "page.html"
+    assert main(["replay", *files, "--out", str(out), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == {"page": str(out), "scene": "short", "scenes": ["short", "heavy"], "flights": 3}
+    page = out.read_text(encoding="utf-8")
+    assert page.count("data-scene=") == 2
+    shown = [
+        (each.name, [flight.label for flight in flights])
+        for flights, each in by_scene([read_flight(file) for file in files])
+    ]
+    assert shown == [("short", ["swing", "swing"]), ("heavy", ["h"])]
+    # In one scene all are drawn together.
+    assert main(["replay", *files, "--out", str(out), "--scene", str(tmp_path / "short.yaml")]) == 0
+    assert out.read_text(encoding="utf-8").count("data-scene=") == 1
+    assert "3 flights of scene short, " in " ".join(capsys.readouterr().out.split())
+
+
+def test_flights_without_a_scene_belong_to_the_first(rollout: Path, scene: Scene) -> None:
+    swing = read_flight(rollout)
+    heavy = scene.replace({"name": "heavy", "base.mass": 30.0})
+    bare = replace(swing, label="bare", scene=None)
+    [(flights, shown), _] = by_scene([bare, swing, replace(swing, scene=heavy)])
+    assert ([flight.label for flight in flights], shown.name) == (["bare", "swing"], "short")
+    with pytest.raises(ValueError, match="no file says which scene it belongs to"):
+        by_scene([bare])

@@ -1,5 +1,10 @@
 """MJCF of scenes in MuJoCo: accelerations, inverse dynamics, tip, start, limits."""
 
+import os
+import subprocess
+import sys
+from xml.etree import ElementTree
+
 import numpy as np
 import pytest
 from foreign_robots import ROBOTS, accelerations, drawn, foreign_scene, relative_error, tip_pose
@@ -7,6 +12,7 @@ from foreign_robots import ROBOTS, accelerations, drawn, foreign_scene, relative
 from dq_space_arm_env import SceneError, load_scene, scene_to_mjcf, scene_to_urdf
 from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.path import shown_target
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -149,17 +155,121 @@ def test_shapes_are_seen_and_weigh_nothing():
         {"cylinder": {"radius": 0.2, "length": 3}, "pose": {"rotation": {"axis": [1, 0, 0], "angle": 30}}},
     ]
     scene = load_scene("payload")
-    scene = scene.replace({f"{body}.geometry": shapes for body in ("base", "links.1", "payload")})
+    bodies = ("base", "links.0", "links.1", "links.2", "payload", "target")
+    scene = scene.replace({f"{body}.geometry": shapes for body in bodies})
     check_accelerations(scene, samples=1)
     model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene))
-    assert [model.body(number).name for number in model.geom_bodyid[::2]] == ["base", "link 2", "payload"]
+    named = [model.body(number).name for number in model.geom_bodyid[::2]]
+    assert named == ["base", "link 1", "link 2", "link 3", "payload", "target"]
     np.testing.assert_allclose(model.geom_size[0], [0.5, 1.0, 1.5])
     np.testing.assert_allclose(model.geom_size[3, :2], [0.2, 1.5])
     np.testing.assert_allclose(model.geom_pos[2], [0.1, 0.2, 0.3])
     np.testing.assert_allclose(np.abs(model.geom_quat[5]), [np.cos(np.pi / 12), np.sin(np.pi / 12), 0, 0])
     np.testing.assert_allclose(model.geom_rgba[4], [0.2, 0.4, 0.6, 1.0], rtol=1e-6)
     assert not model.geom_contype.any()
-    assert "<geom" not in scene_to_mjcf(load_scene("payload"))
+
+
+DRAWN = ("paper", "planar", "payload", "six-joint", "dual-arm", "solar-panels", "heavy-wrist", "servicing")
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_geoms_neither_weigh_nor_push(name):
+    """Masses are the scene's to the bit, and without geoms nothing moves otherwise."""
+    scene = load_scene(name)
+    text = scene_to_mjcf(scene, wrist="fixed")
+    model = mujoco.MjModel.from_xml_string(text)
+    root = ElementTree.fromstring(text)
+    for body in root.iter("body"):
+        for geom in body.findall("geom"):
+            body.remove(geom)
+    bare = mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
+    assert (model.ngeom > 0, bare.ngeom) == (True, 0)
+    masses = {link.name: link.mass for link in scene.links} | {"base": scene.base.mass}
+    assert {each: model.body(each).mass[0] for each in masses} == masses
+    for each in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
+        np.testing.assert_array_equal(getattr(model, each), getattr(bare, each))
+    rng = np.random.default_rng(1)
+    rates, torques = rng.normal(size=model.nv), rng.normal(size=model.nu)
+    found = []
+    for each in (model, bare):
+        data = mujoco.MjData(each)
+        mujoco.mj_resetDataKeyframe(each, data, 0)
+        data.qvel, data.ctrl = rates, torques
+        for _ in range(20):
+            mujoco.mj_step(each, data)
+        found.append((data.qpos.copy(), data.ncon))
+    assert found[0][1] == 0
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_rods_join_the_joints_and_the_camera_sees_arm_and_target(name):
+    scene = load_scene(name)
+    model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene, wrist="fixed"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    target = np.atleast_2d(shown_target(scene)[0])[0]
+    rotation, position = poses.to_matrix(tuple(target))
+    np.testing.assert_allclose(data.site("target").xpos, position, atol=1e-14)
+    np.testing.assert_allclose(data.site("target").xmat.reshape(3, 3), rotation, atol=1e-14)
+    camera = data.camera("overview")
+    joints = [data.body(link.name).xpos for link in scene.links]
+    seen = np.array([data.site("tip").xpos, data.site("target").xpos, *joints]) - camera.xpos
+    right, up, backward = (seen @ camera.xmat.reshape(3, 3)).T
+    reach = np.tan(0.5 * np.radians(model.camera("overview").fovy[0]))
+    assert (backward < 0.0).all()
+    assert (np.abs(up / backward) < reach).all()
+    assert (np.abs(right / backward) < 4.0 / 3.0 * reach).all()
+    # Of a link without shapes some rod begins at its joint and ends at the joint of a link that it carries.
+    for number, parent in enumerate(scene.parent_bodies):
+        if parent == 0 or scene.links[parent - 1].geometry:
+            continue
+        name, start, end = scene.links[parent - 1].name, joints[parent - 1], joints[number]
+        if np.linalg.norm(end - start) < 0.05:
+            continue
+        geoms = np.flatnonzero(model.geom_bodyid == model.body(name).id)
+        ends = [
+            data.geom_xpos[geom] + sign * model.geom_size[geom, 1] * data.geom_xmat[geom].reshape(3, 3)[:, 2]
+            for geom in geoms
+            for sign in (-1.0, 1.0)
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER
+        ]
+        for place in (start, end):
+            assert np.linalg.norm(np.array(ends) - place, axis=1).min() < 1e-12
+
+
+PICTURE = """
+import sys, mujoco
+model = mujoco.MjModel.from_xml_string(sys.stdin.read())
+data = mujoco.MjData(model)
+mujoco.mj_resetDataKeyframe(model, data, 0)
+mujoco.mj_forward(model, data)
+try:
+    renderer = mujoco.Renderer(model, 120, 160)
+except Exception:
+    sys.exit(3)
+renderer.update_scene(data, camera="overview")
+sys.stdout.buffer.write(renderer.render().tobytes())
+"""
+
+
+@pytest.mark.slow
+def test_mujoco_draws_the_spacecraft_in_the_light():
+    """The golden base and the white arm before a dark sky."""
+    text = scene_to_mjcf(load_scene("no-wrist"))
+    command = [sys.executable, "-c", PICTURE]
+    surroundings = os.environ | {"MUJOCO_GL": "egl"}
+    done = subprocess.run(command, input=text.encode(), capture_output=True, env=surroundings, check=False)
+    if done.returncode:
+        pytest.skip("no graphics for MuJoCo")
+    red, green, blue = np.frombuffer(done.stdout, np.uint8).astype(int).reshape(-1, 3).T
+    golden = (red > 120) & (red > blue + 60)
+    white = (np.minimum(np.minimum(red, green), blue) > 110) & (red < blue + 25)
+    dark = np.maximum(np.maximum(red, green), blue) < 60
+    assert 0.03 < golden.mean() < 0.3
+    assert white.mean() > 0.005
+    assert dark.mean() > 0.5
 
 
 def test_a_lamina_is_a_body_to_mujoco_too():

@@ -11,7 +11,8 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 from dq_space_arm_env.viewing.rendering import Renderer
-from experts.figures.animation import check_gif, draw_maneuver, encode_gif, encode_strip
+from experts.figures import animation
+from experts.figures.animation import check_gif, draw_maneuver, encode_gif, encode_strip, encode_webp
 from experts.maneuver import Maneuver
 
 SMALL = PictureFormat(64, 48)
@@ -85,6 +86,52 @@ def test_gif_plays_what_was_drawn(maneuver):
         shown = np.asarray(file.convert("RGB")).astype(int)
         assert np.abs(shown - picture).mean() < 4.0
         assert (np.abs(shown - picture).max(axis=2) > 60).mean() < 0.02
+
+
+def test_webp_plays_what_was_drawn(maneuver):
+    pillow = pytest.importorskip("PIL.Image")
+    pictures = draw_maneuver(maneuver, SMALL, fps=10.0, seconds=1.0, whole=True)
+    file = pillow.open(io.BytesIO(encode_webp(pictures, fps=10.0, hold=2.0, quality=90)))
+    assert file.n_frames == len(pictures) == 11
+    assert file.info["loop"] == 0
+    for number, picture in enumerate(pictures):
+        file.seek(number)
+        file.load()
+        assert file.info["duration"] == (2000 if number == 10 else 100)
+        assert np.abs(np.asarray(file.convert("RGB")).astype(int) - picture).mean() < 6.0
+
+
+@pytest.mark.parametrize("name", ["paper", "servicing", "planar"])
+def test_a_whole_maneuver_stays_in_the_picture(name):
+    """The robot flies off and turns; its shapes stay inside the border of the camera's picture."""
+    scene = load_scene(name)
+    layout = StateLayout.of(scene)
+    states = np.tile(layout.initial_state, (201, 1))
+    states[:, layout.state.joint_angles] += np.linspace(0.0, 1.5, 201)[:, None]
+    whole = Maneuver(scene, states, np.zeros((200, layout.n_u)))
+    camera = animation._camera_of_all(whole, SMALL)
+    tips = np.transpose(poses.position(whole.frames.reshape(-1, 8).T))
+    x, y, _ = camera.project(tips).T
+    assert ((x > 0) & (x < SMALL.width) & (y > 0) & (y < SMALL.height)).all()
+    moved, still = (
+        draw_maneuver(whole, SMALL, fps=1.0, seconds=1.0, whole=every)[0] for every in (True, False)
+    )
+    assert (moved != still).any()
+
+
+def test_constraints_of_a_whole_maneuver_are_drawn_in_green():
+    scene = load_scene("pointing")
+    layout = StateLayout.of(scene)
+    states = np.tile(layout.initial_state, (3, 1))
+    maneuver = Maneuver(scene, states, np.zeros((2, layout.n_u)))
+    shown = draw_maneuver(maneuver, SMALL, fps=50.0, seconds=0.01, whole=True)[0].astype(int)
+    bare = scene.replace(constraints=[])
+    plain = Maneuver(bare, states, np.zeros((2, layout.n_u)))
+    hidden = draw_maneuver(plain, SMALL, fps=50.0, seconds=0.01, whole=True)[0].astype(int)
+    changed = np.abs(shown - hidden).max(axis=2) > 20
+    assert changed.mean() > 0.05
+    greener = shown[changed] - hidden[changed]
+    assert (greener[:, 1] > greener[:, 0]).mean() > 0.9
 
 
 def test_a_strip_shows_moments_side_by_side(maneuver):

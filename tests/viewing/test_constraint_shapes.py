@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import compile_scene, load_scene
+from dq_space_arm_env.algebra import poses, rotations
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.constraint_rows import path_rows
 from dq_space_arm_env.viewing.constraint_shapes import (
@@ -16,6 +17,7 @@ from dq_space_arm_env.viewing.constraint_shapes import (
     VISIBLE,
     constraint_shapes,
     gas_of,
+    shapes_in_space,
     violations,
 )
 from dq_space_arm_env.viewing.replay import replay_page
@@ -156,7 +158,7 @@ def test_what_the_tip_holds_in_a_phase_counts():
 def test_the_page_knows_shapes_and_violations(constrained, make_flight, paper):
     flight = make_flight(constrained)
     pages = [replay_page([flight], scene) for scene in (paper, constrained)]
-    text = r'<script type="application/json" id="replay-data">(.*?)</script>'
+    text = r'<script type="application/json" class="replay-data"[^>]*>(.*?)</script>'
     plain, data = (json.loads(re.search(text, page, re.DOTALL)[1]) for page in pages)
     assert "constraints" not in plain
     drawn, blob, flight = data["constraints"], b64decode(data["blob"]), make_flight(constrained)
@@ -181,3 +183,35 @@ def test_the_page_knows_shapes_and_violations(constrained, make_flight, paper):
 def test_scenes_that_ship_have_few_shapes():
     counts = [len(group) for group in constraint_shapes(load_scene("keep-out"), 1.0)]
     assert counts == [3, 2]
+
+
+def test_shapes_stand_in_space_where_their_frames_are(constrained):
+    """The base is turned and moved: its cones go with it, the sun and the ball in space do not."""
+    shapes = [shape for group in constraint_shapes(constrained, 2.0) for shape in group]
+    turn = rotations.from_axis_angle((0.6, 0.0, 0.8), 0.7)
+    pose = np.array(poses.from_rotation_and_position(turn, (1.0, 2.0, 3.0)))
+    matrix, origin = np.array(rotations.to_matrix(turn)), np.array([1.0, 2.0, 3.0])
+    layout = StateLayout.of(constrained)
+    count = compile_scene(constrained).frame_poses(layout.initial_state).shape[0]
+    frames = np.tile(pose, (count + 2, 1))
+    gas = np.array([[0.0, 0.25, 0.0]])
+    placed = [mesh.corners.reshape(-1, 3) for mesh in shapes_in_space(shapes, frames, gas)]
+    assert len(placed) == len(shapes)
+    for corners, shape in zip(placed, shapes, strict=True):
+        own = shape.mesh.corners.reshape(-1, 3)
+        if shape.place == INERTIAL:
+            expected = own
+        elif shape.axes == INERTIAL:
+            expected = origin + own
+        elif shape.axes > GAS:
+            expected = own @ matrix.T + origin
+        else:  # along the force's gas in base axes, half as long at a quarter of the largest force
+            along = (corners - (matrix @ shape.nozzle + origin)) @ matrix
+            np.testing.assert_allclose(along[:, 1].max(), 0.5 * own[:, 2].max())
+            np.testing.assert_allclose(
+                np.hypot(along[:, 0], along[:, 2]).max(), 0.5 * own[:, 0].max(), rtol=0.01
+            )
+            continue
+        np.testing.assert_allclose(corners, expected, atol=1e-12)
+    quiet = [*shapes_in_space(shapes, frames, 0.0 * gas)]
+    assert len(quiet) == len(shapes) - 1

@@ -255,7 +255,7 @@ def test_a_page_has_the_path_of_the_payload_and_keeps_it_in_view(make_flight):
     flight = make_flight(scene, steps=20)
     far = moving(21, scene.target.pose.dual_quaternion, [0.0, 0.0, 0.0, 0.3, 0.2, 0.1])
     away = replace(flight, payload=far)
-    text = re.search(r'id="replay-data">(.*?)</script>', replay_page([away], scene), re.DOTALL)[1]
+    text = re.search(r'class="replay-data"[^>]*>(.*?)</script>', replay_page([away], scene), re.DOTALL)[1]
     data = json.loads(text)
     place, blob = data["flights"][0]["payload"], b64decode(data["blob"])
     found = np.frombuffer(blob, place["type"], place["length"], place["start"]).reshape(21, 8)

@@ -1,5 +1,6 @@
 """The page in a real browser, offline: silent, and following slider, keys, mouse, size and theme."""
 
+from base64 import b64encode
 from dataclasses import replace
 
 import numpy as np
@@ -352,3 +353,91 @@ def test_violated_constraints_are_red_and_can_be_switched_off(open_flights, make
     opened.page.locator("#constraints input").first.uncheck()
     assert opened.picture() != seen
     assert open_flights([make_flight(paper)], paper).page.is_hidden("#constraints")
+
+
+@pytest.mark.slow
+def test_the_list_of_scenes_and_the_address_choose_one(open_page, make_flight, paper, tmp_path):
+    planar = load_scene("planar").replace(name="a plane: x & y")
+    file = write_replay(tmp_path / "page.html", [make_flight(paper)], paper, ([make_flight(planar)], planar))
+    opened = open_page(file)
+    page = opened.page
+    assert page.locator("#scenes option").all_text_contents() == ["paper", planar.name]
+    assert page.input_value("#scenes") == "paper"
+    assert page.is_hidden("#scene-name")
+    page.keyboard.press("t")
+    theme = page.get_attribute("html", "data-theme")
+    panels = page.locator(".panel").count()
+    with page.expect_navigation(wait_until="load"):
+        page.select_option("#scenes", planar.name)
+    page.locator(".panel").first.wait_for()
+    assert page.inner_text("#scene-description") == planar.description
+    assert page.locator(".panel").count() != panels
+    assert page.get_attribute("html", "data-theme") == theme  # stays as chosen
+    with page.expect_event("load"):
+        page.go_back()
+    page.locator(".panel").first.wait_for()
+    assert page.input_value("#scenes") == "paper"
+    assert {url.partition("#")[0] for url in opened.requests} == {file.as_uri()}
+    alone = write_replay(tmp_path / "one.html", [make_flight(paper)], paper)
+    assert open_page(alone).page.is_hidden("#scenes")
+
+
+PLAYED = """data => new Promise(done => {
+  const video = document.createElement("video");
+  video.onerror = () => done([0, 0, 0, video.error.message]);
+  video.onloadedmetadata = () => {
+    video.onseeked = () => {
+      const canvas = document.createElement("canvas");
+      [canvas.width, canvas.height] = [video.videoWidth, video.videoHeight];
+      const context = canvas.getContext("2d");
+      context.drawImage(video, 0, 0);
+      const colors = new Set(context.getImageData(0, 0, canvas.width, canvas.height).data);
+      done([video.duration, video.videoWidth, video.videoHeight, colors.size]);
+    };
+    video.currentTime = 0.5 * video.duration;
+  };
+  video.src = data;
+})"""
+
+
+@pytest.mark.slow
+def test_a_flight_is_recorded_as_a_video(open_page, page_file, browser):
+    """From its beginning to its end, or until it is paused; the browser plays what it recorded."""
+    opened = open_page(page_file, accept_downloads=True)
+    page = opened.page
+    if page.is_hidden("#record"):
+        pytest.skip("this browser records no canvas")
+    opened.seek(2.0)
+    page.keyboard.press("l")  # a loop would have no end
+    with page.expect_download() as recorded:
+        page.keyboard.press("v")
+        page.locator("#record[aria-pressed=true]").wait_for()
+        page.set_viewport_size({"width": 900, "height": 600})  # the video keeps its size
+    assert opened.time == pytest.approx(3.0)
+    assert page.get_attribute("#loop", "aria-pressed") == "false"
+    page.locator("#record[aria-pressed=false]").wait_for()
+    file = recorded.value
+    kind = file.suggested_filename.rpartition(".")[2]
+    assert file.suggested_filename == f"paper-expert.{kind}"
+    content = file.path().read_bytes()
+    assert len(content) > 20_000
+    assert (content[4:8] == b"ftyp") if kind == "mp4" else content.startswith(b"\x1a\x45\xdf\xa3")
+
+    player = browser.new_page()
+    address = f"data:video/{kind};base64,{b64encode(content).decode()}"
+    duration, width, height, colors = player.evaluate(PLAYED, address)
+    player.close()
+    assert duration is None or duration > 2.5  # from the beginning; unknown in a WebM
+    assert (width % 2, height % 2) == (0, 0)
+    assert width > 300
+    assert colors > 50
+
+    page.select_option("#speed", "0.1")
+    with page.expect_download() as recorded:
+        page.click("#record")
+        while opened.time < 0.05:
+            page.wait_for_timeout(50)
+        page.click("#record")  # ends it
+    assert opened.time < 2.9
+    assert recorded.value.path().stat().st_size > 1000
+    assert opened.requests == [page_file.as_uri()]

@@ -19,7 +19,7 @@ from dq_space_arm_env.viewing.replay.geometry import view_of
 from dq_space_arm_env.viewing.replay.page import SCRIPTS, bundle
 
 BROWSER = files("dq_space_arm_env.viewing.replay").joinpath("browser")
-DATA = re.compile(r'<script type="application/json" id="replay-data">(.*?)</script>', re.DOTALL)
+DATA = re.compile(r'<script type="application/json" class="replay-data"[^>]*>(.*?)</script>', re.DOTALL)
 
 
 def data_of(page):
@@ -54,6 +54,20 @@ def test_labels_cannot_end_the_script(make_flight, paper, tmp_path):
     assert page.count("</script>") == 2
     data = data_of(page)
     assert data["flights"][0]["label"] == label == data["scene"]["name"]
+
+
+def test_scenes_of_a_page_are_listed_by_name(make_flight, paper):
+    """Each with its own data, and names that cannot end an attribute."""
+    planar = load_scene("planar").replace(name='a "b" <c>')
+    page = replay_page([make_flight(paper)], paper, ([make_flight(planar), make_flight(planar, "b")], planar))
+    names = re.findall(r'class="replay-data" data-scene="([^"]*)">', page)
+    assert names == ["paper", "a &quot;b&quot; &lt;c&gt;"]
+    first, second = (json.loads(text) for text in DATA.findall(page))
+    assert [len(first["flights"]), len(second["flights"])] == [1, 2]
+    assert second["scene"]["name"] == planar.name
+    assert first == data_of(replay_page([make_flight(paper)], paper))
+    with pytest.raises(ValueError, match="two scenes are called 'paper': show their flights together"):
+        replay_page([make_flight(paper)], paper, ([make_flight(paper)], paper))
 
 
 @pytest.mark.parametrize("label", ["fl\udce9g", "سلام\u2028", "🚀"])

@@ -8,9 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.viewing.picture_format import View
+from dq_space_arm_env.viewing.picture_format import PictureFormat, View
 
 Array = NDArray[np.float64]
+
+SUN = np.array([-0.50, -0.66, -0.56])
+"""Direction toward the sun in camera axes (right, down, forward): over the left shoulder."""
+
+_DEFAULT_VIEW = View(azimuth=190.0, elevation=-22.0)
+# A planar scene is seen from straight above, x to the right and y up.
+_PLANAR_VIEW = View(azimuth=90.0, elevation=-90.0)
 
 
 @dataclass(frozen=True)
@@ -30,6 +37,13 @@ class Camera:
         inverse_depth = 1.0 / np.where(depth > 0.0, depth, np.nan)
         plane = self.focal_length * seen[..., :2] * inverse_depth
         return np.concatenate([plane + 0.5 * np.array([self.width, self.height]), inverse_depth], axis=-1)
+
+
+def camera_of(region: tuple[Array, Array], is_planar: bool, picture: PictureFormat) -> Camera:
+    """Place a scene's camera by the region of its `SpacecraftModel`; a picture's own view comes first."""
+    given = {key: value for key, value in picture.view._asdict().items() if value is not None}
+    view = (_PLANAR_VIEW if is_planar else _DEFAULT_VIEW)._replace(**given)
+    return camera_around(*region, view, picture.width, picture.height)
 
 
 def camera_around(

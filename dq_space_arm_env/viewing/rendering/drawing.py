@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dq_space_arm_env.viewing.rendering.camera import Camera
+from dq_space_arm_env.viewing.rendering.camera import SUN, Camera
 from dq_space_arm_env.viewing.rendering.rasterizer import Faces
 from dq_space_arm_env.viewing.rendering.solids import Mesh
 
@@ -14,7 +14,7 @@ Image = NDArray[np.uint8]
 
 # Directions toward the lights in camera axes (right, down, forward), and their strengths: the sun over the
 # left shoulder, and the light of the Earth below on the right. They move with the camera.
-_SUN, _SUN_STRENGTH = np.array([-0.50, -0.66, -0.56]), 0.70
+_SUN_STRENGTH = 0.70
 _EARTH, _EARTH_STRENGTH = np.array([0.74, 0.52, -0.42]), 0.22
 _AMBIENT = 0.38
 _SHARPNESS = 5  # of a reflection: number of times the cosine is squared
@@ -35,8 +35,8 @@ _STARS_SEED = 2018
 
 def mesh_faces(mesh: Mesh, rotations: Array, positions: Array, camera: Camera) -> Faces:
     """Project and light the faces toward the camera, given rotation and position (m) of each frame."""
-    halfway = _SUN + np.array([0.0, 0.0, -1.0])
-    directions = np.array([_SUN, _EARTH, halfway / np.linalg.norm(halfway)]) @ camera.axes
+    halfway = SUN + np.array([0.0, 0.0, -1.0])
+    directions = np.array([SUN, _EARTH, halfway / np.linalg.norm(halfway)]) @ camera.axes
     parts: list[Array] = []
     cosines: list[Array] = []
     shown: list[NDArray[np.intp]] = []

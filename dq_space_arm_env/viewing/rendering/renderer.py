@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.path import shown_target
-from dq_space_arm_env.viewing.picture_format import PictureFormat, View
-from dq_space_arm_env.viewing.rendering.camera import camera_around
+from dq_space_arm_env.viewing.picture_format import PictureFormat
+from dq_space_arm_env.viewing.rendering.camera import camera_of
 from dq_space_arm_env.viewing.rendering.drawing import Image, mesh_faces, paint_sky, trail_faces
 from dq_space_arm_env.viewing.rendering.rasterizer import Faces, Rasterizer
+from dq_space_arm_env.viewing.rendering.solids import Mesh
 from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
 from dq_space_arm_env.viewing.rendering.window import Window
 
 Array = NDArray[np.float64]
-
-_DEFAULT_VIEW = View(azimuth=190.0, elevation=-22.0)
-# A planar scene is seen from straight above, x to the right and y up.
-_PLANAR_VIEW = View(azimuth=90.0, elevation=-90.0)
 
 
 class Renderer:
@@ -32,14 +31,15 @@ class Renderer:
 
     Attributes:
         camera: The camera.
+        overlay: Solids in the inertial frame that are drawn too, none at first.
     """
 
     def __init__(self, scene: Scene, picture: PictureFormat | None = None) -> None:
-        width, height, view = picture or PictureFormat()
-        default = _PLANAR_VIEW if scene.base.motion == "planar" else _DEFAULT_VIEW
-        given = {key: value for key, value in view._asdict().items() if value is not None}
+        picture = picture or PictureFormat()
+        width, height, _ = picture
         self._model = SpacecraftModel(scene)
-        self.camera = camera_around(*self._model.region, default._replace(**given), width, height)
+        self.camera = camera_of(self._model.region, scene.base.motion == "planar", picture)
+        self.overlay: Sequence[Mesh] = ()
         self._rasterizer = Rasterizer(width, height)
         self._sky = paint_sky(width, height)
         target, body = (each if each is None or each.ndim == 1 else each[0] for each in shown_target(scene))
@@ -98,12 +98,16 @@ class Renderer:
 
     def _faces(self, dual_quaternions: Array, trail: Array) -> Faces:
         """Faces of the solids and the trail."""
-        # The frames after the robot's are those of the target, of its body and of the payload.
+        # After the robot's frames: those of the target, of its body and of the payload, and the inertial one.
         payload = dual_quaternions[-1] if self._payload is None else self._payload
-        frames = np.vstack([dual_quaternions, self._target, self._target_body, payload])
+        frames = np.vstack([dual_quaternions, self._target, self._target_body, payload, np.eye(8)[0]])
+        mesh = self._model.mesh
+        if self.overlay:
+            placed = [each.moved(len(frames) - 1, np.eye(3), np.zeros(3)) for each in self.overlay]
+            mesh = Mesh.joined([mesh, *placed])
         matrices, origins = poses.to_matrix(frames.T)
         rotations: Array = np.moveaxis(np.array(matrices), 2, 0)
-        solids = mesh_faces(self._model.mesh, rotations, np.array(origins).T, self.camera)
+        solids = mesh_faces(mesh, rotations, np.array(origins).T, self.camera)
         ribbon = trail_faces(trail, self.camera)
         return Faces(
             np.concatenate([solids.corners, ribbon.corners]),

@@ -278,8 +278,8 @@ class SpacecraftModel:
             0, place, outward, [(height * mean, radius * mean) for height, radius in bell], colors, 16
         )
 
-    def _radius(self, frame: int) -> float:
-        """Radius of the link in a frame: the arm tapers toward the tip, m."""
+    def radius(self, frame: int) -> float:
+        """Radius of the link in a frame, m: the arm tapers toward the tip."""
         return self._thickness * (1.15 - 0.4 * frame / self.frame_count)
 
     def _arm(self) -> Iterator[Mesh]:
@@ -288,7 +288,7 @@ class SpacecraftModel:
             if shapes[frame]:
                 continue
             end = self._hand_start(index + 1) if index + 1 in self._tips else self._offsets[index]
-            radius, color = (self._radius(frame), LINK) if frame else (1.2 * self._radius(frame), METAL)
+            radius, color = (self.radius(frame), LINK) if frame else (1.2 * self.radius(frame), METAL)
             if np.linalg.norm(end) > 0.1 * radius:
                 yield cylinder(frame, (0.0, 0.0, 0.0), end, radius, color)
         for frame in self._branch_ends:
@@ -300,12 +300,12 @@ class SpacecraftModel:
             if shapes[joint]:
                 yield from shape_meshes(joint, shapes[joint], LINK)
             elif link.is_spherical:
-                yield ball(joint, (0.0, 0.0, 0.0), 1.5 * self._radius(joint), JOINT)
+                yield ball(joint, (0.0, 0.0, 0.0), 1.5 * self.radius(joint), JOINT)
             elif not link.is_fixed:
                 yield from self._joint(joint)
         if self.scene.wrist is not None:
             frame = len(self._before) - 1
-            yield ball(frame, (0.0, 0.0, 0.0), 1.5 * self._radius(frame), JOINT)
+            yield ball(frame, (0.0, 0.0, 0.0), 1.5 * self.radius(frame), JOINT)
 
     @cached_property
     def _masts(self) -> list[float]:
@@ -340,8 +340,8 @@ class SpacecraftModel:
     def _joint(self, frame: int) -> Iterator[Mesh]:
         """A beveled housing along the joint's z axis, and a mast as long as the joint slides."""
         if mast := self._masts[frame - 1]:
-            yield cylinder(frame, (0.0, 0.0, 0.0), (0.0, 0.0, -mast), 0.7 * self._radius(frame), METAL)
-        radius, half = 1.5 * self._radius(frame), 1.6 * self._radius(frame)
+            yield cylinder(frame, (0.0, 0.0, 0.0), (0.0, 0.0, -mast), 0.7 * self.radius(frame), METAL)
+        radius, half = 1.5 * self.radius(frame), 1.6 * self.radius(frame)
         bevel = 0.2 * radius
         profile = [(-half, 0.0), (-half, radius - bevel), (bevel - half, radius), (half - bevel, radius)]
         profile += [(half, radius - bevel), (half, 0.0)]

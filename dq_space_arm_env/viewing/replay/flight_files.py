@@ -63,6 +63,30 @@ def common_scene(flights: Sequence[Trajectory], scene: Scene | None = None) -> t
     return shown, scene
 
 
+def by_scene(flights: Sequence[Trajectory]) -> list[tuple[list[Trajectory], Scene]]:
+    """Sort flights by the names of their scenes.
+
+    Args:
+        flights: The flights; those that name no scene belong to the first that another names.
+
+    Returns:
+        For each scene, in the order of the flights, what `common_scene` finds.
+
+    Raises:
+        ValueError: If no scene is known, or flights of one scene have different robots or time steps.
+    """
+    first = next((flight.scene for flight in flights if flight.scene is not None), None)
+    groups: dict[str, list[Trajectory]] = {}
+    for flight in flights:
+        scene = flight.scene or first
+        groups.setdefault("" if scene is None else scene.name, []).append(flight)
+    parts = []
+    for group in groups.values():
+        named = next((flight.scene for flight in group if flight.scene is not None), None)
+        parts.append(common_scene(group, named))
+    return parts
+
+
 def _check_same_robot(label: str, own: Scene, scene: Scene) -> None:
     if own.simulation.dt != scene.simulation.dt:
         raise ValueError(

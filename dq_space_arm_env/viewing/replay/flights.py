@@ -46,6 +46,8 @@ class ShownFlight:
     distance: FloatArray  # from tip to target, shape (M + 1,), m
     note: str  # why it is cut off; empty if it is not
     violated: NDArray[np.bool_]  # whether rows of constraints are, shape (rows, M + 1)
+    dt: float  # time step, s
+    stride: int = 1  # of the flight's own steps in one of these
 
     @property
     def steps(self) -> int:
@@ -114,6 +116,7 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
         distance=distance,
         note="" if shown == steps else f"diverges after {seconds:.4g} s",
         violated=violations(*placed) if scene.constraints else np.zeros((0, shown + 1), np.bool_),
+        dt=scene.simulation.dt,
     )
 
 
@@ -227,11 +230,12 @@ def verdict(flight: ShownFlight, scene: Scene) -> str:
     """Describe the end of a flight in a phrase."""
     angle, distance = float(flight.angle[-1]), float(flight.distance[-1])
     place = f"{_rounded(angle)}° and {_length(distance)} from the target"
+    thin = f"; one in {flight.stride} steps shown" if flight.stride > 1 else ""
     if flight.note:
-        return f"{flight.note}, {place}"
+        return f"{flight.note}, {place}{thin}"
     success = scene.success
     reached = angle <= success.attitude_error_deg and distance <= success.position_error
-    return f"ends {place}: {'success' if reached else 'outside the tolerances'}"
+    return f"ends {place}: {'success' if reached else 'outside the tolerances'}{thin}"
 
 
 def _length(meters: float) -> str:

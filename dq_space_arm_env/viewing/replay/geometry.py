@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.constraint_rows import rows_of
-from dq_space_arm_env.viewing.constraint_shapes import GAS, constraint_shapes, gas_of, thruster_shapes
+from dq_space_arm_env.viewing.constraint_shapes import (
+    GAS,
+    REACH,
+    constraint_shapes,
+    gas_of,
+    thruster_shapes,
+)
 from dq_space_arm_env.viewing.rendering.solids import Mesh
 from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
 from dq_space_arm_env.viewing.replay.flights import FloatArray, ShownFlight, poses_at
@@ -21,7 +27,6 @@ from dq_space_arm_env.viewing.replay.flights import FloatArray, ShownFlight, pos
 _CREASE = math.cos(math.radians(40.0))
 _STEPS_PER_METER = 1e5  # resolution of corners; equal ones share a vertex
 _INSTANTS = 9
-_CONES = 4.0  # length of cones over that of the axes at the tip
 _FLOWN_AWAY = 3.0  # times the size of robot, reach and target
 _AZIMUTHS = tuple(math.radians(angle) for angle in range(0, 360, 15))
 _ELEVATIONS = tuple(math.radians(angle) for angle in (12, 24, 36))
@@ -72,7 +77,7 @@ def solids_of(scene: Scene) -> Triangles:
 def constraints_of(scene: Scene, flights: Sequence[ShownFlight]) -> ConstraintDrawing | None:
     """Shapes of the constraints along the path, where flights violate them, and jets; None without any."""
     listed = [each for each in scene.constraints if rows_of(scene, each)]
-    length = _CONES * SpacecraftModel(scene).axis_length
+    length = REACH * SpacecraftModel(scene).axis_length
     groups, jets = constraint_shapes(scene, length), thruster_shapes(scene, length)
     if not listed and not jets:
         return None

@@ -23,6 +23,7 @@ from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
 from dq_space_arm_env.viewing.replay.curves import panels
 from dq_space_arm_env.viewing.replay.flights import prepare, verdict
 from dq_space_arm_env.viewing.replay.geometry import Triangles, constraints_of, solids_of, view_of
+from dq_space_arm_env.viewing.replay.thinning import thinned
 
 # In the order of their dependencies.
 SCRIPTS = (
@@ -36,6 +37,7 @@ SCRIPTS = (
     "labels.mjs",
     "plots.mjs",
     "gestures.mjs",
+    "video.mjs",
     "main.mjs",
 )
 
@@ -64,47 +66,61 @@ class _Blob:
         return b64encode(b"".join(self._parts)).decode("ascii")
 
 
-def replay_page(flights: Sequence[Trajectory], scene: Scene) -> str:
+def replay_page(
+    flights: Sequence[Trajectory], scene: Scene, *others: tuple[Sequence[Trajectory], Scene]
+) -> str:
     """Make a page that shows flights in 3-D and as curves.
 
-    The first flight is drawn solid and the others as ghosts, until the reader selects another.
+    The first flight is drawn solid and the others as ghosts, until the reader selects another. Where all
+    flights of a scene are longer than a page should be, instants of them are left out evenly.
 
     Args:
         flights: One to six, of any lengths.
         scene: The scene of all of them.
+        *others: Flights of further scenes, which the page lists by their names.
 
     Returns:
         HTML that needs no other file and makes no request.
 
     Raises:
-        ValueError: If there are none or too many, or arrays do not fit the scene.
+        ValueError: If a scene has no flights or too many, arrays do not fit it, or two have the same name.
     """
-    content = _read("page.html")
+    shown = [(flights, scene), *others]
+    names = [each.name for _, each in shown]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"two scenes are called {twice!r}: show their flights together or rename one")
     parts = {
-        "title": escape(f"{scene.name}: replay"),
+        "title": escape(f"{', '.join(names)}: replay"),
         "style": _read("replay.css"),
-        "data": _as_script(_describe(flights, scene)),
+        "data": "\n".join(_data_element(*each) for each in shown),
         "script": bundle(),
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], content)
+    return re.sub(r"\{\{(\w+)\}\}", lambda mark: parts[mark[1]], _read("page.html"))
 
 
-def write_replay(path: str | os.PathLike[str], flights: Sequence[Trajectory], scene: Scene) -> Path:
+def write_replay(
+    path: str | os.PathLike[str],
+    flights: Sequence[Trajectory],
+    scene: Scene,
+    *others: tuple[Sequence[Trajectory], Scene],
+) -> Path:
     """Write such a page to a file, in one go or not at all.
 
     Args:
         path: The file, `.html` by convention; its folder must exist.
         flights: One to six, of any lengths.
         scene: The scene of all of them.
+        *others: Flights of further scenes, which the page lists by their names.
 
     Returns:
         The file.
 
     Raises:
-        ValueError: If there are none or too many flights, or arrays do not fit the scene.
+        ValueError: If a scene has no flights or too many, arrays do not fit it, or two have the same name.
     """
     file = Path(path)
-    write_atomically(file, replay_page(flights, scene))
+    write_atomically(file, replay_page(flights, scene, *others))
     return file
 
 
@@ -122,6 +138,12 @@ def bundle() -> str:
 
 def _read(name: str) -> str:
     return files("dq_space_arm_env.viewing.replay").joinpath("browser", name).read_text(encoding="utf-8")
+
+
+def _data_element(flights: Sequence[Trajectory], scene: Scene) -> str:
+    """The data of a scene's flights, under the scene's name."""
+    opening = f'<script type="application/json" class="replay-data" data-scene="{escape(scene.name)}">'
+    return f"{opening}{_as_script(_describe(flights, scene))}</script>"
 
 
 def _as_script(data: dict[str, Any]) -> str:
@@ -146,7 +168,7 @@ def _triangles(triangles: Triangles, blob: _Blob) -> dict[str, Any]:
 
 def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
     """Content of the page as JSON values."""
-    shown = prepare(flights, scene)
+    shown = thinned(prepare(flights, scene))
     view, blob = view_of(shown, scene), _Blob()
     data: dict[str, Any] = {
         "scene": {
@@ -167,6 +189,7 @@ def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
             {
                 "label": flight.label,
                 "steps": flight.steps,
+                "dt": flight.dt,
                 "note": flight.note,
                 "verdict": verdict(flight, scene),
                 "target": _poses(flight.target, blob),

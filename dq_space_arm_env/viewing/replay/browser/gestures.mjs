@@ -68,6 +68,7 @@ export function listenToKeys({ player, camera, commands }) {
     r: () => camera.reset(),
     g: commands.ghosts,
     t: commands.theme,
+    v: commands.record,
     "?": commands.help,
   };
   for (let number = 1; number <= 6; number++) keys[number] = () => commands.choose(number - 1);

@@ -7,16 +7,24 @@ import { Player } from "./player.mjs";
 import { Plots } from "./plots.mjs";
 import { readRecording } from "./recording.mjs";
 import { Renderer } from "./renderer.mjs";
+import { download, Video, videoKind } from "./video.mjs";
 
 const PLAY = "M6 3.8v12.4a.8.8 0 0 0 1.2.7l9.6-6.2a.8.8 0 0 0 0-1.4L7.2 3.1A.8.8 0 0 0 6 3.8z";
 const PAUSE = "M5 3h3.4v14H5zM11.6 3H15v14h-3.4z";
 const SHARPEST = 2; // pixels of a canvas per CSS pixel
 const REST = 180; // ms without a change after which the picture is drawn finely
+const LAST = 300; // ms for which a video waits for its last picture
 
 const find = (id) => document.getElementById(id);
-const recording = readRecording(find("replay-data").textContent);
+// One element for each scene; the address says which is shown, and another one is another start of the page.
+const parts = [...document.querySelectorAll(".replay-data")];
+const chosen = parts.find((part) => `#${encodeURIComponent(part.dataset.scene)}` === location.hash) ?? parts[0];
+const recording = readRecording(chosen.textContent);
 const { scene, flights, constraints } = recording;
-const player = new Player(Math.max(...flights.map((flight) => flight.duration)), scene.dt);
+const player = new Player(
+  Math.max(...flights.map((flight) => flight.duration)),
+  Math.min(...flights.map((flight) => flight.dt)),
+);
 const camera = new Camera(recording.view);
 const moment = { time: 0, solid: 0, visible: flights.map(() => true) };
 moment.shown = constraints ? constraints.names.map(() => true) : [];
@@ -24,7 +32,8 @@ const canvas = find("view"), viewport = find("viewport"), slider = find("time"),
 const plots = new Plots(find("plots"), recording, player);
 const labels = new Labels(find("labels"), find("compass"));
 const renderer = makeRenderer();
-let look = null, stale = true, waiting = false, resting = null;
+let look = null, stale = true, waiting = false, resting = null, video = null;
+const kind = renderer && videoKind(canvas);
 
 /** Null where nothing can be drawn in 3-D; the rest of the page works without. */
 function makeRenderer() {
@@ -80,9 +89,9 @@ function drawNow(now) {
   }
   for (const flight of flights) flight.moveTo(player.time);
   if (renderer && !renderer.gl.isContextLost()) {
-    drawPicture(renderer.slow ? 1 : Math.min(window.devicePixelRatio, SHARPEST));
+    drawPicture(density());
     // Without a graphics processor pictures are coarse while they move, and fine when they rest.
-    if (renderer.slow && !player.playing) resting = setTimeout(() => drawPicture(SHARPEST), REST);
+    if (renderer.slow && !player.playing && !video) resting = setTimeout(() => drawPicture(SHARPEST), REST);
   }
   plots.update(player.time, player.playing, now);
   showTime();
@@ -90,11 +99,15 @@ function drawNow(now) {
   if (player.playing) refresh();
 }
 
+/** Pixels per CSS pixel of a picture that moves. */
+const density = () => (renderer.slow ? 1 : Math.min(window.devicePixelRatio, SHARPEST));
+
 /** Draw the robot with a number of pixels per CSS pixel. */
 function drawPicture(pixel) {
   const [width, height] = [viewport.clientWidth, viewport.clientHeight];
-  const [across, down] = [Math.round(width * pixel), Math.round(height * pixel)];
-  if (canvas.width !== across || canvas.height !== down) {
+  // Even, as videos must be.
+  const [across, down] = [width, height].map((size) => 2 * Math.round((size * pixel) / 2));
+  if (!video && (canvas.width !== across || canvas.height !== down)) { // a video keeps its size
     [canvas.width, canvas.height] = [across, down];
     const legend = find("flights");
     camera.resize(width / height, Math.min((legend.offsetTop + legend.offsetHeight) / height, 0.4));
@@ -118,6 +131,35 @@ function showControls() {
   find("play").title = player.playing ? "Pause (Space)" : "Play (Space)";
   find("speed").value = String(player.speed);
   find("loop").setAttribute("aria-pressed", String(player.loop));
+  find("record").setAttribute("aria-pressed", String(video !== null));
+  find("record").title = video ? "End the video (V)" : "Record a video (V)";
+  find("record").setAttribute("aria-label", find("record").title);
+}
+
+/** Play from the beginning, and record the picture until playback ends or is paused. */
+function record() {
+  if (kind === null) return;
+  if (video) {
+    player.pause();
+    return;
+  }
+  player.loop = false;
+  clearTimeout(resting);
+  drawPicture(density());
+  player.seek(0);
+  video = new Video(canvas, kind);
+  player.play();
+}
+
+function endVideo() {
+  const ended = video;
+  ended.ending = true;
+  setTimeout(() => {
+    video = null;
+    ended.stop((file) => download(file, `${scene.name}-${flights[moment.solid].label}`));
+    showControls();
+    refresh();
+  }, LAST);
 }
 
 function showFlights() {
@@ -184,6 +226,18 @@ function showConstraints() {
   find("constraints").querySelectorAll("label").forEach((label, index) => label.classList.toggle("broken", broken[index]));
 }
 
+/** A list of the scenes in place of the name, where there are several. */
+function buildScenes() {
+  const list = find("scenes");
+  for (const part of parts) list.append(new Option(part.dataset.scene, part.dataset.scene, false, part === chosen));
+  list.hidden = parts.length === 1;
+  find("scene-name").hidden = parts.length > 1;
+  list.addEventListener("change", () => {
+    location.hash = encodeURIComponent(list.value);
+  });
+  window.addEventListener("hashchange", () => location.reload());
+}
+
 function choose(index) {
   if (index >= flights.length) return;
   moment.solid = index;
@@ -205,8 +259,10 @@ const commands = {
   },
   theme() {
     root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
+    window.name = root.dataset.theme; // which stays when the page starts again
     refresh(true);
   },
+  record,
   help() {
     find("help").showModal();
   },
@@ -216,6 +272,7 @@ function connect() {
   player.changed = () => {
     showControls();
     refresh();
+    if (video && !video.ending && !player.playing) endVideo();
   };
   // Rounded: a maximum that is short of the last step by a rounding error would put it out of reach.
   slider.max = Number(player.duration.toPrecision(12));
@@ -226,6 +283,7 @@ function connect() {
     player.speed = Number(event.target.value);
   });
   find("loop").addEventListener("click", commands.loop);
+  find("record").addEventListener("click", commands.record);
   find("theme").addEventListener("click", commands.theme);
   find("help-button").addEventListener("click", commands.help);
   const reset = () => {
@@ -253,14 +311,17 @@ function followTheme() {
   };
   dark.addEventListener("change", apply);
   apply();
+  if (["dark", "light"].includes(window.name)) root.dataset.theme = window.name;
 }
 
 find("scene-name").textContent = scene.name;
 find("scene-description").textContent = scene.description;
 find("scene-description").title = scene.description;
 find("missing").hidden = renderer !== null;
+find("record").hidden = kind === null;
 viewport.classList.toggle("flat", renderer === null);
 followTheme();
+buildScenes();
 buildFlights();
 if (constraints) buildConstraints();
 connect();

@@ -54,7 +54,6 @@ class Panel {
   constructor(panel, recording, player) {
     this.panel = panel;
     this.flights = recording.flights;
-    this.dt = recording.scene.dt;
     this.player = player;
     this.range = rangeOf(panel, this.flights);
     const size = Math.max(-this.range[0], this.range[1]);
@@ -217,33 +216,33 @@ class Panel {
   }
 
   stroke(context, curves, curve, flight) {
-    const { steps } = this.flights[flight];
+    const { steps, dt } = this.flights[flight];
     const length = steps + (this.panel.steps ? 0 : 1);
     const share = Math.ceil(length / (DENSEST * this.width));
     context.beginPath();
-    if (share > 1) this.envelope(context, curves.subarray(curve * length, (curve + 1) * length), share);
+    if (share > 1) this.envelope(context, curves.subarray(curve * length, (curve + 1) * length), share, dt);
     for (let i = 0; i < length && share === 1; i++) {
       const y = this.y(curves[curve * length + i]);
-      context.lineTo(this.x(i * this.dt), y);
-      if (this.panel.steps) context.lineTo(this.x((i + 1) * this.dt), y);
+      context.lineTo(this.x(i * dt), y);
+      if (this.panel.steps) context.lineTo(this.x((i + 1) * dt), y);
     }
     context.stroke();
   }
 
   /** Go from the smallest to the largest of some values at a time, and on: it looks the same, and takes no seconds. */
-  envelope(context, values, share) {
+  envelope(context, values, share, dt) {
     for (let start = 0; start < values.length; start += share) {
       const some = values.subarray(start, start + share);
       const [low, high] = [some.reduce((a, b) => Math.min(a, b)), some.reduce((a, b) => Math.max(a, b))];
-      context.lineTo(this.x(start * this.dt), this.y(low));
-      context.lineTo(this.x(start * this.dt), this.y(high));
+      context.lineTo(this.x(start * dt), this.y(low));
+      context.lineTo(this.x(start * dt), this.y(high));
     }
   }
 
   valueAt(flight, curve, time) {
-    const { steps } = this.flights[flight];
+    const { steps, dt } = this.flights[flight];
     const length = steps + (this.panel.steps ? 0 : 1);
-    const place = this.panel.steps ? Math.floor(time / this.dt + 1e-6) : Math.round(time / this.dt);
+    const place = this.panel.steps ? Math.floor(time / dt + 1e-6) : Math.round(time / dt);
     return this.panel.curves[flight][curve * length + Math.min(place, length - 1)];
   }
 

@@ -23,7 +23,7 @@ export function readRecording(text) {
   const flights = data.flights.map((flight) => {
     const [target, targetBody, payload] = [flight.target, flight.targetBody, flight.payload].map(poses);
     const arrays = { frames: array(flight.frames), target, targetBody, payload };
-    return new Flight({ ...flight, ...arrays }, frameCount, data.scene.dt);
+    return new Flight({ ...flight, ...arrays }, frameCount);
   });
   const panels = data.panels.map((panel) => ({
     ...panel,
@@ -35,10 +35,9 @@ export function readRecording(text) {
 
 /** A flight: its poses at any time; before its beginning the first, after its end the last. */
 export class Flight {
-  constructor(description, frameCount, dt) {
-    Object.assign(this, description); // label, steps, note, verdict, target, targetBody, payload, frames
+  constructor(description, frameCount) {
+    Object.assign(this, description); // label, steps, dt, note, verdict, target, targetBody, payload, frames
     this.frameCount = frameCount;
-    this.dt = dt;
     // The poses of the target, of its body and of the payload come after the robot's.
     this.poses = new Float32Array(8 * (frameCount + 3));
     const others = [this.target, this.targetBody ?? this.target, this.payload ?? this.frames.slice(-8)];
