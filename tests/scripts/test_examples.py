@@ -4,10 +4,12 @@ import importlib
 import re
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
-from dq_space_arm_env import load_scene
+from dq_space_arm_env import compile_scene, load_scene
+from experts import GuidedDDP
 
 
 def run(name: str, *options: str) -> None:
@@ -113,3 +115,16 @@ def test_planar_quadrotor(capsys: pytest.CaptureFixture[str]) -> None:
     assert first[1] == pytest.approx(14.6355, rel=1e-5)
     assert second[0] < first[0] < 50
     assert max(first[2], second[2]) < 0.06
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["debris-capture", "docking", "space-robot-reach"])
+def test_the_expert_solves_the_tasks_of_peers(name: str) -> None:
+    scene = load_scene(Path(f"scripts/examples/{name}.yaml"))
+    assert scene.name == name
+    solution, env = GuidedDDP(scene).solve(), gymnasium.make("DQSpaceArm-v0", scene=scene)
+    assert solution.converged
+    env.reset(options={"nominal": True})
+    for action in compile_scene(scene).layout.to_action(solution.controls):
+        *_, info = env.step(action)
+    assert info["is_success"]
