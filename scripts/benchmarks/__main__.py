@@ -22,6 +22,7 @@ BENCHMARKS = {
     "solvers": "solvers",
     "throughput": "throughput",
     "rendering": "rendering",
+    "basilisk": "basilisk",
 }
 """Packages and modules beside this file, each with a `BENCHMARK`."""
 

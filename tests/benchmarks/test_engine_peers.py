@@ -9,6 +9,8 @@ import pytest
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from experts.report.part_costs import moving_states
+from scripts.benchmarks.basilisk import BENCHMARK
+from scripts.benchmarks.effort import QUICK
 from scripts.benchmarks.peers import peers_of
 from scripts.benchmarks.peers.mujoco_peer import MujocoPeer, mujoco_spec, robot_xml
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
@@ -79,6 +81,13 @@ def test_missing_engines_and_unsuitable_scenes_leave_a_note(
     peers, notes = peers_of(compile_scene(short_scene))
     assert not peers
     assert ["pip install pin)" in notes[0], "pip install mujoco)" in notes[1]] == [True, True]
+
+
+def test_without_basilisk_its_benchmark_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "Basilisk", None)
+    (row,) = BENCHMARK.measure(QUICK)
+    assert row["table"] == "notes"
+    assert "Basilisk not installed (pip install bsk" in row["note"]
 
 
 def test_mujoco_leaves_out_springs_and_dampers_only_where_there_are_none() -> None:

@@ -1,14 +1,18 @@
 """The same motion in Basilisk: wheels, thrusters, a tank, arms that turn and arms that slide."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dq_space_arm_env import Kernels, Scene, compile_scene
+from scripts.benchmarks.basilisk import BENCHMARK
+from scripts.benchmarks.effort import QUICK
+from scripts.benchmarks.harness import select
+from scripts.benchmarks.peers.basilisk_peer import BasiliskTwin, nanoseconds
 
 pytest.importorskip("Basilisk", reason="needs Basilisk: pip install bsk")
 pytestmark = pytest.mark.slow
@@ -30,71 +34,12 @@ def scene(**changes: Any) -> Scene:
     return Scene.model_validate(plain).replace(changes)
 
 
-class Twin:
-    """A hub in Basilisk that starts as the base does; effectors come to it one by one."""
-
-    def __init__(self, kernels: Kernels, method: str = "RK4") -> None:
-        from Basilisk.simulation import spacecraft, svIntegrators
-        from Basilisk.utilities import SimulationBaseClass, macros
-
-        self.sim = SimulationBaseClass.SimBaseClass()
-        process = self.sim.CreateNewProcess("dynamics")
-        process.addTask(self.sim.CreateNewTask("step", macros.sec2nano(DT)))
-        self.hub, self.kernels, base = spacecraft.Spacecraft(), kernels, kernels.scene.base
-        self.hub.ModelTag, self.hub.hub.mHub = "hub", base.mass
-        self.hub.hub.IHubPntBc_B = np.array(base.inertia)
-        self.hub.hub.r_BcB_B = [[0.0], [0.0], [0.0]]
-        x = kernels.layout.initial_state
-        frames, masses = kernels.frame_poses(x), [base.mass, *(link.mass for link in kernels.scene.links)]
-        points = [np.zeros(3), *(np.array(link.center_of_mass) for link in kernels.scene.links)]
-        frames = list(frames[: len(masses)])
-        if (tank := kernels.scene.actuators.tank) is not None:
-            frames, masses = [*frames, frames[0]], [*masses, tank.propellant]
-            points.append(np.array(tank.position))
-        # C is the center of mass of all, not the base's.
-        places = [
-            rotation_of(pose).apply(point) + place_of(pose)
-            for pose, point in zip(frames, points, strict=True)
-        ]
-        self.hub.hub.sigma_BNInit = rotation_of(frames[0]).as_mrp()[:, None]
-        self.hub.hub.omega_BN_BInit = x[kernels.layout.state.angular_velocity][:, None]
-        self.hub.hub.r_CN_NInit = np.average(places, axis=0, weights=masses)[:, None]
-        self.hub.hub.v_CN_NInit = kernels.momentum(x)[:3, None] / sum(masses)
-        self.method = getattr(svIntegrators, f"svIntegrator{method}")(self.hub)
-        self.hub.setIntegrator(self.method)
-        self.messages: list[Any] = []
-        self.models: list[Any] = [self.hub]
-
-    def add(self, effector: Any, *, dynamic: bool = False) -> None:
-        """Attach an effector to the hub."""
-        (self.hub.addDynamicEffector if dynamic else self.hub.addStateEffector)(effector)
-        self.models.insert(-1, effector)
-
-    def command(self, reader: Any, kind: str, field: str, values: Sequence[float]) -> None:
-        """Subscribe to a message that stays as it is."""
-        from Basilisk.architecture import messaging
-
-        payload = getattr(messaging, f"{kind}MsgPayload")()
-        setattr(payload, field, list(values))
-        message = getattr(messaging, f"{kind}Msg")().write(payload)
-        self.messages.append(message)
-        reader.subscribeTo(message)
-
-    def fly(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Rotation matrix of the base after all steps; place, velocity and angular velocity in its axes."""
-        from Basilisk.utilities import macros
-
-        for model in self.models:
-            self.sim.AddModelToTask("step", model)
-        self.sim.InitializeSimulation()
-        self.sim.ConfigureStopTime(macros.sec2nano(DT * STEPS))
-        self.sim.ExecuteSimulation()
-        for effector in self.models[:-1]:  # whose messages are those of the step's start
-            effector.UpdateState(macros.sec2nano(DT * STEPS))
-        state = self.hub.scStateOutMsg.read()
-        turn = Rotation.from_mrp(state.sigma_BN)
-        velocity = turn.inv().apply(state.v_BN_N)
-        return turn.as_matrix(), np.array([*state.r_BN_N, *velocity, *state.omega_BN_B])
+def end_of(twin: BasiliskTwin) -> NDArray[np.float64]:
+    """The state of the scene after all steps."""
+    twin.fly(DT * STEPS)
+    for effector in twin.models[:-1]:  # whose messages are those of the step's start
+        effector.UpdateState(nanoseconds(DT * STEPS))
+    return twin.state()
 
 
 def ours(kernels: Kernels, u: Sequence[float]) -> NDArray[np.float64]:
@@ -105,29 +50,16 @@ def ours(kernels: Kernels, u: Sequence[float]) -> NDArray[np.float64]:
     return states[-1]
 
 
-def compare(kernels: Kernels, x: NDArray[np.float64], twin: Twin) -> None:
+def compare(kernels: Kernels, x: NDArray[np.float64], twin: BasiliskTwin) -> NDArray[np.float64]:
     """Compare pose and velocity of the base."""
-    turn, numbers = twin.fly()
-    layout = kernels.layout.state
-    pose = kernels.frame_poses(x)[0]
-    np.testing.assert_allclose(rotation_of(pose).as_matrix(), turn, rtol=0.0, atol=1e-14)
-    expected = [*place_of(pose), *x[layout.linear_velocity], *x[layout.angular_velocity]]
-    np.testing.assert_allclose(expected, numbers, rtol=0.0, atol=1e-14)
+    end, layout = end_of(twin), kernels.layout.state
+    sign = np.sign(x[layout.pose] @ end[layout.pose])
+    for part, factor in ((layout.pose, sign), (layout.base_velocity, 1.0)):
+        np.testing.assert_allclose(x[part], factor * end[part], rtol=0.0, atol=1e-14)
+    return end
 
 
-def rotation_of(pose: NDArray[np.float64]) -> Rotation:
-    """Rotation of a dual quaternion."""
-    return Rotation.from_quat([*pose[1:4], pose[0]])
-
-
-def place_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Position of a dual quaternion, 2 q_d q_r*."""
-    (w, *v), (a, *b) = pose[:4], pose[4:]
-    place: NDArray[np.float64] = 2.0 * (w * np.array(b) - a * np.array(v) + np.cross(v, b))
-    return place
-
-
-def add_jets(twin: Twin) -> Any:
+def add_jets(twin: BasiliskTwin) -> Any:
     """Thrusters that fire all the time."""
     from Basilisk.simulation import thrusterDynamicEffector
     from Basilisk.utilities import simIncludeThruster
@@ -160,7 +92,7 @@ def test_wheels_and_thrusters() -> None:
     kernels = compile_scene(
         scene(actuators={"wheels": wheels, "thrusters": JETS}, **{"initial_state.wheel_speeds": speeds})
     )
-    twin, factory = Twin(kernels), simIncludeRW.rwFactory()
+    twin, factory = BasiliskTwin(kernels, DT), simIncludeRW.rwFactory()
     for wheel, speed in zip(kernels.scene.actuators.wheels, speeds, strict=True):
         factory.create(
             "custom", [*wheel.unit_axis], Omega=speed * 30.0 / np.pi, Js=wheel.inertia, useMaxTorque=False
@@ -183,7 +115,7 @@ def test_a_tank_that_thrusters_empty() -> None:
 
     tank = {"propellant": 12.0, "position": [-0.3, 0.15, 0.2]}
     kernels = compile_scene(scene(actuators={"thrusters": JETS, "tank": tank}))
-    twin = Twin(kernels)
+    twin = BasiliskTwin(kernels, DT)
     jets, effector, model = add_jets(twin), fuelTank.FuelTank(), fuelTank.FuelTankModelConstantVolume()
     model.propMassInit, model.radiusTankInit = tank["propellant"], 0.0
     model.r_TcT_TInit = [[0.0], [0.0], [0.0]]
@@ -215,9 +147,6 @@ ANGLES, RATES, EFFORTS = (0.3, -0.5, 0.7), (0.4, -0.3, 0.2), (0.5, -0.4, 0.3)
 
 @pytest.mark.parametrize("joint_type", ["revolute", "prismatic"])
 def test_arms_that_turn_and_slide(joint_type: str) -> None:
-    from Basilisk.simulation import linearTranslationNDOFStateEffector, spinningBodyNDOFStateEffector
-
-    turns = joint_type == "revolute"
     kernels = compile_scene(
         scene(
             links=[link | {"joint_type": joint_type} for link in ARM],
@@ -225,51 +154,17 @@ def test_arms_that_turn_and_slide(joint_type: str) -> None:
             **{"initial_state.joint_angles": ANGLES, "initial_state.joint_rates": RATES},
         )
     )
-    twin = Twin(kernels, "RKF78")
-    effector: Any = (
-        spinningBodyNDOFStateEffector.SpinningBodyNDOFStateEffector()
-        if turns
-        else linearTranslationNDOFStateEffector.LinearTranslationNDOFStateEffector()
-    )
-    for link, angle, rate in zip(kernels.scene.links, ANGLES, RATES, strict=True):
-        com, place = (np.array(v)[:, None] for v in (link.center_of_mass, link.joint.position))
-        # Their axis of sliding is given in the parent's axes, their spring is at rest at zero.
-        axes = np.array(link.joint.rotation_matrix)
-        body: Any = (
-            spinningBodyNDOFStateEffector.SpinningBody()
-            if turns
-            else linearTranslationNDOFStateEffector.TranslatingBody()
-        )
-        body.setMass(link.mass)
-        body.setK(link.stiffness)
-        body.setC(link.damping)
-        if turns:
-            body.setISPntSc_S(np.array(link.inertia))
-            body.setR_ScS_S(com)
-            body.setR_SP_P(place)
-            body.setDCM_S0P(axes.T)
-            body.setSHat_S([[0.0], [0.0], [1.0]])
-            body.setThetaInit(angle)
-            body.setThetaDotInit(rate)
-            effector.addSpinningBody(body)
-        else:
-            body.setIPntFc_F(np.array(link.inertia))
-            body.setR_FcF_F(com)
-            body.setR_F0P_P(place)
-            body.setDCM_FP(axes.T)
-            body.setFHat_P(axes[:, 2:])
-            body.setRhoInit(angle)
-            body.setRhoDotInit(rate)
-            effector.addTranslatingBody(body)
-    twin.add(effector)
-    reader = effector.motorTorqueInMsg if turns else effector.motorForceInMsg
-    kind = ("ArrayMotorTorque", "motorTorque") if turns else ("ArrayMotorForce", "motorForce")
-    twin.command(reader, *kind, EFFORTS)
-    x = ours(kernels, [0.0, 0.0, 0.0, *EFFORTS])
-    compare(kernels, x, twin)
-    name = "Theta" if turns else "Rho"
-    names = (getattr(effector, f"getNameOf{name}{part}State")() for part in ("", "Dot"))
-    found, rates = (np.ravel(twin.hub.dynManager.getStateObject(each).getState()) for each in names)
-    state = kernels.layout.state
-    np.testing.assert_allclose(x[state.joint_angles], found, rtol=0.0, atol=1e-14)
-    np.testing.assert_allclose(x[state.joint_rates], rates, rtol=0.0, atol=1e-14)
+    twin = BasiliskTwin(kernels, DT, "RKF78")
+    twin.add_chain(EFFORTS)
+    x, state = ours(kernels, [0.0, 0.0, 0.0, *EFFORTS]), kernels.layout.state
+    end = compare(kernels, x, twin)
+    for part in (state.joint_angles, state.joint_rates):
+        np.testing.assert_allclose(x[part], end[part], rtol=0.0, atol=1e-14)
+
+
+def test_the_benchmark_finds_the_same_motion() -> None:
+    rows = [*BENCHMARK.measure(replace(QUICK, duration=1.0))]
+    (claim,) = select(rows, table="claims")
+    assert claim["status"] == "handled", claim
+    for row in select(rows, table="motion", ours_method="rk4"):  # the same formulas
+        assert row["theirs_error"] == pytest.approx(row["ours_error"], rel=0.1)

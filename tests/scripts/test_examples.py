@@ -6,10 +6,12 @@ import re
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
-from dq_space_arm_env import load_scene
+from dq_space_arm_env import compile_scene, load_scene
+from experts import GuidedDDP
 
 LESSON = Path(__file__).parents[2] / "scripts" / "examples" / "lesson.ipynb"
 
@@ -158,3 +160,16 @@ def test_lesson() -> None:
     for method, order in (("symplectic_euler", 1), ("rk4", 4)):
         errors = [error for _, error in names["curves"][method]]
         assert errors[-2] / errors[-1] == pytest.approx(2**order, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["debris-capture", "docking", "space-robot-reach"])
+def test_the_expert_solves_the_tasks_of_peers(name: str) -> None:
+    scene = load_scene(Path(f"scripts/examples/{name}.yaml"))
+    assert scene.name == name
+    solution, env = GuidedDDP(scene).solve(), gymnasium.make("DQSpaceArm-v0", scene=scene)
+    assert solution.converged
+    env.reset(options={"nominal": True})
+    for action in compile_scene(scene).layout.to_action(solution.controls):
+        *_, info = env.step(action)
+    assert info["is_success"]
