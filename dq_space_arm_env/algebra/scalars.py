@@ -16,18 +16,24 @@ from dq_space_arm_env.algebra._types import Scalar
 __all__ = ["arctan2", "cos", "maximum", "safe_sqrt", "select", "sin", "sqrt", "tanh"]
 
 
-def _casadi(value: Any, function: str) -> Any:
-    """Return the module casadi, imported already where the symbol `value` was made.
+def _symbolic(value: Any, name: str, function: str, *arguments: Any) -> Any:
+    """Apply a function of CasADi, imported already where the symbol `value` was made.
+
+    The result has the type of `value`, whose operators may be faster than CasADi's, see `symbolic.Symbol`.
 
     Raises:
         TypeError: `value` is no CasADi symbol, hence no scalar the algebra knows.
     """
-    if type(value).__module__.partition(".")[0] != "casadi":
+    kind = type(value)
+    if all(base.__module__.partition(".")[0] != "casadi" for base in kind.__mro__):
         raise TypeError(
-            f"scalars.{function} got a {type(value).__name__}: {value!r}. "
+            f"scalars.{name} got a {kind.__name__}: {value!r}. "
             "A scalar must be a number, a NumPy array or a CasADi symbol."
         )
-    return sys.modules["casadi"]
+    result = getattr(sys.modules["casadi"], function)(*arguments)
+    if issubclass(kind, type(result)):
+        result.__class__ = kind
+    return result
 
 
 def sin(x: Scalar) -> Scalar:
@@ -36,7 +42,7 @@ def sin(x: Scalar) -> Scalar:
         return math.sin(x)
     if isinstance(x, (np.ndarray, np.generic)):
         return np.sin(x)
-    return _casadi(x, "sin").sin(x)
+    return _symbolic(x, "sin", "sin", x)
 
 
 def cos(x: Scalar) -> Scalar:
@@ -45,7 +51,7 @@ def cos(x: Scalar) -> Scalar:
         return math.cos(x)
     if isinstance(x, (np.ndarray, np.generic)):
         return np.cos(x)
-    return _casadi(x, "cos").cos(x)
+    return _symbolic(x, "cos", "cos", x)
 
 
 def tanh(x: Scalar) -> Scalar:
@@ -54,7 +60,7 @@ def tanh(x: Scalar) -> Scalar:
         return math.tanh(x)
     if isinstance(x, (np.ndarray, np.generic)):
         return np.tanh(x)
-    return _casadi(x, "tanh").tanh(x)
+    return _symbolic(x, "tanh", "tanh", x)
 
 
 def sqrt(x: Scalar) -> Scalar:
@@ -63,7 +69,7 @@ def sqrt(x: Scalar) -> Scalar:
         return math.sqrt(x)
     if isinstance(x, (np.ndarray, np.generic)):
         return np.sqrt(x)
-    return _casadi(x, "sqrt").sqrt(x)
+    return _symbolic(x, "sqrt", "sqrt", x)
 
 
 def safe_sqrt(x: Scalar) -> Scalar:
@@ -86,7 +92,7 @@ def arctan2(y: Scalar, x: Scalar) -> Scalar:
     ):
         return np.arctan2(y, x)
     symbol = x if isinstance(y, (float, int)) else y
-    return _casadi(symbol, "arctan2").atan2(y, x)
+    return _symbolic(symbol, "arctan2", "atan2", y, x)
 
 
 def maximum(a: Scalar, b: Scalar) -> Scalar:
@@ -100,4 +106,4 @@ def select(condition: Scalar, if_true: Scalar, if_false: Scalar) -> Scalar:
         return if_true if condition else if_false
     if isinstance(condition, np.ndarray):
         return np.where(condition, if_true, if_false)
-    return _casadi(condition, "select").if_else(condition, if_true, if_false)
+    return _symbolic(condition, "select", "if_else", condition, if_true, if_false)

@@ -12,7 +12,7 @@ from dq_space_arm_env.compiler import native
 from dq_space_arm_env.compiler.emit import emit_graph
 from dq_space_arm_env.compiler.program import Buffer, Program, place
 from dq_space_arm_env.compiler.transpose import ArrayAccess
-from dq_space_arm_env.compiler.vector_builder import ELEMENTS, INDEX, POINTER, Target, VectorBuilder
+from dq_space_arm_env.compiler.vector_builder import ELEMENTS, INDEX, POINTER, BlockBuilder, Target
 
 
 def assembly(program: Program, lanes: int, precision: str = "float64") -> str:
@@ -60,7 +60,7 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
     entry = kernel.append_basic_block("entry")
     head, body, done = (kernel.append_basic_block(name) for name in ("head", "body", "done"))
     builder = ir.IRBuilder(entry)
-    vectors = VectorBuilder(builder, target)
+    vectors = BlockBuilder(builder, target)
     # Each array's address, and the place on the stack of every buffer's vectors, stay fixed over the loop.
     arrays = _Arrays(builder, program, addresses)
     starts, total = place(sizes, program.lifetimes())
@@ -107,7 +107,7 @@ def emit_program(module: ir.Module, program: Program, target: Target) -> None:
 
 
 def _emit_calls(
-    vectors: VectorBuilder,
+    vectors: BlockBuilder,
     kernel: ir.Function,
     program: Program,
     functions: Mapping[str, ir.Function],

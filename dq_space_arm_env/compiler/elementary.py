@@ -10,8 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from llvmlite import ir
-
 from dq_space_arm_env.compiler.vector_builder import VectorBuilder
 
 
@@ -77,7 +75,7 @@ _COEFFICIENTS = {
 }
 
 
-def _horner(builder: VectorBuilder, x: ir.Value, coefficients: tuple[float, ...]) -> ir.Value:
+def _horner(builder: VectorBuilder, x: str, coefficients: tuple[float, ...]) -> str:
     """Evaluate coefficients[0] + x coefficients[1] + ... ."""
     result = builder.constant(coefficients[-1])
     for coefficient in coefficients[-2::-1]:
@@ -85,7 +83,7 @@ def _horner(builder: VectorBuilder, x: ir.Value, coefficients: tuple[float, ...]
     return result
 
 
-def sine_cosine(builder: VectorBuilder, x: ir.Value) -> tuple[ir.Value, ir.Value]:
+def sine_cosine(builder: VectorBuilder, x: str) -> tuple[str, str]:
     """Emit sine and cosine of x rad, to about one unit in the last place up to 1e6 (6e3 in float32)."""
     coefficients = _COEFFICIENTS[builder.target.precision]
     quotient = builder.round(builder.multiply(x, builder.constant(2.0 / math.pi)))
@@ -112,7 +110,7 @@ def sine_cosine(builder: VectorBuilder, x: ir.Value) -> tuple[ir.Value, ir.Value
     )
 
 
-def arctangent2(builder: VectorBuilder, y: ir.Value, x: ir.Value) -> ir.Value:
+def arctangent2(builder: VectorBuilder, y: str, x: str) -> str:
     """Emit the angle of the point (x, y) in (-pi, pi], to a few units in the last place; 0 at the origin."""
     zero = builder.constant(0.0)
     magnitude_y, magnitude_x = builder.absolute(y), builder.absolute(x)

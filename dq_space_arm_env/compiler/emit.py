@@ -8,18 +8,16 @@ by the back end.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from llvmlite import ir
 
 from dq_space_arm_env.compiler.elementary import arctangent2, sine_cosine
 from dq_space_arm_env.compiler.graph import LIBRARY_FUNCTIONS, Graph, Node, use_counts
-from dq_space_arm_env.compiler.vector_builder import POINTER, Target, VectorBuilder
+from dq_space_arm_env.compiler.vector_builder import Target, VectorBuilder, WrittenFunction
 
 _COMPARISONS = {"less": "<", "less_equal": "<=", "equal": "==", "not_equal": "!="}
 _LOGICAL = {"not", "and", "or", *_COMPARISONS}
-_LARGE_GRAPH = 40_000
-"""Nodes above which a function is divided into blocks: a single one takes LLVM three times as long."""
+_LARGE_GRAPH = 4_000
+"""Nodes above which a function is divided into blocks: a single one takes LLVM up to three times as long."""
 _LONGEST_BLOCK = 1_000
 """Nodes of such a block."""
 
@@ -27,17 +25,17 @@ _LONGEST_BLOCK = 1_000
 class _GraphEmitter:
     """Walks a graph's nodes once and emits each when a reader asks for it."""
 
-    def __init__(self, graph: Graph, builder: VectorBuilder, pointers: Sequence[ir.Value]) -> None:
-        self.graph = graph
-        self.builder, self.pointers = builder, pointers
-        self.inputs, outputs = pointers[: len(graph.inputs)], pointers[len(graph.inputs) :]
-        self.places: dict[int, list[tuple[ir.Value, int]]] = {}
+    def __init__(self, graph: Graph, builder: VectorBuilder) -> None:
+        self.graph, self.builder = graph, builder
+        count = len(graph.inputs)
+        self.inputs, outputs = builder.pointers[:count], builder.pointers[count:]
+        self.places: dict[int, list[tuple[str, int]]] = {}
         for pointer, indices in zip(outputs, graph.results, strict=True):
             for position, index in enumerate(indices):
                 self.places.setdefault(index, []).append((pointer, position))
         self.uses = use_counts(graph)
-        self.values: list[ir.Value | None] = [None] * len(graph.nodes)
-        self.angles: dict[int, tuple[ir.Value, ir.Value]] = {}
+        self.values: list[str | None] = [None] * len(graph.nodes)
+        self.angles: dict[int, tuple[str, str]] = {}
 
     def run(self) -> None:
         """Emit every node except products that a sum absorbs into a fused multiply-add.
@@ -47,31 +45,23 @@ class _GraphEmitter:
         divided = len(self.graph.nodes) > _LARGE_GRAPH
         for index, node in enumerate(self.graph.nodes):
             if divided and index % _LONGEST_BLOCK == 0:
-                self._begin_block()
+                self.builder.begin_block()
             if not self._is_fusible(index) or index in self.places:
                 self.values[index] = self._emit(node)
             for pointer, position in self.places.get(index, ()):
                 self.builder.store(self.value(index), pointer, position)
+        self.builder.end()
 
-    def _begin_block(self) -> None:
-        """Continue in a new block if an address is not zero: LLVM would merge blocks without a condition."""
-        llvm, here = self.builder.ir, self.pointers[0]
-        following, end = (llvm.append_basic_block(name) for name in ("following", "unreached"))
-        llvm.cbranch(llvm.icmp_unsigned("!=", here, here.type(None)), following, end)
-        llvm.position_at_end(end)
-        llvm.ret_void()
-        llvm.position_at_end(following)
-
-    def value(self, index: int) -> ir.Value:
+    def value(self, index: int) -> str:
         """The emitted value of a node, as a number in every lane."""
         value = self.values[index]
         if value is None:
             value = self.values[index] = self._emit(self.graph.nodes[index])
         if self.graph.nodes[index].operation in _LOGICAL:
-            return self.builder.ir.uitofp(value, self.builder.type)
+            return self.builder.number(value)
         return value
 
-    def _truth(self, index: int) -> ir.Value:
+    def _truth(self, index: int) -> str:
         if self.graph.nodes[index].operation in _LOGICAL:
             value = self.values[index]
             assert value is not None
@@ -83,11 +73,11 @@ class _GraphEmitter:
         operation = self.graph.nodes[index].operation
         return self.builder.target.fused and operation in ("multiply", "square") and self.uses[index] == 1
 
-    def _factors(self, index: int) -> tuple[ir.Value, ir.Value]:
+    def _factors(self, index: int) -> tuple[str, str]:
         arguments = self.graph.nodes[index].arguments
         return self.value(arguments[0]), self.value(arguments[-1])
 
-    def _emit_sum(self, left: int, right: int, *, subtract: bool) -> ir.Value:
+    def _emit_sum(self, left: int, right: int, *, subtract: bool) -> str:
         """Emit left + right or left - right, fused with the product where one of them is fusible."""
         builder = self.builder
         if not subtract and (choice := self._choice(left, right)):
@@ -116,7 +106,7 @@ class _GraphEmitter:
                     return condition, if_true, if_false
         return None
 
-    def _emit(self, node: Node) -> ir.Value:
+    def _emit(self, node: Node) -> str:
         builder, operation, arguments = self.builder, node.operation, node.arguments
         match operation:
             case "input":
@@ -130,9 +120,9 @@ class _GraphEmitter:
                     self.angles[arguments[0]] = sine_cosine(builder, self.value(arguments[0]))
                 return self.angles[arguments[0]][operation == "cos"]
             case "not":
-                return builder.ir.not_(self._truth(arguments[0]))
+                return builder.opposite(self._truth(arguments[0]))
             case "and" | "or":
-                combine = builder.ir.and_ if operation == "and" else builder.ir.or_
+                combine = builder.both if operation == "and" else builder.either
                 return combine(self._truth(arguments[0]), self._truth(arguments[1]))
             case "if_else_zero":
                 return builder.select(
@@ -143,7 +133,7 @@ class _GraphEmitter:
             return builder.compare(_COMPARISONS[operation], *values)
         return self._emit_arithmetic(operation, values)
 
-    def _emit_arithmetic(self, operation: str, values: list[ir.Value]) -> ir.Value:
+    def _emit_arithmetic(self, operation: str, values: list[str]) -> str:
         builder = self.builder
         if operation in LIBRARY_FUNCTIONS:
             return builder.library(LIBRARY_FUNCTIONS[operation], *values)
@@ -183,12 +173,6 @@ class _GraphEmitter:
 
 def emit_graph(module: ir.Module, graph: Graph, target: Target) -> ir.Function:
     """Add a graph to a module as an internal function of one pointer per input, then per output."""
-    count = len(graph.inputs) + len(graph.outputs)
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER] * count), graph.name)
-    function.linkage = "internal"
-    for argument in function.args:
-        argument.add_attribute("noalias")
-    builder = VectorBuilder(ir.IRBuilder(function.append_basic_block("entry")), target)
-    _GraphEmitter(graph, builder, function.args).run()
-    builder.ir.ret_void()
+    function = WrittenFunction(module, graph.name, len(graph.inputs) + len(graph.outputs))
+    _GraphEmitter(graph, VectorBuilder(function, target)).run()
     return function

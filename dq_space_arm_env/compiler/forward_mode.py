@@ -212,7 +212,7 @@ def _applied(joint: Graph, name: str, n_inputs: int, n_outputs: int, coefficient
     kept = [i for i in range(len(inputs)) if i in read or n_inputs <= i < len(joint.inputs)]
     slots = {position: new for new, position in enumerate(kept)}
     moved = tuple(
-        replace(node, slot=(slots[node.slot[0]], node.slot[1])) if node.operation == "input" else node
+        node._replace(slot=(slots[node.slot[0]], node.slot[1])) if node.operation == "input" else node
         for node in part.nodes
     )
     return replace(part, inputs=tuple(inputs[i] for i in kept), nodes=moved)
@@ -232,7 +232,7 @@ def _part(
             wanted.update(graph.nodes[index].arguments)
     new_index = {index: new for new, index in enumerate(sorted(wanted))}
     nodes = tuple(
-        replace(graph.nodes[index], arguments=tuple(new_index[i] for i in graph.nodes[index].arguments))
+        graph.nodes[index]._replace(arguments=tuple(new_index[i] for i in graph.nodes[index].arguments))
         for index in sorted(wanted)
     )
     places = tuple(tuple(new_index[i] for i in indices) for indices in results)

@@ -11,15 +11,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi
+
+from dq_space_arm_env.algebra.symbolic import symbols
 
 Expression = Any  # a CasADi SX scalar, or a Python float that a trace folded
 
 
-@dataclass(frozen=True)
-class Node:
+class Node(NamedTuple):
     """One operation: its name, the nodes it reads, and its constant or input position."""
 
     operation: str
@@ -137,20 +138,20 @@ def trace(
     It returns a sequence of scalars per output. `given` are further inputs, by symbols that the function
     already holds; empty ones are left out. Raises NotImplementedError for operations without an instruction.
     """
-    symbols = {key: [casadi.SX.sym(f"{key}_{i}") for i in range(size)] for key, size in inputs.items()}
-    outputs = function(**symbols)
+    traced = {key: symbols(key, size) for key, size in inputs.items()}
+    outputs = function(**traced)
     return graph_of(
-        name, {**symbols, **{key: list(values) for key, values in given.items() if values}}, outputs
+        name, {**traced, **{key: list(values) for key, values in given.items() if values}}, outputs
     )
 
 
 def graph_of(
-    name: str, symbols: Mapping[str, Sequence[Expression]], outputs: Mapping[str, Sequence[Expression]]
+    name: str, inputs: Mapping[str, Sequence[Expression]], outputs: Mapping[str, Sequence[Expression]]
 ) -> Graph:
     """Trace the operations from the symbols of each input to the expressions of each output."""
     flat = [casadi.SX(value) for values in outputs.values() for value in values]
     shared = casadi.cse(casadi.vertcat(*flat)) if flat else casadi.SX(0, 1)
-    arguments = [casadi.vertcat(*values) if len(values) else casadi.SX(0, 1) for values in symbols.values()]
+    arguments = [casadi.vertcat(*values) if len(values) else casadi.SX(0, 1) for values in inputs.values()]
     # A structurally zero output entry would be dropped from the result's sparsity pattern.
     function = casadi.Function(name, arguments, [casadi.densify(shared)])
     nodes, results = _static_single_assignment(function)
@@ -160,7 +161,7 @@ def graph_of(
         start += len(values)
     return Graph(
         name=name,
-        inputs=tuple((key, len(values)) for key, values in symbols.items()),
+        inputs=tuple((key, len(values)) for key, values in inputs.items()),
         outputs=tuple((key, len(values)) for key, values in outputs.items()),
         nodes=nodes,
         results=tuple(split),
@@ -179,10 +180,10 @@ def _static_single_assignment(function: casadi.Function) -> tuple[tuple[Node, ..
     results = [-1] * function.nnz_out()
 
     def add(node: Node) -> int:
-        if node not in index:
-            index[node] = len(nodes)
+        found = index.setdefault(node, len(nodes))
+        if found == len(nodes):
             nodes.append(node)
-        return index[node]
+        return found
 
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)

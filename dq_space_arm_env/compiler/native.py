@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import ctypes
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from itertools import count
+from threading import Lock
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -21,9 +23,12 @@ from dq_space_arm_env.common.host_machine import host_machine
 KernelFunction = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
 
 
-# Above this many lines of assembly, LLVM's optimizer and its thorough code generator cost seconds and gain a
-# few per cent: the trace has shared and folded everything already.
-_LARGE_MODULE = 12_000
+# Lines of assembly above which LLVM's optimizer, half of the time that small modules take, gains nothing: the
+# trace has shared and folded everything already.
+_LARGE_MODULE = 3_000
+# Lines above which a function's instructions stay in their order, see `_in_given_order`.
+_LONG_FUNCTION = 3_000
+_ORDER = Lock()
 
 
 def _target_machine(opt: int) -> llvm.TargetMachine:
@@ -52,10 +57,28 @@ def _optimized(assembly: str) -> tuple[llvm.ModuleRef, llvm.TargetMachine]:
     return module, machine
 
 
+@contextmanager
+def _in_given_order() -> Iterator[None]:
+    """Keep LLVM from scheduling instructions, by an option of the whole process; no result depends on it.
+
+    A trace computes a value shortly before its readers need it. In functions of thousands of instructions
+    LLVM's machine scheduler moves the two apart: it takes half of the code generator's time, and what no
+    longer fits in registers a sixth of the code's.
+    """
+    with _ORDER:
+        llvm.set_option("", "-enable-misched=false")
+        try:
+            yield
+        finally:
+            llvm.set_option("", "-enable-misched=true")
+
+
 def compile_to_object(assembly: str) -> bytes:
     """Compile LLVM assembly to an object file for this processor."""
     module, machine = _optimized(assembly)
-    return bytes(machine.emit_object(module))
+    longest = max(function.count("\n") for function in assembly.split("\ndefine "))
+    with _in_given_order() if longest > _LONG_FUNCTION else nullcontext():
+        return bytes(machine.emit_object(module))
 
 
 @cache

@@ -142,6 +142,6 @@ def _with_shared_reciprocals(graph: Graph) -> Graph:
             reciprocal = add(Node("invert", arguments[1:]))
             moved.append(add(Node("multiply", (arguments[0], reciprocal))))
         else:
-            moved.append(add(replace(node, arguments=arguments)))
+            moved.append(add(node._replace(arguments=arguments)))
     results = tuple(tuple(moved[i] for i in indices) for indices in graph.results)
     return replace(graph, nodes=tuple(nodes), results=results)

@@ -17,7 +17,7 @@ from dq_space_arm_env.compiler.vector_builder import (
     ELEMENTS,
     INDEX,
     POINTER,
-    VectorBuilder,
+    BlockBuilder,
     vector_type,
 )
 
@@ -27,7 +27,7 @@ INT32 = ir.IntType(32)
 class ArrayAccess:
     """Reads and writes of arrays with elements of one type, appended to a basic block."""
 
-    def __init__(self, vectors: VectorBuilder, dtype: str) -> None:
+    def __init__(self, vectors: BlockBuilder, dtype: str) -> None:
         self.vectors = vectors
         self.dtype = dtype
         self.element = ELEMENTS[dtype]
@@ -132,7 +132,7 @@ class ArrayAccess:
         builder, wanted = self.vectors.ir, vector_type(self.element, self.lanes)
         vector = self.vectors.load(block, index)
         if self.dtype == "bool":
-            return builder.zext(self.vectors.compare("!=", vector, self.vectors.constant(0.0)), wanted)
+            return builder.zext(self.vectors.nonzero(vector), wanted)
         if self.dtype == self.vectors.target.precision:
             return vector
         return builder.fptrunc(vector, wanted) if self.dtype == "float32" else builder.fpext(vector, wanted)

@@ -48,7 +48,6 @@ class KernelLibrary:
         self._kernels: dict[tuple[str, str, int], BoundKernel] = {}
         self._paper_kernels: dict[tuple[str, int], BoundKernel] = {}
         self._single_row_calls: dict[tuple[str, str | None, bool, bool], SingleRowCalls] = {}
-        self._announced = False
 
     @cached_property
     def _programs(self) -> ScenePrograms:
@@ -183,9 +182,9 @@ class KernelLibrary:
         return np.broadcast_to(given, (rows, self.n_p))
 
     def _announce(self) -> None:
-        """Explain, once, why the first use of a scene takes a moment."""
-        if not self._announced:
-            self._announced = True
+        """Explain, once for all variants of a scene, why its first use takes a moment."""
+        if self.scene.name not in _ANNOUNCED:
+            _ANNOUNCED.add(self.scene.name)
             _logger().info(
                 "compiling scene %r for its first use, which takes seconds; the result is kept in %s",
                 self.scene.name,
@@ -252,6 +251,7 @@ def source_hash() -> str:
     return digest.hexdigest()
 
 
+_ANNOUNCED: set[str] = set()
 PENALIZED = "penalized_"
 """Prefix of programs whose cost has a penalty for each constraint."""
 

@@ -30,6 +30,7 @@ import casadi
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.algebra.scalars import select
+from dq_space_arm_env.algebra.symbolic import symbols
 from dq_space_arm_env.algebra.vectors import norm
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.equations_of_motion import Motion
@@ -71,9 +72,9 @@ class SceneEquations:
     def of(cls, scene: Scene, parameters: Scalars | None = None) -> SceneEquations:
         """Equations of a scene with symbols, `field.parameters`, for what varies; or with given values."""
         layout = StateLayout.of(scene)
-        symbols: list[Scalar] = []
+        varying: list[Scalar] = []
         if parameters is None:
-            parameters = symbols = [casadi.SX.sym(f"parameter_{i}") for i in range(layout.n_p)]
+            parameters = varying = symbols("parameter", layout.n_p)
         given = dict(zip(layout.parameters.names, parameters, strict=True))
         target: Scalars = body_pose(scene, given)
         velocity: Scalars = body_velocity(scene, given)
@@ -82,7 +83,7 @@ class SceneEquations:
             target = dq.multiply(target, grasp)
             velocity = dual_vectors.inverse_transform(*poses.to_matrix(grasp), velocity)
         tree = KinematicTree.from_scene(scene, given)
-        field = SpaceArmField(tree, layout, symbols, scene.simulation.formulation)
+        field = SpaceArmField(tree, layout, varying, scene.simulation.formulation)
         return cls(scene, tree, target, velocity, layout, field, given)
 
     def y(self, x: Scalars) -> Scalars:

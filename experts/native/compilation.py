@@ -28,21 +28,20 @@ def compiled(loop: Loop) -> Loop:
     loop that allocates does not compile, and no time goes into counting references to arrays, which was a
     third of the backward pass. The interpreter lock is released.
     """
-    return _compile(loop, in_place=False)
+    return _compile(loop)
 
 
 def inlined(loop: Loop) -> Loop:
-    """Compile like `compiled`, but inline at every call.
+    """Compile like `compiled`, but as part of each loop that calls it.
 
     A matrix is nine arguments, and a named tuple of arrays a hundred or more: passing them takes as long as
-    the work of a small function.
+    the work of a small function. No code is made for the function alone.
     """
-    return _compile(loop, in_place=True)
+    return _compile(loop, inline="always")
 
 
-def _compile(loop: Loop, *, in_place: bool) -> Loop:
-    options: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
-    options["forceinline"] = in_place
+def _compile(loop: Loop, **options: Any) -> Loop:
+    options |= {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False, "no_cfunc_wrapper": True}
     dispatcher = njit(nogil=True, boundscheck=False, **options)(loop)
     dispatcher._cache = LoopCache(loop)  # numba's way to cache, but for whose files it trusts
     return cast(Loop, dispatcher)
