@@ -64,6 +64,8 @@ LAYER_NORMALIZED: Mapping[str, type[BasePolicy]] = {
 class FallingEntropy(OffPolicyAlgorithm):
     """A maximum-entropy algorithm whose target entropy goes linearly to `final_target_entropy`, if given."""
 
+    target_entropy: str | float
+
     def __init__(self, *arguments: Any, final_target_entropy: float | None = None, **options: Any) -> None:
         self.final_target_entropy = final_target_entropy
         super().__init__(*arguments, **options)
