@@ -111,6 +111,7 @@ class OffPolicy(_Common):
     train_freq: Many = Field(default=1, description="decisions of each copy between updates")
     gradient_steps: Many = Field(default=1, description="gradient steps per update")
     n_critics: Few = Field(default=2, description="critics; the lowest value or quantiles count")
+    layer_norm: StrictBool = Field(default=False, description="whether critics are layer-normalized")
     hindsight: Hindsight | None = Field(
         default=None, description="learn on the goal environment, with hindsight; absent: neither"
     )
@@ -132,6 +133,18 @@ class _MaximumEntropy(OffPolicy):
     target_entropy: Finite | Literal["auto"] = Field(
         default="auto", description="entropy it is learned for; 'auto': minus the number of actions"
     )
+    final_target_entropy: Finite | None = Field(
+        default=None, description="final target entropy, reached linearly; absent: target_entropy"
+    )
+
+    def _problems(self) -> Iterator[Problem]:
+        yield from super()._problems()
+        if self.final_target_entropy is not None and self.ent_coef != "auto":
+            yield Problem(
+                ("final_target_entropy",),
+                self.final_target_entropy,
+                f"must be absent with ent_coef = {self.ent_coef:g}: no entropy is aimed at then",
+            )
 
 
 class Demonstrated(Model):
@@ -158,22 +171,12 @@ class SAC(_MaximumEntropy):
     """Soft actor-critic (Haarnoja et al., 2018)."""
 
     name: Literal["SAC"]
-    final_target_entropy: Finite | None = Field(
-        default=None, description="final target entropy, reached linearly; absent: target_entropy"
-    )
-    layer_norm: StrictBool = Field(default=False, description="whether critics are layer-normalized")
     demonstrations: Demonstrated | None = Field(
         default=None, description="expert decisions to learn from as well; absent: none"
     )
 
     def _problems(self) -> Iterator[Problem]:
         yield from super()._problems()
-        if self.final_target_entropy is not None and self.ent_coef != "auto":
-            yield Problem(
-                ("final_target_entropy",),
-                self.final_target_entropy,
-                f"must be absent with ent_coef = {self.ent_coef:g}: no entropy is aimed at then",
-            )
         if self.demonstrations is not None and self.hindsight is not None:
             yield Problem(
                 ("demonstrations",), "given", "must be absent with hindsight, which has its own replay buffer"
@@ -217,6 +220,9 @@ class TD3(OffPolicy):
     target_noise_clip: Positive = Field(default=0.5, description="bound of this noise, in action scales")
     action_noise: NonNegative = Field(
         default=0.1, description="standard deviation of the exploration noise, in action scales"
+    )
+    final_action_noise: NonNegative | None = Field(
+        default=None, description="final standard deviation, reached linearly; absent: action_noise"
     )
 
 

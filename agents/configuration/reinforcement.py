@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from pydantic import Field, StrictBool
 
-from agents.configuration.algorithms import PPO, SAC, Algorithm, Hindsight, OffPolicy
+from agents.configuration.algorithms import PPO, Algorithm, Hindsight, OffPolicy
 from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many, StartFrom
 from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
 
@@ -91,7 +91,7 @@ class Configuration(AgentConfiguration):
                 f"all copies gather {decisions:,} decisions, at most {MOST_IN_MEMORY:,} fit into memory"
             )
             yield Problem(("environment", "copies"), self.environment.copies, sentence)
-        if isinstance(self.algorithm, SAC) and self.algorithm.layer_norm and not self.network.hidden:
+        if isinstance(self.algorithm, OffPolicy) and self.algorithm.layer_norm and not self.network.hidden:
             yield Problem(
                 ("network", "hidden"), [], "must have a layer for algorithm.layer_norm to normalize"
             )

@@ -11,11 +11,9 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
-from sb3_contrib import TQC
-from stable_baselines3 import TD3, HerReplayBuffer
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -26,8 +24,9 @@ from agents.policies.exported import units_of
 from agents.reinforcement.callback import Advance, TimeIsUp, TrainingCallback
 from agents.reinforcement.checkpoint import read_checkpoint
 from agents.reinforcement.networks import ACTIVATIONS, ScaledActionsPolicy, ScaledObservations
+from agents.reinforcement.off_policy import LAYER_NORMALIZED, TruncatedQuantileCritics, TwinDelayed
 from agents.reinforcement.ppo import ProximalPolicyOptimization
-from agents.reinforcement.sac import DemonstrationBuffer, LayerNormalizedPolicy, SoftActorCritic
+from agents.reinforcement.sac import DemonstrationBuffer, SoftActorCritic
 from agents.reinforcement.training_environment import action_limits, make_environment
 from agents.reinforcement.training_progress import Progress
 from agents.reinforcement.warm_start import fly_again, set_actor
@@ -39,8 +38,8 @@ from dq_space_arm_env.common.files import write_atomically
 LEARNERS: Mapping[str, type[BaseAlgorithm]] = {
     "PPO": ProximalPolicyOptimization,
     "SAC": SoftActorCritic,
-    "TQC": TQC,
-    "TD3": TD3,
+    "TQC": TruncatedQuantileCritics,
+    "TD3": TwinDelayed,
 }
 TRIAL_ACTIONS = 0.3
 """Standard deviation of the random actions that measure the spread of observations, in action scales."""
@@ -176,10 +175,10 @@ def make_learner(
         policy = ScaledActionsPolicy
         policy_options["log_std_init"] = algorithm.log_std_init
     else:
-        _set_off_policy_options(algorithm, options, policy_options, environment)
+        _set_off_policy_options(algorithm, options, policy_options)
         policy = "MlpPolicy" if algorithm.hindsight is None else "MultiInputPolicy"
-        if isinstance(algorithm, c.SAC) and algorithm.layer_norm:
-            policy = LayerNormalizedPolicy
+        if algorithm.layer_norm:
+            policy = LAYER_NORMALIZED[algorithm.name]
     model = LEARNERS[algorithm.name](
         policy, environment, policy_kwargs=policy_options, seed=configuration.seed, device="cpu", **options
     )
@@ -189,7 +188,7 @@ def make_learner(
 
 
 def _set_off_policy_options(
-    algorithm: c.OffPolicy, options: dict[str, Any], policy_options: dict[str, Any], environment: VecEnv
+    algorithm: c.OffPolicy, options: dict[str, Any], policy_options: dict[str, Any]
 ) -> None:
     """Put the options of algorithms with a replay buffer where Stable-Baselines3 expects them."""
     policy_options["n_critics"] = options.pop("n_critics")
@@ -203,9 +202,8 @@ def _set_off_policy_options(
         options["replay_buffer_class"] = DemonstrationBuffer
         options["cloning_weight"] = algorithm.demonstrations.cloning_weight
     if isinstance(algorithm, c.TD3):
-        assert environment.action_space.shape is not None
-        deviation = np.full(environment.action_space.shape, options.pop("action_noise"))
-        options["action_noise"] = NormalActionNoise(np.zeros_like(deviation), deviation)
+        first, last = options.pop("action_noise"), options.pop("final_action_noise")
+        options["deviations"] = first, first if last is None else last
     if algorithm.hindsight is not None:
         options["replay_buffer_class"] = HerReplayBuffer
         options["replay_buffer_kwargs"] = algorithm.hindsight.model_dump(exclude={"reward_type"})

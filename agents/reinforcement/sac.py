@@ -1,7 +1,6 @@
-"""Soft actor-critic that also learns from demonstrations, with its critic and replay buffer.
+"""Soft actor-critic that also learns from demonstrations, with its replay buffer.
 
-Part of each batch is demonstrated, and the critics are layer-normalized, which keeps them from overestimating
-out-of-distribution actions: both after Ball et al., "Efficient Online Reinforcement Learning with Offline
+Part of each batch is demonstrated, after Ball et al., "Efficient Online Reinforcement Learning with Offline
 Data" (ICML 2023). The actor may be drawn to demonstrated actions as in Fujimoto and Gu, "A Minimalist
 Approach to Offline Reinforcement Learning" (NeurIPS 2021).
 """
@@ -13,43 +12,14 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecNormalize
-from stable_baselines3.sac.policies import SACPolicy
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import mse_loss
 
+from agents.reinforcement.off_policy import FallingEntropy
 from agents.reinforcement.warm_start import Flown
-
-
-class LayerNormalizedCritic(ContinuousCritic):
-    """Critics with a layer normalization before each activation."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        for number, plain in enumerate(self.q_networks):
-            assert isinstance(plain, nn.Sequential)
-            linear = [module for module in plain if isinstance(module, nn.Linear)]
-            layers = create_mlp(
-                linear[0].in_features,
-                1,
-                [layer.out_features for layer in linear[:-1]],
-                type(plain[1]),
-                post_linear_modules=[nn.LayerNorm],
-            )
-            self.q_networks[number] = nn.Sequential(*layers)
-            setattr(self, f"qf{number}", self.q_networks[number])
-
-
-class LayerNormalizedPolicy(SACPolicy):
-    """The policy of SAC, with layer-normalized critics."""
-
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        options = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return LayerNormalizedCritic(**options).to(self.device)
 
 
 class DemonstrationBuffer(ReplayBuffer):
@@ -89,34 +59,18 @@ class DemonstrationBuffer(ReplayBuffer):
         return ReplayBufferSamples(*(torch.cat(pair) for pair in zip(parts, others, strict=True)))
 
 
-class SoftActorCritic(SAC):
-    """SAC of Stable-Baselines3 with a cloning term in the actor's loss, and exploration that ends.
+class SoftActorCritic(FallingEntropy, SAC):
+    """SAC of Stable-Baselines3 with a target entropy that may fall, and a cloning term in the actor's loss.
 
     `cloning_weight` weighs the mean squared difference from demonstrated actions, relative to the mean size
-    of values; 0 is SAC's own loss. The target entropy goes linearly to `final_target_entropy`: critics learn
-    what an action is worth from actions that differ, and little noise at the end lets the actor be precise.
+    of values; 0 is SAC's own loss.
     """
 
-    def __init__(
-        self,
-        *arguments: Any,
-        cloning_weight: float = 0.0,
-        final_target_entropy: float | None = None,
-        **options: Any,
-    ) -> None:
-        self.cloning_weight, self.final_target_entropy = cloning_weight, final_target_entropy
+    def __init__(self, *arguments: Any, cloning_weight: float = 0.0, **options: Any) -> None:
+        self.cloning_weight = cloning_weight
         super().__init__(*arguments, **options)
 
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        # "auto" until here, a number now; Stable-Baselines3 types it as either.
-        self.first_target_entropy = float(vars(self)["target_entropy"])
-
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        if self.final_target_entropy is not None:
-            first, last = self.first_target_entropy, self.final_target_entropy
-            self.target_entropy = last + (first - last) * self._current_progress_remaining
-            self.logger.record("train/target_entropy", self.target_entropy)
         if not self.cloning_weight:
             super().train(gradient_steps, batch_size)
             return

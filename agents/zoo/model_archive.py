@@ -32,7 +32,7 @@ _POLICIES = frozenset(
         "stable_baselines3.td3.policies",
         "sb3_contrib.tqc.policies",
         "agents.reinforcement.networks",
-        "agents.reinforcement.sac",
+        "agents.reinforcement.off_policy",
     }
 )
 """Modules whose policies act as this file computes."""

@@ -34,11 +34,12 @@ PAPER = load_scene("paper")
 STEPS, REPEAT, COPIES = 40, 4, 4
 EVERY = {"evaluate_every": 1600, "checkpoint_every": 1600}
 OFF_POLICY = {"batch_size": 32, "learning_starts": 200, "buffer_size": 2000, "gradient_steps": 2}
+FALLING_ENTROPY = {"target_entropy": 3.0, "final_target_entropy": -9.0}
 ALGORITHMS = {
     "PPO": {"name": "PPO", "n_steps": 10, "batch_size": 40, "n_epochs": 2},
-    "SAC": {"name": "SAC", **OFF_POLICY, "target_entropy": 3.0, "final_target_entropy": -9.0},
-    "TQC": {"name": "TQC", **OFF_POLICY},
-    "TD3": {"name": "TD3", **OFF_POLICY},
+    "SAC": {"name": "SAC", **OFF_POLICY, **FALLING_ENTROPY},
+    "TQC": {"name": "TQC", **OFF_POLICY, **FALLING_ENTROPY, "layer_norm": True},
+    "TD3": {"name": "TD3", **OFF_POLICY, "layer_norm": True, "action_noise": 0.3, "final_action_noise": 0.1},
     "HER": {"name": "SAC", **OFF_POLICY, "hindsight": {"n_sampled_goal": 2}},
 }
 
@@ -193,13 +194,38 @@ def test_a_run_resumes_with_optimizer_and_buffer(algorithm, trained, scene_file,
 
 
 @pytest.mark.sampled
-def test_the_target_entropy_goes_linearly_to_its_end(trained):
-    model = trained("SAC").model
+@pytest.mark.parametrize("algorithm", ["SAC", "TQC"])
+def test_the_target_entropy_goes_linearly_to_its_end(algorithm, trained):
+    model = trained(algorithm).model
     done = model.num_timesteps / 800  # decisions
     assert done > 0.95
     # The last update follows the last decision of all copies.
     assert model.target_entropy == pytest.approx(3.0 - 12.0 * done, abs=1e-9)
     assert trained("HER").model.target_entropy == -model.action_space.shape[0]
+
+
+@pytest.mark.sampled
+def test_exploration_noise_goes_linearly_to_its_end(trained):
+    model = trained("TD3").model
+    chosen = model.policy.scale_action(model.predict(model._last_obs)[0])
+    for left in (1.0, 0.5, 0.0):
+        model._current_progress_remaining = left
+        explored = [model._sample_action(0, n_envs=COPIES)[1] for _ in range(100)]
+        noise = (np.array(explored) - chosen)[:, np.abs(chosen) < 0.2]
+        assert noise.size > 500
+        assert noise.std() == pytest.approx(0.1 + 0.2 * left, rel=0.1)
+
+
+@pytest.mark.sampled
+@pytest.mark.parametrize(("algorithm", "outputs"), [("TQC", 25), ("TD3", 1)])
+def test_critics_are_layer_normalized_and_optimized(algorithm, outputs, trained):
+    critic = trained(algorithm).model.critic
+    hidden = [torch.nn.Linear, torch.nn.LayerNorm, torch.nn.ReLU]
+    for network in critic.q_networks:
+        assert [type(layer) for layer in network] == [*hidden, *hidden, torch.nn.Linear]
+        assert network[-1].out_features == outputs
+        assert all(np.abs(network[layer].weight.detach().numpy() - 1.0).max() > 1e-5 for layer in (1, 4))
+    assert len(list(critic.parameters())) == 2 * (3 * 2 + 2 * 2)
 
 
 @pytest.mark.parametrize("algorithm", ["HER", "SAC"])
