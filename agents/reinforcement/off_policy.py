@@ -6,7 +6,7 @@ precise. Layer normalization keeps critics from overestimating out-of-distributi
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ class _LayerNormalized(BasePolicy):
     """A policy whose critics have a layer normalization before each activation."""
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        critic = super().make_critic(features_extractor)  # type: ignore[misc]
+        critic = cast(Any, super()).make_critic(features_extractor)  # of SAC, TQC or TD3
         for number, plain in enumerate(critic.q_networks):
             linear = [module for module in plain if isinstance(module, nn.Linear)]
             layers = create_mlp(
@@ -101,7 +101,8 @@ class TwinDelayed(TD3):
     def deviation(self) -> float:
         """Current standard deviation of the noise, in action scales."""
         first, last = self.deviations
-        return last + (first - last) * self._current_progress_remaining
+        deviation: float = last + (first - last) * self._current_progress_remaining
+        return deviation
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -109,4 +110,5 @@ class TwinDelayed(TD3):
         assert self.action_space.shape is not None
         deviation = np.full((n_envs, *self.action_space.shape), self.deviation)
         noise = NormalActionNoise(np.zeros_like(deviation), deviation)
-        return super()._sample_action(learning_starts, noise, n_envs)
+        actions: tuple[NDArray[Any], NDArray[Any]] = super()._sample_action(learning_starts, noise, n_envs)
+        return actions
