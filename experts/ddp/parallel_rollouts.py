@@ -10,7 +10,7 @@ import numpy as np
 
 from dq_space_arm_env.kernels.bound import buffer_table
 from experts.ddp.backward_pass import Update
-from experts.native.compilation import BufferTable, call_kernel, compiled
+from experts.native.compilation import BufferTable, call_kernel, compiled, part
 from experts.native.padded_algebra import FloatArray, set_product_sum
 from experts.problems.shooting_problem import RateLimits, ShootingProblem, native_calls, rate_limits
 
@@ -162,7 +162,7 @@ def _roll_out(
             work.totals[lane] = np.inf
 
 
-@compiled
+@part
 def _apply_update(
     stage: int,
     alphas: FloatArray,
