@@ -17,6 +17,7 @@ from experts.native.padded_algebra import (
     FloatArray,
     factorize,
     padded,
+    padded_in_loops,
     padded_zeros,
     substitute,
 )
@@ -208,7 +209,7 @@ def _newton_step(hessian: FloatArray, work: BoxQPWorkspace) -> int:
         work.step[a] = work.slope[i]
     if not factorize(work.system, work.inverse_pivots, n_free):
         return -1
-    substitute(work.system, work.inverse_pivots, padded(size), n_free)
+    substitute(work.system, work.inverse_pivots, padded_in_loops(size), n_free)
     return n_free
 
 

@@ -17,6 +17,9 @@ from experts.problems.shooting_problem import RateLimits, ShootingProblem, nativ
 LANES = 8
 """Step lengths per call: a whole number of vectors on any processor."""
 
+LANE_KERNELS = ("difference", "step_with_cost")
+"""Kernels that work on all lanes at once."""
+
 
 class _Work(NamedTuple):
     """Trajectories and work arrays of the lanes."""
@@ -71,8 +74,7 @@ class ParallelRollouts:
         # Keeps the kernels' code and the arrays behind the tables alive.
         self._arrays = (time_step, *problem.terminal_inputs)
         self._code = difference, step, terminal = (
-            problem.kernel("difference", batched=True),
-            problem.kernel("step_with_cost", batched=True),
+            *(problem.kernel(name, batched=True) for name in LANE_KERNELS),
             problem.kernel("terminal_cost"),
         )
         self._kernels = _Kernels(

@@ -11,13 +11,14 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import njit, typeof, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from dq_space_arm_env.common.first_use import announce, compiling
 from experts.native.loop_cache import LoopCache
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
@@ -66,7 +67,20 @@ _OPTIONS: dict[str, Any] = {
 
 def _cached(dispatcher: Any, loop: Loop) -> Loop:
     dispatcher._cache = LoopCache(loop)  # numba's way to cache, but for whose files it trusts
+    compile_loop = dispatcher._compiler.compile
+
+    def compile_aloud(*signature: Any) -> Any:
+        announce("the solver", if_first=True)
+        with compiling(lambda: f"{loop.__name__.strip('_')} of the solver"):
+            return compile_loop(*signature)
+
+    dispatcher._compiler.compile = compile_aloud
     return cast(Loop, dispatcher)
+
+
+def prepare(loop: Callable[..., Any], *arguments: Any) -> None:
+    """Compile a loop for arguments of some types, or load it from the cache, without calling it."""
+    cast(Any, loop).compile(tuple(map(typeof, arguments)))
 
 
 class _PartLibrary(JITCodeLibrary):

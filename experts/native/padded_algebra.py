@@ -7,7 +7,7 @@ never mix with others, so their content does not matter. The register tiles of `
 import numpy as np
 from numpy.typing import NDArray
 
-from experts.native.compilation import compiled, inlined, part
+from experts.native.compilation import inlined, part
 from experts.native.vector_code import LANES, TILE_ROWS
 from experts.native.vector_tiles import (
     factorize_rows,
@@ -29,10 +29,12 @@ SMALLEST_PIVOT = 1e-14
 """A pivot below this share of its diagonal entry is rounding noise: the matrix is not positive definite."""
 
 
-@compiled
 def padded(size: int) -> int:
     """Round a row length up to whole vectors."""
     return -(-size // LANES) * LANES
+
+
+padded_in_loops = part(padded)
 
 
 def padded_zeros(*shape: int) -> FloatArray:
