@@ -1,11 +1,11 @@
 """Executors run tasks: in this process, in a pool of processes here, or on a cluster (`RayExecutor`)."""
 
-import os
 import selectors
 from collections.abc import Generator, Iterable, Iterator
 from itertools import islice
 from typing import Any, Protocol, TypeVar
 
+from dq_space_arm_env.common.host_machine import processors
 from dq_space_arm_env.common.worker_process import WorkerLostError, WorkerProcess, is_worker
 
 MOST_LOSSES = 3
@@ -144,12 +144,6 @@ def _dismiss(selector: selectors.BaseSelector, worker: object) -> None:
     assert isinstance(worker, WorkerProcess)
     selector.unregister(worker)
     worker.close()
-
-
-def processors() -> int:
-    """Count the processors that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def local_executor(workers: int | None = None) -> Executor:

@@ -19,9 +19,10 @@ from agents.experiments.shared_demonstrations import SharedDemonstrations
 from agents.experiments.training_task import FAILED, TRAINED, TrainingTask
 from agents.training import default_folder, with_changes
 from dq_space_arm_env import load_scene
+from dq_space_arm_env.common.host_machine import processors
 from dq_space_arm_env.common.progress import Advance, Status
 from dq_space_arm_env.common.tables import Column, Row, TextTable, tabulate
-from experts.executors import Executor, ProcessExecutor, processors
+from experts.executors import Executor, ProcessExecutor
 
 Report = Callable[[Advance], None]
 _PARTS = 1000  # of a training, in the bar

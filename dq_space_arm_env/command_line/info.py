@@ -13,6 +13,7 @@ from dq_space_arm_env.command_line.policy_sources import policy_names
 from dq_space_arm_env.command_line.verb import json_option, print_document
 from dq_space_arm_env.common.console import table_console
 from dq_space_arm_env.common.entry_points import entry_points, load
+from dq_space_arm_env.common.host_machine import processors
 
 VARIABLES = (
     "DQ_SPACE_ARM_CACHE",
@@ -138,9 +139,7 @@ def gather() -> dict[str, dict[str, Any]]:
         "machine": {
             **origin["machine"],
             "processors": os.cpu_count(),
-            "processors for this process": len(os.sched_getaffinity(0))
-            if hasattr(os, "sched_getaffinity")
-            else os.cpu_count(),
+            "processors for this process": processors(),
             "memory_GB": _memory(),
             "python": sys.executable,
             "terminal": sys.stdout.isatty(),

@@ -45,6 +45,11 @@ def cache_key(*parts: str) -> str:
     return hashlib.sha256(json.dumps(everything).encode()).hexdigest()
 
 
+def is_kept(name: str, key: str) -> bool:
+    """Tell whether there is a file for code, which `read_code` may still refuse."""
+    return _file(name, key).is_file()
+
+
 def read_code(name: str, key: str) -> bytes | None:
     """Read what `keep_code` wrote; None, with a warning unless it is missing, if it may not be used."""
     path, content = _file(name, key), b""

@@ -1,5 +1,6 @@
 """The processor that this process runs on, for which code is compiled."""
 
+import os
 from dataclasses import dataclass
 from functools import cache
 
@@ -27,3 +28,9 @@ def host_machine() -> Machine:
     else:  # 64-bit Arm and the like: 128-bit vectors, fused multiply-add is part of the base instruction set
         lanes, fused = 2, True
     return Machine(llvm.get_host_cpu_name(), features.flatten(), lanes, fused)
+
+
+def processors() -> int:
+    """Count the processors that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
+    return len(affinity(0)) if affinity else os.cpu_count() or 1

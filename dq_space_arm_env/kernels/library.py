@@ -6,18 +6,17 @@ A process that finds its kernels in the cache neither traces nor compiles, nor d
 from __future__ import annotations
 
 import hashlib
-import logging
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.common.code_cache import cache_directory, cache_key
+from dq_space_arm_env.common.code_cache import cache_key, is_kept
+from dq_space_arm_env.common.first_use import announce, compiling
 from dq_space_arm_env.common.host_machine import host_machine
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.compiler import native
@@ -79,10 +78,9 @@ class KernelLibrary:
         `integrator` is that of programs that take a step, the scene's by default; `lanes` the rows the code
         works on at a time: 1, or the processor's vector width (default).
         """
-        plain = name.removeprefix(PENALIZED)
-        method = (integrator or self.scene.simulation.integrator) if plain in _STEPS else ""
-        key = (name, method, self.lanes if lanes is None else lanes)
+        key = name, method, _ = self._variant(name, integrator, lanes)
         if key not in self._kernels:
+            plain = name.removeprefix(PENALIZED)
 
             def trace() -> Program:
                 if name.startswith("environment_"):
@@ -93,6 +91,20 @@ class KernelLibrary:
 
             self._kernels[key] = self._load(*key, trace)
         return self._kernels[key]
+
+    def is_ready(self, name: str, *, integrator: str | None = None, lanes: int | None = None) -> bool:
+        """Tell whether a kernel is loaded or cached; the arguments are those of `kernel`."""
+        variant = self._variant(name, integrator, lanes)
+        return variant in self._kernels or is_kept(name, self._cache_key(*variant))
+
+    def _variant(self, name: str, integrator: str | None, lanes: int | None) -> tuple[str, str, int]:
+        """Name of a kernel, its integrator, empty where it takes no step, and its lanes."""
+        takes_steps = name.removeprefix(PENALIZED) in _STEPS
+        method = (integrator or self.scene.simulation.integrator) if takes_steps else ""
+        return name, method, self.lanes if lanes is None else lanes
+
+    def _cache_key(self, name: str, variant: str, lanes: int) -> str:
+        return cache_key(self.scene.content_hash(), source_hash(), name, variant, str(lanes))
 
     def paper_kernel(self, name: str, *, lanes: int | None = None) -> BoundKernel:
         """Compile a program of `PaperPrograms`, the redundant formulation, or load it from the cache."""
@@ -110,15 +122,15 @@ class KernelLibrary:
 
     def _load(self, name: str, variant: str, lanes: int, trace: Callable[[], Program]) -> BoundKernel:
         """Load a kernel from the cache; trace and compile it if it is missing."""
-        parts = (self.scene.content_hash(), source_hash(), name, variant, str(lanes))
 
         def build() -> tuple[bytes, dict[str, Any]]:
             from dq_space_arm_env.compiler.build import build_program
 
-            self._announce()
-            return build_program(trace(), lanes, self.scene.simulation.precision)
+            announce(f"scene {self.scene.name!r}")
+            with compiling(lambda: f"{name} of scene {self.scene.name!r}"):
+                return build_program(trace(), lanes, self.scene.simulation.precision)
 
-        return BoundKernel(native.load_or_build(name, cache_key(*parts), build))
+        return BoundKernel(native.load_or_build(name, self._cache_key(name, variant, lanes), build))
 
     def operation_count(self, name: str, *, integrator: str | None = None) -> int:
         """Arithmetic operations of a program per state, after folding and sharing subexpressions."""
@@ -181,16 +193,6 @@ class KernelLibrary:
             )
         return np.broadcast_to(given, (rows, self.n_p))
 
-    def _announce(self) -> None:
-        """Explain, once for all variants of a scene, why its first use takes a moment."""
-        if self.scene.name not in _ANNOUNCED:
-            _ANNOUNCED.add(self.scene.name)
-            _logger().info(
-                "compiling scene %r for its first use, which takes seconds; the result is kept in %s",
-                self.scene.name,
-                cache_directory(),
-            )
-
 
 def compile_program(program: Program, lanes: int) -> BoundKernel:
     """Compile a program that belongs to no scene, in double precision, or load it from the cache."""
@@ -209,33 +211,6 @@ def matrices(entries: Array, rows: int, columns: int) -> Array:
     return entries.reshape(*entries.shape[:-1], rows, columns)
 
 
-class _StandardError(logging.StreamHandler[TextIO]):
-    """Writes to the present standard error, not the one at the logger's creation."""
-
-    @property
-    def stream(self) -> TextIO:
-        """The present standard error."""
-        return sys.stderr
-
-    @stream.setter
-    def stream(self, value: TextIO) -> None:
-        """Nothing is kept."""
-
-
-@cache
-def _logger() -> logging.Logger:
-    """The package's logger; its messages are shown unless its level is raised."""
-    logger = logging.getLogger("dq_space_arm_env")
-    if not logger.handlers:
-        handler = _StandardError()
-        handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
-        logger.addHandler(handler)
-        logger.propagate = False
-    if logger.level == logging.NOTSET:
-        logger.setLevel(logging.INFO)
-    return logger
-
-
 @cache
 def source_hash() -> str:
     """Hash of the source that kernels are made from: a changed model never meets an old kernel.
@@ -251,7 +226,6 @@ def source_hash() -> str:
     return digest.hexdigest()
 
 
-_ANNOUNCED: set[str] = set()
 PENALIZED = "penalized_"
 """Prefix of programs whose cost has a penalty for each constraint."""
 

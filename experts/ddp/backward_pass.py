@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from experts.ddp.box_qp import NOT_POSITIVE_DEFINITE, BoxQPWorkspace, box_qp, box_qp_workspace
 from experts.ddp.derivatives import Derivatives, Hessians
-from experts.native.compilation import compiled, inlined
+from experts.native.compilation import compiled, inlined, part
 from experts.native.padded_algebra import (
     FloatArray,
     add_vector_product,
@@ -313,7 +313,7 @@ def _update_value(luu: FloatArray, mu: float, n_free: int, work: PassWorkspace) 
     set_product_sum_upper(work.Vxx, work.Vxx, work.K, work.coupling, n_free)
 
 
-@inlined
+@part
 def _follow_bounds(stage: int, n_free: int, work: PassWorkspace) -> None:
     """Let inputs that are clamped at bounds of their rates follow those, and the free ones respond.
 
@@ -338,7 +338,7 @@ def _follow_bounds(stage: int, n_free: int, work: PassWorkspace) -> None:
             work.K[a, t] += work.response[a]
 
 
-@inlined
+@part
 def _update_value_of_followers(n_tangent: int, n_free: int, work: PassWorkspace) -> None:
     """Add to the value function what clamped inputs that follow contribute.
 
@@ -387,7 +387,7 @@ def _store(stage: int, n_tangent: int, n_free: int, update: Update, work: PassWo
                 update.Vxx_all[stage, i, j] = work.Vxx[i, j]
 
 
-@compiled
+@part
 def _is_finite(work: PassWorkspace) -> bool:
     """Whether the expansion of Q at the current stage, or the value function after it, is finite."""
     n_tangent, n_controls = work.Vxx.shape[0], work.k.shape[0]

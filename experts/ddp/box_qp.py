@@ -12,11 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from experts.native.compilation import compiled
+from experts.native.compilation import part
 from experts.native.padded_algebra import (
     FloatArray,
     factorize,
     padded,
+    padded_in_loops,
     padded_zeros,
     substitute,
 )
@@ -74,7 +75,7 @@ def box_qp_workspace(size: int, right_sides: int = 0) -> BoxQPWorkspace:
     )
 
 
-@compiled
+@part
 def box_qp(
     hessian: FloatArray,
     gradient: FloatArray,
@@ -115,7 +116,7 @@ def box_qp(
     return _projected_newton(hessian, gradient, lower, upper, minimizer, work)
 
 
-@compiled
+@part
 def _solve_held(
     hessian: FloatArray, gradient: FloatArray, lower: FloatArray, upper: FloatArray, work: BoxQPWorkspace
 ) -> int:
@@ -134,7 +135,7 @@ def _solve_held(
     return n_free
 
 
-@compiled
+@part
 def _change_sides(
     hessian: FloatArray,
     gradient: FloatArray,
@@ -160,7 +161,7 @@ def _change_sides(
     return changed
 
 
-@compiled
+@part
 def _projected_newton(
     hessian: FloatArray,
     gradient: FloatArray,
@@ -195,14 +196,10 @@ def _projected_newton(
     return ITERATION_LIMIT, n_free
 
 
-@compiled
+@part
 def _newton_step(hessian: FloatArray, work: BoxQPWorkspace) -> int:
     """List the free components, solve for their Newton step and right sides; return their number, or -1."""
-    size, n_free = work.sides.shape[0], 0
-    for i in range(size):
-        if work.sides[i] == 0:
-            work.free[n_free] = i
-            n_free += 1
+    size, n_free = work.sides.shape[0], _list_free(work)
     for a in range(n_free):
         i = work.free[a]
         copy_row(work.system, a, hessian, i)
@@ -212,11 +209,22 @@ def _newton_step(hessian: FloatArray, work: BoxQPWorkspace) -> int:
         work.step[a] = work.slope[i]
     if not factorize(work.system, work.inverse_pivots, n_free):
         return -1
-    substitute(work.system, work.inverse_pivots, padded(size), n_free)
+    substitute(work.system, work.inverse_pivots, padded_in_loops(size), n_free)
     return n_free
 
 
-@compiled
+@part
+def _list_free(work: BoxQPWorkspace) -> int:
+    """List the free components in rising order; return their number."""
+    n_free = 0
+    for i in range(work.sides.shape[0]):
+        if work.sides[i] == 0:
+            work.free[n_free] = i
+            n_free += 1
+    return n_free
+
+
+@part
 def _find_sides(lower: FloatArray, upper: FloatArray, point: FloatArray, work: BoxQPWorkspace) -> None:
     """Hold the components that the slope at a point pushes out of the box."""
     for i in range(point.shape[0]):
@@ -228,7 +236,7 @@ def _find_sides(lower: FloatArray, upper: FloatArray, point: FloatArray, work: B
         work.sides[i] = side
 
 
-@compiled
+@part
 def _projected_step(
     hessian: FloatArray,
     gradient: FloatArray,
@@ -262,7 +270,7 @@ def _projected_step(
     return value
 
 
-@compiled
+@part
 def _evaluate(hessian: FloatArray, gradient: FloatArray, point: FloatArray, work: BoxQPWorkspace) -> float:
     """Compute the slope Hx + g at a point, and return the value 1/2 x'Hx + g'x = 1/2 x'(slope + g)."""
     set_vector_sum(work.slope, gradient, hessian, point, point.shape[0])

@@ -10,12 +10,15 @@ import numpy as np
 
 from dq_space_arm_env.kernels.bound import buffer_table
 from experts.ddp.backward_pass import Update
-from experts.native.compilation import BufferTable, call_kernel, compiled
+from experts.native.compilation import BufferTable, call_kernel, compiled, part
 from experts.native.padded_algebra import FloatArray, set_product_sum
 from experts.problems.shooting_problem import RateLimits, ShootingProblem, native_calls, rate_limits
 
 LANES = 8
 """Step lengths per call: a whole number of vectors on any processor."""
+
+LANE_KERNELS = ("difference", "step_with_cost")
+"""Kernels that work on all lanes at once."""
 
 
 class _Work(NamedTuple):
@@ -71,8 +74,7 @@ class ParallelRollouts:
         # Keeps the kernels' code and the arrays behind the tables alive.
         self._arrays = (time_step, *problem.terminal_inputs)
         self._code = difference, step, terminal = (
-            problem.kernel("difference", batched=True),
-            problem.kernel("step_with_cost", batched=True),
+            *(problem.kernel(name, batched=True) for name in LANE_KERNELS),
             problem.kernel("terminal_cost"),
         )
         self._kernels = _Kernels(
@@ -162,7 +164,7 @@ def _roll_out(
             work.totals[lane] = np.inf
 
 
-@compiled
+@part
 def _apply_update(
     stage: int,
     alphas: FloatArray,

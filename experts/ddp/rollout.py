@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from dq_space_arm_env.kernels.bound import buffer_table
-from experts.native.compilation import BufferTable, call_kernel, compiled, inlined
+from experts.native.compilation import BufferTable, call_kernel, compiled, inlined, part
 from experts.problems.shooting_problem import (
     RETRACTION_KERNEL_NAME,
     FloatArray,
@@ -97,7 +97,7 @@ def closed_loop_rollout(
     return _add_terminal(total, terminal, terminal_buffers, stage_costs, terminal_cost)
 
 
-@compiled
+@part
 def _add_terminal(
     total: float,
     terminal: int,

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
 from time import perf_counter
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +28,16 @@ from experts.ddp.derivatives import (
     gauss_newton_hessians,
     mirrored,
 )
-from experts.ddp.parallel_rollouts import LANES, ParallelRollouts
+from experts.ddp.parallel_rollouts import LANE_KERNELS, LANES, ParallelRollouts
 from experts.ddp.rollout import FINISHED, Trajectory
-from experts.native.compilation import BufferTable
+from experts.native.compilation import BufferTable, prepare
 from experts.problems.shooting_problem import (
     KERNEL_NAMES,
     SECOND_ORDER_KERNEL_NAMES,
     FloatArray,
+    Kernel,
     ShootingProblem,
+    compiling_aside,
     native_calls,
     rate_limits,
     stage_bounds,
@@ -44,6 +46,9 @@ from experts.problems.shooting_problem import (
 
 BATCHED_KERNELS = ("linearize", "cost_derivatives", "lagrangian_hessian")
 """Kernels that work on all stages at once; rollouts proceed stage by stage."""
+
+LONGEST_KERNELS = ("lagrangian_hessian", "linearize")
+"""Kernels that take longest to compile."""
 
 _STAGES_PER_BLOCK = 32
 """Stages that a thread differentiates at a time: enough to outweigh its overhead."""
@@ -106,8 +111,6 @@ class ShootingWorkspace:
         self._spare_update: Update = allocate_update(*sizes, keep_values=keep_values)
         self._time_step = np.array([problem.time_step])
         self._no_gaps = np.zeros((0, problem.n_tangent))
-        names = (*KERNEL_NAMES, *SECOND_ORDER_KERNEL_NAMES) if second_order else KERNEL_NAMES
-        self._kernels = {name: problem.kernel(name, batched=name in BATCHED_KERNELS) for name in names}
         self._patterns: tuple[NDArray[np.bool_], ...] | None = None  # of A and B; unknown
         self._pass_work = pass_workspace(problem.n_tangent, problem.n_controls)
         self._gauss_newton = gauss_newton_hessians(self.derivatives)
@@ -116,10 +119,21 @@ class ShootingWorkspace:
         self._costates = np.zeros((stages, problem.n_tangent))
         self._mirrored: Hessians | None = None
         self._exact_is_current = False
-        self._parallel = ParallelRollouts(problem, self._time_step)
         self.current = Trajectory(problem)
         self.trial = Trajectory(problem)
         self.bounds = stage_bounds(problem)
+        self._kernels = self._compile(second_order)
+        self._parallel = ParallelRollouts(problem, self._time_step)
+
+    def _compile(self, second_order: bool) -> dict[str, Kernel]:
+        """Return the kernels that a solve uses, by name; its longest loop compiles beside them."""
+        names = (*SECOND_ORDER_KERNEL_NAMES, *KERNEL_NAMES) if second_order else KERNEL_NAMES
+        wanted = [(name, name in BATCHED_KERNELS) for name in names]
+        in_lanes = [(name, True) for name in LANE_KERNELS]
+        longest_first = sorted([*wanted, *in_lanes], key=lambda each: each[0] not in LONGEST_KERNELS)
+        with compiling_aside(self.problem, longest_first):
+            prepare(backward_pass, *self._pass_arguments(0.0, self._gauss_newton, self._no_gaps))
+        return {name: self.problem.kernel(name, batched=batched) for name, batched in wanted}
 
     @timed("rollout")
     def start(self, initial_state: FloatArray, controls: FloatArray) -> None:
@@ -203,17 +217,9 @@ class ShootingWorkspace:
         called, or else Gauss-Newton's. Gaps of the current trajectory, shape (N, n_t), are closed by the
         update.
         """
-        bounds, follows = self._present_bounds()
-        outcome = backward_pass(
-            self.derivatives,
-            self._exact if exact else self._mirrored or self._gauss_newton,
-            self._no_gaps if gaps is None else gaps,
-            self.current.controls,
-            *bounds,
-            float(mu),
-            self._spare_update,
-            self._pass_work._replace(follows=follows),
-        )
+        hessians = self._exact if exact else self._mirrored or self._gauss_newton
+        gaps = self._no_gaps if gaps is None else gaps
+        outcome = backward_pass(*self._pass_arguments(mu, hessians, gaps))
         result = PassResult(*outcome, float(mu), exact)
         if result.status == PASS_NOT_FINITE:
             # Its padding may hold NaN, which would spoil all later passes.
@@ -221,6 +227,12 @@ class ShootingWorkspace:
         if result.completed:
             self.update, self._spare_update = self._spare_update, self.update
         return result
+
+    def _pass_arguments(self, mu: float, hessians: Hessians, gaps: FloatArray) -> tuple[Any, ...]:
+        """Arguments of `backward_pass`."""
+        bounds, follows = self._present_bounds()
+        work, controls = self._pass_work._replace(follows=follows), self.current.controls
+        return (self.derivatives, hessians, gaps, controls, *bounds, float(mu), self._spare_update, work)
 
     def _present_bounds(self) -> tuple[tuple[FloatArray, FloatArray], NDArray[np.int64]]:
         """Bounds of the controls around the current trajectory, and what they follow, see `PassWorkspace`."""

@@ -7,7 +7,7 @@ never mix with others, so their content does not matter. The register tiles of `
 import numpy as np
 from numpy.typing import NDArray
 
-from experts.native.compilation import compiled, inlined
+from experts.native.compilation import inlined, part
 from experts.native.vector_code import LANES, TILE_ROWS
 from experts.native.vector_tiles import (
     factorize_rows,
@@ -29,10 +29,12 @@ SMALLEST_PIVOT = 1e-14
 """A pivot below this share of its diagonal entry is rounding noise: the matrix is not positive definite."""
 
 
-@compiled
 def padded(size: int) -> int:
     """Round a row length up to whole vectors."""
     return -(-size // LANES) * LANES
+
+
+padded_in_loops = part(padded)
 
 
 def padded_zeros(*shape: int) -> FloatArray:
@@ -68,14 +70,14 @@ def prefetch_to_write(array: FloatArray) -> None:
         prefetch_line_to_write(array, offset)
 
 
-@compiled
+@part
 def set_symmetric_product(target: FloatArray, upper: FloatArray, right: FloatArray) -> None:
     """Compute the product of a symmetric matrix, given on and above the diagonal, and a matrix."""
     for i in range(0, target.shape[0], TILE_ROWS):
         symmetric_product_rows(target, i, upper, right)
 
 
-@compiled
+@part
 def set_product_sum(
     target: FloatArray, start: FloatArray, left: FloatArray, right: FloatArray, rows: Rows
 ) -> None:
@@ -85,7 +87,7 @@ def set_product_sum(
         sum_product_rows(target, n, i, 0, start, left, right, rows)
 
 
-@compiled
+@part
 def set_product_sum_upper(
     target: FloatArray, start: FloatArray, left: FloatArray, right: FloatArray, rows: Rows
 ) -> None:
@@ -98,7 +100,7 @@ def set_product_sum_upper(
         sum_product_rows(target, n, i, i - i % LANES, start, left, right, rows)
 
 
-@compiled
+@part
 def add_vector_product(target: FloatArray, matrix: FloatArray, vector: FloatArray, depth: int) -> None:
     """Add the product of a transposed matrix and a vector: ``target += matrix' vector``."""
     for i in range(depth):
@@ -107,7 +109,7 @@ def add_vector_product(target: FloatArray, matrix: FloatArray, vector: FloatArra
             target[j] += factor * row[j]
 
 
-@compiled
+@part
 def mirror_upper(matrix: FloatArray, size: int) -> None:
     """Copy the upper triangle onto the lower one."""
     for i in range(1, size):
@@ -115,7 +117,7 @@ def mirror_upper(matrix: FloatArray, size: int) -> None:
             matrix[i, j] = matrix[j, i]
 
 
-@compiled
+@part
 def factorize(matrix: FloatArray, inverse_pivots: FloatArray, size: int) -> bool:
     """Overwrite a symmetric matrix by its factor U, ``matrix = U' D^-1 U``, D being the diagonal of U.
 
@@ -128,7 +130,7 @@ def factorize(matrix: FloatArray, inverse_pivots: FloatArray, size: int) -> bool
     return True
 
 
-@compiled
+@part
 def substitute(system: FloatArray, inverse_pivots: FloatArray, begin: int, size: int) -> None:
     """Solve ``matrix X = -G``, with D U'^-1 G from `factorize` from a column on, overwriting them by X."""
     for i in range(size - TILE_ROWS, -TILE_ROWS, -TILE_ROWS):

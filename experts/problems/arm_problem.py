@@ -2,7 +2,8 @@
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from dq_space_arm_env import Kernels, Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.kernels.library import PENALIZED
+from dq_space_arm_env.kernels.parallel_compilation import Request, compiling_aside
 from dq_space_arm_env.scene import INTEGRATORS
 from dq_space_arm_env.scene.constraint_rows import (
     n_multipliers,
@@ -238,13 +240,21 @@ class ArmProblem:
 
     def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return a kernel of `ShootingProblem`."""
+        return self.kernels.kernel(**self._request(name, batched=batched)._asdict())
+
+    def compiling_aside(self, wanted: Sequence[tuple[str, bool]]) -> AbstractContextManager[None]:
+        """Let another process compile kernels, given by name and whether batched, while a block runs."""
+        requests = [self._request(name, batched=batched) for name, batched in wanted]
+        return compiling_aside(self.kernels, requests)
+
+    def _request(self, name: str, *, batched: bool) -> Request:
         name = "emphasized_terminal_cost" if name == "terminal_cost" else name
         integrator: str | None = self.integrator
         if name == "lagrangian_hessian":
             integrator = INTEGRATORS[self.integrator].curvature
         if self.is_constrained and name not in ("difference", "retract"):
             name = PENALIZED + name
-        return self.kernels.kernel(name, integrator=integrator, lanes=None if batched else 1)
+        return Request(name, integrator, None if batched else 1)
 
 
 def misses(kernels: Kernels, states: FloatArray, parameters: FloatArray) -> FloatArray:
@@ -379,8 +389,15 @@ class WindowProblem:
 
     def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return a kernel of `ShootingProblem`."""
-        name = _QUADRATIC.get(name, name) if self.ends_early else name
-        return self.maneuver.kernel(name, batched=batched)
+        return self.maneuver.kernel(self._own(name), batched=batched)
+
+    def compiling_aside(self, wanted: Sequence[tuple[str, bool]]) -> AbstractContextManager[None]:
+        """See `ArmProblem.compiling_aside`."""
+        return self.maneuver.compiling_aside([(self._own(name), batched) for name, batched in wanted])
+
+    def _own(self, name: str) -> str:
+        """Name of a kernel in the maneuver."""
+        return _QUADRATIC.get(name, name) if self.ends_early else name
 
     def carried(self, states: FloatArray, parameters: FloatArray) -> FloatArray | None:
         """See `carried_along`, with the present parameters."""

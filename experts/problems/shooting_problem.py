@@ -32,7 +32,7 @@ tangent state z and control u. `retract`, the inverse of `difference`, removes r
 serves guesses of the states, and only problems with `has_retraction` need it.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, NamedTuple, Protocol
 
@@ -221,6 +221,17 @@ def native_calls(problem: ShootingProblem) -> AbstractContextManager[None]:
     """Surround native calls: a kernel written in Python raises after them what native code cannot pass on."""
     surround: AbstractContextManager[None] = getattr(problem, "native_calls", nullcontext)()
     return surround
+
+
+def compiling_aside(
+    problem: ShootingProblem, wanted: Sequence[tuple[str, bool]]
+) -> AbstractContextManager[None]:
+    """Surround other work while kernels, given by name and whether batched, are compiled by another process.
+
+    For problems that know how; those that take longest come first.
+    """
+    surround: Callable[..., AbstractContextManager[None]] | None = getattr(problem, "compiling_aside", None)
+    return nullcontext() if surround is None else surround(wanted)
 
 
 def check_interface(candidate: Any) -> None:

@@ -21,8 +21,7 @@ class SolveProgress:
 
     def __enter__(self) -> Self:
         self._display.__enter__()
-        told = "compiling a new scene takes half a minute, one with stiff joints two"
-        self._display.show(f"preparing ({told})", now=True)
+        self._display.show("preparing", now=True)
         return self
 
     def __exit__(

@@ -15,6 +15,7 @@ from experts.report.scene_variants import feature_variants
 from scripts.benchmarks.effort import QUICK, Sampling
 from scripts.benchmarks.harness import Row, select, shortcomings
 from scripts.benchmarks.scene_cost.mechanisms import mechanism_rows
+from scripts.benchmarks.scene_cost.preparations import preparation_rows
 from scripts.benchmarks.scene_cost.processes import IMPORT, MAKE, STEP, WRENCHES, process_rows
 from scripts.benchmarks.scene_cost.sizes import BATCH, OUTPUTS, output_rows, program_row, scene_rows, size_row
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
@@ -162,3 +163,12 @@ def test_nothing_optional_is_imported_and_casadi_only_to_compile(processes: list
     used = ", ".join(row["imports"] for row in found["warm"])
     assert "llvmlite" in used
     assert "casadi" not in used
+
+
+@pytest.mark.slow
+def test_a_solver_is_prepared_with_an_empty_and_with_a_full_cache() -> None:
+    rows = list(preparation_rows(["planar"]))
+    assert [(row["title"], row["cache"]) for row in rows] == [("planar", "empty"), ("planar", "warm")]
+    times = ("kernels_cpu_s", "rest_cpu_s", "alone_wall_s", "cpu_s", "wall_s")
+    assert all(row[key] >= 0.0 for row in rows for key in times)
+    assert rows[0]["kernels_cpu_s"] > rows[1]["kernels_cpu_s"]  # those are loaded, not compiled

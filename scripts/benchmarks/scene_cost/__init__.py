@@ -15,6 +15,7 @@ from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Benchmark, Picture, Row, Table, time_column
 from scripts.benchmarks.scene_cost.installation import installation_rows
 from scripts.benchmarks.scene_cost.mechanisms import mechanism_rows
+from scripts.benchmarks.scene_cost.preparations import preparation_rows
 from scripts.benchmarks.scene_cost.processes import process_rows
 from scripts.benchmarks.scene_cost.sizes import BATCH, output_rows, program_row, scene_rows
 
@@ -33,6 +34,7 @@ def measure(effort: Effort) -> Iterator[Row]:
     yield from mechanism_rows(paper)
     yield from output_rows(first, effort.compilations)
     yield from process_rows(effort.processes, derivatives=effort.slow_cases)
+    yield from preparation_rows((REFERENCE, *(("six-joint",) if effort.slow_cases else ())))
     yield from installation_rows()
 
 
@@ -134,6 +136,21 @@ BENCHMARK = Benchmark(
                 "modules",
                 "imports",
                 "compiles",
+            ),
+            by=("cache",),
+        ),
+        Table(
+            "preparations",
+            "Until the expert's solver of a scene is ready: one iteration in a new process, {cache} cache\n"
+            "CPU s of kernels and of the rest, loops and the iteration; s that pass in one process; "
+            "CPU s and s that pass where another helps",
+            (
+                "title",
+                Column("kernels_cpu_s", "kernels\nCPU s", ".2f"),
+                Column("rest_cpu_s", "loops\nCPU s", ".2f"),
+                Column("alone_wall_s", "one process\ns", ".2f"),
+                Column("cpu_s", "two\nCPU s", ".2f"),
+                Column("wall_s", "two\ns", ".2f"),
             ),
             by=("cache",),
         ),

@@ -7,10 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experts.ddp.box_qp import NOT_POSITIVE_DEFINITE, SOLVED, box_qp, box_qp_workspace
+from experts.ddp import box_qp as box_qp_module
+from experts.ddp.box_qp import NOT_POSITIVE_DEFINITE, SOLVED, box_qp_workspace
+from experts.native.compilation import compiled
 from experts.native.padded_algebra import padded_zeros
 
 Vector = np.ndarray
+box_qp = compiled(box_qp_module.box_qp.py_func)  # a part of the backward pass, called from Python here
 
 
 def solve(

@@ -167,6 +167,7 @@ def test_a_cache_that_cannot_be_a_folder_costs_only_the_cache(
 
 def test_every_loop_of_the_solver_is_behind_the_guard() -> None:
     import experts
+    from experts.native import compilation
     from experts.native.loop_cache import LoopCache
 
     for module in pkgutil.walk_packages(experts.__path__, "experts."):
@@ -180,7 +181,26 @@ def test_every_loop_of_the_solver_is_behind_the_guard() -> None:
         if isinstance(value, Dispatcher)
     }
     assert len(loops) > 30
-    assert all(type(loop._cache) is LoopCache for loop in loops)
+    kept = {loop for loop in loops if type(loop) is not compilation._PartDispatcher}
+    assert 10 < len(kept) < len(loops)
+    assert all(type(loop._cache) is LoopCache for loop in kept)
+
+
+def test_a_part_of_loops_is_compiled_within_them_and_cannot_be_called() -> None:
+    from experts.native.compilation import compiled, part
+
+    @part
+    def plus_one(value: float) -> float:
+        return value + 1.0
+
+    @compiled
+    def plus_two(value: float) -> float:
+        return plus_one(plus_one(value))
+
+    assert plus_two(1.5) == 3.5
+    for argument in (1.5, 1):  # of a type that it was compiled for, and of another
+        with pytest.raises(TypeError, match=r"plus_one is a part of compiled loops"):
+            plus_one(argument)
 
 
 FULL_DISK = """

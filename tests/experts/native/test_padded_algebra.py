@@ -1,21 +1,19 @@
 import numpy as np
 import pytest
 
+from experts.native import padded_algebra
 from experts.native.compilation import compiled
-from experts.native.padded_algebra import (
-    FloatArray,
-    add_vector_product,
-    factorize,
-    mirror_upper,
-    nonzero_rows,
-    padded,
-    padded_zeros,
-    set_product_sum,
-    set_product_sum_upper,
-    set_symmetric_product,
-    substitute,
-)
+from experts.native.padded_algebra import FloatArray, nonzero_rows, padded, padded_zeros
 from experts.native.vector_tiles import copy_in, copy_row, copy_row_out, set_row_sum, set_vector_sum
+
+# Parts of loops, each compiled as a loop that Python can call.
+add_vector_product = compiled(padded_algebra.add_vector_product.py_func)
+factorize = compiled(padded_algebra.factorize.py_func)
+mirror_upper = compiled(padded_algebra.mirror_upper.py_func)
+set_product_sum = compiled(padded_algebra.set_product_sum.py_func)
+set_product_sum_upper = compiled(padded_algebra.set_product_sum_upper.py_func)
+set_symmetric_product = compiled(padded_algebra.set_symmetric_product.py_func)
+substitute = compiled(padded_algebra.substitute.py_func)
 
 SIZES = [(1, 1, 1), (3, 5, 4), (8, 8, 8), (21, 12, 21), (12, 21, 9), (7, 60, 5)]
 
