@@ -420,8 +420,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         if self._path is not None:
             self._following[...] = self._path[int(self._memory[0]) + 1]
         take_step()  # inputs, motion, observation, reward and end of the episode: task/episode.py
-        numbers = self._unpack(self._numbers)
-        over = numbers[-3]
+        row = self._unpack(self._numbers)
+        over = row[-3]
         if over and np.isnan(action).any():
             raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
         self._over = over
@@ -430,28 +430,26 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         if self.render_mode is not None:
             self._show()
         if self._more_names:
-            reward, *report, _, success, diverged = numbers
+            reward, *report, _, success, diverged = row
             flags = {"is_success": success, "diverged": diverged}
             info = dict(zip(self._more_names, report, strict=True)) | flags
             if self.scene.constraints:
                 info = grouped(info)
-            return self._observation.copy(), reward, over, False, info
-        # Written out: a call, or a loop over names, would make a step some per cent slower.
-        reward, pose, speed, effort, end_pose, end_speed, angle, distance, error, over, success, diverged = (
-            numbers
-        )
-        info = {
-            "cost_pose": pose,
-            "cost_base_velocity": speed,
-            "cost_control": effort,
-            "terminal_cost_pose": end_pose,
-            "terminal_cost_base_velocity": end_speed,
-            "attitude_error": angle,
-            "position_error": distance,
-            "step_error": error,
-            "is_success": success,
-            "diverged": diverged,
-        }
+        else:
+            # Written out: a call, a loop over names or a list would make a step some per cent slower.
+            reward, pose, speed, effort, end_pose, end_speed, angle, gap, error, over, success, diverged = row
+            info = {
+                "cost_pose": pose,
+                "cost_base_velocity": speed,
+                "cost_control": effort,
+                "terminal_cost_pose": end_pose,
+                "terminal_cost_base_velocity": end_speed,
+                "attitude_error": angle,
+                "position_error": gap,
+                "step_error": error,
+                "is_success": success,
+                "diverged": diverged,
+            }
         return self._observation.copy(), reward, over, False, info
 
     def reset(

@@ -53,10 +53,9 @@ class BoundKernel:
 class KernelCall:
     """A kernel with the addresses of its arrays, for repeated calls.
 
-    Arrays given once are kept alive; others take their place before a call. All must be C-contiguous (those
-    by column may have their columns further apart, all the same), with the shape and element type of the
-    kernel's `ArraySpec`s. A call without all of them is a ValueError: the
-    code would read and write at address 0.
+    Arrays given once are kept alive; others take their place before a call. All must have the shape and
+    element type of the kernel's `ArraySpec`s, and be C-contiguous; only columns of arrays by column may be
+    apart. A call without all of them is a ValueError: the code would read and write at address 0.
     """
 
     def __init__(self, kernel: BoundKernel, arrays: Mapping[str, Array]) -> None:
@@ -77,8 +76,7 @@ class KernelCall:
                 array = arrays[spec.name]
                 self.place(**{spec.name: array})
                 if spec.by_column:  # the columns of a single row are numbers
-                    distance = array.strides[0] // array.itemsize
-                    self._buffers[self._slots[spec.name] + 1] = distance
+                    self._buffers[self._slots[spec.name] + 1] = array.strides[0] // array.itemsize
 
     def place(self, **arrays: Array) -> None:
         """Replace arrays by others of the same shape, which the caller keeps alive."""
