@@ -290,9 +290,10 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         # Report and flags side by side: Python's numbers of both in one call.
         count = arrays["report"].size
         form = Struct(f"{count}d{len(FLAGS)}?")
-        self._unpack, self._numbers = form.unpack, np.zeros(form.size, dtype=np.uint8)
-        arrays["report"] = self._numbers[: 8 * count].view(np.float64)
-        arrays["flags"] = self._numbers[8 * count :].view(np.bool_)
+        numbers: Any = np.zeros(form.size, dtype=np.uint8)
+        self._unpack, self._numbers = form.unpack, numbers
+        arrays["report"] = numbers[: 8 * count].view(np.float64)
+        arrays["flags"] = numbers[8 * count :].view(np.bool_)
         # A step reads state and memory before it writes them: they stay where they are.
         arrays["x_kept"], arrays["memory_kept"] = arrays["x"], arrays["memory"]
         self._start, self._observe = KernelCall(start, arrays), KernelCall(observe, arrays)

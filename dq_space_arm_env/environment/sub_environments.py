@@ -83,7 +83,10 @@ class SubEnvironments:
         start, observe = (self._kernels.kernel(f"environment_{name}") for name in ("start", "observe"))
         calls = KernelCall(start, arrays), KernelCall(observe, arrays)
         arrays |= {"x_kept": self._x_next, "memory_kept": self._memory_next, "following": self._following}
-        names = {np.float64: "environment_step", np.float32: "environment_step_float32_actions"}
+        names: dict[type, str] = {
+            np.float64: "environment_step",
+            np.float32: "environment_step_float32_actions",
+        }
         steps = {kind: KernelCall(self._kernels.kernel(name), arrays) for kind, name in names.items()}
         return _Calls(*calls, steps)
 
