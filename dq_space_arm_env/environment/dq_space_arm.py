@@ -6,8 +6,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cached_property
 from pathlib import Path
+from struct import Struct
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -23,11 +25,11 @@ from dq_space_arm_env.environment.reset_options import GivenStart, check_scene, 
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
 from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.kernels import compile_scene
-from dq_space_arm_env.kernels.bound import KernelCall
+from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.scene.start import episode_scene
-from dq_space_arm_env.task.step_report import MEMORY, OBSERVATION_LIMIT, REPORT, grouped, report_names
+from dq_space_arm_env.task.step_report import FLAGS, MEMORY, OBSERVATION_LIMIT, REPORT, grouped, report_names
 from dq_space_arm_env.viewing.payload_places import Payloads, leaves_tip
 from dq_space_arm_env.viewing.picture_format import PictureFormat
 
@@ -37,6 +39,16 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 _ROW = np.zeros(1, dtype=np.int64)  # of the one state
+
+# A view of the action, and the function that takes a step with it.
+_StepCall = tuple[Any, Callable[[], None]]
+
+
+def _step_call(kernel: BoundKernel, arrays: Mapping[str, Array]) -> _StepCall:
+    """Bind a step to the arrays of an environment, and to one of its own for actions of the kernel's type."""
+    (spec,) = (spec for spec in kernel.inputs if spec.name == "action")
+    action: Any = np.zeros(spec.stride, spec.dtype)
+    return memoryview(action), KernelCall(kernel, {**arrays, "action": action}).of_one_row()
 
 
 class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
@@ -267,7 +279,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         """Allocate the arrays of the compiled functions, whose addresses a step passes unchanged."""
         start = self.kernels.kernel("environment_start", lanes=1)
         observe = self.kernels.kernel("environment_observe", lanes=1)
-        step = self.kernels.kernel("environment_step", lanes=1)
+        step = self.kernels.kernel("environment_step_float32_actions", lanes=1)
         arrays = {
             spec.name: np.zeros(spec.stride, dtype=spec.dtype)
             for kernel in (start, observe, step)
@@ -275,19 +287,28 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         }
         if "episode_parameters" in arrays:
             arrays["episode_parameters"] = arrays["parameters"]
+        # Report and flags side by side: Python's numbers of both in one call.
+        count = arrays["report"].size
+        form = Struct(f"{count}d{len(FLAGS)}?")
+        numbers: Any = np.zeros(form.size, dtype=np.uint8)
+        self._unpack, self._numbers = form.unpack, numbers
+        arrays["report"] = numbers[: 8 * count].view(np.float64)
+        arrays["flags"] = numbers[8 * count :].view(np.bool_)
         # A step reads state and memory before it writes them: they stay where they are.
         arrays["x_kept"], arrays["memory_kept"] = arrays["x"], arrays["memory"]
         self._start, self._observe = KernelCall(start, arrays), KernelCall(observe, arrays)
-        self._take_step = KernelCall(step, arrays).of_one_row()
-        self._x, self._draws, self._action = arrays["x"], arrays["draws"], arrays["action"]
+        self._arrays, self._step = arrays, _step_call(step, arrays)
+        self._x, self._draws = arrays["x"], arrays["draws"]
         self._memory = arrays["memory"]
         self._parameters = arrays.get("parameters", np.zeros(0, dtype=self.kernels.dtype))
         self._path = given_path(self.scene, self.scene.simulation.steps) if "following" in arrays else None
         self._following = arrays.get("following", np.zeros(0))
-        self._observation, self._report, self._flags = (
-            arrays[name] for name in ("observation", "report", "flags")
-        )
-        self._action_shape = self._action.shape
+        self._observation = arrays["observation"]
+
+    @cached_property
+    def _step_of_doubles(self) -> _StepCall:
+        """The step for actions of any type but that of the action space."""
+        return _step_call(self.kernels.kernel("environment_step", lanes=1), self._arrays)
 
     @property
     def state(self) -> Array:
@@ -387,18 +408,22 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         if self._over:
             state = "is over" if self._begun else "has not begun"
             raise ResetNeeded(f"the episode {state}: call reset() before step()")
-        # Arrays of floats are taken as they are; telling them by identity costs nothing.
-        if type(action) is not np.ndarray or not ((kind := action.dtype) is SINGLE or kind is DOUBLE):
-            action = real_array("action", action)
-        if action.shape != self._action_shape:
-            raise ValueError(f"action: shape {action.shape}, should be {self._action_shape}")
-        self._action[...] = action
+        # Arrays of the action space's type are taken as they are; telling them by identity costs nothing.
+        if type(action) is np.ndarray and action.dtype is SINGLE:
+            given, take_step = self._step
+        else:
+            action = real_array("action", action, DOUBLE)
+            given, take_step = self._step_of_doubles
+        try:
+            given[:] = action  # faster than NumPy, which would broadcast
+        except ValueError:
+            raise ValueError(f"action: shape {action.shape}, should be {given.shape}") from None
         if self._path is not None:
             self._following[...] = self._path[int(self._memory[0]) + 1]
-        self._take_step()  # inputs, motion, observation, reward and end of the episode: task/episode.py
-        over, success, diverged = self._flags.tolist()
-        report = self._report.tolist()
-        if over and np.isnan(self._action).any():
+        take_step()  # inputs, motion, observation, reward and end of the episode: task/episode.py
+        row = self._unpack(self._numbers)
+        over = row[-3]
+        if over and np.isnan(action).any():
             raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
         self._over = over
         if self._payloads is not None and self._memory[0] in self._payloads.releases:
@@ -406,25 +431,26 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         if self.render_mode is not None:
             self._show()
         if self._more_names:
+            reward, *report, _, success, diverged = row
             flags = {"is_success": success, "diverged": diverged}
-            info = dict(zip(self._more_names, report[1:], strict=True)) | flags
+            info = dict(zip(self._more_names, report, strict=True)) | flags
             if self.scene.constraints:
                 info = grouped(info)
-            return self._observation.copy(), report[0], over, False, info
-        # Written out: a call, or a loop over names, would make a step some per cent slower.
-        reward, pose, velocity, control, end_pose, end_velocity, angle, distance, error = report
-        info = {
-            "cost_pose": pose,
-            "cost_base_velocity": velocity,
-            "cost_control": control,
-            "terminal_cost_pose": end_pose,
-            "terminal_cost_base_velocity": end_velocity,
-            "attitude_error": angle,
-            "position_error": distance,
-            "step_error": error,
-            "is_success": success,
-            "diverged": diverged,
-        }
+        else:
+            # Written out: a call, a loop over names or a list would make a step some per cent slower.
+            reward, pose, speed, effort, end_pose, end_speed, angle, gap, error, over, success, diverged = row
+            info = {
+                "cost_pose": pose,
+                "cost_base_velocity": speed,
+                "cost_control": effort,
+                "terminal_cost_pose": end_pose,
+                "terminal_cost_base_velocity": end_speed,
+                "attitude_error": angle,
+                "position_error": gap,
+                "step_error": error,
+                "is_success": success,
+                "diverged": diverged,
+            }
         return self._observation.copy(), reward, over, False, info
 
     def reset(
@@ -459,8 +485,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             self._memory[...] = memory
         if self.render_mode is not None:
             self._show()
-        _, success, diverged = self._flags.tolist()
-        info = grouped(dict(zip(self._more_names or REPORT[1:], self._report.tolist()[1:], strict=True)))
+        _, *report, _, success, diverged = self._unpack(self._numbers)
+        info = grouped(dict(zip(self._more_names or REPORT[1:], report, strict=True)))
         info |= {"is_success": success, "diverged": diverged}
         if self.kernels.n_p:
             info["parameters"] = dict(

@@ -100,7 +100,7 @@ class _GoalSubEnvironments(SubEnvironments):
 
     def __init__(self, kernels: Kernels, count: int, goals: GoalRewards) -> None:
         super().__init__(kernels, count)
-        self._goals, self._unseen = goals, self._results.fresh().observation
+        self._goals = goals
         names = report_names(kernels.scene)
         self._errors = names.index("attitude_error"), names.index("position_error")
 
@@ -110,7 +110,7 @@ class _GoalSubEnvironments(SubEnvironments):
             plain = super().observe(rows)
             result = plain._replace(observation=self._shown())
         else:
-            super().observe(rows, result._replace(observation=self._unseen))
+            super().observe(rows, result)  # writes the observation that goals replace
             for name, part in self._shown(rows).items():
                 result.observation[name][rows] = part
         self._judge(rows, result)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from sys import getrefcount
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.compiler.random_draws import draws_kernel, generator_states
 from dq_space_arm_env.environment.reset_options import GivenStart
 from dq_space_arm_env.kernels import Kernels
-from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
+from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall, address_of
 from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.path import PATH, given_path
 from dq_space_arm_env.scene.start import number_of_draws
@@ -24,6 +24,7 @@ Rows = NDArray[np.int64]
 
 _TERMINATED, _DIVERGED = FLAGS.index("terminated"), FLAGS.index("diverged")
 _SPARES = 4  # a training loop holds the results of the last step or two
+_PADDING = 8  # numbers between rows of a report; those of 1024 copies would fall on the same lines of a cache
 
 
 class StepResult(NamedTuple):
@@ -32,6 +33,15 @@ class StepResult(NamedTuple):
     observation: Any  # shape (count, n_obs); of goal environments, such arrays by name
     report: NDArray[np.float64]  # a row for each of `report_names`, shape (len(report_names(scene)), count)
     flags: NDArray[np.bool_]  # a row for each name in FLAGS, shape (len(FLAGS), count)
+    addresses: Mapping[str, int]  # of the arrays that compiled functions write, by their names
+
+
+class _Calls(NamedTuple):
+    """Compiled functions, bound to one of two sets of states."""
+
+    start: KernelCall
+    observe: KernelCall
+    steps: dict[type, KernelCall]  # by the type of the actions
 
 
 class SubEnvironments:
@@ -61,26 +71,29 @@ class SubEnvironments:
 
         drawing = BoundKernel(draws_kernel(self._draws.shape[1]))
         self._draw = KernelCall(drawing, {"states": self._generators, "draws": self._draws})
-        constant = {"draws": self._draws, "parameters": self.parameters}
-        self._start = KernelCall(start, constant)
-        self._observe = KernelCall(observe, constant | self._results.fresh()._asdict())
-        self._steps = self._step_calls(kernels)
+        self._calls = self._calls_next = self._bound()
         self._swap()
-        self._steps_next = self._step_calls(kernels)
-        self._swap()
+        self._calls = self._bound()
 
-    def _step_calls(self, kernels: Kernels) -> dict[type, KernelCall]:
-        """The step by the type of the actions, from the present arrays of states to the others."""
-        arrays = {"x": self.x, "x_kept": self._x_next, "parameters": self.parameters}
-        arrays["episode_parameters"] = self.parameters
-        arrays |= {"memory": self._memory, "memory_kept": self._memory_next, "following": self._following}
+    def _bound(self) -> _Calls:
+        """Calls that read the present arrays of states; a step writes the others."""
+        arrays = {"x": self.x, "memory": self._memory, "memory_kept": self._memory, "draws": self._draws}
+        arrays |= {"parameters": self.parameters, "episode_parameters": self.parameters}
         arrays |= self._results.fresh()._asdict()
-        names = {np.float64: "environment_step", np.float32: "environment_step_float32_actions"}
-        return {kind: KernelCall(kernels.kernel(name), arrays) for kind, name in names.items()}
+        start, observe = (self._kernels.kernel(f"environment_{name}") for name in ("start", "observe"))
+        calls = KernelCall(start, arrays), KernelCall(observe, arrays)
+        arrays |= {"x_kept": self._x_next, "memory_kept": self._memory_next, "following": self._following}
+        names: dict[type, str] = {
+            np.float64: "environment_step",
+            np.float32: "environment_step_float32_actions",
+        }
+        steps = {kind: KernelCall(self._kernels.kernel(name), arrays) for kind, name in names.items()}
+        return _Calls(*calls, steps)
 
     def _swap(self) -> None:
         self.x, self._x_next = self._x_next, self.x
         self._memory, self._memory_next = self._memory_next, self._memory
+        self._calls, self._calls_next = self._calls_next, self._calls
 
     def kept(self) -> dict[str, Array]:
         """Arrays that all later steps and resets depend on."""
@@ -118,8 +131,7 @@ class SubEnvironments:
             self._draw.on_rows(rows)
         else:
             self._draws[rows] = 0.0
-        self._start.place(x=self.x, memory=self._memory)
-        self._start.on_rows(rows)
+        self._calls.start.on_rows(rows)
         if given is not None:
             x, parameters = self.x[rows], self.parameters[rows]
             given.apply(self._kernels, x, parameters)
@@ -133,16 +145,19 @@ class SubEnvironments:
         Without arrays for the result it takes new ones, whose other rows are arbitrary.
         """
         seen = self._results.fresh() if result is None else result
-        self._observe.place(x=self.x, memory=self._memory, memory_kept=self._memory, **seen._asdict())
-        self._observe.on_rows(rows)
+        self._calls.observe.place_at(seen.addresses)
+        self._calls.observe.on_rows(rows)
         return seen
 
     def observe_states(self, x: Array) -> Any:
         """Observations of other states, shape (count, n_x), at the present times."""
         seen = self._results.fresh()
         x = np.ascontiguousarray(x, self.x.dtype)
-        self._observe.place(x=x, memory=self._memory, memory_kept=self._memory_next, **seen._asdict())
-        self._observe.on_rows(np.arange(self.count))
+        observe = self._calls.observe
+        observe.place(x=x, memory_kept=self._memory_next)
+        observe.place_at(seen.addresses)
+        observe.on_rows(np.arange(self.count))
+        observe.place(x=self.x, memory_kept=self._memory)
         return seen.observation
 
     def move(self, rows: Rows, x: Array) -> None:
@@ -161,18 +176,17 @@ class SubEnvironments:
         if values.shape != self._action_shape:
             raise ValueError(f"actions: shape {values.shape}, should be {self._action_shape}")
         values = np.ascontiguousarray(values, np.float32 if values.dtype == np.float32 else np.float64)
-        result, call = self._results.take(), self._steps[values.dtype.type]
-        observation, report, flags = result
+        result, call = self._results.take(), self._calls.steps[values.dtype.type]
         if self._path is not None:
             stages = np.minimum(self._memory[:, 0].astype(np.int64) + 1, len(self._path) - 1)
             np.take(self._path, stages, axis=0, out=self._following)
-        call.place(action=values, observation=observation, report=report, flags=flags)
+        call.place(action=values)
+        call.place_at(result.addresses)
         call(self.count, self._kernels.threads)
         # NaN diverges, and hardly anything else does: looking for it after the step costs nothing.
-        if np.count_nonzero(flags[_TERMINATED]) and flags[_DIVERGED].any():
+        if np.count_nonzero(result.flags[_TERMINATED]) and result.flags[_DIVERGED].any():
             _refuse_nan(values, resetting)
         self._swap()
-        self._steps, self._steps_next = self._steps_next, self._steps
         return result
 
 
@@ -201,11 +215,13 @@ class _ResultArrays:
     def fresh(self) -> StepResult:
         """New arrays, contents arbitrary."""
         count = self._observation_shape[0]
-        return StepResult(
-            np.empty(self._observation_shape, self._dtype),
-            np.empty((self._rows, count)),
-            np.empty((len(FLAGS), count), np.bool_),
-        )
+        arrays: dict[str, Array] = {
+            "observation": np.empty(self._observation_shape, self._dtype),
+            "report": np.empty((self._rows, count + _PADDING))[:, :count],
+            "flags": np.empty((len(FLAGS), count), np.bool_),
+        }
+        addresses = {name: address_of(array) for name, array in arrays.items()}
+        return StepResult(**arrays, addresses=addresses)
 
     def take(self) -> StepResult:
         """Free arrays, used before if possible, contents arbitrary."""
@@ -222,5 +238,6 @@ class _ResultArrays:
 
 
 def _holders(result: StepResult) -> int:
-    """References to the arrays of a result; a view holds one to the array that it shows."""
-    return getrefcount(result[0]) + getrefcount(result[1]) + getrefcount(result[2])
+    """References to the arrays of a result; a view holds one to the array that owns the memory."""
+    observation, report, flags, _ = result
+    return sum(map(getrefcount, (observation, report, report.base, flags)))

@@ -293,7 +293,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             self._over = _NONE
         rewards, terminated, final = result.report[0], result.flags[0], None
         if np.count_nonzero(terminated):
-            rows = np.flatnonzero(terminated)
+            (rows,) = terminated.nonzero()
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 rewards, terminated = rewards.copy(), terminated.copy()
                 final = self._final(rows, result)

@@ -53,9 +53,9 @@ class BoundKernel:
 class KernelCall:
     """A kernel with the addresses of its arrays, for repeated calls.
 
-    Arrays given once are kept alive; others take their place before a call. All must be C-contiguous, with
-    the shape and element type of the kernel's `ArraySpec`s. A call without all of them is a ValueError: the
-    code would read and write at address 0.
+    Arrays given once are kept alive; others take their place before a call. All must have the shape and
+    element type of the kernel's `ArraySpec`s, and be C-contiguous; only columns of arrays by column may be
+    apart. A call without all of them is a ValueError: the code would read and write at address 0.
     """
 
     def __init__(self, kernel: BoundKernel, arrays: Mapping[str, Array]) -> None:
@@ -76,7 +76,7 @@ class KernelCall:
                 array = arrays[spec.name]
                 self.place(**{spec.name: array})
                 if spec.by_column:  # the columns of a single row are numbers
-                    self._buffers[self._slots[spec.name] + 1] = array.shape[1] if array.ndim == 2 else 1
+                    self._buffers[self._slots[spec.name] + 1] = array.strides[0] // array.itemsize
 
     def place(self, **arrays: Array) -> None:
         """Replace arrays by others of the same shape, which the caller keeps alive."""
@@ -84,6 +84,11 @@ class KernelCall:
             self._buffers[self._slots[name]] = address_of(array)
         if self._missing:
             self._missing.difference_update(arrays)
+
+    def place_at(self, addresses: Mapping[str, int]) -> None:
+        """Replace arrays, see `place`, by those at addresses found before, see `address_of`."""
+        for name, address in addresses.items():
+            self._buffers[self._slots[name]] = address
 
     def _require_arrays(self) -> None:
         if self._missing:

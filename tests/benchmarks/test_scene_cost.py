@@ -146,7 +146,7 @@ def test_only_what_is_called_is_compiled(processes: list[Row]) -> None:
     compiled = {row["stage"]: row["compiles"] for row in select(processes, table="processes", cache="empty")}
     assert compiled == {
         IMPORT: "",
-        MAKE: "environment_observe, environment_start, environment_step",
+        MAKE: "environment_observe, environment_start, environment_step_float32_actions",
         STEP: "step",
         WRENCHES: "reaction_wrenches",
     }
