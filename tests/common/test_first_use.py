@@ -4,6 +4,7 @@ import io
 import logging
 import re
 import time
+from collections.abc import Iterator
 from contextlib import redirect_stderr
 
 import pytest
@@ -22,13 +23,17 @@ class Terminal(io.StringIO):
 
 
 @pytest.fixture
-def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
     stream = Terminal()
+    logger = first_use._logger()
+    level = logger.level
+    logger.setLevel(logging.INFO)  # reports and benchmarks in the same process raise it
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(first_use, "SECONDS_TO_WAIT", 0.05)
     monkeypatch.setattr(first_use, "_ticker", first_use._Ticker())
     monkeypatch.setattr(first_use, "_announced", set())
-    return stream
+    yield stream
+    logger.setLevel(level)
 
 
 def wait(terminal: Terminal) -> None:
@@ -70,15 +75,10 @@ def test_the_progress_of_a_run_shows_the_line(terminal: Terminal) -> None:
 
 
 def test_the_level_of_the_logger_silences_both(terminal: Terminal) -> None:
-    logger = logging.getLogger("dq_space_arm_env")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        wait(terminal)
-        with redirect_stderr(terminal):
-            first_use.announce("scene 'paper'")
-    finally:
-        logger.setLevel(level)
+    first_use._logger().setLevel(logging.WARNING)
+    wait(terminal)
+    with redirect_stderr(terminal):
+        first_use.announce("scene 'paper'")
     assert terminal.getvalue() == ""
 
 
