@@ -23,8 +23,9 @@ Array = NDArray[Any]
 LEAST = 0.01  # price at first, and at least: one that had vanished would come back too late
 STIFFNESS = 5.0  # penalty of a row, relative to one over its tolerance
 CHARGED = 0.5  # violation that counts, relative to the tolerance: flights between decisions keep within it
-ALLOWED = 0.005  # share of the episodes that may violate a row
+ALLOWED = 0.005  # share of the episodes that may violate a row, over the number of those with a price above
 MOST = 0.1  # share beyond which a price rises no faster
+NEAR = 5.0  # tolerances; where few episodes come so near, a price falls as fast as it rises
 RATE = 0.5  # of change of a price's logarithm in an update, for all episodes
 
 
@@ -84,7 +85,10 @@ class Penalties:
             np.reshape(each, (rows, each.shape[-1])) for each in (states[1:], inputs[:-1], parameters[1:])
         )
         residuals = kernels.constraints(after, held, given if kernels.n_p else None)
-        violated = residuals[:, self._is_penalized] > CHARGED * self._tolerances
-        shares = violated.reshape(len(inputs) - 1, -1, len(self.prices)).any(axis=0).mean(axis=0)
-        factors = np.exp(RATE * (np.minimum(shares, MOST) - ALLOWED))
+        shape = len(inputs) - 1, -1, len(self.prices)
+        worst = (residuals[:, self._is_penalized] / self._tolerances).reshape(shape).max(axis=0)
+        violating = np.minimum((worst > CHARGED).mean(axis=0), MOST)
+        near = np.minimum((worst > -NEAR).mean(axis=0) / MOST, 1.0)
+        allowed = ALLOWED / max(1, int((self.prices > LEAST).sum()))
+        factors = np.exp(RATE * (violating - MOST + near * (MOST - allowed)))
         self.prices[:] = np.where(self._priced, np.maximum(self.prices * factors, LEAST), 0.0)

@@ -162,14 +162,23 @@ def test_prices_rise_where_an_episode_violates(limited):
     tolerances = np.array([row.tolerance for row in path_rows(limited)])
     at_ends = zip(states[1:], inputs[:-1], strict=True)
     found = np.array([compile_scene(limited).constraints(*each) for each in at_ends])
-    shares = (found > 0.5 * tolerances).any(axis=0).mean(axis=0)
-    assert len(set(shares)) > 3
+    violating, near = ((found > each * tolerances).any(axis=0).mean(axis=0) for each in (0.5, -5.0))
+    assert len(set(violating)) > 3
+    far = near == 0.0
+    assert far.any()
+
+    def factors(with_prices):
+        """One rises by up to 5 %, falls slowly where episodes come near, and else as fast as it rises."""
+        rises = np.minimum(violating, 0.1) - 0.005 / max(1, with_prices)
+        falls_fast = 0.1 - np.minimum(near, 0.1)
+        return np.exp(0.5 * (rises - falls_fast * (0.1 - 0.005 / max(1, with_prices)) / 0.1))
+
     flown.episodes.price_violations(1500.0)
-    factors = np.exp(0.5 * (np.minimum(shares, 0.1) - 0.005))
-    np.testing.assert_allclose(penalties.prices, 0.01 * np.maximum(factors, 1.0))  # 0.01 is the least
+    np.testing.assert_allclose(penalties.prices, 0.01 * np.maximum(factors(0), 1.0))  # 0.01 is the least
     penalties.prices[:] = 1.0
     flown.episodes.price_violations(1500.0)
-    np.testing.assert_allclose(penalties.prices, factors)
+    np.testing.assert_allclose(penalties.prices, factors(len(violating)))
+    np.testing.assert_allclose(penalties.prices[far], math.exp(-0.05))
     assert penalties.cost == 1500.0
 
 
