@@ -31,6 +31,7 @@ Array = NDArray[Any]
 DIVERGED = 20.0  # times the median cost; episodes beyond it do not count
 STEEP = 10.0  # times the slope that usual episodes do not exceed; slopes beyond it are shortened
 STEEP_PENALTIES = 100.0  # likewise where few episodes may violate constraints
+ROUGH = 0.01  # penalty of outputs that alternate by their limits, relative to the cost of an episode
 USUAL = 0.5  # share of the usual episodes
 USUAL_DISTURBED = 0.9  # where a push just before the end is as usual as none, and a thousand times as steep
 
@@ -113,6 +114,9 @@ class Episodes:
         self.divide(self.substeps)
         self._end = self._bind_end()
         self._met, self._usual, self._firsts = Met(), USUAL, firsts
+        self._inner = np.ones((decisions - 2, 1, 1))  # whether both neighbours are of the same phase
+        for first in firsts[1:]:
+            self._inner[max(first - 2, 0) : first] = 0.0
         self._arrivals: list[Arrival] = arrivals(times, firsts)
 
     def divide(self, substeps: Array) -> None:
@@ -251,12 +255,14 @@ class Episodes:
     ) -> tuple[list[SingleArray], Array]:
         """Exact gradient of the mean cost by the network's weights, and the costs of `fly`.
 
-        Episodes that diverge, or cost many times the median, do not count; where the slope of one grows to
-        many times the median, it is shortened, and the gradient is no longer exact.
+        The gradient, not the costs, has the penalties of constraints and of roughness. Episodes that
+        diverge, or cost many times the median, do not count; where the slope of one grows to many times the
+        median, it is shortened, and the gradient is no longer exact.
         """
         costs = self.fly(starts, mean, scale, emphasis)
         finite = np.isfinite(costs)
-        lost = ~finite | (costs > DIVERGED * (np.median(costs[finite]) if finite.any() else 0.0))
+        typical = float(np.median(costs[finite])) if finite.any() else 0.0
+        lost = ~finite | (costs > DIVERGED * typical)
         rows, kept = len(starts), max(1, len(starts) - int(lost.sum()))
         if any_lost := bool(lost.any()):
             for values in self._layers.values:
@@ -266,6 +272,7 @@ class Episodes:
         self._cotangents[-1] += self._by_state
         self._cotangents[-1][lost] = 0.0
         self._by_output[:] = 0.0
+        by_roughness = self._by_roughness(typical / kept)
         # What does not depend on slopes, for all decisions at once.
         decisions = len(self._calls)
         by_effort = 2.0 * self._held[:, None, None] * self._efforts * self._inputs[:-1]
@@ -285,7 +292,7 @@ class Episodes:
             if any_lost:
                 slope[lost] = 0.0
             self._arrivals[k].back(slope, self._by_output)
-            back = self._layers.backward(k, self._by_output[k] * units[k])
+            back = self._layers.backward(k, self._by_output[k] * units[k] + by_roughness[k])
             np.multiply(back, scale * kept, out=self._by_observation)
             self._calls[k]["observation_vjp"](rows)
             self._cotangents[k] += self._by_state
@@ -293,6 +300,22 @@ class Episodes:
                 self._cotangents[k][lost] = 0.0
             _shorten(self._cotangents[k], steep, self._usual)
         return self._layers.gradient(), costs
+
+    def _by_roughness(self, cost: float) -> Array:
+        """Slopes by the outputs, (K, B, n_u), of a penalty of their second differences.
+
+        Without it policies learn to alternate from decision to decision, which no flight at every time step
+        does. A smooth policy pays the fourth power of the steps; jumps and noise go unpunished.
+        """
+        slopes = np.zeros_like(self._by_output)
+        if self._met.jumps is not None or self._met.noise is not None:
+            return slopes
+        outputs = self._layers.values[-1] * self.units
+        second = outputs[2:] - 2.0 * outputs[1:-1] + outputs[:-2]
+        second *= 2.0 * ROUGH * cost / len(slopes) * self._inner
+        for first, factor in enumerate((1.0, -2.0, 1.0)):
+            slopes[first : first + len(second)] += factor * second
+        return np.asarray(slopes * self.units)
 
     def price_violations(self, cost: float) -> None:
         """Let penalties follow what the episodes flown last violate, and the cost of recent ones."""

@@ -88,6 +88,7 @@ def with_phases(scene):
 @pytest.mark.parametrize("case", ["plain", "disturbed", "substeps", "phases"])
 def test_gradients_agree_with_differences(small_scene, monkeypatch, case):
     monkeypatch.setattr(episodes, "STEEP", math.inf)  # which shortens slopes
+    monkeypatch.setattr(episodes, "ROUGH", 0.0)
     flown = Flown(with_phases(small_scene) if case == "phases" else small_scene)
     flown.in_double_precision()
     if case == "disturbed":
@@ -109,6 +110,37 @@ def test_gradients_agree_with_differences(small_scene, monkeypatch, case):
         assert expected == pytest.approx(float((slope * direction).sum()), rel=1e-6)
 
 
+@pytest.mark.parametrize("phases", [False, True])
+def test_slopes_have_those_of_roughness(small_scene, monkeypatch, phases):
+    flown = Flown(with_phases(small_scene) if phases else small_scene)
+    flown.in_double_precision()
+    found = {}
+    for rough in (0.0, 1e3):  # large beside the cost
+        monkeypatch.setattr(episodes, "ROUGH", rough)
+        found[rough], costs = flown.gradient()
+    firsts = flown.episodes._firsts
+    assert len(firsts) == (3 if phases else 1)
+
+    def roughness():
+        flown.costs()
+        outputs = 0.05 * flown.episodes._layers.values[-1]
+        parts = np.split(outputs, firsts[1:])
+        squares = sum((np.diff(part, n=2, axis=0) ** 2).sum() for part in parts)
+        return 1e3 * np.median(costs) * squares / (DECISIONS * COUNT)
+
+    rng = np.random.default_rng(1)
+    for weight, *slopes in zip(flown.weights, found[0.0], found[1e3], strict=True):
+        direction = rng.normal(size=weight.shape)
+        direction *= 1e-5 / np.linalg.norm(direction)
+        kept, ends = weight.copy(), []
+        for sign in (1, -1):
+            weight[:] = kept + sign * direction
+            ends.append(roughness())
+        weight[:] = kept
+        expected = float(((slopes[1] - slopes[0]) * direction).sum())
+        assert (ends[0] - ends[1]) / 2.0 == pytest.approx(expected, rel=1e-6)
+
+
 def penalty(t, slope_at_zero):
     """That of Ben-Tal & Zibulevsky with a penalty of 1."""
     inside = -0.25 * np.log(-2.0 * np.minimum(t, -0.5)) - 0.375
@@ -117,6 +149,7 @@ def penalty(t, slope_at_zero):
 
 def test_slopes_have_those_of_penalties(limited, monkeypatch):
     monkeypatch.setattr(episodes, "STEEP_PENALTIES", math.inf)
+    monkeypatch.setattr(episodes, "ROUGH", 0.0)
     flown = Flown(limited)
     flown.in_double_precision()
     kernels, rows, penalties = flown.episodes._kernels, path_rows(limited), flown.episodes.penalties
