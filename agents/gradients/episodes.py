@@ -348,6 +348,10 @@ class Episodes:
         with np.errstate(invalid="ignore"):  # of episodes that diverged
             return misses(self._kernels, self._states[-1], self.parameters[-1])
 
+    def terminal_cost(self) -> float:
+        """Median of the terminal costs of the episodes flown last, as emphasized."""
+        return float(np.median(self._terminal[np.isfinite(self._terminal)]))
+
     def sizes(self) -> Array:
         """Root mean squares of the inputs flown last, by actuator, fractions of the limits, (n_u,)."""
         squares = np.square(self._inputs[:-1]).mean(axis=0)

@@ -50,9 +50,10 @@ FINAL_RATE = 3e-3  # learning rate at the end, relative to its peak
 FIRST_UNITS = 0.1  # of the network's outputs, fractions of the limits
 UNITS_PER_SIZE = 4.0  # units that they become, relative to the root mean square of the inputs
 FASTEST_UNITS = 1.03  # largest factor by which units change in an update
-TRAVELLED = 0.3  # share of the updates after which the end weight may rise
-ENOUGH = 0.98  # share of successful episodes at which it does not
-STRICTER = 1.02  # its factor in an update
+TRAVELLED = 0.4  # share of the updates after which the end weight may rise
+MISSING = 0.01  # share of episodes that miss, from which on it rises no faster
+WITHIN = 0.7  # of the tolerances; where all episodes end so near, the end weight falls
+STRICTER = 1.02  # largest factor of the end weight in an update, and of its fall
 STRICTEST = 1000.0  # largest end weight, relative to its first value
 TRIAL_ACTIONS = 0.005  # standard deviation of the actions that measure the spread of observations
 COARSE = 1e-4  # tolerance of methods that adapt their steps, rad and m; at least the scene's
@@ -61,6 +62,9 @@ TINY = 1e-12  # motion [rad, m] that is none
 SEEN = 128  # episodes of that
 FARTHEST = 5.0  # motion [rad, m] by the first outputs over an episode; units are smaller beyond
 WORSE = 2.0  # median cost relative to recent ones, above which the weights go back to what they were
+DRIFTED = 1.5  # likewise of recent costs, relative to those with the weights to go back to
+WORTHY = 1.2  # likewise, up to which newer weights take their place
+PATIENCE = 1.003  # factor in an update by which costs may rise, as where constraints come to matter
 FORGETTING = 0.05  # share of the newest in the mean of recent costs
 BETWEEN_COPIES = 50  # updates between copies of the weights to go back to
 MOST_CAUTION = 1e-3  # factor of the learning rate at which the training gives up
@@ -69,7 +73,7 @@ BETWEEN_DIVISIONS = 20  # updates between measurements of the integration's erro
 TOLERATED = 1e-3  # share of the cost by which the integration may change it, over all decisions
 BETWEEN_MESSAGES = 20  # updates
 CHECKPOINT = "checkpoint.npz"
-_NUMBERS = ("_seconds", "_typical", "_caution", "_growth", "_end_weight")  # of a checkpoint
+_NUMBERS = ("_seconds", "_typical", "_kept_cost", "_caution", "_growth")  # of a checkpoint
 
 
 class Learned(NamedTuple):
@@ -131,7 +135,7 @@ class _Learner:
         self._typical, self._caution = math.inf, 1.0  # recent cost; factor of the learning rate
         self._growth = FASTEST_UNITS  # of units, at most
         self._end_weight = settings.end_weight
-        self._kept = self._state()
+        self._kept, self._kept_cost = self._state(), math.inf
 
     def _begin_with(self, policy: ExportedPolicy | None, units: Array) -> None:
         """Take the weights of a policy, and its units; outputs have some of their own."""
@@ -217,12 +221,14 @@ class _Learner:
         gradient, median = self._fly(starts)
         if done % BETWEEN_DIVISIONS == 0 and self._divide(median):
             gradient, median = self._fly(starts)
-        if math.isinf(median) or (done > WARM_UP and median > WORSE * self._typical):
+        drifted = self._typical > DRIFTED * self._kept_cost
+        if math.isinf(median) or (done > WARM_UP and (drifted or median > WORSE * self._typical)):
             # The motion has become unstable: take the weights from before, and smaller steps.
             self._restore(self._kept)
             before = self._fly(starts)[1]
+            self._typical = min(self._typical, self._kept_cost)
             if not self._divide(before) and before > WORSE * self._typical:
-                self._typical = before  # those were no better
+                self._typical = self._kept_cost = before  # those were no better
             self._caution *= CAUTION
             self._growth = 1.0
         else:
@@ -254,14 +260,15 @@ class _Learner:
         if not wrong.any():
             return False
         episodes.divide(np.where(wrong, np.minimum(2 * episodes.substeps, most), episodes.substeps))
-        self._typical = math.inf  # costs are others now
+        self._typical = self._kept_cost = math.inf  # costs are others now
         return True
 
     def _follow(self, gradient: Sequence[Array], median: float) -> None:
         """Take a step against the gradient of episodes with a median cost."""
         done, settings = self._updates, self._settings
-        if done % BETWEEN_COPIES == 0:
-            self._kept = self._state()
+        if done % BETWEEN_COPIES == 0 and not self._typical > WORTHY * self._kept_cost:
+            self._kept, self._kept_cost = self._state(), self._typical
+        self._kept_cost *= PATIENCE
         warm_up = min(1.0, (done + 1) / WARM_UP)
         falling = FINAL_RATE + (1.0 - FINAL_RATE) * 0.5 * (1.0 + math.cos(math.pi * done / settings.updates))
         # Relative to the cost, which differs by orders between scenes, a gradient has the norm 1 at most.
@@ -276,9 +283,15 @@ class _Learner:
         """Let the end weight rise while episodes miss, and the outputs' units follow the inputs flown."""
         settings, episodes = self._settings, self._episodes
         judged = settings.copies if self._mismatch is None else calm(settings.copies)
-        reaches = np.mean(episodes.misses()[:judged] <= 1.0)
-        if self._updates > TRAVELLED * settings.updates and reaches < ENOUGH:
-            self._end_weight = min(STRICTER * self._end_weight, STRICTEST * settings.end_weight)
+        before, misses = self._end_weight, episodes.misses()
+        missing = 1.0 - np.mean(misses[:judged] <= 1.0)
+        if np.all(misses <= WITHIN):  # of disturbed episodes, too
+            self._end_weight = max(before / STRICTER, 1.0)
+        elif self._updates > TRAVELLED * settings.updates:
+            factor = STRICTER ** min(missing / MISSING, 1.0)
+            self._end_weight = min(factor * before, STRICTEST * settings.end_weight)
+            rise = (self._end_weight / before - 1.0) * episodes.terminal_cost()
+            self._typical, self._kept_cost = self._typical + rise, self._kept_cost + rise
         episodes.price_violations(self._typical)
         factors = UNITS_PER_SIZE * episodes.sizes() / episodes.units
         factors = np.clip(factors, 1.0 / FASTEST_UNITS, self._growth)
@@ -310,6 +323,7 @@ class _Learner:
         """Copies of weights and optimizer by name."""
         weights = {f"weight{index}": each for index, each in enumerate(self._weights)}
         everything = {**weights, **self._optimizer.arrays(), "units": self._episodes.units}
+        everything["end_weight"] = np.array(self._end_weight)
         if (penalties := self._episodes.penalties) is not None:
             everything["prices"] = penalties.prices
         return {name: np.array(each) for name, each in everything.items()}
@@ -318,7 +332,7 @@ class _Learner:
         for index, weight in enumerate(self._weights):
             weight[:] = arrays[f"weight{index}"]
         self._optimizer.restore(arrays)
-        self._episodes.units[:] = arrays["units"]
+        self._episodes.units[:], self._end_weight = arrays["units"], float(arrays["end_weight"])
         if (penalties := self._episodes.penalties) is not None:
             penalties.prices[:] = arrays["prices"]
 

@@ -172,16 +172,19 @@ def test_methods_that_adapt_their_steps_do_so_less(small_scene):
     assert gradient_training.coarser(explicit).simulation.rtol == 1e-4
 
 
-def test_end_weights_rise_where_episodes_miss(small_file, small_scene):
+def test_end_weights_rise_where_episodes_miss_and_else_fall(small_file, small_scene):
     learner = gradient_training._Learner(settings(small_file), small_scene)
     learner._update()
     assert learner._end_weight == 400.0  # it is too early
     learner._updates = 100
     learner._adapt()
     assert learner._end_weight == pytest.approx(408.0)
-    learner._episodes.misses = lambda: np.zeros(COUNT)
+    learner._episodes.misses = lambda: np.full(COUNT, 0.9)  # within, but with nothing to spare
     learner._adapt()
     assert learner._end_weight == pytest.approx(408.0)
+    learner._episodes.misses = lambda: np.full(COUNT, 0.6)
+    learner._adapt()
+    assert learner._end_weight == pytest.approx(400.0)
 
 
 def test_unstable_motions_go_back_to_the_last_copy(small_file, small_scene):
@@ -197,6 +200,30 @@ def test_unstable_motions_go_back_to_the_last_copy(small_file, small_scene):
     assert 1e-3 < learner._typical < 2.0 * cost
     learner._update()
     assert not np.array_equal(learner._weights[0], kept)
+
+
+def test_costs_that_drift_go_back_to_the_last_copy(small_file, small_scene):
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    for _ in range(60):
+        learner._update()
+    kept, caution = learner._kept["weight0"].copy(), learner._caution
+    assert not np.array_equal(learner._weights[0], kept)
+    learner._kept_cost = learner._typical / 1.6
+    learner._update()
+    np.testing.assert_array_equal(learner._weights[0], kept)
+    assert learner._caution < caution
+    assert learner._typical == learner._kept_cost
+
+
+@pytest.mark.parametrize(("factor", "taken"), [(1.1, True), (1.3, False)])
+def test_copies_are_taken_while_costs_stay(small_file, small_scene, factor, taken):
+    learner = gradient_training._Learner(settings(small_file), small_scene)
+    for _ in range(50):
+        learner._update()
+    before, kept = learner._weights[0].copy(), learner._kept["weight0"].copy()
+    learner._kept_cost = learner._typical / factor
+    learner._update()
+    np.testing.assert_array_equal(learner._kept["weight0"], before if taken else kept)
 
 
 def test_training_starts_from_a_policy(small_file, tmp_path):
