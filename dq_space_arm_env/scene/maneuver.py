@@ -328,6 +328,12 @@ class Spread(Model):
     payload_inertia: Fraction = Field(
         default=0.0, description="inertia of the payload about its center of mass, as a fraction of it"
     )
+    observed: bool = Field(
+        default=False,
+        exclude_if=lambda observed: not observed,
+        description="whether the relative changes of drawn masses and inertias are observed, one number for "
+        "each body's mass and inertia",
+    )
 
 
 class Success(Model):

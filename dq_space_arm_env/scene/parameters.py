@@ -246,6 +246,11 @@ def drawn_factors(scene: Scene) -> Iterator[tuple[float, list[Number]]]:
             yield width, [number for number in found if number.nominal]
 
 
+def observed_masses(scene: Scene) -> list[Number]:
+    """Masses and inertias whose relative changes are observed; inertias by their first entries."""
+    return [group[0] for _, group in drawn_factors(scene) if group] if scene.spread.observed else []
+
+
 def has_target_spread(scene: Scene) -> bool:
     """Tell whether the target is drawn for each episode."""
     return bool(scene.spread.target_rotation or scene.spread.target_position)

@@ -32,7 +32,14 @@ from dq_space_arm_env.scene.maneuver import (
     TipWrench,
 )
 from dq_space_arm_env.scene.motion import Motion, ScrewMotion, Tumbling, Waypoints
-from dq_space_arm_env.scene.parameters import ACTUATORS, control_numbers, is_part, numbers, parents
+from dq_space_arm_env.scene.parameters import (
+    ACTUATORS,
+    control_numbers,
+    drawn_factors,
+    is_part,
+    numbers,
+    parents,
+)
 from dq_space_arm_env.scene.phases import Phase, StagedNumbers, phase_problems, staged_numbers
 from dq_space_arm_env.scene.pose import Matrix3, Pose
 from dq_space_arm_env.scene.simulation import Simulation
@@ -264,6 +271,9 @@ class Scene(Model):
             half_width = getattr(self.spread, field)
             if half_width and not part:
                 yield Problem(("spread", field), half_width, f"must be 0: the scene has no {part_name}")
+        if self.spread.observed and not any(drawn_factors(self)):
+            sentence = "must be false: neither masses nor inertias are drawn"
+            yield Problem(("spread", "observed"), True, sentence)
         if self.target.base_velocity_relative and self.target.motion is None:
             sentence = "must be false: the target has no motion to be relative to"
             yield Problem(("target", "base_velocity_relative"), True, sentence)

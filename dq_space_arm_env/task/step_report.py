@@ -4,7 +4,7 @@ from typing import Any
 
 from dq_space_arm_env.scene.constraint_rows import exact_rows, path_rows
 from dq_space_arm_env.scene.layout import StateLayout
-from dq_space_arm_env.scene.parameters import moving_numbers
+from dq_space_arm_env.scene.parameters import moving_numbers, observed_masses
 from dq_space_arm_env.scene.schema import Scene
 
 # The costs are those of the stage before the step and the terminal ones after it, which are zero before the
@@ -98,6 +98,7 @@ def observation_entries(scene: Scene) -> list[tuple[str, str]]:
         *state[where.joint_rates.start :],
         *([("phase", "1")] if scene.phases else []),
         *((f"target {name}", unit) for name, unit in pose if scene.target.observed),
+        *((f"relative change of {drawn.name}", "1") for drawn in observed_masses(scene)),
         *((f"goal from {tip.name} {name}", unit) for tip in scene.other_tips for name, unit in pose),
         *((f"margin of {row.name}", "1") for row in rows if row.observed is not None),
         *((f"tip relative to the target {name}", unit) for name, unit in twist if moves),

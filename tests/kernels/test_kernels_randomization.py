@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.scene import Spread, StateLayout
 from dq_space_arm_env.scene.start import episode_scene, episode_start, number_of_draws, parameter_values
+from dq_space_arm_env.task.step_report import observation_entries
 
 TARGETS = {"joint_angles": 0.5, "target_rotation": 0.4, "target_position": 0.3}
 MASSES = {"base_mass": 0.2, "base_inertia": 0.3, "link_masses": 0.4, "link_inertias": 0.5}
@@ -112,6 +113,28 @@ def test_copies_have_parameters_of_their_own():
         np.testing.assert_array_equal(parameters, env.parameters)
 
 
+def test_masses_are_observed_where_asked():
+    plain = spread_out("payload")
+    scene = plain.replace({"spread.observed": True})
+    telling, plainly = DQSpaceArmVectorEnv(5, scene), DQSpaceArmVectorEnv(5, plain)
+    seen, less = (venv.reset(seed=3)[0] for venv in (telling, plainly))
+    entries = [name for name, _ in observation_entries(scene)]
+    where = [index for index, name in enumerate(entries) if name.startswith("relative change of ")]
+    places = ["base", "links.0", "links.1", "links.2", "payload"]
+    told = {f"{place}.{quantity}" for place in places for quantity in ("mass", "inertia.xx")}
+    assert {entries[index].removeprefix("relative change of ") for index in where} == told
+    for index in where:
+        column = telling.kernels.parameters.names.index(entries[index].removeprefix("relative change of "))
+        relative = telling.parameters[:, column] / telling.kernels.parameters.nominal[column]
+        np.testing.assert_allclose(seen[:, index], relative - 1.0, atol=1e-15)
+    np.testing.assert_array_equal(np.delete(seen, where, axis=1), less)
+    calm = telling.kernels.observation_jacobian(telling.states, p=telling.parameters)
+    assert not calm[:, where].any()
+    nominal, _ = make(scene).reset(options={"nominal": True})
+    assert not nominal[where].any()
+    assert "observed" not in plain.model_dump()["spread"]
+
+
 def test_drawn_bodies_keep_their_proportions():
     scene = spread_out("payload")
     draws = np.random.default_rng(0).uniform(-1, 1, number_of_draws(scene))
@@ -148,6 +171,7 @@ def test_a_drawn_target_is_turned_in_its_axes_and_moved_in_inertial_ones():
     [
         ({"base_mass": 1.0}, r"spread.base_mass = 1.*must be a fraction: 0 or greater, and less than 1"),
         ({"payload_mass": 0.1}, "spread.payload_mass = 0.1.*must be 0: the scene has no payload"),
+        ({"observed": True}, "spread.observed = True: must be false: neither masses nor inertias are drawn"),
         ({"target_position": -1}, "spread.target_position = -1.*0 or greater"),
     ],
 )
