@@ -31,7 +31,7 @@ Array = NDArray[Any]
 DIVERGED = 20.0  # times the median cost; episodes beyond it do not count
 STEEP = 10.0  # times the slope that usual episodes do not exceed; slopes beyond it are shortened
 STEEP_PENALTIES = 100.0  # likewise where few episodes may violate constraints
-ROUGH = 0.01  # penalty of outputs that alternate by their limits, relative to the cost of an episode
+ROUGH = 0.003  # penalty of outputs that alternate by their limits, relative to the cost of an episode
 USUAL = 0.5  # share of the usual episodes
 USUAL_DISTURBED = 0.9  # where a push just before the end is as usual as none, and a thousand times as steep
 
@@ -68,7 +68,7 @@ class Episodes:
         substeps: Equal integration steps of each decision, shape (K,); see `divide`.
         parameters: Parameters of each decision and of the end, shape (K + 1, B, n_p).
         units: Inputs of an output of 1, fractions of the limits, shape (n_u,).
-        penalties: Those of the scene's constraints in the cost; None without.
+        penalties: Those of the scene's constraints, and of success, in the cost.
     """
 
     def __init__(
@@ -93,9 +93,8 @@ class Episodes:
             self._weights[end - 1] += -0.5 if last else 0.5
         self._held = steps / dt - self._weights[:-1]  # of the input's cost, which is not of a point in time
         self.parameters = np.zeros((decisions + 1, count, kernels.n_p), dtype)
-        self.penalties: Penalties | None = None
-        if priced_rows(scene).any():
-            self.penalties = Penalties(kernels, decisions, count, self._weights[-1])
+        self.penalties = Penalties(kernels, decisions, count, self._weights[-1])
+        self._is_constrained = bool(priced_rows(scene).any())
         self._states = np.zeros((decisions + 1, count, kernels.n_x), dtype)
         self._measured = np.zeros_like(self._states) if noisy else self._states
         self._observations = np.zeros((decisions, count, n_obs), dtype)
@@ -180,7 +179,8 @@ class Episodes:
 
     def _call(self, name: str, k: int, arrays: dict[str, Array]) -> KernelCall:
         """A kernel on arrays; slopes of costs have those of the penalties."""
-        if self.penalties is not None and name in ("step_with_cost_vjp", "emphasized_terminal_cost_vjp"):
+        along = self._is_constrained and name == "step_with_cost_vjp"
+        if along or name == "emphasized_terminal_cost_vjp":
             name, arrays = PENALIZED + name, {**arrays, "parameters": self.penalties.parameters[k]}
         return KernelCall(self._kernels.kernel(name), arrays)
 
@@ -212,8 +212,7 @@ class Episodes:
         Returns the costs, (B,), with the terminal pose's multiplied by the emphasis.
         """
         self._states[0], self._emphasis[:] = starts, emphasis
-        if self.penalties is not None:
-            self.penalties.prepare(self.parameters, emphasis)
+        self.penalties.prepare(self.parameters, emphasis)
         rows, layout = len(starts), self._kernels.layout
         # Phases change limits.
         high = layout.limits_with(self.parameters if self._kernels.parameters.staged else self.parameters[:1])
@@ -279,7 +278,7 @@ class Episodes:
         above, below = (self._wanted > self._high[:decisions]), (self._wanted < self._low[:decisions])
         is_limited: Array = np.any(above | below, axis=(1, 2))
         units = self.units * self._high / kept
-        steep = STEEP if self.penalties is None else STEEP_PENALTIES
+        steep = STEEP_PENALTIES if self._is_constrained else STEEP
         for k in range(decisions - 1, -1, -1):
             further: Array | float = 0.0
             for _, reverse in reversed(self._further[k]):
@@ -317,11 +316,16 @@ class Episodes:
             slopes[first : first + len(second)] += factor * second
         return np.asarray(slopes * self.units)
 
-    def price_violations(self, cost: float) -> None:
-        """Let penalties follow what the episodes flown last violate, and the cost of recent ones."""
-        if self.penalties is not None:
-            self.penalties.cost = cost
-            self.penalties.follow(self._states, self._inputs, self.parameters)
+    def price_violations(self, cost: float, judged: int) -> None:
+        """Let penalties follow what the episodes flown last violate, and the cost of recent ones.
+
+        The first ones, as many as are judged, by where they end, too.
+        """
+        self.penalties.cost = cost
+        if self._is_constrained:
+            self.penalties.follow_path(self._states, self._inputs, self.parameters)
+        if judged:
+            self.penalties.follow_ends(self._states[-1, :judged], self.parameters[-1, :judged])
 
     def errors(self) -> Array:
         """How much each decision's integration changes the cost of the episodes of the last `gradient`, (K,).
@@ -347,10 +351,6 @@ class Episodes:
         """Largest error of the tip at the end of each episode flown last, relative to its tolerance, (B,)."""
         with np.errstate(invalid="ignore"):  # of episodes that diverged
             return misses(self._kernels, self._states[-1], self.parameters[-1])
-
-    def terminal_cost(self) -> float:
-        """Median of the terminal costs of the episodes flown last, as emphasized."""
-        return float(np.median(self._terminal[np.isfinite(self._terminal)]))
 
     def sizes(self) -> Array:
         """Root mean squares of the inputs flown last, by actuator, fractions of the limits, (n_u,)."""

@@ -50,11 +50,9 @@ FINAL_RATE = 3e-3  # learning rate at the end, relative to its peak
 FIRST_UNITS = 0.1  # of the network's outputs, fractions of the limits
 UNITS_PER_SIZE = 4.0  # units that they become, relative to the root mean square of the inputs
 FASTEST_UNITS = 1.03  # largest factor by which units change in an update
-TRAVELLED = 0.4  # share of the updates after which the end weight may rise
-MISSING = 0.01  # share of episodes that miss, from which on it rises no faster
-WITHIN = 0.7  # of the tolerances; where all episodes end so near, the end weight falls
-STRICTER = 1.02  # largest factor of the end weight in an update, and of its fall
-STRICTEST = 1000.0  # largest end weight, relative to its first value
+TRAVELLED = 0.3  # share of the updates after which missing the tolerances has a price
+MISSING = 0.05  # share of episodes that miss them, up to which the end weight falls
+LIGHTER = 1.01  # factor of its fall in an update
 TRIAL_ACTIONS = 0.005  # standard deviation of the actions that measure the spread of observations
 COARSE = 1e-4  # tolerance of methods that adapt their steps, rad and m; at least the scene's
 PART = 0.1  # least deviation of an observation, of that in motions over a radian or a meter
@@ -216,6 +214,8 @@ class _Learner:
         rows = rng.integers(len(self._starts.states), size=settings.copies)
         self._episodes.parameters[:] = self._starts.at(rows)
         starts = self._starts.states[rows]
+        since = (done / settings.updates - TRAVELLED) / (1.0 - TRAVELLED)
+        self._episodes.penalties.hardening = max(since, 0.0)
         if self._mismatch is not None:
             self._episodes.meet(Met.draw(self._mismatch, self._flown, self._times, len(rows), rng))
         gradient, median = self._fly(starts)
@@ -280,19 +280,13 @@ class _Learner:
         self._adapt()
 
     def _adapt(self) -> None:
-        """Let the end weight rise while episodes miss, and the outputs' units follow the inputs flown."""
+        """Let the end weight fall, prices follow violations, and the outputs' units the inputs flown."""
         settings, episodes = self._settings, self._episodes
+        if np.mean(episodes.misses() > 1.0) <= MISSING:
+            self._end_weight = max(self._end_weight / LIGHTER, 1.0)
         judged = settings.copies if self._mismatch is None else calm(settings.copies)
-        before, misses = self._end_weight, episodes.misses()
-        missing = 1.0 - np.mean(misses[:judged] <= 1.0)
-        if np.all(misses <= WITHIN):  # of disturbed episodes, too
-            self._end_weight = max(before / STRICTER, 1.0)
-        elif self._updates > TRAVELLED * settings.updates:
-            factor = STRICTER ** min(missing / MISSING, 1.0)
-            self._end_weight = min(factor * before, STRICTEST * settings.end_weight)
-            rise = (self._end_weight / before - 1.0) * episodes.terminal_cost()
-            self._typical, self._kept_cost = self._typical + rise, self._kept_cost + rise
-        episodes.price_violations(self._typical)
+        travelled = self._updates > TRAVELLED * settings.updates
+        episodes.price_violations(self._typical, judged if travelled else 0)
         factors = UNITS_PER_SIZE * episodes.sizes() / episodes.units
         factors = np.clip(factors, 1.0 / FASTEST_UNITS, self._growth)
         episodes.units *= factors
@@ -324,8 +318,7 @@ class _Learner:
         weights = {f"weight{index}": each for index, each in enumerate(self._weights)}
         everything = {**weights, **self._optimizer.arrays(), "units": self._episodes.units}
         everything["end_weight"] = np.array(self._end_weight)
-        if (penalties := self._episodes.penalties) is not None:
-            everything["prices"] = penalties.prices
+        everything["prices"] = self._episodes.penalties.prices
         return {name: np.array(each) for name, each in everything.items()}
 
     def _restore(self, arrays: Mapping[str, Array]) -> None:
@@ -333,8 +326,7 @@ class _Learner:
             weight[:] = arrays[f"weight{index}"]
         self._optimizer.restore(arrays)
         self._episodes.units[:], self._end_weight = arrays["units"], float(arrays["end_weight"])
-        if (penalties := self._episodes.penalties) is not None:
-            penalties.prices[:] = arrays["prices"]
+        self._episodes.penalties.prices[:] = arrays["prices"]
 
     def _write(self, path: Path) -> None:
         stream = io.BytesIO()
@@ -358,8 +350,8 @@ class _Learner:
             self._episodes.divide(arrays["substeps"])
             for name in _NUMBERS:
                 setattr(self, name, float(arrays[name]))
-            if (penalties := self._episodes.penalties) is not None and math.isfinite(self._typical):
-                penalties.cost = self._typical
+            if math.isfinite(self._typical):
+                self._episodes.penalties.cost = self._typical
         except (KeyError, ValueError, OSError, UnreadableError) as error:
             raise RunFolderError(
                 f"{place} cannot be read ({error}); remove it to restart the training"

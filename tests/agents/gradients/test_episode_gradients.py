@@ -18,7 +18,7 @@ from agents.policies import ExportedPolicy
 from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.environment.disturbances import Disturbance
 from dq_space_arm_env.environment.rollouts import rollout
-from dq_space_arm_env.scene.constraint_rows import path_rows
+from dq_space_arm_env.scene.constraint_rows import path_rows, terminal_rows
 
 pytestmark = pytest.mark.agents
 
@@ -152,25 +152,36 @@ def test_slopes_have_those_of_penalties(limited, monkeypatch):
     monkeypatch.setattr(episodes, "ROUGH", 0.0)
     flown = Flown(limited)
     flown.in_double_precision()
-    kernels, rows, penalties = flown.episodes._kernels, path_rows(limited), flown.episodes.penalties
-    tolerances, margins = (np.array([getattr(row, key) for row in rows]) for key in ("tolerance", "margin"))
-    penalties.prices[:] = np.random.default_rng(2).uniform(0.5, 2.0, len(rows))
-    penalties.cost = 100.0
-    at_tolerance = penalties.prices * penalties.cost / limited.simulation.steps
+    kernels, path, penalties = flown.episodes._kernels, path_rows(limited), flown.episodes.penalties
+    success = [row for row in terminal_rows(limited) if row.name.startswith("success")]
+    assert terminal_rows(limited)[-len(success) :] == tuple(success)
+    (tolerances, margins), (last_tolerances, last_margins) = (
+        [np.array([getattr(row, key) for row in rows]) for key in ("tolerance", "margin")]
+        for rows in (path, success)
+    )
+    penalties.prices[:] = np.random.default_rng(2).uniform(0.5, 2.0, len(path) + len(success))
+    penalties.cost, penalties.hardening = 100.0, 0.5
+    along, at_end = np.split(penalties.prices * penalties.cost, [len(path)])
+    along /= limited.simulation.steps
 
     def costs():
-        """Costs, and penalties from the residuals."""
+        """Costs, penalties from the residuals, and these."""
         scene_costs = flown.costs(emphasis=10.0)
         states, inputs = flown.episodes._states, flown.episodes._inputs
         found = [kernels.constraints(x, u) for x, u in zip(states, inputs, strict=True)]
-        each = penalty(5.0 * (np.array(found) + margins) / tolerances, at_tolerance / 5.0)
-        return scene_costs + flown.episodes._weights @ each.sum(axis=-1), np.array(found)
+        each = penalty(5.0 * (np.array(found) + margins) / tolerances, along / 5.0)
+        ends = kernels.terminal_constraints(states[-1])[:, -len(success) :]
+        steep = 5.0 * math.sqrt(10.0)
+        last = penalty(steep * (ends + last_margins) / last_tolerances, at_end / steep)
+        total = scene_costs + flown.episodes._weights @ each.sum(axis=-1) + last.sum(axis=-1)
+        return total, np.array(found), ends
 
     gradient, plain = flown.gradient(emphasis=10.0)
     np.testing.assert_array_equal(plain, flown.costs(emphasis=10.0))  # without penalties
     violated = (costs()[1] > 0.0).any(axis=(0, 1))
     assert violated.any()
     assert not violated.all()
+    assert (costs()[2] > 0.0).any()
     rng = np.random.default_rng(1)
     for weight, slope in zip(flown.weights, gradient, strict=True):
         direction = rng.normal(size=weight.shape)
@@ -206,13 +217,37 @@ def test_prices_rise_where_an_episode_violates(limited):
         falls_fast = 0.1 - np.minimum(near, 0.1)
         return np.exp(0.5 * (rises - falls_fast * (0.1 - 0.005 / max(1, with_prices)) / 0.1))
 
-    flown.episodes.price_violations(1500.0)
-    np.testing.assert_allclose(penalties.prices, 0.01 * np.maximum(factors(0), 1.0))  # 0.01 is the least
-    penalties.prices[:] = 1.0
-    flown.episodes.price_violations(1500.0)
-    np.testing.assert_allclose(penalties.prices, factors(len(violating)))
-    np.testing.assert_allclose(penalties.prices[far], math.exp(-0.05))
+    n = len(tolerances)
+    flown.episodes.price_violations(1500.0, judged=0)
+    np.testing.assert_allclose(penalties.prices[:n], 0.01 * np.maximum(factors(0), 1.0))  # 0.01 is the least
+    assert not penalties.prices[n:].any()
+    penalties.prices[:n] = 1.0
+    flown.episodes.price_violations(1500.0, judged=0)
+    np.testing.assert_allclose(penalties.prices[:n], factors(len(violating)))
+    np.testing.assert_allclose(penalties.prices[:n][far], math.exp(-0.05))
     assert penalties.cost == 1500.0
+
+
+def test_prices_of_success_follow_where_judged_episodes_end(small_scene):
+    flown = Flown(small_scene)
+    flown.costs()
+    episodes_, penalties = flown.episodes, flown.episodes.penalties
+    tolerances = np.radians(small_scene.success.attitude_error_deg), small_scene.success.position_error
+    np.testing.assert_array_equal(penalties.prices, 0.0)
+    judged = COUNT // 2
+    episodes_.price_violations(1500.0, judged=judged)
+    np.testing.assert_array_equal(penalties.prices, 0.01)
+    errors = episodes_._kernels.observation(episodes_._states[-1, :judged], np.zeros((judged, 1)))[1]
+    shares = (errors > 0.93 * np.array(tolerances)).mean(axis=0)
+    assert (shares > 0.1).all()
+    penalties.prices[:] = 1.0, 5.99
+    episodes_.price_violations(1500.0, judged=judged)
+    np.testing.assert_allclose(penalties.prices, [math.exp(0.036), 6.0])
+    loose = Flown(small_scene.replace({"success.position_error": 100.0}))
+    loose.costs()
+    loose.episodes.penalties.prices[:] = 1.0
+    loose.episodes.price_violations(1500.0, judged=judged)
+    np.testing.assert_allclose(loose.episodes.penalties.prices, [math.exp(0.036), math.exp(-0.004)])
 
 
 def test_an_episode_that_diverges_does_not_count(small_scene):

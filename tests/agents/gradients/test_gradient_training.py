@@ -172,19 +172,22 @@ def test_methods_that_adapt_their_steps_do_so_less(small_scene):
     assert gradient_training.coarser(explicit).simulation.rtol == 1e-4
 
 
-def test_end_weights_rise_where_episodes_miss_and_else_fall(small_file, small_scene):
+def test_end_weights_fall_where_episodes_reach_and_missing_has_a_price_later(small_file, small_scene):
     learner = gradient_training._Learner(settings(small_file), small_scene)
+    prices = learner._episodes.penalties.prices
     learner._update()
-    assert learner._end_weight == 400.0  # it is too early
-    learner._updates = 100
+    assert learner._end_weight == 400.0  # they miss
+    learner._episodes.misses = lambda: np.where(np.arange(COUNT) < 1, 1.1, 0.9)
     learner._adapt()
-    assert learner._end_weight == pytest.approx(408.0)
-    learner._episodes.misses = lambda: np.full(COUNT, 0.9)  # within, but with nothing to spare
+    assert learner._end_weight == 400.0  # one of 16
+    learner._episodes.misses = lambda: np.full(COUNT, 0.9)
     learner._adapt()
-    assert learner._end_weight == pytest.approx(408.0)
-    learner._episodes.misses = lambda: np.full(COUNT, 0.6)
-    learner._adapt()
-    assert learner._end_weight == pytest.approx(400.0)
+    assert learner._end_weight == pytest.approx(400.0 / 1.01)
+    assert not prices.any()
+    learner._updates = 78  # 60 % of what comes after 30 % of the updates
+    learner._update()
+    assert learner._episodes.penalties.hardening == pytest.approx(0.5)
+    assert prices.all()
 
 
 def test_unstable_motions_go_back_to_the_last_copy(small_file, small_scene):
