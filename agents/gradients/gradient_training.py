@@ -282,7 +282,7 @@ class _Learner:
     def _adapt(self) -> None:
         """Let the end weight fall, prices follow violations, and the outputs' units the inputs flown."""
         settings, episodes = self._settings, self._episodes
-        if np.mean(episodes.misses() > 1.0) <= MISSING:
+        if 1.0 - np.mean(episodes.misses() <= 1.0) <= MISSING:  # NaN misses, too
             self._end_weight = max(self._end_weight / LIGHTER, 1.0)
         judged = settings.copies if self._mismatch is None else calm(settings.copies)
         travelled = self._updates > TRAVELLED * settings.updates

@@ -39,7 +39,7 @@ class _Ascent(NamedTuple):
 
 # Flights between decisions keep within their tolerances; rows share what is allowed.
 ALONG = _Ascent(charged=0.5, near=-5.0, allowed=0.005, most=0.1, rate=0.5, dearest=math.inf)
-# An error of e tolerances violates by (e^2 - 1) / 2: those above 0.93 count.
+# An error of e tolerances violates by (e^2 - 1) / 2: those above 0.93 count, and all are near.
 AT_END = _Ascent(charged=-0.07, near=-1.0, allowed=0.004, most=0.04, rate=1.0, dearest=6.0)
 
 
