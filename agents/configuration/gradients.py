@@ -29,8 +29,8 @@ class AnalyticPolicyGradient(Model):
     starts: Many = Field(default=16384, description="starts that episodes are drawn from")
     end_weight: Positive = Field(
         default=400.0,
-        description="factor of the terminal pose's cost at first, for reaching the tolerances; it falls while "
-        "nearly all episodes do",
+        description="factor of the terminal pose's cost at first, for reaching the tolerances; it falls "
+        "while nearly all episodes do",
     )
 
     def _problems(self) -> Iterator[Problem]:

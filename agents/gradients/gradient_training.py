@@ -62,6 +62,8 @@ FARTHEST = 5.0  # motion [rad, m] by the first outputs over an episode; units ar
 WORSE = 2.0  # median cost relative to recent ones, above which the weights go back to what they were
 DRIFTED = 1.5  # likewise of recent costs, relative to those with the weights to go back to
 WORTHY = 1.2  # likewise, up to which newer weights take their place
+LOST = 0.3  # further share of episodes that miss the tolerances, beyond which the weights go back, too
+WORTHY_LOSS = 0.1  # likewise, up to which newer weights take their place
 PATIENCE = 1.003  # factor in an update by which costs may rise, as where constraints come to matter
 FORGETTING = 0.05  # share of the newest in the mean of recent costs
 BETWEEN_COPIES = 50  # updates between copies of the weights to go back to
@@ -71,7 +73,7 @@ BETWEEN_DIVISIONS = 20  # updates between measurements of the integration's erro
 TOLERATED = 1e-3  # share of the cost by which the integration may change it, over all decisions
 BETWEEN_MESSAGES = 20  # updates
 CHECKPOINT = "checkpoint.npz"
-_NUMBERS = ("_seconds", "_typical", "_kept_cost", "_caution", "_growth")  # of a checkpoint
+_NUMBERS = ("_seconds", "_typical", "_missing", "_kept_cost", "_kept_missing", "_caution", "_growth")
 
 
 class Learned(NamedTuple):
@@ -133,7 +135,8 @@ class _Learner:
         self._typical, self._caution = math.inf, 1.0  # recent cost; factor of the learning rate
         self._growth = FASTEST_UNITS  # of units, at most
         self._end_weight = settings.end_weight
-        self._kept, self._kept_cost = self._state(), math.inf
+        self._missing = 1.0  # share of recent episodes that miss the tolerances
+        self._kept, self._kept_cost, self._kept_missing = self._state(), math.inf, 1.0
 
     def _begin_with(self, policy: ExportedPolicy | None, units: Array) -> None:
         """Take the weights of a policy, and its units; outputs have some of their own."""
@@ -221,12 +224,13 @@ class _Learner:
         gradient, median = self._fly(starts)
         if done % BETWEEN_DIVISIONS == 0 and self._divide(median):
             gradient, median = self._fly(starts)
-        drifted = self._typical > DRIFTED * self._kept_cost
+        drifted = self._typical > DRIFTED * self._kept_cost or self._missing > self._kept_missing + LOST
         if math.isinf(median) or (done > WARM_UP and (drifted or median > WORSE * self._typical)):
             # The motion has become unstable: take the weights from before, and smaller steps.
             self._restore(self._kept)
             before = self._fly(starts)[1]
             self._typical = min(self._typical, self._kept_cost)
+            self._missing = min(self._missing, self._kept_missing)
             if not self._divide(before) and before > WORSE * self._typical:
                 self._typical = self._kept_cost = before  # those were no better
             self._caution *= CAUTION
@@ -266,8 +270,9 @@ class _Learner:
     def _follow(self, gradient: Sequence[Array], median: float) -> None:
         """Take a step against the gradient of episodes with a median cost."""
         done, settings = self._updates, self._settings
-        if done % BETWEEN_COPIES == 0 and not self._typical > WORTHY * self._kept_cost:
-            self._kept, self._kept_cost = self._state(), self._typical
+        stays = self._typical <= WORTHY * self._kept_cost
+        if done % BETWEEN_COPIES == 0 and stays and self._missing <= self._kept_missing + WORTHY_LOSS:
+            self._kept, self._kept_cost, self._kept_missing = self._state(), self._typical, self._missing
         self._kept_cost *= PATIENCE
         warm_up = min(1.0, (done + 1) / WARM_UP)
         falling = FINAL_RATE + (1.0 - FINAL_RATE) * 0.5 * (1.0 + math.cos(math.pi * done / settings.updates))
@@ -282,9 +287,11 @@ class _Learner:
     def _adapt(self) -> None:
         """Let the end weight fall, prices follow violations, and the outputs' units the inputs flown."""
         settings, episodes = self._settings, self._episodes
-        if 1.0 - np.mean(episodes.misses() <= 1.0) <= MISSING:  # NaN misses, too
+        reaches = episodes.misses() <= 1.0  # those that diverge do not
+        if 1.0 - reaches.mean() <= MISSING:
             self._end_weight = max(self._end_weight / LIGHTER, 1.0)
         judged = settings.copies if self._mismatch is None else calm(settings.copies)
+        self._missing += FORGETTING * (1.0 - reaches[:judged].mean() - self._missing)
         travelled = self._updates > TRAVELLED * settings.updates
         episodes.price_violations(self._typical, judged if travelled else 0)
         factors = UNITS_PER_SIZE * episodes.sizes() / episodes.units

@@ -205,26 +205,33 @@ def test_unstable_motions_go_back_to_the_last_copy(small_file, small_scene):
     assert not np.array_equal(learner._weights[0], kept)
 
 
-def test_costs_that_drift_go_back_to_the_last_copy(small_file, small_scene):
+@pytest.mark.parametrize("what", ["costs", "misses"])
+def test_what_drifts_goes_back_to_the_last_copy(small_file, small_scene, what):
     learner = gradient_training._Learner(settings(small_file), small_scene)
     for _ in range(60):
         learner._update()
     kept, caution = learner._kept["weight0"].copy(), learner._caution
     assert not np.array_equal(learner._weights[0], kept)
-    learner._kept_cost = learner._typical / 1.6
+    if what == "costs":
+        learner._kept_cost = learner._typical / 1.6
+    else:
+        learner._kept_missing = learner._missing - 0.31
     learner._update()
     np.testing.assert_array_equal(learner._weights[0], kept)
     assert learner._caution < caution
-    assert learner._typical == learner._kept_cost
+    assert learner._typical <= learner._kept_cost
+    assert learner._missing <= learner._kept_missing
 
 
-@pytest.mark.parametrize(("factor", "taken"), [(1.1, True), (1.3, False)])
-def test_copies_are_taken_while_costs_stay(small_file, small_scene, factor, taken):
+@pytest.mark.parametrize(
+    ("factor", "more", "taken"), [(1.1, 0.05, True), (1.3, 0.05, False), (1.1, 0.15, False)]
+)
+def test_copies_are_taken_while_costs_and_misses_stay(small_file, small_scene, factor, more, taken):
     learner = gradient_training._Learner(settings(small_file), small_scene)
     for _ in range(50):
         learner._update()
     before, kept = learner._weights[0].copy(), learner._kept["weight0"].copy()
-    learner._kept_cost = learner._typical / factor
+    learner._kept_cost, learner._kept_missing = learner._typical / factor, learner._missing - more
     learner._update()
     np.testing.assert_array_equal(learner._kept["weight0"], before if taken else kept)
 
