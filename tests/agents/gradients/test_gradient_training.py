@@ -122,7 +122,7 @@ def test_constraints_are_learned_and_prices_resumed(limited, small_file, tmp_pat
 def test_units_follow_the_inputs_and_leave_the_policy(small_file, small_scene):
     learner = gradient_training._Learner(settings(small_file), small_scene)
     seen = DQSpaceArmVectorEnv(COUNT, small_scene).reset(seed=SEEDS)[0]
-    for _ in range(60):
+    for _ in range(61):  # the integration is not measured now
         learner._update()
     before, units = learner.export({})(seen), learner._episodes.units.copy()
     for _ in range(300):
@@ -192,10 +192,11 @@ def test_end_weights_fall_where_episodes_reach_and_missing_has_a_price_later(sma
 
 def test_unstable_motions_go_back_to_the_last_copy(small_file, small_scene):
     learner = gradient_training._Learner(settings(small_file), small_scene)
-    for _ in range(60):
+    for _ in range(61):  # the integration is not measured now
         learner._update()
     kept, caution = learner._kept["weight0"].copy(), learner._caution
     learner._weights[0][:] += 0.1
+    learner._divide = lambda _: False  # or costs would be others
     learner._typical = 1e-3  # even the copy is no better: training goes on from its cost
     cost = learner._update()
     np.testing.assert_array_equal(learner._weights[0], kept)
@@ -208,7 +209,7 @@ def test_unstable_motions_go_back_to_the_last_copy(small_file, small_scene):
 @pytest.mark.parametrize("what", ["costs", "misses"])
 def test_what_drifts_goes_back_to_the_last_copy(small_file, small_scene, what):
     learner = gradient_training._Learner(settings(small_file), small_scene)
-    for _ in range(60):
+    for _ in range(61):  # the integration is not measured now
         learner._update()
     kept, caution = learner._kept["weight0"].copy(), learner._caution
     assert not np.array_equal(learner._weights[0], kept)
