@@ -67,16 +67,17 @@ def settings(small_file, **algorithm):
 
 def test_training_lowers_the_cost_and_resumes_to_the_bit(small_file, small_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(gradient_training, "TOLERATED", 1e-9)  # such that decisions are divided
-    trained = train_by_gradients(settings(small_file), tmp_path / "whole")
+    long = settings(small_file, updates=240)
+    trained = train_by_gradients(long, tmp_path / "whole")
     curve = [line["median_cost"] for line in trained_curve(tmp_path / "whole")]
     idle = np.median(rollout(lambda seen: np.zeros((len(seen), 6)), small_scene, validation_seeds(8)).cost)
     assert curve[-1] < 0.2 * idle
-    assert trained.policy.metadata["training"]["updates"] == 120
+    assert trained.policy.metadata["training"]["updates"] == 240
 
-    resumed = resume_after(77, settings(small_file), tmp_path / "halves", monkeypatch)
+    resumed = resume_after(177, long, tmp_path / "halves", monkeypatch)
     for one, other in zip(trained.policy.weights, resumed.policy.weights, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert len(trained_curve(tmp_path / "halves")) == 2
+    assert len(trained_curve(tmp_path / "halves")) == 4
 
 
 def resume_after(updates, configuration, folder, monkeypatch):
