@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.gradients.disturbed_flights import Arrival, Met, arrivals
 from agents.gradients.layers import Layers, SingleArray
-from agents.gradients.penalties import Penalties, priced_rows
+from agents.gradients.penalties import Penalties
 from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.kernels.library import PENALIZED
@@ -94,7 +94,6 @@ class Episodes:
         self._held = steps / dt - self._weights[:-1]  # of the input's cost, which is not of a point in time
         self.parameters = np.zeros((decisions + 1, count, kernels.n_p), dtype)
         self.penalties = Penalties(kernels, decisions, count, self._weights[-1])
-        self._is_constrained = bool(priced_rows(scene).any())
         self._states = np.zeros((decisions + 1, count, kernels.n_x), dtype)
         self._measured = np.zeros_like(self._states) if noisy else self._states
         self._observations = np.zeros((decisions, count, n_obs), dtype)
@@ -179,7 +178,7 @@ class Episodes:
 
     def _call(self, name: str, k: int, arrays: dict[str, Array]) -> KernelCall:
         """A kernel on arrays; slopes of costs have those of the penalties."""
-        along = self._is_constrained and name == "step_with_cost_vjp"
+        along = self.penalties.is_constrained and name == "step_with_cost_vjp"
         if along or name == "emphasized_terminal_cost_vjp":
             name, arrays = PENALIZED + name, {**arrays, "parameters": self.penalties.parameters[k]}
         return KernelCall(self._kernels.kernel(name), arrays)
@@ -278,7 +277,7 @@ class Episodes:
         above, below = (self._wanted > self._high[:decisions]), (self._wanted < self._low[:decisions])
         is_limited: Array = np.any(above | below, axis=(1, 2))
         units = self.units * self._high / kept
-        steep = STEEP_PENALTIES if self._is_constrained else STEEP
+        steep = STEEP_PENALTIES if self.penalties.is_constrained else STEEP
         for k in range(decisions - 1, -1, -1):
             further: Array | float = 0.0
             for _, reverse in reversed(self._further[k]):
@@ -322,7 +321,7 @@ class Episodes:
         The first ones, as many as are judged, by where they end, too.
         """
         self.penalties.cost = cost
-        if self._is_constrained:
+        if self.penalties.is_constrained:
             self.penalties.follow_path(self._states, self._inputs, self.parameters)
         if judged:
             self.penalties.follow_ends(self._states[-1, :judged], self.parameters[-1, :judged])

@@ -53,7 +53,8 @@ class Penalties:
     """Penalties of B episodes of K decisions.
 
     Attributes:
-        parameters: Those of the penalized programs, shape (K + 1, B, n_p + 2 m).
+        parameters: Those of the penalized programs, shape (K + 1, B, n_p + 2 m); of the end alone, K = 0,
+            where no row along the path has a price.
         prices: Of the rows along the path, then of those of success, shape (r,): what a violation by the
             tolerance costs at first order, relative to a cost; along the path if it lasts all the episode.
             Those of success are zero before `follow_ends`.
@@ -76,16 +77,21 @@ class Penalties:
         self.prices, self.cost = np.where(self._priced, LEAST, 0.0), 0.0
         self.prices[self._ends] = 0.0
         self.hardening = 0.0
-        m = n_multipliers(scene)
-        self.parameters = np.zeros((decisions + 1, count, kernels.n_p + 2 * m), kernels.dtype)
+        m, stages = n_multipliers(scene), decisions + 1 if self.is_constrained else 1
+        self.parameters = np.zeros((stages, count, kernels.n_p + 2 * m), kernels.dtype)
         self._multipliers, self._penalties = np.split(self.parameters[..., kernels.n_p :], 2, axis=-1)
+
+    @property
+    def is_constrained(self) -> bool:
+        """Whether a row along the path has a price."""
+        return bool(self._priced[self._path].any())
 
     def prepare(self, parameters: Array, emphasis: float) -> None:
         """Take the scene's parameters of each decision and the end, (K + 1, B, n_p), and the end's emphasis.
 
         The emphasis multiplies all of the terminal cost but the base's velocity: here, not the penalties.
         """
-        self.parameters[..., : self._kernels.n_p] = parameters
+        self.parameters[..., : self._kernels.n_p] = parameters[-len(self.parameters) :]
         path, penalties = self._path, STIFFNESS / self._tolerances
         penalties[self._ends] *= STIFFER**self.hardening
         multipliers = self.prices / self._tolerances * self.cost
