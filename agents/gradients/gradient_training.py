@@ -222,10 +222,11 @@ class _Learner:
         if self._mismatch is not None:
             self._episodes.meet(Met.draw(self._mismatch, self._flown, self._times, len(rows), rng))
         gradient, median = self._fly(starts)
-        if done % BETWEEN_DIVISIONS == 0 and self._divide(median):
+        is_unstable = self._is_unstable(median)  # motions that are lost err without being worth substeps
+        if done % BETWEEN_DIVISIONS == 0 and not is_unstable and self._divide(median):
             gradient, median = self._fly(starts)
-        drifted = self._typical > DRIFTED * self._kept_cost or self._missing > self._kept_missing + LOST
-        if math.isinf(median) or (done > WARM_UP and (drifted or median > WORSE * self._typical)):
+            is_unstable = self._is_unstable(median)
+        if is_unstable:
             # The motion has become unstable: take the weights from before, and smaller steps.
             self._restore(self._kept)
             before = self._fly(starts)[1]
@@ -245,6 +246,12 @@ class _Learner:
             )
         self._updates += 1
         return median
+
+    def _is_unstable(self, median: float) -> bool:
+        """Whether episodes with a median cost, or the recent ones, have lost what earlier ones had."""
+        drifted = self._typical > DRIFTED * self._kept_cost or self._missing > self._kept_missing + LOST
+        lost = self._updates > WARM_UP and (drifted or median > WORSE * self._typical)
+        return math.isinf(median) or lost
 
     def _fly(self, starts: Array) -> tuple[list[Array], float]:
         """The gradient of episodes, and their median cost; infinite where all diverge."""

@@ -191,15 +191,18 @@ def test_end_weights_fall_where_episodes_reach_and_missing_has_a_price_later(sma
     assert prices.all()
 
 
-def test_unstable_motions_go_back_to_the_last_copy(small_file, small_scene):
+@pytest.mark.parametrize("updates", [60, 61])  # the integration is measured next, or not
+def test_unstable_motions_go_back_to_the_last_copy(small_file, small_scene, updates):
     learner = gradient_training._Learner(settings(small_file), small_scene)
-    for _ in range(61):  # the integration is not measured now
+    for _ in range(updates):
         learner._update()
     kept, caution = learner._kept["weight0"].copy(), learner._caution
     learner._weights[0][:] += 0.1
-    learner._divide = lambda _: False  # or costs would be others
+    measured = []
+    learner._divide = lambda _: measured.append(learner._weights[0].copy())  # or costs would be others
     learner._typical = 1e-3  # even the copy is no better: training goes on from its cost
     cost = learner._update()
+    np.testing.assert_array_equal(measured, [kept])  # not what has become unstable
     np.testing.assert_array_equal(learner._weights[0], kept)
     assert learner._caution < caution
     assert 1e-3 < learner._typical < 2.0 * cost
