@@ -72,17 +72,18 @@ class Arrival(NamedTuple):
         by_output[self.before, self.rows] -= ahead * cotangent
 
 
-def arrivals(times: Array, firsts: Sequence[int], delays: Array | None = None) -> list[Arrival]:
-    """What acts halfway through each decision, by the times of decisions (K + 1,) and delays (B,), s.
+def arrivals(times: Array, dt: float, firsts: Sequence[int], delays: Array | None = None) -> list[Arrival]:
+    """What acts in each decision, by the times of decisions (K + 1,), the time step, and delays (B,), s.
 
-    Without delays, the first decisions of phases extrapolate nothing.
+    Flights hold each action for a time step: on average over a decision, they act with the output of half
+    a step before its middle. Without delays, the first decisions of phases extrapolate nothing.
     """
-    middles, found = 0.5 * (times[:-1] + times[1:]), []
-    for k, middle in enumerate(middles):
+    means, found = 0.5 * (times[:-1] + times[1:] - dt), []
+    for k, mean in enumerate(means):
         if delays is None:
-            newest, wanted = np.array(k), np.array(middle)
+            newest, wanted = np.array(k), np.array(mean)
         else:
-            wanted = middle - delays
+            wanted = mean - delays
             newest = np.minimum(np.searchsorted(times, wanted), k)
         before = np.maximum(newest - (delays is not None or k not in firsts), 0)
         between = times[newest] - times[before]

@@ -1,11 +1,11 @@
 """Episodes flown by a network, and the exact gradient of their cost by its weights.
 
 An episode is divided into K decisions, at t_0 = 0, ..., t_K = T, instead of its N time steps, which are many
-more. Between two times the input is constant: what the network would give at their middle, extrapolated from
-its last two outputs, or, where actions act late, interpolated between earlier ones. The cost is summed by the
-trapezoidal rule. Both err with the square of the steps, so that a policy flies at every time step as it was
-trained. Where the integration of a decision errs, it is divided into substeps; where phases change
-parameters, a decision ends.
+more. Between two times the input is constant: what the network would give half a time step before their
+middle, since a flight holds each action for a time step; extrapolated from its last two outputs, or, where
+actions act late, interpolated between earlier ones. The cost is summed by the trapezoidal rule. Both err with
+the square of the steps, so that a policy flies at every time step as it was trained. Where the integration of
+a decision errs, it is divided into substeps; where phases change parameters, a decision ends.
 """
 
 from __future__ import annotations
@@ -31,7 +31,11 @@ Array = NDArray[Any]
 DIVERGED = 20.0  # times the median cost; episodes beyond it do not count
 STEEP = 10.0  # times the slope that usual episodes do not exceed; slopes beyond it are shortened
 STEEP_PENALTIES = 100.0  # likewise where few episodes may violate constraints
-ROUGH = 0.003  # penalty of outputs that alternate by their limits, relative to the cost of an episode
+ROUGH = 0.003  # least penalty of outputs that alternate by their limits, relative to the cost of an episode
+ROUGHEST = 10.0  # most
+ROUGHER = 1.1  # factor of its rise in an update in which inputs alternate
+SMOOTHER = 0.99  # and of its fall in others
+ALTERNATING = 0.01  # mean of how far an input turns back after a decision, of its limit, that counts as such
 USUAL = 0.5  # share of the usual episodes
 USUAL_DISTURBED = 0.9  # where a push just before the end is as usual as none, and a thousand times as steep
 
@@ -69,6 +73,7 @@ class Episodes:
         parameters: Parameters of each decision and of the end, shape (K + 1, B, n_p).
         units: Inputs of an output of 1, fractions of the limits, shape (n_u,).
         penalties: Those of the scene's constraints, and of success, in the cost.
+        roughness: Penalty of outputs that alternate, relative to an episode's cost; see `price_roughness`.
     """
 
     def __init__(
@@ -111,11 +116,12 @@ class Episodes:
         self._further: list[list[tuple[KernelCall, KernelCall]]] = []
         self.divide(self.substeps)
         self._end = self._bind_end()
-        self._met, self._usual, self._firsts = Met(), USUAL, firsts
+        self.roughness = ROUGH
+        self._met, self._usual, self._firsts, self._dt = Met(), USUAL, firsts, dt
         self._inner = np.ones((decisions - 2, 1, 1))  # whether both neighbours are of the same phase
         for first in firsts[1:]:
             self._inner[max(first - 2, 0) : first] = 0.0
-        self._arrivals: list[Arrival] = arrivals(times, firsts)
+        self._arrivals: list[Arrival] = arrivals(times, dt, firsts)
 
     def divide(self, substeps: Array) -> None:
         """Divide decisions into equal integration steps, (K,), that hold the input."""
@@ -202,7 +208,7 @@ class Episodes:
 
     def meet(self, met: Met) -> None:
         """Let delays, jumps and noise disturb the next flights."""
-        self._met, self._arrivals = met, arrivals(self._times, self._firsts, met.delays)
+        self._met, self._arrivals = met, arrivals(self._times, self._dt, self._firsts, met.delays)
         self._usual = USUAL_DISTURBED
 
     def fly(self, starts: Array, mean: Array, scale: Array, emphasis: float) -> Array:
@@ -310,7 +316,7 @@ class Episodes:
             return slopes
         outputs = self._layers.values[-1] * self.units
         second = outputs[2:] - 2.0 * outputs[1:-1] + outputs[:-2]
-        second *= 2.0 * ROUGH * cost / len(slopes) * self._inner
+        second *= 2.0 * self.roughness * cost / len(slopes) * self._inner
         for first, factor in enumerate((1.0, -2.0, 1.0)):
             slopes[first : first + len(second)] += factor * second
         return np.asarray(slopes * self.units)
@@ -325,6 +331,15 @@ class Episodes:
             self.penalties.follow_path(self._states, self._inputs, self.parameters)
         if judged:
             self.penalties.follow_ends(self._states[-1, :judged], self.parameters[-1, :judged])
+
+    def price_roughness(self) -> None:
+        """Let the penalty of outputs that alternate follow how far the inputs flown last do."""
+        changes = np.diff(self._inputs[:-1] / self._kernels.layout.control_limit, axis=0)
+        before, after = changes[:-1], changes[1:]
+        back = np.maximum(np.minimum(before, -after), np.minimum(-before, after))  # the smaller of the two
+        alternates = (np.maximum(back, 0.0) * self._inner).mean(axis=(0, 1)) > ALTERNATING
+        factor = ROUGHER if alternates.any() else SMOOTHER
+        self.roughness = min(max(self.roughness * factor, ROUGH), ROUGHEST)
 
     def errors(self) -> Array:
         """How much each decision's integration changes the cost of the episodes of the last `gradient`, (K,).

@@ -69,6 +69,7 @@ FORGETTING = 0.05  # share of the newest in the mean of recent costs
 BETWEEN_COPIES = 50  # updates between copies of the weights to go back to
 MOST_CAUTION = 1e-3  # factor of the learning rate at which the training gives up
 CAUTION = 0.7  # factor of the learning rate when they do
+RECOVERY = 1.001  # factor by which it comes back in an update
 BETWEEN_DIVISIONS = 20  # updates between measurements of the integration's errors
 TOLERATED = 1e-3  # share of the cost by which the integration may change it, over all decisions
 BETWEEN_MESSAGES = 20  # updates
@@ -286,6 +287,7 @@ class _Learner:
         # Relative to the cost, which differs by orders between scenes, a gradient has the norm 1 at most.
         norm = math.sqrt(sum(float(np.square(each, dtype=np.float64).sum()) for each in gradient))
         relative = [each / np.float32(max(norm, median)) for each in gradient]
+        self._caution = min(self._caution * RECOVERY, 1.0)
         self._optimizer.update(relative, self._caution * warm_up * falling * settings.learning_rate)
         recent = self._typical if math.isfinite(self._typical) else median
         self._typical = recent + FORGETTING * (median - recent)
@@ -301,6 +303,7 @@ class _Learner:
         self._missing += FORGETTING * (1.0 - reaches[:judged].mean() - self._missing)
         travelled = self._updates > TRAVELLED * settings.updates
         episodes.price_violations(self._typical, judged if travelled else 0)
+        episodes.price_roughness()
         factors = UNITS_PER_SIZE * episodes.sizes() / episodes.units
         factors = np.clip(factors, 1.0 / FASTEST_UNITS, self._growth)
         episodes.units *= factors
@@ -348,6 +351,7 @@ class _Learner:
         kept = {f"kept.{name}": each for name, each in self._kept.items()}
         arrays = {**self._state(), **kept, **{name: np.array(each) for name, each in numbers.items()}}
         arrays["substeps"] = self._episodes.substeps
+        arrays["roughness"] = np.array(self._episodes.roughness)
         np.savez(stream, **arrays)  # type: ignore[arg-type]
         write_atomically(path / CHECKPOINT, stream.getvalue())
 
@@ -362,6 +366,7 @@ class _Learner:
             self._kept = {name.removeprefix("kept."): a for name, a in arrays.items() if "kept." in name}
             self._updates = int(place.name)
             self._episodes.divide(arrays["substeps"])
+            self._episodes.roughness = float(arrays["roughness"])
             for name in _NUMBERS:
                 setattr(self, name, float(arrays[name]))
             if math.isfinite(self._typical):

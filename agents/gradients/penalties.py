@@ -9,7 +9,6 @@ the end, have no penalty, nor have the torques of motors at speed, to which envi
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,14 +32,15 @@ class _Ascent(NamedTuple):
     near: float  # violation; where few episodes come so near, a price falls as fast as it rises
     allowed: float  # share of the episodes at which a price stays
     most: float  # share beyond which it rises no faster
-    rate: float  # of change of its logarithm in an update, for all episodes
+    fastest: float  # change of its logarithm in an update, at most
     dearest: float  # price at most
 
 
 # Flights between decisions keep within their tolerances; rows share what is allowed.
-ALONG = _Ascent(charged=0.5, near=-5.0, allowed=0.005, most=0.1, rate=0.5, dearest=math.inf)
+ALONG = _Ascent(charged=0.5, near=-5.0, allowed=0.005, most=0.1, fastest=0.05, dearest=1e3)
+FEWER = 0.2  # factor by which the most of them becomes less as penalties become stiffer
 # An error of e tolerances violates by (e^2 - 1) / 2: those above 0.93 count, and all are near.
-AT_END = _Ascent(charged=-0.07, near=-1.0, allowed=0.004, most=0.04, rate=1.0, dearest=6.0)
+AT_END = _Ascent(charged=-0.07, near=-1.0, allowed=0.002, most=0.04, fastest=0.04, dearest=6.0)
 
 
 def priced_rows(scene: Scene) -> NDArray[np.bool_]:
@@ -117,7 +117,8 @@ class Penalties:
         residuals = kernels.constraints(after, held, given if kernels.n_p else None)[:, self._is_penalized]
         worst = residuals.reshape(len(inputs) - 1, inputs.shape[1], -1).max(axis=0)
         priced = max(1, int((self.prices[self._path] > LEAST).sum()))
-        self._follow(self._path, worst, ALONG._replace(allowed=ALONG.allowed / priced))
+        most = ALONG.most * FEWER**self.hardening
+        self._follow(self._path, worst, ALONG._replace(allowed=ALONG.allowed / priced, most=most))
 
     def follow_ends(self, states: Array, parameters: Array) -> None:
         """Let the prices of success follow where episodes end, with states (B, n_x), parameters (B, n_p)."""
@@ -128,10 +129,10 @@ class Penalties:
 
     def _follow(self, rows: slice, worst: Array, ascent: _Ascent) -> None:
         """Let the prices of rows follow the largest residuals of episodes, (B, r)."""
-        charged, close, allowed, most, rate, dearest = ascent
+        charged, close, allowed, most, fastest, dearest = ascent
         relative = worst / self._tolerances[rows]
         violating = np.minimum((relative > charged).mean(axis=0), most)
         near = np.minimum((relative > close).mean(axis=0) / most, 1.0)
-        factors = np.exp(rate * (violating - most + near * (most - allowed)))
+        factors = np.exp(fastest * ((violating - most) / most + near * (1.0 - allowed / most)))
         prices = np.clip(self.prices[rows] * factors, LEAST, dearest)
         self.prices[rows] = np.where(self._priced[rows], prices, 0.0)

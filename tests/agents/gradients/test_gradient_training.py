@@ -206,8 +206,10 @@ def test_unstable_motions_go_back_to_the_last_copy(small_file, small_scene, upda
     np.testing.assert_array_equal(learner._weights[0], kept)
     assert learner._caution < caution
     assert 1e-3 < learner._typical < 2.0 * cost
+    caution = learner._caution
     learner._update()
     assert not np.array_equal(learner._weights[0], kept)
+    assert learner._caution == pytest.approx(1.001 * caution)
 
 
 @pytest.mark.parametrize("what", ["costs", "misses"])
