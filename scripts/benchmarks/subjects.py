@@ -29,6 +29,7 @@ from scripts.benchmarks.harness import Row, select
 OURS = "dq-space-arm"
 DYNAMICS, STEP, ENVIRONMENT = "forward dynamics", "step", "environment step"
 GRADIENT, JACOBIANS = "gradient of a step", "Jacobians of a step"
+EPISODES = "gradient of episodes, by decision"
 GOALS = "goal environment step"
 FLOAT64, FLOAT32 = "float64", "float32"
 COMPARED_INTEGRATORS = ("symplectic_euler", "rk4")  # integrators that other engines and solvers have as well
@@ -38,7 +39,7 @@ COMPARED_INTEGRATORS = ("symplectic_euler", "rk4")  # integrators that other eng
 class Subject:
     """A subject of timing."""
 
-    what: str  # DYNAMICS, STEP, GRADIENT, JACOBIANS, ENVIRONMENT or GOALS
+    what: str  # DYNAMICS, STEP, GRADIENT, JACOBIANS, EPISODES, ENVIRONMENT or GOALS
     engine: str
     way: str  # of calling it
     integrator: str = ""
@@ -164,6 +165,34 @@ def kernel_case(
     # One row is called as the single environment does it, many as the vector environment does.
     run = call.of_one_row() if batch == 1 else partial(call, batch, variant.threads)
     return Case(subject, run)
+
+
+def episodes_case(scene: Scene, copies: int = 128, decisions: int = 50) -> Case:
+    """Gradient of the episodes of an update of `apg` by the network's weights: policy, steps and both back.
+
+    Raises:
+        ModuleNotFoundError: If the extra `agents` is not installed.
+    """
+    from threadpoolctl import ThreadpoolController
+
+    from agents.gradients.episodes import Episodes, decision_times
+    from agents.gradients.layers import Layers, random_weights
+    from agents.gradients.starts import Starts
+
+    times = decision_times(scene, decisions, crowding=0.8)
+    starts = Starts.draw(scene, copies, times, 0, (1.0,))[1]
+    kernels = compile_scene(scene)
+    seen = kernels.observation(starts.states, np.full((copies, 1), times[-1]), starts.parameters)[0].shape[1]
+    weights = random_weights([seen, 64, 64, kernels.n_u], np.random.default_rng(0))
+    episodes = Episodes(scene, Layers(weights, decisions, copies), times, 0.1)
+    episodes.parameters[:] = starts.at(np.arange(copies))
+    pools = ThreadpoolController()
+
+    def run() -> None:
+        with pools.limit(limits=1, user_api="blas"):  # as in training
+            episodes.gradient(starts.states, np.zeros(seen), np.ones(seen), 1.0)
+
+    return Case(Subject(what=EPISODES, engine=OURS, way="policy and kernels", batch=copies * decisions), run)
 
 
 FUNCTION = "function of Kernels"

@@ -16,6 +16,7 @@ from scripts.benchmarks.subjects import (
     COMPARED_INTEGRATORS,
     DYNAMICS,
     ENVIRONMENT,
+    EPISODES,
     FLOAT32,
     FLOAT64,
     MAKE,
@@ -59,6 +60,12 @@ def test_operation_counts_are_those_of_the_kernels(rows: list[Row], short_scene:
     dynamics = select(rows, table="timings", engine=OURS, what=DYNAMICS, precision=FLOAT64)
     expected = compile_scene(short_scene).operation_count("forward_dynamics")
     assert {row["operations"] for row in dynamics} == {expected}
+
+
+def test_the_gradient_of_episodes_is_timed_by_decision(rows: list[Row]) -> None:
+    pytest.importorskip("threadpoolctl")
+    (found,) = select(rows, table="timings", what=EPISODES)
+    assert found["batch"] == 128 * 50
 
 
 def test_engines_agree(rows: list[Row]) -> None:

@@ -18,6 +18,7 @@ from scripts.benchmarks.subjects import (
     COMPARED_INTEGRATORS,
     DYNAMICS,
     ENVIRONMENT,
+    EPISODES,
     FLOAT64,
     GOALS,
     GRADIENT,
@@ -33,6 +34,7 @@ from scripts.benchmarks.subjects import (
     VECTOR,
     Subject,
     environment_cases,
+    episodes_case,
     fastest,
     function_cases,
     goal_cases,
@@ -77,6 +79,10 @@ def measure_scene(scene: Scene, effort: Effort, peaks: Mapping[str, float]) -> I
         *environment_cases(scene, sizes),
         *goal_cases(scene, (SYNCHRONOUS_COPIES, TRAINING_COPIES)),
     ]
+    try:
+        cases.append(episodes_case(scene))
+    except ModuleNotFoundError as error:
+        yield note(f"{EPISODES}: left out, {error.name} is not installed")
     for peer in peers:
         cases += peer.cases(*moving_states(kernels, TRAINING_COPIES))
     timings = [_row(scene, timing, peaks) for timing in time_cases(cases, effort.kernel_timing)]
