@@ -108,7 +108,9 @@ class Episodes:
         self._terminal, self._emphasis = np.zeros((2, count, 1), dtype)
         self._cotangents = np.zeros((decisions + 1, count, kernels.n_t), dtype)
         self._by_input, self._by_held = np.zeros((2, count, kernels.n_u), dtype)
-        self._by_output = np.zeros((decisions, count, kernels.n_u))
+        # New arrays of this size in every update would take longer than what is computed in them.
+        self._by_output, self._rough, self._outputs, second = np.zeros((4, decisions, count, kernels.n_u))
+        self._second = second[:-2]
         self._by_observation = np.zeros((count, n_obs), dtype)
         self._by_state = np.zeros((count, kernels.n_t), dtype)
         self._cost_weights = np.repeat(self._weights[:, None, None], count, axis=1).astype(dtype)
@@ -311,15 +313,21 @@ class Episodes:
         Without it policies learn to alternate from decision to decision, which no flight at every time step
         does. A smooth policy pays the fourth power of the steps; jumps and noise go unpunished.
         """
-        slopes = np.zeros_like(self._by_output)
+        slopes, second = self._rough, self._second
         if self._met.jumps is not None or self._met.noise is not None:
             return slopes
-        outputs = self._layers.values[-1] * self.units
-        second = outputs[2:] - 2.0 * outputs[1:-1] + outputs[:-2]
+        outputs = np.multiply(self._layers.values[-1], self.units, out=self._outputs)
+        np.multiply(outputs[1:-1], -2.0, out=second)
+        second += outputs[2:]
+        second += outputs[:-2]
         second *= 2.0 * self.roughness * cost / len(slopes) * self._inner
-        for first, factor in enumerate((1.0, -2.0, 1.0)):
-            slopes[first : first + len(second)] += factor * second
-        return np.asarray(slopes * self.units)
+        slopes[:-2], slopes[-2:] = second, 0.0
+        second *= 2.0
+        slopes[1:-1] -= second
+        second *= 0.5
+        slopes[2:] += second
+        slopes *= self.units
+        return slopes
 
     def price_violations(self, cost: float, judged: int) -> None:
         """Let penalties follow what the episodes flown last violate, and the cost of recent ones.

@@ -66,7 +66,7 @@ LOST = 0.3  # further share of episodes that miss the tolerances, beyond which t
 WORTHY_LOSS = 0.1  # likewise, up to which newer weights take their place
 PATIENCE = 1.003  # factor in an update by which costs may rise, as where constraints come to matter
 FORGETTING = 0.05  # share of the newest in the mean of recent costs
-BETWEEN_COPIES = 50  # updates between copies of the weights to go back to
+BETWEEN_COPIES = 50  # updates between copies of the weights; those to go back to are the last but one
 MOST_CAUTION = 1e-3  # factor of the learning rate at which the training gives up
 CAUTION = 0.7  # factor of the learning rate when they do
 RECOVERY = 1.001  # factor by which it comes back in an update
@@ -74,7 +74,8 @@ BETWEEN_DIVISIONS = 20  # updates between measurements of the integration's erro
 TOLERATED = 1e-3  # share of the cost by which the integration may change it, over all decisions
 BETWEEN_MESSAGES = 20  # updates
 CHECKPOINT = "checkpoint.npz"
-_NUMBERS = ("_seconds", "_typical", "_missing", "_kept_cost", "_kept_missing", "_caution", "_growth")
+_NUMBERS = ("_seconds", "_typical", "_missing", "_caution", "_growth")
+_COPIES = ("_kept", "_newer")
 
 
 class Learned(NamedTuple):
@@ -137,7 +138,7 @@ class _Learner:
         self._growth = FASTEST_UNITS  # of units, at most
         self._end_weight = settings.end_weight
         self._missing = 1.0  # share of recent episodes that miss the tolerances
-        self._kept, self._kept_cost, self._kept_missing = self._state(), math.inf, 1.0
+        self._kept, self._newer = self._state(), self._state()
 
     def _begin_with(self, policy: ExportedPolicy | None, units: Array) -> None:
         """Take the weights of a policy, and its units; outputs have some of their own."""
@@ -231,10 +232,12 @@ class _Learner:
             # The motion has become unstable: take the weights from before, and smaller steps.
             self._restore(self._kept)
             before = self._fly(starts)[1]
-            self._typical = min(self._typical, self._kept_cost)
-            self._missing = min(self._missing, self._kept_missing)
+            self._typical = min(self._typical, float(self._kept["typical"]))
+            self._missing = min(self._missing, float(self._kept["missing"]))
             if not self._divide(before) and before > WORSE * self._typical:
-                self._typical = self._kept_cost = before  # those were no better
+                self._typical = before  # those were no better
+                self._kept["typical"][...] = before
+            self._newer = {name: each.copy() for name, each in self._kept.items()}
             self._caution *= CAUTION
             self._growth = 1.0
         else:
@@ -250,8 +253,9 @@ class _Learner:
 
     def _is_unstable(self, median: float) -> bool:
         """Whether episodes with a median cost, or the recent ones, have lost what earlier ones had."""
-        drifted = self._typical > DRIFTED * self._kept_cost or self._missing > self._kept_missing + LOST
-        lost = self._updates > WARM_UP and (drifted or median > WORSE * self._typical)
+        drifted = self._typical > DRIFTED * self._kept["typical"]
+        drifted |= self._missing > self._kept["missing"] + LOST
+        lost = self._updates > WARM_UP and bool(drifted or median > WORSE * self._typical)
         return math.isinf(median) or lost
 
     def _fly(self, starts: Array) -> tuple[list[Array], float]:
@@ -272,16 +276,21 @@ class _Learner:
         if not wrong.any():
             return False
         episodes.divide(np.where(wrong, np.minimum(2 * episodes.substeps, most), episodes.substeps))
-        self._typical = self._kept_cost = math.inf  # costs are others now
+        self._typical = math.inf  # costs are others now
+        for copy in (self._kept, self._newer):
+            copy["typical"][...] = math.inf
         return True
 
     def _follow(self, gradient: Sequence[Array], median: float) -> None:
         """Take a step against the gradient of episodes with a median cost."""
         done, settings = self._updates, self._settings
-        stays = self._typical <= WORTHY * self._kept_cost
-        if done % BETWEEN_COPIES == 0 and stays and self._missing <= self._kept_missing + WORTHY_LOSS:
-            self._kept, self._kept_cost, self._kept_missing = self._state(), self._typical, self._missing
-        self._kept_cost *= PATIENCE
+        stays = self._typical <= WORTHY * self._kept["typical"]
+        stays &= self._missing <= self._kept["missing"] + WORTHY_LOSS
+        if done % BETWEEN_COPIES == 0 and stays:
+            # The newest may be on the brink: it is gone back to once what came of it is known.
+            self._kept, self._newer = self._newer, self._state()
+        for copy in (self._kept, self._newer):
+            copy["typical"] *= PATIENCE
         warm_up = min(1.0, (done + 1) / WARM_UP)
         falling = FINAL_RATE + (1.0 - FINAL_RATE) * 0.5 * (1.0 + math.cos(math.pi * done / settings.updates))
         # Relative to the cost, which differs by orders between scenes, a gradient has the norm 1 at most.
@@ -331,11 +340,12 @@ class _Learner:
         )
 
     def _state(self) -> dict[str, Array]:
-        """Copies of weights and optimizer by name."""
+        """Copies of weights and optimizer by name, with the recent cost and share of misses."""
         weights = {f"weight{index}": each for index, each in enumerate(self._weights)}
         everything = {**weights, **self._optimizer.arrays(), "units": self._episodes.units}
         everything["end_weight"] = np.array(self._end_weight)
         everything["prices"] = self._episodes.penalties.prices
+        everything |= {"typical": np.array(self._typical), "missing": np.array(self._missing)}
         return {name: np.array(each) for name, each in everything.items()}
 
     def _restore(self, arrays: Mapping[str, Array]) -> None:
@@ -348,8 +358,9 @@ class _Learner:
     def _write(self, path: Path) -> None:
         stream = io.BytesIO()
         numbers = {name: getattr(self, name) for name in _NUMBERS}
-        kept = {f"kept.{name}": each for name, each in self._kept.items()}
-        arrays = {**self._state(), **kept, **{name: np.array(each) for name, each in numbers.items()}}
+        arrays = {**self._state(), **{name: np.array(each) for name, each in numbers.items()}}
+        for copy in _COPIES:
+            arrays |= {f"{copy}.{name}": each for name, each in getattr(self, copy).items()}
         arrays["substeps"] = self._episodes.substeps
         arrays["roughness"] = np.array(self._episodes.roughness)
         np.savez(stream, **arrays)  # type: ignore[arg-type]
@@ -363,7 +374,10 @@ class _Learner:
         try:
             arrays = read_arrays(place / CHECKPOINT)
             self._restore(arrays)
-            self._kept = {name.removeprefix("kept."): a for name, a in arrays.items() if "kept." in name}
+            for copy in _COPIES:
+                start = f"{copy}."
+                found = {name.removeprefix(start): a for name, a in arrays.items() if name.startswith(start)}
+                setattr(self, copy, found)
             self._updates = int(place.name)
             self._episodes.divide(arrays["substeps"])
             self._episodes.roughness = float(arrays["roughness"])
