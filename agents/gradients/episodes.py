@@ -341,11 +341,14 @@ class Episodes:
             self.penalties.follow_ends(self._states[-1, :judged], self.parameters[-1, :judged])
 
     def price_roughness(self) -> None:
-        """Let the penalty of outputs that alternate follow how far the inputs flown last do."""
+        """Let the penalty of outputs that alternate follow how far the inputs flown last do.
+
+        Episodes that diverge, whose inputs are not numbers, do not hide that others alternate.
+        """
         changes = np.diff(self._inputs[:-1] / self._kernels.layout.control_limit, axis=0)
         before, after = changes[:-1], changes[1:]
         back = np.maximum(np.minimum(before, -after), np.minimum(-before, after))  # the smaller of the two
-        alternates = (np.maximum(back, 0.0) * self._inner).mean(axis=(0, 1)) > ALTERNATING
+        alternates = (np.fmax(back, 0.0) * self._inner).mean(axis=(0, 1)) > ALTERNATING
         factor = ROUGHER if alternates.any() else SMOOTHER
         self.roughness = min(max(self.roughness * factor, ROUGH), ROUGHEST)
 
