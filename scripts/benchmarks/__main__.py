@@ -23,6 +23,7 @@ BENCHMARKS = {
     "throughput": "throughput",
     "rendering": "rendering",
     "basilisk": "basilisk",
+    "devices": "devices",
 }
 """Packages and modules beside this file, each with a `BENCHMARK`."""
 

@@ -1,5 +1,6 @@
 """Other engines: the same robot, left out with a sentence where it cannot be had."""
 
+import dataclasses
 import sys
 
 import gymnasium
@@ -9,8 +10,10 @@ import pytest
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from experts.report.part_costs import moving_states
+from scripts.benchmarks import devices
 from scripts.benchmarks.basilisk import BENCHMARK
-from scripts.benchmarks.effort import QUICK
+from scripts.benchmarks.effort import QUICK, Sampling
+from scripts.benchmarks.harness import select
 from scripts.benchmarks.peers import peers_of
 from scripts.benchmarks.peers.mujoco_peer import MujocoPeer, mujoco_spec, robot_xml
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
@@ -88,6 +91,22 @@ def test_without_basilisk_its_benchmark_is_a_note(monkeypatch: pytest.MonkeyPatc
     (row,) = BENCHMARK.measure(QUICK)
     assert row["table"] == "notes"
     assert "Basilisk not installed (pip install bsk" in row["note"]
+
+
+def test_without_jax_devices_are_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "jax", None)
+    (row,) = devices.BENCHMARK.measure(QUICK)
+    assert "JAX is not installed (pip install jax" in row["note"]
+
+
+@pytest.mark.slow  # XLA compiles four functions
+def test_a_device_is_compared_with_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("jax")
+    monkeypatch.setitem(devices.BATCHES, "cpu", (8,))
+    effort = dataclasses.replace(QUICK, scenes=("planar",), kernel_timing=Sampling(1, 1e-4))
+    rows = list(devices.BENCHMARK.measure(effort))
+    assert len(select(rows, table="devices", engine="XLA")) == len(select(rows, status="handled")) == 4
+    assert all(row["way"] == "cpu" and row["error"] < 1e-12 for row in select(rows, engine="XLA"))
 
 
 def test_mujoco_leaves_out_springs_and_dampers_only_where_there_are_none() -> None:
