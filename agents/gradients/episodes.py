@@ -30,7 +30,7 @@ Array = NDArray[Any]
 
 DIVERGED = 20.0  # times the median cost; episodes beyond it do not count
 STEEP = 10.0  # times the slope that usual episodes do not exceed; slopes beyond it are shortened
-STEEP_PENALTIES = 100.0  # likewise where few episodes may violate constraints
+STEEP_PENALTIES = 40.0  # likewise where few episodes may violate constraints
 ROUGH = 0.003  # least penalty of outputs that alternate by their limits, relative to the cost of an episode
 ROUGHEST = 10.0  # most
 ROUGHER = 1.1  # factor of its rise in an update in which inputs alternate
