@@ -178,10 +178,10 @@ def test_end_weights_fall_where_episodes_reach_and_missing_has_a_price_later(sma
     prices = learner._episodes.penalties.prices
     learner._update()
     assert learner._end_weight == 400.0  # they miss
-    learner._episodes.misses = lambda: np.where(np.arange(COUNT) < 1, 1.1, 0.9)
+    learner._episodes.misses = lambda: np.where(np.arange(COUNT) < 5, 1.1, 0.9)
     learner._adapt()
-    assert learner._end_weight == 400.0  # one of 16
-    learner._episodes.misses = lambda: np.full(COUNT, 0.9)
+    assert learner._end_weight == 400.0  # five of 16
+    learner._episodes.misses = lambda: np.where(np.arange(COUNT) < 4, 1.1, 0.9)
     learner._adapt()
     assert learner._end_weight == pytest.approx(400.0 / 1.01)
     assert not prices.any()
