@@ -1,4 +1,4 @@
-"""Kernels that another process compiles while this one has other work.
+"""Kernels, and other code, that another process compiles while this one has other work.
 
 LLVM compiles in one thread of a process at a time; another process can fill the cache meanwhile. Nothing
 depends on it: what it does not leave there is compiled where it is used.
@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -34,7 +34,9 @@ class Request(NamedTuple):
 
 
 @contextmanager
-def compiling_aside(kernels: Kernels, requests: Sequence[Request]) -> Iterator[None]:
+def compiling_aside(
+    kernels: Kernels, requests: Sequence[Request], before: Callable[[], None] | None = None
+) -> Iterator[bool]:
     """Let another process compile the kernels that are missing while a `with` block runs.
 
     At the end of the block this process takes the last of those that the other has not begun, and waits for
@@ -44,20 +46,24 @@ def compiling_aside(kernels: Kernels, requests: Sequence[Request]) -> Iterator[N
     Args:
         kernels: Those of the scene.
         requests: The kernels, those that take longest first.
+        before: A function of a module that the other process calls first, to fill a cache of its own.
+
+    Yields:
+        Whether there is another process.
     """
     missing = [request for request in requests if not kernels.is_ready(**request._asdict())]
     if len(missing) < _FEWEST or not _may_start():
-        yield
+        yield False
         return
     announce(f"scene {kernels.scene.name!r}")
     try:
-        helper = _Helper(kernels, missing)
+        helper = _Helper(kernels, missing, before)
     except OSError:  # no more processes
-        yield
+        yield False
         return
     try:
         with compiling(helper.describe):
-            yield
+            yield True
             helper.finish()
     finally:
         helper.close()
@@ -80,12 +86,17 @@ def _may_start() -> bool:
 class _Helper:
     """The other process, and what is left to do."""
 
-    def __init__(self, kernels: Kernels, requests: Sequence[Request]) -> None:
-        self._kernels, self._requests, self._total = kernels, list(requests), len(requests)
+    def __init__(
+        self, kernels: Kernels, requests: Sequence[Request], before: Callable[[], None] | None
+    ) -> None:
+        self._kernels, self._requests = kernels, list(requests)
         self._finished, self._alive, self._changed = 0, True, threading.Condition()
         self._worker = WorkerProcess(quiet=True)
+        if before is not None:
+            self._worker.assign(before)
         for request in requests:
             self._worker.assign(_compile, kernels.scene, request)
+        self._total = self._left = len(requests) + (before is not None)
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
@@ -96,7 +107,7 @@ class _Helper:
                 with self._changed:
                     self._finished += 1
                     self._changed.notify()
-        except Exception:  # whatever it was, it shows again where the kernel is compiled here
+        except Exception:  # whatever it was, it shows again where the code is compiled here
             pass
         finally:
             with self._changed:
@@ -104,17 +115,18 @@ class _Helper:
                 self._changed.notify()
 
     def finish(self) -> None:
-        """Compile the last kernels here, and wait for the one that the process is at."""
-        while self._alive and self._finished < len(self._requests):
-            if self._finished + 1 < len(self._requests):
+        """Compile the last kernels here, and wait for what the process is at."""
+        while self._alive and self._finished < self._left:
+            if self._requests and self._finished + 1 < self._left:
+                self._left -= 1
                 self._kernels.kernel(**self._requests.pop()._asdict())
                 continue
             with self._changed:
-                self._changed.wait_for(lambda: not self._alive or self._finished >= len(self._requests))
+                self._changed.wait_for(lambda: not self._alive or self._finished >= self._left)
 
     def describe(self) -> str:
         """Say how far the two have come."""
-        done = self._finished + self._total - len(self._requests)
+        done = self._finished + self._total - self._left
         return f"scene {self._kernels.scene.name!r} ({done} of {self._total} functions)"
 
     def close(self) -> None:

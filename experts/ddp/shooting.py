@@ -30,7 +30,8 @@ from experts.ddp.derivatives import (
 )
 from experts.ddp.parallel_rollouts import LANE_KERNELS, LANES, ParallelRollouts
 from experts.ddp.rollout import FINISHED, Trajectory
-from experts.native.compilation import BufferTable, prepare
+from experts.native.compilation import BufferTable, is_prepared, prepare
+from experts.problems.python_problem import PythonProblem
 from experts.problems.shooting_problem import (
     KERNEL_NAMES,
     SECOND_ORDER_KERNEL_NAMES,
@@ -126,13 +127,20 @@ class ShootingWorkspace:
         self._parallel = ParallelRollouts(problem, self._time_step)
 
     def _compile(self, second_order: bool) -> dict[str, Kernel]:
-        """Return the kernels that a solve uses, by name; its longest loop compiles beside them."""
+        """Return the kernels that a solve uses, by name.
+
+        Where another process compiles what is missing of them, and the other loops, this one compiles the
+        longest loop.
+        """
         names = (*SECOND_ORDER_KERNEL_NAMES, *KERNEL_NAMES) if second_order else KERNEL_NAMES
         wanted = [(name, name in BATCHED_KERNELS) for name in names]
         in_lanes = [(name, True) for name in LANE_KERNELS]
         longest_first = sorted([*wanted, *in_lanes], key=lambda each: each[0] not in LONGEST_KERNELS)
-        with compiling_aside(self.problem, longest_first):
-            prepare(backward_pass, *self._pass_arguments(0.0, self._gauss_newton, self._no_gaps))
+        longest_loop = (backward_pass, *self._pass_arguments(0.0, self._gauss_newton, self._no_gaps))
+        others = None if is_prepared(*longest_loop) else compile_other_loops
+        with compiling_aside(self.problem, longest_first, others) as is_aside:
+            if is_aside:
+                prepare(*longest_loop)
         return {name: self.problem.kernel(name, batched=batched) for name, batched in wanted}
 
     @timed("rollout")
@@ -287,6 +295,26 @@ class ShootingWorkspace:
 
         with native_calls(self.problem):
             share_rows(work_on, rows, self._threads, _STAGES_PER_BLOCK)
+
+
+def compile_other_loops() -> None:
+    """Compile the loops beside `backward_pass`, the same for all problems, with one of one number."""
+    problem = PythonProblem(
+        lambda x, u: x + u,
+        lambda x, u: u @ u,
+        lambda x: x @ x,
+        initial_state=[1.0],
+        n_controls=1,
+        horizon=1,
+        lagrangian_hessian=lambda x, u, multiplier: (np.zeros((1, 1)), np.zeros((1, 1)), np.eye(1)),
+    )
+    work = ShootingWorkspace(problem, second_order=True)
+    work.start(problem.initial_state, np.zeros((1, 1)))
+    work.differentiate()
+    work.differentiate_twice()
+    work.cost_rounding()
+    work.try_step(1.0)
+    work.try_steps(SHORTER_STEPS)
 
 
 SHORTER_STEPS: FloatArray = np.float64(0.5) ** np.arange(1, LANES + 1)

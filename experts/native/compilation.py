@@ -83,6 +83,12 @@ def prepare(loop: Callable[..., Any], *arguments: Any) -> None:
     cast(Any, loop).compile(tuple(map(typeof, arguments)))
 
 
+def is_prepared(loop: Callable[..., Any], *arguments: Any) -> bool:
+    """Tell whether a loop is compiled for arguments of some types, here or in the cache."""
+    dispatcher, signature = cast(Any, loop), tuple(map(typeof, arguments))
+    return signature in dispatcher.overloads or dispatcher._cache.holds(signature, dispatcher.targetctx)
+
+
 class _PartLibrary(JITCodeLibrary):
     """Code to link into that of others, as it was lowered."""
 

@@ -18,7 +18,7 @@ from numba.core.caching import FunctionCache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
-from dq_space_arm_env.common.code_cache import cache_directory, cache_key, keep_code, read_code
+from dq_space_arm_env.common.code_cache import cache_directory, cache_key, is_kept, keep_code, read_code
 
 _ROOMS = ("ddp", "native")  # of the package experts: what loops are made of
 
@@ -38,6 +38,10 @@ class LoopCache(FunctionCache):
 
     def flush(self) -> None:
         """Keep what there is: its key says whether it is up to date."""
+
+    def holds(self, signature: Any, target: Any) -> bool:
+        """Tell whether there is a file for arguments of some types."""
+        return self._enabled and is_kept(self._name, self._key(signature, target.codegen()))
 
     def _load_overload(self, signature: Any, target: Any) -> Any:
         code = read_code(self._name, self._key(signature, target.codegen())) if self._enabled else None

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -242,10 +242,12 @@ class ArmProblem:
         """Return a kernel of `ShootingProblem`."""
         return self.kernels.kernel(**self._request(name, batched=batched)._asdict())
 
-    def compiling_aside(self, wanted: Sequence[tuple[str, bool]]) -> AbstractContextManager[None]:
+    def compiling_aside(
+        self, wanted: Sequence[tuple[str, bool]], before: Callable[[], None] | None = None
+    ) -> AbstractContextManager[bool]:
         """Let another process compile kernels, given by name and whether batched, while a block runs."""
         requests = [self._request(name, batched=batched) for name, batched in wanted]
-        return compiling_aside(self.kernels, requests)
+        return compiling_aside(self.kernels, requests, before)
 
     def _request(self, name: str, *, batched: bool) -> Request:
         name = "emphasized_terminal_cost" if name == "terminal_cost" else name
@@ -391,9 +393,11 @@ class WindowProblem:
         """Return a kernel of `ShootingProblem`."""
         return self.maneuver.kernel(self._own(name), batched=batched)
 
-    def compiling_aside(self, wanted: Sequence[tuple[str, bool]]) -> AbstractContextManager[None]:
+    def compiling_aside(
+        self, wanted: Sequence[tuple[str, bool]], before: Callable[[], None] | None = None
+    ) -> AbstractContextManager[bool]:
         """See `ArmProblem.compiling_aside`."""
-        return self.maneuver.compiling_aside([(self._own(name), batched) for name, batched in wanted])
+        return self.maneuver.compiling_aside([(self._own(name), batched) for name, batched in wanted], before)
 
     def _own(self, name: str) -> str:
         """Name of a kernel in the maneuver."""

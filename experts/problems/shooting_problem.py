@@ -224,14 +224,15 @@ def native_calls(problem: ShootingProblem) -> AbstractContextManager[None]:
 
 
 def compiling_aside(
-    problem: ShootingProblem, wanted: Sequence[tuple[str, bool]]
-) -> AbstractContextManager[None]:
+    problem: ShootingProblem, wanted: Sequence[tuple[str, bool]], before: Callable[[], None] | None
+) -> AbstractContextManager[bool]:
     """Surround other work while kernels, given by name and whether batched, are compiled by another process.
 
-    For problems that know how; those that take longest come first.
+    For problems that know how, and tell whether there is one; those that take longest come first. The process
+    calls a function before.
     """
-    surround: Callable[..., AbstractContextManager[None]] | None = getattr(problem, "compiling_aside", None)
-    return nullcontext() if surround is None else surround(wanted)
+    surround: Callable[..., AbstractContextManager[bool]] | None = getattr(problem, "compiling_aside", None)
+    return nullcontext(False) if surround is None else surround(wanted, before)
 
 
 def check_interface(candidate: Any) -> None:
@@ -276,7 +277,8 @@ def stage_bounds(problem: ShootingProblem) -> tuple[FloatArray, FloatArray]:
     """Lower and upper bounds of every stage, shape (N, n_u) each."""
     shape = problem.horizon, problem.n_controls
     bounds = (problem.control_lower, problem.control_upper)
-    lower, upper = (np.array(np.broadcast_to(bound, shape), dtype=np.float64) for bound in bounds)
+    # Of one order for all problems: loops are compiled for each.
+    lower, upper = (np.array(np.broadcast_to(bound, shape), np.float64, order="C") for bound in bounds)
     return lower, upper
 
 

@@ -1,5 +1,6 @@
 """Another process compiles kernels: it hands them over by the cache, and nothing depends on it."""
 
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 
 from dq_space_arm_env import Kernels, Scene
 from dq_space_arm_env.common import worker_process
+from dq_space_arm_env.common.code_cache import cache_directory
 from dq_space_arm_env.compiler import build
 from dq_space_arm_env.kernels import parallel_compilation
 from dq_space_arm_env.kernels.parallel_compilation import Request, compiling_aside
@@ -61,6 +63,24 @@ def test_what_another_process_has_compiled_is_loaded(
     with compiling_aside(Kernels(short_scene), REQUESTS):  # nothing is missing
         pass
     assert len(workers) == 1
+
+
+@pytest.mark.slow
+def test_what_is_to_come_before_is_called_there(
+    cache: Path, short_scene: Scene, workers: list[object]
+) -> None:
+    with compiling_aside(Kernels(short_scene), REQUESTS, leave_a_mark) as is_aside:
+        assert is_aside
+    assert (cache / "mark").read_text() != str(os.getpid())
+    assert all(Kernels(short_scene).is_ready(**request._asdict()) for request in REQUESTS)
+    (cache / "mark").unlink()
+    with compiling_aside(Kernels(short_scene), REQUESTS, leave_a_mark) as is_aside:
+        assert not is_aside  # nothing is missing
+    assert not (cache / "mark").exists()
+
+
+def leave_a_mark() -> None:
+    (cache_directory() / "mark").write_text(str(os.getpid()))
 
 
 @pytest.mark.parametrize("end", ["os._exit(1)", "sys.stdin.buffer.read(1); os._exit(1)"])
