@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from time import perf_counter
 from typing import Any
@@ -40,8 +41,7 @@ def measure(effort: Effort) -> Iterator[Row]:
     if find_spec("jax") is None:
         yield note("Devices are left out: JAX is not installed (pip install jax, or jax[cuda13] for a GPU).")
         return
-    import jax
-
+    jax: Any = import_module("jax")
     with jax.enable_x64(True):
         # Beside an accelerator, the processor is none of `jax.devices()`.
         devices = dict.fromkeys([jax.devices("cpu")[0], jax.devices()[0]])
