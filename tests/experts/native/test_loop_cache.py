@@ -40,8 +40,10 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def run(cache: Path, tmp_path: Path) -> Callable[[], tuple[float, int]]:
+def run(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[float, int]]:
     """Import the loop as a new process would, and call it: its result, and how often it was compiled."""
+    # Bytecode of a source that changes within a second, to the same length, would be taken for up to date.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     source = tmp_path / "loops.py"
     source.write_text(LOOPS)
 
