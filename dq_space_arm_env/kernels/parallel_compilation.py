@@ -36,7 +36,7 @@ class Request(NamedTuple):
 @contextmanager
 def compiling_aside(
     kernels: Kernels, requests: Sequence[Request], before: Callable[[], None] | None = None
-) -> Iterator[bool]:
+) -> Iterator[None]:
     """Let another process compile the kernels that are missing while a `with` block runs.
 
     At the end of the block this process takes the last of those that the other has not begun, and waits for
@@ -47,23 +47,20 @@ def compiling_aside(
         kernels: Those of the scene.
         requests: The kernels, those that take longest first.
         before: A function of a module that the other process calls first, to fill a cache of its own.
-
-    Yields:
-        Whether there is another process.
     """
     missing = [request for request in requests if not kernels.is_ready(**request._asdict())]
     if len(missing) < _FEWEST or not _may_start():
-        yield False
+        yield
         return
     announce(f"scene {kernels.scene.name!r}")
     try:
         helper = _Helper(kernels, missing, before)
     except OSError:  # no more processes
-        yield False
+        yield
         return
     try:
         with compiling(helper.describe):
-            yield True
+            yield
             helper.finish()
     finally:
         helper.close()

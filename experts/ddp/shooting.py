@@ -9,6 +9,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dq_space_arm_env.common.worker_process import is_worker
 from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
 from dq_space_arm_env.kernels.threads import share_rows
 from experts.ddp.backward_pass import (
@@ -137,9 +138,9 @@ class ShootingWorkspace:
         in_lanes = [(name, True) for name in LANE_KERNELS]
         longest_first = sorted([*wanted, *in_lanes], key=lambda each: each[0] not in LONGEST_KERNELS)
         longest_loop = (backward_pass, *self._pass_arguments(0.0, self._gauss_newton, self._no_gaps))
-        others = None if is_prepared(*longest_loop) else compile_other_loops
-        with compiling_aside(self.problem, longest_first, others) as is_aside:
-            if is_aside:
+        is_missing = not is_prepared(*longest_loop)
+        with compiling_aside(self.problem, longest_first, compile_other_loops if is_missing else None):
+            if not (is_missing and is_worker()):  # whose parent may be at it
                 prepare(*longest_loop)
         return {name: self.problem.kernel(name, batched=batched) for name, batched in wanted}
 
@@ -298,7 +299,7 @@ class ShootingWorkspace:
 
 
 def compile_other_loops() -> None:
-    """Compile the loops beside `backward_pass`, the same for all problems, with one of one number."""
+    """Compile the loops but `backward_pass`, the same for all problems, by calling them for a tiny one."""
     problem = PythonProblem(
         lambda x, u: x + u,
         lambda x, u: u @ u,

@@ -243,8 +243,8 @@ class ArmProblem:
         return self.kernels.kernel(**self._request(name, batched=batched)._asdict())
 
     def compiling_aside(
-        self, wanted: Sequence[tuple[str, bool]], before: Callable[[], None] | None = None
-    ) -> AbstractContextManager[bool]:
+        self, wanted: Sequence[tuple[str, bool]], before: Callable[[], None] | None
+    ) -> AbstractContextManager[None]:
         """Let another process compile kernels, given by name and whether batched, while a block runs."""
         requests = [self._request(name, batched=batched) for name, batched in wanted]
         return compiling_aside(self.kernels, requests, before)
@@ -394,8 +394,8 @@ class WindowProblem:
         return self.maneuver.kernel(self._own(name), batched=batched)
 
     def compiling_aside(
-        self, wanted: Sequence[tuple[str, bool]], before: Callable[[], None] | None = None
-    ) -> AbstractContextManager[bool]:
+        self, wanted: Sequence[tuple[str, bool]], before: Callable[[], None] | None
+    ) -> AbstractContextManager[None]:
         """See `ArmProblem.compiling_aside`."""
         return self.maneuver.compiling_aside([(self._own(name), batched) for name, batched in wanted], before)
 

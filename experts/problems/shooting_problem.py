@@ -225,14 +225,13 @@ def native_calls(problem: ShootingProblem) -> AbstractContextManager[None]:
 
 def compiling_aside(
     problem: ShootingProblem, wanted: Sequence[tuple[str, bool]], before: Callable[[], None] | None
-) -> AbstractContextManager[bool]:
+) -> AbstractContextManager[None]:
     """Surround other work while kernels, given by name and whether batched, are compiled by another process.
 
-    For problems that know how, and tell whether there is one; those that take longest come first. The process
-    calls a function before.
+    For problems that know how; those that take longest come first. The process calls a function before.
     """
-    surround: Callable[..., AbstractContextManager[bool]] | None = getattr(problem, "compiling_aside", None)
-    return nullcontext(False) if surround is None else surround(wanted, before)
+    surround: Callable[..., AbstractContextManager[None]] | None = getattr(problem, "compiling_aside", None)
+    return nullcontext() if surround is None else surround(wanted, before)
 
 
 def check_interface(candidate: Any) -> None:
