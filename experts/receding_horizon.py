@@ -28,7 +28,7 @@ from experts.guesses.guided import RESERVE, GuidedDDP
 from experts.identification import ModelWatch
 from experts.maneuver_plan import ManeuverPlan
 from experts.problems.arm_problem import ArmProblem, WindowProblem, as_problem
-from experts.problems.shooting_problem import FloatArray, check_array, check_at_least
+from experts.problems.shooting_problem import FloatArray, check_array, check_at_least, stage_bounds
 
 PREDICTIONS = 40
 """Predictions in an episode of where the plan's policy ends."""
@@ -212,8 +212,7 @@ class RecedingHorizonExpert:
             self.fallbacks += 1
         self.dropouts += dropped
         self._next_stage, self._measured = stage + 1, not dropped
-        limits = self.maneuver.control_upper
-        return self.control / (limits if limits.ndim == 1 else limits[stage])
+        return self.maneuver.kernels.layout.to_action(self.control, self.maneuver.parameters.rows[stage])
 
     def _checked(self, observation_or_state: ArrayLike) -> FloatArray:
         """Return an observation or a state, or raise for another shape; its numbers may be wrong."""
@@ -356,6 +355,7 @@ class RecedingHorizonExpert:
         work = self._workspace(plan.maneuver, horizon, ends_early=end < self.maneuver.horizon)
         assert isinstance(work.problem, WindowProblem)
         work.problem.begin_at(stage)
+        work.bounds = stage_bounds(work.problem)
         first = stage - plan.first_stage
         work.problem.parameters.more[:] = plan.multipliers[first : first + horizon + 1]
         kept = 0

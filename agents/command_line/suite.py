@@ -86,10 +86,12 @@ def suite(
     """
     executor = chosen_executor(workers, ray)
     from agents.suite.running import run_suite
-    from agents.suite.suite_page import check, check_columns, suite_page
+    from agents.suite.suite_page import check, check_columns, published, suite_page
     from dq_space_arm_env.common.progress import ProgressDisplay
     from dq_space_arm_env.common.tables import tabulate
 
+    if other is not None:
+        published(other)  # what cannot be read ends the run before it begins
     written = destination(out, as_json, picture)
     chosen = given(tasks=tasks, seeds=seeds, workers=workers, executor=executor)
     with (
@@ -100,11 +102,11 @@ def suite(
     page, console = suite_page(run, picture=picture), written.console(150)
     for section in page.sections:
         section.print(console)
-    rows = [] if other is None else check(run, other)
-    if rows:
-        console.print(tabulate(f"Beside {other}", rows, check_columns()).for_terminal())
     for sentence in page.shortcomings:
         console.print(sentence, markup=False)
     console.print(f"{out}: {', '.join(page.save(out, 'suite'))}", markup=False)
+    rows = [] if other is None else check(run, other)
+    if rows:
+        console.print(tabulate(f"Beside {other}", rows, check_columns()).for_terminal())
     written.print(page.record)
     return FAILURE if run.notes or any(row["verdict"] == "differs" for row in rows) else SUCCESS

@@ -30,14 +30,14 @@ class AnalyticPolicyGradient(Model):
     end_weight: Positive = Field(
         default=400.0,
         description="factor of the terminal pose's cost at first, for reaching the tolerances; it falls "
-        "while nearly all episodes do",
+        "while at most a quarter of them miss",
     )
 
     def _problems(self) -> Iterator[Problem]:
         if self.crowding > 1.0:
             yield Problem(("crowding",), self.crowding, "must be at most 1, as cosines")
-        if self.decisions < 2:
-            yield Problem(("decisions",), self.decisions, "must be at least 2")
+        if self.decisions < 3:
+            yield Problem(("decisions",), self.decisions, "must be at least 3")
 
 
 class FlightMismatch(Mismatch):

@@ -28,7 +28,13 @@ from agents.evaluation.plan_followers import (
     RecedingHorizon,
     onboard_follower,
 )
-from agents.evaluation.planned_flights import PlannedFlights, agents_source, fly_plans, fly_receding
+from agents.evaluation.planned_flights import (
+    PLAN_SOURCES,
+    PlannedFlights,
+    agents_source,
+    fly_plans,
+    fly_receding,
+)
 from agents.evaluation.training_runs import (
     Group,
     evaluation_command,
@@ -234,6 +240,7 @@ class _Work:
         path = file if isinstance(file, Path) else None
         content = {"policy": file_hash(path) if path and path.is_file() else None}
         content |= self._common(condition, self.n)
+        content["agents"] = agents_source((*PLAN_SOURCES, "zoo"))  # how a file becomes a policy
         if normalize is not None:
             content["normalize"] = file_hash(Path(normalize))
         kept = self.kept if path else KeptRows(None)

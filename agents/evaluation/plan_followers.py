@@ -55,8 +55,9 @@ def plans_of(settings: Settings, result: ShardResult) -> tuple[Plans, FloatArray
 
 def _parts(solution: Solution, layout: StateLayout) -> tuple[FloatArray | float, ...]:
     """States, actions and gains of a solution; zeros if one is not finite."""
-    limits = layout.limits_with(solution.parameters[0])
-    parts = (solution.states, solution.controls / limits, solution.feedback_gains / limits[:, None])
+    stages = solution.parameters[:-1]
+    actions = layout.to_action(solution.controls, stages)
+    parts = (solution.states, actions, layout.to_action_gains(solution.feedback_gains, stages))
     return parts if all(np.isfinite(part).all() for part in parts) else (0.0, 0.0, 0.0)
 
 
@@ -76,15 +77,16 @@ def onboard_follower(scene: Scene, *, feedback: bool) -> Callable[[NDArray[Any]]
     problem = ArmProblem(scene)
     kernels, to_action = problem.kernels, problem.kernels.layout.to_action
     solution = expert_of(problem.scene).solver.solve()
-    policy, actions, stages = solution.policy(problem), to_action(solution.controls), count()
+    policy, rows, stages = solution.policy(problem), problem.parameters.rows, count()
     if feedback:
-        rows = problem.parameters.rows
 
         def act(seen: NDArray[Any]) -> FloatArray:
             stage = next(stages)
-            return np.asarray(to_action(policy(kernels.state_from_observation(seen, p=rows[stage]), stage)))
+            control = policy(kernels.state_from_observation(seen, p=rows[stage]), stage)
+            return np.asarray(to_action(control, rows[stage]))
 
         return act
+    actions = to_action(solution.controls, rows[:-1])
     return lambda seen: np.asarray(actions[next(stages)])
 
 

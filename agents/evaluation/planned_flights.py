@@ -35,7 +35,7 @@ from experts.demonstrations.settings import Settings, software
 from experts.demonstrations.shard import Task, draw_starts
 from experts.executors import Executor
 
-_SOURCES = (
+PLAN_SOURCES = (
     *(f"evaluation/{name}.py" for name in ("conditions", "evaluating", "expert_costs", "plan_followers")),
     *("evaluation/planned_flights.py", "evaluation/plans.py", "policies"),
 )
@@ -196,7 +196,7 @@ def _files(
 
 
 @cache
-def agents_source(names: tuple[str, ...] = _SOURCES) -> str:
+def agents_source(names: tuple[str, ...] = PLAN_SOURCES) -> str:
     """SHA-256 of the files and folders of this package that flights follow from."""
     folder, digest = Path(__file__).parents[1], hashlib.sha256()
     for name in names:

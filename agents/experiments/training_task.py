@@ -104,12 +104,12 @@ class TrainingTask(NamedTuple):
         """Whether the folder holds the policy that this training would end with."""
         try:
             kept = load_exported(self.folder / POLICY).metadata
-            there = load_configuration(kept["configuration"])
+            there = load_configuration(kept["configuration"]).resolved()
             scene_hash = load_scene(self.configuration.scene).content_hash()
         except (PolicyFileError, KeyError, TypeError, ValueError):
             return False
         same = there.model_copy(update={"description": self.configuration.description})
-        return same == self.configuration and kept.get("scene_hash") == scene_hash
+        return same == self.configuration.resolved() and kept.get("scene_hash") == scene_hash
 
     def progress(self) -> Status:
         """How far the training has come, as it was noted."""

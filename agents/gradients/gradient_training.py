@@ -361,7 +361,8 @@ class _Learner:
         arrays = {**self._state(), **{name: np.array(each) for name, each in numbers.items()}}
         for copy in _COPIES:
             arrays |= {f"{copy}.{name}": each for name, each in getattr(self, copy).items()}
-        arrays["substeps"] = self._episodes.substeps
+        arrays |= {"mean": self._mean, "scale": self._scale, "substeps": self._episodes.substeps}
+        arrays["cost"] = np.array(self._episodes.penalties.cost)
         arrays["roughness"] = np.array(self._episodes.roughness)
         np.savez(stream, **arrays)  # type: ignore[arg-type]
         write_atomically(path / CHECKPOINT, stream.getvalue())
@@ -383,8 +384,8 @@ class _Learner:
             self._episodes.roughness = float(arrays["roughness"])
             for name in _NUMBERS:
                 setattr(self, name, float(arrays[name]))
-            if math.isfinite(self._typical):
-                self._episodes.penalties.cost = self._typical
+            self._mean, self._scale = arrays["mean"], arrays["scale"]
+            self._episodes.penalties.cost = float(arrays["cost"])
         except (KeyError, ValueError, OSError, UnreadableError) as error:
             raise RunFolderError(
                 f"{place} cannot be read ({error}); remove it to restart the training"

@@ -88,12 +88,11 @@ class Solver:
     def _plan(
         self, demonstration: Demonstration, state: FloatArray, stage: int, end: int
     ) -> Corrections | None:
-        maneuver, parameters = self._maneuver, demonstration.parameters
-        limits = self._kernels.layout.limits_with(parameters)
-        maneuver.parameters.set(parameters)  # its end is that of the window
+        maneuver, layout = self._maneuver, self._kernels.layout
+        maneuver.parameters.set(demonstration.parameters)  # its end is that of the window
         rows = maneuver.parameters.rows[stage:]
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
-        guess = self._followed(demonstration, state, stage, limits, rows) * limits
+        guess = layout.to_control(self._followed(demonstration, state, stage, rows), rows[:-1])
         solution = BoxDDP(problem).solve(x0=state, u_init=guess, parameters=rows)
         if solution.converged and problem.misses(solution.states[-1]) > 1.0:
             within = BoxDDP(problem.constrained(RESERVE), initial_regularization=NEAR_REGULARIZATION)
@@ -104,29 +103,24 @@ class Solver:
         steps = slice(0, end - stage)
         states = solution.states[steps]
         left = (maneuver.horizon - stage - np.arange(len(states))) * maneuver.time_step
-        gains = solution.feedback_gains[steps] / limits[:, None]
+        gains = layout.to_action_gains(solution.feedback_gains[steps], rows[steps])
         return Corrections(
             states,
             self._kernels.observation(states, left[:, None], p=rows[steps])[0],
-            solution.controls[steps] / limits,
+            layout.to_action(solution.controls[steps], rows[steps]),
             gains.astype(np.float32),
             rows[steps].copy(),
         )
 
     def _followed(
-        self,
-        demonstration: Demonstration,
-        state: FloatArray,
-        stage: int,
-        limits: FloatArray,
-        rows: FloatArray,
+        self, demonstration: Demonstration, state: FloatArray, stage: int, rows: FloatArray
     ) -> FloatArray:
         """Actions of the demonstration's feedback policy, rolled out from a state."""
-        actions = demonstration.actions[stage:].copy()
-        least = self._kernels.layout.lower_limits(np.ones_like(limits))
+        actions, layout = demonstration.actions[stage:].copy(), self._kernels.layout
+        least = layout.lower_limits(np.ones(layout.n_u))
         for k in range(len(actions)):
             deviation = self._kernels.difference(demonstration.states[stage + k], state)
             wanted = actions[k] + demonstration.feedback_gains[stage + k] @ deviation
             actions[k] = np.clip(wanted, least, 1.0)
-            state = self._kernels.step(state, actions[k] * limits, p=rows[k])
+            state = self._kernels.step(state, layout.to_control(actions[k], rows[k]), p=rows[k])
         return actions

@@ -115,7 +115,7 @@ def _mean_action(
     `rows` are the parameters of the flights' stages, shape (B, N + 1, n_p).
     """
     kernels = data.kernels
-    total, limits = np.zeros((len(chosen), kernels.n_u)), kernels.layout.limits_with(rows[:, 0])
+    total = np.zeros((len(chosen), kernels.n_u))
     least = kernels.layout.lower_limits(np.ones(kernels.n_u))
     stages = range(stage, min(stage + hold, data.scene.simulation.steps))
     for at in stages:
@@ -123,7 +123,7 @@ def _mean_action(
         gains = np.array([each.feedback_gains[at] for each in chosen])
         nominal = np.array([each.actions[at] for each in chosen])
         actions = np.clip(nominal + np.einsum("bij,bj->bi", gains, deviation), least, 1.0)
-        states = kernels.step(states, actions * limits, p=rows[:, at])
+        states = kernels.step(states, kernels.layout.to_control(actions, rows[:, at]), p=rows[:, at])
         total += actions
     mean: SingleArray = (total / len(stages)).astype(np.float32)
     return mean

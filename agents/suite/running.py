@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,6 +33,7 @@ from experts.executors import Executor, local_executor
 TASK = "{task}"
 """In the path of a policy: the name of a task."""
 TRAININGS = "trainings"
+_ONE_NAME = "entrants: two are named {!r}; put another name and = before the path of one"
 _NAMED = re.compile(r"([\w.-]+)=(.+)")
 Report = Callable[[Advance], None]
 
@@ -165,7 +167,8 @@ def run_suite(
         The scores.
 
     Raises:
-        SuiteError: If the suite or a task is not what it should be, or nobody can fly.
+        SuiteError: If the suite or a task is not what it should be, two entrants have one name, or nobody can
+            fly.
         ConfigurationError, PolicyError, PolicyFileError: If an entrant cannot be used.
         DemonstrationsError: If processes of the expert are killed again and again; finished rows remain.
         KeyboardInterrupt: If the user interrupts it; likewise.
@@ -175,6 +178,7 @@ def run_suite(
     if not entrants and not policies:
         entrants = (*CONTROLLERS, *chosen.agents, ZOO)
     controllers, agents, files = _sorted_out(entrants, chosen)
+    _check_names([*(CONTROLLERS[each] for each in controllers), *map(agent_name, agents), *files, *policies])
     fliers = {task: [*_from_files(files, task, scene, trust)] for task, scene in scenes.items()}
     for task, scene in scenes.items():
         fliers[task] += [(name, as_policy(make(scene), name)) for name, make in policies.items()]
@@ -238,6 +242,13 @@ def agent_name(agent: str) -> str:
     return Path(agent).stem if agent.endswith((".yaml", ".yml")) else agent
 
 
+def _check_names(names: Sequence[str]) -> None:
+    """Raise SuiteError if two entrants have one name: they would count as one."""
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise SuiteError(_ONE_NAME.format(name))
+
+
 def _sorted_out(entrants: Sequence[str], suite: Suite) -> tuple[list[str], list[str], dict[str, str]]:
     """Controllers, agents to train, and paths of policies by name among the entrants."""
     controllers: list[str] = []
@@ -250,7 +261,10 @@ def _sorted_out(entrants: Sequence[str], suite: Suite) -> tuple[list[str], list[
             agents.append(entrant)
         else:
             named = _NAMED.fullmatch(entrant)
-            files |= {named[1]: named[2]} if named else {entrant: entrant}
+            name, path = (named[1], named[2]) if named else (entrant, entrant)
+            if name in files:
+                raise SuiteError(_ONE_NAME.format(name))
+            files[name] = path
     return controllers, agents, files
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -72,6 +73,21 @@ def overall_rows(run: SuiteRun, condition: str) -> Iterator[Row]:
         }
 
 
+def published(file: str | Path) -> tuple[dict[str, Any], dict[tuple[str, str, str], Row]]:
+    """Read the JSON file of another run: its suite, and scores by task, condition and entrant.
+
+    Raises:
+        SuiteError: If the file is not one.
+    """
+    try:
+        tasks = read_mapping(file)["parts"]["tasks"]
+        return tasks["suite"], {
+            (row["task"], row["condition"], row["entrant"]): row for row in tasks["scores"]
+        }
+    except (UnreadableError, KeyError, TypeError) as error:
+        raise SuiteError(f"{file}: is not the JSON file of a suite: {error}") from error
+
+
 def check(run: SuiteRun, file: str | Path) -> list[Row]:
     """Compare scores with those in the JSON file of another run.
 
@@ -82,13 +98,7 @@ def check(run: SuiteRun, file: str | Path) -> list[Row]:
     Raises:
         SuiteError: If the file is not one, or they have no score in common.
     """
-    try:
-        content = read_mapping(file)
-        scores = content["parts"]["tasks"]["scores"]
-        theirs = {(row["task"], row["condition"], row["entrant"]): row for row in scores}
-        suite = content["parts"]["tasks"]["suite"]
-    except (UnreadableError, KeyError, TypeError) as error:
-        raise SuiteError(f"{file}: is not the JSON file of a suite: {error}") from error
+    suite, theirs = published(file)
     mine = run.suite.model_dump(mode="json", include={"name", "starts", "tasks"})
     if any(suite.get(key) != mine[key] for key in ("name", "starts", "tasks")):
         raise SuiteError(f"{file}: is of {suite.get('name')!r}, should be of {run.suite.name!r}")

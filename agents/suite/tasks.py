@@ -71,6 +71,8 @@ class Suite(Model):
         for name in self.conditions:
             if name not in CONDITIONS:
                 yield Problem(("conditions",), name, f"must be one of {', '.join(CONDITIONS)}")
+            elif self.conditions.count(name) > 1:
+                yield Problem(("conditions",), name, "must stand there once")
         for name in self.agents:
             if name in (*CONTROLLERS, ZOO):
                 yield Problem(("agents",), name, "is the name of a controller: choose another")

@@ -74,7 +74,7 @@ class DQSpaceArmGoalVectorEnv(ComputesRewards, DQSpaceArmVectorEnv):
         self._goals = GoalRewards(self.kernels, self.reward_type)
         return _GoalSubEnvironments(self.kernels, self.num_envs, self._goals)
 
-    def _show_again(self, rows: Rows, result: StepResult, begins: bool) -> None:
+    def _show_again(self, rows: Rows, result: StepResult) -> None:
         """Do nothing: goal sub-environments that are observed show all their states."""
 
     def step(self, actions: ArrayLike) -> tuple[Observation, Array, Mask, Mask, dict[str, Any]]:

@@ -280,7 +280,8 @@ class _Log:
         actions[self.failed] = 0.0
         if self.states is not None and self.observations is not None and self.controls is not None:
             self.states[:, step], self.observations[:, step] = self.state, observation
-            self.controls[:, step] = self._layout.to_control(np.clip(actions, -1.0, 1.0))
+            stages = environment.stage_parameters
+            self.controls[:, step] = self._layout.to_control(np.clip(actions, -1.0, 1.0), stages)
         if noise is None:
             return actions
         least = self._layout.lower_limits(np.ones(self._layout.n_u))
@@ -288,11 +289,17 @@ class _Log:
         disturbed = np.clip(commanded + noise, least, 1.0)
         if self.controls is not None:
             self.noise = np.zeros_like(self.controls) if self.noise is None else self.noise
-            self.noise[:, step] = (disturbed - commanded) * self._layout.control_limit
+            limits = self._layout.limits_with(environment.stage_parameters)
+            self.noise[:, step] = (disturbed - commanded) * limits
         return disturbed
 
     def after_step(self, step: int, reward: FloatArray, terminated: Mask, info: dict[str, Any]) -> None:
         flying = self.flying
+        self.state = self._environment.states
+        if self.states is not None:
+            self.states[:, step + 1] = self.state
+        overlap = np.abs(np.sum(self._attitude * self.state[:, self._real], axis=1))
+        np.minimum(self._overlap, overlap, out=self._overlap, where=flying)
         np.copyto(self.rewards[:, step], reward, where=flying)
         for name, sums in self.cost_terms.items():
             np.add(sums, info[name], out=sums, where=flying)
@@ -302,12 +309,7 @@ class _Log:
         ending = flying & terminated
         if ending.any():
             self._keep_last(info, ending)
-            self.flying = flying = flying & ~terminated
-        self.state = self._environment.states
-        if self.states is not None:
-            self.states[:, step + 1] = self.state
-        overlap = np.abs(np.sum(self._attitude * self.state[:, self._real], axis=1))
-        np.minimum(self._overlap, overlap, out=self._overlap, where=flying)
+            self.flying = flying & ~terminated
 
     def _keep_last(self, info: dict[str, Any], rows: Mask) -> None:
         for name, values in self.last.items():

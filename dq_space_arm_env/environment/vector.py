@@ -181,11 +181,14 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             Observations, shape (num_envs, n_obs), the present ones where nothing is reset; and info.
 
         Raises:
+            ResetNeeded: For some of the sub-environments, before the first reset of all.
             ValueError: If an option or the number of seeds is wrong.
         """
-        rest, begins = dict(options or {}), not self._begun
+        rest = dict(options or {})
         mask = self._checked_mask(rest.pop("reset_mask", None))
         rows, others = np.flatnonzero(mask), np.flatnonzero(~mask)
+        if len(others) and not self._begun:
+            raise ResetNeeded("the other episodes have not begun: call reset() before reset() of some")
         saved = saved_state(rest)
         if saved is None:
             starts = self._given_starts(rows, rest)
@@ -198,14 +201,14 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             self.set_state(self._given_state(saved, rows), rows)
             self._seed(seed, rows)
         result = self._envs.observe(rows)
-        self._show_again(others, result, begins)
+        self._show_again(others, result)
         result.report[:, others], result.flags[:, others] = 0.0, False
         self._remember(result.observation)
         return result.observation, self._info(result, mask) | self._drawn(rows)
 
-    def _show_again(self, rows: Rows, result: StepResult, begins: bool) -> None:
+    def _show_again(self, rows: Rows, result: StepResult) -> None:
         """Put observations of sub-environments that are not reset into a result."""
-        if self._seen is None or begins:
+        if self._seen is None:
             result.observation[rows] = self._envs.observe(rows).observation[rows]
         else:
             result.observation[rows] = self._seen[rows]
@@ -319,7 +322,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         Raises:
             ResetNeeded: Before the first reset.
             TypeError: If the increments are masked, or not of real numbers.
-            ValueError: If the increments have a wrong shape.
+            ValueError: If the increments have a wrong shape, or are not finite.
         """
         if not self._begun:
             raise ResetNeeded("the episodes have not begun: call reset() before perturb()")
@@ -327,6 +330,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         expected = self.num_envs, self.kernels.n_t
         if increments.shape != expected:
             raise ValueError(f"increments: shape {increments.shape}, should be {expected}")
+        if not np.isfinite(increments).all():
+            raise ValueError(f"increments: {shortened(increments)}, should be finite")
         rows = np.flatnonzero(increments.any(axis=1))
         if len(rows):
             self._envs.move(rows, self.kernels.retract(self._envs.x[rows], increments[rows]))

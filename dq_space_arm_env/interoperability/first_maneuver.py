@@ -21,6 +21,8 @@ from dq_space_arm_env.scene import Cost, Scene
 _TARGET_OFFSET = 0.3
 # Angle by which every joint of an arm that would begin in a singular pose is bent, rad.
 _BEND = 0.5
+# Distance of the start from the stops of a joint, rad (slides: m), so that it can be drawn.
+_ROOM = 0.2
 # Smallest singular value of the tip's Jacobian, relative to the largest, below which a pose is singular.
 _SINGULAR = 0.01
 # Limit of a torque that is scaled for free flight, relative to the effort of a swing by 1 rad.
@@ -40,10 +42,12 @@ def start_angles(arm: Arm) -> list[float]:
 
 
 def _at_rest(joint: UrdfJoint) -> float:
-    """Zero where the limits allow it, or midway between them; at the one that there is."""
+    """Zero, at some distance from limits near it, or midway between them where they exclude it."""
     lower, upper = joint.limits or ANY_ANGLE
-    middle = 0.5 * (lower + upper)
-    return min(max(0.0, lower), upper) if lower <= 0.0 <= upper or math.isinf(middle) else middle
+    middle, room = 0.5 * (lower + upper), min(_ROOM, 0.5 * (upper - lower))
+    if not lower <= 0.0 <= upper and math.isfinite(middle):
+        return middle
+    return min(max(0.0, lower + room), upper - room)
 
 
 def _moved(joint: UrdfJoint, angle: float, step: float) -> float | None:

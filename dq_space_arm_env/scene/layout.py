@@ -224,30 +224,51 @@ class StateLayout:
         lower[..., self.control.thruster_force] = 0.0
         return lower
 
-    def to_control(self, action: ArrayLike) -> Array:
+    def to_control(self, action: ArrayLike, parameters: Array | None = None) -> Array:
         """Scale actions to controls.
 
         Args:
             action: Fractions of the limits in [-1, 1], shape (..., n_u); below 0 a thruster is off.
+            parameters: Of the stages, where limits may be parameters, shape (..., n_p); None: nominal limits.
 
         Returns:
             Controls, shape (..., n_u), N, N m, rad/s.
         """
-        controls = real_array("action", action, np.float64) * self.control_limit
+        controls = real_array("action", action, np.float64) * self._limits(parameters)
         jets = controls[..., self.control.thruster_force]
         np.maximum(jets, 0.0, out=jets)
         return controls
 
-    def to_action(self, control: ArrayLike) -> Array:
+    def to_action(self, control: ArrayLike, parameters: Array | None = None) -> Array:
         """Scale controls to actions, the inverse of `to_control`.
 
         Args:
             control: Controls, shape (..., n_u), N, N m, rad/s.
+            parameters: As for `to_control`.
 
         Returns:
-            Fractions of the limits, shape (..., n_u); 0 where a control has no limit.
+            Fractions of the limits, shape (..., n_u); 0 where a control has no limit, or its limit is 0.
         """
-        return real_array("control", control, np.float64) / self.control_limit
+        controls, limits = real_array("control", control, np.float64), self._limits(parameters)
+        actions: Array = np.zeros(np.broadcast_shapes(controls.shape, limits.shape))
+        np.divide(controls, limits, out=actions, where=limits > 0.0)
+        return actions
+
+    def to_action_gains(self, gains: Array, parameters: Array | None = None) -> Array:
+        """Scale feedback gains of controls to those of actions.
+
+        Args:
+            gains: Controls per deviation, shape (..., n_u, n_t).
+            parameters: As for `to_control`.
+
+        Returns:
+            Fractions of the limits per deviation, shape (..., n_u, n_t).
+        """
+        rows = None if parameters is None else parameters[..., None, :]
+        return self.to_action(gains.swapaxes(-1, -2), rows).swapaxes(-1, -2)
+
+    def _limits(self, parameters: Array | None) -> Array:
+        return self.control_limit if parameters is None else self.limits_with(parameters)
 
     @classmethod
     def of(cls, scene: Scene) -> "StateLayout":

@@ -1,6 +1,7 @@
 """What actuators do with their inputs: physics of the environment that no input overrides.
 
-Plans know these limits as bounds of the inputs and as constraints; kernels take inputs as they are.
+Plans know these limits as bounds of the inputs and as constraints; kernels take inputs as they are. Of two
+numbers of which one is NaN, compiled minima and maxima are the second: there stands the input, and NaN stays.
 """
 
 from __future__ import annotations
@@ -88,9 +89,9 @@ def _wheel_torques(equations: SceneEquations, x: Scalars, torques: Scalars) -> l
         if math.isfinite(wheel.speed):
             # J (+-Omega_max - Omega) / h reaches the largest speed at the end of the step.
             to_top, to_bottom = (wheel.inertia / dt * (end - speed) for end in (wheel.speed, -wheel.speed))
-            torque = casadi.fmin(casadi.fmax(torque, casadi.fmin(to_bottom, 0.0)), casadi.fmax(to_top, 0.0))
+            torque = casadi.fmin(casadi.fmax(to_top, 0.0), casadi.fmax(casadi.fmin(to_bottom, 0.0), torque))
         if math.isfinite(wheel.power):
             most = wheel.power / casadi.fmax(casadi.fabs(speed), _LEAST_SPEED)
-            torque = casadi.fmin(casadi.fmax(torque, -most), most)
+            torque = casadi.fmin(most, casadi.fmax(-most, torque))
         result.append(torque)
     return result

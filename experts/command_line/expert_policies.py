@@ -45,14 +45,16 @@ def load_policy(policy: str, start: Start, console: Console, seed: int | None, t
         expert.reset(start.state, parameters=start.parameters)
         return Pilot("receding horizon", StateFeedback(lambda states, step: expert(states[0])[None]))
     if name == "plan":
-        actions = layout.to_action(_plan(start, console).controls)
+        solution = _plan(start, console)
+        actions = layout.to_action(solution.controls, solution.parameters[:-1])
         return Pilot("open-loop plan", StateFeedback(lambda states, step: actions[step][None]))
     if name == "gains":
         label, solution = "plan with gains", _plan(start, console)
     else:
         label, solution = Path(policy).stem, _read(Path(policy), start.scene)
-    follow = solution.policy(start.scene)
-    return Pilot(label, StateFeedback(lambda states, step: layout.to_action(follow(states[0], step))[None]))
+    follow, stages = solution.policy(start.scene), solution.parameters
+    acting = StateFeedback(lambda states, step: layout.to_action(follow(states[0], step), stages[step])[None])
+    return Pilot(label, acting)
 
 
 def _plan(start: Start, console: Console) -> Solution:

@@ -27,9 +27,10 @@ def read_demonstration(source: str, label: str | None) -> Trajectory | None:
     except DemonstrationsError as error:
         raise ValueError(str(error)) from error
     layout, parameters = StateLayout.of(scene), demonstration.parameters
-    controls = demonstration.actions * layout.limits_with(parameters)
+    stages = demonstrations.kernels.stage_parameters(parameters)
+    controls = layout.to_control(demonstration.actions, stages[:-1])
     if layout.parameters.move_target:
-        parameters = demonstrations.kernels.stage_parameters(parameters)
+        parameters = stages
     flight = Trajectory(label or f"demonstration {number}", np.array(demonstration.states), controls)
     if layout.n_p:
         flight = replace(flight, target=layout.target_with(parameters))

@@ -254,7 +254,8 @@ def _verified_episodes(expert: Expert, outcomes: list[Outcome]) -> tuple[FloatAr
         good = [outcome for outcome in outcomes if outcome.is_good]
         actions = np.empty((len(good), problem.horizon, problem.n_controls))
         for row, outcome in zip(actions, good, strict=True):
-            np.divide(outcome.solution.controls, _limits(problem, outcome), out=row)
+            solution = outcome.solution
+            row[:] = problem.kernels.layout.to_action(solution.controls, solution.parameters[:-1])
         if not good:
             return actions, replay(problem.scene, [0], np.zeros((1, *actions.shape[1:])))
         episodes = replay(problem.scene, [outcome.seed for outcome in good], actions)
@@ -267,18 +268,13 @@ def _verified_episodes(expert: Expert, outcomes: list[Outcome]) -> tuple[FloatAr
             good[i].reason = REPLAY_DIFFERS
 
 
-def _limits(problem: ArmProblem, outcome: Outcome) -> FloatArray:
-    """Limits of the inputs, which may be parameters, shape (n_u,)."""
-    return problem.kernels.layout.limits_with(outcome.parameters)
-
-
 def _demonstration_arrays(
     problem: ArmProblem, outcomes: Sequence[Outcome], actions: FloatArray, episodes: Rollout
 ) -> Arrays:
     gains = np.empty((*actions.shape, problem.n_tangent), dtype=np.float32)
     for row, outcome in zip(gains, outcomes, strict=True):
-        limits = _limits(problem, outcome)[:, None]
-        np.divide(outcome.solution.feedback_gains, limits, out=row, casting="same_kind")
+        solution = outcome.solution
+        row[:] = problem.kernels.layout.to_action_gains(solution.feedback_gains, solution.parameters[:-1])
     count = len(outcomes)
     assert episodes.states is not None
     assert episodes.observations is not None

@@ -97,8 +97,9 @@ def samples(demonstrations: Demonstrations, count: int) -> bytes:
 
 def _draw_sample(column: Any, demonstrations: Demonstrations, demonstration: Demonstration) -> None:
     """Start, end, errors, and inputs at a limit, one below the other."""
-    limits = demonstrations.kernels.layout.limits_with(demonstration.parameters)
-    controls = demonstration.actions * limits
+    kernels = demonstrations.kernels
+    stages = kernels.stage_parameters(demonstration.parameters)
+    controls = kernels.layout.to_control(demonstration.actions, stages[:-1])
     maneuver = Maneuver(demonstration.episode_scene, demonstration.states, controls)
     start, end, attitude, position, limits = column
     last = len(maneuver.time) - 1

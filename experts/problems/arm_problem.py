@@ -379,7 +379,7 @@ class WindowProblem:
     @property
     def control_lower(self) -> FloatArray:
         """See `ArmProblem.control_lower`."""
-        return -self.control_upper
+        return self.maneuver.kernels.layout.lower_limits(self.control_upper)
 
     def constrained(self, reserve: float = 0.0) -> "WindowProblem":
         """See `ArmProblem.constrained`; for the last stages of a maneuver."""

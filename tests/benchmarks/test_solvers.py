@@ -23,7 +23,7 @@ from scripts.benchmarks.solvers.random_starts import (
     measure_starts,
     summarized,
 )
-from scripts.benchmarks.solvers.receding import Control, World, cost_of, fly, measure_flights
+from scripts.benchmarks.solvers.receding import Controller, World, cost_of, fly, measure_flights
 from scripts.benchmarks.solvers.runs import (
     GUIDED,
     TITLES,
@@ -255,8 +255,9 @@ def test_random_starts_are_the_episodes_of_the_environment(problem: ArmProblem, 
 def test_an_undisturbed_episode_costs_what_the_plan_says(problem: ArmProblem) -> None:
     solution = BoxDDP(problem).solve()
 
-    def cost(control: Control, world: World, seed: int = 0) -> float:
-        return cost_of(fly(problem, control, world, seed))
+    def cost(control: Controller, world: World, seed: int = 0) -> float:
+        to_action = problem.kernels.layout.to_action
+        return cost_of(fly(problem, lambda x, k: to_action(control(x, k)), world, seed))
 
     def open_loop(state: FloatArray, stage: int) -> FloatArray:
         return np.asarray(solution.controls[stage])

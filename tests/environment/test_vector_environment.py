@@ -108,6 +108,17 @@ def test_a_refused_step_changes_nothing():
     assert_same(venv.step(np.zeros((9, 12))), twin.step(np.zeros((9, 12))))
 
 
+@pytest.mark.parametrize("name", ["wheels", "thrusters", "motors"])
+def test_nan_in_any_input_is_refused_whatever_actuators_do_with_it(name):
+    venv = DQSpaceArmVectorEnv(2, short(name))
+    venv.reset(seed=0)
+    for column in range(venv.single_action_space.shape[0]):
+        actions = np.zeros((2, venv.single_action_space.shape[0]))
+        actions[1, column] = np.nan
+        with pytest.raises(ValueError, match=r"NaN for sub-environments \[1\]"):
+            venv.step(actions)
+
+
 def test_actions_of_a_copy_that_is_being_reset_do_not_matter():
     venv = DQSpaceArmVectorEnv(2, short(steps=1))
     venv.reset(seed=0)
@@ -221,6 +232,7 @@ def test_what_a_caller_does_to_results_does_not_matter():
         (lambda v: v.reset(options={"reset_mask": np.zeros(4, dtype=bool)}), "False everywhere"),
         (lambda v: v.reset(options={"reset_mask": [True] * 4}), "should be a bool array"),
         (lambda v: v.reset(options={"nominel": True}), r"\['nominel'\] unknown; choose from nominal"),
+        (lambda v: v.perturb(np.full((4, v.kernels.n_t), np.inf)), "increments: .*should be finite"),
     ],
 )
 def test_bad_input_is_refused(call, message):
@@ -237,6 +249,8 @@ def test_bad_construction_is_refused():
         DQSpaceArmVectorEnv(2, render_mode="human")
     with pytest.raises(ResetNeeded):
         DQSpaceArmVectorEnv(2).step(np.zeros((2, 12)))
+    with pytest.raises(ResetNeeded, match="the other episodes have not begun"):
+        DQSpaceArmVectorEnv(2).reset(options={"reset_mask": np.array([True, False])})
 
 
 def test_episodes_are_cut_off_by_single_environments_alone():

@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
+from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.scene import StateLayout
 from experts import BoxDDP, GuidedDDP, RecedingHorizonExpert
 from experts.guesses.guided import RESERVE
 from experts.maneuver_plan import ManeuverPlan, _convex_part
-from experts.problems.arm_problem import ArmProblem
+from experts.problems.arm_problem import ArmProblem, WindowProblem
 
 SCENES = ("paper", "payload")
 
@@ -28,6 +29,30 @@ def experts():
 def paper(experts):
     experts["paper"].reset()
     return experts["paper"]
+
+
+def test_a_window_has_the_bounds_of_its_stages():
+    maneuver = ArmProblem("thrusters")
+    lower = WindowProblem(maneuver, 10).control_lower
+    assert not lower[..., maneuver.kernels.layout.control.thruster_force].any()
+    np.testing.assert_array_equal(lower, maneuver.control_lower)
+
+
+@pytest.mark.slow
+def test_it_flies_through_a_phase_without_actuators():
+    expert, actions = RecedingHorizonExpert("release"), []
+
+    def act(states, stage):
+        actions.append(expert(states[0]))
+        return actions[-1][None]
+
+    expert.reset(expert.maneuver.initial_state)
+    flown = rollout(StateFeedback(act), expert.maneuver.scene, starts=expert.maneuver.initial_state[None])
+    assert np.isfinite(actions).all()
+    assert not actions[799][:9].any()  # the latch opens
+    assert flown.is_success[0]
+    assert expert.fallbacks == 0
+    assert flown.cost[0] == pytest.approx(expert.plan.solution.cost, rel=1e-9)
 
 
 def open_loop(plan):

@@ -11,6 +11,7 @@ import dq_space_arm_env
 from dq_space_arm_env import Scene, SceneError, compile_scene, load_scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
+from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.interoperability.pinocchio_twin import pinocchio_model, to_pinocchio
 from dq_space_arm_env.kernels.capture import catch_payload
 from dq_space_arm_env.scene.phases import phase_scene
@@ -66,6 +67,24 @@ def test_an_episode_costs_what_the_kernels_say_stage_by_stage(name: str) -> None
     cost += kernels.terminal_cost(x, p=rows[-1])
     assert over
     assert returned == pytest.approx(-cost, rel=1e-13)
+
+
+def test_recorded_controls_are_fractions_of_the_limits_of_their_phase() -> None:
+    scene = SCENES["release"]
+    problem = ArmProblem(scene)
+    layout, rows = problem.kernels.layout, problem.parameters.rows[:-1]
+    limits = layout.limits_with(rows)
+    assert not limits.all(axis=1).all()  # the robot coasts
+    actions = np.random.default_rng(8).uniform(-1.0, 1.0, limits.shape)
+    acting = rollout(StateFeedback(lambda states, stage: actions[stage, None]), scene, record=True)
+    assert acting.controls is not None
+    np.testing.assert_array_equal(acting.controls[0], actions * limits)
+    back = layout.to_action(acting.controls[0], rows)
+    np.testing.assert_allclose(back, np.where(limits > 0.0, actions, 0.0), rtol=0.0, atol=1e-15)
+    gains = np.ones((*limits.shape, problem.n_tangent))
+    found = layout.to_action_gains(gains, rows)
+    assert found.shape == gains.shape
+    np.testing.assert_array_equal(found[..., 3], np.divide(1.0, limits, out=0.0 * limits, where=limits > 0.0))
 
 
 @pytest.mark.parametrize("name", ["capture-and-detumble"])

@@ -29,8 +29,8 @@ UNDISTURBED = "none"
 HORIZON_LOSS = 0.05
 """Largest cost of looking ahead for a part of the maneuver, relative to the plan, undisturbed."""
 
-Control = Callable[[FloatArray, int], FloatArray]
-"""From a state, shape (n_x,), and a stage to a control, shape (n_u,), units of the scene."""
+Controller = Callable[[FloatArray, int], FloatArray]
+"""From a state, shape (n_x,), and a stage to an action, shape (n_u,), fractions of the limits."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +61,12 @@ def worlds(scene: Scene, other_masses: bool) -> list[World]:
     return found
 
 
-def fly(problem: ArmProblem, control: Control, world: World, seed: int) -> Rollout:
+def fly(problem: ArmProblem, controller: Controller, world: World, seed: int) -> Rollout:
     """Simulate an episode from the problem's initial state."""
-    scene, limits = problem.scene, problem.control_upper
+    scene = problem.scene
     rng = np.random.default_rng(seed)
     found = Disturbances(scene, rng, push=world.push, pushes=PUSHES, evenly=True, measurement=world.noise)
-    policy = StateFeedback(lambda states, stage: (control(states[0], stage) / limits)[None])
+    policy = StateFeedback(lambda states, stage: controller(states[0], stage)[None])
     parameters = None
     if world.mass_factor != 1.0:
         scene, parameters = with_loads(scene, [world.mass_factor])
@@ -92,7 +92,7 @@ def measure_flights(problem: ArmProblem, effort: Effort) -> Iterator[Row]:
     for world in worlds(scene, effort.other_masses):
         seeds = [effort.seed + i for i in range(effort.episodes if world.is_random else 1)]
         policy, open_loop = (
-            [cost_of(fly(problem, control, world, seed)) for seed in seeds]
+            [cost_of(fly(problem, _acting(problem, control), world, seed)) for seed in seeds]
             for control in (plan.policy, lambda state, stage: np.asarray(plan.solution.controls[stage]))
         )
         for expert in experts:
@@ -106,6 +106,12 @@ def measure_flights(problem: ArmProblem, effort: Effort) -> Iterator[Row]:
                 )
 
 
+def _acting(problem: ArmProblem, control: Callable[[FloatArray, int], FloatArray]) -> Controller:
+    """Scale controls, in units of the scene, to actions."""
+    layout, rows = problem.kernels.layout, problem.parameters.rows
+    return lambda state, stage: layout.to_action(control(state, stage), rows[stage])
+
+
 def _plan(expert: RecedingHorizonExpert, problem: ArmProblem) -> ManeuverPlan:
     expert.reset(problem.initial_state)
     assert expert.plan is not None  # `reset` with a state plans
@@ -117,7 +123,7 @@ def _flight(problem: ArmProblem, expert: RecedingHorizonExpert, world: World, se
     flights, fallbacks, replans, plan_cost = [], 0, 0, 0.0
     for seed in seeds:
         plan_cost = _plan(expert, problem).solution.cost
-        flights.append(fly(problem, lambda x, k: expert(x) * problem.control_upper, world, seed))
+        flights.append(fly(problem, lambda state, stage: expert(state), world, seed))
         fallbacks += expert.fallbacks
         replans += expert.replans
     times = 1e3 * np.concatenate([flight.action_seconds for flight in flights])

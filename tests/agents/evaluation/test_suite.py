@@ -71,6 +71,7 @@ def test_a_scene_that_has_changed_is_refused(content):
         ({"starts": 501}, "starts = 501"),
         ({"limits": {**LIMITS, "success": 2.0}}, "limits.success = 2"),
         ({"conditions": ["storm"]}, "must be one of training"),
+        ({"conditions": ["training", "training"]}, "must stand there once"),
         ({"agents": {"gains": TINY}}, "is the name of a controller"),
         ({"tasks": {"paper": "xyz"}}, "tasks.paper = 'xyz'"),
         ({"color": "red"}, "color"),
@@ -93,6 +94,13 @@ def test_unknown_names_are_refused(content):
         run_suite(["magic"], suite)
     with pytest.raises(SuiteError, match="fits no task, or there is no such file"):
         run_suite(["nowhere/{task}.npz"], suite)
+    for entrants, policies in (
+        (["a=x.npz", "a=y.npz"], {}),
+        (["one/b.yaml", "two/b.yaml"], {}),
+        (["tiny"], {"tiny": still}),
+    ):
+        with pytest.raises(SuiteError, match="two are named"):
+            run_suite(entrants, suite, policies=policies)
     with pytest.raises(ConfigurationError, match=r"algorithm\.name"):
         Suite.model_validate({**content, "agents": {"tiny": {}}}).training(
             "tiny", next(iter(content["tasks"]))
@@ -221,6 +229,10 @@ def test_the_verb_writes_page_and_json_and_tells_a_failed_training(content, cach
     record = json.loads((out / "suite.json").read_text())
     assert len(record["parts"]["tasks"]["scores"]) == 2
     assert "plan with gains" not in (out / "suite.md").read_text()
+    (out / "suite.md").unlink()
+    with pytest.raises(SuiteError, match="is not the JSON file of a suite"):  # before anybody flies
+        CliRunner().invoke(suite_verb, ["tiny", *verb, "--check", str(file)], catch_exceptions=False)
+    assert not (out / "suite.md").exists()
     file.write_text(json.dumps({**content, "agents": {"tiny": broken}}))
     with pytest.raises(ConfigurationError, match="demonstrations"):
         CliRunner().invoke(suite_verb, ["tiny", *verb], catch_exceptions=False)

@@ -172,6 +172,18 @@ def test_a_policy_of_another_configuration_is_not_taken_for_this_training(
     assert "was started with another configuration: network.hidden" in row["failure"]
 
 
+@pytest.mark.slow
+@pytest.mark.agents
+def test_a_clone_is_trained_once(small_file: Path, tmp_path: Path) -> None:
+    """Its folder has the seed of its demonstrations, which the configuration leaves to the run."""
+    pytest.importorskip("torch")
+    content = {"name": "clone", "scene": str(small_file), "demonstrations": {"problems": 2}}
+    algorithm = {"name": "cloning", "optimization": {"updates": 3, "batch_size": 4}, "validate_every": 3}
+    task = training_task(load_configuration({**content, "algorithm": algorithm}), tmp_path)
+    assert task.run()["outcome"] == "trained"
+    assert task.is_trained()
+
+
 def test_progress_is_that_of_all(configuration: AgentConfiguration, tmp_path: Path) -> None:
     overview, task = Overview(4), training_task(configuration, tmp_path)
     assert overview.status().line == "0 of 4 trainings, 0%"

@@ -276,7 +276,7 @@ def test_a_damaged_checkpoint_is_refused(small_file, tmp_path):
     ("changes", "message"),
     [
         ({"crowding": 1.5}, "algorithm.*crowding = 1.5: must be at most 1"),
-        ({"decisions": 1}, "algorithm.*decisions = 1: must be at least 2"),
+        ({"decisions": 2}, "algorithm.*decisions = 2: must be at least 3"),
         ({"copies": 10_000_000}, "algorithm.copies = 10000000: all copies take 400,000,000 decisions"),
     ],
 )
