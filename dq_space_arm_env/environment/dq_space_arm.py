@@ -103,17 +103,25 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     | 32-34 | velocity of the target, as if it reached to the tip                   | -1e12 | 1e12 | m/s  |
     | 35    | time left in the episode                                              | 0    | T   | s     |
 
-    Reaction wheels add their axial momenta after the joint rates, N m s, and their torques after the wrist's rates.
-    Thrusters add their forces at the end; an action below 0 is off, and a pulse shorter than the shortest does not fire.
-    A tank adds the mass of its propellant after the momenta of wheels, kg; when it is empty the thrusters stop.
-    At its largest speed a wheel's torque stops, and a motor takes no more than its power: what then acts is less than the action asks for.
+    Other scenes add entries between the joint rates and the twists, or the time left, in this order:
 
-    Angles and rates of motors behind elastic gears, rad and rad/s, stand after the joint rates, commands on their way
-    and outputs of actuators that lag, `layout.state.drives`, in N, N m, rad/s, after those and the controls before.
-    Where rates of controls are limited, the controls before, those of `layout.previous_controls`, stand after the
-    joint rates, in N, N m, rad/s. In a scene with phases the number of the phase, from 0, is one more entry: before
-    the twists, or the time left. Where other tips have goals, their error dual quaternions follow, with a scalar part of at least 0.
-    `dq-space-arm scenes show SCENE` prints the tables of any scene.
+    | Observation                                                       | where                                          | Unit     |
+    |-------------------------------------------------------------------|------------------------------------------------|----------|
+    | angles, then rates of motors                                      | gears are elastic                              | rad, rad/s |
+    | axial momenta of the wheels                                       | there are reaction wheels                      | N m s    |
+    | mass of the propellant                                            | thrusters have a tank                          | kg       |
+    | controls before, `layout.previous_controls`                       | their rates are limited                        | N, N m, rad/s |
+    | commands on their way, outputs, `layout.state.drives`             | actuators act late, or lag                     | N, N m, rad/s |
+    | number of the phase, from 0                                       | there are phases                               |          |
+    | pose of the target, q_{D/I}                                       | `target.observed`                              | 1, m     |
+    | masses, relative change                                           | `spread.observed`                              |          |
+    | error dual quaternions of other tips, scalar part at least 0      | they have goals                                | 1, m     |
+    | margins of constraints, tanh(-c / scale)                          | constraints have `observed`                    |          |
+
+    Actions follow in this order: base force, base torque, joint torques, wrist rates, torques of wheels, forces of thrusters. An action below 0
+    turns a thruster off, and a pulse shorter than the shortest does not fire; when the tank is empty the thrusters stop. At its largest speed a wheel's
+    torque stops, and a motor takes no more than its power: what then acts is less than the action asks for. `dq-space-arm scenes show SCENE` prints the
+    tables of any scene.
 
     ## Rewards
 
@@ -144,7 +152,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
 
     Where a scene has constraints, `info["constraints"]` has every residual by its name, which is at most 0 where the constraint holds, of the state after
     the step and of the input, and `info["cost"]` the sum of their violations, each over its tolerance (the convention of safe reinforcement learning; the
-    reward is without). What is exact at the end is charged there. The margins that a scene asks for stand in the observation after the phase, as tanh(-c / scale).
+    reward is without). What is exact at the end is charged there.
 
     ## Starting State
 
@@ -190,6 +198,9 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     ## Vectorized environment
 
     `DQSpaceArmVectorEnv` steps many sub-environments with one call of vectorized machine code, bit-equal to single environments with the same seeds.
+    After the end of an episode the next step resets (`autoreset_mode="NextStep"`), or the same step (`"SameStep"`, with `final_obs` and `final_info`), or the
+    caller (`"Disabled"`). `reset(seed=s)` seeds copy i with s + i; `options={"reset_mask": mask}` resets some, and `initial_state`, `target` and `parameters`
+    may have a row for each. `truncated` is always false; `max_episode_steps` is refused: set `simulation.steps`. `perturb(increments)` pushes the states.
 
     ```python
     >>> venv = gymnasium.make_vec("DQSpaceArm-v0", num_envs=3)

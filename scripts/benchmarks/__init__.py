@@ -11,4 +11,6 @@ scene_cost       cost of scenes, their parts, outputs, processes and the install
 solvers          cost gap of the expert against seconds
 throughput       states and environment steps per second
 rendering        pictures per second
+basilisk         the same motion in Basilisk; optional
+devices          the step in JAX, on a processor and a GPU; optional
 """

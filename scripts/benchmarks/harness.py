@@ -180,7 +180,7 @@ _CLAIMS_TABLE = Table(
 
 
 def collect(benchmark: Benchmark, effort: Effort, console: Console) -> tuple[list[Row], bool]:
-    """Measure; an interrupt keeps the rows so far, and is the second result."""
+    """Measure; an interrupt keeps the rows so far, and is the second result. An error is a failed claim."""
     rows: list[Row] = []
     with console.status(f"Measuring: {benchmark.name}") as status:
         try:
@@ -191,6 +191,14 @@ def collect(benchmark: Benchmark, effort: Effort, console: Console) -> tuple[lis
         except KeyboardInterrupt:
             console.print("Interrupted: the measurements so far are saved.")
             return rows, True
+        except Exception as error:
+            if not rows:
+                raise  # nothing is lost: unusable input, a missing package
+            console.print_exception()
+            sentence = f"ended by {type(error).__name__}: {error}"
+            rows.append(
+                claim("run", "to the end", benchmark.name, None, None, note=sentence, status=Status.FAILED)
+            )
     return rows, False
 
 

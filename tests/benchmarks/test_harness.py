@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, UNUSABLE
+from dq_space_arm_env.common.files import json_value
 from scripts.benchmarks import __main__ as command
 from scripts.benchmarks.effort import QUICK, STANDARD, Effort, Sampling
 from scripts.benchmarks.harness import Benchmark, Picture, Row, Status, Table, claim, note, run, section_of
@@ -24,11 +25,11 @@ def test_a_claim_holds_up_to_its_bound(error: float, status: str) -> None:
     assert claim("group", "name", "subject", error, 1.0)["status"] == status
 
 
-def benchmark(rows: list[Row], *, interrupt: bool = False) -> Benchmark:
+def benchmark(rows: list[Row], *, ends: BaseException | None = None) -> Benchmark:
     def measure(effort: Effort) -> Iterator[Row]:
         yield from rows
-        if interrupt:
-            raise KeyboardInterrupt
+        if ends is not None:
+            raise ends
 
     times = Table("times", "Times, {engine}\nin ns", ("way", "ns"), by=("engine",))
     plot: dict[str, Any] = {"x": "ns", "y": "ns", "color": "way"}
@@ -59,18 +60,23 @@ def test_a_section_has_a_table_for_each_value_and_sentences_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rows", "interrupt", "expected"),
+    ("rows", "ends", "expected"),
     [
-        (ROWS, False, SUCCESS),
-        ([*ROWS, claim("g", "bad", "s", 2.0, 1.0)], False, FAILURE),
-        (ROWS, True, INTERRUPTED),
+        (ROWS, None, SUCCESS),
+        ([*ROWS, claim("g", "bad", "s", 2.0, 1.0)], None, FAILURE),
+        (ROWS, KeyboardInterrupt(), INTERRUPTED),
+        (ROWS, ZeroDivisionError("no mass"), FAILURE),
     ],
 )
-def test_files_and_exit_status(tmp_path: Path, rows: list[Row], interrupt: bool, expected: int) -> None:
+def test_files_and_exit_status(
+    tmp_path: Path, rows: list[Row], ends: BaseException | None, expected: int
+) -> None:
     console = Console(file=StringIO(), width=120)
-    assert run([benchmark(rows, interrupt=interrupt)], QUICK, tmp_path, console) == expected
+    assert run([benchmark(rows, ends=ends)], QUICK, tmp_path, console) == expected
     found = json.loads((tmp_path / "made_up.json").read_text(encoding="utf-8"))
-    assert len(found["rows"]) == len(rows)
+    assert found["rows"][: len(rows)] == json_value(rows)
+    added = [row["note"] for row in found["rows"][len(rows) :]]
+    assert added == (["ended by ZeroDivisionError: no mass"] if isinstance(ends, ZeroDivisionError) else [])
     assert found["effort"]["name"] == "quick"
     assert found["machine"]["processor_name"]
     assert "Made up" in (tmp_path / "report.html").read_text(encoding="utf-8")

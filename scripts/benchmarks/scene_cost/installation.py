@@ -19,7 +19,7 @@ from scripts.benchmarks.harness import Row
 
 NAME = "dq-space-arm"
 BASE = ""  # the extra of the base
-_SOURCES = ("agents", "configs/agents", "configs/scenes", "dq_space_arm_env", "experts")
+_SOURCES = ("agents", "configs", "dq_space_arm_env", "experts")
 
 
 def installation_rows() -> Iterator[Row]:

@@ -70,7 +70,7 @@ def cases() -> Iterator[Case]:
             GROUP, f"{text} in u_init", "expert", "refused, naming u_init", partial(_expert_controls, number)
         )
     yield Case(GROUP, "NaN in each entry of an action", "environment, step", "refused", _nan_action)
-    criterion = "refused, naming the copy, or this copy diverged and the others untouched"
+    criterion = "refused, naming the copy"
     title = "NaN in an action of one copy"
     yield Case(GROUP, title, "vector environment, step", criterion, _nan_action_of_one_copy, 0.0, "copies")
     criterion = "clipped to the limits: the bits of an action of 1 or -1"
@@ -222,10 +222,13 @@ def _begun() -> DQSpaceArmEnv:
 
 def _nan_action(effort: Effort) -> Outcome:
     attempts: list[Callable[[], object]] = []
-    for entry in range(compile_scene("paper").n_u):
-        action = np.zeros(compile_scene("paper").n_u)
-        action[entry] = np.nan
-        attempts.append(partial(_begun().step, action))
+    for scene in ("paper", "wheels", "thrusters"):
+        env = DQSpaceArmEnv(scene)
+        env.reset(options={"nominal": True})
+        for entry in range(env.kernels.n_u):
+            action = np.zeros(env.kernels.n_u)
+            action[entry] = np.nan
+            attempts.append(partial(env.step, action))
     return _all_refused(attempts, "action")
 
 
@@ -234,7 +237,7 @@ def _nan_action_of_one_copy(effort: Effort) -> Outcome:
     env.reset(options={"nominal": True})
     actions = np.zeros(env.action_space.shape or ())
     actions[2, 3] = np.nan
-    return refusal(lambda: env.step(actions), naming="action")
+    return refusal(lambda: env.step(actions), naming="sub-environments [2]")
 
 
 def _infinite_action(effort: Effort) -> Outcome:

@@ -8,10 +8,12 @@ else *failed*: a larger error, a number that is not finite, a missing refusal, a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import cast
+
+import numpy as np
 
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, Status, claim
@@ -45,6 +47,16 @@ class NotClaimed:
 
 
 Outcome = Handled | Refused | NotClaimed
+
+
+def largest(*errors: float) -> float:
+    """The largest error; NaN if there is one, over which `max` would pass."""
+    return float(np.max(errors))
+
+
+def worst_point(curve: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """The point of a curve with the largest error; the first with NaN, if there is one."""
+    return curve[int(np.argmax([error for _, error in curve]))]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.scene import INTEGRATORS
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.stability.cases import Case, Handled, Outcome
+from scripts.benchmarks.stability.cases import Case, Handled, Outcome, largest
 from scripts.benchmarks.stability.motions import REDUCED
 from scripts.benchmarks.stability.scenes import PRECISIONS, applied, paper, rounded, walk, with_simulation
 from scripts.benchmarks.stability.time_steps import UNIT, moving_start, unit_error
@@ -128,5 +128,5 @@ def _half_turn(integrator: str, precision: str, effort: Effort) -> Outcome:
         end = walk(kernels, x, np.zeros((1, kernels.n_u)), 0.015, integrator)[-1][where.pose]
         half = np.zeros(8)
         half[1 + axis] = 1.0
-        worst = max(worst, float(np.abs(end.astype(np.float64) - half).max()))
+        worst = largest(worst, float(np.abs(end.astype(np.float64) - half).max()))
     return Handled(worst)

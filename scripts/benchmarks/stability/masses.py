@@ -9,7 +9,16 @@ import numpy as np
 
 from dq_space_arm_env import Scene, load_scene
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome, Refused, refusal
+from scripts.benchmarks.stability.cases import (
+    Case,
+    Handled,
+    NotClaimed,
+    Outcome,
+    Refused,
+    largest,
+    refusal,
+    worst_point,
+)
 from scripts.benchmarks.stability.references import (
     FORMULATIONS,
     MINIMAL,
@@ -86,9 +95,11 @@ def _light_base(effort: Effort) -> Outcome:
     found = [
         (
             ratio,
-            max(
-                judge(sample, MINIMAL_SINGLE).forward
-                for sample in samples(with_mass_ratio(ratio), effort.samples)
+            largest(
+                *(
+                    judge(sample, MINIMAL_SINGLE).forward
+                    for sample in samples(with_mass_ratio(ratio), effort.samples)
+                )
             ),
         )
         for ratio in light
@@ -144,7 +155,9 @@ def _with_heavy_payload() -> Scene:
 
 def _forward(scene: Callable[[], Scene], formulation: str, effort: Effort) -> Outcome:
     found = [judge(sample, formulation) for sample in samples(scene(), effort.samples)]
-    return Handled(max(e.forward for e in found), f"backward error {max(e.backward for e in found):.1e}")
+    return Handled(
+        largest(*(e.forward for e in found)), f"backward error {max(e.backward for e in found):.1e}"
+    )
 
 
 def samples(scene: Scene, count: int, scale: float = 1.0) -> list[Sample]:
@@ -175,24 +188,24 @@ def _ratios(formulation: str, measure: str, effort: Effort) -> Outcome:
     curve, claimed, by_norm = [], [], 0.0
     for ratio in effort.mass_ratios:
         found = [judge(sample, formulation) for sample in samples(with_mass_ratio(ratio), effort.samples)]
-        worst = max(e.by_row if measure == BACKWARD else e.forward for e in found)
-        by_norm = max(by_norm, *(e.backward for e in found))
+        worst = largest(*(e.by_row if measure == BACKWARD else e.forward for e in found))
+        by_norm = largest(by_norm, *(e.backward for e in found))
         curve.append((ratio, worst))
         if measure == BACKWARD or ratio >= SMALLEST_RATIO.get(formulation, 0.0):
             claimed.append(worst)
-    ratio, worst = max(curve, key=lambda point: point[1])
+    ratio, worst = worst_point(curve)
     note = f"worst at a ratio of {ratio:g}: {worst:.1e}"
     if measure == BACKWARD:
         note += f"; in norms {by_norm:.1e}"
         if not by_norm < BACKWARD_BOUND * ROUNDING.get(formulation, 1.0):
             return Handled(np.inf, note, tuple(curve))
-    return Handled(max(claimed), note, tuple(curve))
+    return Handled(largest(*claimed), note, tuple(curve))
 
 
 def _inertias(scene: Callable[[], Scene], formulation: str, effort: Effort) -> Outcome:
     found = [judge(sample, formulation) for sample in samples(scene(), effort.samples)]
-    forward = max(e.forward for e in found)
-    return Handled(max(e.by_row for e in found), f"forward error {forward:.1e}")
+    forward = largest(*(e.forward for e in found))
+    return Handled(largest(*(e.by_row for e in found)), f"forward error {forward:.1e}")
 
 
 def _refusals() -> Iterator[Case]:

@@ -16,7 +16,7 @@ from experts.guesses.screw_motion import screw_motion
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome
+from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome, largest, worst_point
 from scripts.benchmarks.stability.masses import BACKWARD_BOUND, ROUNDING, judge
 from scripts.benchmarks.stability.references import DIGITS, FORMULATIONS, Sample, column, turn
 from scripts.benchmarks.stability.scenes import paper, random_state, with_links
@@ -84,7 +84,7 @@ def _fast(formulation: str, effort: Effort) -> Outcome:
         x[where.angular_velocity] = 100.0 * spin / np.linalg.norm(spin)
         x[where.joint_rates] = rates
         found = judge(Sample.of(kernels.scene, x, rng.normal(size=kernels.n_u)), formulation)
-        worst, residual = max(worst, found.forward), max(residual, found.by_row)
+        worst, residual = largest(worst, found.forward), largest(residual, found.by_row)
     return Handled(worst, f"row-wise backward error {residual:.1e}")
 
 
@@ -96,7 +96,7 @@ def _configuration(formulation: str, angles: tuple[float, ...], effort: Effort) 
         x = random_state(kernels, rng)
         x[kernels.layout.state.joint_angles] = angles
         found = judge(Sample.of(kernels.scene, x, rng.normal(size=kernels.n_u)), formulation)
-        worst, forward = max(worst, found.by_row), max(forward, found.forward)
+        worst, forward = largest(worst, found.by_row), largest(forward, found.forward)
     return Handled(worst, f"forward error {forward:.1e}")
 
 
@@ -107,7 +107,7 @@ def _passive(formulation: str, effort: Effort) -> Outcome:
         rng = np.random.default_rng(seed)
         sample = Sample.of(scene, random_state(kernels, rng), rng.normal(size=kernels.n_u))
         found = judge(sample, formulation)
-        worst, forward = max(worst, found.by_row), max(forward, found.forward)
+        worst, forward = largest(worst, found.by_row), largest(forward, found.forward)
     return Handled(worst, f"forward error {forward:.1e}")
 
 
@@ -140,7 +140,7 @@ def _gimbal_lock(theta: float, effort: Effort) -> Outcome:
         x[where.wrist_angles.start + 1] = theta
         exact = _tip_rotation(x[where.joint_angles], x[where.wrist_angles])
         found, _ = poses.to_matrix(tuple(kernels.tip_pose(x).tolist()))
-        worst = max(worst, float(np.abs(np.array(found) - exact).max()))
+        worst = largest(worst, float(np.abs(np.array(found) - exact).max()))
         u = kernels.layout.control_limit * rng.uniform(-1.0, 1.0, kernels.n_u)
         for result in (kernels.step(x, u), *kernels.linearize(x, u)):
             worst = worst if np.isfinite(result).all() else np.inf
@@ -158,7 +158,7 @@ def _guess_at_gimbal_lock(theta: float, effort: Effort) -> Outcome:
             return Handled(np.inf, "the guess is not finite")
         if isinstance(array, np.ndarray) and array.shape == (problem.horizon, problem.n_controls):
             outside = float(np.max(np.abs(array) - problem.control_upper))
-    return Handled(max(outside, 0.0))
+    return Handled(largest(outside, 0.0))
 
 
 def _rotation_errors(precision: str, batch: bool, angles: tuple[float, ...]) -> list[tuple[float, float]]:
@@ -177,19 +177,19 @@ def _rotation_errors(precision: str, batch: bool, angles: tuple[float, ...]) -> 
         for x, tip in zip(states.astype(np.float64), tips.astype(np.float64), strict=True):
             exact = _tip_rotation(x[where.joint_angles], x[where.wrist_angles])
             found, _ = poses.to_matrix(tuple(tip.tolist()))
-            worst = max(worst, float(np.abs(np.array(found) - exact).max()))
+            worst = largest(worst, float(np.abs(np.array(found) - exact).max()))
         curve.append((size, worst / float(np.finfo(kernels.dtype).eps)))
     return curve
 
 
 def _wound(precision: str, batch: bool, effort: Effort) -> Outcome:
     curve = _rotation_errors(precision, batch, tuple(t for t in _TURNS if t <= REDUCED[precision]))
-    return Handled(max(error for _, error in curve), curve=tuple(curve))
+    return Handled(worst_point(curve)[1], curve=tuple(curve))
 
 
 def _beyond_single(effort: Effort) -> Outcome:
     curve = _rotation_errors("float32", True, tuple(t for t in _TURNS if t > REDUCED["float32"]))
-    size, error = max(curve, key=lambda point: point[1])
+    size, error = worst_point(curve)
     if not np.isfinite(error):
         return Handled(error)
     return NotClaimed(

@@ -14,7 +14,7 @@ import numpy as np
 
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome
+from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome, worst_point
 from scripts.benchmarks.stability.scenes import paper, walk
 from scripts.benchmarks.stability.time_steps import TIME_STEPS, moving_start
 from scripts.benchmarks.work_precision.methods import PAPER, PROJECTED, Method, Walk
@@ -73,7 +73,7 @@ def _local_errors(name: str, effort: Effort) -> Outcome:
         fine = walk(kernels, x, np.tile(u, (_FINE, 1)), dt / _FINE, "rk4")[-1]
         bound = 30.0 * dt ** (_ORDER + 1) + 1000.0 * float(np.finfo(np.float64).eps)
         curve.append((dt, _apart(_end(name, x, u[None], dt), fine) / bound))
-    worst, error = max(curve, key=lambda point: point[1])
+    worst, error = worst_point(curve)
     return Handled(error, f"most at dt = {worst:g} s", tuple(curve))
 
 
@@ -111,4 +111,4 @@ def _free_motion(name: str, effort: Effort) -> Outcome:
             kept = f"the momentum drifts by {curve[-1][1]:.2g} in {curve[-1][0]:.0e} steps"
             return NotClaimed(f"{kept}; claimed are {claimed:.0e}", tuple(curve))
         curve.append((float(steps), drift if np.isfinite(drift) else np.inf))
-    return Handled(max(drift for _, drift in curve), f"{curve[-1][0]:.0e} steps", tuple(curve))
+    return Handled(worst_point(curve)[1], f"{curve[-1][0]:.0e} steps", tuple(curve))

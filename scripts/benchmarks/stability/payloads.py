@@ -16,7 +16,7 @@ from dq_space_arm_env.kernels.capture import catch_payload
 from dq_space_arm_env.scene import Payload
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.stability.cases import Case, Handled, Outcome, refusal
+from scripts.benchmarks.stability.cases import Case, Handled, Outcome, largest, refusal
 from scripts.benchmarks.stability.scenes import random_state
 
 GROUP = "payloads"
@@ -104,7 +104,7 @@ def _difference(before: list[Momentum], after: list[Momentum]) -> float:
     for part in Momentum._fields:
         terms = [getattr(momentum, part) for momentum in before]
         change = sum(terms) - sum(getattr(momentum, part) for momentum in after)
-        worst = max(worst, float(np.abs(change).max() / max(np.abs(term).max() for term in terms)))
+        worst = largest(worst, float(np.abs(change).max() / max(np.abs(term).max() for term in terms)))
     return worst
 
 
@@ -118,7 +118,7 @@ def _caught(factor: float, effort: Effort) -> Outcome:
         x, twist = random_state(free, rng), rng.normal(size=6)
         after = catch_payload(free, loaded, x, twist)
         before = [_of_robot(free, x), _of_payload(payload, free.tip_pose(x), twist)]
-        worst = max(worst, _difference(before, [_of_robot(loaded, after)]))
+        worst = largest(worst, _difference(before, [_of_robot(loaded, after)]))
         energy = free.energy(x) + _energy(payload, twist)
         if loaded.energy(after) > energy * (1.0 + 1e-12):
             return Handled(np.inf, f"energy grows from {energy:.6g} J to {loaded.energy(after):.6g} J")
@@ -146,7 +146,7 @@ def _released(factor: float, effort: Effort) -> Outcome:
     for seed in range(effort.samples):
         x = random_state(free, np.random.default_rng(seed))
         after = [_of_robot(free, x), _of_payload(payload, free.tip_pose(x), _tip_twist(free, x))]
-        worst = max(worst, _difference([_of_robot(loaded, x)], after))
+        worst = largest(worst, _difference([_of_robot(loaded, x)], after))
     return Handled(worst)
 
 

@@ -17,7 +17,7 @@ from experts.guesses.screw_motion import screw_motion
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.stability.cases import Case, Handled, Outcome, refusal
+from scripts.benchmarks.stability.cases import Case, Handled, Outcome, largest, refusal, worst_point
 from scripts.benchmarks.stability.scenes import PRECISIONS, applied, paper, walk
 from scripts.benchmarks.stability.time_steps import moving_start, unit_error
 
@@ -73,7 +73,7 @@ def _return_to_manifold(integrator: str, precision: str, effort: Effort) -> Outc
     for deviation in DEVIATIONS:
         x = _disturbed(moving_start(kernels), deviation)
         curve.append((deviation, unit_error(walk(kernels, x, still, dt, integrator)[-1:])))
-    deviation, error = max(curve, key=lambda point: point[1])
+    deviation, error = worst_point(curve)
     return Handled(error, f"most after {deviation:g}", tuple(curve))
 
 
@@ -131,7 +131,7 @@ def _difference(axis: int, effort: Effort) -> Outcome:
     again = kernels.retract(x, back)
     # q and -q are one pose.
     apart = min(float(np.abs(again - half).max()), float(np.abs(again[:8] + half[:8]).max()))
-    return Handled(max(abs(float(np.linalg.norm(back)) - np.pi), apart))
+    return Handled(largest(abs(float(np.linalg.norm(back)) - np.pi), apart))
 
 
 def _guess(axis: int, effort: Effort) -> Outcome:

@@ -14,7 +14,7 @@ import numpy as np
 from dq_space_arm_env import Scene
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome
+from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome, largest, worst_point
 from scripts.benchmarks.stability.free_bodies import Solution, free_bodies
 from scripts.benchmarks.stability.masses import samples
 from scripts.benchmarks.stability.scenes import random_arm
@@ -53,14 +53,14 @@ def _case(name: str, subject: str, bound: float, run: Callable[[Effort], Outcome
 def wrench_error(found: FloatArray, exact: Solution) -> float:
     """Largest error of a reaction wrench, relative to the largest component of its force or torque."""
     found, right = found.reshape(-1, 5), exact.reactions[:, :5]
-    return max(_relative(found[:, part], right[:, part]) for part in (slice(0, 3), slice(3, 5)))
+    return largest(*(_relative(found[:, part], right[:, part]) for part in (slice(0, 3), slice(3, 5))))
 
 
 def acceleration_error(found: FloatArray, exact: Solution) -> float:
     """Largest error of the base's angular or linear acceleration, or of a joint's, relative to its size."""
     right = exact.accelerations
     base = _relative(found[:6].reshape(2, 3), right[:6].reshape(2, 3))
-    return max(base, _relative(found[6:, None], right[6:, None]))
+    return largest(base, _relative(found[6:, None], right[6:, None]))
 
 
 def _relative(found: FloatArray, right: FloatArray) -> float:
@@ -76,7 +76,7 @@ def _worst(scene: Scene, subject: str, count: int) -> float:
             errors.append(wrench_error(sample.kernels.reaction_wrenches(*given), exact))
         else:
             errors.append(acceleration_error(sample.kernels.forward_dynamics(*given), exact))
-    return max(errors)
+    return largest(*errors)
 
 
 def _ratios(joints: int, subject: str, effort: Effort) -> Outcome:
@@ -85,8 +85,8 @@ def _ratios(joints: int, subject: str, effort: Effort) -> Outcome:
     for seed, root in enumerate(effort.mass_ratios):
         ratio = min(max(root**2, LIGHTEST), 1.0 / LIGHTEST)
         scene = random_arm([ratio, *[1.0 / joints] * joints], seed)
-        found.append((_worst(scene, subject, -(-effort.samples // joints)), ratio))
-    error, ratio = max(found)
+        found.append((ratio, _worst(scene, subject, -(-effort.samples // joints))))
+    ratio, error = worst_point(found)
     return Handled(error, f"worst at a ratio of {ratio:g}")
 
 

@@ -178,7 +178,7 @@ def errors(system: LinearSystem, motion: Motion, found: FloatArray) -> Errors:
             terms[3 + axis] = abs(mpf(found[3 + axis])) + abs(turning[axis])
         sizes = _absolute(matrix) * terms + system.sizes
         backward = float(mpmath.norm(residual, mpmath.inf) / scale) if scale else 0.0
-        by_row = max(float(abs(residual[i]) / sizes[i]) if sizes[i] else 0.0 for i in range(size))
+        by_row = np.max([float(abs(residual[i]) / sizes[i]) if sizes[i] else 0.0 for i in range(size)])
     largest = float(np.abs(exact).max())
     forward = float(np.abs(found - exact).max()) / largest if largest else 0.0
     return Errors(backward, by_row, forward)

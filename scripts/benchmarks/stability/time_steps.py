@@ -13,7 +13,7 @@ from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.scene import INTEGRATORS
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
-from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome
+from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed, Outcome, largest, worst_point
 from scripts.benchmarks.stability.scenes import PRECISIONS, applied, paper, rounded, walk
 from scripts.benchmarks.work_precision.many_digits import torque_free_motion
 from scripts.benchmarks.work_precision.motions import body_scene
@@ -97,7 +97,7 @@ def unit_error(states: FloatArray) -> float:
     real, dual = states[:, :4], states[:, 4:8]
     norm = np.abs(np.linalg.norm(real, axis=1) - 1.0).max()
     overlap = np.abs((real * dual).sum(axis=1)) / (1.0 + np.linalg.norm(dual, axis=1))
-    return float(max(norm, overlap.max()))
+    return largest(norm, overlap.max())
 
 
 def moving_start(kernels: Kernels, rate: float = 0.2) -> FloatArray:
@@ -119,7 +119,7 @@ def _local_errors(integrator: str, precision: str, effort: Effort) -> Outcome:
         error = float(np.abs(exact.difference(fine, found)).max())
         # The many small steps of the reference round too.
         curve.append((dt, error / (30.0 * dt ** (order + 1) + 1000.0 * float(np.finfo(precision).eps))))
-    worst, error = max(curve, key=lambda point: point[1])
+    worst, error = worst_point(curve)
     return Handled(error, f"most at dt = {worst:g} s", tuple(curve))
 
 
@@ -134,8 +134,8 @@ def _free_motion(integrator: str, precision: str, effort: Effort) -> Outcome:
     for done in range(_CHUNK, max(effort.steps, _CHUNK) + 1, _CHUNK):
         states = walk(kernels, x, still, kernels.scene.simulation.dt, integrator)
         x = states[-1].astype(np.float64)
-        unit = max(unit, unit_error(states[:: _CHUNK // 10]))
-        drift = max(drift, float((np.abs(exact.momentum(x) - first) / sizes).max()))
+        unit = largest(unit, unit_error(states[:: _CHUNK // 10]))
+        drift = largest(drift, float((np.abs(exact.momentum(x) - first) / sizes).max()))
         lost = unit > UNIT[precision] or not drift <= bound
         if lost and done > claimed:
             before = f"the momentum drifts by {curve[-1][1]:.2g} in {curve[-1][0]:.0e} steps"

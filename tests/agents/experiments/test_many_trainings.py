@@ -177,10 +177,12 @@ def test_a_policy_of_another_configuration_is_not_taken_for_this_training(
 def test_a_clone_is_trained_once(small_file: Path, tmp_path: Path) -> None:
     """Its folder has the seed of its demonstrations, which the configuration leaves to the run."""
     pytest.importorskip("torch")
-    content = {"name": "clone", "scene": str(small_file), "demonstrations": {"problems": 2}}
+    content = {"name": "clone", "scene": str(small_file), "demonstrations": {"problems": 4}}
     algorithm = {"name": "cloning", "optimization": {"updates": 3, "batch_size": 4}, "validate_every": 3}
     task = training_task(load_configuration({**content, "algorithm": algorithm}), tmp_path)
-    assert task.run()["outcome"] == "trained"
+    task.folder.mkdir()
+    row = task.run()
+    assert row["outcome"] == "trained", row["failure"]
     assert task.is_trained()
 
 

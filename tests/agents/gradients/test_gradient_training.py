@@ -260,6 +260,17 @@ def test_training_starts_from_a_policy(small_file, tmp_path):
         train_by_gradients(settings(small_file).model_copy(update=wider), tmp_path / "third")
 
 
+def test_normalization_is_that_of_the_checkpoint(small_file, tmp_path, monkeypatch):
+    """Weights belong to it; the policy that a training starts from may have been trained anew since."""
+    first = resume_after(10, settings(small_file, updates=20), tmp_path, monkeypatch).policy
+    other = first.mean + 1.0, 2.0 * first.scale
+    monkeypatch.setattr(gradient_training._Learner, "_normalization", lambda *arguments: other)
+    (tmp_path / "policy.npz").unlink()
+    again = train_by_gradients(settings(small_file, updates=20), tmp_path).policy
+    np.testing.assert_array_equal(again.mean, first.mean)
+    np.testing.assert_array_equal(again.scale, first.scale)
+
+
 def trained_curve(folder):
     return RunFolder(folder, load_configuration(folder / "config.yaml")).evaluations()
 
