@@ -11,8 +11,9 @@ from experts.ddp.shooting import ShootingWorkspace
 from experts.ddp.solution import Policy, Solution, StopReason
 from experts.guesses.guided import GuidedDDP
 from experts.guesses.policies import follow
-from experts.problems.arm_problem import ArmProblem, WindowProblem
+from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
+from experts.problems.window_problem import WindowProblem
 
 
 @dataclass(frozen=True, eq=False)

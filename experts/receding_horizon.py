@@ -27,8 +27,9 @@ from experts.ddp.solution import Solution
 from experts.guesses.guided import RESERVE, GuidedDDP
 from experts.identification import ModelWatch
 from experts.maneuver_plan import ManeuverPlan
-from experts.problems.arm_problem import ArmProblem, WindowProblem, as_problem
+from experts.problems.arm_problem import ArmProblem, as_problem
 from experts.problems.shooting_problem import FloatArray, check_array, check_at_least, stage_bounds
+from experts.problems.window_problem import WindowProblem
 
 PREDICTIONS = 40
 """Predictions in an episode of where the plan's policy ends."""

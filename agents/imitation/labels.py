@@ -12,8 +12,9 @@ from experts.ddp.box_ddp import BoxDDP
 from experts.demonstrations import Demonstrations, DemonstrationsError
 from experts.demonstrations.reading import Demonstration
 from experts.guesses.guided import NEAR_REGULARIZATION, RESERVE
-from experts.problems.arm_problem import ArmProblem, WindowProblem
+from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
+from experts.problems.window_problem import WindowProblem
 
 
 def label_by_gains(demonstrations: Demonstrations, visits: Rollout) -> Corrections:

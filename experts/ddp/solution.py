@@ -240,6 +240,7 @@ class Solution:
             raise ValueError(f"{where} is not a solution: it lacks {', '.join(sorted(missing))}")
         facts = parse_json(str(found.pop("facts")), f"{where}: facts")
         _check(found, facts, where)
+        report = facts.get("constraints")
         return cls(
             **found,
             cost=facts["cost"],
@@ -248,7 +249,7 @@ class Solution:
             optimality=facts["optimality"],
             iterations=facts["iterations"],
             metadata=facts["metadata"],
-            constraints=ConstraintReport(**facts["constraints"]) if "constraints" in facts else None,
+            constraints=None if report is None else ConstraintReport(**report),
         )
 
 
@@ -277,12 +278,18 @@ def _check(arrays: Mapping[str, NDArray[Any]], facts: Any, where: str) -> None:
         raise ValueError(
             f"{where}: facts: stop_reason is {shortened(facts['stop_reason'])}, it should be one of {reasons}"
         )
+    report = facts.get("constraints")
+    if report is not None and (not isinstance(report, dict) or set(report) != set(ConstraintReport._fields)):
+        wanted = ", ".join(ConstraintReport._fields)
+        raise ValueError(f"{where}: facts: constraints is {shortened(report)}, it should have {wanted}")
     steps, axes = (
         len(np.atleast_1d(arrays["controls"])),
-        {"states": 2, "controls": 2, "feedback_gains": 3, "parameters": 2},
+        {"states": 2, "controls": 2, "feedback_gains": 3, "parameters": 2, "multipliers": 2},
     )
     for name, count in axes.items():
-        array, rows = arrays[name], steps + (name in ("states", "parameters"))
+        if name in _OPTIONAL_ARRAYS and name not in arrays:
+            continue
+        array, rows = arrays[name], steps + (name not in ("controls", "feedback_gains"))
         if array.ndim != count or array.dtype.kind not in "iuf" or len(array) != rows:
             raise ValueError(
                 f"{where}: {name} has shape {array.shape} of {array.dtype}, it should have {count} axes of "

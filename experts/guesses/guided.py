@@ -34,8 +34,9 @@ from experts.guesses.other_side import other_side
 from experts.guesses.policies import coarsened, follow, refined, track
 from experts.guesses.preparation import Preparation, keep_preparation, preparation_key, read_preparation
 from experts.guesses.screw_motion import screw_motion as guess_screw_motion
-from experts.problems.arm_problem import ArmProblem, WindowProblem
+from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array, check_at_least
+from experts.problems.window_problem import WindowProblem
 
 START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
 """First regularizations of solves of the initial state from zero controls; the cheapest solution is kept."""

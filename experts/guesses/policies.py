@@ -8,8 +8,9 @@ from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
 from experts.ddp.rollout import FINISHED, Trajectory
 from experts.ddp.shooting import ShootingWorkspace
 from experts.ddp.solution import Solution
-from experts.problems.arm_problem import ArmProblem, WindowProblem
+from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array, stage_bounds
+from experts.problems.window_problem import WindowProblem
 
 
 def policies(solution: Solution, problem: ShootingProblem) -> dict[str, Solution]:

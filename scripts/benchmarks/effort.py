@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
@@ -91,11 +92,13 @@ class Effort:
             old = known[name]
             if isinstance(old, tuple):
                 items = value if isinstance(value, list) else [value]
+                if isinstance(old, Sampling) and len(items) != len(old):
+                    raise ValueError(f"setting {name}: {value!r} must be {len(old)} numbers")
                 value = Sampling(*items) if isinstance(old, Sampling) else tuple(items)
             if not isinstance(value, type(old)) and not (isinstance(old, float) and isinstance(value, int)):
                 raise ValueError(f"setting {name}: {value!r} must be of type {type(old).__name__}")
-            if isinstance(value, int) and value < 0:
-                raise ValueError(f"setting {name}: {value}, must not be negative")
+            if isinstance(value, int | float) and not 0 <= value < math.inf:
+                raise ValueError(f"setting {name}: {value}, must be finite and not negative")
             changes[name] = value
         return replace(self, **changes)
 

@@ -91,7 +91,20 @@ def test_settings_override_the_effort() -> None:
     assert STANDARD.changed(("kernel_timing=[3, 0.1]",)).kernel_timing == Sampling(3, 0.1)
 
 
-@pytest.mark.parametrize("setting", ["starts", "start=3", "starts=many", "starts=-1", "peers=3", "only=["])
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "starts",
+        "start=3",
+        "starts=many",
+        "starts=-1",
+        "duration=-1.0",
+        "duration=.nan",
+        "kernel_timing=[1]",
+        "peers=3",
+        "only=[",
+    ],
+)
 def test_a_wrong_setting_is_named(setting: str) -> None:
     with pytest.raises(ValueError, match=f"setting '?{setting.partition('=')[0]}"):
         STANDARD.changed((setting,))

@@ -10,7 +10,8 @@ from dq_space_arm_env.scene import StateLayout
 from experts import BoxDDP, GuidedDDP, RecedingHorizonExpert
 from experts.guesses.guided import RESERVE
 from experts.maneuver_plan import ManeuverPlan, _convex_part
-from experts.problems.arm_problem import ArmProblem, WindowProblem
+from experts.problems.arm_problem import ArmProblem
+from experts.problems.window_problem import WindowProblem
 
 SCENES = ("paper", "payload")
 

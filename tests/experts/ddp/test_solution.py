@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,26 @@ def test_other_files_are_not_taken_for_solutions(tmp_path):
     np.savez(tmp_path / "other.npz", states=np.zeros(3))
     with pytest.raises(ValueError, match="lacks controls, facts, feedback_gains, history"):
         Solution.load(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"multipliers": np.zeros(3)}, "multipliers has shape"),
+        ({"multipliers": np.zeros((2, 2))}, "multipliers has shape"),
+        ({"constraints": {"color": 1.0}}, "constraints is .* it should have"),
+        ({"constraints": 3}, "constraints is 3, it should have"),
+    ],
+)
+def test_wrong_constraints_of_a_file_are_named(solution, tmp_path, changes, message):
+    solution.save(tmp_path / "solution.npz")
+    arrays = dict(np.load(tmp_path / "solution.npz"))
+    facts = json.loads(str(arrays["facts"]))
+    facts |= {name: value for name, value in changes.items() if name == "constraints"}
+    arrays |= {name: value for name, value in changes.items() if name != "constraints"}
+    np.savez(tmp_path / "wrong.npz", **{**arrays, "facts": json.dumps(facts)})
+    with pytest.raises(ValueError, match=message):
+        Solution.load(tmp_path / "wrong.npz")
 
 
 def test_policy_repeats_the_trajectory(solution, unicycle):
