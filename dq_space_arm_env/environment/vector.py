@@ -134,7 +134,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         self._names = report_names(self.scene)[1:]
         keys = (*grouped(dict.fromkeys(self._names)), "is_success", "diverged")
         self._masks = dict.fromkeys((f"_{key}" for key in keys), self._all)
-        self._over = _NONE  # rows whose episodes are over, to be reset by the next step or the caller
+        # Rows whose episodes are over or have not begun, to be reset by the next step or the caller.
+        self._over: Rows = np.arange(num_envs)
         self._seen = np.zeros(self.observation_space.shape or (), self.kernels.dtype) if disabled else None
         self._trails = None if render_mode is None else Trails(num_envs)
         self._payloads = Payloads(self.kernels, num_envs) if leaves_tip(self.scene) else None
@@ -181,14 +182,11 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             Observations, shape (num_envs, n_obs), the present ones where nothing is reset; and info.
 
         Raises:
-            ResetNeeded: For some of the sub-environments, before the first reset of all.
             ValueError: If an option or the number of seeds is wrong.
         """
         rest = dict(options or {})
         mask = self._checked_mask(rest.pop("reset_mask", None))
         rows, others = np.flatnonzero(mask), np.flatnonzero(~mask)
-        if len(others) and not self._begun:
-            raise ResetNeeded("the other episodes have not begun: call reset() before reset() of some")
         saved = saved_state(rest)
         if saved is None:
             starts = self._given_starts(rows, rest)
@@ -331,7 +329,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         if increments.shape != expected:
             raise ValueError(f"increments: shape {increments.shape}, should be {expected}")
         if not np.isfinite(increments).all():
-            raise ValueError(f"increments: {shortened(increments)}, should be finite")
+            raise ValueError(f"increments: {shortened(increments)} should be finite")
         rows = np.flatnonzero(increments.any(axis=1))
         if len(rows):
             self._envs.move(rows, self.kernels.retract(self._envs.x[rows], increments[rows]))

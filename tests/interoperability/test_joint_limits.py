@@ -111,18 +111,20 @@ def test_impossible_limits_are_refused(limit, sentence):
 @pytest.mark.parametrize(
     ("given", "start", "target"),
     [
-        (limit(0, 3), 0.0, 0.3),
-        (limit(-3, 0), 0.0, -0.3),
+        (limit(-3, 3), 0.0, 0.3),
+        (limit(0, 3), 0.2, 0.5),  # off the stop
+        (limit(-3, 0), -0.2, -0.5),
+        (limit(-0.1, 3), 0.1, 0.4),
         (limit(1, 2), 1.5, 1.8),
-        (limit(-0.1, 0.2), 0.0, 0.1),  # halfway to the farther limit
-        (limit(0.5, 1e6), 0.5, 0.8),
-        (limit(-1e6, -0.5), -0.5, -0.8),
+        (limit(-0.1, 0.2), 0.05, 0.125),  # midway; from there halfway to a limit
+        (limit(0.5, 1e6), 0.7, 1.0),
+        (limit(-1e6, -0.5), -0.7, -1.0),
     ],
 )
 def test_start_and_target_lie_within_the_limits(given, start, target):
     """The chain's axis is x, along which its links follow each other: the target's turn is the joint's."""
     scene = scene_from_urdf(arm(given), "link 1")
-    assert scene.initial_state.joint_angles == (start,)
+    assert scene.initial_state.joint_angles == (pytest.approx(start, abs=1e-15),)
     turn = scene.target.pose.rotation_matrix
     assert math.atan2(turn[2][1], turn[1][1]) == pytest.approx(target, abs=1e-12)
 

@@ -42,9 +42,8 @@ def single_episode(scene, seed, policy):
     while not over:
         observation, reward, over, _, info = env.step(policy(observation[None])[0])
         cost, effort = cost - reward, effort + info["cost_control"]
-        if not over:
-            overlap = min(abs(first @ env.unwrapped.state[:4]), 1.0)
-            turn = max(turn, math.degrees(2.0 * math.acos(overlap)))
+        overlap = min(abs(first @ env.unwrapped.state[:4]), 1.0)
+        turn = max(turn, math.degrees(2.0 * math.acos(overlap)))
     return cost, effort, turn, info
 
 
