@@ -52,7 +52,9 @@ def load_policy(policy: str, start: Start, console: Console, seed: int | None, t
         label, solution = "plan with gains", _plan(start, console)
     else:
         label, solution = Path(policy).stem, _read(Path(policy), start.scene)
-    follow, stages = solution.policy(start.scene), solution.parameters
+    follow = solution.policy(start.scene)
+    # Without parameters, the solution was made with constants.
+    stages = solution.parameters if solution.parameters.size else [None] * len(solution.controls)
     acting = StateFeedback(lambda states, step: layout.to_action(follow(states[0], step), stages[step])[None])
     return Pilot(label, acting)
 
