@@ -329,7 +329,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         if increments.shape != expected:
             raise ValueError(f"increments: shape {increments.shape}, should be {expected}")
         if not np.isfinite(increments).all():
-            raise ValueError(f"increments: {shortened(increments)} should be finite")
+            raise ValueError(f"increments: {shortened(increments)}, should be finite")
         rows = np.flatnonzero(increments.any(axis=1))
         if len(rows):
             self._envs.move(rows, self.kernels.retract(self._envs.x[rows], increments[rows]))

@@ -61,8 +61,8 @@ def scene_from_urdf(
     `joint limits`, which the expert keeps to. Equal limits of 0 and rates of 0 are placeholders and limit
     nothing, as limits of 1e4 rad, rad/s or N m and more. Shapes and meshes, transmissions and simulator
     settings are left out, Coulomb friction with a warning. Start: at rest, the base link's axes along the
-    inertial ones, joints at zero, or midway between limits that exclude zero; an arm that is singular there,
-    as a straight one, begins with every joint bent by 0.5 rad.
+    inertial ones, joints at zero but off their stops, or midway between limits that exclude zero; an arm that
+    is singular there, as a straight one, begins with every joint bent by 0.5 rad.
     Cost: the defaults, but each joint has a weight of its torque that lets an arm of any size move within
     seconds. Integrator: `rk4`, or `rodas4` for dampers too stiff for it. Change anything else with
     `scene.replace(...)`.

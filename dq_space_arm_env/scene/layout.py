@@ -229,10 +229,14 @@ class StateLayout:
 
         Args:
             action: Fractions of the limits in [-1, 1], shape (..., n_u); below 0 a thruster is off.
-            parameters: Of the stages, where limits may be parameters, shape (..., n_p); None: nominal limits.
+            parameters: Of the stages, where limits may be parameters, shape (..., n_p), units of
+                `parameters`; None: nominal limits.
 
         Returns:
             Controls, shape (..., n_u), N, N m, rad/s.
+
+        Raises:
+            TypeError: If the actions are masked, or not of real numbers.
         """
         controls = real_array("action", action, np.float64) * self._limits(parameters)
         jets = controls[..., self.control.thruster_force]
@@ -248,6 +252,9 @@ class StateLayout:
 
         Returns:
             Fractions of the limits, shape (..., n_u); 0 where a control has no limit, or its limit is 0.
+
+        Raises:
+            TypeError: If the controls are masked, or not of real numbers.
         """
         controls, limits = real_array("control", control, np.float64), self._limits(parameters)
         actions: Array = np.zeros(np.broadcast_shapes(controls.shape, limits.shape))
