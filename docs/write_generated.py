@@ -47,7 +47,7 @@ _PLACES = {  # of parts that stand in several places of a scene
 }
 
 TEXTS: Mapping[str, Callable[[], str]] = {
-    "scene-keys": partial(key_tables, Scene, _PLACES),
+    "scene-keys": lambda: re.sub("^###", "##", key_tables(Scene, _PLACES), flags=re.M),  # a whole page
     "reinforcement-keys": partial(key_tables, configuration.Configuration),
     "imitation-keys": partial(key_tables, configuration.ImitationConfiguration),
     "gradient-keys": partial(key_tables, GradientConfiguration),

@@ -22,7 +22,7 @@ from agents.configuration.residual import ResidualConfiguration
 from agents.zoo import list_policies
 from agents.zoo.shelf import policy_file
 from dq_space_arm_env.command_line.verb import DefaultGroup
-from dq_space_arm_env.scene.constraints import Constraint
+from dq_space_arm_env.scene.constraints import Constraint, Plume
 from dq_space_arm_env.validation import parse_yaml
 
 ROOT = Path(__file__).parent.parent
@@ -201,9 +201,18 @@ def test_every_number_of_a_scene_has_a_unit():
 
 def test_tables_of_keys_are_complete():
     text = keys.key_tables(dq_space_arm_env.Scene)
-    rows = re.findall(r"^\| `(\w+)` \|", text, flags=re.MULTILINE)
-    expected = [name for model in keys.models_of(dq_space_arm_env.Scene) for name in model.model_fields]
-    assert rows == expected
+    found = {}
+    for section in text.split("### ")[1:]:
+        heading, _, table = section.partition("\n")
+        place = heading.partition(", ")[0]
+        common = found.get(place, set()) if place != heading else set()
+        found[heading] = common | set(re.findall(r"^\| `(\w+)` \|", table, flags=re.MULTILINE))
+    assert found["`constraints[]`, `kind: plume`"] == set(Plume.model_fields) - {"kind"}
+    assert found["`target.motion`, `kind: screw`"] == {"angular_velocity", "linear_velocity"}
+    written = set().union(*found.values())
+    named = {name for model in keys.models_of(dq_space_arm_env.Scene) for name in model.model_fields}
+    assert written == named - {"kind"}
+    assert len(found) == 1 + len(keys.models_of(dq_space_arm_env.Scene))  # and what all constraints have
     assert "| `mass` | mass of the base, kg | number | **required** |" in text
 
 

@@ -77,6 +77,8 @@ def _leaves(annotation: Any) -> set[Any]:
 def key_tables(model: type[BaseModel], names: dict[type[BaseModel], str] | None = None) -> str:
     """Write the keys of a model and of its parts, a section with a table for each.
 
+    Where a place takes one of several parts, what all of them have comes once, before the first of them.
+
     Args:
         model: The outermost model.
         names: Headings of the sections, by model; by default where the part stands in the file.
@@ -84,9 +86,20 @@ def key_tables(model: type[BaseModel], names: dict[type[BaseModel], str] | None 
     Returns:
         Markdown, its headings of level 3.
     """
-    paths = _paths(model)
-    headings = names or {}
-    return "\n".join(_section(part, headings.get(part, paths[part])) for part in models_of(model))
+    parts = models_of(model)
+    headings = _paths(model) | (names or {})
+    rows = {part: _rows(part) for part in parts}
+    sections, common = [], {}
+    for part in parts:
+        place = headings[part]
+        together = [other for other in parts if headings[other] == place]
+        if len(together) > 1 and place not in common:
+            common[place] = [row for row in rows[part] if all(row in rows[other] for other in together)]
+            if common[place]:
+                sections.append(_section(place, "Keys of every kind.", common[place]))
+        own = [row for row in rows[part] if row not in common.get(place, ())]
+        sections.append(_section(place + _choice(part), _text(part.__doc__ or ""), own))
+    return "\n".join(sections)
 
 
 def _paths(model: type[BaseModel]) -> dict[type[BaseModel], str]:
@@ -109,21 +122,30 @@ def _is_list(annotation: Any) -> bool:
     return get_origin(annotation) in (tuple, list)
 
 
-def _section(model: type[BaseModel], heading: str) -> str:
-    lines = [f"### {heading}{_choice(model)}", "", _text(model.__doc__ or ""), ""]
-    lines += ["| key | meaning | kind | default |", "|---|---|---|---|"]
+def _section(heading: str, text: str, rows: list[str]) -> str:
+    table = ["", "| key | meaning | kind | default |", "|---|---|---|---|", *rows] if rows else []
+    return "\n".join([f"### {heading}", "", text, *table]) + "\n"
+
+
+def _rows(model: type[BaseModel]) -> list[str]:
+    """The rows of its table: all keys but the one that its heading has."""
+    rows = []
     for name, field in model.model_fields.items():
-        meaning = _text(field.description or "which one it is")
-        cells = (f"`{name}`", meaning, kind_of(field), default_of(field))
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    return "\n".join(lines) + "\n"
+        if (name, field) != _chooser(model):
+            cells = (f"`{name}`", _text(field.description or ""), kind_of(field), default_of(field))
+            rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return rows
+
+
+def _chooser(model: type[BaseModel]) -> tuple[str, FieldInfo] | None:
+    """The key by which a file chooses a part, where there are several for one place: it has one value."""
+    fields = ((name, model.model_fields[name]) for name in ("kind", "name") if name in model.model_fields)
+    return next(((name, f) for name, f in fields if get_origin(f.annotation) is Literal), None)
 
 
 def _choice(model: type[BaseModel]) -> str:
-    """The name by which a file chooses a part, where there are several for one place."""
-    name = model.model_fields.get("name")
-    chosen = get_args(name.annotation) if name is not None and get_origin(name.annotation) is Literal else ()
-    return f", `name: {chosen[0]}`" if chosen else ""
+    chooser = _chooser(model)
+    return f", `{chooser[0]}: {get_args(chooser[1].annotation)[0]}`" if chooser else ""
 
 
 def _text(text: str) -> str:
@@ -153,6 +175,8 @@ def _kind(annotation: Any) -> str:
     if origin in (Union, types.UnionType):
         return " or ".join(dict.fromkeys(_kind(part) for part in parts if part is not type(None)))
     if origin is tuple:
+        if parts and get_origin(parts[0]) is tuple and get_args(parts[0])[1] is Any:  # read from a mapping
+            return "mapping: text to value"
         one = _kind(parts[0])
         if len(parts) == 2 and parts[1] is Ellipsis:
             return {"number": "numbers", "keys": "list of keys"}.get(one, f"list: {one}")

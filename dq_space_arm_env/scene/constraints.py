@@ -6,7 +6,7 @@ links (their joint frames), "tip" (G), "target" (the target's body) and "grasp" 
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, StrictBool
 
@@ -95,8 +95,6 @@ class Volume(Model):
 class Constraint(Model):
     """What constraints of every kind have."""
 
-    default_tolerance: ClassVar[float] = 0.01
-
     name: Name = Field(description="name of the constraint, unique in the scene")
     margin: NonNegative = Field(
         default=0.0,
@@ -104,7 +102,7 @@ class Constraint(Model):
         "environment charges without it",
     )
     tolerance: Positive = Field(
-        default=default_tolerance,
+        default=0.01,
         description="violation that costs 1 in the environment, in the unit of the residual",
     )
     terminates: StrictBool = Field(
