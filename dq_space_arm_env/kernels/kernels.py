@@ -296,6 +296,21 @@ class Kernels(DerivativeKernels):
         observation, errors = self.call("observation", x=x, time_left=time_left, p=p)
         return observation, errors
 
+    def tip_errors(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Errors that decide about success, of several tips the largest.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            p: Parameters of the stage, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by
+                default.
+
+        Returns:
+            Attitude error [deg] and position error [m], shape (2,) or (B, 2); where the target moves or
+            success asks for it, angular velocity [deg/s] and velocity [m/s] relative to the target besides,
+            with the wrist held, shape (4,) or (B, 4). In the order of `scene.success.tolerances`.
+        """
+        return self.call("tip_errors", x=x, p=p)[0]
+
     def relative_twist(self, x: ArrayLike, u: ArrayLike | None = None, p: ArrayLike | None = None) -> Array:
         """Twist of the tip relative to the target, which may move.
 

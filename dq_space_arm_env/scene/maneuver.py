@@ -1,5 +1,6 @@
 """Maneuver of a scene: actuators and limits, target, cost, start, spread of starts, success."""
 
+import math
 from typing import Literal
 
 from pydantic import Field
@@ -352,3 +353,9 @@ class Success(Model):
         exclude_if=lambda largest: largest is None,
         description="largest velocity of the tip relative to the target, m/s; absent: any",
     )
+
+    @property
+    def tolerances(self) -> tuple[float, float, float, float]:
+        """Largest errors in degrees, m, deg/s and m/s; infinite where any counts."""
+        turning, moving = self.angular_velocity_error_deg, self.velocity_error
+        return self.attitude_error_deg, self.position_error, turning or math.inf, moving or math.inf

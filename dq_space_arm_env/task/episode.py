@@ -289,10 +289,8 @@ def is_success(scene: Scene, errors: Scalars) -> Scalar:
 
 def within(success: Success, errors: Scalars) -> Scalar:
     """Whether the tip is within tolerances, as far as errors are given."""
-    pose = success.attitude_error_deg, success.position_error
-    largest = (*pose, success.angular_velocity_error_deg, success.velocity_error)
     met: Scalar = None
-    for error, most in zip(errors[:4], largest, strict=False):
-        if most is not None:
+    for error, most in zip(errors[:4], success.tolerances, strict=False):
+        if most < math.inf:
             met = error <= most if met is None else casadi.logic_and(met, error <= most)
     return met

@@ -21,7 +21,6 @@ from dq_space_arm_env.common.files import json_value, to_json, write_atomically
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.tables import plain_table
 from dq_space_arm_env.scene import StateLayout
-from dq_space_arm_env.task.step_report import has_twist_errors
 from experts import BoxDDP, GuidedDDP, Solution, StopReason
 from experts.problems.arm_problem import ArmProblem
 from experts.report import Maneuver, SolveProgress
@@ -36,9 +35,7 @@ class SolveRun:
     start: Start
     solver: str
     solution: Solution
-    # Angular velocity [deg/s] and velocity [m/s] of the tip relative to the target at the end, with the wrist
-    # held; None where neither moves the target nor does success ask for them.
-    final_velocities: tuple[float, float] | None
+    final_errors: tuple[float, ...]  # see `Kernels.tip_errors`; infinite where the motion has diverged
     preparation_seconds: float  # compile or load, and solve the guesses' source, s
     preparation_iterations: int | None  # of the solve from the scene's own start; None without
     solve_seconds: float  # s
@@ -49,25 +46,10 @@ class SolveRun:
         return self.solution.stop_reason is StopReason.INTERRUPTED
 
     @property
-    def final_errors(self) -> tuple[float, float]:
-        """Attitude error [deg] and position error [m] at the end; inf where the motion has diverged."""
-        if not math.isfinite(self.solution.cost):
-            return math.inf, math.inf
-        maneuver = Maneuver(self.start.episode_scene, self.solution.states, self.solution.controls)
-        return math.degrees(maneuver.angle[-1]), float(maneuver.distance[-1])
-
-    @property
     def is_success(self) -> bool:
-        """Whether the tip ends within the scene's tolerances."""
-        attitude, position = self.final_errors
-        success = self.scene.success
-        turning, moving = self.final_velocities or (0.0, 0.0)
-        return (
-            attitude <= success.attitude_error_deg
-            and position <= success.position_error
-            and turning <= (success.angular_velocity_error_deg or math.inf)
-            and moving <= (success.velocity_error or math.inf)
-        )
+        """Whether all tips end within the scene's tolerances."""
+        tolerances = self.scene.success.tolerances
+        return all(error <= most for error, most in zip(self.final_errors, tolerances, strict=False))
 
 
 def check_figures() -> None:
@@ -105,21 +87,19 @@ def solve(
         progress.start()
         solution = solver.solve(begun.state, callback=progress.update, parameters=begun.parameters)
     solved = perf_counter()
-    velocities = _final_velocities(scene, solution) if has_twist_errors(scene) else None
+    errors = _final_errors(scene, solution)
     # The files are of the episode's scene, where what was drawn is constant; what changes on the way is not.
     every, kept = (StateLayout.of(each).parameters.names for each in (scene, begun.episode_scene))
     solution.parameters = solution.parameters[:, [every.index(name) for name in kept]]
     solution.metadata |= {"scene": begun.episode_scene.model_dump(mode="json"), "start": begun.title}
     name = type(solver).__name__
-    return SolveRun(scene, begun, name, solution, velocities, prepared - began, before, solved - prepared)
+    return SolveRun(scene, begun, name, solution, errors, prepared - began, before, solved - prepared)
 
 
-def _final_velocities(scene: Scene, solution: Solution) -> tuple[float, float]:
-    """See `SolveRun.final_velocities`; inf where the motion has diverged."""
-    if not math.isfinite(solution.cost):
-        return math.inf, math.inf
-    twist = ArmProblem(scene).kernels.relative_twist(solution.states[-1], p=solution.parameters[-1])
-    return math.degrees(math.hypot(*twist[:3])), math.hypot(*twist[3:])
+def _final_errors(scene: Scene, solution: Solution) -> tuple[float, ...]:
+    """See `SolveRun.final_errors`."""
+    errors = ArmProblem(scene).kernels.tip_errors(solution.states[-1], p=solution.parameters[-1])
+    return tuple(errors.tolist()) if math.isfinite(solution.cost) else (math.inf,) * len(errors)
 
 
 def save(run: SolveRun, folder: Path, *, figures: bool) -> list[Path]:
@@ -140,7 +120,7 @@ def save(run: SolveRun, folder: Path, *, figures: bool) -> list[Path]:
 def record(run: SolveRun) -> dict[str, Any]:
     """Describe a run for programs."""
     solution = run.solution
-    attitude, position = run.final_errors
+    attitude, position, *velocities = run.final_errors
     found = {
         "scene": run.scene.name,
         "start": run.start.title,
@@ -160,8 +140,8 @@ def record(run: SolveRun) -> dict[str, Any]:
         "final_position_error_m": position,
         "is_success": run.is_success,
     }
-    if run.final_velocities is not None:
-        turning, moving = run.final_velocities
+    if velocities:
+        turning, moving = velocities
         found |= {"final_angular_velocity_error_deg_s": turning, "final_velocity_error_m_s": moving}
     return {name: json_value(value) for name, value in found.items()}
 
@@ -169,7 +149,7 @@ def record(run: SolveRun) -> dict[str, Any]:
 def table(run: SolveRun) -> Table:
     """Describe a run for people."""
     solution, success = run.solution, run.scene.success
-    attitude, position = run.final_errors
+    attitude, position, *velocities = run.final_errors
     verdict = "converged" if solution.converged else f"NOT converged ({solution.stop_reason.value})"
     reached = "within the tolerance" if run.is_success else "NOT within the tolerance"
     guess = str(solution.metadata.get("guess", "zero controls"))
@@ -198,8 +178,8 @@ def table(run: SolveRun) -> Table:
         ("attitude error", f"{attitude:.3g} deg", f"tolerance {success.attitude_error_deg:g} deg; {reached}"),
         ("position error", f"{position:.3g} m", f"tolerance {success.position_error:g} m"),
     ]
-    if run.final_velocities is not None:
-        turning, moving = run.final_velocities
+    if velocities:
+        turning, moving = velocities
         asked = success.angular_velocity_error_deg, success.velocity_error
         limits = ("relative to the target" + (f"; tolerance {most:g}" if most else "") for most in asked)
         shown = f"{turning:.3g} deg/s", f"{moving:.3g} m/s"

@@ -31,9 +31,10 @@ from dq_space_arm_env.common.worker_process import WorkerLostError, WorkerProces
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.scene.entries import ParameterEntries
 from experts.demonstrations.reading import Demonstration, Demonstrations
-from experts.demonstrations.shard import PARAMETERS, are_successes, tip_errors
+from experts.demonstrations.shard import PARAMETERS, tip_errors
 from experts.demonstrations.staging import staged
 from experts.demonstrations.tensors import DemonstrationsError
+from experts.problems.arm_problem import misses
 
 ALGORITHM = "Control-limited differential dynamic programming (box-DDP)"
 CARD = "README.md"
@@ -260,7 +261,7 @@ def _infos(
         "state": states,
         "attitude_error": attitude,
         "position_error": position,
-        "is_success": are_successes(kernels, states, parameters),
+        "is_success": misses(kernels, states, parameters) <= 1.0,
     }
     if kernels.scene.constraints:
         infos["cost"] = np.append(0.0, demonstration.constraint_costs())  # as `reset` and `step` report it

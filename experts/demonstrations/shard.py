@@ -305,22 +305,7 @@ def _failure_arrays(problem: ArmProblem, outcomes: Sequence[Outcome]) -> Arrays:
 
 def tip_errors(kernels: Kernels, states: FloatArray, parameters: FloatArray) -> FloatArray:
     """Attitude error [deg] and position error [m] of states, shape (n, 2); parameters (n_p,) or (n, n_p)."""
-    if not len(states):
-        return np.zeros((0, 2))
-    _, errors = kernels.observation(states, np.zeros((len(states), 1)), p=parameters)
-    return np.stack([np.degrees(errors[:, 0]), errors[:, 1]], axis=1)
-
-
-def are_successes(kernels: Kernels, states: FloatArray, parameters: FloatArray) -> NDArray[np.bool_]:
-    """Whether an episode that ended in a state would be a success, shape (n,); parameters (n, n_p)."""
-    success, (attitude, position) = kernels.scene.success, tip_errors(kernels, states, parameters).T
-    found = (attitude <= success.attitude_error_deg) & (position <= success.position_error)
-    if success.angular_velocity_error_deg is not None or success.velocity_error is not None:
-        twist = kernels.relative_twist(states, np.zeros((len(states), kernels.n_u)), p=parameters)
-        turning, moving = (np.linalg.norm(part, axis=1) for part in (twist[:, :3], twist[:, 3:]))
-        found &= np.degrees(turning) <= (success.angular_velocity_error_deg or np.inf)
-        found &= moving <= (success.velocity_error or np.inf)
-    return np.asarray(found)
+    return kernels.tip_errors(states, p=parameters)[:, :2] if len(states) else np.zeros((0, 2))
 
 
 def _parameters(problem: ArmProblem, outcomes: Sequence[Outcome]) -> FloatArray:

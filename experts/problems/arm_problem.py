@@ -270,18 +270,8 @@ def misses(kernels: Kernels, states: FloatArray, parameters: FloatArray) -> Floa
     Returns:
         Errors, at most 1 in success, shape () or (B,); NaN or infinite where a state is.
     """
-    success, given = kernels.scene.success, parameters if kernels.n_p else None
-    errors = kernels.observation(states, np.zeros((*states.shape[:-1], 1)), given)[1]
-    relative = [
-        np.degrees(errors[..., 0]) / success.attitude_error_deg,
-        errors[..., 1] / success.position_error,
-    ]
-    turning, moving = success.angular_velocity_error_deg, success.velocity_error
-    if turning is not None or moving is not None:
-        twist = kernels.relative_twist(states, p=given)
-        relative.append(np.degrees(np.linalg.norm(twist[..., :3], axis=-1)) / (turning or math.inf))
-        relative.append(np.linalg.norm(twist[..., 3:], axis=-1) / (moving or math.inf))
-    return np.asarray(np.max(relative, axis=0))
+    errors = kernels.tip_errors(states, parameters if kernels.n_p else None)
+    return np.asarray(np.max(errors / kernels.scene.success.tolerances[: errors.shape[-1]], axis=-1))
 
 
 def carried_along(

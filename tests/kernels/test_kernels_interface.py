@@ -6,7 +6,7 @@ import weakref
 import numpy as np
 import pytest
 
-from dq_space_arm_env import compile_scene, list_scenes, load_scene
+from dq_space_arm_env import DQSpaceArmEnv, compile_scene, list_scenes, load_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from scripts.benchmarks.robots import robots
 
@@ -136,3 +136,22 @@ def test_a_feature_removed_from_the_paper_scene_pays():
     assert passive["dynamics"] <= whole["dynamics"]
     springs = [link.model_dump() | {"stiffness": 1.0} for link in paper.links]
     assert size_of(paper.replace(links=springs))["dynamics"] > whole["dynamics"]
+
+
+@pytest.mark.parametrize("name", ["paper", "dual-arm", "tumbling-target"])
+def test_errors_of_the_tips_are_those_that_the_environment_reports(name):
+    scene = load_scene(name)
+    if scene.other_tips:  # whose velocities count too
+        scene = scene.replace(success={"velocity_error": 0.01, "angular_velocity_error_deg": 1.0})
+    env = DQSpaceArmEnv(scene)
+    env.reset(seed=1)
+    names = ["attitude_error", "position_error", "angular_velocity_error", "velocity_error"]
+    action = np.linspace(-1.0, 1.0, env.action_space.shape[0], dtype=np.float32)
+    for _ in range(5):
+        info = env.step(action)[4]
+    errors = compile_scene(scene).tip_errors(env.state, p=env.stage_parameters)
+    assert len(errors) == (2 if name == "paper" else 4)
+    np.testing.assert_array_equal(errors, [info[name] for name in names[: len(errors)]])
+    if scene.other_tips:
+        main = compile_scene(scene).relative_twist(env.state, p=env.stage_parameters)
+        assert errors[3] > np.linalg.norm(main[3:])  # the other tip is the faster one

@@ -30,7 +30,7 @@ from dq_space_arm_env.scene.parameters import moving_numbers
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.thrusters import burning_refusal
 from dq_space_arm_env.task.augmented_lagrangian import PenalizedEquations
-from dq_space_arm_env.task.episode import next_target, seen, with_target
+from dq_space_arm_env.task.episode import next_target, seen, tip_errors, with_target
 from dq_space_arm_env.task.equations import SceneEquations, total
 from dq_space_arm_env.task.step_report import n_observations
 
@@ -81,6 +81,7 @@ class ScenePrograms:
             "retract": self._retract,
             "measured_step": self._measured_step,
             "observation": self._observation,
+            "tip_errors": self._tip_errors,
             "relative_twist": self._relative_twist,
             "next_target": self._next_target,
             "observation_jacobian": robot.observation_jacobian,
@@ -248,6 +249,14 @@ class ScenePrograms:
             x=self.field.n_x,
             time_left=1,
         )
+
+    def _tip_errors(self) -> Program:
+        """Errors of the tips as the environment reports them."""
+
+        def outputs(x: Scalars) -> Mapping[str, Scalars]:
+            return {"errors": tip_errors(self.equations, x, seen(self.equations, x, 0.0)["errors"])}
+
+        return self._program("tip_errors", outputs, x=self.field.n_x)
 
     def _relative_twist(self) -> Program:
         """Twist of the tip relative to the target."""
