@@ -53,7 +53,7 @@ class Evaluation:
         flights: Outcome of each episode.
         optimal: The expert's costs from the same starts; None if not asked for.
         action_seconds: Time per action, s.
-        wall_seconds: Time of all flights together, s.
+        wall_seconds: Time of all flights together, with the plans of the controllers that fly by them, s.
         metadata: Metadata of the policy's file.
         same_scene: Whether it was trained in the scene that the condition changes; None if unknown.
     """

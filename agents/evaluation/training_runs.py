@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 from agents.configuration import ConfigurationError, list_configurations, load_configuration
 from agents.evaluation.evaluating import Evaluation
 from agents.evaluation.statistics import FEWEST_RUNS, Runs, compare_runs
+from agents.run_folder import CONFIGURATION, EVALUATIONS
 from agents.zoo.shelf import SHELF
 from dq_space_arm_env.common.bounded_reading import parse_json, read_text
 
-CONFIGURATION, EVALUATIONS = "config.yaml", "evaluations.jsonl"
 _EPISODES = {"schedule": "evaluation_episodes", "progression": "evaluation_episodes", "curve": "episodes"}
 _BUDGET = {"total_steps": "--total-steps", "minutes": "--minutes"}
 
