@@ -4,14 +4,12 @@ import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.command_line.policy_sources import load_policy, owns_policy, statistics_by_model
-from dq_space_arm_env.command_line.simulated_episode import (
-    begin,
-    fly,
-)
+from dq_space_arm_env.command_line.simulated_episode import Start, begin, fly
 from dq_space_arm_env.common.bounded_reading import archive_members
 from dq_space_arm_env.viewing.replay import Trajectory, by_scene, common_scene, read_flight, write_replay
 
@@ -42,9 +40,7 @@ def collect_flights(
     if len(recordings) < len(sources):
         if scene is None:
             raise ValueError("no file says which scene the policy should fly: give --scene")
-        first = min(recordings, default=None)
-        state = None if first is None or seed is not None else recordings[first].states[0]
-        begun = begin(scene, seed, state)
+        seed, begun = _common_start(scene, seed, recordings[min(recordings)] if recordings else None)
         for place, (label, source) in enumerate(sources):
             if place not in recordings:
                 found = statistics.get(source)
@@ -65,6 +61,17 @@ def show_maneuver(scene: Scene, page: Path, console: Console) -> str:
         f"{page}: the first maneuver {verdict}, {flight.attitude_error:.2g} degrees and "
         f"{flight.position_error:.2g} m off; open it in a browser"
     )
+
+
+def _common_start(scene: Scene, seed: int | None, flight: Trajectory | None) -> tuple[int | None, Start]:
+    """Where policies start, and its seed: where a flight did, which a seed has with target and masses."""
+    if seed is not None or flight is None:
+        return seed, begin(scene, seed, None)
+    if flight.seed is not None:
+        drawn = begin(scene, flight.seed, None)
+        if np.array_equal(drawn.state, flight.states[0]):
+            return flight.seed, drawn
+    return None, begin(scene, None, flight.states[0])
 
 
 def _is_policy(source: str) -> bool:

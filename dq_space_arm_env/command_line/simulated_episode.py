@@ -139,8 +139,11 @@ def _units(layout: StateLayout, actuator: str) -> str:
 
 def numerical_error(start: Start, flight: Trajectory) -> float:
     """How far the tip ends from where the same inputs truly bring it, m or rad, whichever is larger."""
+    kernels = compile_scene(start.scene)
     inputs = flight.controls if flight.noise is None else flight.controls + flight.noise
-    errors = compile_scene(start.scene).numerical_error(flight.states, inputs, start.parameters)
+    stages = kernels.stage_parameters(start.parameters)[: len(inputs)]
+    inputs = kernels.applied_inputs(flight.states[:-1], inputs, p=stages)
+    errors = kernels.numerical_error(flight.states, inputs, start.parameters)
     return float(errors[-1])
 
 

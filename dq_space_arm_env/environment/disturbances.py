@@ -128,14 +128,14 @@ def with_loads(
         The scene to fly in, and the parameters of each episode in it, shape (B, n_p').
 
     Raises:
-        ValueError: If there is no mass to multiply.
+        ValueError: If there is no mass to multiply, or phases change it.
     """
     factors = np.asarray(factors, dtype=np.float64)
     names = [number.name for number in load_numbers(scene)]
-    if not names and (factors != 1.0).any():
-        raise ValueError(
-            f"scene {scene.name!r} has neither payload nor links: mass_factors should be 1 alone"
-        )
+    staged = scene.staged.values if scene.phases else {}
+    if (factors != 1.0).any() and (not names or names[0] in staged):
+        reason = f"phases that change {names[0]}" if names else "neither payload nor links"
+        raise ValueError(f"scene {scene.name!r} has {reason}: mass_factors should be 1 alone")
     flown, known = scene.replace(parameters=[*scene.parameters, *names]), StateLayout.of(scene).parameters
     varying = StateLayout.of(flown).parameters
     rows = np.tile(varying.nominal, (len(factors), 1))

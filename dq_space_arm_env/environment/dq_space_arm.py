@@ -26,6 +26,7 @@ from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_s
 from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
+from dq_space_arm_env.kernels.stages import present_parameters
 from dq_space_arm_env.scene import Scene, load_scene
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.scene.start import episode_scene
@@ -346,12 +347,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     def stage_parameters(self) -> Array:
         """`parameters`, with pose and velocity of a target that moves as they are now, shape (n_p,); a copy. `ResetNeeded` before the first reset."""
         self._require_reset("reading the parameters")
-        parameters = self._parameters.copy()
-        entries = self.kernels.parameters
-        if entries.staged:
-            parameters = self.kernels.stage_parameters(parameters)[int(self._memory[0])]
-        parameters[list(entries.moving)] = self._memory[len(MEMORY) :][: len(entries.moving)]
-        return parameters
+        present: Array = present_parameters(self.kernels, self._parameters[None], self._memory[None])[0]
+        return present
 
     @property
     def episode_scene(self) -> Scene:
@@ -387,7 +384,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             "over": np.array(True),
             "generator": np.empty(4, np.uint64),
         }
-        found = checked_state(state, expected)
+        found = checked_state(state, expected, self.scene.simulation.steps)
         self._begin_trail()
         for name, array in self._kept().items():
             array[...] = found[name]

@@ -243,7 +243,8 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
         Raises:
             ValueError: If an array is missing, or has another shape or type.
         """
-        truncated = checked_state(state, {"truncated": np.array(True)})["truncated"]
+        expected = {"truncated": np.array(True)}
+        truncated = checked_state(state, expected, self.scene.simulation.steps)["truncated"]
         self._env.set_state(state)
         self.np_random, self._truncated = self._env.np_random, bool(truncated)
 

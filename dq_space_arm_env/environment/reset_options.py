@@ -178,6 +178,8 @@ def _checked_target(kernels: Kernels, target: Any) -> Array:
             "machine code: give the scene a spread of target_position or target_rotation, or add target.pose "
             "to its parameters"
         )
+    if {*kernels.parameters.staged}.intersection(kernels.parameters.indices(TARGET)):
+        raise ValueError(f"options: target; the phases of scene {kernels.scene.name!r} say where it is")
     pose = _unit_pose("target is a pose", _finite("target", target, 8))
     fixed = [index for index in range(8) if index not in entries]
     if np.abs(pose[fixed]).max(initial=0.0) > 1e-6:
@@ -191,6 +193,14 @@ def _checked_target(kernels: Kernels, target: Any) -> Array:
 def _checked_parameters(kernels: Kernels, parameters: Any) -> Array:
     """Parameters with which the scene is valid: a mass may not be negative."""
     values = _finite("parameters", parameters, kernels.n_p)
+    nominal, names = kernels.parameters.nominal, kernels.parameters.names
+    other = [index for index in kernels.parameters.staged if values[index] != nominal[index]]
+    if other and (values[other] != kernels.stage_parameters(values)[0, other]).any():
+        index = other[0]
+        raise ValueError(
+            f"options: parameters; {names[index]} is {values[index]:g}, should be {nominal[index]:g}: it is "
+            "the phases that change it"
+        )
     _check_values(kernels, tuple(values.tolist()))
     return values
 

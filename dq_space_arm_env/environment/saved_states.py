@@ -27,11 +27,12 @@ class PicklesEpisodes(EzPickle):
             self.set_state(d["state"])
 
 
-def checked_state(state: Mapping[str, Any], expected: Mapping[str, Array]) -> dict[str, Array]:
+def checked_state(state: Mapping[str, Any], expected: Mapping[str, Array], steps: int) -> dict[str, Array]:
     """Arrays of a saved state with the names, shapes and types of those expected; others are passed over.
 
     Raises:
-        ValueError: If the state is no mapping, or an array is missing, or has another shape or type.
+        ValueError: If the state is no mapping, an array is missing, or has another shape or type, or the
+            memory counts a number of steps that an episode of so many does not have.
     """
     if not isinstance(state, Mapping):
         raise ValueError(f"state: {shortened(state)}, should be what get_state() returns")
@@ -46,4 +47,7 @@ def checked_state(state: Mapping[str, Any], expected: Mapping[str, Array]) -> di
                 f"{wanted.dtype}"
             )
         found[name] = array
+    taken = found.get("memory", np.zeros(1))[..., 0]
+    if not np.isin(taken, np.arange(steps + 1)).all():
+        raise ValueError(f"state: memory counts {taken} steps, should be whole numbers up to {steps}")
     return found

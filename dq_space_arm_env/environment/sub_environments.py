@@ -14,6 +14,7 @@ from dq_space_arm_env.compiler.random_draws import draws_kernel, generator_state
 from dq_space_arm_env.environment.reset_options import GivenStart
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall, address_of
+from dq_space_arm_env.kernels.stages import present_parameters
 from dq_space_arm_env.scene.motion import Waypoints
 from dq_space_arm_env.scene.path import PATH, given_path
 from dq_space_arm_env.scene.start import number_of_draws
@@ -106,20 +107,7 @@ class SubEnvironments:
 
     def stage_parameters(self, rows: Rows | slice = slice(None)) -> Array:
         """Parameters with pose and velocity of moving targets as they are now, shape (k, n_p); a copy."""
-        parameters, memory = self.parameters[rows].copy(), self._memory[rows]
-        entries = self._kernels.parameters
-        if entries.staged:
-            starts, values, _, catches = self._kernels.scene.staged
-            stages = memory[:, 0].astype(np.int64)
-            caught = [start for start, catch in zip(starts, catches, strict=True) if catch]
-            for row in np.flatnonzero(np.isin(stages + 1, caught)):  # with the twist of the target then
-                parameters[row] = self._kernels.stage_parameters(parameters[row])[stages[row]]
-            phases = np.searchsorted(starts, stages, side="right") - 1
-            for name, each in values.items():
-                parameters[:, entries.names.index(name)] = np.array(each)[phases]
-        size = len(entries.moving)
-        parameters[:, list(entries.moving)] = memory[:, len(MEMORY) : len(MEMORY) + size]
-        return parameters
+        return present_parameters(self._kernels, self.parameters[rows], self._memory[rows])
 
     def seed(self, rows: Rows, seeds: Sequence[int | None]) -> None:
         """Seed random generators, unpredictably for None; a negative seed is a ValueError."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,8 +105,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
             )
         picture = width, height, default_camera_config
         PicklesEpisodes.__init__(self, num_envs, scene, autoreset_mode, render_mode, threads, *picture)
-        if num_envs < 1:
-            raise ValueError(f"num_envs: {num_envs}, should be at least 1")
+        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise ValueError(f"num_envs: {num_envs!r}, should be a whole number of at least 1")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(
                 f"render_mode: {render_mode!r}; a vector environment has no window, "
@@ -233,8 +233,10 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         """Seed the generators that are given a seed or have none yet."""
         if seed is None or isinstance(seed, (int, np.integer)):
             seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
-        else:
+        elif isinstance(seed, Iterable):
             seeds = list(seed)
+        else:
+            raise ValueError(f"seed: {seed!r}, should be a whole number, or one for each sub-environment")
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed: {len(seeds)} seeds, should be {self.num_envs}, one per sub-environment")
         if not self._begun:
@@ -333,6 +335,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         rows = np.flatnonzero(increments.any(axis=1))
         if len(rows):
             self._envs.move(rows, self.kernels.retract(self._envs.x[rows], increments[rows]))
+            if self._seen is not None:
+                self._seen[rows] = self.observe()[rows]
 
     def observe(self, states: ArrayLike | None = None) -> Any:
         """Give observations without a step.
@@ -391,7 +395,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         if not self._begun and len(chosen) < self.num_envs:
             raise ResetNeeded("the other episodes have not begun: call reset() before set_state() of some")
         kept = self._kept()
-        found = checked_state(state, {name: array[chosen] for name, array in kept.items()})
+        expected = {name: array[chosen] for name, array in kept.items()}
+        found = checked_state(state, expected, self.scene.simulation.steps)
         self._begin_trails(chosen)
         for name, array in kept.items():
             array[chosen] = found[name]

@@ -11,6 +11,7 @@ from dq_space_arm_env.scene import INTEGRATORS, Scene, SceneError
 from dq_space_arm_env.scene.actuator_chains import chains
 from dq_space_arm_env.scene.constraint_rows import sides
 from dq_space_arm_env.scene.constraints import JointLimits
+from dq_space_arm_env.scene.phases import phases_change_masses
 from dq_space_arm_env.validation import did_you_mean
 
 
@@ -93,6 +94,8 @@ def refuse(
         problems.append("it has no reaction wheels: leave them out with replace({'actuators.wheels': None})")
     if scene.actuators.tank is not None:
         problems.append("it has no tank that empties: leave it out with replace({'actuators.tank': None})")
+    if phases_change_masses(scene):
+        problems.append("its masses stay, and phases change some: leave them out with replace(phases=())")
     geared = [link.name for link in scene.links if link.motor is not None and link.motor.inertia]
     if rotors and geared and not any(link.is_elastic for link in scene.links):
         problems.append(f"it has no rotors, and link {geared[0]!r} has one: set its motor's inertia to 0")

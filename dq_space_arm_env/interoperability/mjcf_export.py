@@ -41,7 +41,7 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     joint; fixed links have none. Where arms branch, MuJoCo's coordinates follow one arm after the other.
     A rotor is an armature, Coulomb friction a friction loss, which MuJoCo has without the smoothing speed.
     MuJoCo pushes joints back from their limits, the scene's kernels do not, and it has no limits of rates.
-    Site `tip` has the frame G, body `payload` is held at the tip.
+    Site `tip` has the frame G, body `payload` is held at the tip; other tips have sites by their names.
 
     Actuators are motors with the names, limits and order of the scene's inputs, without the wrist's rates;
     forces and torques act in base axes at e0. MuJoCo clips controls at the limits, the scene's kernels do
@@ -63,8 +63,8 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
 
     Raises:
         SceneError: If the scene has a wrist that is not to be fixed, a constant wrench at the tip, a screw
-            joint, reaction wheels, an elastic gear, a rotor that turns with the body before its joint, or an
-            actuator that lags or delays.
+            joint, reaction wheels, an elastic gear, a rotor that turns with the body before its joint, an
+            actuator that lags or delays, or phases that change masses.
     """
     refuse(scene, "MJCF", wrist, at_once=True)
     root = Element("mujoco", model=scene.name)
@@ -87,14 +87,15 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
         if not link.is_fixed:
             _add_joint(body, link, lower, upper)
         _add_inertial(body, link, link.center_of_mass)
-    tip, body = tip_on_its_body(scene), bodies[scene.tip_body]
     looks.add_arm(bodies, scene)
-    looks.add_mark(body, scene, "tip", tip)
-    if scene.payload is not None:
-        payload = _add_body(body, free_name("payload", names), tip)
-        _add_inertial(payload, scene.payload, scene.payload.center_of_mass)
-        looks.add_payload(payload, scene.payload)
-    looks.add_target(world, scene, free_name("target", [*names, base.get("name", ""), "payload"]))
+    names += [free_name("payload", names)]
+    _add_tip(bodies[scene.tip_body], scene, "tip", tip_on_its_body(scene), (names[-1], scene.payload))
+    for other in scene.other_tips:
+        names += [free_name(f"{other.name} payload", names)]
+        body, frame = bodies[scene.body_named(other.link)], other.frame.dual_quaternion
+        site = free_name(other.name, ("e0", "tip", "target"))
+        _add_tip(body, scene, site, frame, (names[-1], other.payload))
+    looks.add_target(world, scene, free_name("target", [*names, base.get("name", "")]))
     _add_actuators(root, scene)
     _add_start(root, scene)
     ElementTree.indent(root)
@@ -103,10 +104,23 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
 
 def _add_base_joint(base: Element, scene: Scene) -> None:
     if scene.base.motion == "spatial":
-        SubElement(base, "freejoint", name="base joint")
+        links = [f"{link.name} joint" for link in scene.links]
+        SubElement(base, "freejoint", name=free_name("base joint", links))
         return
     for name, kind, axis in (("x", "slide", "1 0 0"), ("y", "slide", "0 1 0"), ("z", "hinge", "0 0 1")):
         SubElement(base, "joint", name=f"base {kind} {name}", type=kind, axis=axis)
+
+
+def _add_tip(
+    body: Element, scene: Scene, name: str, pose: Sequence[float], held: tuple[str, Payload | None]
+) -> None:
+    """Mark a tip, and add what it holds."""
+    looks.add_mark(body, scene, name, pose)
+    name, payload = held
+    if payload is not None:
+        holding = _add_body(body, name, pose)
+        _add_inertial(holding, payload, payload.center_of_mass)
+        looks.add_payload(holding, payload)
 
 
 def _add_body(parent: Element, name: str, pose: Sequence[float]) -> Element:

@@ -28,15 +28,16 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     The root link `base` has the frame e0, at the center of mass; tell the simulator that it floats
     (Pinocchio: `JointModelFreeFlyer`). Each further link has the frame of its joint and carries the scene's
     name; its joint turns about z, or slides along it, and is called by the link's name and " joint". A link
-    `tip` without mass, or with that of the payload, has the frame G. Torque limits become efforts, 0 for a
-    joint without motor. The scene's joint limits, without their margins, make a joint revolute, others are
-    continuous; 1e4 rad (m) and rad/s (m/s) stand for none where URDF asks for a number. It has no thrusters,
-    wheels, start, task or other constraints. Shapes become visuals.
+    `tip` without mass, or with that of the payload, has the frame G; so have other tips, by their names.
+    Torque limits become efforts, 0 for a joint without motor. The scene's joint limits, without their
+    margins, make a joint revolute, others are continuous; 1e4 rad (m) and rad/s (m/s) stand for none where
+    URDF asks for a number. It has no thrusters, wheels, start, task or other constraints. Shapes become
+    visuals.
 
     Features that URDF lacks and that change the motion are refused: joint springs, rotors, screw and
-    spherical joints, a wrench at the tip, a planar base, reaction wheels. The massless wrist as three joints
-    would have infinite accelerations; fixed at its initial angles it changes no acceleration, but the tip
-    cannot turn.
+    spherical joints, a wrench at the tip, a planar base, reaction wheels, phases that change masses. The
+    massless wrist as three joints would have infinite accelerations; fixed at its initial angles it changes
+    no acceleration, but the tip cannot turn.
 
     Args:
         scene: A validated scene.
@@ -59,13 +60,19 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     ):
         _add_link(root, link.name, link, link.center_of_mass)
         _add_joint(root, link, bodies[parent], effort, bounds)
-    tip = free_name("tip", names)
-    payload = scene.payload
-    _add_link(root, tip, payload, (0.0, 0.0, 0.0) if payload is None else payload.center_of_mass)
-    joint = SubElement(root, "joint", name=f"{tip} joint", type="fixed")
-    _connect(joint, bodies[scene.tip_body], tip, tip_on_its_body(scene))
+    tip = free_name("tip", [*names, *(other.name for other in scene.other_tips)])
+    _add_tip(root, tip, bodies[scene.tip_body], tip_on_its_body(scene), scene.payload)
+    for other in scene.other_tips:
+        body = bodies[scene.body_named(other.link)]
+        _add_tip(root, other.name, body, other.frame.dual_quaternion, other.payload)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_tip(root: Element, name: str, body: str, pose: Sequence[float], payload: Payload | None) -> None:
+    _add_link(root, name, payload, (0.0, 0.0, 0.0) if payload is None else payload.center_of_mass)
+    joint = SubElement(root, "joint", name=f"{name} joint", type="fixed")
+    _connect(joint, body, name, pose)
 
 
 def _efforts(scene: Scene) -> list[float]:

@@ -7,6 +7,7 @@ disk; the next process loads it without tracing, compiling or importing CasADi.
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,7 +117,8 @@ class Kernels(DerivativeKernels):
 
         Args:
             states: States at the ends of time steps, the start first, shape (N + 1, n_x) or (N + 1, B, n_x).
-            u: Inputs held during the steps, shape (N, n_u) or (N, B, n_u), units of `layout.control`.
+            u: Inputs held during the steps, shape (N, n_u) or (N, B, n_u), units of `layout.control`; of a
+                flight in the environment what acted, see `applied_inputs`. A catch is taken to hold.
             p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
@@ -143,8 +145,9 @@ class Kernels(DerivativeKernels):
         """Take many steps in a row without returning to Python.
 
         The results are those of repeated calls of `step`, except for integrators that conserve the momentum:
-        they hand it on from step to step besides the state, so it does not wander with the rounding errors of
-        the states. `gauss6` also hands on what rounding cuts off the joint angles.
+        they hand it on from step to step besides the state, as long as masses stay, so it does not wander
+        with the rounding errors of the states. `gauss6` also hands on what rounding cuts off the joint
+        angles.
 
         Args:
             x: State at the start, shape (n_x,), units of `layout.state`.
@@ -174,11 +177,25 @@ class Kernels(DerivativeKernels):
         kernel = self.kernel("walk", integrator=self._integrator(integrator), lanes=1)
         given = self.parameter_rows(p, steps)
         sizes = {spec.name: spec.stride for spec in kernel.inputs}
+        held = {"u": np.broadcast_to(inputs, (steps, self.n_u)), "parameters": given}
+        if "momentum" in sizes and (changes := self._changes_of_mass(given)):
+            # From there on the momentum is that of other bodies.
+            parts = [start[None]]
+            for begin, end in pairwise((0, *changes, steps)):
+                x, own = parts[-1][-1], slice(begin, end)
+                parts.append(self.simulate(x, held["u"][own], end - begin, dt, integrator, p=given[own])[1:])
+            return np.concatenate(parts)[::every]
         handed_on = {"momentum": self.momentum(start, p=given[0])} if "momentum" in sizes else {}
         if "remainder" in sizes:
             handed_on["remainder"] = np.zeros(sizes["remainder"], self.dtype)
-        held = {"u": np.broadcast_to(inputs, (steps, self.n_u)), "parameters": given}
         return walk(kernel, start, handed_on, held, steps, self._time_step(dt), every)
+
+    def _changes_of_mass(self, parameters: Array) -> list[int]:
+        """Rows whose masses or inertias are not those of the row before."""
+        names = self.parameters.names
+        masses = [i for i, name in enumerate(names) if "mass" in name or "inertia" in name]
+        changed = np.diff(parameters[:, masses], axis=0).any(axis=1)
+        return (1 + np.flatnonzero(changed)).tolist()
 
     def integrate(
         self,
@@ -295,6 +312,21 @@ class Kernels(DerivativeKernels):
         """
         observation, errors = self.call("observation", x=x, time_left=time_left, p=p)
         return observation, errors
+
+    def applied_inputs(self, x: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Inputs as the actuators apply them in the environment, which `step` takes as they are.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            u: Inputs within their limits, shape (n_u,) or (B, n_u).
+            p: Parameters of the stage, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by
+                default.
+
+        Returns:
+            Inputs that act, shape (n_u,) or (B, n_u): slew limits, back EMF, wheels' speed and power, the
+            shortest pulses and what is left in the tank allow no more.
+        """
+        return self.call("applied_inputs", x=x, u=u, p=p)[0]
 
     def tip_errors(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Errors that decide about success, of several tips the largest.

@@ -38,8 +38,8 @@ class KernelLibrary:
     """The compiled programs of a scene, by name."""
 
     def __init__(self, scene: Scene, threads: int = 1) -> None:
-        if threads < 1:
-            raise ValueError(f"threads: {threads}, should be at least 1")
+        if not isinstance(threads, int | np.integer) or threads < 1:
+            raise ValueError(f"threads: {threads!r}, should be a whole number of at least 1")
         self.scene, self.threads, self.layout = scene, threads, StateLayout.of(scene)
         layout = self.layout
         self.n_x, self.n_t, self.n_u, self.n_p = layout.n_x, layout.n_t, layout.n_u, layout.n_p

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.kernels.bound import walk
 from dq_space_arm_env.scene.motion import Waypoints
-from dq_space_arm_env.scene.parameters import CATCH, target_entries, velocity_entries
+from dq_space_arm_env.scene.parameters import CATCH, is_part, target_entries, velocity_entries
 from dq_space_arm_env.scene.path import given_path
+from dq_space_arm_env.task.step_report import MEMORY
 
 if TYPE_CHECKING:
     from dq_space_arm_env.kernels.library import KernelLibrary
@@ -38,6 +39,39 @@ def fill_stages(kernels: KernelLibrary, rows: NDArray[Any]) -> None:
         if moving and pose is not None:
             still = [*(pose[i] for i in target_entries(scene)), *[0.0] * len(velocity_entries(scene))]
             rows[begin:end, moving] = still
+
+
+def present_parameters(
+    kernels: KernelLibrary, parameters: NDArray[Any], memory: NDArray[Any]
+) -> NDArray[Any]:
+    """Parameters of the stages that episodes are in.
+
+    Args:
+        kernels: Those of the scene.
+        parameters: At the start of each episode, shape (k, n_p), units of `parameters`.
+        memory: Of each, as a step of the environment leaves it: shape (k, m), see `task.episode.observe`.
+
+    Returns:
+        Those with the target as it is now, and what is held; shape (k, n_p).
+    """
+    entries, found = kernels.parameters, parameters.copy()
+    size, names = len(entries.moving), entries.names
+    if entries.staged:
+        starts, values, _, catches = kernels.scene.staged
+        stages = memory[:, 0].astype(np.int64)
+        caught = [start for start, catch in zip(starts, catches, strict=True) if catch]
+        for row in np.flatnonzero(np.isin(stages + 1, caught)):  # with the twist of the target then
+            path = np.tile(found[row], (kernels.scene.simulation.steps + 1, 1))
+            fill_stages(kernels, path)
+            found[row] = path[stages[row]]
+        phases = np.searchsorted(starts, stages, side="right") - 1
+        for name, each in values.items():
+            found[:, names.index(name)] = np.array(each)[phases]
+        if caught:  # or missed, and not held since
+            payload = [index for index, name in enumerate(names) if is_part(name, "payload")]
+            found[:, payload] *= memory[:, len(MEMORY) + size][:, None]
+    found[:, list(entries.moving)] = memory[:, len(MEMORY) : len(MEMORY) + size]
+    return found
 
 
 def target_path(kernels: KernelLibrary, start: NDArray[Any]) -> NDArray[Any]:

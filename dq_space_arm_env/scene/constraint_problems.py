@@ -18,6 +18,7 @@ from dq_space_arm_env.scene.constraints import (
     limited_motors,
     per_link,
 )
+from dq_space_arm_env.scene.phases import phases_change_masses
 from dq_space_arm_env.validation.problems import Problem
 
 Scene = Any  # `schema.Scene`, which has constraints
@@ -82,10 +83,10 @@ def _joint_limit_problems(
                 sentence = f"link {link.name!r} must have none, its joint is {link.joint_type}: .inf"
                 yield Problem((*here, field), given, sentence)
     lower, upper, rate = (per_link(getattr(limits, field), count) for field in ("lower", "upper", "rate"))
-    if not any(math.isfinite(bound) for bound in (*lower, *upper, *rate)):
-        yield Problem(
-            here, limits, "must bound something: all its bounds are infinite, or there are no links"
-        )
+    bounds = zip(scene.links, lower, upper, rate, strict=True)
+    if not any(math.isfinite(bound) for link, *own in bounds if link.freedoms == 1 for bound in own):
+        sentence = "must bound something: all its bounds are infinite, or no joint has one coordinate"
+        yield Problem(here, limits, sentence)
     for index in range(count):
         if not lower[index] < upper[index]:
             sentence = f"must be above the lower limit of link {index}, {lower[index]:g} rad"
@@ -151,6 +152,7 @@ def _wheel_problems(scene: Scene, place: tuple[str | int, ...]) -> Iterator[Prob
         "thrusters change the total momentum": _has_thrusters(scene),
         "a wrench at the tip changes the total momentum": scene.tip_wrench is not None,
         "a catch changes the total momentum": catches,
+        "phases change masses": phases_change_masses(scene),
         "the start is not at rest": any(velocities),
     }
     for reason, holds in reasons.items():

@@ -120,7 +120,10 @@ class Constraint(Model):
 
 
 class JointLimits(Constraint):
-    """Least and greatest joint angles, and greatest joint rates; residuals in rad and rad/s."""
+    """Least and greatest joint angles, and greatest joint rates; residuals in rad and rad/s.
+
+    Joints of one coordinate have them: one number for all links passes over spherical and fixed ones.
+    """
 
     kind: Literal["joint_limits"] = Field(description="'joint_limits'")
     lower: Bounds = Field(

@@ -95,7 +95,17 @@ def _read(file: Traversable) -> Scene:
         raise SceneError(f"{file}: the file is empty; a scene needs at least name, base and target")
     if not isinstance(data, dict):
         raise SceneError(f"{file}: must be a mapping (key: value) at the top, not a {type(data).__name__}")
+    if isinstance(file, Path):
+        _find_beside(file, data)
     return _validated(data, str(file))
+
+
+def _find_beside(file: Path, data: dict[str, Any]) -> None:
+    """Read the path of a target's poses from where the scene's file is."""
+    target = data.get("target")
+    motion = target.get("motion") if isinstance(target, dict) else None
+    if isinstance(motion, dict) and motion.get("kind") == "file" and isinstance(motion.get("path"), str):
+        motion["path"] = str(file.parent / motion["path"])
 
 
 def _validated(data: object, origin: str) -> Scene:

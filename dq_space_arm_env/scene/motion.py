@@ -93,7 +93,7 @@ def _read_motion(value: Any) -> Any:
     kind = value.get("kind") if isinstance(value, dict) else None
     if kind == "file":
         return _read_file(value)
-    if kind not in _KINDS:
+    if not isinstance(kind, str) or kind not in _KINDS:
         raise problem(f"must be a mapping whose kind is one of {', '.join(_KINDS)}, file; or absent: at rest")
     return _KINDS[kind].model_validate(value)
 

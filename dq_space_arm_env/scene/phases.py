@@ -6,6 +6,7 @@ code. At its start the payload may be caught.
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
+from itertools import pairwise
 from typing import Annotated, Any, NamedTuple
 
 from pydantic import BeforeValidator, Field, PlainSerializer
@@ -13,6 +14,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer
 from dq_space_arm_env.scene.maneuver import Success
 from dq_space_arm_env.scene.parameters import (
     ACTUATORS,
+    control_numbers,
     drawn_factors,
     has_target_spread,
     numbers,
@@ -30,22 +32,31 @@ _ACTUATORS = "actuators."
 def _read_changes(value: Any) -> tuple[tuple[str, Any], ...]:
     """Flatten mappings within mappings into paths with their values, sorted."""
     if isinstance(value, tuple):  # read before
-        value = dict(value)
+        return value
     if not isinstance(value, Mapping):
         raise problem("must be a mapping from paths, such as base.mass, to new values")
-    return tuple(sorted(_flat(value.items()), key=lambda change: change[0]))
+    changes = sorted(_flat(value.items()), key=lambda change: change[0])
+    for (path, _), (following, _) in pairwise(changes):
+        if path == following:
+            raise problem(f"gives {path} twice")
+    return tuple(changes)
 
 
 def _flat(items: Iterable[tuple[Any, Any]], prefix: str = "") -> Iterable[tuple[str, Any]]:
     for key, value in items:
-        if isinstance(value, Mapping):
-            yield from _flat(value.items(), f"{prefix}{key}.")
+        inner = value.model_dump(exclude_unset=True) if isinstance(value, Model) else value
+        if isinstance(inner, Mapping) and inner:
+            yield from _flat(inner.items(), f"{prefix}{key}.")
         else:
-            yield f"{prefix}{key}", _hashable(value)
+            yield f"{prefix}{key}", _plain(f"{prefix}{key}", inner)
 
 
-def _hashable(value: Any) -> Any:
-    return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value
+def _plain(path: str, value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return tuple(_plain(path, entry) for entry in value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise problem(f"{path} must be numbers or null, each by its path, such as links.0.mass")
 
 
 Changes = Annotated[
@@ -112,11 +123,13 @@ def staged_numbers(scene: Scene) -> StagedNumbers:
 
 
 def phase_scene(scene: Scene, phase: Phase) -> tuple[Scene, tuple[str, ...]]:
-    """The scene with the numbers of a phase, and the paths of what is missing in it."""
-    changes, removed = {}, []
+    """The scene with the numbers of a phase, and the names of those that are zero in it."""
+    changes, removed, idle = {}, list[str](), set[str]()
     for path, value in phase.changes:
-        if value is None and (path == "payload" or path.startswith(_ACTUATORS)):
-            removed.append(path if path == "payload" else f"{path}.limit")
+        if value is None and path == "payload":
+            removed.append(path)
+        elif value is None and path.startswith(_ACTUATORS):
+            idle.add(path.removeprefix(_ACTUATORS))
         else:
             changes[path] = value
             if path == "target.motion":  # at rest, nothing of it is drawn
@@ -124,7 +137,18 @@ def phase_scene(scene: Scene, phase: Phase) -> tuple[Scene, tuple[str, ...]]:
                     ("spread.target_angular_velocity", "spread.target_linear_velocity"), 0.0
                 )
                 changes["target.base_velocity_relative"] = False
-    return scene.replace({**changes, "phases": ()}), tuple(removed)
+    own = scene.replace({**changes, "phases": ()})
+    controls = control_numbers(own)
+    removed += [
+        each.limit.name for field, part in ACTUATORS.items() if part in idle for each in controls[field]
+    ]
+    return own, tuple(removed)
+
+
+def phases_change_masses(scene: Scene) -> bool:
+    """Tell whether masses or inertias are not the same all the time, or what the tip holds."""
+    paths = (path for phase in scene.phases for path, _ in phase.changes)
+    return any(path == "payload" or "mass" in path or "inertia" in path for path in paths)
 
 
 def _is_in(name: str, paths: Iterable[str]) -> bool:
@@ -171,6 +195,10 @@ def phase_problems(scene: Scene) -> Iterator[Problem]:
                 here, dict(phase.changes), "moves a target that came to rest: keep target.motion null"
             )
         moves = not rests
+        posed = next((path for path, _ in phase.changes if _is_in(path, ("target.pose",))), None)
+        if posed is not None and own.target.motion is not None:
+            sentence = "has no effect on a target that moves: it needs target.motion: null beside it"
+            yield Problem((*here, posed), dict(phase.changes)[posed], sentence)
         held.append(scene.payload is not None and "payload" not in removed)
         gains = held[-2:] == [False, True]
         if gains != (phase.catch is not None):

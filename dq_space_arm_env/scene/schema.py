@@ -338,14 +338,16 @@ class Scene(Model):
         controls = [each for numbers in control_numbers(self).values() for each in numbers]
         limited = [controls[index] for index in previous_controls(self)]
         if given and len(given) != len(limited):
-            names = ", ".join(each.name for each in limited) or "constraints limit no control's rate"
+            names = ", ".join(each.name for each in limited) or "nothing limits a control's rate"
             sentence = f"must be {len(limited)} numbers ({names}); it has {len(given)}"
             yield Problem(place, given, sentence)
             return
         for index, value in enumerate(given):
             control = limited[index]
-            if abs(value) > control.limit.nominal:
-                sentence = f"must be within the limit of {control.name}, {control.limit.nominal:g}"
+            most = control.limit.nominal
+            least = 0.0 if is_part(control.limit.name, "actuators.thrusters") else -most
+            if not least <= value <= most:
+                sentence = f"must be within the limits of {control.name}, {least:g} to {most:g}"
                 yield Problem((*place, index), value, sentence)
 
     def _planar_problems(self) -> Iterator[Problem]:

@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field
 
 from dq_space_arm_env.scene.constraints import Direction
 from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
+from dq_space_arm_env.scene.parameters import thruster_names
 from dq_space_arm_env.validation.fields import Limit, Name, Position, Positive, Three
 from dq_space_arm_env.validation.problems import Model, Problem, problem
 
@@ -117,12 +118,16 @@ def burning_refusal(integrator: str) -> str | None:
 
 def thruster_problems(scene: Scene) -> Iterator[Problem]:
     """Find thrusters that contradict themselves or others, or leave the plane of a planar base."""
-    names: list[str] = []
+    names = thruster_names(scene)
     for index, thruster in enumerate(scene.actuators.thrusters or ()):
         here = ("actuators", "thrusters", index)
-        if thruster.name in names:
-            yield Problem((*here, "name"), thruster.name, "another thruster has this name")
-        names += [] if thruster.name is None else [thruster.name]
+        if names[index] in names[:index]:
+            yield Problem((*here, "name"), names[index], "another thruster has this name")
+        most = thruster.force * scene.simulation.dt
+        if thruster.impulse_bit > (1.0 + 1e-12) * most:
+            field = "minimum_impulse" if thruster.minimum_on_time is None else "minimum_on_time"
+            sentence = f"never fires: with the largest force a time step has an impulse of {most:g} N s"
+            yield Problem((*here, field), getattr(thruster, field), sentence)
         if thruster.minimum_on_time is not None:
             if thruster.minimum_impulse is not None:
                 sentence = "must be absent: minimum_on_time says the same"
@@ -152,7 +157,7 @@ def allocate(scene: Scene, force: ArrayLike, torque: ArrayLike) -> Array:
         forces give the wanted ones.
 
     Raises:
-        ValueError: If the scene has no thrusters, or a shape is wrong.
+        ValueError: If the scene has no thrusters, a shape is wrong, or a number is not finite.
     """
     thrusters = scene.actuators.thrusters
     if not thrusters:
@@ -162,6 +167,8 @@ def allocate(scene: Scene, force: ArrayLike, torque: ArrayLike) -> Array:
     )
     if wanted.ndim > 2 or wanted.shape[-1] != 6:
         raise ValueError(f"force, torque: shapes {np.shape(force)}, {np.shape(torque)}, must end in 3")
+    if not np.isfinite(wanted).all():
+        raise ValueError(f"force, torque: {wanted}, should be finite")
     wrenches = np.array([[*each.unit_direction, *each.moment] for each in thrusters]).T
     forces = np.array([_non_negative(wrenches, each) for each in np.atleast_2d(wanted)])
     share = np.array([each.force for each in thrusters]) / np.maximum(forces, 1e-300)

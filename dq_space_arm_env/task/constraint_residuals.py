@@ -502,6 +502,7 @@ def _exact(situation: _Situation, quantity: str, pose: Scalars, twist: Scalars) 
         return twist
     if quantity == "base_velocity":
         moving = (*situation.motion.angular, *situation.motion.linear)
-        return [a - b for a, b in zip(moving, situation.scene.target.base_velocity, strict=True)]
+        desired = situation.equations.desired_base_velocity(situation.base)
+        return [a - b for a, b in zip(moving, desired, strict=True)]
     linear, angular, _ = situation.momentum()
     return linear if quantity == "linear_momentum" else angular

@@ -76,13 +76,16 @@ def command(equations: SceneEquations, action: Scalars, x: Scalars = ()) -> Outp
 
 def observe(equations: SceneEquations, x: Scalars, memory: Scalars) -> Outputs:
     """Observation and report of a state, without a step."""
-    scene, rest = equations.scene, memory[len(MEMORY) :]
+    scene, layout, rest = equations.scene, equations.layout, memory[len(MEMORY) :]
     equations = at_stage(equations, memory[0], rest)
     view = seen(equations, x, (scene.simulation.steps - memory[0]) * scene.simulation.dt)
     errors = tip_errors(equations, x, view["errors"])
     errors += [equations.given[PHASE]] if scene.phases else []
     catching = [rest[-1], 0.0, 0.0] if has_catch(scene) else []
-    residuals = reported(equations, equations, x, [0.0] * equations.field.n_u, x) if scene.constraints else []
+    u = [0.0] * equations.field.n_u
+    for control, value in zip(layout.previous_controls, x[layout.state.actuators], strict=True):
+        u[control] = value  # they do not change before the first step
+    residuals = reported(equations, equations, x, u, x) if scene.constraints else []
     charge = [charged(scene, residuals, at_end=0.0)[0]] if scene.constraints else []
     last = [*errors, *catching, 0.0, *charge, *residuals]
     costs = [0.0] * (len(report_names(scene)) - len(last))

@@ -200,10 +200,15 @@ class SceneEquations:
 
     def _velocity_cost(self, x: Scalars, field: str) -> Scalar:
         motion = self.field.motion(self.y(x))
-        references: Scalars = self.scene.target.base_velocity
-        if self.scene.target.base_velocity_relative:
-            references = dual_vectors.add(references, self.target_twist(self.base_pose(x)))
+        references = self.desired_base_velocity(self.base_pose(x))
         return weighted_square((*motion.angular, *motion.linear), references, self.state_weights(field))
+
+    def desired_base_velocity(self, base: Scalars) -> Scalars:
+        """Desired velocity of the base in its axes, 6, from its pose: it may be relative to the target's."""
+        desired: Scalars = self.scene.target.base_velocity
+        if self.scene.target.base_velocity_relative:
+            desired = dual_vectors.add(desired, self.target_twist(base))
+        return desired
 
     def state_weights(self, field: str) -> list[Scalar]:
         """Weights of the state in the cost by their field in the scene, such as "terminal_pose"."""

@@ -178,7 +178,9 @@ def violations(scene: Scene, states: FloatArray, controls: FloatArray, body: Flo
     given = {**equations.given, **places}
     grasp = dq.multiply(body_pose(scene, given), grasp_pose(scene, given))
     equations = replace(equations, given=given, target=grasp)
-    x, u = list(states.T), list(np.vstack([controls, np.zeros_like(controls[:1])]).T)
+    layout, last = StateLayout.of(scene), np.zeros_like(controls[:1])
+    last[0, list(layout.previous_controls)] = states[-1, layout.state.actuators]  # they change no more
+    x, u = list(states.T), list(np.vstack([controls, last]).T)
     residuals = path_residuals(equations, equations.base_pose(x), equations.y(x), u)
     rows = [row for each in scene.constraints for row in rows_of(scene, each)]
     limits = [VISIBLE * row.tolerance for row in rows]

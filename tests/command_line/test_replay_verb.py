@@ -51,6 +51,17 @@ def test_policy_flies_from_where_the_first_flight_starts(rollout: Path, scene: S
     step = kernels.step(flight.states[0], flight.controls[0])
     np.testing.assert_allclose(flight.states[1], step, atol=1e-12)
 
+    # With the target and the masses that its seed has drawn.
+    drawn = scene.replace(spread={"target_position": 0.2, "link_masses": 0.1, "joint_angles": 0.3})
+    sources = [(None, str(policy))]
+    [((first,), _)] = collect_flights(sources, drawn, Console(quiet=True), seed=3)
+    first.save(tmp_path / "first.npz")
+    sources.insert(0, (None, str(tmp_path / "first.npz")))
+    [((_, second), _)] = collect_flights(sources, None, Console(quiet=True))
+    assert second.seed == 3
+    np.testing.assert_array_equal(second.target, first.target)
+    np.testing.assert_array_equal(second.states, first.states)
+
     # The folder of a solution stands for its file.
     out, folder = tmp_path / "page.html", tmp_path / "solved"
     folder.mkdir()

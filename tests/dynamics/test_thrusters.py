@@ -151,10 +151,14 @@ def test_names_limits_and_weights_are_those_of_the_jets() -> None:
         ({"force": -1.0}, "must be a number greater than 0"),
         ({"minimum_impulse": 0.1, "minimum_on_time": 0.1}, "minimum_on_time says the same"),
         ({"force": np.inf, "minimum_on_time": 0.1}, "the largest force is not finite"),
+        ({"minimum_on_time": 0.11}, "never fires: with the largest force a time step has an impulse of"),
+        ({"minimum_impulse": 5.0}, "never fires"),
     ],
 )
 def test_thrusters_that_do_not_fit_are_refused(jet: dict[str, Any], sentence: str) -> None:
     with pytest.raises(SceneError, match=sentence):
         planar(**{"actuators.thrusters": [JETS[0] | jet]})
+    with pytest.raises(SceneError, match="another thruster has this name"):
+        planar(**{"actuators.thrusters": [JETS[0] | {"name": "thruster 2"}, JETS[1]]})
     with pytest.raises(SceneError, match="must be a list of thrusters"):
         planar(**{"actuators.thrusters": []})

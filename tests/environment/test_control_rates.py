@@ -143,9 +143,15 @@ def test_the_control_before_the_episode_is_given():
     np.testing.assert_array_equal(env.state[-count:], np.linspace(0.5, 1.5, count))
     with pytest.raises(SceneError, match=rf"must be {count} numbers \(base torque z, "):
         LIMITED.replace(initial_state={"previous_controls": [1.0]})
-    with pytest.raises(SceneError, match="limit no control's rate"):
+    _, info = env.reset(options={"nominal": True})
+    assert info["cost"] == 0.0  # nothing changes before the first step
+    np.testing.assert_allclose(
+        list(info["constraints"].values()),
+        np.tile([-4.0, -4.0] + [-2.0] * (2 * count - 2), 1) * LIMITED.simulation.dt,
+    )
+    with pytest.raises(SceneError, match="nothing limits a control's rate"):
         PLAIN.replace(initial_state={"previous_controls": [1.0]})
-    with pytest.raises(SceneError, match=r"previous_controls\[0\] = 99.0: must be within the limit of base"):
+    with pytest.raises(SceneError, match=r"previous_controls\[0\] = 99.0: must be within the limits of base"):
         LIMITED.replace(initial_state={"previous_controls": [99.0] * count})
 
 
@@ -163,6 +169,12 @@ def test_each_joint_wheel_and_thruster_may_have_a_rate_of_its_own():
     assert [limit.rate for limit in rates_of(wheels)] == [1.0, 2.0, 3.0, 4.0]
     jets = load_scene("thrusters").replace(constraints=[{**rates, "thrusters": 2.0}])
     assert [limit.name for limit in rates_of(jets)] == [f"{name} force" for name in thruster_names(jets)]
+    with pytest.raises(
+        SceneError, match=r"previous_controls\[3\] = -0.5: must be within the limits of .*, 0 to"
+    ):
+        jets.replace(
+            initial_state={"previous_controls": [0.0, 0.0, 0.0, -0.5] + [0.0] * (len(rates_of(jets)) - 4)}
+        )
     heavy = load_scene("heavy-wrist")  # whose wrist has three torques
     torques = [float(index + 1) for index in range(len(heavy.links))]
     heavy = heavy.replace(constraints=[*heavy.constraints, {**rates, "joint_torque": torques}])

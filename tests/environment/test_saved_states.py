@@ -189,6 +189,13 @@ def test_bad_states_are_refused_and_change_nothing():
             each.reset(options={"state": state, "nominal": True})
         with pytest.raises(ValueError, match="state: x has shape"):
             each.reset(options={"state": {**state, "x": state["x"][:2]}})
+        for steps in (-1.0, 0.5, 1e7, np.nan):
+            counted = state["memory"].copy()
+            counted[..., 0] = steps
+            with pytest.raises(
+                ValueError, match=r"state: memory counts .* steps, should be whole numbers up to"
+            ):
+                each.set_state({**state, "memory": counted})
         assert_same(each.get_state(), state)
     for rows in ([3], [0, 0], [[True]], "x"):
         with pytest.raises(ValueError, match="rows: "):

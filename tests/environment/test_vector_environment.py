@@ -229,6 +229,7 @@ def test_what_a_caller_does_to_results_does_not_matter():
     [
         (lambda v: v.step(np.zeros((3, 12))), r"shape \(3, 12\), should be \(4, 12\)"),
         (lambda v: v.reset(seed=[1, 2]), "2 seeds, should be 4"),
+        (lambda v: v.reset(seed=1.5), "seed: 1.5, should be a whole number, or one for each"),
         (lambda v: v.reset(options={"reset_mask": np.zeros(4, dtype=bool)}), "False everywhere"),
         (lambda v: v.reset(options={"reset_mask": [True] * 4}), "should be a bool array"),
         (lambda v: v.reset(options={"nominel": True}), r"\['nominel'\] unknown; choose from nominal"),
@@ -259,9 +260,22 @@ def test_copies_that_a_first_reset_leaves_out_begin_at_the_next_step(mode):
     assert not over.any()
 
 
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_who_is_pushed_and_not_reset_shows_where_it_is(mode):
+    venv = DQSpaceArmVectorEnv(2, short(), mode)
+    venv.reset(seed=5)
+    venv.perturb(np.full((2, venv.kernels.n_t), 0.01))
+    pushed = venv.observe()[1]
+    observations, _ = venv.reset(options={"reset_mask": np.array([True, False])})
+    np.testing.assert_array_equal(observations[1], pushed)
+
+
 def test_bad_construction_is_refused():
-    with pytest.raises(ValueError, match="num_envs: 0, should be at least 1"):
-        DQSpaceArmVectorEnv(0)
+    for number in (0, 1.5):
+        with pytest.raises(ValueError, match=f"num_envs: {number}, should be a whole number of at least 1"):
+            DQSpaceArmVectorEnv(number)
+        with pytest.raises(ValueError, match=f"threads: {number}, should be a whole number of at least 1"):
+            DQSpaceArmVectorEnv(2, threads=number)
     with pytest.raises(ValueError, match="render_mode: 'human'"):
         DQSpaceArmVectorEnv(2, render_mode="human")
     with pytest.raises(ResetNeeded):

@@ -1,5 +1,6 @@
 """MJCF of scenes in MuJoCo: accelerations, inverse dynamics, tip, start, limits."""
 
+import math
 import os
 import subprocess
 import sys
@@ -282,9 +283,26 @@ def test_a_lamina_is_a_body_to_mujoco_too():
         check_accelerations(scene.replace(base=base), samples=1)
 
 
+def test_every_tip_holds_its_payload():
+    scene = load_scene("dual-arm")
+    held = {"mass": 30.0, "inertia": [1.0, 2.0, 2.5], "center_of_mass": [0.1, 0.0, 0.2]}
+    scene = scene.replace({"other_tips.0.payload": held})
+    model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene))
+    bodies = [scene.base, *scene.links, scene.other_tips[0].payload]
+    total = math.fsum(body.mass for body in [*bodies, *([scene.payload] if scene.payload else [])])
+    assert model.body_mass.sum() == pytest.approx(total, rel=1e-14)
+    check_accelerations(scene, samples=2)
+
+
+def test_a_link_may_be_called_base():
+    scene = load_scene("no-wrist").replace({"links.0.name": "base"})
+    check_accelerations(scene, samples=1)
+
+
 @pytest.mark.parametrize(
     ("name", "wrist", "sentence"),
     [
+        ("release", "fixed", r"its masses stay, and phases change some: leave them out with replace\(phases"),
         ("paper", "refuse", r"written as MJCF:\n  - the wrist has joints without mass.*wrist='fixed'"),
         ("tip-load", "fixed", r"no constant wrench at the tip: leave it out with replace\(tip_wrench"),
         ("paper", "free", "wrist: 'free', it must be 'refuse' or 'fixed'"),

@@ -2,6 +2,7 @@
 
 import math
 from time import process_time
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -345,6 +346,17 @@ def test_a_fixed_wrist_changes_no_acceleration():
     assert relative_error(found, accelerations(scene, x, u)) < 1e-13
 
 
+def test_other_tips_keep_their_payloads():
+    held = {"mass": 30.0, "inertia": [1.0, 2.0, 2.5], "center_of_mass": [0.1, 0.0, 0.2]}
+    scene = load_scene("dual-arm").replace({"other_tips.0.payload": held})
+    robot = ElementTree.fromstring(scene_to_urdf(scene))
+    name, link = scene.other_tips[0].name, scene.other_tips[0].link
+    (joint,) = (each for each in robot.findall("joint") if each.find("child").get("link") == name)
+    assert joint.find("parent").get("link") == link
+    (body,) = (each for each in robot.findall("link") if each.get("name") == name)
+    assert float(body.find("inertial/mass").get("value")) == 30.0
+
+
 def test_names_of_our_own_make_way():
     scene = load_scene("no-wrist")
     names = ("base", "tip", "tip_")
@@ -361,6 +373,7 @@ def test_names_of_our_own_make_way():
         ("paper", {}, "the wrist has joints without mass"),
         ("tip-load", {}, "no constant wrench at the tip"),
         ("planar", {}, "no base that moves in a plane"),
+        ("release", {}, "its masses stay, and phases change some"),
         ("no-wrist", {"stiffness": 1.0}, "no joint springs, and link 'link 1' has one"),
     ],
 )

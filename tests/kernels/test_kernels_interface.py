@@ -155,3 +155,28 @@ def test_errors_of_the_tips_are_those_that_the_environment_reports(name):
     if scene.other_tips:
         main = compile_scene(scene).relative_twist(env.state, p=env.stage_parameters)
         assert errors[3] > np.linalg.norm(main[3:])  # the other tip is the faster one
+
+
+ACTUATORS = {
+    "motors": {},
+    "wheels": {"actuators.wheels.0.power": 0.05, "constraints": []},
+    "thrusters": {"actuators.thrusters.0.minimum_impulse": 0.05},
+    "paper": {"actuators.base_force": {"limit": 10.0, "slew_limit": 100.0}},
+}
+
+
+@pytest.mark.parametrize("name", ACTUATORS)
+def test_applied_inputs_are_those_that_act_in_the_environment(name):
+    scene = load_scene(name).replace(ACTUATORS[name]) if ACTUATORS[name] else load_scene(name)
+    env, kernels = DQSpaceArmEnv(scene), compile_scene(scene)
+    env.reset(seed=2)
+    rng, clipped = np.random.default_rng(3), False
+    for _ in range(40):
+        x, row = env.state, env.stage_parameters
+        action = rng.choice([-1.0, 0.3, 1.0], kernels.n_u)
+        asked = kernels.layout.to_control(action, row if kernels.n_p else None)
+        acting = kernels.applied_inputs(x, asked, p=row)
+        env.step(action)
+        np.testing.assert_allclose(env.state, kernels.step(x, acting, p=row), rtol=0.0, atol=1e-9)
+        clipped = clipped or bool(np.abs(acting - asked).max() > 1e-3)
+    assert clipped

@@ -1,5 +1,6 @@
 """Motions of the target in scene files: errors by field, files of poses, changes, drawn motions, hashes."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,17 @@ def test_a_file_needs_a_path_and_nothing_else() -> None:
     ):
         with pytest.raises(SceneError, match="must have a kind, file, and a path"):
             with_motion(motion)
+
+
+def test_a_file_is_found_beside_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "poses.csv").write_text("\n".join([HEADER, *ROWS]) + "\n")
+    entries = load_scene("no-wrist").model_dump(mode="json", exclude_unset=True)
+    entries["target"]["motion"] = {"kind": "file", "path": "poses.csv"}
+    (tmp_path / "scene.yaml").write_text(json.dumps(entries))
+    for folder in (tmp_path, tmp_path.parent):
+        monkeypatch.chdir(folder)
+        path = tmp_path / "scene.yaml"
+        assert len(load_scene(path.relative_to(folder)).target.motion.points) == len(ROWS)
 
 
 def test_a_file_becomes_the_waypoints_that_it_holds(tmp_path: Path) -> None:

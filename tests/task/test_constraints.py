@@ -9,11 +9,13 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from dq_space_arm_env import SceneError, compile_scene, load_scene
-from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra import dual_quaternion as dq
+from dq_space_arm_env.algebra import dual_vectors, poses
 from dq_space_arm_env.kernels.library import PENALIZED
 from dq_space_arm_env.scene.constraint_rows import n_multipliers, path_rows
 from dq_space_arm_env.scene.constraints import Volume
-from dq_space_arm_env.task.constraint_residuals import _Segment, _segment_distance
+from dq_space_arm_env.task.constraint_residuals import _Segment, _segment_distance, terminal_residuals
+from dq_space_arm_env.task.equations import SceneEquations
 
 FRAME = {"frame": "link 2", "to": [0.75, 0.1, -0.2], "radius": 0.05}
 KINDS = {
@@ -288,6 +290,42 @@ def test_mistakes_are_named(changes, message):
     rest = {} if changes["kind"] in WITHOUT_DEFAULTS else KINDS.get(changes["kind"], {})
     with pytest.raises(SceneError, match=message):
         load_scene("paper").replace(constraints=[{"name": "it", **rest, **changes}])
+
+
+def test_a_bound_that_no_joint_has_is_refused():
+    links = [{**load_scene("no-wrist").links[0].model_dump(mode="json"), "joint_type": "spherical"}]
+    ball = load_scene("no-wrist").replace({"links": links, "initial_state.joint_angles": []})
+    with pytest.raises(SceneError, match="no joint has one coordinate"):
+        ball.replace(constraints=[{"kind": "joint_limits", "name": "it", "rate": 0.1}])
+
+
+def test_wheels_of_changing_masses_store_what_nobody_knows():
+    scene = with_wheels()
+    phases = [
+        {"name": "a", "steps": 10},
+        {"name": "b", "steps": scene.simulation.steps - 10, "changes": {"base.mass": 50.0}},
+    ]
+    with pytest.raises(SceneError, match="what the wheels store is not known: phases change masses"):
+        scene.replace(phases=phases)
+
+
+def test_an_exact_base_velocity_is_that_of_the_cost():
+    """A base that moves along with a target, as if fixed to it."""
+    entry = {"kind": "terminal", "name": "it", "exact": ["base_velocity"]}
+    scene = load_scene("tumbling-target").replace(
+        {"constraints": [entry], "target.base_velocity_relative": True, "target.base_velocity": [0.0] * 6}
+    )
+    kernels = compile_scene(scene)
+    row, x = kernels.stage_parameters()[-1], kernels.layout.initial_state.copy()
+    relative = dq.multiply(dq.conjugate(tuple(kernels.layout.target_with(row))), tuple(x[:8]))
+    twist = dual_vectors.inverse_transform(
+        *poses.to_matrix(relative), tuple(kernels.layout.target_velocity_with(row))
+    )
+    x[kernels.layout.state.base_velocity] = twist
+    equations = SceneEquations.of(scene, row.tolist())
+    assert float(equations.terminal_cost_terms(list(x))[1]) < 1e-25
+    residuals = terminal_residuals(equations, list(x[:8]), list(x[8:]))
+    np.testing.assert_allclose(np.array(residuals[-6:], dtype=float), 0.0, atol=1e-13)
 
 
 def test_two_constraints_of_a_name_are_refused():

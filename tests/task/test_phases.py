@@ -11,9 +11,11 @@ import dq_space_arm_env
 from dq_space_arm_env import Scene, SceneError, compile_scene, load_scene
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
+from dq_space_arm_env.environment.disturbances import with_loads
 from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.interoperability.pinocchio_twin import pinocchio_model, to_pinocchio
 from dq_space_arm_env.kernels.capture import catch_payload
+from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.phases import phase_scene
 from experts.problems.arm_problem import ArmProblem
 
@@ -207,6 +209,7 @@ def test_a_catch_outside_the_tolerances_fails() -> None:
         assert info["caught"] == (stage + 1 < start)
         assert info["shock"] == 0.0
     assert not info["is_success"]
+    assert env.stage_parameters[env.kernels.parameters.names.index("payload.mass")] == 0.0
     # Nothing is held: the free robot moves on.
     assert (
         np.abs(
@@ -263,6 +266,64 @@ def test_what_every_phase_changes_is_changed() -> None:
     assert not kernels.layout.limits_with(rows[3])[kernels.layout.control.base_force].any()
 
 
+@pytest.mark.parametrize(
+    ("name", "actuator", "change"),
+    [
+        ("wheels", "wheels", {}),
+        ("thrusters", "thrusters", {}),
+        ("paper", "joint_torque", {"links.0.torque_limit": 1.5}),
+    ],
+)
+def test_an_actuator_out_of_work_gives_nothing(name: str, actuator: str, change: dict[str, Any]) -> None:
+    scene = load_scene(name).replace(change) if change else load_scene(name)
+    phases = [
+        {"name": "off", "steps": 2, "changes": {f"actuators.{actuator}": None}},
+        {"name": "on", "steps": scene.simulation.steps - 2},
+    ]
+    scene = scene.replace(phases=phases)
+    layout, rows = StateLayout.of(scene), compile_scene(scene).stage_parameters()
+    fields = {"wheels": "wheel_torque", "thrusters": "thruster_force"}
+    own = getattr(layout.control, fields.get(actuator, actuator))
+    off, on = layout.limits_with(rows[1])[own], layout.limits_with(rows[2])[own]
+    assert not off.any()
+    np.testing.assert_array_equal(on, layout.control_limit[own])
+
+
+def test_what_phases_set_is_no_option_of_a_reset() -> None:
+    scene = SCENES["release"].replace({"phases.1.changes.target.pose.position": [1.0, 0.0, 2.0]})
+    env = dq_space_arm_env.DQSpaceArmEnv(scene)
+    with pytest.raises(ValueError, match="target; the phases of scene"):
+        env.reset(options={"target": scene.target.pose.dual_quaternion})
+    env.reset(seed=1)
+    env.reset(options={"parameters": env.parameters})
+    env.reset(options={"parameters": env.stage_parameters})
+    heavier = env.parameters
+    heavier[env.kernels.parameters.names.index("payload.mass")] *= 2.0
+    with pytest.raises(ValueError, match=r"payload.mass is 100, should be 50: it is the phases"):
+        env.reset(options={"parameters": heavier})
+
+
+def test_a_payload_that_phases_change_has_no_factor() -> None:
+    scene = SCENES["release"]
+    assert with_loads(scene, [1.0])[0] is not None
+    with pytest.raises(ValueError, match=r"phases that change payload.mass: mass_factors should be 1"):
+        with_loads(scene, [1.0, 2.0])
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "momentum_rk4", "gauss6"])
+def test_many_steps_across_a_release_are_single_ones(integrator: str) -> None:
+    scene = SCENES["release"].replace(simulation={"integrator": integrator})
+    kernels = compile_scene(scene)
+    x, rows = kernels.layout.initial_state, kernels.stage_parameters()[:-1]
+    u, count = np.full(kernels.n_u, 0.01), len(rows)
+    walked = kernels.simulate(x, u, count, p=rows)
+    states = [x]
+    for row in rows:
+        states.append(kernels.step(states[-1], u, p=row))
+    np.testing.assert_allclose(walked, states, rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(kernels.simulate(x, u, count, every=3, p=rows), walked[::3])
+
+
 def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
     problem = ArmProblem("capture-and-detumble")
     coarse, entries = problem.coarsened(5), problem.kernels.parameters
@@ -295,6 +356,19 @@ def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
         ({"spread.payload_mass": 0.1}, "it can have no spread"),
         ({"payload": None}, "the scene has no payload"),
         ({"phases.0.changes": {"payload": None, "target.motion": None}}, "keep target.motion null"),
+        (
+            {"phases.0.changes": {"payload": None, "target.pose.position": [1, 2, 3]}},
+            "needs target.motion: null",
+        ),
+        ({"phases.1.changes": {"payload": None, "links": [{"mass": 3}]}}, "links must be numbers or null"),
+        (
+            {"phases.1.changes": {"payload": None, "simulation.dt": {}}},
+            "simulation.dt must be numbers or null",
+        ),
+        (
+            {"phases.1.changes": {"payload": None, "base.mass": 50, "base": {"mass": 60}}},
+            "gives base.mass twice",
+        ),
     ],
 )
 def test_mistakes_are_named(changes: dict[str, Any], words: str) -> None:

@@ -29,6 +29,7 @@ from dq_space_arm_env.kernels.programs.stage_programs import of_stage, stage_met
 from dq_space_arm_env.scene.parameters import moving_numbers
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.scene.thrusters import burning_refusal
+from dq_space_arm_env.task.actuator_limits import applied
 from dq_space_arm_env.task.augmented_lagrangian import PenalizedEquations
 from dq_space_arm_env.task.episode import next_target, seen, tip_errors, with_target
 from dq_space_arm_env.task.equations import SceneEquations, total
@@ -81,6 +82,7 @@ class ScenePrograms:
             "retract": self._retract,
             "measured_step": self._measured_step,
             "observation": self._observation,
+            "applied_inputs": self._applied_inputs,
             "tip_errors": self._tip_errors,
             "relative_twist": self._relative_twist,
             "next_target": self._next_target,
@@ -249,6 +251,14 @@ class ScenePrograms:
             x=self.field.n_x,
             time_left=1,
         )
+
+    def _applied_inputs(self) -> Program:
+        """What actuators do with their inputs."""
+
+        def outputs(x: Scalars, u: Scalars) -> Mapping[str, Scalars]:
+            return {"applied": applied(self.equations, x, u)}
+
+        return self._program("applied_inputs", outputs, x=self.field.n_x, u=self.field.n_u)
 
     def _tip_errors(self) -> Program:
         """Errors of the tips as the environment reports them."""
