@@ -150,7 +150,7 @@ def _draw_training_costs(axes: Axes, rows: Sequence[Row], looks: Looks) -> None:
         optimum = row.facts["validation_optimum"]
         costs = [point["median_cost"] for point in row.facts["learning_curve"]]
         known = [None if cost is None or optimum is None else _excess(cost / optimum) for cost in costs]
-        end = _excess(float(np.median(row.evaluation.flights.cost)) / _median_optimum(row))
+        end = _excess(_median_ratio(row))
         _draw_training(axes, row, known, end, looks)
         if (seconds := _training_seconds(row)) is not None:
             _draw_gap(axes, seconds, Interval(*3 * [end / 100.0]), looks[row.name])
@@ -261,12 +261,13 @@ def _set_training_axis(axes: Axes, rows: Sequence[Row]) -> None:
     axes.set_title("Line: validation starts; marker: evaluation", loc="left", fontsize=8.5)
 
 
-def _median_optimum(row: Row) -> float:
-    """Median of the optimal costs, dimensionless; NaN if none is known."""
+def _median_ratio(row: Row) -> float:
+    """Median cost over the median optimum, of the starts whose optimum is known; NaN if none is."""
     optimal = row.evaluation.optimal
     if optimal is None or np.isnan(optimal.cost).all():
         return float("nan")
-    return float(np.nanmedian(optimal.cost))
+    known = np.isfinite(optimal.cost)
+    return float(np.median(row.evaluation.flights.cost[known]) / np.median(optimal.cost[known]))
 
 
 def _training_seconds(row: Row) -> float | None:

@@ -20,6 +20,7 @@ from agents.configuration.imitation import ImitationConfiguration, ObjectiveWeig
 from agents.evaluation.statistics import rate_over_runs
 from agents.imitation.cloning import Making, clone, fingerprint
 from agents.imitation.trainer import Progress
+from agents.run_folder import reserved
 from dq_space_arm_env.common.bounded_reading import parse_json, read_text
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import Advance, Status
@@ -64,7 +65,7 @@ def measure(
     """Train all variants, fly each from the starts of `tests`, and return a row per training.
 
     Each seed learns from demonstrations of its own, or all from the only ones. Network and optimizer are the
-    configuration's; finished trainings in the folder are kept.
+    configuration's; finished trainings in the folder are kept. RunFolderError if another process works there.
     """
     if len(demonstrations) not in (1, effort.seeds):
         raise ValueError(f"{len(demonstrations)} sets of demonstrations: should be 1 or {effort.seeds}")
@@ -74,25 +75,26 @@ def measure(
         if set(pool.column("seed").tolist()) & set(tests.column("seed").tolist()):
             raise ValueError("demonstrations and tests share starts: give them different seeds")
     identity = _identity(configuration, effort, demonstrations, tests)
-    done = _read(folder / LINES, identity)
-    found = {(row["variant"], row["count"], row["seed"]) for row in done}
-    order = list(_order(effort))
-    for number, (variant, count, seed) in enumerate(order):
-        if (variant, count, seed) in found:
-            continue
-        label = f"{number + 1} of {len(order)}, {TITLES[variant]}, {count} demonstrations"
+    with reserved(folder):
+        done = _read(folder / LINES, identity)
+        found = {(row["variant"], row["count"], row["seed"]) for row in done}
+        order = list(_order(effort))
+        for number, (variant, count, seed) in enumerate(order):
+            if (variant, count, seed) in found:
+                continue
+            label = f"{number + 1} of {len(order)}, {TITLES[variant]}, {count} demonstrations"
 
-        def tell(advance: Advance, number: int = number, label: str = label) -> None:
-            if progress is not None:
-                finished, total = number * advance.total + advance.done, len(order) * advance.total
-                progress(Status(finished, total, f"{label}: {advance.describe()}"))
+            def tell(advance: Advance, number: int = number, label: str = label) -> None:
+                if progress is not None:
+                    finished, total = number * advance.total + advance.done, len(order) * advance.total
+                    progress(Status(finished, total, f"{label}: {advance.describe()}"))
 
-        # A larger set contains the smaller ones of the same seed.
-        pool = demonstrations[seed % len(demonstrations)]
-        chosen = pool.select(np.random.default_rng(seed).permutation(len(pool))[:count])
-        done.append(_train(configuration, effort, variant, chosen, seed, tests, tell))
-        lines = "".join(json.dumps(line) + "\n" for line in (identity, *done))
-        write_atomically(folder / LINES, lines)
+            # A larger set contains the smaller ones of the same seed.
+            pool = demonstrations[seed % len(demonstrations)]
+            chosen = pool.select(np.random.default_rng(seed).permutation(len(pool))[:count])
+            done.append(_train(configuration, effort, variant, chosen, seed, tests, tell))
+            lines = "".join(json.dumps(line) + "\n" for line in (identity, *done))
+            write_atomically(folder / LINES, lines)
     return done
 
 

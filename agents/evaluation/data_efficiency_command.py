@@ -120,12 +120,12 @@ def _verdict(measured: Sequence[Row]) -> list[str]:
         if found is None:
             sentences.append(f"Cloning {TITLES[variant]} is nowhere better than actions alone.")
             continue
-        need = f"{found.needed}"
+        need, times = f"{found.needed}", f"{found.ratio:.3g} times"
         if found.needed is None:
-            need = f"more than {max(point['count'] for point in measured)}"
+            need, times = f"more than {max(point['count'] for point in measured)}", f"more than {times}"
         sentences.append(
             f"Cloning {TITLES[variant]}: {found.point['success']:.1%} with {found.point['count']} "
-            f"demonstrations; actions alone need {need}, {found.ratio:.0f} times as many."
+            f"demonstrations; actions alone need {need}, {times} as many."
         )
     return sentences
 

@@ -67,9 +67,10 @@ def evaluate_policies(
     summaries = []
     statistics = statistics_by_model(policies, normalize)
     for condition in CONDITIONS if ALL in conditions else conditions:
+        evaluations = []
         with progress_bar() as show:
-            evaluations = [
-                evaluate(
+            for number, policy in enumerate(policies, 1):
+                evaluation = evaluate(
                     policy,
                     scene,
                     n,
@@ -80,23 +81,21 @@ def evaluate_policies(
                     normalize=statistics.get(policy),
                     progress=show,
                 )
-                for policy in policies
-            ]
+                evaluations.append(evaluation)
+                if out is not None:  # what is flown stays, whatever happens to the next
+                    name = f"{number}-{Path(evaluation.policy).stem}-{condition}"
+                    content = json.dumps({**evaluation.record(), "provenance": provenance()})
+                    out.mkdir(parents=True, exist_ok=True)
+                    write_atomically(out / (re.sub(r"[^\w.-]+", "-", name) + ".json"), content + "\n")
         summaries += [evaluation.summary() for evaluation in evaluations]
         console.print(evaluation_table(evaluations).for_terminal())
         if together := groups(evaluations):
             console.print(groups_table(together).for_terminal())
         for sentence in remarks(evaluations):
             console.print(sentence, markup=False)
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            for number, evaluation in enumerate(evaluations, 1):
-                name = f"{number}-{Path(evaluation.policy).stem}-{condition}"
-                content = json.dumps({**evaluation.record(), "provenance": provenance()})
-                write_atomically(out / (re.sub(r"[^\w.-]+", "-", name) + ".json"), content + "\n")
-            if together:
-                seeds = {"groups": [group_record(group) for group in together], "provenance": provenance()}
-                write_atomically(out / f"seeds-{condition}.json", json.dumps(seeds) + "\n")
+        if out is not None and together:
+            seeds = {"groups": [group_record(group) for group in together], "provenance": provenance()}
+            write_atomically(out / f"seeds-{condition}.json", json.dumps(seeds) + "\n")
     return summaries
 
 

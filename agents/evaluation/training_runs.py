@@ -69,13 +69,16 @@ def learning_curve(policy: Path) -> list[dict[str, Any]]:
     for line in read_text(file).splitlines():
         try:
             found = parse_json(line, str(file))
+            seconds, rate = float(found["seconds"]), float(found["success_rate"])
             cost = found.get("median_cost")
             point = {
-                "seconds": float(found["seconds"]),
+                "seconds": seconds,
                 "environment_steps": int(found.get("environment_steps", 0)),
-                "success_rate": float(found["success_rate"]),
-                "median_cost": None if cost is None or math.isnan(cost) else float(cost),
+                "success_rate": rate,
+                "median_cost": None if cost is None or not math.isfinite(cost) else float(cost),
             }
+            if not (math.isfinite(seconds) and 0.0 <= rate <= 1.0):
+                continue
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
             continue  # not a point of a learning curve
         points.append(point)
@@ -94,7 +97,7 @@ def seed_of(metadata: Mapping[str, Any]) -> int | None:
     """The seed of a training run; None if the metadata lack it."""
     configuration = metadata.get("configuration")
     seed = configuration.get("seed") if isinstance(configuration, Mapping) else None
-    return None if seed is None else int(seed)
+    return seed if isinstance(seed, int) else None
 
 
 def validation_episodes(metadata: Mapping[str, Any]) -> int | None:

@@ -83,7 +83,7 @@ def statistics_by_model(policies: Sequence[str], normalize: Path | None) -> dict
 
 def owns_policy(policy: str) -> bool:
     """Tell whether a name or a path is a policy, rather than a recorded flight."""
-    return policy in _BUILT_IN or any(source.owns_policy(policy) for source in _sources())
+    return policy.lower() in _BUILT_IN or any(source.owns_policy(policy) for source in _sources())
 
 
 def _built_in(name: str, start: Start, seed: int | None) -> Pilot:

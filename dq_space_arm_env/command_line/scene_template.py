@@ -39,7 +39,7 @@ def _mapping(model: BaseModel, indent: str, *, apart: bool = False, explained: b
             continue
         if isinstance(model, Phase) and name == "changes":
             yield from _with_comment(f"{indent}{name}:", comment, indent)
-            yield from (f"{indent}  {path}: {_inline(number)}" for path, number in value)
+            yield from (f"{indent}  {path}: {_untyped(number)}" for path, number in value)
             continue
         models = isinstance(value, tuple) and isinstance(value[0], BaseModel)
         line = f"{indent}{name}: {_inline(value)}" if isinstance(value, Pose) else ""
@@ -100,6 +100,13 @@ def _inline(value: Any) -> str:
         return str(value)
     # JSON's text is YAML's; what YAML would take for the end of a line is escaped.
     return json.dumps(str(value), ensure_ascii=not str(value).isprintable())
+
+
+def _untyped(value: Any) -> str:
+    """A value whose type nothing tells but how it is written: 2.0 stays 2.0."""
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_untyped, value))}]"
+    return repr(value) if isinstance(value, float) and math.isfinite(value) else _inline(value)
 
 
 def _is_diagonal(value: tuple[Any, ...]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,6 +90,7 @@ def simulate(
     from dq_space_arm_env.command_line.simulated_episode import (
         begin,
         drowned_inputs,
+        final_errors,
         fly,
         numerical_error,
         read_noise,
@@ -112,28 +114,21 @@ def simulate(
         print_document({**flight.facts(), **known, "file": None if out is None else str(out)})
         return
     console = table_console()
-    console.print(_table(loaded, flight, error))
+    console.print(_table(loaded, flight, final_errors(begun, flight), error))
     if out is not None:
         console.print(f"{out}: watch it with `dq-space-arm replay {out}`", markup=False, soft_wrap=True)
 
 
-def _table(scene: Scene, flight: Trajectory, error: float) -> Table:
+def _table(scene: Scene, flight: Trajectory, errors: Sequence[float], error: float) -> Table:
+    from dq_space_arm_env.command_line.simulated_episode import error_rows
     from dq_space_arm_env.common.tables import plain_table
 
-    success = scene.success
-    verdict = (
-        "DIVERGED" if flight.diverged else "success" if flight.is_success else "NOT within the tolerance"
-    )
+    verdict = "DIVERGED" if flight.diverged else "success" if flight.is_success else "NO success"
     rows = (
         ("start", flight.start, ""),
         ("cost J", f"{flight.cost:.6f}", "minus the sum of the rewards"),
         ("steps", str(len(flight.controls)), f"{1e6 * flight.action_seconds:.0f} us for an action"),
-        (
-            "attitude error",
-            f"{flight.attitude_error:.3g} deg",
-            f"tolerance {success.attitude_error_deg:g} deg",
-        ),
-        ("position error", f"{flight.position_error:.3g} m", f"tolerance {success.position_error:g} m"),
+        *error_rows(scene.success, errors),
         ("numerical error", f"{error:.1e}", "m or rad, of the tip at the end"),
         ("end", verdict, ""),
     )

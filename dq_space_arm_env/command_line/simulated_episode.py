@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from dq_space_arm_env.environment.disturbances import Disturbances
 from dq_space_arm_env.environment.rollouts import Policy, StateFeedback, rollout
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene.maneuver import Success
 from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.task.trajectory import Trajectory
 
@@ -135,6 +136,27 @@ def drowned_inputs(noise: NDArray[np.float64], scene: Scene) -> str | None:
 
 def _units(layout: StateLayout, actuator: str) -> str:
     return ", ".join(dict.fromkeys(layout.control.units[getattr(layout.control, actuator)]))
+
+
+def final_errors(start: Start, flight: Trajectory) -> tuple[float, ...]:
+    """Errors at the end of a flight, see `Kernels.tip_errors`."""
+    kernels = compile_scene(start.scene)
+    row = kernels.stage_parameters(start.parameters)[len(flight.controls)]
+    return tuple(kernels.tip_errors(flight.states[-1], p=row).tolist())
+
+
+def error_rows(success: Success, errors: Sequence[float]) -> Iterator[tuple[str, str, str]]:
+    """Rows of a table: errors at the end in the order of the tolerances, and these."""
+    names = (
+        ("attitude error", "deg"),
+        ("position error", "m"),
+        ("angular velocity", "deg/s"),
+        ("velocity", "m/s"),
+    )
+    for (name, unit), error, most in zip(names, errors, success.tolerances, strict=False):
+        notes = ["relative to the target"] if "velocity" in name else []
+        notes += [f"tolerance {most:g} {unit}"] if math.isfinite(most) else []
+        yield name, f"{error:.3g} {unit}", "; ".join(notes)
 
 
 def numerical_error(start: Start, flight: Trajectory) -> float:

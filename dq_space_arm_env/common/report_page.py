@@ -139,14 +139,14 @@ class Section:
 
     def markdown(self) -> Iterator[str]:
         """Blocks of Markdown; each figure is a file of its name beside it."""
-        yield from (f"## {self.title}", self.caption)
+        yield from (f"## {one_line(self.title)}", one_line(self.caption))
         for sentence in self.shortcomings:
-            yield f"**{sentence}**"
+            yield f"**{one_line(sentence)}**"
         for figure in self.figures:
-            yield from (f"![{one_line(figure.caption)}]({figure.name}.png)", f"*{figure.caption}*")
+            yield from (f"![{one_line(figure.caption)}]({figure.name}.png)", f"*{one_line(figure.caption)}*")
         for table in self.tables:
             yield from table.markdown()
-        yield from self.notes
+        yield from map(one_line, self.notes)
 
 
 @dataclass

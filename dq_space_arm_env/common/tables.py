@@ -140,8 +140,9 @@ def plain_table(
 
 
 def one_line(text: str) -> str:
-    """Text on one line of Markdown, fit for a cell."""
-    return " ".join(text.split()).replace("|", "\\|")
+    """Text on one line of Markdown, fit for a cell; names from files make neither markup nor links."""
+    line = " ".join(text.split()).replace("|", "\\|")
+    return line.replace("<", "&lt;").replace("](", "]\\(")
 
 
 def _markdown_row(cells: Iterable[str]) -> str:

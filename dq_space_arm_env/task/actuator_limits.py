@@ -32,6 +32,11 @@ def reads_state(scene: Scene) -> bool:
     return bool(any(limited) or scene.actuators.tank or slew_limits(scene) or limited_motors(scene))
 
 
+def are_ideal(scene: Scene) -> bool:
+    """Tell whether actuators apply all that is asked of them within their limits."""
+    return not reads_state(scene) and not any(jet.impulse_bit for jet in scene.actuators.thrusters or ())
+
+
 def applied(equations: SceneEquations, x: Scalars, u: Scalars) -> list[Scalar]:
     """Inputs that act, n_u, of those that are asked for; the state matters where `reads_state`."""
     scene, result = equations.scene, list(u)

@@ -16,6 +16,7 @@ from dq_space_arm_env import Scene
 from dq_space_arm_env.command_line.simulated_episode import (
     Start,
     begin,
+    error_rows,
 )
 from dq_space_arm_env.common.files import json_value, to_json, write_atomically
 from dq_space_arm_env.common.provenance import provenance
@@ -148,8 +149,7 @@ def record(run: SolveRun) -> dict[str, Any]:
 
 def table(run: SolveRun) -> Table:
     """Describe a run for people."""
-    solution, success = run.solution, run.scene.success
-    attitude, position, *velocities = run.final_errors
+    solution = run.solution
     verdict = "converged" if solution.converged else f"NOT converged ({solution.stop_reason.value})"
     reached = "within the tolerance" if run.is_success else "NOT within the tolerance"
     guess = str(solution.metadata.get("guess", "zero controls"))
@@ -175,13 +175,7 @@ def table(run: SolveRun) -> Table:
         ("cost J", f"{solution.cost:.6f}", led),
         ("end", verdict, solution.message),
         ("iterations", str(solution.iterations), seconds),
-        ("attitude error", f"{attitude:.3g} deg", f"tolerance {success.attitude_error_deg:g} deg; {reached}"),
-        ("position error", f"{position:.3g} m", f"tolerance {success.position_error:g} m"),
     ]
-    if velocities:
-        turning, moving = velocities
-        asked = success.angular_velocity_error_deg, success.velocity_error
-        limits = ("relative to the target" + (f"; tolerance {most:g}" if most else "") for most in asked)
-        shown = f"{turning:.3g} deg/s", f"{moving:.3g} m/s"
-        rows += list(zip(("angular velocity", "velocity"), shown, limits, strict=True))
+    (name, error, tolerance), *others = error_rows(run.scene.success, run.final_errors)
+    rows += [(name, error, f"{tolerance}; {reached}"), *others]
     return plain_table(f"Scene {run.scene.name}", ("", "", ""), rows)

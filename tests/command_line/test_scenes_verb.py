@@ -199,3 +199,7 @@ def test_new_writes_a_valid_file_and_spoils_none(tmp_path: Path, capsys: pytest.
     assert "must end in .yaml" in capsys.readouterr().err
     assert main(["scenes", "new", "-", "--from", "payload"]) == SUCCESS
     assert load_scene(parse_yaml(capsys.readouterr().out)) == load_scene("payload")
+    for name in ("capture-and-detumble", "refuelling"):  # whose phases have numbers of any type
+        assert main(["scenes", "new", "-", "--from", name]) == SUCCESS
+        again = load_scene(parse_yaml(capsys.readouterr().out))
+        assert again.content_hash() == load_scene(name).content_hash()

@@ -72,7 +72,7 @@ def test_html_is_well_formed_and_needs_no_other_file(origin: dict[str, Any]) -> 
 def test_markdown_tables_have_a_cell_for_each_column(origin: dict[str, Any]) -> None:
     page = page_of([section()], origin).markdown()
     assert "|  | m \\| s | two lines |\n| --- | ---: | ---: |\n| a & b | 1 | 2 |\n" in page
-    assert "![What <is> seen](made_up.png)" in page
+    assert "![What &lt;is> seen](made_up.png)" in page
 
 
 def test_what_is_inaccurate_is_at_the_top_of_both(origin: dict[str, Any]) -> None:
@@ -132,3 +132,8 @@ def test_numbers_make_curves_and_text_makes_bars() -> None:
     assert plot.png(ROWS).startswith(b"\x89PNG")
     (axes,) = Plot("time_us", "method", color="motion", log="x").figure(ROWS).axes
     assert [bar.get_width() for bar in axes.patches] == [12, 2400, 3]
+
+
+def test_names_from_files_make_no_markup():
+    lines = "\n".join(TextTable("t", ("name",), (("<img src=x> [a](javascript:b)",),)).markdown())
+    assert "&lt;img src=x> [a]\\(javascript:b)" in lines

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dq_space_arm_env import compile_scene, list_scenes, load_scene
+from dq_space_arm_env import DQSpaceArmEnv, compile_scene, list_scenes, load_scene
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene.constraint_rows import path_rows
 from dq_space_arm_env.scene.pose import PLANAR_POSE
-from dq_space_arm_env.viewing.replay import common_scene
+from dq_space_arm_env.viewing.replay import Trajectory, common_scene
 from dq_space_arm_env.viewing.replay.curves import panels
 from dq_space_arm_env.viewing.replay.flights import MOST_FLIGHTS, prepare, verdict
 
@@ -78,6 +79,54 @@ def test_own_target_is_what_errors_refer_to(paper, make_flight):
     assert missed.angle[-1] == pytest.approx(4.0)
     assert verdict(missed, paper).startswith("ends 4°")
     assert verdict(missed, paper).endswith("outside the tolerances")
+
+
+def test_success_is_that_of_the_environment(paper, make_flight):
+    """It may ask for more than a pose: velocities, a catch."""
+    flight = replace(make_flight(paper), attitude_error=1.0, position_error=0.01)
+    tip = prepare([flight], paper)[0].frames[-1, -1]
+    for success, end in ((True, ": success"), (False, ": no success")):
+        shown = prepare([replace(flight, target=tip, is_success=success)], paper)[0]
+        assert verdict(shown, paper).endswith(end)
+
+
+def test_states_that_are_no_poses_are_refused(paper, make_flight):
+    flight = make_flight(paper)
+    states = flight.states.copy()
+    states[7, :4] *= 2.0
+    with pytest.raises(ValueError, match=r"states: entries 0 to 3 have length 2, should have 1"):
+        prepare([replace(flight, states=states)], paper)
+    with pytest.raises(ValueError, match=r"have length 0, should have 1"):
+        prepare([replace(flight, states=np.zeros_like(states))], paper)
+
+
+@pytest.mark.parametrize("name", ["wheels", "motors"])
+def test_constraints_are_those_of_what_acts(name):
+    """Full actions, which the actuators cut down to what they can do."""
+    scene = load_scene(name)
+    env = DQSpaceArmEnv(scene)
+    env.reset(seed=0)
+    states, controls = [env.state], []
+    for _ in range(60):
+        action = np.ones(env.action_space.shape, np.float32)
+        *_, info = env.step(action)
+        assert info["cost"] < 1e-9
+        states.append(env.state)
+        controls.append(env.kernels.layout.to_control(action))
+    flight = Trajectory("full", np.array(states), np.array(controls), scene=scene)
+    shown = prepare([flight], scene)[0]
+    assert np.abs(shown.acting - shown.controls).max() > 1e-3
+    assert not shown.violated[:, :-1].any()
+
+
+def test_constraints_are_those_of_the_page():
+    """Those of the flight's own scene may be others."""
+    scene = load_scene("keep-out").replace(simulation={"steps": 20})
+    states = np.tile(compile_scene(scene).layout.initial_state, (21, 1))
+    controls = np.zeros((20, compile_scene(scene).n_u))
+    before = scene.replace(constraints=[])
+    shown = prepare([Trajectory("before", states, controls, scene=before)], scene)[0]
+    assert shown.violated.shape == (len(path_rows(scene)), 21)
 
 
 def drifting(start, steps):

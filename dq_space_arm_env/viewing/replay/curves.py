@@ -64,7 +64,8 @@ def _inputs(
     actuator: str, title: str, entries: slice, layout: StateLayout, flights: Sequence[ShownFlight]
 ) -> Panel:
     unit, limits = layout.control.units[entries.start], layout.control_limit[entries]
-    largest = max(float(np.abs(flight.controls[:, entries]).max()) for flight in flights)
+    inputs = [each for flight in flights for each in (flight.controls, flight.noise) if each is not None]
+    largest = max(float(np.abs(each[:, entries]).max()) for each in inputs)
     scale, prefix = (1e3, "m") if 0.0 < largest < _SMALL else (1.0, "")
     sides = (0.0, 1.0) if actuator == "thruster_force" else (-1.0, 1.0)
     bounds = sorted({side * scale * limit for limit in limits[np.isfinite(limits)] for side in sides})

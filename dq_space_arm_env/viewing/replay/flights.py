@@ -15,6 +15,7 @@ from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.scene.pose import PLANAR_POSE
+from dq_space_arm_env.scene.start import unit_quaternions
 from dq_space_arm_env.task.step_report import STATE_LIMIT
 from dq_space_arm_env.task.trajectory import Trajectory
 from dq_space_arm_env.viewing.constraint_shapes import violations
@@ -25,7 +26,7 @@ MOST_FLIGHTS = 6
 """Flights on one page: as many as there are colors that everybody can tell apart."""
 
 _LARGEST_INPUT = 1e30  # larger ones have blown up, and exceed the page's single precision
-_UNIT = 1e-3  # within which a target's real part has length 1
+_UNIT = 1e-3  # within which the real part of a pose has length 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,7 @@ class ShownFlight:
     label: str
     controls: FloatArray  # commanded, shape (M, n_u), N, N m or rad/s
     noise: FloatArray | None  # added to it at the actuators, same shape and units; None for none
+    acting: FloatArray  # what the actuators make of both, same shape and units
     # Desired pose of the tip q_{D/I}, and pose of the target's body, None if that is the same; one that moves
     # has a pose for each state, with signs that make them continuous in time.
     target: FloatArray  # shape (8,) or (M + 1, 8)
@@ -45,6 +47,7 @@ class ShownFlight:
     angle: FloatArray  # Euler angle of the tip's attitude error, shape (M + 1,), deg
     distance: FloatArray  # from tip to target, shape (M + 1,), m
     note: str  # why it is cut off; empty if it is not
+    is_success: bool | None  # as flown; None if unknown
     violated: NDArray[np.bool_]  # whether rows of constraints are, shape (rows, M + 1)
     dt: float  # time step, s
     stride: int = 1  # of the flight's own steps in one of these
@@ -90,6 +93,14 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
     shown = _finite_steps(states, controls, noise)
     if shown < 1:
         raise ValueError(f"{what}: its first step is not finite or has blown up: there is nothing to show")
+    for part in (_real_part(layout), *unit_quaternions(scene)):
+        lengths = np.linalg.norm(states[: shown + 1, part], axis=1)
+        if (np.abs(lengths - 1.0) > _UNIT).any():
+            worst = lengths[np.abs(lengths - 1.0).argmax()]
+            raise ValueError(
+                f"{what}: states: entries {part.start} to {part.stop - 1} have length {worst:.4g}, should "
+                "have 1: they are a rotation"
+            )
     flight = aimed(flight, scene)
     given, body = flight.target, flight.target_body
     assert given is not None
@@ -103,11 +114,17 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
     seconds = shown * scene.simulation.dt
     body = None if body is None else _target(f"{what}: target_body", body, steps, shown)
     angle, distance = tip_errors(flight.scene or scene, frames, target, body)
-    placed = flight.scene or scene, states[: shown + 1], controls[:shown], target if body is None else body
+    own = flight.scene or scene
+    given_inputs = controls[:shown] if noise is None else controls[:shown] + noise[:shown]
+    acting = _acting(own, states[:shown], given_inputs)
+    # The page has one list of constraints; limits and targets are the flight's.
+    charged = own.replace(constraints=scene.constraints) if own.constraints != scene.constraints else own
+    placed = charged, states[: shown + 1], acting, target if body is None else body
     return ShownFlight(
         label=flight.label,
         controls=controls[:shown],
         noise=None if noise is None else noise[:shown],
+        acting=acting,
         target=target,
         target_body=body,
         payload=payload,
@@ -115,9 +132,25 @@ def _prepare(flight: Trajectory, scene: Scene, layout: StateLayout) -> ShownFlig
         angle=np.degrees(angle),
         distance=distance,
         note="" if shown == steps else f"diverges after {seconds:.4g} s",
+        is_success=None if np.isnan(flight.attitude_error) else flight.is_success,
         violated=violations(*placed) if scene.constraints else np.zeros((0, shown + 1), np.bool_),
         dt=scene.simulation.dt,
     )
+
+
+def _acting(scene: Scene, states: FloatArray, inputs: FloatArray) -> FloatArray:
+    """Inputs as the actuators of a scene apply them, (M, n_u), at states, (M, n_x)."""
+    if not scene.constraints and scene.actuators.thrusters is None:
+        return inputs  # neither a row nor a jet shows them
+    # Compiled code is loaded, or made, for actuators that are not ideal alone.
+    from dq_space_arm_env.kernels import compile_scene
+    from dq_space_arm_env.task.actuator_limits import are_ideal
+
+    if are_ideal(scene):
+        return inputs
+    kernels = compile_scene(scene)
+    stages = np.minimum(np.arange(len(inputs)), scene.simulation.steps)
+    return np.asarray(kernels.applied_inputs(states, inputs, p=kernels.stage_parameters()[stages]))
 
 
 def frame_poses(scene: Scene, layout: StateLayout, states: FloatArray) -> FloatArray:
@@ -210,6 +243,12 @@ def _target(what: str, value: ArrayLike, steps: int, shown: int) -> FloatArray:
     return moving[0] if (moving == moving[0]).all() else moving
 
 
+def _real_part(layout: StateLayout) -> slice:
+    """Entries of the real part of the base's pose in a state."""
+    pose = layout.state.pose
+    return slice(pose.start, (pose.start + pose.stop) // 2)
+
+
 def _numbers(name: str, value: ArrayLike) -> FloatArray:
     try:
         return np.array(value, dtype=np.float64)
@@ -233,9 +272,10 @@ def verdict(flight: ShownFlight, scene: Scene) -> str:
     thin = f"; one in {flight.stride} steps shown" if flight.stride > 1 else ""
     if flight.note:
         return f"{flight.note}, {place}{thin}"
-    success = scene.success
-    reached = angle <= success.attitude_error_deg and distance <= success.position_error
-    return f"ends {place}: {'success' if reached else 'outside the tolerances'}{thin}"
+    within = angle <= scene.success.attitude_error_deg and distance <= scene.success.position_error
+    reached = within if flight.is_success is None else flight.is_success
+    end = "success" if reached else "no success" if within else "outside the tolerances"
+    return f"ends {place}: {end}{thin}"
 
 
 def _length(meters: float) -> str:

@@ -98,7 +98,7 @@ def constraints_of(scene: Scene, flights: Sequence[ShownFlight]) -> ConstraintDr
         broken.append(np.array(spans))
     nozzles = tuple(shape.nozzle for _, shape in shapes)
     has_gas = any(shape.axes <= GAS for _, shape in shapes)
-    gas = tuple(gas_of(scene, flight.controls) for flight in flights) if has_gas else ()
+    gas = tuple(gas_of(scene, flight.acting) for flight in flights) if has_gas else ()
     names = (*(each.name for each in listed), *(["thrusters"] if jets else []))
     owners = tuple(number for number, _ in shapes)
     return ConstraintDrawing(

@@ -52,6 +52,7 @@ def _thinned(flight: ShownFlight, stride: int) -> ShownFlight:
         flight,
         controls=controls,
         noise=noise,
+        acting=_extremes(flight.acting, instants),
         target=_at(flight.target, instants),
         target_body=None if flight.target_body is None else _at(flight.target_body, instants),
         payload=None if flight.payload is None else _at(flight.payload, instants),

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("torch")
 
 from agents.evaluation.data_efficiency import LINES, points, saving
+from agents.evaluation.data_efficiency_command import _verdict as verdict
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.common.console import UNUSABLE
 from experts import generate_demonstrations, load_demonstrations
@@ -117,3 +118,9 @@ def test_the_saving_is_counted_at_equal_success():
     assert (found.point["count"], found.needed, found.ratio) == (20, None, 50.0)
     assert saving([*plain, point("gains", 1000, 0.4)], "gains") is None
     assert saving([point("gains", 10, 0.5)], "gains") is None
+
+
+def test_a_bound_is_said_to_be_one():
+    plain = [point("actions", 10, 0.1), point("actions", 1000, 0.5)]
+    *_, last = verdict([*plain, point("gains", 20, 0.55), point("augmentation", 15, 0.1)])
+    assert last.endswith("actions alone need more than 1000, more than 50 times as many.")

@@ -26,7 +26,7 @@ from agents.evaluation.comparison_tables import (
 from agents.evaluation.expert_costs import validation_costs
 from agents.evaluation.plan_followers import FEEDBACK, OPEN_LOOP, RECEDING
 from agents.evaluation.planned_flights import fly_plans
-from agents.evaluation.training_runs import agent_of, training_command
+from agents.evaluation.training_runs import agent_of, learning_curve, seed_of, training_command
 from agents.policies import ExportedPolicy
 from agents.run_folder import validation_seeds
 from dq_space_arm_env import DQSpaceArmVectorEnv
@@ -337,3 +337,17 @@ def test_learning_curves_end_in_their_markers(comparison):
     shown = 100.0 * (900.0 / stub.facts["validation_optimum"] - 1.0)
     curve = next(line for line in figure.subfigs[1].axes[0].lines if len(line.get_xdata()) == 3)
     assert curve.get_ydata()[0] == pytest.approx(max(shown, 0.01))
+
+
+def test_points_of_a_curve_that_are_no_numbers_are_passed_over(tmp_path):
+    points = [
+        {"seconds": 1.0, "success_rate": 0.5, "median_cost": math.inf},
+        {"seconds": math.nan, "success_rate": 0.5, "median_cost": 1.0},
+        {"seconds": 2.0, "success_rate": math.nan, "median_cost": 1.0},
+        {"seconds": 3.0, "success_rate": 0.75, "median_cost": 7.0},
+    ]
+    (tmp_path / "evaluations.jsonl").write_text("".join(json.dumps(each) + "\n" for each in points))
+    found = learning_curve(tmp_path / "policy.npz")
+    assert [(each["seconds"], each["median_cost"]) for each in found] == [(1.0, None), (3.0, 7.0)]
+    assert seed_of({"configuration": {"seed": "x"}}) is None
+    assert seed_of({"configuration": {"seed": 3}}) == 3

@@ -26,17 +26,19 @@ function withMinus(text) {
 /** Smallest and largest value that a panel shows: zero, the curves, and bounds near them. */
 export function rangeOf(panel, flights) {
   let low = 0, high = 0;
-  panel.curves.forEach((curve, index) => {
-    let values = curve;
-    if (flights[index].note) {
-      // What diverged would flatten all the rest.
-      const sizes = Float32Array.from(curve, Math.abs).sort();
-      const cap = 3 * sizes[Math.floor(0.9 * (sizes.length - 1))];
-      values = curve.map((value) => Math.min(Math.max(value, -cap), cap));
-    }
-    for (const value of values) {
-      low = Math.min(low, value);
-      high = Math.max(high, value);
+  flights.forEach((flight, index) => {
+    for (const curve of [panel.curves[index], panel.disturbed[index]]) {
+      let values = curve ?? [];
+      if (curve && flight.note) {
+        // What diverged would flatten all the rest.
+        const sizes = Float32Array.from(curve, Math.abs).sort();
+        const cap = 3 * sizes[Math.floor(0.9 * (sizes.length - 1))];
+        values = curve.map((value) => Math.min(Math.max(value, -cap), cap));
+      }
+      for (const value of values) {
+        low = Math.min(low, value);
+        high = Math.max(high, value);
+      }
     }
   });
   const [lowest, highest] = [low, high];
