@@ -12,6 +12,7 @@ reaches the target. Kernels with constraints are compiled for the first start th
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Self, cast
 
@@ -215,11 +216,17 @@ class GuidedDDP:
             long_steps += guess.long_steps
             attempts += self._attempts(guess, start, callback, attempts)
             last = attempts[-1].solution
-            if last.stop_reason is StopReason.INTERRUPTED or (self._is_good(last) and not self.compare):
+            interrupted = guess.interrupted or last.stop_reason is StopReason.INTERRUPTED
+            if interrupted or (self._is_good(last) and not self.compare):
                 break
-        if self.compare and last.stop_reason is not StopReason.INTERRUPTED:
+        if self.compare and not interrupted:
             attempts += self._other_side(attempts, start, callback)
+            interrupted = attempts[-1].solution.stop_reason is StopReason.INTERRUPTED
         solution = best_solution(attempts, self.problem, self._is_good)
+        if interrupted and solution.stop_reason is not StopReason.INTERRUPTED:
+            # An attempt before that one is the cheapest; that it converged does not undo the interrupt.
+            message = "interrupted by the user"
+            solution = replace(solution, stop_reason=StopReason.INTERRUPTED, message=message)
         solution.metadata["long_steps"] = list(long_steps)
         self._remember(solution)
         return solution
@@ -235,7 +242,8 @@ class GuidedDDP:
         attempts = [Attempt(guess.name, solution)]
         misses = solution.converged and not self._is_good(solution)
         can_be_led = isinstance(self.problem, ArmProblem | WindowProblem) and solution.constraints is None
-        if self.reach_target and misses and can_be_led and not is_known(solution, before):
+        wanted = self.reach_target and not guess.interrupted
+        if wanted and misses and can_be_led and not is_known(solution, before):
             solver = self._constrained
             solver.initial_regularization = NEAR_REGULARIZATION
             rows = self.problem.parameters.rows
@@ -282,7 +290,10 @@ class GuidedDDP:
     def _coarse_guess(
         self, coarse: "GuidedDDP", start: FloatArray, callback: Callback | None
     ) -> Guess | None:
-        """Solve in long steps, and follow the policy in the problem's own; None if that diverges."""
+        """Solve in long steps, and follow the policy in the problem's own; None if that diverges.
+
+        Where the user interrupts that, and it diverges, the guess is zero controls.
+        """
         factor = self.problem.horizon // coarse.problem.horizon
 
         def report(record: IterationRecord) -> None:
@@ -294,8 +305,9 @@ class GuidedDDP:
         found = coarse.solve(start, report, parameters=self.problem.parameters.rows[::factor])
         policy = refined(found, self.problem)
         trial = follow(policy, self.problem, start)
+        interrupted = found.stop_reason is StopReason.INTERRUPTED
         if not np.isfinite(trial.cost):
-            return None
+            return zero_controls()._replace(interrupted=True) if interrupted else None
         facts = found.metadata
         attempts = facts["long_steps"] + facts["attempts"]  # those in steps twice as long come first
         return Guess(
@@ -303,7 +315,7 @@ class GuidedDDP:
             trial.controls,
             trial.cost,
             NEAR_REGULARIZATION,
-            interrupted=found.stop_reason is StopReason.INTERRUPTED,
+            interrupted=interrupted,
             long_steps=tuple({**attempt, "cost": factor * attempt["cost"]} for attempt in attempts),
             multipliers=multipliers_of(policy),
         )

@@ -490,6 +490,40 @@ def test_a_user_who_stops_it_in_long_steps_gets_the_trajectory_so_far(paper):
     assert len(solution.controls) == paper.problem.horizon
 
 
+def test_an_interrupt_at_any_iteration_ends_the_solve():
+    """In long steps several guesses are compared: an earlier one may have converged, and be the best."""
+    planar, start = GuidedDDP("planar"), random_start("planar", 0)
+    records = []
+    planar.solve(start, callback=records.append)
+    for last in range(1, len(records) + 1):
+        seen = []
+
+        def interrupt(record, seen=seen, last=last):
+            seen.append(record)
+            if len(seen) == last:
+                raise KeyboardInterrupt
+
+        solution = planar.solve(start, callback=interrupt)
+        assert solution.stop_reason is StopReason.INTERRUPTED
+        assert len(seen) == last
+        assert np.isfinite(solution.cost)
+
+
+def test_an_interrupt_counts_where_the_guess_from_long_steps_is_optimal_or_diverges(monkeypatch):
+    def interrupt(record):
+        raise KeyboardInterrupt
+
+    planar = GuidedDDP("planar")
+    optimal = planar.solve()
+    monkeypatch.setattr("experts.guesses.guided.refined", lambda solution, problem: optimal)
+    assert planar.solve(callback=interrupt).stop_reason is StopReason.INTERRUPTED
+    nowhere = replace(optimal, controls=np.full_like(optimal.controls, np.nan))
+    monkeypatch.setattr("experts.guesses.guided.refined", lambda solution, problem: nowhere)
+    solution = planar.solve(random_start("planar", 0), callback=interrupt)
+    assert solution.stop_reason is StopReason.INTERRUPTED
+    assert names(solution) == ["zero controls"]
+
+
 def test_a_number_of_steps_that_does_not_divide_the_stages_is_refused():
     with pytest.raises(ValueError, match="factor is 7; it must divide the 1000 stages"):
         GuidedDDP("paper", coarsening=7)
