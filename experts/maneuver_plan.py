@@ -8,7 +8,7 @@ import numpy as np
 
 from experts.ddp.augmented_lagrangian import AugmentedLagrangian
 from experts.ddp.shooting import ShootingWorkspace
-from experts.ddp.solution import Policy, Solution, StopReason
+from experts.ddp.solution import Policy, Solution, StopReason, uninterrupted
 from experts.guesses.guided import GuidedDDP
 from experts.guesses.policies import follow
 from experts.problems.arm_problem import ArmProblem
@@ -46,13 +46,14 @@ class ManeuverPlan:
 
         Raises:
             RuntimeError: If the maneuver cannot be simulated or differentiated from this state.
+            KeyboardInterrupt: If the user interrupts the solve.
         """
         maneuver = model or cast(ArmProblem, planner.problem)
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         problem.begin_at(stage)
         library = [_last_stages(solution, problem.horizon) for solution in known]
         solver = GuidedDDP(problem, library=library, reserve=planner.reserve) if stage > 0 else planner
-        solution = solver.solve(state, parameters=problem.parameters.rows)
+        solution = uninterrupted(solver.solve(state, parameters=problem.parameters.rows))
         if solution.constraints is not None and problem.constraints is None:
             rows, maneuver = maneuver.parameters.rows, maneuver.constrained(planner.reserve)
             maneuver.parameters.set(rows)

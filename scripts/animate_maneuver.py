@@ -23,7 +23,8 @@ from dq_space_arm_env.command_line.verb_program import run_to_end
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, complain
 from dq_space_arm_env.common.files import check_writable, check_writable_file, write_atomically
 from dq_space_arm_env.viewing.picture_format import PictureFormat
-from experts import GuidedDDP, Solution, StopReason
+from experts import GuidedDDP, Solution
+from experts.ddp.solution import uninterrupted
 from experts.figures.animation import check_gif, draw_maneuver, encode_gif, encode_strip, encode_webp
 from experts.maneuver import Maneuver
 
@@ -50,7 +51,7 @@ def _run(options: argparse.Namespace) -> int:
         raise ValueError(f"moments: {options.moments}, should be at least 2: the start and the end")
     check_writable_file(options.out)
     scene = load_scene(options.scene)
-    solution = GuidedDDP(scene).solve()
+    solution = uninterrupted(GuidedDDP(scene).solve())
     maneuver = Maneuver(scene, solution.states, solution.controls)
     if is_strip:
         duration = float(maneuver.time[-1])
@@ -82,9 +83,7 @@ def draw_gallery(names: Sequence[str] = (), folder: Path = GALLERY) -> int:
         is_old = picture.exists() and known.get(scene.name, {}).get("scene") == scene.content_hash()
         if is_old and not names:
             continue
-        solution = GuidedDDP(scene).solve()
-        if solution.stop_reason is StopReason.INTERRUPTED:
-            raise KeyboardInterrupt
+        solution = uninterrupted(GuidedDDP(scene).solve())
         if not solution.converged:
             complain(f"{scene.name}: not drawn, {solution.message}")
             status = FAILURE

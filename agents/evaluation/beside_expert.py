@@ -15,6 +15,7 @@ from dq_space_arm_env import Scene
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.environment.rollouts import rollout
 from dq_space_arm_env.scene.start import episode_scene
+from experts.ddp.solution import uninterrupted
 from experts.guesses.guided import GuidedDDP
 from experts.maneuver import Maneuver
 from experts.problems.arm_problem import ArmProblem
@@ -91,7 +92,7 @@ def fly_beside_expert(policy: ActingPolicy, scene: Scene, seeds: list[int | None
         maneuver = Maneuver(flown_in, path.states, path.controls)
         agent = Side(policy.label, maneuver, path.cost, path.is_success, action_seconds)
         started = perf_counter()
-        solution = solver.solve(path.states[0], parameters=parameters)
+        solution = uninterrupted(solver.solve(path.states[0], parameters=parameters))
         seconds = perf_counter() - started
         maneuver = Maneuver(flown_in, solution.states, solution.controls)
         success = problem.is_success(solution.states[-1])

@@ -18,7 +18,7 @@ from dq_space_arm_env import Scene, compile_scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
 from dq_space_arm_env.scene import StateLayout
 from experts import RecedingHorizonExpert
-from experts.ddp.solution import Solution
+from experts.ddp.solution import Solution, uninterrupted
 from experts.demonstrations.outcomes import expert_of
 from experts.demonstrations.settings import Settings
 from experts.demonstrations.shard import ShardResult, draw_starts
@@ -48,7 +48,7 @@ def plans_of(settings: Settings, result: ShardResult) -> tuple[Plans, FloatArray
     gains[rows] = arrays["feedback_gains"]
     varied = draw_starts(settings.scene, [settings.problem_seed(problem) for problem in problems]).parameters
     for row, start in zip(arrays["failures.index"] - problems.start, arrays["failures.start"], strict=True):
-        solution = expert_of(settings.scene).solver.solve(start, parameters=varied[row])
+        solution = uninterrupted(expert_of(settings.scene).solver.solve(start, parameters=varied[row]))
         states[row], actions[row], gains[row] = _parts(solution, layout)
     return Plans(states, actions, gains, varied, np.arange(len(problems))), np.array(result.solve_seconds)
 
@@ -76,7 +76,7 @@ def onboard_follower(scene: Scene, *, feedback: bool) -> Callable[[NDArray[Any]]
     """
     problem = ArmProblem(scene)
     kernels, to_action = problem.kernels, problem.kernels.layout.to_action
-    solution = expert_of(problem.scene).solver.solve()
+    solution = uninterrupted(expert_of(problem.scene).solver.solve())
     policy, rows, stages = solution.policy(problem), problem.parameters.rows, count()
     if feedback:
 

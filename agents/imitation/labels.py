@@ -9,6 +9,7 @@ from agents.imitation.samples import Corrections
 from dq_space_arm_env import Scene
 from dq_space_arm_env.environment.rollouts import Rollout
 from experts.ddp.box_ddp import BoxDDP
+from experts.ddp.solution import uninterrupted
 from experts.demonstrations import Demonstrations, DemonstrationsError
 from experts.demonstrations.reading import Demonstration
 from experts.guesses.guided import NEAR_REGULARIZATION, RESERVE
@@ -94,10 +95,10 @@ class Solver:
         rows = maneuver.parameters.rows[stage:]
         problem = WindowProblem(maneuver, maneuver.horizon - stage)
         guess = layout.to_control(self._followed(demonstration, state, stage, rows), rows[:-1])
-        solution = BoxDDP(problem).solve(x0=state, u_init=guess, parameters=rows)
+        solution = uninterrupted(BoxDDP(problem).solve(x0=state, u_init=guess, parameters=rows))
         if solution.converged and problem.misses(solution.states[-1]) > 1.0:
             within = BoxDDP(problem.constrained(RESERVE), initial_regularization=NEAR_REGULARIZATION)
-            reached = within.solve(x0=state, u_init=solution.controls, parameters=rows)
+            reached = uninterrupted(within.solve(x0=state, u_init=solution.controls, parameters=rows))
             solution = reached if reached.converged else solution  # too late to reach the target
         if not solution.converged:
             return None

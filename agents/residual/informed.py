@@ -19,6 +19,7 @@ from dq_space_arm_env import Scene
 from dq_space_arm_env.environment.disturbances import with_loads
 from dq_space_arm_env.environment.rollouts import rollout
 from experts import BoxDDP
+from experts.ddp.solution import uninterrupted
 from experts.demonstrations import Demonstrations
 from experts.problems.arm_problem import ArmProblem
 
@@ -81,7 +82,7 @@ def _solved(
     parameters: FloatArray,
 ) -> Row:
     began = perf_counter()
-    solution = solver.solve(x0=start, u_init=guess, parameters=parameters)
+    solution = uninterrupted(solver.solve(x0=start, u_init=guess, parameters=parameters))
     return {
         "seed": seed,
         "cost": solution.cost if solution.converged else None,

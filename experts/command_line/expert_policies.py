@@ -61,11 +61,13 @@ def load_policy(policy: str, start: Start, console: Console, seed: int | None, t
 
 def _plan(start: Start, console: Console) -> Solution:
     from experts import GuidedDDP
+    from experts.ddp.solution import uninterrupted
     from experts.report import SolveProgress
 
     with SolveProgress(console) as progress:
         solver = GuidedDDP(start.scene)
-        return solver.solve(start.state, callback=progress.update, parameters=start.parameters)
+        found = solver.solve(start.state, callback=progress.update, parameters=start.parameters)
+        return uninterrupted(found)
 
 
 def _read(path: Path, scene: Scene) -> Solution:

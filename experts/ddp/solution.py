@@ -299,6 +299,13 @@ def _check(arrays: Mapping[str, NDArray[Any]], facts: Any, where: str) -> None:
         raise ValueError(f"{where}: history has other columns, they should be those of IterationRecord")
 
 
+def uninterrupted(solution: Solution) -> Solution:
+    """The solution; KeyboardInterrupt if the user interrupted the solve."""
+    if solution.stop_reason is StopReason.INTERRUPTED:
+        raise KeyboardInterrupt
+    return solution
+
+
 class FeedbackPolicy:
     """The feedback policy of a solution; it owns its buffers, so give each thread its own."""
 

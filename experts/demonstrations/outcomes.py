@@ -16,7 +16,7 @@ import numpy as np
 
 from dq_space_arm_env import Scene
 from experts.ddp.rollout import Trajectory
-from experts.ddp.solution import Solution, StopReason
+from experts.ddp.solution import Solution, StopReason, uninterrupted
 from experts.guesses.guided import RESERVE, GuidedDDP
 from experts.guesses.policies import follow, policies
 from experts.problems.arm_problem import ArmProblem
@@ -92,7 +92,7 @@ def expert_of(scene: Scene) -> Expert:
 
 def solve(expert: Expert, index: int, seed: int, start: FloatArray, parameters: FloatArray) -> Outcome:
     """Solve a problem: a start, (n_x,), and what varies in its scene, (n_p,)."""
-    solution = expert.solver.solve(start, parameters=parameters)
+    solution = uninterrupted(expert.solver.solve(start, parameters=parameters))
     name = solution.metadata["guess"]
     guess = GUESSES[0] if name.startswith(GUESSES[0]) else name
     return Outcome(index, seed, start, solution, guess, _judge(expert.problem, solution))
@@ -119,7 +119,7 @@ def solve_again(expert: Expert, outcomes: list[Outcome], retries: list[Retry]) -
             second_order=expert.solver.second_order,
             max_iterations=MOST_ITERATIONS,
         )
-        solution = guide.solve(old.start, parameters=old.parameters)
+        solution = uninterrupted(guide.solve(old.start, parameters=old.parameters))
         reason = _judge(expert.problem, solution)
         new = Outcome(old.index, old.seed, old.start, solution, NEIGHBOR, reason)
         cheaper = solution.cost < (1.0 - LEAST_GAIN) * old.solution.cost
@@ -129,8 +129,6 @@ def solve_again(expert: Expert, outcomes: list[Outcome], retries: list[Retry]) -
 
 def _judge(problem: ArmProblem, solution: Solution) -> str:
     """Return the reason of an outcome: `CONVERGED` for a demonstration."""
-    if solution.stop_reason is StopReason.INTERRUPTED:
-        raise KeyboardInterrupt
     missed = solution.converged and not problem.is_success(solution.states[-1])
     return MISSED_TARGET if missed else solution.stop_reason.value
 

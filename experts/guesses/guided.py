@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from experts.ddp.box_ddp import BoxDDP
-from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason
+from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason, uninterrupted
 from experts.guesses.attempts import Attempt, best_solution, is_known
 from experts.guesses.coarsening import checked_factors, find_coarsening
 from experts.guesses.initial_guesses import (
@@ -439,12 +439,9 @@ class GuidedDDP:
         most = solver.max_iterations
         solver.max_iterations = NEAR_ITERATIONS_CONSTRAINED if constrained else NEAR_ITERATIONS
         try:
-            solution = self._solve_from(guess, start)
+            return uninterrupted(self._solve_from(guess, start)).converged
         finally:
             solver.max_iterations = most
-        if solution.stop_reason is StopReason.INTERRUPTED:
-            raise KeyboardInterrupt
-        return solution.converged
 
     def _solve_initial_state(self) -> list[Solution]:
         """Solve the problem's own initial state; no solution if every rollout diverges."""
@@ -452,10 +449,7 @@ class GuidedDDP:
         self.problem.parameters.set(None)
         solutions: list[Solution] = []
         for regularization in START_REGULARIZATIONS:
-            solution = self._solve_from(zero_controls(regularization), start)
-            if solution.stop_reason is StopReason.INTERRUPTED:
-                raise KeyboardInterrupt
-            solutions.append(solution)
+            solutions.append(uninterrupted(self._solve_from(zero_controls(regularization), start)))
         best = min(solutions, key=lambda solution: solution.cost)
         return [best] if np.isfinite(best.cost) else []
 

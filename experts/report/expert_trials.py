@@ -11,7 +11,7 @@ from dq_space_arm_env.common.report_page import Section
 from dq_space_arm_env.common.tables import Column, Row
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.scene import Scene
-from experts.ddp.solution import StopReason
+from experts.ddp.solution import uninterrupted
 from experts.guesses.guided import GuidedDDP
 from experts.maneuver import Maneuver
 from experts.report.effort import Announce, Effort
@@ -39,8 +39,7 @@ def solve_episode(expert: GuidedDDP, env: DQSpaceArmEnv, seed: int) -> Row:
     began = perf_counter()
     solution = expert.solve(np.asarray(env.state, dtype=np.float64), parameters=env.parameters)
     seconds = perf_counter() - began
-    if solution.stop_reason is StopReason.INTERRUPTED:
-        raise KeyboardInterrupt
+    uninterrupted(solution)
     scene = env.episode_scene
     end = Maneuver(scene, solution.states[-1:], solution.controls[-1:])
     angle, distance = float(np.degrees(end.angle[-1])), float(end.distance[-1])

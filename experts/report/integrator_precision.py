@@ -20,6 +20,7 @@ from dq_space_arm_env.kernels import Kernels, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.scene import INTEGRATORS, Scene
 from experts.ddp.box_ddp import BoxDDP
+from experts.ddp.solution import uninterrupted
 from experts.problems.shooting_problem import FloatArray
 from experts.report.effort import Announce, Effort
 from experts.report.timing import time_in_turns
@@ -68,7 +69,7 @@ def with_simulation(scene: Scene, **changes: Any) -> Scene:
 def expert_motion(scene: Scene, max_iterations: int) -> Motion:
     """The expert's maneuver, converged or not; free motion where the expert diverges."""
     scene = with_simulation(scene, precision="float64")
-    solution = BoxDDP(scene, max_iterations=max_iterations).solve()
+    solution = uninterrupted(BoxDDP(scene, max_iterations=max_iterations).solve())
     controls = solution.controls if np.isfinite(solution.cost) else np.zeros_like(solution.controls)
     return Motion(scene, np.array(solution.states[0]), np.array(controls))
 

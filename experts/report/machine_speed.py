@@ -10,6 +10,7 @@ import numpy as np
 from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmVectorEnv, compile_scene
 from dq_space_arm_env.common.tables import Row
 from experts.ddp.box_ddp import BoxDDP
+from experts.ddp.solution import uninterrupted
 from experts.report.timing import time_in_turns
 
 SCENE = "paper"
@@ -63,7 +64,7 @@ def _measure() -> list[float]:
     solver, solves = BoxDDP(SCENE), []
     for _ in range(_SOLVES):
         begun = perf_counter()
-        solution = solver.solve()
+        solution = uninterrupted(solver.solve())
         solves.append(perf_counter() - begun)
     best = min(solves)
     each = [times[0], *(time / COPIES for time in times[1:])]

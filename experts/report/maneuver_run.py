@@ -13,7 +13,7 @@ from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollou
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.scene import Scene, StateLayout
 from experts.ddp.box_ddp import BoxDDP
-from experts.ddp.solution import IterationRecord, Solution, StopReason
+from experts.ddp.solution import IterationRecord, Solution, uninterrupted
 from experts.maneuver import Maneuver
 from experts.problems.shooting_problem import FloatArray
 
@@ -110,8 +110,7 @@ def run_maneuver(
 
 def _compile_solver(scene: Scene) -> None:
     """Take one iteration, to keep the compiler's time out of the solve's."""
-    if BoxDDP(scene, max_iterations=1).solve().stop_reason is StopReason.INTERRUPTED:
-        raise KeyboardInterrupt
+    uninterrupted(BoxDDP(scene, max_iterations=1).solve())
 
 
 def replay(scene: Scene, controls: FloatArray) -> Rollout:

@@ -8,7 +8,7 @@ import pytest
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
-from experts import BoxDDP, GuidedDDP, StopReason
+from experts import BoxDDP, GuidedDDP
 from experts.ddp.second_order import SecondOrder
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
@@ -34,7 +34,6 @@ from scripts.benchmarks.solvers.runs import (
     median_run,
     relative_gaps,
     time_to_gap,
-    uninterrupted,
 )
 from scripts.benchmarks.solvers.tracking import measure_tracking
 
@@ -121,16 +120,6 @@ def test_guided_runs_begin_with_the_policy_of_the_library(problem: ArmProblem, g
     assert run.costs[0] < zero.costs[0]
     assert (np.diff(run.costs) <= 0.0).all()
     assert run.replayed_cost == pytest.approx(guided.solve(start).cost, rel=1e-12)
-
-
-def test_an_interrupted_solve_interrupts_the_benchmark(problem: ArmProblem) -> None:
-    def interrupt(record: object) -> None:
-        raise KeyboardInterrupt
-
-    solution = BoxDDP(problem).solve(callback=interrupt)
-    assert solution.stop_reason is StopReason.INTERRUPTED
-    with pytest.raises(KeyboardInterrupt):
-        uninterrupted(solution)
 
 
 def test_other_problems_are_measured_by_their_own_best(problem: ArmProblem, guided: GuidedDDP) -> None:

@@ -19,6 +19,7 @@ from time import perf_counter
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.tables import Column
 from experts.ddp.box_ddp import BoxDDP
+from experts.ddp.solution import uninterrupted
 from experts.guesses.guided import GuidedDDP
 from experts.problems.arm_problem import ArmProblem, as_problem
 from experts.problems.shooting_problem import FloatArray
@@ -32,7 +33,7 @@ from scripts.benchmarks.solvers.mismatched import measure_mismatches
 from scripts.benchmarks.solvers.own_problems import measure_own_problems
 from scripts.benchmarks.solvers.random_starts import draw_starts, measure_starts
 from scripts.benchmarks.solvers.receding import measure_flights
-from scripts.benchmarks.solvers.runs import GAPS, Search, uninterrupted
+from scripts.benchmarks.solvers.runs import GAPS, Search
 from scripts.benchmarks.solvers.tracking import measure_tracking
 from scripts.benchmarks.subjects import COMPARED_INTEGRATORS
 

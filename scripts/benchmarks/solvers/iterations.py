@@ -16,12 +16,12 @@ from experts.ddp.backward_pass import PASS_COMPLETED
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.second_order import EXACT_MU, SecondOrder
 from experts.ddp.shooting import ShootingWorkspace
-from experts.ddp.solution import Solution
+from experts.ddp.solution import Solution, uninterrupted
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row
-from scripts.benchmarks.solvers.runs import TITLES, uninterrupted
+from scripts.benchmarks.solvers.runs import TITLES
 
 
 def measure_iterations(problem: ArmProblem, effort: Effort) -> Iterator[Row]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
+from experts.ddp.solution import uninterrupted
 from experts.guesses.guided import GuidedDDP
 from experts.identification import Identification, doubtful_numbers
 from experts.problems.arm_problem import ArmProblem
@@ -22,7 +23,6 @@ from experts.receding_horizon import RecedingHorizonExpert
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim
 from scripts.benchmarks.solvers.random_starts import draw_starts
-from scripts.benchmarks.solvers.runs import uninterrupted
 
 STIFFNESS = 1.0
 """Of a spring in every joint, at rest at zero, N m/rad."""

@@ -14,12 +14,13 @@ import numpy as np
 
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.second_order import SecondOrder
+from experts.ddp.solution import uninterrupted
 from experts.problems.casadi_problem import CasadiProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim, note
 from scripts.benchmarks.peers import crocoddyl_kernels
-from scripts.benchmarks.solvers.runs import TITLES, uninterrupted
+from scripts.benchmarks.solvers.runs import TITLES
 from scripts.examples.cart_pole import cart_pole
 from scripts.examples.planar_quadrotor import HOVER, planar_quadrotor
 

@@ -14,13 +14,14 @@ import numpy as np
 
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.scene.start import draw_initial_state
+from experts.ddp.solution import uninterrupted
 from experts.guesses.guided import GuidedDDP
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from experts.report.expert_trials import solve_episode
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.harness import Row, claim
-from scripts.benchmarks.solvers.runs import GUIDED, relative_gap, uninterrupted
+from scripts.benchmarks.solvers.runs import GUIDED, relative_gap
 
 FURTHER_GUESSES = 12
 JUDGES_SEED = 1_000_000

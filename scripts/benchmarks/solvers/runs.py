@@ -17,7 +17,7 @@ import numpy as np
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.rollout import Trajectory
 from experts.ddp.second_order import SecondOrder
-from experts.ddp.solution import IterationRecord, Solution, StopReason
+from experts.ddp.solution import IterationRecord, Solution, uninterrupted
 from experts.guesses.guided import GuidedDDP
 from experts.guesses.initial_guesses import POLICY_REGULARIZATION
 from experts.guesses.policies import follow
@@ -135,13 +135,6 @@ def papers_states(problem: ArmProblem, max_iterations: int) -> Solve:
         return _timed_run(PAPERS_STATES, problem, x0, partial(solver.solve, start))
 
     return solve
-
-
-def uninterrupted(solution: Solution) -> Solution:
-    """The solution; KeyboardInterrupt if the user interrupted the solve."""
-    if solution.stop_reason is StopReason.INTERRUPTED:
-        raise KeyboardInterrupt
-    return solution
 
 
 def _timed_run(

@@ -12,11 +12,11 @@ import numpy as np
 
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.algebra import poses
+from experts.ddp.solution import uninterrupted
 from experts.guesses.guided import GuidedDDP
 from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.harness import Row, claim
-from scripts.benchmarks.solvers.runs import uninterrupted
 
 SCENE = "tracking"
 TRANSIENT = 4.0  # s, for the tip to reach the target

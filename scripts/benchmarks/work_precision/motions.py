@@ -14,6 +14,7 @@ import numpy as np
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.scene import InitialState, Spread
 from experts import BoxDDP
+from experts.ddp.solution import uninterrupted
 from experts.problems.shooting_problem import FloatArray
 
 DEFAULT_ACCURACY = 1e-4
@@ -101,7 +102,7 @@ def _maneuver(duration: float) -> MotionCase:
     scene = load_scene("paper")
     dt = scene.simulation.dt
     steps = min(max(round(duration / dt), 1), scene.simulation.steps)
-    solution = BoxDDP(scene, second_order="gauss_newton").solve()
+    solution = uninterrupted(BoxDDP(scene, second_order="gauss_newton").solve())
     return MotionCase(
         "maneuver",
         "The paper's maneuver, the expert's inputs",
@@ -118,7 +119,7 @@ def _maneuver(duration: float) -> MotionCase:
 def scene_case(name: str) -> MotionCase:
     """The expert's maneuver in a scene."""
     scene = load_scene(name)
-    solution = BoxDDP(scene).solve()
+    solution = uninterrupted(BoxDDP(scene).solve())
     return MotionCase(
         name,
         name,

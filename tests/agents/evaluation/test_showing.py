@@ -7,11 +7,13 @@ import pytest
 
 from agents.evaluation import evaluate, evaluation_seeds
 from agents.evaluation.beside_expert import fly_beside_expert
+from agents.evaluation.plan_followers import onboard_follower
 from agents.policies import ExportedPolicy
+from agents.residual.informed import _solved
 from agents.zoo.finding import as_policy
 from dq_space_arm_env import DQSpaceArmEnv
 from dq_space_arm_env.command_line import main
-from experts import GuidedDDP
+from experts import BoxDDP, GuidedDDP, StopReason
 from experts.problems.arm_problem import ArmProblem
 
 
@@ -53,6 +55,28 @@ def test_the_experts_own_controls_have_no_gap(quick):
         assert pair.agent.is_success
         assert pair.agent.record()["effort"] == pytest.approx(pair.expert.record()["effort"])
     np.testing.assert_array_equal(nominal.agent.maneuver.states[0], ArmProblem(quick).initial_state)
+
+
+def test_an_interrupted_solve_is_no_result(exported, quick, monkeypatch):
+    """Nothing is written, or flown, as if the expert had failed."""
+
+    def interrupt(record):
+        raise KeyboardInterrupt
+
+    problem, solver = ArmProblem(quick), BoxDDP(quick)
+    stopped = solver.solve(callback=interrupt)
+    assert stopped.stop_reason is StopReason.INTERRUPTED
+    for each in (BoxDDP, GuidedDDP):
+        monkeypatch.setattr(each, "solve", lambda self, *arguments, **options: stopped)
+    monkeypatch.setattr(GuidedDDP, "library", ())
+    start, guess, parameters = problem.initial_state, stopped.controls, problem.parameters.rows[0]
+    for call in (
+        lambda: fly_beside_expert(as_policy(ExportedPolicy.load(exported)), quick, [None]),
+        lambda: onboard_follower(quick, feedback=True),
+        lambda: _solved(problem, solver, 0, start, guess, parameters),
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            call()
 
 
 def test_a_flight_is_that_of_an_evaluation(exported, quick):

@@ -104,6 +104,15 @@ def test_new_plans_begin_where_the_flight_went_and_are_optimal(some):
         np.testing.assert_allclose(again.actions[begin:end], rest, atol=2e-3)
 
 
+def test_an_interrupted_plan_ends_the_labels(some, monkeypatch):
+    def interrupt(solver, state, callback):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("experts.ddp.box_ddp.BoxDDP._iterate", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        Solver(some.scene).label(some, flown(some, change=0.02), 1, np.random.default_rng(0))
+
+
 def test_plans_know_the_target_and_the_masses_of_each_stage(staged):
     plans_know_the_target_and_the_masses(staged)
 

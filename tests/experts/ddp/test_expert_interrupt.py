@@ -5,8 +5,23 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
+from rich.console import Console
+
+from dq_space_arm_env import load_scene
+from dq_space_arm_env.command_line.simulated_episode import begin
+from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
+from experts import BoxDDP, GuidedDDP
+from experts.command_line.expert_policies import load_policy
+from experts.ddp.solution import StopReason, uninterrupted
+from experts.demonstrations import outcomes
+from experts.demonstrations.outcomes import Expert
+from experts.maneuver_plan import ManeuverPlan
+from experts.problems.arm_problem import ArmProblem
+from experts.report.expert_trials import solve_episode
+from experts.report.integrator_precision import expert_motion
 
 SOLVE = """
 import signal
@@ -35,3 +50,41 @@ def test_a_real_interrupt_ends_the_solve_with_its_best_trajectory(delay):
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     assert output == "interrupted True True\n"
+
+
+# What calls the solver -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stopped(monkeypatch):
+    """Solves of the problem "planar" that return, interrupted, after their first iteration."""
+
+    def interrupt(record):
+        raise KeyboardInterrupt
+
+    solution = BoxDDP("planar").solve(callback=interrupt)
+    assert solution.stop_reason is StopReason.INTERRUPTED
+    for solver in (BoxDDP, GuidedDDP):
+        monkeypatch.setattr(solver, "solve", lambda self, *arguments, **options: solution)
+    return solution
+
+
+def test_only_an_interrupted_solution_interrupts(stopped):
+    converged = replace(stopped, stop_reason=StopReason.CONVERGED)
+    assert uninterrupted(converged) is converged
+    with pytest.raises(KeyboardInterrupt):
+        uninterrupted(stopped)
+
+
+def test_no_caller_takes_an_interrupted_solution_for_a_failed_one(stopped):
+    planar, problem = load_scene("planar"), ArmProblem("planar")
+    expert, begun = GuidedDDP(problem), begin(planar)
+    for call in (
+        lambda: ManeuverPlan.make(expert, begun.state, 0),
+        lambda: expert_motion(planar, 10),
+        lambda: solve_episode(expert, DQSpaceArmEnv(planar), 0),
+        lambda: outcomes.solve(Expert(problem, expert), 0, 0, begun.state, begun.parameters),
+        lambda: load_policy("plan", begun, Console(quiet=True), None, False),
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            call()
