@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from time import perf_counter
+from typing import cast
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.scene import Scene
 from experts.ddp.solution import uninterrupted
 from experts.guesses.guided import GuidedDDP
-from experts.maneuver import Maneuver
+from experts.problems.arm_problem import ArmProblem, misses
 from experts.report.effort import Announce, Effort
 
 _QUANTILES = {"least": 0.0, "median": 0.5, "90 %": 0.9, "most": 1.0}
@@ -37,17 +38,17 @@ def solve_episode(expert: GuidedDDP, env: DQSpaceArmEnv, seed: int) -> Row:
     """Solve the episode that begins with a seed; KeyboardInterrupt if the user interrupts it."""
     env.reset(seed=seed)
     began = perf_counter()
-    solution = expert.solve(np.asarray(env.state, dtype=np.float64), parameters=env.parameters)
+    state = np.asarray(env.state, dtype=np.float64)
+    solution = uninterrupted(expert.solve(state, parameters=env.parameters))
     seconds = perf_counter() - began
-    uninterrupted(solution)
-    scene = env.episode_scene
-    end = Maneuver(scene, solution.states[-1:], solution.controls[-1:])
-    angle, distance = float(np.degrees(end.angle[-1])), float(end.distance[-1])
+    kernels = cast(ArmProblem, expert.problem).kernels
+    end, p = solution.states[-1], solution.parameters[-1]
+    angle, distance = kernels.tip_errors(end, p=p)[:2].tolist()
     attempts = solution.metadata.get("attempts", ())
     return {
         "seed": seed,
         "converged": solution.converged,
-        "success": angle <= scene.success.attitude_error_deg and distance <= scene.success.position_error,
+        "success": bool(misses(kernels, end, p) <= 1.0),
         "iterations": sum(attempt["iterations"] for attempt in attempts) or solution.iterations,
         "long_step_iterations": sum(a["iterations"] for a in solution.metadata.get("long_steps", ())),
         "seconds": seconds,

@@ -140,6 +140,22 @@ def test_starts_are_those_of_the_seeds(drawing: Scene) -> None:
     assert all(row["converged"] and row["success"] for row in rows)
 
 
+def test_success_is_that_of_the_environment_where_the_target_moves(short_scene: Scene) -> None:
+    """Errors are those at the end, to where the target is then; tolerances of velocities count."""
+    motion = {"kind": "screw", "linear_velocity": [0.1, 0.0, 0.0]}
+    wide = {"attitude_error_deg": 30.0, "position_error": 0.5}
+    moving = short_scene.replace(target={"motion": motion}, success=wide)
+    expert, env = GuidedDDP(moving), DQSpaceArmEnv(moving)
+    row = expert_trials.solve_episode(expert, env, 0)
+    planned = expert.solve(np.asarray(env.state))
+    kernels = compile_scene(moving)
+    errors = kernels.tip_errors(planned.states[-1], p=kernels.stage_parameters()[-1])
+    assert [row["attitude_error_deg"], row["position_error_m"]] == pytest.approx(errors[:2].tolist())
+    strict = moving.replace(success={"velocity_error": 0.5 * float(errors[3])})
+    assert row["success"]
+    assert not expert_trials.solve_episode(GuidedDDP(strict, reach_target=False), env, 0)["success"]
+
+
 def test_starts_that_fail_are_listed_by_seed(spread_scene: Scene) -> None:
     rows = expert_trials.measure(spread_scene, Effort(starts=2, max_iterations=1), announce)["starts"]
     section = expert_trials.section(spread_scene, {"starts": rows})
