@@ -104,13 +104,10 @@ def _outcome(row: Row) -> str:
 
 
 def _quantiles(rows: Sequence[Row]) -> list[Row]:
-    return [
-        {
-            "quantity": name,
-            **{
-                title: float(np.quantile([row[name] for row in rows], share))
-                for title, share in _QUANTILES.items()
-            },
-        }
-        for name in ("iterations", "long_step_iterations", "seconds", "cost")
-    ]
+    """Distributions of what is known: a start that diverged has no cost."""
+    found: list[Row] = []
+    for name in ("iterations", "long_step_iterations", "seconds", "cost"):
+        known = [row[name] for row in rows if row[name] is not None]
+        shares = {title: float(np.quantile(known, q)) if known else None for title, q in _QUANTILES.items()}
+        found.append({"quantity": name, **shares})
+    return found

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from dq_space_arm_env import DQSpaceArmEnv, Scene, compile_scene
 from dq_space_arm_env.command_line import main
+from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.report_page import Section
 from dq_space_arm_env.common.tables import Row
 from dq_space_arm_env.scene import INTEGRATORS
@@ -161,6 +162,18 @@ def test_starts_that_fail_are_listed_by_seed(spread_scene: Scene) -> None:
     section = expert_trials.section(spread_scene, {"starts": rows})
     assert section.record["shares"] == [{"starts": 2, "converged": 0.0, "success": 0.0}]
     assert [row["seed"] for row in section.record["failed"]] == [0, 1]
+
+
+def test_a_start_that_diverges_has_no_cost_in_the_distributions(short_scene: Scene) -> None:
+    good = {"seed": 0, "converged": True, "success": True, "iterations": 3, "long_step_iterations": 5}
+    good |= {"seconds": 0.1, "cost": 7.0, "attitude_error_deg": 0.1, "position_error_m": 0.01}
+    lost = {**good, "seed": 1, "converged": False, "success": False, "cost": math.inf}
+    lost |= {"attitude_error_deg": math.nan, "position_error_m": math.nan}
+    for starts, median in (([good, lost], 7.0), ([lost], None)):
+        section = expert_trials.section(short_scene, json_value({"starts": starts}))
+        cost = next(row for row in section.record["quantiles"] if row["quantity"] == "cost")
+        assert cost["median"] == cost["most"] == median
+        assert [row["seed"] for row in section.record["failed"]] == [1]
 
 
 def test_a_scene_without_spread_is_solved_once(short_scene: Scene) -> None:
