@@ -7,6 +7,8 @@ moves along with the robot. Moved across the obstacle along that normal, for as 
 tip's path is of the other class, and the arm follows it (`screw_motion`).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from dq_space_arm_env.algebra import dual_quaternion as dq
@@ -28,6 +30,13 @@ LEAST_RISE = 0.1
 """Least time, as a share of the horizon, in which the tip moves across, and back."""
 
 
+class Contact(NamedTuple):
+    """A row of a distance."""
+
+    row: int  # among all rows along the path, those of rates of controls too
+    apart: float  # how far the axes of its volumes are apart in contact, m
+
+
 def other_side(problem: ArmProblem, solution: Solution) -> ScrewMotion | None:
     """Guess a maneuver that passes the obstacle in a solution's way on the other side.
 
@@ -38,15 +47,15 @@ def other_side(problem: ArmProblem, solution: Solution) -> ScrewMotion | None:
     Returns:
         The guess from the same start; None if no obstacle is in the way.
     """
-    apart = _axes_apart(problem.scene)
-    columns = np.array(list(apart), dtype=int)
+    contacts = contacts_of(problem.scene)
+    columns = np.array(list(contacts), dtype=int)
     pushes = solution.multipliers[:-1, columns]
     if not (pushes > PUSHED).any():
         return None
     column = int(columns[pushes.sum(axis=0).argmax()])
     stages = np.flatnonzero(solution.multipliers[:-1, column] > PUSHED)
     stage = int(solution.multipliers[:-1, column].argmax())
-    normal = _normal(problem, solution, stage, column)
+    normal = _normal(problem, solution, stage, contacts[column].row)
     if not normal.any():
         return None
     count, last = N_INTERVALS + 1, problem.horizon
@@ -56,7 +65,7 @@ def other_side(problem: ArmProblem, solution: Solution) -> ScrewMotion | None:
     share = _smooth(t / rise) * _smooth(1.0 - (t - stages[-1] / last) / rise)
     tips = problem.kernels.frame_poses(solution.states[knots])[:, -1]
     rotation, position = poses.to_rotation_and_position(tuple(tips.T))
-    shift = -ACROSS * apart[column] * np.outer(normal, share * _smooth((1.0 - t) / LEAST_RISE))
+    shift = -ACROSS * contacts[column].apart * np.outer(normal, share * _smooth((1.0 - t) / LEAST_RISE))
     path = np.stack(poses.from_rotation_and_position(rotation, np.asarray(position) + shift), axis=-1)
     step = last * problem.time_step / N_INTERVALS
     ways = screw.logarithm(dq.multiply(dq.conjugate(tuple(path[:-1].T)), tuple(path[1:].T)))
@@ -64,21 +73,23 @@ def other_side(problem: ArmProblem, solution: Solution) -> ScrewMotion | None:
     return follow_path(problem, solution.states[0], TipPath(path, np.vstack([velocities, velocities[-1:]])))
 
 
-def _axes_apart(scene: Scene) -> dict[int, float]:
-    """Columns of the rows of distances, and how far the axes of their volumes are apart in contact, m."""
-    found, column = {}, 0
+def contacts_of(scene: Scene) -> dict[int, Contact]:
+    """The rows of distances, by their columns of multipliers; rows of rates have none."""
+    found, row, column = {}, 0, 0
     for each in scene.constraints:
+        rows = rows_of(scene, each)
         if isinstance(each, Distance):
             for i, (_, body, _, obstacle) in enumerate(pairs_that_may_touch(scene, each)):
-                found[column + i] = body.radius + obstacle.radius + each.margin
-        column += len(rows_of(scene, each))
+                found[column + i] = Contact(row + i, body.radius + obstacle.radius + each.margin)
+        row += len(rows)
+        column += sum(not one.is_rate for one in rows)
     return found
 
 
-def _normal(problem: ArmProblem, solution: Solution, stage: int, column: int) -> FloatArray:
+def _normal(problem: ArmProblem, solution: Solution, stage: int, row: int) -> FloatArray:
     """Direction away from the obstacle, in inertial axes, shape (3,); zeros if it moves with the robot."""
     state, control, p = solution.states[stage], solution.controls[stage], solution.parameters[stage]
-    slopes = problem.kernels.constraint_jacobian(state, control, p=p)[column]
+    slopes = problem.kernels.constraint_jacobian(state, control, p=p)[row]
     entries, twist = list(PLANAR_TWIST if problem.kernels.layout.planar else range(6)), np.zeros(6)
     twist[entries] = slopes[: len(entries)]
     base = problem.kernels.frame_poses(state[None])[0, 0]

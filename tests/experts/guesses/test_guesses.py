@@ -9,6 +9,7 @@ import pytest
 import dq_space_arm_env  # noqa: F401 - registers the environment
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
+from dq_space_arm_env.scene.constraint_rows import path_rows, penalized_rows
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.start import (
     draw_initial_state,
@@ -22,7 +23,7 @@ from experts import BoxDDP, GuidedDDP, StopReason
 from experts.demonstrations.outcomes import GUESSES
 from experts.guesses.guided import START_REGULARIZATIONS
 from experts.guesses.initial_guesses import STRAYED, ZERO_REGULARIZATION
-from experts.guesses.other_side import other_side
+from experts.guesses.other_side import contacts_of, other_side
 from experts.guesses.policies import coarsened, follow, refined
 from experts.guesses.screw_motion import ScrewMotion
 from experts.problems.arm_problem import ArmProblem
@@ -597,3 +598,14 @@ def test_a_cheaper_way_is_found_on_the_other_side_of_an_obstacle():
 
 def test_where_no_obstacle_is_in_the_way_no_other_side_is_guessed(paper):
     assert other_side(paper.problem, paper.library[0]) is None
+
+
+def test_contacts_are_found_among_multipliers_and_among_rows_that_have_none():
+    """A rate of controls is a row of the constraints, but the expert has no multiplier of it."""
+    scene = load_scene("keep-out")  # all its rows are distances
+    rate = {"name": "slew", "kind": "control_rate", "joint_torque": 4.0, "base_torque": 5.0}
+    for constraints in ([rate, *scene.constraints], [*scene.constraints, rate]):
+        mixed = scene.replace(constraints=constraints)
+        contacts = contacts_of(mixed)
+        assert [path_rows(mixed)[contact.row] for contact in contacts.values()] == list(path_rows(scene))
+        assert [penalized_rows(mixed)[column] for column in contacts] == list(path_rows(scene))
