@@ -26,6 +26,7 @@ class ActuatorHistory:
     inputs: tuple[str, ...]
     values: FloatArray  # Inputs, constant over a time step, shape (N, inputs), `unit`
     limits: FloatArray  # Largest magnitude of each input, shape (inputs,), `unit`
+    least: FloatArray  # Smallest value of each input, zero for thrusters, shape (inputs,), `unit`
     weights: FloatArray  # Weight of each squared input in the cost, shape (inputs,), 1/unit^2
 
     @property
@@ -36,7 +37,8 @@ class ActuatorHistory:
     @property
     def clamped_share(self) -> float:
         """Share of the inputs at a limit over all stages, 0 to 1."""
-        return float(np.mean(np.abs(self.values) >= _AT_LIMIT * self.limits))
+        at_limit = (self.values >= _AT_LIMIT * self.limits) | (self.values <= _AT_LIMIT * self.least)
+        return float(np.mean(at_limit))
 
     @property
     def effort(self) -> float:
@@ -115,6 +117,7 @@ class Maneuver:
                 layout.control.names[entries],
                 self.controls[:, entries],
                 layout.control_limit[entries],
+                layout.lower_limits(layout.control_limit)[entries],
                 layout.control_weight[entries],
             )
             histories.append(history)

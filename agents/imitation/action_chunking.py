@@ -22,6 +22,7 @@ from agents.imitation.samples import Statistics
 from agents.imitation.trainer import Progress, Trainer, Watch, torch_threads
 from agents.policies.chunk_network import ChunkNetwork
 from dq_space_arm_env import Scene
+from dq_space_arm_env.scene import StateLayout
 from experts.demonstrations import Demonstrations
 from experts.demonstrations.reading import Batch
 
@@ -60,10 +61,14 @@ class ChunkLoss:
 
     needs = ("observations", "actions")
 
+    def __init__(self, scene: Scene) -> None:
+        layout = StateLayout.of(scene)
+        self._least = layout.lower_limits(np.ones(layout.n_u))
+
     def __call__(self, network: ChunkNetwork, batch: Batch, rng: np.random.Generator) -> Losses:
         """Evaluate the loss, with gradients."""
         outputs = network(network.normalized(batch.arrays["observations"]))
-        action = action_errors(network, outputs, batch.arrays["actions"]).abs().mean()
+        action = action_errors(network, outputs, batch.arrays["actions"], self._least).abs().mean()
         none = torch.zeros(())
         return Losses(action, action, none, none)
 
@@ -89,7 +94,7 @@ def clone_chunks(
     with torch_threads(making.threads):
         trainer = Trainer(
             network := _new_network(Statistics.of(training), settings, making),
-            ChunkLoss(),
+            ChunkLoss(demonstrations.scene),
             settings.optimization,
             validate_every=settings.validate_every,
             seed=making.seed,

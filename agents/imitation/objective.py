@@ -46,6 +46,7 @@ class Objective:
     def __init__(self, kernels: Kernels, statistics: Statistics, weights: ObjectiveWeights) -> None:
         self._kernels, self._weights, self._spread = kernels, weights, statistics.spread
         self._action_deviation = statistics.action_deviation
+        self._least = kernels.layout.lower_limits(np.ones(kernels.n_u))
         self._gain_size = torch.from_numpy(statistics.gain_size.astype(np.float32))
 
     @property
@@ -70,7 +71,7 @@ class Objective:
             gain = self._gain_error(network, slopes, batch, directions)
         else:
             outputs = network(normalized)
-        action = action_errors(network, outputs, arrays["actions"]).square().mean()
+        action = action_errors(network, outputs, arrays["actions"], self._least).square().mean()
         if weights.augmentation_weight:
             augmentation = self._augmentation_error(network, batch, rng)
         total = action + weights.gain_weight * gain + weights.augmentation_weight * augmentation
@@ -84,7 +85,8 @@ class Objective:
     ) -> Tensor:
         """Error of d/de pi(o(x (+) e d)) - G d, each input relative to the size of its gains."""
         wanted = torch.from_numpy(_times(batch.arrays["feedback_gains"], directions).astype(np.float32))
-        free = torch.from_numpy(np.abs(batch.arrays["actions"]) < 1.0)
+        actions = batch.arrays["actions"]
+        free = torch.from_numpy((self._least < actions) & (actions < 1.0))
         errors = (slopes * network.action_scale.float() - wanted) / self._gain_size
         return torch.where(free, errors, 0.0).square().mean()
 
@@ -95,8 +97,9 @@ class Objective:
         states = self._kernels.retract(arrays["states"], directions)
         time_left, parameters = arrays["observations"][:, -1:], arrays.get(PARAMETERS)
         observations = self._kernels.observation(states, time_left, p=parameters)[0]
-        wanted = np.clip(arrays["actions"] + _times(arrays["feedback_gains"], directions), -1.0, 1.0)
-        return action_errors(network, network(network.normalized(observations)), wanted).square().mean()
+        wanted = np.clip(arrays["actions"] + _times(arrays["feedback_gains"], directions), self._least, 1.0)
+        outputs = network(network.normalized(observations))
+        return action_errors(network, outputs, wanted, self._least).square().mean()
 
 
 def observation_change(
@@ -120,9 +123,11 @@ def _times(gains: NDArray[np.float32], directions: FloatArray) -> FloatArray:
     return np.asarray(np.matmul(gains, directions[:, :, None].astype(np.float32))[:, :, 0])
 
 
-def action_errors(network: NormalizedNetwork, outputs: Tensor, actions: FloatArray) -> Tensor:
+def action_errors(
+    network: NormalizedNetwork, outputs: Tensor, actions: FloatArray, least: FloatArray
+) -> Tensor:
     """Errors of actions; one that is at a limit may be wanted beyond it, which clipping undoes."""
     wanted = torch.from_numpy(actions)
     errors = network.action_mean + network.action_scale * outputs - wanted
-    beyond = ((wanted >= 1.0) & (errors > 0.0)) | ((wanted <= -1.0) & (errors < 0.0))
+    beyond = ((wanted >= 1.0) & (errors > 0.0)) | ((wanted <= torch.from_numpy(least)) & (errors < 0.0))
     return (torch.where(beyond, 0.0, errors) / network.action_scale).float()

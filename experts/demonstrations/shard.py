@@ -275,7 +275,8 @@ def _demonstration_arrays(
     for row, outcome in zip(gains, outcomes, strict=True):
         solution = outcome.solution
         row[:] = problem.kernels.layout.to_action_gains(solution.feedback_gains, solution.parameters[:-1])
-    count = len(outcomes)
+    count, layout = len(outcomes), problem.kernels.layout
+    at_limit = (actions == layout.lower_limits(np.ones(layout.n_u))) | (actions == 1.0)
     assert episodes.states is not None
     assert episodes.observations is not None
     final_errors = np.stack([episodes.attitude_error, episodes.position_error], axis=1)
@@ -290,7 +291,7 @@ def _demonstration_arrays(
         "guess": np.array([GUESSES.index(outcome.guess) for outcome in outcomes], dtype=np.uint8),
         "start_errors": episodes.initial_errors[:count],
         "final_errors": final_errors[:count],
-        "clamped_share": np.mean(np.abs(actions) == 1.0, axis=(1, 2)),
+        "clamped_share": np.mean(at_limit, axis=(1, 2)),
     }
 
 

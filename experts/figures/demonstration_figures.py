@@ -114,7 +114,7 @@ def _draw_sample(column: Any, demonstrations: Demonstrations, demonstration: Dem
     attitude.axhline(success.attitude_error_deg, **LIMIT_STYLE)
     position.plot(maneuver.time, maneuver.distance, color=GREEN)
     position.axhline(success.position_error, **LIMIT_STYLE)
-    share, edges = _limit_share(demonstration.actions)
+    share, edges = _limit_share(demonstration.actions, kernels.layout.lower_limits(np.ones(kernels.n_u)))
     limits.stairs(100.0 * share, edges * demonstrations.scene.simulation.dt, color=PURPLE, fill=True)
     limits.set_xlabel("time [s]", fontsize=_TITLE)
     for axes in (attitude, position):
@@ -133,8 +133,8 @@ def _share_scale(row: Any) -> None:
         axes.tick_params(labelleft=False)
 
 
-def _limit_share(actions: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+def _limit_share(actions: FloatArray, least: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """Share of the inputs at a limit in each block of stages, and the edges of the blocks."""
     edges = np.unique(np.linspace(0, len(actions), _BLOCKS + 1).astype(np.int64))
-    clamped = np.mean(np.abs(actions) == 1.0, axis=1)
+    clamped = np.mean((actions == least) | (actions == 1.0), axis=1)
     return np.add.reduceat(clamped, edges[:-1]) / np.diff(edges), edges

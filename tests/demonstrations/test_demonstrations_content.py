@@ -11,7 +11,7 @@ import pytest
 from demonstration_files import ends_inside
 
 from dq_space_arm_env import Scene, load_scene
-from dq_space_arm_env.scene import Spread
+from dq_space_arm_env.scene import Spread, StateLayout
 from experts import BoxDDP, generate_demonstrations
 from experts.demonstrations import Demonstration, Demonstrations, SerialExecutor
 from experts.demonstrations.settings import Settings
@@ -131,3 +131,14 @@ def test_unusable_input_is_refused(changes, sentence: str, quick_scene: Scene, t
     with pytest.raises(ValueError, match=sentence):
         generate_demonstrations(**arguments)
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.slow
+def test_idle_thrusters_are_at_a_limit(tmp_path: Path):
+    scene = load_scene("thrusters").replace(simulation={"dt": 0.15, "steps": 100})
+    (made,) = generate_demonstrations(scene, 1, tmp_path / "jets", executor=SerialExecutor())
+    jets = StateLayout.of(scene).control.thruster_force
+    clamped = np.abs(made.actions) == 1.0
+    clamped[:, jets] |= made.actions[:, jets] == 0.0
+    assert clamped[:, jets].mean() > 0.4
+    assert made.facts["clamped_share"] == clamped.mean()

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from dq_space_arm_env import Scene, compile_scene
+from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion
+from dq_space_arm_env.scene import StateLayout
 from experts.report import Maneuver, ManeuverRun, replay
 from experts.report.maneuver_run import errors_with_finer_steps
 
@@ -46,6 +47,16 @@ def test_actuator_counts_what_is_at_the_limit(paper_maneuver: Maneuver) -> None:
     assert joints.largest[1:].max() < 2.0
     shares = [actuator.clamped_share > 0.0 for actuator in paper_maneuver.actuators]
     assert shares == [False, False, True, False]
+
+
+def test_a_thruster_that_is_idle_is_at_its_limit() -> None:
+    layout = StateLayout.of(load_scene("thrusters"))
+    controls = np.tile(0.5 * layout.control_limit, (10, 1))
+    controls[:4, layout.control.thruster_force] = 0.0
+    maneuver = Maneuver(load_scene("thrusters"), np.tile(layout.initial_state, (11, 1)), controls)
+    shares = {actuator.name: actuator.clamped_share for actuator in maneuver.actuators}
+    assert shares.pop("thruster_force") == pytest.approx(0.4)
+    assert not any(shares.values())
 
 
 def test_efforts_add_up_to_the_input_part_of_the_cost(paper_maneuver: Maneuver) -> None:

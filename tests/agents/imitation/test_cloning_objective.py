@@ -144,6 +144,33 @@ def test_more_than_the_limit_is_as_good_as_the_limit(demonstrations, statistics,
         assert found.action.item() == pytest.approx(size, rel=1e-5)
 
 
+def test_the_least_action_of_a_thruster_is_zero():
+    """Idle, it may be wanted to pull: clipping undoes that, and its row of gains is zero."""
+    kernels = compile_scene("thrusters")
+    layout, n_u = kernels.layout, kernels.n_u
+    jets = layout.control.thruster_force
+    states = np.tile(layout.initial_state, (4, 1))
+    observations = kernels.observation(states, np.full((4, 1), 3.0))[0]
+    actions = np.full((4, n_u), 0.5)
+    actions[:, jets] = 0.0
+    gains = np.zeros((4, n_u, kernels.n_t), np.float32)
+    arrays = {"states": states, "observations": observations, "actions": actions, "feedback_gains": gains}
+    seen, given = np.zeros(observations.shape[1]), np.zeros(n_u)
+    units = seen, seen + 1.0, given, given + 1.0
+    statistics = Statistics(*units, np.ones(kernels.n_t), given + 1.0)
+    network = PolicyNetwork(len(seen), n_u, hidden=())
+    network.normalize(*units)
+    with torch.no_grad():
+        network.layers[0].weight.zero_()
+        network.layers[0].weight[jets] = 0.01
+        network.layers[0].bias.copy_(torch.from_numpy(actions[0]))
+        network.layers[0].bias[jets] = -2.0
+    batch = Batch(np.zeros(4, int), np.arange(4), arrays)
+    weights = ObjectiveWeights(gain_weight=1.0, augmentation_weight=1.0)
+    found = Objective(kernels, statistics, weights)(network, batch, np.random.default_rng(0))
+    assert found.action.item() == found.gain.item() == found.augmentation.item() == 0.0
+
+
 def test_augmentation_asks_for_the_action_that_the_gains_give(demonstrations, statistics, batch):
     network, exact = linear_network(demonstrations, statistics, batch)
     inside = np.abs(exact.arrays["actions"]).max(axis=1) < 0.9
