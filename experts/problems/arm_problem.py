@@ -168,12 +168,18 @@ class ArmProblem:
             found[:-1, caught] = blocks[:, -1, caught]
         return found
 
+    @property
+    def _has_delays(self) -> bool:
+        return any(chain.delay for chain in self.kernels.layout.chains)
+
     def can_coarsen(self, factor: int) -> bool:
-        """Tell whether long steps of so many stages end where the robot changes.
+        """Tell whether long steps of so many stages end where the robot changes, and no delay counts steps.
 
         Args:
             factor: Steps in one of the longer steps; it divides the number of stages.
         """
+        if factor > 1 and self._has_delays:
+            return False
         entries = self.kernels.parameters
         others = {index for path in ("cost", "actuators", PHASE, CATCH) for index in entries.indices(path)}
         robot = [index for index in entries.staged if index not in others]
@@ -195,6 +201,10 @@ class ArmProblem:
         """
         if not isinstance(factor, int | np.integer) or factor < 1 or self.horizon % factor:
             raise ValueError(f"factor is {factor!r}; it must divide the {self.horizon} stages")
+        if factor > 1 and self._has_delays:
+            raise ValueError(
+                f"factor is {factor}; it must be 1: delays of actuators are whole steps, longer in long ones"
+            )
         if not self.can_coarsen(factor):
             raise ValueError(
                 f"factor is {factor}; it must divide the stages of the phases that change the robot"

@@ -18,7 +18,7 @@ from dq_space_arm_env.common.report_page import Section
 from dq_space_arm_env.common.tables import Column, Row
 from dq_space_arm_env.kernels import Kernels, compile_scene
 from dq_space_arm_env.kernels.bound import KernelCall
-from dq_space_arm_env.scene import INTEGRATORS, Scene
+from dq_space_arm_env.scene import INTEGRATORS, Scene, StateLayout
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.solution import uninterrupted
 from experts.problems.shooting_problem import FloatArray
@@ -101,7 +101,11 @@ def reference_end(motion: Motion) -> tuple[FloatArray, float]:
 
 
 def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[Row]]:
-    """Errors and times of all integrators."""
+    """Errors and times of all integrators; ValueError where they would be those of different robots."""
+    if any(chain.delay for chain in StateLayout.of(scene).chains):
+        raise ValueError(
+            "delays of actuators are whole steps, so another step would be another robot: leave them out"
+        )
     announce("the expert's maneuver", 0, 4)
     motion = expert_motion(scene, effort.max_iterations)
     announce("the reference", 1, 4)

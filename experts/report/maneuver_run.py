@@ -28,7 +28,7 @@ class ManeuverRun:
     scene: Scene
     solution: Solution
     replay: Rollout  # of one episode
-    finer_errors: tuple[float, float]  # deg and m at the end, see `errors_with_finer_steps`
+    finer_errors: tuple[float, float] | None  # deg and m at the end, see `errors_with_finer_steps`
     zero_control_cost: float  # J of doing nothing, where the solver starts
     tolerance: float  # relative decrease of the cost below which the solver has converged
     preparation_seconds: float  # to compile scene and solver, or to load both from the cache
@@ -119,8 +119,15 @@ def replay(scene: Scene, controls: FloatArray) -> Rollout:
     return rollout(StateFeedback(lambda states, step: actions[step, None]), scene)
 
 
-def errors_with_finer_steps(scene: Scene, controls: FloatArray, substeps: int = 4) -> tuple[float, float]:
-    """Errors of the tip [deg, m] at the end of a plan that RK4 integrates with a shorter time step."""
+def errors_with_finer_steps(
+    scene: Scene, controls: FloatArray, substeps: int = 4
+) -> tuple[float, float] | None:
+    """Errors of the tip [deg, m] at the end of a plan that RK4 integrates with a shorter time step.
+
+    None where an actuator has a delay: it is whole steps, and shorter in shorter ones.
+    """
+    if any(chain.delay for chain in StateLayout.of(scene).chains):
+        return None
     kernels, dt = compile_scene(scene), scene.simulation.dt / substeps
     finer = np.repeat(controls, substeps, axis=0)
     with np.errstate(all="ignore"):

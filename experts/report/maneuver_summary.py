@@ -74,8 +74,11 @@ def _result_rows(run: ManeuverRun) -> Iterable[tuple[str, str, str]]:
     yield "attitude error", f"{start:.3g}° → {end:.3g}°", tolerance
     reached = "within the tolerance" if replay.is_success[0] else "NOT within the tolerance"
     yield "position error", f"{maneuver.distance[0]:.3g} m → {maneuver.distance[-1]:.3g} m", reached
-    angle, distance = run.finer_errors
-    yield "the same plan, RK4, Δt/4", f"{angle:.3g}°, {distance:.3g} m", "error of the integrator"
+    if run.finer_errors is None:
+        yield "the same plan, RK4, Δt/4", "-", "delays of actuators are whole steps"
+    else:
+        angle, distance = run.finer_errors
+        yield "the same plan, RK4, Δt/4", f"{angle:.3g}°, {distance:.3g} m", "error of the integrator"
     agreement = "= -J" if run.replay_agrees else "DIFFERS from -J"
     yield (
         "return in DQSpaceArm-v0",
@@ -99,7 +102,7 @@ def summarize(run: ManeuverRun) -> dict[str, Any]:
     """Collect the numbers of a run: JSON values, units in the keys, None where a number is not finite."""
     solution, replay, maneuver = run.solution, run.replay, run.maneuver
     success = run.scene.success
-    attitude, position = run.finer_errors
+    attitude, position = run.finer_errors or (None, None)
     summary = {
         "scene": run.scene.name,
         "result": {

@@ -1,15 +1,20 @@
 """The quantities of Figures 3 to 6, and the replays: eq. (31), the cost of section V."""
 
+import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.scene import StateLayout
-from experts.report import Maneuver, ManeuverRun, replay
+from experts.report import Maneuver, ManeuverRun, integrator_precision, replay
+from experts.report.effort import QUICK
 from experts.report.maneuver_run import errors_with_finer_steps
+from experts.report.maneuver_summary import print_tables, summarize
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
@@ -105,3 +110,15 @@ def test_zero_controls_cost_is_that_of_staying(short_run: ManeuverRun) -> None:
     start = kernels.layout.initial_state
     expected = 60 * kernels.cost(start, np.zeros(2)) + kernels.terminal_cost(start)
     assert short_run.zero_control_cost == pytest.approx(expected, rel=1e-9)
+
+
+def test_delays_count_steps_so_finer_ones_show_no_error_of_the_integrator(short_run: ManeuverRun) -> None:
+    delayed = short_run.scene.replace(actuators={"joint_torque": {"limit": 0.5, "delay": 2}})
+    assert errors_with_finer_steps(delayed, short_run.solution.controls) is None
+    run = replace(short_run, finer_errors=None)
+    assert summarize(run)["finer_integration"]["final_attitude_error_deg"] is None
+    console = Console(width=200, record=True, file=io.StringIO())
+    print_tables(console, run)
+    assert "delays of actuators are whole steps" in console.export_text()
+    with pytest.raises(ValueError, match="another step would be another robot"):
+        integrator_precision.measure(delayed, QUICK, lambda *given: None)

@@ -533,6 +533,15 @@ def test_a_number_of_steps_that_does_not_divide_the_stages_is_refused():
             GuidedDDP("paper", coarsening=coarsening)
 
 
+def test_delays_count_steps_and_leave_no_long_ones():
+    delayed = load_scene("planar").replace(actuators={"joint_torque": {"limit": 1.0, "delay": 2}})
+    problem = ArmProblem(delayed)
+    assert problem.can_coarsen(1)
+    assert not any(problem.can_coarsen(factor) for factor in (2, 4, 8))
+    with pytest.raises(ValueError, match="factor is 4; it must be 1: delays of actuators are whole steps"):
+        problem.coarsened(4)
+
+
 def test_only_scenes_have_long_steps(unicycle):
     with pytest.raises(
         ValueError, match=r"coarsening is \(2,\); only the maneuver of a scene has long steps"
