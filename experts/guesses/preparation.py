@@ -41,6 +41,8 @@ def preparation_key(problem: ArmProblem, settings: Mapping[str, Any]) -> str:
         problem.integrator,
         problem.horizon,
         problem.time_step,
+        problem.is_constrained,
+        problem.reserve,
         dict(settings),
         *(np.asarray(array).tolist() for array in numbers),
     ]

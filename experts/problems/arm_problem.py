@@ -46,6 +46,7 @@ class ArmProblem:
         terminal_inputs: The last stage's parameters, if there are any, and the weight of the terminal cost's
             pose, shape (1,): 1, or less in long steps, see `coarsened`.
         constraints: Those of the scene and of success at its end; None without.
+        reserve: Share of the tolerances of success that those keep free.
         has_second_order: Whether the registry of integrators names second derivatives for the scene's; the
             solver uses Gauss-Newton's model where there are none.
     """
@@ -73,7 +74,7 @@ class ArmProblem:
         self.time_step = self.scene.simulation.dt
         self.initial_state: FloatArray = layout.initial_state
         self._limits_vary = not set(layout.control.limits).isdisjoint(layout.parameters.names)
-        self._end_weight, self._reserve = 1.0, 0.0
+        self._end_weight, self.reserve = 1.0, 0.0
         self._make_inputs()
 
     def constrained(self, reserve: float = 0.0) -> "ArmProblem":
@@ -83,7 +84,7 @@ class ArmProblem:
             reserve: Share of the tolerances to keep free.
         """
         twin = copy.copy(self)
-        twin.is_constrained, twin._reserve = True, reserve
+        twin.is_constrained, twin.reserve = True, reserve
         twin._make_inputs()
         return twin
 
@@ -138,7 +139,7 @@ class ArmProblem:
             return None
         path, terminal, kernels = penalized_rows(self.scene), terminal_rows(self.scene), self.kernels
         which = [not row.is_rate for row in path_rows(self.scene)]
-        reserve = self._reserve * np.array([0.0 if row.is_equality else row.tolerance for row in terminal])
+        reserve = self.reserve * np.array([0.0 if row.is_equality else row.tolerance for row in terminal])
 
         def residuals(states: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
             rows, along = parameters.rows, np.zeros((len(controls), 0))

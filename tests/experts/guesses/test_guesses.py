@@ -25,6 +25,7 @@ from experts.guesses.guided import START_REGULARIZATIONS
 from experts.guesses.initial_guesses import STRAYED, ZERO_REGULARIZATION
 from experts.guesses.other_side import contacts_of, other_side
 from experts.guesses.policies import coarsened, follow, refined
+from experts.guesses.preparation import preparation_key
 from experts.guesses.screw_motion import ScrewMotion
 from experts.problems.arm_problem import ArmProblem
 from scripts.benchmarks.solvers.runs import roll_out
@@ -576,6 +577,13 @@ def test_other_settings_have_another_preparation(kept):
     for settings in ({"remember": 1}, {"coarsening": 8}, {"library": []}):
         GuidedDDP("planar", **settings).solve()
     assert len(kept()) == 4
+
+
+def test_success_as_constraint_has_another_preparation():
+    problem = ArmProblem("planar")
+    keys = [preparation_key(each, {}) for each in (problem, problem.constrained(), problem.constrained(0.3))]
+    assert len(set(keys)) == 3
+    assert preparation_key(problem.constrained(0.3), {}) == keys[2]
 
 
 def test_a_damaged_preparation_is_made_again(kept):
