@@ -17,7 +17,7 @@ therefore complete at any moment; the rest is left over from a killed run and is
 import hashlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -62,11 +62,18 @@ class Folder:
         """
         for folder in (self.path, self.path / SHARDS, self.path / LOG):
             folder.mkdir(parents=True, exist_ok=True)
-        with _reserved(self.path, self.part):
-            if self.part.of == 1:  # no other run is writing
-                remove_leftovers(self.path)
+        with _reserved(self.path, self.part, self._remove_leftovers):
             self._check_settings()
             yield
+
+    def _remove_leftovers(self) -> None:
+        """Remove what killed runs left of this part's shards, and beside them if it is all of the work."""
+        if self.part.of == 1:
+            remove_leftovers(self.path)
+        for path in (self.path / SHARDS).iterdir():
+            match = SHARD_NAME.match(path.name.removeprefix("."))
+            if match and int(match[1]) in self.shards and path.name != match[0]:
+                path.unlink(missing_ok=True)
 
     def _check_settings(self) -> None:
         path, here = self.path / SETTINGS, self.settings.record()
@@ -88,13 +95,9 @@ class Folder:
         """Yield each shard of this part and its file, or None; remove damaged files and duplicates."""
         files: dict[int, list[Path]] = {}
         for path in sorted((self.path / SHARDS).iterdir()):
-            name = path.name.removeprefix(".")
-            match = SHARD_NAME.match(name)
+            match = SHARD_NAME.fullmatch(path.name)
             if match and int(match[1]) in self.shards:
-                if path.name == match[0]:
-                    files.setdefault(int(match[1]), []).append(path)
-                else:
-                    path.unlink(missing_ok=True)  # left over from a killed run
+                files.setdefault(int(match[1]), []).append(path)
         for shard in self.shards:
             sound = None
             for path in files.get(shard, ()):
@@ -160,8 +163,11 @@ def manifest_of(settings: Path, paths: list[Path]) -> dict[str, Any]:
 
 
 @contextmanager
-def _reserved(folder: Path, part: Part) -> Iterator[None]:
-    """Lock a part of the work. A run that does all of it excludes any other; parts exclude only that."""
+def _reserved(folder: Path, part: Part, remove_leftovers: Callable[[], None]) -> Iterator[None]:
+    """Lock a part of the work. A run that does all of it excludes any other; parts exclude only that.
+
+    Leftovers are removed unless the work is divided in another way beside: then they may be of a living run.
+    """
     refusal = DemonstrationsError(
         f"another run is writing to {folder}: wait for it, or choose another folder"
     )
@@ -173,4 +179,15 @@ def _reserved(folder: Path, part: Part) -> Iterator[None]:
                 with locked(other, refusal):
                     pass
             held.enter_context(locked(mine, refusal))
+            if not any(map(_is_held, set(log.glob("lock-*")) - set(log.glob(f"lock-*-of-{part.of}")))):
+                remove_leftovers()
         yield
+
+
+def _is_held(lock: Path) -> bool:
+    """Whether a living run holds a lock."""
+    try:
+        with locked(lock, BlockingIOError()):
+            return False
+    except BlockingIOError:
+        return True

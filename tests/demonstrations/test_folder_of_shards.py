@@ -55,10 +55,29 @@ def test_sound_shards_are_those_that_their_names_say(quick_scene: Scene, tmp_pat
         (tmp_path / "shards" / names[1]).write_bytes(b"another content")
         copy = tmp_path / "shards" / f"000000-{'f' * 64}.safetensors"  # not its hash
         copy.write_bytes(b"")
-        (tmp_path / "shards" / f".{names[0]}.0123456789abcdef.part").write_bytes(b"half of")
         (tmp_path / "shards" / "notes.txt").write_text("stays")
         assert found(folder) == {0: names[0], 1: None, 2: None}
         assert sorted(path.name for path in (tmp_path / "shards").iterdir()) == [names[0], "notes.txt"]
+
+
+def test_what_killed_runs_left_is_removed_unless_it_may_be_of_a_living_one(
+    quick_scene: Scene, tmp_path: Path
+) -> None:
+    """The shards of 1/2 are also of 1/3: beside each other, a half-written one may be the other's."""
+    half, third = (folder_of(quick_scene, tmp_path, Part(1, of)) for of in (2, 3))
+    other_half = folder_of(quick_scene, tmp_path, Part(2, 2))
+    with half.opened():
+        name = f"000000-{'0' * 64}.safetensors"
+    leftover = tmp_path / "shards" / f".{name}.0123456789abcdef.part"
+    leftover.write_bytes(b"half of")
+    with half.opened():
+        assert not leftover.exists()
+        leftover.write_bytes(b"half of")
+        with other_half.opened(), third.opened():
+            assert list(found(third)) == [0]
+            assert leftover.exists()
+    with third.opened():
+        assert not leftover.exists()
 
 
 def test_a_part_leaves_the_shards_of_others_alone(quick_scene: Scene, tmp_path: Path) -> None:
