@@ -11,7 +11,7 @@ of imitation, a folder for each part |
 | `tensorboard/` | curves for TensorBoard |
 | `progress.json` | how far the training has come, where it is one of several |
 | `best.npz` | of reinforcement: the policy that was best in these evaluations, exported |
-| `policy.npz`, `model.zip` | the policy at the end, exported, and the model; written last |
+| `model.zip`, `policy.npz` | the model at the end, and the policy, exported; written last, in this order |
 | `.lock` | empty; locked while a process trains here |
 
 Files and checkpoints are written under a temporary name and renamed: under their own name they are complete.

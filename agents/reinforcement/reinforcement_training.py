@@ -98,10 +98,10 @@ def train_learner(
     finally:
         torch.set_num_threads(threads)
         environment.close()
-    policy.save(folder.path / POLICY)
     content = io.BytesIO()
     model.save(content)
     write_atomically(folder.path / MODEL, content.getvalue())
+    policy.save(folder.path / POLICY)  # last: a folder with it is a finished run
     return Trained(folder.path, model, policy)
 
 

@@ -353,6 +353,19 @@ def test_two_processes_do_not_train_in_one_folder(scene_file, tmp_path):
         pass
 
 
+@pytest.mark.slow
+def test_the_policy_is_written_last(scene_file, tmp_path, monkeypatch):
+    """With it a run counts as finished: killed before, it resumes and writes the model too."""
+
+    def fail(path, content):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("agents.reinforcement.reinforcement_training.write_atomically", fail)
+    with pytest.raises(OSError, match="no space left"):
+        train(configuration("PPO", scene_file), tmp_path)
+    assert not (tmp_path / "policy.npz").exists()
+
+
 def test_a_run_whose_time_is_up_is_left_as_it_is(scene_file, tmp_path):
     settings = configuration("PPO", scene_file, total_steps=10**6).model_dump(exclude_none=True)
     settings["schedule"]["minutes"] = 1e-6
