@@ -36,7 +36,7 @@ from agents.evaluation.evaluation_verbs import progress_bar
 from agents.evaluation.expert_costs import EVALUATION_SEEDS
 from agents.evaluation.training_runs import training_command
 from agents.policies import ExportedPolicy, PolicyFileError
-from agents.zoo.finding import policy_path
+from agents.zoo.finding import as_policy, check_fit, policy_path
 from agents.zoo.shelf import MOST_BYTES, SHELF, ZooError, file_hash, list_policies
 from dq_space_arm_env import Scene, list_scenes, load_scene
 from dq_space_arm_env.command_line.verb_program import run_to_end
@@ -77,6 +77,9 @@ def add_to_zoo(
     command = training or training_command(policy.metadata)
     scene = _checked(policy, file, chosen, command, shelf)
     assert command is not None
+    others = [load_scene(other) for other in also]
+    for other in others:  # before hours of flights
+        check_fit(as_policy(policy), other)
     ordered = ["training", *(condition for condition in conditions if condition != "training")]
     evaluations = [
         evaluate(
@@ -93,7 +96,7 @@ def add_to_zoo(
         )
         for condition in ordered
     ]
-    elsewhere = [evaluate(policy, other, n, label=chosen, expert=False).summary() for other in also]
+    elsewhere = [evaluate(policy, other, n, label=chosen, expert=False).summary() for other in others]
     shelf.mkdir(parents=True, exist_ok=True)
     weights = shelf / f"{chosen}.npz"
     write_atomically(weights, content)  # as evaluated, even if the file changed since

@@ -9,9 +9,9 @@ from agents.evaluation import evaluate, evaluation_seeds, fly
 from agents.evaluation.conditions import physics_hash
 from agents.policies import ExportedPolicy
 from agents.zoo import ZooError, list_policies, load_policy
-from agents.zoo.finding import as_policy, check_fit
+from agents.zoo.finding import PolicyError, as_policy, check_fit
 from agents.zoo.shelf import MOST_BYTES, SHELF, file_hash, load_record, policy_file
-from dq_space_arm_env import load_scene
+from dq_space_arm_env import SceneError, load_scene
 from experts.demonstrations import SerialExecutor
 from scripts.add_to_zoo import REPEATED, add_to_zoo, card, main
 
@@ -114,6 +114,14 @@ def test_what_does_not_belong_into_the_zoo_is_refused(shipped, tmp_path, monkeyp
     other = write_policy(tmp_path / "other", scene="mine")
     with pytest.raises(ZooError, match="trained for scene 'mine', which does not ship"):
         add_to_zoo(other, training="x", shelf=shelf)
+    # Scenes to fly it in besides are looked at before the first flight.
+    monkeypatch.setattr("scripts.add_to_zoo.evaluate", lambda *given, **options: pytest.fail("flies"))
+    found = {"quick": QUICK}
+    monkeypatch.setattr("scripts.add_to_zoo.load_scene", lambda name: found.get(name) or load_scene(name))
+    with pytest.raises(SceneError, match="no-such-scene"):
+        add_to_zoo(run, training="x", also=["no-such-scene"], shelf=shelf)
+    with pytest.raises(PolicyError, match="scene 'paper' has"):
+        add_to_zoo(run, training="x", also=["quick", "paper"], shelf=shelf)
     monkeypatch.setattr("scripts.add_to_zoo.MOST_BYTES", 100)
     with pytest.raises(ZooError, match="together they should be at most 100"):
         add_to_zoo(run, training="x", shelf=shelf)
