@@ -25,7 +25,7 @@ _HOMES = {
     "Cloned": "cloning",
     "Making": "cloning",
     "clone": "cloning",
-    "train_by_imitation": "training",
+    "train_by_imitation": "imitation_training",
 }
 
 

@@ -2,6 +2,14 @@
 
 import re
 
+import pytest
+
+import agents
+import agents.imitation
+import agents.policies
+import dq_space_arm_env
+import experts
+
 EXTRA = ("stable_baselines3", "torch")
 
 TRAINING = """
@@ -27,3 +35,15 @@ def test_the_command_names_what_is_missing_in_a_sentence(run_without, tmp_path):
 def test_importing_loads_no_learning_library(run_without):
     code = 'import agents; print({"torch", "stable_baselines3", "agents.vec_env"} & set(sys.modules))'
     assert run_without((), code).stdout.strip() == "set()"
+
+
+@pytest.mark.agents
+@pytest.mark.parametrize(
+    "package",
+    [agents, agents.imitation, agents.policies, dq_space_arm_env, experts],
+    ids=lambda p: p.__name__,
+)
+def test_every_name_that_is_imported_on_first_use_is_there(package):
+    pytest.importorskip("stable_baselines3")
+    for name in package.__all__:
+        assert getattr(package, name) is not None
