@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env import Kernels
-from experts.demonstrations import Demonstrations
+from experts.demonstrations import Demonstrations, DemonstrationsError
 
 FloatArray = NDArray[np.float64]
 
@@ -34,6 +34,8 @@ class Plans:
     @classmethod
     def of(cls, demonstrations: Demonstrations) -> Self:
         """Plans of demonstrations, one flight each, copied to memory."""
+        if not len(demonstrations):
+            raise DemonstrationsError(f"{demonstrations.path} has no demonstration to fly: generate others")
         shape = (len(demonstrations), *demonstrations[0].feedback_gains.shape)
         gains = np.empty(shape, dtype=np.float32)
         states, actions, varied = [], [], []

@@ -26,6 +26,7 @@ from agents.residual.mismatch_comparison import compare_under_mismatch, read_cor
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.environment.rollouts import rollout
+from experts.demonstrations import DemonstrationsError
 from experts.demonstrations.shard import draw_starts
 
 pytestmark = pytest.mark.slow
@@ -40,6 +41,11 @@ SETTINGS = {"repeat": 10, "memory": 0.5, "full_authority": 0.1}
 @pytest.fixture(scope="module")
 def plans(demonstrations):
     return Plans.of(demonstrations)
+
+
+def test_no_demonstrations_make_no_plans(demonstrations):
+    with pytest.raises(DemonstrationsError, match="has no demonstration to fly"):
+        Plans.of(demonstrations[:0])
 
 
 def constant(scene, value=0.0):
