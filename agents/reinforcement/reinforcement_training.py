@@ -21,7 +21,7 @@ from agents import configuration as c
 from agents.demonstrations import expert_seconds, prepare_demonstrations
 from agents.policies import ExportedPolicy
 from agents.policies.exported import units_of
-from agents.reinforcement.callback import Advance, TimeIsUp, TrainingCallback
+from agents.reinforcement.callback import TimeIsUp, TrainingCallback
 from agents.reinforcement.checkpoint import read_checkpoint
 from agents.reinforcement.networks import ACTIVATIONS, ScaledActionsPolicy, ScaledObservations
 from agents.reinforcement.off_policy import LAYER_NORMALIZED, TruncatedQuantileCritics, TwinDelayed
@@ -34,6 +34,7 @@ from agents.run_folder import DEMONSTRATIONS, MODEL, POLICY, TENSORBOARD, RunFol
 from agents.zoo.starting import load_start, spent_before
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.files import write_atomically
+from dq_space_arm_env.common.progress import Advance
 
 LEARNERS: Mapping[str, type[BaseAlgorithm]] = {
     "PPO": ProximalPolicyOptimization,
@@ -66,7 +67,7 @@ def train_by_reinforcement(
         configuration,
         folder,
         environment,
-        lambda: _begin(configuration, scene, folder, environment),
+        lambda: _begin(configuration, scene, folder, environment, report),
         lambda before: TrainingCallback(configuration, scene, folder, before, report),
     )
 
@@ -109,7 +110,11 @@ def train_learner(
 
 
 def _begin(
-    configuration: c.Configuration, scene: Scene, folder: RunFolder, environment: VecEnv
+    configuration: c.Configuration,
+    scene: Scene,
+    folder: RunFolder,
+    environment: VecEnv,
+    report: Callable[[Advance], None],
 ) -> tuple[BaseAlgorithm, Progress]:
     """Make a learner, with demonstrations in its replay buffer where the configuration asks for them."""
     model, algorithm = make_learner(configuration, environment), configuration.algorithm
@@ -118,7 +123,8 @@ def _begin(
     if not isinstance(algorithm, c.SAC) or algorithm.demonstrations is None:
         return model, spent
     given = algorithm.demonstrations
-    demonstrations = prepare_demonstrations(given.source, scene, folder.path / DEMONSTRATIONS)
+    place = folder.path / DEMONSTRATIONS
+    demonstrations = prepare_demonstrations(given.source, scene, place, progress=report)
     flown = fly_again(demonstrations, configuration, scene)
     assert isinstance(model, SoftActorCritic)
     assert isinstance(model.replay_buffer, DemonstrationBuffer)

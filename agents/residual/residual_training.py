@@ -15,7 +15,7 @@ from agents.demonstrations import expert_seconds, prepare_demonstrations
 from agents.evaluation.plan_followers import follower
 from agents.evaluation.plans import Plans
 from agents.policies import ExportedPolicy
-from agents.reinforcement.callback import Advance, TrainingCallback
+from agents.reinforcement.callback import TrainingCallback
 from agents.reinforcement.networks import export_policy
 from agents.reinforcement.reinforcement_training import Trained, make_learner, train_learner
 from agents.reinforcement.training_environment import held_environment
@@ -28,6 +28,7 @@ from agents.vec_env import SB3VecEnv
 from agents.wrappers.shaping import action_scale
 from agents.wrappers.vector import ShapeReward
 from dq_space_arm_env import Scene, load_scene
+from dq_space_arm_env.common.progress import Advance
 from experts.demonstrations import Demonstrations
 
 VALIDATION_SEED = 1
@@ -44,7 +45,9 @@ def train_residual(
     """Train a correction; an interrupted run resumes from its last checkpoint."""
     scene = load_scene(configuration.scene)
     folder = RunFolder(Path(out), configuration)
-    demonstrations = prepare_demonstrations(configuration.demonstrations, scene, folder.path / DEMONSTRATIONS)
+    demonstrations = prepare_demonstrations(
+        configuration.demonstrations, scene, folder.path / DEMONSTRATIONS, progress=report
+    )
     practiced, kept = split(demonstrations, configuration.schedule.evaluation_episodes)
     environment = make_residual_environment(configuration, scene, practiced)
     learner = configuration.learner()

@@ -57,6 +57,18 @@ def trained(demonstrations, small_file, tmp_path_factory):
     return train(configuration(demonstrations, small_file), tmp_path_factory.mktemp("run"))
 
 
+def test_demonstrations_report_their_progress(demonstrations, small_file, tmp_path, monkeypatch):
+    def prepare(*given, progress):
+        progress("they are made")
+        raise DemonstrationsError("enough")
+
+    monkeypatch.setattr("agents.reinforcement.reinforcement_training.prepare_demonstrations", prepare)
+    reports = []
+    with pytest.raises(DemonstrationsError, match="enough"):
+        train(configuration(demonstrations, small_file), tmp_path, report=reports.append)
+    assert reports == ["they are made"]
+
+
 def test_a_demonstration_is_flown_again_to_its_own_target(drawn, small_file):
     settings = configuration(drawn, small_file, action_repeat=1)
     flown = fly_again(drawn, settings, drawn.scene)

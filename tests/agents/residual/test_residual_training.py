@@ -57,6 +57,18 @@ def trained_parameters(run):
     return {name: array.numpy().copy() for name, array in run.model.policy.state_dict().items()}
 
 
+def test_demonstrations_report_their_progress(configuration, tmp_path, monkeypatch):
+    def prepare(*given, progress):
+        progress("they are made")
+        raise DemonstrationsError("enough")
+
+    monkeypatch.setattr("agents.residual.residual_training.prepare_demonstrations", prepare)
+    reports = []
+    with pytest.raises(DemonstrationsError, match="enough"):
+        train_residual(configuration(), tmp_path, reports.append)
+    assert reports == ["they are made"]
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_before_training_the_agent_is_the_plan_with_its_gains(
     algorithm, configuration, small_scene, demonstrations
