@@ -66,10 +66,21 @@ def ranked_guesses(
                 guess = guess._replace(multipliers=multipliers_of(solution))
             rollouts.append(guess)
             strayed = strayed and trial.cost > STRAYED * solution.cost
-    if strayed and kinematic_guess is not None:
-        controls, cost = track(problem, *kinematic_guess(start))
+    motion = _motion(kinematic_guess, start) if strayed and kinematic_guess is not None else None
+    if motion is not None:
+        controls, cost = track(problem, *motion)
         rollouts.append(Guess("screw motion", controls, cost, SCREW_REGULARIZATION))
     return sorted((guess for guess in rollouts if np.isfinite(guess.cost)), key=lambda guess: guess.cost)
+
+
+def _motion(kinematic_guess: KinematicGuess, start: FloatArray) -> ScrewMotion | None:
+    """The guess from a start; None where kinematics overflow."""
+    try:
+        with np.errstate(all="ignore"):
+            motion = kinematic_guess(start)
+    except np.linalg.LinAlgError:
+        return None
+    return motion if all(np.isfinite(each).all() for each in motion) else None
 
 
 def multipliers_of(solution: Solution) -> FloatArray | None:

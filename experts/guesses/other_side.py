@@ -47,6 +47,8 @@ def other_side(problem: ArmProblem, solution: Solution) -> ScrewMotion | None:
     Returns:
         The guess from the same start; None if no obstacle is in the way.
     """
+    if not solution.multipliers.size:  # it has diverged
+        return None
     contacts = contacts_of(problem.scene)
     columns = np.array(list(contacts), dtype=int)
     pushes = solution.multipliers[:-1, columns]

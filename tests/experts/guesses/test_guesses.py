@@ -200,6 +200,15 @@ def test_if_every_rollout_diverges_the_solution_says_so(double_integrator):
     assert names(solution) == ["zero controls"]
 
 
+@pytest.mark.parametrize("rate", [1e5, 1e8, 1e160])
+def test_an_arm_that_whirls_beyond_all_numbers_diverges(rate):
+    """Kinematics overflow before the dynamics, or leave singular matrices: there is no such guess."""
+    solver = GuidedDDP("planar")
+    start = np.array(solver.problem.initial_state)
+    start[solver.problem.kernels.layout.state.joint_rates] = rate
+    assert solver.solve(start).stop_reason is StopReason.DIVERGED
+
+
 # Interrupts ------------------------------------------------------------------------------------------------
 
 
@@ -615,6 +624,8 @@ def test_a_cheaper_way_is_found_on_the_other_side_of_an_obstacle():
 
 def test_where_no_obstacle_is_in_the_way_no_other_side_is_guessed(paper):
     assert other_side(paper.problem, paper.library[0]) is None
+    diverged = replace(paper.library[0], multipliers=np.zeros((0, 0)))
+    assert other_side(ArmProblem("keep-out"), diverged) is None
 
 
 def test_contacts_are_found_among_multipliers_and_among_rows_that_have_none():
