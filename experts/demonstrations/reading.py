@@ -214,15 +214,24 @@ class Demonstrations(Sequence[Demonstration]):
         """Select demonstrations.
 
         Args:
-            positions: Their positions in this sequence, shape (M,).
+            positions: Their positions in this sequence, shape (M,); or a mask of all, shape (len(self),).
 
         Returns:
             The selection, in this order.
 
         Raises:
             IndexError: If there is no such position.
+            ValueError: If a mask has another shape.
+            TypeError: If they are neither whole numbers nor a mask.
         """
-        chosen = self._places[np.asarray(positions, dtype=np.int64)]
+        given = np.asarray(positions)
+        if given.dtype == np.bool_:
+            if given.shape != (len(self),):
+                raise ValueError(f"positions is a mask of shape {given.shape}; expected ({len(self)},)")
+            given = np.flatnonzero(given)
+        elif given.size and not np.issubdtype(given.dtype, np.integer):
+            raise TypeError(f"positions are of type {given.dtype}; expected whole numbers, or a mask")
+        chosen = self._places[given.astype(np.int64)]
         return type(self)(self.path, self.settings, self.manifest, selection=(self._files, chosen))
 
     def column(self, name: str) -> NDArray[Any]:

@@ -51,6 +51,13 @@ def test_it_is_a_sequence(whole: Demonstrations):
     assert whole[-1].index == 17
     assert [d.index for d in whole[3:9:2]] == [3, 5, 7]
     assert whole.select([9, 2]).column("index").tolist() == [9, 2]
+    assert len(whole.select([])) == 0
+    cheap = whole.column("cost") < np.median(whole.column("cost"))
+    assert whole.select(cheap).column("index").tolist() == np.flatnonzero(cheap).tolist()
+    with pytest.raises(ValueError, match=r"positions is a mask of shape \(3,\); expected \(18,\)"):
+        whole.select(cheap[:3])
+    with pytest.raises(TypeError, match="positions are of type float64; expected whole numbers, or a mask"):
+        whole.select([0.0, 1.0])
     with pytest.raises(IndexError):
         whole[18]
 
