@@ -41,6 +41,8 @@ class Settings:
         for name, value, least in (("n", n, 1), ("seed", seed, 0), ("shard_size", shard_size, 1)):
             if value < least:
                 raise ValueError(f"{name}: {value}, should be at least {least}")
+        if seed >= 2**63:  # `settings.json` could not be read again
+            raise ValueError(f"seed: {seed}, should be less than 2**63")
         resolved = in_double_precision(load_scene(scene))
         DQSpaceArmVectorEnv(1, resolved)  # refuses a scene without normalized actions
         if n > 1 and not any(resolved.spread.model_dump().values()):
