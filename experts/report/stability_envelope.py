@@ -4,7 +4,7 @@ Three motions without inputs are pushed further and further, each in one quantit
 
 - step: a slow free motion of the scene, in longer and longer steps;
 - rate: the same directions, faster and faster, over as many radians, in the scene's steps;
-- stiffness: all joints on springs at rest, slightly deflected, in the scene's steps.
+- stiffness: all joints but spherical ones on springs at rest, slightly deflected, in the scene's steps.
 
 In the first two, an integrator holds while the tip ends close to that of the method of order 8 with short
 steps. In the third, it holds while the vibration stays bounded. Without dampers, the only time constant of a
@@ -24,6 +24,7 @@ from dq_space_arm_env.common.report_page import Section
 from dq_space_arm_env.common.tables import Column, Row
 from dq_space_arm_env.kernels import Kernels, compile_scene
 from dq_space_arm_env.scene import INTEGRATORS, Scene
+from dq_space_arm_env.scene.bodies import freedoms
 from experts.problems.shooting_problem import FloatArray
 from experts.report.effort import Announce, Effort
 from experts.report.integrator_precision import tip_error, with_simulation
@@ -52,7 +53,7 @@ def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[
         ("step", "s", _slow_motion(scene), dt, _STEP_RANGE),
         ("rate", "rad/s", _fast_motion(scene), 1.0, _RATE_RANGE),
     ]
-    if scene.links:
+    if _sprung_coordinates(scene):
         searches.append(("stiffness", "N m/rad", _vibration(scene), 1.0, _STIFFNESS_RANGE))
     rows: list[Row] = []
     for index, integrator in enumerate(INTEGRATORS):
@@ -156,26 +157,33 @@ def _fast_motion(scene: Scene) -> Callable[[str, float], bool]:
 
 
 def on_springs(scene: Scene) -> Scene:
-    """The scene with each joint on a spring at rest, without dampers and wrench."""
-    angles = scene.initial_state.joint_angles
-    springs = [
-        link.model_copy(update={"stiffness": STIFFNESS, "damping": 0.0, "rest_angle": angle})
-        for link, angle in zip(scene.links, angles, strict=True)
-    ]
-    return scene.replace(links=springs, tip_wrench=None)
+    """The scene with each joint on a spring at rest, spherical ones aside, without dampers and wrench."""
+    angles = dict(zip(freedoms(scene.links), scene.initial_state.joint_angles, strict=True))
+    links = [link.model_copy(update={"stiffness": 0.0, "damping": 0.0}) for link in scene.links]
+    for (index, axis), angle in angles.items():
+        if not axis:
+            links[index] = links[index].model_copy(update={"stiffness": STIFFNESS, "rest_angle": angle})
+    return scene.replace(links=links, tip_wrench=None)
+
+
+def _sprung_coordinates(scene: Scene) -> list[int]:
+    """Places of the joints on springs among the coordinates of all joints."""
+    ends = np.cumsum([len(link.coordinates) for link in scene.links])
+    return [int(end) - 1 for link, end in zip(scene.links, ends, strict=True) if link.freedoms == 1]
 
 
 def _vibration(scene: Scene) -> Callable[[str, float], bool]:
     kernels, dt = compile_scene(on_springs(scene)), scene.simulation.dt
-    where, x = kernels.layout.state, _start(kernels, 0.0)
-    rest = x[where.joint_angles].copy()
-    x[where.joint_angles] += DEFLECTION * np.random.default_rng(0).uniform(0.5, 1.0, rest.shape)
+    x = _start(kernels, 0.0)
+    sprung = kernels.layout.state.joint_angles.start + np.array(_sprung_coordinates(scene))
+    rest = x[sprung].copy()
+    x[sprung] += DEFLECTION * np.random.default_rng(0).uniform(0.5, 1.0, rest.shape)
 
     def holds(integrator: str, stiffness: float) -> bool:
         h = dt * math.sqrt(stiffness / STIFFNESS)
         with np.errstate(all="ignore"):
             states = kernels.simulate(x, np.zeros(kernels.n_u), SWINGS, h, integrator)
-            sizes = np.abs(states[:, where.joint_angles] - rest).max(axis=1)
+            sizes = np.abs(states[:, sprung] - rest).max(axis=1)
             early, late = sizes[: SWINGS // 2].max(), sizes[SWINGS // 2 :].max()
         # A vibration that has blown up may stay as large as it is: its size counts, too.
         return bool(late <= GROWTH * early and max(early, late) <= LARGEST_SWING)

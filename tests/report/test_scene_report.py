@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from dq_space_arm_env import DQSpaceArmEnv, Scene, compile_scene
+from dq_space_arm_env import DQSpaceArmEnv, Scene, compile_scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.report_page import Section
@@ -85,6 +85,19 @@ def test_stiffness_ends_where_the_stability_polynomial_says(short_scene: Scene, 
             assert product > 100.0, name
         else:
             assert product == pytest.approx(entry.imaginary_interval, rel=0.06), name
+
+
+def test_spherical_joints_are_on_no_springs() -> None:
+    """Their coordinates are a quaternion: three degrees of freedom, four numbers."""
+    scene = load_scene("heavy-wrist")
+    sprung = on_springs(scene)
+    assert [link.stiffness for link in sprung.links] == [1.0, 1.0, 1.0, 0.0]
+    assert [link.rest_angle for link in sprung.links] == [-0.6, 0.9, -1.6, 0.0]
+    assert not any(link.damping for link in sprung.links)
+    assert stability_envelope._sprung_coordinates(scene) == [0, 1, 2]
+    holds = stability_envelope._vibration(scene)
+    assert holds("rk4", 1.0)
+    assert not holds("rk4", 1e7)
 
 
 def test_higher_order_holds_longer_steps_and_slow_motions(short_scene: Scene, limits: Limits) -> None:
