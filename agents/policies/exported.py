@@ -53,9 +53,13 @@ def units_of(observations: ArrayLike) -> tuple[FloatArray, FloatArray]:
         Mean and inverse standard deviation of each entry, shape (n_obs,); 0 for the latter of a constant.
     """
     samples = np.asarray(observations).astype(np.float64)
-    deviation = samples.std(axis=0)
+    return samples.mean(axis=0), scale_of(samples.std(axis=0))
+
+
+def scale_of(deviation: FloatArray) -> FloatArray:
+    """One over the standard deviation of each entry; 0 for a constant."""
     varies = deviation > CONSTANT
-    return samples.mean(axis=0), np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
+    return np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
 
 
 def _tanh(values: FloatArray, spare: FloatArray) -> None:

@@ -14,9 +14,8 @@ from torch import Tensor, nn
 
 from agents.configuration.imitation import SMOOTH_ACTIVATIONS
 from agents.policies.chunking import Exported
-from agents.policies.exported import ExportedPolicy, FloatArray
+from agents.policies.exported import ExportedPolicy, FloatArray, scale_of
 
-CONSTANT = 1e-9  # standard deviation below which an entry of the observation is constant, in its unit
 FIRST_OUTPUTS = 0.1  # initial size of the last layer relative to PyTorch's, to start near the mean action
 
 
@@ -51,11 +50,9 @@ class NormalizedNetwork(nn.Module):
         action_deviation: ArrayLike,
     ) -> None:
         """Set the units of observations and actions."""
-        deviation = np.asarray(observation_deviation, dtype=np.float64)
-        varies = deviation > CONSTANT
         values = {
             "observation_mean": observation_mean,
-            "observation_scale": np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0),
+            "observation_scale": scale_of(np.asarray(observation_deviation, dtype=np.float64)),
             "action_mean": action_mean,
             "action_scale": action_deviation,
         }

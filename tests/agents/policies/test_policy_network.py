@@ -7,6 +7,7 @@ torch = pytest.importorskip("torch")
 
 from agents.policies import PolicyNetwork  # noqa: E402
 from agents.policies.chunk_network import ChunkNetwork  # noqa: E402
+from agents.policies.exported import units_of  # noqa: E402
 
 pytestmark = pytest.mark.agents
 
@@ -58,6 +59,15 @@ def test_entries_that_did_not_vary_are_ignored():
     np.testing.assert_array_equal(made.act(changed), made.act(observations()))
     policy = made.export({})
     np.testing.assert_array_equal(policy(changed), policy(observations()))
+
+
+def test_networks_of_all_trainings_agree_on_what_is_constant():
+    deviation = np.array([1e-8, 1e-7, 1e-5, 1.0])
+    samples = np.outer([-1.0, 1.0], deviation)
+    made = PolicyNetwork(4, 1)
+    made.normalize(np.zeros(4), deviation, np.zeros(1), np.ones(1))
+    np.testing.assert_array_equal(made.observation_scale.numpy(), units_of(samples)[1])
+    assert made.observation_scale.tolist() == pytest.approx([0.0, 0.0, 1e5, 1.0])
 
 
 @pytest.mark.parametrize("activation", ["tanh", "silu"])
