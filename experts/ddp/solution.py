@@ -109,8 +109,8 @@ class Solution:
     Attributes:
         states: Shape (N + 1, n_x).
         controls: Shape (N, n_u).
-        feedback_gains: K of u = u_k + K_k (x (-) x_k), zero in the rows of inputs at a bound; shape (N,
-            n_u, n_t).
+        feedback_gains: K of u = u_k + K_k (x (-) x_k), zero in the rows of inputs at a bound, and 1 at the
+            previous input where it bounds their rate; shape (N, n_u, n_t).
         cost: Total cost; inf if the first rollout diverged.
         stop_reason: Why the solve ended.
         message: The reason in one sentence, with its numbers.

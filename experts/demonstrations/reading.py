@@ -55,7 +55,7 @@ class Demonstration:
         actions: Inputs as fractions of their limits, shape (N, n_u).
         rewards: Shape (N,).
         feedback_gains: G of a = clip(a_k + G_k (x (-) x_k)) for actions a, float32, shape (N, n_u, n_t); zero
-            in the rows of inputs at a limit.
+            in the rows of inputs at a limit, but for the previous input where it limits their rate.
         parameters: What varied in the scene, shape (n_p,), entries and units as in `kernels.parameters`.
         scene: The scene of all of them, in double precision.
         facts: The other numbers about it, by the names of `shard.SUMMARIES`; guess and stop reason in words.

@@ -21,8 +21,9 @@ Arrays of a shard with M demonstrations and F failures, N stages:
 | `failures.final_errors` | (F, 2) | as planned |
 | `failures.parameters` | (F, n_p) | what varied in the scene |
 
-Gains are control-limited: rows of inputs at a limit are zero. Only scenes in which something varies, by their
-spread or by their list of parameters, have `parameters`.
+Gains are control-limited: rows of inputs at a limit are zero, but for the previous input where it limits
+their rate. Only scenes in which something varies, by their spread or by their list of parameters, have
+`parameters`.
 """
 
 import hashlib

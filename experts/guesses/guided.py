@@ -93,7 +93,7 @@ class GuidedDDP:
             reserve: Share of the tolerances to keep free where they become constraints, for disturbances.
             remember: Number of converged solutions that may join the library. With 0 a solution depends on
                 its start alone, otherwise also on those solved before.
-            attempts: Most guesses to solve for a start.
+            attempts: Most guesses to solve for a start; with long steps, the guess from them comes on top.
             compare: Whether to solve that many, and keep the best solution, rather than stop at the first
                 that converges within the tolerances. In long steps they are always compared.
             coarsening: Steps in a long one, in which a maneuver is solved first; it divides the number of

@@ -34,6 +34,11 @@ def test_maneuver_keeps_to_the_rates():
     assert solution.iterations <= 110
     found = changes(solution, problem)
     assert found.max() <= 1.0 + 1e-12
+    previous = problem.kernels.layout.tangent.actuators
+    gains = solution.feedback_gains[:, problem.rate_limits.controls]
+    follow = np.isclose(gains[:, :, previous], np.eye(previous.stop - previous.start)).all(axis=2)
+    assert follow.any()
+    assert np.abs(gains[follow]).sum() == pytest.approx(follow.sum())  # rows of the identity
     assert found[1:].min() > 1.0 - 1e-12  # the motors meet their limits
     assert solution.cost > 1.001 * plain.cost
     assert problem.kernels.constraints(solution.states[:-1], solution.controls).max() <= 1e-12
