@@ -27,7 +27,7 @@ class ActuatorHistory:
     values: FloatArray  # Inputs, constant over a time step, shape (N, inputs), `unit`
     limits: FloatArray  # Largest magnitude of each input, shape (inputs,), `unit`
     least: FloatArray  # Smallest value of each input, zero for thrusters, shape (inputs,), `unit`
-    weights: FloatArray  # Weight of each squared input in the cost, shape (inputs,), 1/unit^2
+    weights: FloatArray  # Weight of each squared input in the cost, shape (N, inputs), 1/unit^2
 
     @property
     def largest(self) -> FloatArray:
@@ -106,7 +106,7 @@ class Maneuver:
     def actuators(self) -> tuple[ActuatorHistory, ...]:
         """The scene's actuators in the order of the controls."""
         layout = StateLayout.of(self.scene)
-        histories = []
+        weights, histories = _control_weights(self.scene, layout, len(self.controls)), []
         for name in CONTROL_UNITS:
             entries = getattr(layout.control, name)
             if entries.start == entries.stop:
@@ -118,7 +118,7 @@ class Maneuver:
                 self.controls[:, entries],
                 layout.control_limit[entries],
                 layout.lower_limits(layout.control_limit)[entries],
-                layout.control_weight[entries],
+                weights[:, entries],
             )
             histories.append(history)
         return tuple(histories)
@@ -126,3 +126,13 @@ class Maneuver:
     def actuator(self, name: str) -> ActuatorHistory | None:
         """The actuator of a name in the scene's `actuators`; None if the scene does not have it."""
         return next((actuator for actuator in self.actuators if actuator.name == name), None)
+
+
+def _control_weights(scene: Scene, layout: StateLayout, steps: int) -> FloatArray:
+    """Weights of the squared controls in each of some steps, shape (steps, n_u): phases may change them."""
+    weights, staged = np.tile(layout.control_weight, (steps, 1)), scene.staged
+    phases = np.searchsorted(staged.starts, np.arange(steps), side="right") - 1
+    for column, name in enumerate(layout.control.weights):
+        if name in staged.values:
+            weights[:, column] = np.array(staged.values[name])[phases]
+    return weights

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion
+from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.scene import StateLayout
 from experts.report import Maneuver, ManeuverRun, integrator_precision, replay
 from experts.report.effort import QUICK
@@ -71,6 +72,29 @@ def test_efforts_add_up_to_the_input_part_of_the_cost(paper_maneuver: Maneuver) 
     assert sum(actuator.effort for actuator in paper_maneuver.actuators) == pytest.approx(effort, rel=1e-9)
     values = np.hstack([actuator.values for actuator in paper_maneuver.actuators])
     assert np.array_equal(values, controls)
+
+
+def test_phases_have_weights_and_robots_of_their_own() -> None:
+    """A coast whose torques cost more, and a payload that is let go on the way."""
+    plain = load_scene("release")
+    last = len(plain.phases) - 1
+    scene = plain.replace({f"phases.{last}.changes.cost.joint_torque": 10.0})
+    kernels = compile_scene(scene)
+    rows, steps = kernels.stage_parameters(), scene.simulation.steps
+    actions = np.random.default_rng(1).uniform(-0.01, 0.01, (steps, kernels.n_u))
+    flown = rollout(StateFeedback(lambda states, stage: actions[stage, None]), scene, record=True)
+    assert flown.states is not None
+    assert flown.controls is not None
+    maneuver = Maneuver(scene, flown.states[0], flown.controls[0])
+    states = flown.states[0, :-1]
+    acting = flown.controls[0]
+    effort = np.sum(
+        kernels.cost(states, acting, p=rows[:-1]) - kernels.cost(states, 0.0 * acting, p=rows[:-1])
+    )
+    assert sum(actuator.effort for actuator in maneuver.actuators) == pytest.approx(effort, rel=1e-9)
+    found = errors_with_finer_steps(scene, acting)
+    assert found is not None
+    np.testing.assert_allclose(found, [flown.attitude_error[0], flown.position_error[0]], rtol=0.0, atol=1e-6)
 
 
 def test_absent_actuators_are_left_out(short_run: ManeuverRun) -> None:
