@@ -246,7 +246,9 @@ class _Work:
         kept = self.kept if path else KeptRows(None)
         evaluation, _ = finished(kept, f"{name}-{condition}", content, fly)
         solves = evaluation.summary()["expert_solves"]
-        command = evaluation_command(path, self.scene_name, self.n, normalize) if path else None
+        command = None
+        if path:
+            command = evaluation_command(path, self.scene_name, self.n, normalize, trust=self.trust)
         facts = {
             "is_agent": True,
             "planning_seconds": 0.0,

@@ -123,10 +123,13 @@ def training_command(metadata: Mapping[str, Any], policy: Path | None = None) ->
     return shlex.join(["dq-space-arm", "train", *options])
 
 
-def evaluation_command(policy: Path, scene: str, n: int, normalize: str | Path | None = None) -> str:
+def evaluation_command(
+    policy: Path, scene: str, n: int, normalize: str | Path | None = None, *, trust: bool = False
+) -> str:
     """The command that evaluates a policy again; append the conditions."""
     name = policy.stem if policy.parent == SHELF else str(policy)
     statistics = [] if normalize is None else ["--normalize", str(normalize)]
+    statistics += ["--trust"] if trust and policy.suffix == ".zip" else []
     options = [name, "--scene", scene, "-n", str(n), *statistics, "--condition"]
     return shlex.join(["dq-space-arm", "evaluate", *options])
 

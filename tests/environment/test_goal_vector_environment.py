@@ -152,7 +152,11 @@ def test_copies_and_results_are_the_callers():
         ),
         (lambda v: DQSpaceArmGoalVectorEnv(2, DRAWN, "dens"), ValueError, "choose from sparse and dense"),
         (lambda v: DQSpaceArmGoalVectorEnv(2, "dual-arm"), ValueError, "tips besides the main one"),
-        (lambda v: DQSpaceArmGoalVectorEnv(0, DRAWN), ValueError, "num_envs: 0, should be at least 1"),
+        (
+            lambda v: DQSpaceArmGoalVectorEnv(0, DRAWN),
+            ValueError,
+            "num_envs: 0, should be a whole number of at least 1",
+        ),
         (lambda v: DQSpaceArmGoalVectorEnv(2, DRAWN).step(np.zeros((2, 12))), ResetNeeded, "reset"),
     ],
 )

@@ -99,7 +99,7 @@ def test_work_is_done_where_no_more_threads_can_be_started(monkeypatch):
 
 
 def test_no_thread_at_all_is_refused():
-    with pytest.raises(ValueError, match="threads: 0, should be at least 1"):
+    with pytest.raises(ValueError, match="threads: 0, should be a whole number of at least 1"):
         Kernels(load_scene("paper"), threads=0)
 
 
