@@ -23,7 +23,7 @@ from dq_space_arm_env.dynamics.step_stability import joint_motion
 from dq_space_arm_env.interoperability.bus_actuators import with_jets, with_wheels
 from dq_space_arm_env.interoperability.exporting import joint_limits
 from dq_space_arm_env.interoperability.first_maneuver import with_scaled_limits
-from dq_space_arm_env.interoperability.step_choice import StepTrial, measured_steps
+from dq_space_arm_env.interoperability.step_choice import StepTrial, measured_steps, needs_stiff_method
 from dq_space_arm_env.interoperability.urdf_elements import read_robot
 from dq_space_arm_env.scene import Simulation
 from dq_space_arm_env.scene.path import shown_target
@@ -82,13 +82,23 @@ def in_options() -> Iterator[None]:
 def import_urdf(
     file: str, tip: str | None, arguments: Mapping[str, Any], proposals: Proposals = Proposals()
 ) -> Imported:
-    """Make a scene of a URDF file; `arguments` are those of `scene_from_urdf`."""
+    """Make a scene of a URDF file; `arguments` are those of `scene_from_urdf`.
+
+    Where these do not say whether to keep dampers, those that only a method for stiff joints follows are
+    refused: who was not asked would wait for hours.
+    """
     path = Path(file)
     if tip is None:
         raise SceneError(f"--tip LINK is missing, the link that is to reach the target; {_tips(path)}")
     with warnings.catch_warnings(record=True) as caught, in_options():
         warnings.simplefilter("always")
         own = scene_from_urdf(path, tip, **arguments)
+    if "dampers" not in arguments and needs_stiff_method(own):
+        raise SceneError(
+            f"dampers of {path} stop joints within {_stopping(own)}, too fast for rk4: solving would take "
+            "minutes and training hours. They are guesses in many files: --no-dampers leaves them out, "
+            "--dampers keeps them"
+        )
     scene = with_scaled_limits(own) if proposals.scaled_efforts else own
     if proposals.wheels != "ideal":
         scene = with_wheels(scene, proposals.wheels)
@@ -214,12 +224,17 @@ def _steps(imported: Imported) -> Iterator[str]:
         yield f"  steps   a swing by {'; by '.join(words)}: the last one is taken"
     elif simulation.integrator != Simulation().integrator:
         yield f"  steps   by {simulation.integrator}: the joints' dampers are too stiff for others"
-    if (decay := joint_motion(scene).decay) * Simulation().dt > 1.0:
+    if joint_motion(scene).decay * Simulation().dt > 1.0:
         yield (
-            f"          dampers stop joints within {1e3 / decay:.2g} ms: solving and training take many "
+            f"          dampers stop joints within {_stopping(scene)}: solving and training take many "
             "times as long; many files'"
         )
         yield "          dampers are guesses: --no-dampers leaves them out"
+
+
+def _stopping(scene: Scene) -> str:
+    """Time in which dampers stop joints."""
+    return f"{1e3 / joint_motion(scene).decay:.2g} ms"
 
 
 def _numbers(values: tuple[float, ...]) -> str:

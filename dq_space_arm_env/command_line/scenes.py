@@ -255,7 +255,12 @@ def _write(path: Path, text: str) -> None:
     is_flag=True,
     help="Keep the efforts in ROBOT as limits of the torques, for work against gravity.",
 )
-@click.option("--no-dampers", is_flag=True, help="Leave out the viscous damping of the joints.")
+@click.option(
+    "--dampers/--no-dampers",
+    default=None,
+    help="Keep the viscous damping of the joints, or leave it out.  [default: keep, but ask where it stops "
+    "joints within some milliseconds]",
+)
 @click.option(
     "--balance-inertias",
     is_flag=True,
@@ -300,7 +305,7 @@ def import_(
     wheels: str,
     base_torque: float,
     full_efforts: bool,
-    no_dampers: bool,
+    dampers: bool | None,
     spread: float,
     measure: bool,
     replay: bool,
@@ -341,7 +346,7 @@ def import_(
         spacecraft["mount"] = scene_exchange.mounted(mount, mount_rotation)
     arguments |= {
         "spacecraft": spacecraft or None,
-        "dampers": not no_dampers,
+        **given(dampers=dampers),
         "base_force": base_force or None,
         "base_torque": base_torque or None,
         "lock_branches": lock_branches or lock,

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dq_space_arm_env.algebra import poses
-from dq_space_arm_env.dynamics.step_stability import STIFF
+from dq_space_arm_env.dynamics.step_stability import STIFF, joint_motion
 from dq_space_arm_env.interoperability.swing_efforts import FloatArray, swing_torques
 from dq_space_arm_env.kernels import Kernels, compile_scene
-from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.scene import INTEGRATORS, Scene
 
 ACCURACY = 1e-4
 """Error of the tip at the end of the swing that is small enough, m and rad."""
@@ -32,6 +32,12 @@ class StepTrial(NamedTuple):
         """The scene with this integrator and time step; episodes last as long."""
         dt, steps = scene.simulation.dt / self.division, scene.simulation.steps * self.division
         return scene.replace(simulation={"integrator": self.integrator, "dt": dt, "steps": steps})
+
+
+def needs_stiff_method(scene: Scene) -> bool:
+    """Whether the dampers of the joints stop them too fast for every division of `rk4`."""
+    shortest = scene.simulation.dt / max(DIVISIONS)
+    return joint_motion(scene).decay * shortest > INTEGRATORS["rk4"].real_interval
 
 
 def measured_steps(scene: Scene) -> list[StepTrial]:

@@ -109,7 +109,12 @@ def test_stiff_dampers_take_short_steps_or_a_stiff_method(
         damped = text.replace("<limit", f'<dynamics damping="{damping}"/><limit')
         Path("arm.urdf").write_text(damped, encoding="utf-8")
         words = ["scenes", "import", "arm.urdf", "--tip", "hand", *CARRIED, "--force"]
-        assert main(words) == SUCCESS
+        if method == "rodas4":
+            Path("arm.yaml").unlink()
+            assert main(words) == UNUSABLE
+            assert "--no-dampers leaves them out, --dampers keeps them" in capsys.readouterr().err
+            assert not Path("arm.yaml").exists()
+        assert main([*words, *["--dampers"] * (method == "rodas4")]) == SUCCESS
         found = load_scene("arm.yaml")
         simulation = found.simulation
         assert simulation.integrator == method
