@@ -247,7 +247,11 @@ def evaluate(
         )
     started = perf_counter()
     flights = fly_under(
-        condition, acting.act, given, seeds, lambda done, total: progress(Advance("flights", done, total))
+        condition,
+        acting.act,
+        given,
+        seeds,
+        lambda done, total: progress(Advance("steps of all flights", done, total)),
     )
     wall_seconds, made_in = perf_counter() - started, acting.metadata.get("scene_hash")
     return Evaluation(

@@ -30,7 +30,7 @@ Array = NDArray[Any]
 
 DIVERGED = 20.0  # times the median cost; episodes beyond it do not count
 STEEP = 10.0  # times the slope that usual episodes do not exceed; slopes beyond it are shortened
-STEEP_PENALTIES = 40.0  # likewise where few episodes may violate constraints
+STEEP_PENALTIES = 40.0  # likewise where `Penalties.are_strict`
 ROUGH = 0.003  # least penalty of outputs that alternate by their limits, relative to the cost of an episode
 ROUGHEST = 10.0  # most
 ROUGHER = 1.1  # factor of its rise in an update in which inputs alternate
@@ -285,7 +285,7 @@ class Episodes:
         above, below = (self._wanted > self._high[:decisions]), (self._wanted < self._low[:decisions])
         is_limited: Array = np.any(above | below, axis=(1, 2))
         units = self.units * self._high / kept
-        steep = STEEP_PENALTIES if self.penalties.is_constrained else STEEP
+        steep = STEEP_PENALTIES if self.penalties.are_strict else STEEP
         for k in range(decisions - 1, -1, -1):
             further: Array | float = 0.0
             for _, reverse in reversed(self._further[k]):

@@ -86,6 +86,11 @@ class Penalties:
         """Whether a row along the path has a price."""
         return bool(self._priced[self._path].any())
 
+    @property
+    def are_strict(self) -> bool:
+        """Whether rows along the path have prices, or one of success can rise no further."""
+        return self.is_constrained or bool((self.prices[self._ends] >= AT_END.dearest).any())
+
     def prepare(self, parameters: Array, emphasis: float) -> None:
         """Take the scene's parameters of each decision and the end, (K + 1, B, n_p), and the end's emphasis.
 

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("threadpoolctl")
 
 from agents.configuration.gradients import FlightMismatch
-from agents.gradients import episodes
+from agents.gradients import episodes, penalties
 from agents.gradients.disturbed_flights import Met
 from agents.gradients.episodes import Episodes, decision_times
 from agents.gradients.layers import Layers, random_weights
@@ -217,6 +217,18 @@ def test_slopes_have_those_of_penalties(limited, monkeypatch):
         assert (ends[0] - ends[1]) / 2.0 == pytest.approx(float((slope * direction).sum()), rel=1e-5)
 
 
+def test_slopes_are_shortened_less_where_success_is_as_dear_as_may_be(small_scene, monkeypatch):
+    monkeypatch.setattr(episodes, "STEEP_PENALTIES", math.inf)
+    flown, norms = Flown(small_scene), []
+    for dearest, steep in ((6.1, 0.5), (6.1, math.inf), (6.0, 0.5)):
+        monkeypatch.setattr(penalties, "AT_END", penalties.AT_END._replace(dearest=dearest))
+        monkeypatch.setattr(episodes, "STEEP", steep)
+        flown.episodes.penalties.prices[:] = 6.0
+        norms.append([np.linalg.norm(each) for each in flown.gradient()[0]])
+    assert np.greater(norms[1], 1.1 * np.array(norms[0])).all()
+    np.testing.assert_array_equal(norms[2], norms[1])
+
+
 def test_torques_to_which_environments_clip_have_no_price():
     assert not priced_rows(load_scene("motors")).any()
     assert priced_rows(load_scene("servicing")).tolist() == [True] * 4
@@ -268,8 +280,10 @@ def test_prices_of_success_follow_where_judged_episodes_end(small_scene):
     shares = (errors > 0.93 * np.array(tolerances)).mean(axis=0)
     assert (shares > 0.1).all()
     penalties.prices[:] = 1.0, 5.99
+    assert not penalties.are_strict
     episodes_.price_violations(1500.0, judged=judged)
     np.testing.assert_allclose(penalties.prices, [math.exp(0.038), 6.0])
+    assert penalties.are_strict
     loose = Flown(small_scene.replace({"success.position_error": 100.0}))
     loose.costs()
     loose.episodes.penalties.prices[:] = 1.0
