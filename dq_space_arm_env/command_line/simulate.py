@@ -22,7 +22,7 @@ from dq_space_arm_env.common.console import complain, message_console, table_con
 from dq_space_arm_env.common.files import check_writable_file
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.console import ConsoleRenderable
 
     from dq_space_arm_env import Scene
     from dq_space_arm_env.task.trajectory import Trajectory
@@ -119,7 +119,7 @@ def simulate(
         console.print(f"{out}: watch it with `dq-space-arm replay {out}`", markup=False, soft_wrap=True)
 
 
-def _table(scene: Scene, flight: Trajectory, errors: Sequence[float], error: float) -> Table:
+def _table(scene: Scene, flight: Trajectory, errors: Sequence[float], error: float) -> ConsoleRenderable:
     from dq_space_arm_env.command_line.simulated_episode import error_rows
     from dq_space_arm_env.common.tables import plain_table
 

@@ -9,8 +9,13 @@ from numbers import Real
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, ConsoleRenderable
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
+
+_UNBOUNDED = 10_000  # width at which tables are measured
 
 Row = Mapping[str, Any]
 """One observation: JSON values by column, units in the names of the columns, NaN where unknown."""
@@ -65,21 +70,12 @@ class TextTable:
             return False
         return index >= self.right if isinstance(self.right, int) else index in self.right
 
-    def for_terminal(self) -> Table:
-        """The table as `rich` prints it; brackets in the cells are no markup."""
-        table = Table(
-            title=Text(self.title),
-            title_justify="left",
-            title_style="bold",
-            box=SIMPLE_HEAD,
-            show_header=any(self.headings),
-        )
-        for index, heading in enumerate(self.headings):
-            justify = "right" if self.is_right(index) else "left"
-            table.add_column(Text(heading), overflow="fold", justify=justify)  # type: ignore[arg-type]
-        for row in self.rows:
-            table.add_row(*(Text(cell) for cell in row))
-        return table
+    def for_terminal(self) -> ConsoleRenderable:
+        """The table as `rich` prints it; brackets in the cells are no markup.
+
+        Where it is too wide, parts of it stand below each other, each with the first column.
+        """
+        return _OnTerminal(self)
 
     def markdown(self) -> Iterator[str]:
         """Title and table as blocks of Markdown."""
@@ -109,6 +105,55 @@ class TextTable:
         return "".join(written)
 
 
+@dataclass(frozen=True)
+class _OnTerminal:
+    """A table as wide as the terminal."""
+
+    table: TextTable
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
+        wide, columns = options.update_width(_UNBOUNDED), range(len(self.table.headings))
+
+        def measured(part: Table) -> Measurement:
+            return Measurement.get(console, wide, part)
+
+        whole = self._part(columns)
+        if measured(whole).maximum <= options.max_width:
+            yield whole
+            return
+        part, title = [*columns[:1]], True
+        for index in columns[1:]:
+            longer = self._part([*part, index], title, narrow=True)
+            if len(part) > 1 and measured(longer).minimum > options.max_width:
+                yield self._part(part, title, narrow=True)
+                part, title = [*columns[:1]], False
+            part.append(index)
+        yield self._part(part, title, narrow=True)
+
+    def _part(self, columns: Sequence[int], title: bool = True, narrow: bool = False) -> Table:
+        """Some columns; where narrow, numbers are whole all the same, and their headings wrap at words."""
+        table = Table(
+            title=Text(self.table.title) if title else None,
+            title_justify="left",
+            title_style="bold",
+            box=SIMPLE_HEAD,
+            show_header=any(self.table.headings),
+        )
+        for index in columns:
+            heading, is_right = self.table.headings[index], self.table.is_right(index)
+            cells = [line for row in self.table.rows for line in row[index].splitlines()]
+            width = max(map(cell_len, [*heading.split(), *cells]), default=0)
+            table.add_column(
+                Text(heading),
+                overflow="fold",
+                justify="right" if is_right else "left",
+                width=width if narrow and is_right else None,
+            )
+        for row in self.table.rows:
+            table.add_row(*(Text(row[index]) for index in columns))
+        return table
+
+
 def tabulate(title: str, rows: Iterable[Row], columns: Iterable[Column | str] | None = None) -> TextTable:
     """Write rows as a table; numbers stand flush right.
 
@@ -134,7 +179,7 @@ def tabulate(title: str, rows: Iterable[Row], columns: Iterable[Column | str] | 
 
 def plain_table(
     title: str, headings: Iterable[str], rows: Iterable[Iterable[str]], right: int | None = None
-) -> Table:
+) -> ConsoleRenderable:
     """Make a table of plain text for the terminal; columns from `right` on are flush right."""
     return TextTable(title, tuple(headings), tuple(tuple(row) for row in rows), right).for_terminal()
 

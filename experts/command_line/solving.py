@@ -9,8 +9,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
+from rich.console import Console, ConsoleRenderable
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.command_line.simulated_episode import (
@@ -147,7 +146,7 @@ def record(run: SolveRun) -> dict[str, Any]:
     return {name: json_value(value) for name, value in found.items()}
 
 
-def table(run: SolveRun) -> Table:
+def table(run: SolveRun) -> ConsoleRenderable:
     """Describe a run for people."""
     solution = run.solution
     verdict = "converged" if solution.converged else f"NOT converged ({solution.stop_reason.value})"

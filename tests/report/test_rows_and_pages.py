@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.report_page import Figure, Page, Section
@@ -16,6 +17,36 @@ from dq_space_arm_env.common.tables import Column, TextTable, tabulate
 
 PNG = b"\x89PNG made up"
 TABLE = TextTable("A <title>\nexplained", ("", "m | s", "two\nlines"), (("a & b", "1", "2"),), right=1)
+
+
+def printed(table: TextTable, width: int) -> list[str]:
+    console = Console(width=width)
+    with console.capture() as found:
+        console.print(table.for_terminal())
+    return found.get().splitlines()
+
+
+@pytest.mark.parametrize(("width", "parts"), [(40, 9), (60, 4), (80, 3), (100, 3), (200, 1)])
+def test_wide_tables_stand_in_parts_below_each_other(width: int, parts: int) -> None:
+    """No number is broken, each column is in one part, and each part has the first column."""
+    names = [f"constraint violations {index}" for index in range(9)]
+    numbers = [f"{10**index:,} [0.0, {index}.5]" for index in range(9)]
+    table = TextTable("Flights", ("policy", *names), (("mine, an agent", *numbers),), right=1)
+    lines = printed(table, width)
+    assert max(map(len, lines)) <= width
+    assert sum("Flights" in line for line in lines) == 1
+    for number in numbers:
+        assert sum(f" {number} " in f" {line} " for line in lines) == 1
+    heads = sum(line.lstrip().startswith(("policy", "mine")) for line in lines)
+    assert heads == 2 * parts
+
+
+def test_text_wraps_at_words_and_leaves_a_table_whole() -> None:
+    table = TextTable("Keys", ("key", "meaning"), (("mass", "mass of the base " * 12),))
+    lines = printed(table, 40)
+    assert max(map(len, lines)) <= 40
+    assert " ".join(" ".join(lines).split()).count("mass of the base") >= 8
+    assert sum("meaning" in line for line in lines) == 1
 
 
 def section() -> Section:
