@@ -213,6 +213,7 @@ class Episodes:
         self._met, self._arrivals = met, arrivals(self._times, self._dt, self._firsts, met.delays)
         self._usual = USUAL_DISTURBED
 
+    @np.errstate(over="ignore", invalid="ignore")  # of episodes that diverge
     def fly(self, starts: Array, mean: Array, scale: Array, emphasis: float) -> Array:
         """Fly from states (B, n_x); observations are normalized as `(o - mean) * scale`.
 
@@ -229,9 +230,9 @@ class Episodes:
         for k, calls in enumerate(self._calls):
             self._disturb(k)
             calls["observation"](rows)
-            with np.errstate(over="ignore", invalid="ignore"):  # of episodes that diverge
-                self._layers.values[0][k] = (self._observations[k] - mean) * scale
-                self._layers.forward(k)
+            np.subtract(self._observations[k], mean, out=self._by_observation)
+            np.multiply(self._by_observation, scale, out=self._layers.values[0][k])
+            self._layers.forward(k)
             arrival = self._arrivals[k]
             np.multiply(arrival.of(self._layers.values[-1]), units[k] * arrival.arrived, out=self._wanted[k])
             np.maximum(self._wanted[k], self._low[k], out=self._inputs[k])  # `numpy.clip` takes twice as long
@@ -284,7 +285,7 @@ class Episodes:
         by_effort = 2.0 * self._held[:, None, None] * self._efforts * self._inputs[:-1]
         above, below = (self._wanted > self._high[:decisions]), (self._wanted < self._low[:decisions])
         is_limited: Array = np.any(above | below, axis=(1, 2))
-        units = self.units * self._high / kept
+        units, scales = self.units * self._high / kept, scale * kept
         steep = STEEP_PENALTIES if self.penalties.are_strict else STEEP
         for k in range(decisions - 1, -1, -1):
             further: Array | float = 0.0
@@ -292,14 +293,16 @@ class Episodes:
                 reverse(rows)
                 further = further + self._by_held
             self._calls[k]["step_with_cost_vjp"](rows)
-            slope = self._by_input + further + by_effort[k]
+            if self._further[k]:
+                self._by_input += further
+            slope = np.add(self._by_input, by_effort[k], out=by_effort[k])
             if is_limited[k]:  # beyond a limit only what leads back counts
                 slope[(above[k] & (slope < 0.0)) | (below[k] & (slope > 0.0))] = 0.0
             if any_lost:
                 slope[lost] = 0.0
             self._arrivals[k].back(slope, self._by_output)
             back = self._layers.backward(k, self._by_output[k] * units[k] + by_roughness[k])
-            np.multiply(back, scale * kept, out=self._by_observation)
+            np.multiply(back, scales, out=self._by_observation)
             self._calls[k]["observation_vjp"](rows)
             self._cotangents[k] += self._by_state
             if any_lost:

@@ -58,7 +58,8 @@ class Layers:
         for index in range(self._last, 0, -1):
             slope, value = self._cotangents[index][decision], self.values[index][decision]
             if index < self._last:
-                slope *= 1.0 - value * value
+                of_tanh = value * value
+                slope *= np.subtract(1.0, of_tanh, out=of_tanh)
             np.matmul(slope, self.weights[2 * index - 2].T, out=self._cotangents[index - 1][decision])
         inputs: SingleArray = self._cotangents[0][decision]
         return inputs
