@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rich.console import ConsoleRenderable
 
     from dq_space_arm_env import Scene
+    from dq_space_arm_env.command_line.simulated_episode import Catch
     from dq_space_arm_env.task.trajectory import Trajectory
 
 
@@ -89,6 +90,7 @@ def simulate(
     from dq_space_arm_env import load_scene
     from dq_space_arm_env.command_line.simulated_episode import (
         begin,
+        catches,
         drowned_inputs,
         final_errors,
         fly,
@@ -114,12 +116,16 @@ def simulate(
         print_document({**flight.facts(), **known, "file": None if out is None else str(out)})
         return
     console = table_console()
-    console.print(_table(loaded, flight, final_errors(begun, flight), error))
+    inputs = flight.controls if flight.noise is None else flight.controls + flight.noise
+    caught = catches(begun, flight.states, inputs)
+    console.print(_table(loaded, flight, final_errors(begun, flight), error, caught))
     if out is not None:
         console.print(f"{out}: watch it with `dq-space-arm replay {out}`", markup=False, soft_wrap=True)
 
 
-def _table(scene: Scene, flight: Trajectory, errors: Sequence[float], error: float) -> ConsoleRenderable:
+def _table(
+    scene: Scene, flight: Trajectory, errors: Sequence[float], error: float, caught: Sequence[Catch]
+) -> ConsoleRenderable:
     from dq_space_arm_env.command_line.simulated_episode import error_rows
     from dq_space_arm_env.common.tables import plain_table
 
@@ -128,6 +134,7 @@ def _table(scene: Scene, flight: Trajectory, errors: Sequence[float], error: flo
         ("start", flight.start, ""),
         ("cost J", f"{flight.cost:.6f}", "minus the sum of the rewards"),
         ("steps", str(len(flight.controls)), f"{1e6 * flight.action_seconds:.0f} us for an action"),
+        *(row for catch in caught for row in catch.rows()),
         *error_rows(scene.success, errors),
         ("numerical error", f"{error:.1e}", "m or rad, of the tip at the end"),
         ("end", verdict, ""),

@@ -13,8 +13,10 @@ from rich.console import Console, ConsoleRenderable
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.command_line.simulated_episode import (
+    Catch,
     Start,
     begin,
+    catches,
     error_rows,
 )
 from dq_space_arm_env.common.files import json_value, to_json, write_atomically
@@ -36,6 +38,7 @@ class SolveRun:
     solver: str
     solution: Solution
     final_errors: tuple[float, ...]  # see `Kernels.tip_errors`; infinite where the motion has diverged
+    catches: list[Catch]
     preparation_seconds: float  # compile or load, and solve the guesses' source, s
     preparation_iterations: int | None  # of the solve from the scene's own start; None without
     solve_seconds: float  # s
@@ -47,6 +50,11 @@ class SolveRun:
 
     @property
     def is_success(self) -> bool:
+        """Whether the payload is caught where it is to be, and all tips end within the tolerances."""
+        return self.ends_within and all(catch.is_met for catch in self.catches)
+
+    @property
+    def ends_within(self) -> bool:
         """Whether all tips end within the scene's tolerances."""
         tolerances = self.scene.success.tolerances
         return all(error <= most for error, most in zip(self.final_errors, tolerances, strict=False))
@@ -88,12 +96,13 @@ def solve(
         solution = solver.solve(begun.state, callback=progress.update, parameters=begun.parameters)
     solved = perf_counter()
     errors = _final_errors(scene, solution)
+    caught = catches(begun, solution.states, solution.controls)
     # The files are of the episode's scene, where what was drawn is constant; what changes on the way is not.
     every, kept = (StateLayout.of(each).parameters.names for each in (scene, begun.episode_scene))
     solution.parameters = solution.parameters[:, [every.index(name) for name in kept]]
     solution.metadata |= {"scene": begun.episode_scene.model_dump(mode="json"), "start": begun.title}
     name = type(solver).__name__
-    return SolveRun(scene, begun, name, solution, errors, prepared - began, before, solved - prepared)
+    return SolveRun(scene, begun, name, solution, errors, caught, prepared - began, before, solved - prepared)
 
 
 def _final_errors(scene: Scene, solution: Solution) -> tuple[float, ...]:
@@ -143,6 +152,8 @@ def record(run: SolveRun) -> dict[str, Any]:
     if velocities:
         turning, moving = velocities
         found |= {"final_angular_velocity_error_deg_s": turning, "final_velocity_error_m_s": moving}
+    if run.catches:
+        found["missed_catches"] = [catch.phase for catch in run.catches if not catch.is_met]
     return {name: json_value(value) for name, value in found.items()}
 
 
@@ -150,7 +161,7 @@ def table(run: SolveRun) -> ConsoleRenderable:
     """Describe a run for people."""
     solution = run.solution
     verdict = "converged" if solution.converged else f"NOT converged ({solution.stop_reason.value})"
-    reached = "within the tolerance" if run.is_success else "NOT within the tolerance"
+    reached = "within the tolerance" if run.ends_within else "NOT within the tolerance"
     guess = str(solution.metadata.get("guess", "zero controls"))
     if guess.startswith("policy"):
         guess = "the prepared maneuver, with its feedback gains"
@@ -176,5 +187,6 @@ def table(run: SolveRun) -> ConsoleRenderable:
         ("iterations", str(solution.iterations), seconds),
     ]
     (name, error, tolerance), *others = error_rows(run.scene.success, run.final_errors)
+    rows += [row for catch in run.catches for row in catch.rows()]
     rows += [(name, error, f"{tolerance}; {reached}"), *others]
     return plain_table(f"Scene {run.scene.name}", ("", "", ""), rows)

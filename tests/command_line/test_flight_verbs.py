@@ -12,7 +12,14 @@ from rich.console import Console
 from dq_space_arm_env import DQSpaceArmEnv, Scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.command_line.policy_sources import load_policy
-from dq_space_arm_env.command_line.simulated_episode import begin, drowned_inputs, fly, read_noise, read_state
+from dq_space_arm_env.command_line.simulated_episode import (
+    begin,
+    catches,
+    drowned_inputs,
+    fly,
+    read_noise,
+    read_state,
+)
 from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, UNUSABLE
 from dq_space_arm_env.task.trajectory import Trajectory
 from experts import Solution
@@ -120,6 +127,54 @@ def test_solutions_fly_as_planned(solved: Path, scene_file: str, capsys: pytest.
     for policy in ("plan", "gains", "receding", str(solved / "solution.npz")):
         assert main(["simulate", scene_file, "--seed", "3", "--policy", policy, "--json"]) == SUCCESS
         assert documents(capsys)["cost"] == pytest.approx(cost, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_catches_are_judged_as_environments_judge_them() -> None:
+    """Each error a little within its tolerance, then beyond it, of a target that tumbles."""
+    lengths = {f"phases.{index}.steps": steps for index, steps in enumerate((6, 1, 5))}
+    short = load_scene("capture-and-detumble").replace({**lengths, "simulation.steps": 12})
+    start = begin(short)
+    rng, shape = np.random.default_rng(1), (12, DQSpaceArmEnv(short).kernels.n_u)
+    inputs = rng.uniform(-1.0, 1.0, shape)
+
+    def flown(scene: Scene) -> tuple[Any, bool]:
+        env, states = DQSpaceArmEnv(scene), [start.state]
+        env.reset(options={"initial_state": start.state})
+        for action in inputs:
+            *_, info = env.step(action)
+            states.append(env.state)
+        commanded = env.kernels.layout.to_control(inputs, env.kernels.stage_parameters()[:-1])
+        (found,) = catches(begin(scene), states, commanded)
+        return found, bool(info["caught"])
+
+    names = ("attitude_error_deg", "position_error", "angular_velocity_error_deg", "velocity_error")
+    errors = flown(short)[0].errors
+    for name in ("", *names):
+        sizes = [
+            error * (0.999 if name == each else 1.001) for each, error in zip(names, errors, strict=True)
+        ]
+        scene = short.replace({"phases.2.catch": dict(zip(names, sizes, strict=True))})
+        found, caught = flown(scene)
+        assert found.errors == pytest.approx(errors)
+        assert found.is_met == caught == (name == "")
+
+
+@pytest.mark.slow
+def test_a_plan_that_misses_its_catch_is_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lengths = {f"phases.{index}.steps": steps for index, steps in enumerate((6, 1, 5))}
+    short = load_scene("capture-and-detumble").replace({**lengths, "simulation.steps": 12})
+    short.to_yaml(tmp_path / "short.yaml")
+    monkeypatch.chdir(tmp_path)
+    words = ["solve", "short.yaml", "--solver", "box", "--max-iterations", "1", "--out", "out"]
+    assert main(words) == FAILURE
+    assert re.search(r"catch, detumble +MISSED +nothing is held", capsys.readouterr().out)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["missed_catches"], summary["is_success"]) == (["detumble"], False)
+    assert main(["simulate", "short.yaml", "--policy", "zero"]) == SUCCESS
+    assert "MISSED" in capsys.readouterr().out
 
 
 @pytest.mark.slow
