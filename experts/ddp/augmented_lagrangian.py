@@ -17,6 +17,7 @@ which multipliers meet the rows. Rows of success are squares of errors, which
 fall ever more slowly as their multipliers grow: steps from small multipliers are therefore not too long.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -68,6 +69,10 @@ PATIENCE = 8
 """Updates without progress at the largest penalty after which a problem counts as infeasible."""
 PROGRESS = 0.9
 """Largest share of the smallest violation so far that counts as progress."""
+
+
+NOTABLE = 0.1  # violation, relative to the tolerance, that messages name besides the worst
+MOST_NAMED = 4
 
 
 class ConstraintReport(NamedTuple):
@@ -215,6 +220,30 @@ class AugmentedLagrangian:
     def _violations(self, residuals: FloatArray) -> FloatArray:
         """Violations of the rows, negative where they are met, shape (N + 1, m); -inf where there is none."""
         return np.where(self._equalities, np.abs(residuals), np.where(self._inequalities, residuals, -np.inf))
+
+    def violated(self, states: FloatArray, controls: FloatArray, time_step: float) -> str:
+        """The rows that a trajectory violates most, relative to their tolerances, the worst first, in words.
+
+        Of success, whose residuals are (e^2 - tolerance^2) / (2 tolerance), the errors e.
+        """
+        constraints, found = self.constraints, dict[str, tuple[float, str]]()
+        violations = self._violations(constraints.find(states, controls))
+        for rows, block, first in (
+            (constraints.path, violations[:-1], 0),
+            (constraints.terminal, violations[-1:], len(violations) - 1),
+        ):
+            for column, row in enumerate(rows):
+                stage = int(block[:, column].argmax())
+                most, unit = float(block[stage, column]), "" if row.unit == "1" else f" {row.unit}"
+                share = most / row.tolerance
+                text = f"{row.name} by {most:.2g}{unit} at {(first + stage) * time_step:.3g} s"
+                if row.name.startswith("success: "):
+                    error = math.sqrt(max(row.tolerance**2 + 2.0 * row.tolerance * most, 0.0))
+                    text = f"{row.name} is {error:.3g}{unit}, {row.tolerance:.3g} at most"
+                if share > found.get(row.name, (0.0, ""))[0]:
+                    found[row.name] = share, text
+        worst, *others = sorted(found.values(), reverse=True)[:MOST_NAMED] or [(0.0, "none")]
+        return "; ".join([worst[1], *(text for share, text in others if share >= NOTABLE)])
 
     def report(
         self, states: FloatArray, controls: FloatArray, cost: float, time_step: float

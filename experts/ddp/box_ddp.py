@@ -134,6 +134,7 @@ class BoxDDP:
 
         Returns:
             The best trajectory found, whatever the reason to stop; always a rollout of its controls from x0.
+            Under constraints the last one: costs and violations of others do not compare.
             Its cost is without penalties.
 
         Raises:
@@ -349,6 +350,8 @@ class BoxDDP:
         lower, upper = stage_bounds(problem)
         state = np.asarray(problem.initial_state if x0 is None else x0, dtype=np.float64)
         check_array("x0", state, (problem.n_states,))
+        if x0 is not None and problem.has_retraction:
+            self._multiple_shooting().projected("x0", state[None].copy())
         shape = (problem.horizon, problem.n_controls)
         if u_init is None:
             return state, np.clip(0.0, lower, upper)

@@ -85,12 +85,9 @@ class MultiplierMethod:
         state.moved, state.idle_iterations, state.optimality = True, 0, np.inf
         if not lagrangian.is_infeasible:
             return None
-        report = self._report()
-        return Stop(
-            StopReason.INFEASIBLE,
-            f"{report.worst_row} is violated by {report.violation:.1e} at {report.worst_time:.3g} s, and "
-            "larger penalties do not help",
-        )
+        current, time_step = work.current, work.problem.time_step
+        violated = lagrangian.violated(current.states, current.controls, time_step)
+        return Stop(StopReason.INFEASIBLE, f"violated are {violated}; larger penalties do not help")
 
     def finish(self, stop: Stop) -> Finish:
         """Compute the gains with moderate penalties, and the cost without any."""
@@ -107,7 +104,8 @@ class MultiplierMethod:
         multipliers, report = lagrangian.constraints.multipliers.copy(), self._report()
         lagrangian.leave_out()
         work.evaluate_anew()
-        message += f"; the largest violation is {max(report.violation, 0.0):.1e}, of {report.worst_row}"
+        if report.violation > 0.0:
+            message += f"; the largest violation is {report.violation:.1e}, of {report.worst_row}"
         reason = stop.reason
         if reason is StopReason.REGULARIZATION_LIMIT and report.violation > SERIOUS:
             reason = StopReason.INFEASIBLE

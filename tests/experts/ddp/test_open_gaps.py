@@ -194,6 +194,8 @@ def test_poses_off_the_manifold_are_refused():
     states[5, :4] *= 1.01
     with pytest.raises(ValueError, match=r"x_init\[5\] is no state: .* must be a unit dual quaternion"):
         BoxDDP(problem).solve(x_init=states)
+    with pytest.raises(ValueError, match=r"^x0 is no state: .* must be a unit dual quaternion"):
+        BoxDDP(problem).solve(states[5])
 
 
 def test_problem_without_a_retraction_takes_no_guess_of_the_states(unicycle):
