@@ -61,7 +61,7 @@ def demonstrations() -> None:
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
-    help="Output folder.  [default: results/demonstrations/<name of the scene>]",
+    help="Output folder.  [default: results/demonstrations/<scene or its file>]",
 )
 @click.option("--shard-size", type=int, help="Problems per file.  [default: 32]")
 @click.option(
@@ -96,7 +96,7 @@ def generate(
     from experts.report.reproduction import results_folder
 
     loaded = load_scene(scene)
-    folder = out or results_folder(loaded, "demonstrations")
+    folder = out or results_folder(scene, "demonstrations")
     check_writable(folder)
     with keeping(_KEPT):
         record = command.generate(

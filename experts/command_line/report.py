@@ -26,7 +26,7 @@ from dq_space_arm_env.common.files import check_writable
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
-    help="Output folder.  [default: results/reports/<scene>]",
+    help="Output folder.  [default: results/reports/<scene or its file>]",
 )
 @json_option
 def report(scene: str, quick: bool, out: Path | None, as_json: bool) -> int:
@@ -43,7 +43,7 @@ def report(scene: str, quick: bool, out: Path | None, as_json: bool) -> int:
     from experts.report.scene_report import report as measure
 
     loaded = load_scene(scene)
-    folder = out or results_folder(loaded, "reports")
+    folder = out or results_folder(scene, "reports")
     check_writable(folder)
     folder.mkdir(parents=True, exist_ok=True)
     console = message_console() if as_json else table_console()

@@ -26,7 +26,7 @@ from dq_space_arm_env.common.files import check_writable
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
-    help="Output folder.  [default: results/solutions/<scene>[-<seed>]]",
+    help="Output folder.  [default: results/solutions/<scene or its file>[-<seed>]]",
 )
 @start_option
 @seed_option
@@ -65,7 +65,7 @@ def solve(
         message_console().print(f"{scene}: {sentence}", markup=False, soft_wrap=True)
     if figures:
         solving.check_figures()
-    folder = out or solving.default_folder(loaded, seed)
+    folder = out or solving.default_folder(scene, seed)
     check_writable(folder)
     run = solving.solve(
         loaded,

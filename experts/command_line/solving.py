@@ -66,8 +66,8 @@ def check_figures() -> None:
         raise ValueError('--figures needs matplotlib: pip install "dq-space-arm[plots]"')
 
 
-def default_folder(scene: Scene, seed: int | None) -> Path:
-    """Name the folder of a solution."""
+def default_folder(scene: str, seed: int | None) -> Path:
+    """Name the folder of a solution of a scene, given by its name or file."""
     folder = results_folder(scene, "solutions")
     return folder if seed is None else folder.with_name(f"{folder.name}-{seed}")
 

@@ -67,9 +67,9 @@ def run(
     return SUCCESS if maneuver.solution.converged and maneuver.replay_agrees else FAILURE
 
 
-def results_folder(scene: Scene, *parents: str) -> Path:
-    """The folder of a scene's results: results/<parents>/<name of the scene>, safe as a path."""
-    return Path("results", *parents) / re.sub(r"[^\w.-]+", "-", scene.name)
+def results_folder(scene: str, *parents: str) -> Path:
+    """The folder of the results of a scene, given by its name or file: results/<parents>/<its stem>."""
+    return Path("results", *parents) / re.sub(r"[^\w.-]+", "-", Path(scene).stem)
 
 
 def _save(run: ManeuverRun, folder: Path) -> list[Path]:
