@@ -130,12 +130,13 @@ def _table(
     from dq_space_arm_env.common.tables import plain_table
 
     verdict = "DIVERGED" if flight.diverged else "success" if flight.is_success else "NO success"
+    charged = "" if flight.noise is None else "; noise is charged as inputs are"
     trusted = "m or rad, of the tip at the end"
     if not error <= min(math.radians(scene.success.attitude_error_deg), scene.success.position_error):
         trusted += ": the motion is too fast for the time step, and its numbers mean nothing"
     rows = (
         ("start", flight.start, ""),
-        ("cost J", f"{flight.cost:.6f}", "minus the sum of the rewards"),
+        ("cost J", f"{flight.cost:.6f}", "minus the sum of the rewards" + charged),
         ("steps", str(len(flight.controls)), f"{1e6 * flight.action_seconds:.0f} us for an action"),
         *(row for catch in caught for row in catch.rows()),
         *error_rows(scene.success, errors),
