@@ -24,7 +24,7 @@ from dq_space_arm_env.interoperability.bus_actuators import with_jets, with_whee
 from dq_space_arm_env.interoperability.exporting import joint_limits
 from dq_space_arm_env.interoperability.first_maneuver import with_scaled_limits
 from dq_space_arm_env.interoperability.step_choice import StepTrial, measured_steps, needs_stiff_method
-from dq_space_arm_env.interoperability.urdf_elements import read_robot
+from dq_space_arm_env.interoperability.urdf_elements import read_robot, without_effort
 from dq_space_arm_env.scene import Simulation
 from dq_space_arm_env.scene.path import shown_target
 
@@ -62,7 +62,7 @@ class Imported:
 
     scene: Scene
     warnings: tuple[str, ...]
-    # The robot's own limits of the torques, base to tip, N m; passive: None.
+    # Limits of the torques, base to tip, before they were lowered, N m; passive: None.
     efforts: tuple[float | None, ...]
     steps: tuple[StepTrial, ...] = ()  # integrators and time steps that were measured
 
@@ -99,7 +99,7 @@ def import_urdf(
             "minutes and training hours. They are guesses in many files: --no-dampers leaves them out, "
             "--dampers keeps them"
         )
-    scene = with_scaled_limits(own) if proposals.scaled_efforts else own
+    scene = with_scaled_limits(own, without_effort(read_robot(path))) if proposals.scaled_efforts else own
     if proposals.wheels != "ideal":
         scene = with_wheels(scene, proposals.wheels)
     if proposals.thrusters != "ideal" and scene.actuators.base_force is not None:
@@ -200,7 +200,7 @@ def _scaled(imported: Imported) -> Iterator[str]:
     ]
     if pairs:
         most = max(before / after for before, after in pairs)
-        efforts = tuple(before for before in own if before is not None)
+        efforts = tuple(before for before, _ in pairs)
         yield (
             "          scaled for free flight to three times what a swing by 1 rad in seconds takes: the "
             "file's efforts,"

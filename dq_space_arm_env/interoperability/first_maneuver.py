@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -122,12 +122,17 @@ def with_torque_weights(scene: Scene, arm: Arm) -> Scene:
     return scene.replace(weights)
 
 
-def with_scaled_limits(scene: Scene) -> Scene:
-    """The scene, with torque limits that leave a swing by 1 rad in seconds a headroom of three, or less."""
+def with_scaled_limits(scene: Scene, kept: Collection[str] = ()) -> Scene:
+    """The scene, with torque limits that leave a swing by 1 rad in seconds a headroom of three, or less.
+
+    Links named in `kept` keep theirs.
+    """
     limits = {
         f"links.{index}.torque_limit": limit
         for index, (link, effort) in enumerate(zip(scene.links, swing_efforts(scene), strict=True))
-        if link.torque_limit is not None and (limit := float(f"{_HEADROOM * effort:.2g}")) < link.torque_limit
+        if link.torque_limit is not None
+        and link.name not in kept
+        and (limit := float(f"{_HEADROOM * effort:.2g}")) < link.torque_limit
     }
     scene = scene.replace(limits)
     largest = max((link.torque_limit for link in scene.links if link.torque_limit is not None), default=None)

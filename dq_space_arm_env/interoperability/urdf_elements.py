@@ -107,6 +107,11 @@ def read_robot(source: str | Path) -> UrdfRobot:
     )
 
 
+def without_effort(robot: UrdfRobot) -> list[str]:
+    """Links on joints of which the file does not say how strong they are."""
+    return [joint.child for joint in robot.joints.values() if joint.effort is None]
+
+
 def _content(source: str | Path) -> str | bytes:
     """The text, or the bytes of the file, whose encoding the XML parser detects."""
     if not isinstance(source, str | Path):

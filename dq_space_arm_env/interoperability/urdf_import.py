@@ -23,7 +23,7 @@ from dq_space_arm_env.interoperability.first_maneuver import (
 )
 from dq_space_arm_env.interoperability.rigid_body import Body, tidied
 from dq_space_arm_env.interoperability.urdf_arm import HERE, Arm, ArmJoint, arm_of
-from dq_space_arm_env.interoperability.urdf_elements import read_robot
+from dq_space_arm_env.interoperability.urdf_elements import read_robot, without_effort
 from dq_space_arm_env.scene import Pose, Scene, SceneError
 from dq_space_arm_env.scene.bodies import BASE, Inertia
 from dq_space_arm_env.validation import Model, Positive, Vector3
@@ -90,8 +90,9 @@ def scene_from_urdf(
         balance_inertias: Whether to mend inertias that violate the triangle inequality, with a warning, by
             raising the smallest principal moment; otherwise they are refused.
         dampers: Whether to keep the viscous damping of the joints.
-        scaled_efforts: Whether to lower the limits of the torques to three times what a swing of all joints
-            by 1 rad in seconds takes. Efforts of robots that work against gravity are hundreds of times that.
+        scaled_efforts: Whether to lower the URDF's limits of the torques to three times what a swing of all
+            joints by 1 rad in seconds takes; `joint_torque` stays. Efforts for work against gravity are
+            hundreds of times that.
 
     Returns:
         The scene.
@@ -129,7 +130,7 @@ def scene_from_urdf(
     }
     scene = with_torque_weights(stable(_validated(data, robot.name)), arm)
     if scaled_efforts:
-        scene = with_scaled_limits(scene)
+        scene = with_scaled_limits(scene, without_effort(robot))
     return scene if target is not None else scene.replace(target={"pose": default_target(scene, arm)})
 
 

@@ -79,6 +79,29 @@ def test_the_import_proposes_what_free_flight_takes(here: Path, capsys: pytest.C
     assert "warning: torque limits: " in capsys.readouterr().out
 
 
+def test_torques_that_the_user_gives_stay(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = Path(ARM).read_text(encoding="utf-8").replace('effort="2"', 'effort="0"', 1)
+    text = text.replace('effort="2"', 'effort="870"')
+    Path("arm.urdf").write_text(text, encoding="utf-8")
+    words = [
+        "scenes",
+        "import",
+        "arm.urdf",
+        "--tip",
+        "hand",
+        *CARRIED,
+        "--joint-torque",
+        "400",
+        "--no-measure",
+    ]
+    assert main(words) == SUCCESS
+    limits = [link.torque_limit for link in load_scene("arm.yaml").links]
+    assert limits.count(400.0) == 1
+    scaled = capsys.readouterr().out.partition("scaled")[2]
+    assert "870 N m" in scaled
+    assert "400" not in scaled
+
+
 def test_wheels_and_jets_are_in_size_for_the_spacecraft(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
