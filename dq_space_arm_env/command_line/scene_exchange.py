@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
+from ast import literal_eval
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,13 +31,11 @@ from dq_space_arm_env.scene.path import shown_target
 
 _OPTIONS = {
     r"spacecraft=\{'mass': \.\.\., 'inertia': \.\.\.\}": "--spacecraft-mass and --spacecraft-inertia",
-    r"lock_branches holds such joints at zero, those named or, if True, all": (
-        "--lock holds such a joint at zero, --lock-branches all of them"
-    ),
+    r"lock_branches=True all": "--lock-branches all",
     r"^lock_branches(?=: )": "--lock",
     r"wrist='fixed'": "--wrist fixed",
     r"give joint_torque, N m,": "give --joint-torque, N m,",
-    r"in passive$": "with --passive",
+    r"in passive(?=$| )": "with --passive",
     r"^(tip|base|passive)(?=: )": r"--\1",
     r"^joint_torque(?= = )": "--joint-torque",
     r"balance_inertias=True": "--balance-inertias",
@@ -76,7 +75,13 @@ def in_options() -> Iterator[None]:
         message = str(error)
         for argument, option in _OPTIONS.items():
             message = re.sub(argument, option, message)
+        message = re.sub(r"lock_branches=(\[.*?\])(?= holds)", _locks, message)
         raise SceneError(message) from error
+
+
+def _locks(names: re.Match[str]) -> str:
+    """The names of a list in Python, as options."""
+    return " ".join(f"--lock {quote(name)}" for name in literal_eval(names[1]))
 
 
 def import_urdf(

@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import islice
+from typing import NoReturn
 
 import numpy as np
 
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.algebra.quaternion import normalize
 from dq_space_arm_env.interoperability.rigid_body import Array, Body, balanced, lumped
-from dq_space_arm_env.interoperability.urdf_elements import MOVABLE, Pose, UrdfJoint, UrdfRobot
+from dq_space_arm_env.interoperability.urdf_elements import MOVABLE, UNLIMITED, Pose, UrdfJoint, UrdfRobot
 from dq_space_arm_env.scene import SceneError
 from dq_space_arm_env.scene.bodies import flaw_of
 from dq_space_arm_env.validation import did_you_mean
@@ -136,14 +137,23 @@ class UrdfTree:
                     f"{', '.join(MOVABLE)} and fixed joints only{free}"
                 )
             if joint.mimics is not None:
+                nearer = (
+                    f": choose a tip before it, as link {joint.parent!r}" if joint is not chain[0] else ""
+                )
                 raise SceneError(
                     f"URDF: joint {joint.name!r} on the way to link {tip!r} mimics joint {joint.mimics!r}; "
-                    "in a scene every joint moves by itself"
+                    f"in a scene every joint moves by itself{nearer}"
                 )
         return chain
 
-    def branches(self, base: str, chain: list[UrdfJoint], locked: Collection[str]) -> list[UrdfJoint]:
-        """Other joints that move a mass, each after those that carry it, but for the locked ones."""
+    def branches(
+        self, base: str, chain: list[UrdfJoint], locked: Collection[str], motorless: Collection[str]
+    ) -> list[UrdfJoint]:
+        """Other joints that move a mass, each after those that carry it, but for the locked ones.
+
+        The message about joints that a scene cannot have also names those without an effort, so that one
+        more try is enough; those in `motorless` need none.
+        """
         for name in locked:
             known = [joint for joint in self.robot.joints if self.robot.joints[joint] not in chain]
             if name not in known:
@@ -153,14 +163,36 @@ class UrdfTree:
                 )
         rank = {name: index for index, name in enumerate(self.robot.joints)}
         found: list[UrdfJoint] = []
+        refused: dict[str, str] = {}
         bodies = [base, *(joint.child for joint in chain)]
         for body in bodies:  # it grows
             at_body = self._hanging(body, [*chain, *found], locked)
             for joint in sorted(at_body, key=lambda each: rank[each.name]):
-                self._check_branch(joint, at_body[joint])
+                if reason := self._unfit(joint, at_body[joint], chain):
+                    refused[joint.name] = reason
                 found.append(joint)
-                bodies.append(joint.child)
+                bodies.append(joint.child if at_body[joint] else joint.parent)
+        if refused:
+            self._refuse(refused, [*chain, *found], motorless)
         return found
+
+    def _refuse(
+        self, reasons: dict[str, str], moving: list[UrdfJoint], motorless: Collection[str]
+    ) -> NoReturn:
+        """Name all joints that a scene cannot have, and how to hold them."""
+        held = [*reasons]
+        for name in held:  # it grows: what is mimicked must not move either
+            mimicked = self.robot.joints[name].mimics
+            if mimicked in self.robot.joints and mimicked not in held:
+                held.append(mimicked)
+        named = ", ".join(f"joint {name!r} {reason}" for name, reason in reasons.items())
+        driven = [each for each in moving if each.name not in motorless and each.name not in held]
+        missing = missing_efforts(driven)
+        raise SceneError(
+            f"URDF: beside the way from base to tip, where it moves a mass, {named}; in a scene every joint "
+            f"moves by itself and is {', '.join(MOVABLE)} or fixed; lock_branches={held} holds such joints "
+            f"at zero, lock_branches=True all{missing and f'; {missing}'}"
+        )
 
     def _hanging(self, body: str, moving: list[UrdfJoint], locked: Collection[str]) -> dict[UrdfJoint, bool]:
         """Other joints at a link and what is fixed to it that move a mass, each with whether it is below."""
@@ -213,21 +245,14 @@ class UrdfTree:
                 if other is not crossed:
                     waiting.append((other, other.child if other.parent == here else other.parent))
 
-    def _check_branch(self, joint: UrdfJoint, down: bool) -> None:
-        """Refuse a joint beside the chain that a scene cannot have."""
-        reasons = {
-            f"mimics joint {joint.mimics!r}: in a scene every joint moves by itself": joint.mimics,
-            f"is {joint.type}: a scene has {', '.join(MOVABLE)} and fixed joints only": (
-                joint.type not in MOVABLE
-            ),
-            f"carries the base: choose link {joint.parent!r}, or one above it, as base": not down,
-        }
-        for reason, holds in reasons.items():
-            if holds:
-                raise SceneError(
-                    f"URDF: joint {joint.name!r}, which moves a mass beside the way from base to tip, "
-                    f"{reason}; lock_branches holds such joints at zero, those named or, if True, all"
-                )
+    def _unfit(self, joint: UrdfJoint, down: bool, chain: list[UrdfJoint]) -> str:
+        """Why a scene cannot have a joint beside the chain; empty where it can."""
+        self._check_locked(joint, chain)  # not even locked
+        if joint.mimics is not None:
+            return f"mimics joint {joint.mimics!r}"
+        if joint.type not in MOVABLE:
+            return f"is {joint.type}"
+        return "" if down else f"carries the base (choose link {joint.parent!r}, or one above it, as base)"
 
     def _check_locked(self, joint: UrdfJoint, moving: list[UrdfJoint]) -> None:
         if joint.mimics is not None and any(joint.mimics == other.name for other in moving):
@@ -235,6 +260,27 @@ class UrdfTree:
                 f"URDF: joint {joint.name!r} mimics joint {joint.mimics!r} of the chain: in a scene every "
                 "joint moves by itself"
             )
+
+
+def missing_efforts(driven: Collection[UrdfJoint]) -> str:
+    """Say which of the joints have no effort, or a placeholder; empty for none."""
+    absent = [joint.name for joint in driven if joint.effort is None and joint.written_effort < UNLIMITED]
+    huge = [
+        f"effort {joint.written_effort:g} of joint {joint.name}"
+        for joint in driven
+        if joint.written_effort >= UNLIMITED
+    ]
+    parts = [f"no effort limit for joint {', '.join(absent)}"] if absent else []
+    if huge:
+        parts.append(
+            f"{', '.join(huge)} {'is a placeholder' if len(huge) == 1 else 'are placeholders'} (1e4 and more)"
+        )
+    if not parts:
+        return ""
+    return (
+        f"{'; '.join(parts)}: give joint_torque, N m, for all joints without one, or name those without a "
+        "motor in passive"
+    )
 
 
 def arm_of(
@@ -245,18 +291,19 @@ def arm_of(
     extra: Body | None,
     mount: Pose = HERE,
     balance: bool = False,
+    motorless: Collection[str] = (),
 ) -> Arm:
     """Free a robot at its base link, to which `extra` is fixed; the chain from base to tip comes first.
 
     `mount` is the pose of the base link in the frame of `extra`; `balance` mends inertias that violate the
-    triangle inequality.
+    triangle inequality; joints in `motorless` need no effort.
     """
     tree = UrdfTree(robot)
     base = tree.root if base is None else base
     chain = tree.chain(tip, base)
     moving = chain
     if lock_branches is not True:
-        moving = [*chain, *tree.branches(base, chain, lock_branches or ())]
+        moving = [*chain, *tree.branches(base, chain, lock_branches or (), motorless)]
     placed = tree.carried(base, mount, moving)
     bodies = [*_bodies(robot, placed), *([] if extra is None else [extra])]
     body = lumped(bodies)

@@ -57,6 +57,7 @@ class UrdfJoint:
     origin: Pose  # pose of the joint frame, and of the child at zero angle, in the parent's, 8 numbers, m
     axis: Array  # unit vector in the joint frame, shape (3,)
     effort: float | None  # largest torque, N m; None for none, UNLIMITED, or 0: many files' word for unknown
+    written_effort: float  # as in the file, N m; 0 for none
     limits: tuple[float, float] | None  # smallest and largest angle, rad; infinite or None for none
     rate: float  # largest rate, rad/s; infinite for none
     damping: float  # viscous, N m s/rad
@@ -195,6 +196,7 @@ def _read_joint(element: Element) -> UrdfJoint:
         origin=_origin(element, where),
         axis=_axis(element, where) if kind in MOVABLE else np.array([0.0, 0.0, 1.0]),
         effort=effort if effort and effort < UNLIMITED else None,
+        written_effort=effort,
         limits=_limits(limit, where, unit) if kind in ("revolute", "prismatic") else None,
         rate=_rate(limit, where, unit) if kind in MOVABLE else math.inf,
         damping=damping,

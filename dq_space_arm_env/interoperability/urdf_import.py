@@ -22,7 +22,7 @@ from dq_space_arm_env.interoperability.first_maneuver import (
     written_pose,
 )
 from dq_space_arm_env.interoperability.rigid_body import Body, tidied
-from dq_space_arm_env.interoperability.urdf_arm import HERE, Arm, ArmJoint, arm_of
+from dq_space_arm_env.interoperability.urdf_arm import HERE, Arm, ArmJoint, arm_of, missing_efforts
 from dq_space_arm_env.interoperability.urdf_elements import read_robot, without_effort
 from dq_space_arm_env.scene import Pose, Scene, SceneError
 from dq_space_arm_env.scene.bodies import BASE, Inertia
@@ -107,7 +107,8 @@ def scene_from_urdf(
         raise SceneError(f"lock_branches = {lock_branches!r}: must be a list of names of joints, or True")
     if joint_torque is not None and not (isinstance(joint_torque, int | float) and joint_torque > 0):
         raise SceneError(f"joint_torque = {joint_torque!r}: must be a number greater than 0, N m")
-    arm = arm_of(robot, tip, base, lock_branches, extra, mount, balance_inertias)
+    motorless = passive if joint_torque is None else robot.joints
+    arm = arm_of(robot, tip, base, lock_branches, extra, mount, balance_inertias, motorless)
     _check_passive(arm, passive)
     _warn(arm)
     center = ", ".join(f"{number:.9g}" for number in arm.base_center)
@@ -204,12 +205,8 @@ def _warn(arm: Arm) -> None:
 def _motors(arm: Arm, joint_torque: float | None, passive: Collection[str]) -> dict[str, Any] | None:
     """The scene's joint motors; each link also has its own limit."""
     driven = [part.joint for part in arm.joints if part.joint.name not in passive]
-    unlimited = [joint.name for joint in driven if joint.effort is None]
-    if unlimited and joint_torque is None:
-        raise SceneError(
-            f"URDF: no effort limit for joint {', '.join(unlimited)}: give joint_torque, N m, for all joints "
-            "without one, or name those without a motor in passive"
-        )
+    if joint_torque is None and (missing := missing_efforts(driven)):
+        raise SceneError(f"URDF: {missing}")
     if not driven:
         return None
     limits = [limit for joint in driven if (limit := joint.effort or joint_torque) is not None]

@@ -216,6 +216,11 @@ def test_warnings_and_the_options_that_help(here: Path, capsys: pytest.CaptureFi
     text = text.replace('<limit effort="2" velocity="1"/>', '<dynamics friction="1"/>')
     Path("gripper.urdf").write_text(text, encoding="utf-8")
     words = ["scenes", "import", "gripper.urdf", "--tip", "hand", *CARRIED]
+    planar = text.replace('name="f" type="revolute"', 'name="my f" type="planar"')
+    Path("planar.urdf").write_text(planar, encoding="utf-8")
+    assert main(["scenes", "import", "planar.urdf", *words[3:]]) == UNUSABLE
+    message = capsys.readouterr().err
+    assert "--lock 'my f' holds such joints at zero, --lock-branches all; no effort limit for" in message
     assert main(words) == UNUSABLE
     assert "no effort limit for joint elbow, f: give --joint-torque, N m, for all" in capsys.readouterr().err
     assert main([*words, "--lock-branches"]) == UNUSABLE

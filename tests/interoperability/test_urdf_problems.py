@@ -44,6 +44,11 @@ BASE, ARM, B = link("base"), link("arm"), link("b")
 GOOD = (BASE, joint("j1", "base", "arm"), ARM)
 BAD = link("b", body(ixx=-1))
 MIMIC = '<mimic joint="j1"/>'
+FINGERS = (
+    *(joint("j2", "arm", "l"), link("l")),
+    *(joint("j3", "arm", "r", content='<mimic joint="j2"/>'), link("r")),
+    *(joint("j4", "arm", "p", "planar"), link("p")),
+)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +79,7 @@ MIMIC = '<mimic joint="j1"/>'
         ),
         (
             robot(BASE, joint("j1", "base", "b"), B, joint("j2", "b", "arm", content=MIMIC), ARM),
-            "joint 'j2' on the way to link 'arm' mimics joint 'j1'",
+            "joint 'j2' on the way to link 'arm' mimics joint 'j1'.*: choose a tip before it, as link 'b'$",
         ),
         (arm("fixed"), "no joint moves link 'arm'"),
         (robot(link("base", ""), *GOOD[1:]), "base link 'base' has no mass, .* give the spacecraft"),
@@ -82,11 +87,20 @@ MIMIC = '<mimic joint="j1"/>'
         (arm(content=""), "no effort limit for joint j1: give joint_torque"),
         (
             robot(*GOOD, joint("j2", "base", "b", "planar"), B),
-            r"joint 'j2', which .* beside the way .*, is planar: .* lock_branches holds such joints at zero",
+            r"beside the way .*, joint 'j2' is planar; .* lock_branches=\['j2'\] holds such joints at zero",
         ),
         (
             robot(*GOOD, joint("j2", "base", "b", content=MIMIC), B),
-            r"joint 'j2', which .* beside the way .*, mimics joint 'j1'.*; lock_branches holds",
+            "joint 'j2' mimics joint 'j1' of the chain",
+        ),
+        (
+            arm(content='<limit effort="50000"/>'),
+            r"URDF: effort 50000 of joint j1 is a placeholder \(1e4 and more\): give joint_torque",
+        ),
+        (
+            robot(*GOOD, *FINGERS, joint("j5", "base", "c", content=""), link("c")),
+            r"joint 'j3' mimics joint 'j2', joint 'j4' is planar; .* lock_branches=\['j3', 'j4', 'j2'\] "
+            ".* no effort limit for joint j5: give joint_torque",
         ),
         (robot(*GOOD[:2], link("arm", body(izz=3))), "moments 1, 1, 3 .* the two smaller must add up"),
         (robot(*GOOD[:2], link("arm", body(izz=0))), "principal moments .*, all must be greater than 0"),
