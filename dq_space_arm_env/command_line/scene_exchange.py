@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
+import textwrap
 import warnings
 from ast import literal_eval
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +28,7 @@ from dq_space_arm_env.interoperability.exporting import joint_limits
 from dq_space_arm_env.interoperability.first_maneuver import with_scaled_limits
 from dq_space_arm_env.interoperability.step_choice import StepTrial, measured_steps, needs_stiff_method
 from dq_space_arm_env.interoperability.urdf_elements import read_robot, without_effort
-from dq_space_arm_env.scene import Simulation
+from dq_space_arm_env.scene import Link, Simulation
 from dq_space_arm_env.scene.path import shown_target
 
 _OPTIONS = {
@@ -165,14 +167,30 @@ def record(imported: Imported, file: str, source: str) -> dict[str, Any]:
 
 
 def summary(imported: Imported, file: str, added: bool) -> Iterator[str]:
-    """Summarize an imported scene, and what its user will want to change."""
+    """Summarize an imported scene, and what its user will want to change, in lines for the terminal."""
+    for line in _lines(imported, file, added):
+        yield from _wrapped(line)
+
+
+def _wrapped(line: str) -> list[str]:
+    """Break a line where the terminal ends, but neither commands nor numbers and their units."""
+    whole = re.sub(r"`[^`]*`|\d N m|\d \w", lambda found: found[0].replace(" ", "\u00a0"), line)
+    indent = " " * (10 if line.startswith(" ") else 2)
+    width = shutil.get_terminal_size().columns
+    broken = textwrap.wrap(
+        whole, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
+    return [part.replace("\u00a0", " ") for part in broken]
+
+
+def _lines(imported: Imported, file: str, added: bool) -> Iterator[str]:
     scene = imported.scene
     degrees, meters = _way(scene)
-    links = ", ".join(f"{link.name} {link.mass:.4g} kg" for link in scene.links)
+    links = ", ".join(f"{link.name} {_number(link.mass, 4)} kg" for link in scene.links)
     joints = "1 joint" if len(scene.links) == 1 else f"{len(scene.links)} joints"
     yield f"{file}: {scene.name}, {joints}"
     more = "" if added else "; --spacecraft-mass adds the spacecraft"
-    yield f"  base    {scene.base.mass:.4g} kg{more}"
+    yield f"  base    {_number(scene.base.mass, 4)} kg{more}"
     yield f"  links   {links}"
     yield f"  limits  {'; '.join(_limits(scene)) or 'no motors'}; edit actuators and links"
     yield from _scaled(imported)
@@ -180,7 +198,8 @@ def summary(imported: Imported, file: str, added: bool) -> Iterator[str]:
     ranges = sum(math.isfinite(lower) or math.isfinite(upper) for lower, upper, _ in limits_of_joints)
     rates = sum(math.isfinite(rate) for *_, rate in limits_of_joints)
     yield f"  joints  {ranges} with limits of the angle, {rates} of the rate; edit constraints"
-    yield f"  start   at rest, joints at {_numbers(scene.initial_state.joint_angles)} rad; edit initial_state"
+    start = zip(scene.links, scene.initial_state.joint_angles, strict=True)
+    yield f"  start   at rest, {', '.join(_by_kind(start, 'unit', ' at'))}; edit initial_state"
     yield f"  target  {degrees:.3g} degrees and {meters:.3g} m from the start; edit target"
     yield from _steps(imported)
     spread = scene.spread
@@ -198,21 +217,18 @@ def summary(imported: Imported, file: str, added: bool) -> Iterator[str]:
 def _scaled(imported: Imported) -> Iterator[str]:
     """Say which limits of torques were lowered, and why."""
     own = imported.efforts
-    pairs = [
-        (before, link.torque_limit)
+    lowered = [
+        (link, before, link.torque_limit)
         for before, link in zip(own, imported.scene.links, strict=True)
         if before is not None and link.torque_limit is not None and before > link.torque_limit
     ]
-    if pairs:
-        most = max(before / after for before, after in pairs)
-        efforts = tuple(before for before, _ in pairs)
+    if lowered:
+        most = max(before / after for _, before, after in lowered)
+        efforts = ", ".join(_by_kind(((link, before) for link, before, _ in lowered), "effort_unit"))
         yield (
             "          scaled for free flight to three times what a swing by 1 rad in seconds takes: the "
-            "file's efforts,"
-        )
-        yield (
-            f"          {_numbers(efforts)} N m, work against gravity and are up to {most:,.0f} times as "
-            "large; --full-efforts keeps them"
+            f"file's efforts, {efforts}, work against gravity and are up to {most:,.0f} times as large; "
+            "--full-efforts keeps them"
         )
 
 
@@ -226,15 +242,16 @@ def _steps(imported: Imported) -> Iterator[str]:
             + (f"ends {each.error:.0e} m or rad off" if math.isfinite(each.error) else "diverges")
             for each in imported.steps
         ]
-        yield f"  steps   a swing by {'; by '.join(words)}: the last one is taken"
+        taken = "this is" if len(words) == 1 else "the last one is"
+        yield f"  steps   a swing by {'; by '.join(words)}: {taken} taken"
     elif simulation.integrator != Simulation().integrator:
         yield f"  steps   by {simulation.integrator}: the joints' dampers are too stiff for others"
-    if joint_motion(scene).decay * Simulation().dt > 1.0:
+    slower = simulation.integrator != Simulation().integrator or simulation.dt < Simulation().dt
+    if slower and joint_motion(scene).decay * Simulation().dt > 1.0:
         yield (
             f"          dampers stop joints within {_stopping(scene)}: solving and training take many "
-            "times as long; many files'"
+            "times as long; many files' dampers are guesses: --no-dampers leaves them out"
         )
-        yield "          dampers are guesses: --no-dampers leaves them out"
 
 
 def _stopping(scene: Scene) -> str:
@@ -242,9 +259,23 @@ def _stopping(scene: Scene) -> str:
     return f"{1e3 / joint_motion(scene).decay:.2g} ms"
 
 
-def _numbers(values: tuple[float, ...]) -> str:
+def _number(value: float, digits: int = 3) -> str:
+    """A number with some digits, or whole where it has more."""
+    return f"{value:.0f}" if abs(value) >= 10**digits - 0.5 else f"{value:.{digits}g}"
+
+
+def _numbers(values: Sequence[float]) -> str:
     """The numbers, or the one that they all are."""
-    return ", ".join(f"{value:.3g}" for value in (values if len(set(values)) > 1 else values[:1]))
+    return ", ".join(_number(value) for value in (values if len(set(values)) > 1 else values[:1]))
+
+
+def _by_kind(values: Iterable[tuple[Link, float]], unit: str, verb: str = "") -> Iterator[str]:
+    """The numbers of joints and those of slides, each with their unit, an attribute of links."""
+    pairs = list(values)
+    for kind, turns in (("joints", True), ("slides", False)):
+        found = [(value, getattr(link, unit)) for link, value in pairs if link.turns is turns]
+        if found:
+            yield f"{kind}{verb} {_numbers([value for value, _ in found])} {found[0][1]}"
 
 
 def _limits(scene: Scene) -> Iterator[str]:
@@ -260,8 +291,11 @@ def _limits(scene: Scene) -> Iterator[str]:
     if actuators.base_torque is not None:
         yield f"wheels {_numbers(actuators.base_torque.limit)} N m"
     if actuators.joint_torque is not None:
-        torques = [f"{link.torque_limit:.3g}" if link.torque_limit else "passive" for link in scene.links]
-        yield f"joints {', '.join(torques if len(set(torques)) > 1 else torques[:1])} N m"
+        limits = [(link, link.torque_limit) for link in scene.links if link.torque_limit]
+        yield from _by_kind(((link, limit) for link, limit in limits if limit is not None), "effort_unit")
+        passive = [link.name for link in scene.links if not link.torque_limit]
+        if passive:
+            yield f"passive: {', '.join(passive)}"
 
 
 def _way(scene: Scene) -> tuple[float, float]:

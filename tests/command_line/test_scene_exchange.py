@@ -79,6 +79,36 @@ def test_the_import_proposes_what_free_flight_takes(here: Path, capsys: pytest.C
     assert "warning: torque limits: " in capsys.readouterr().out
 
 
+def test_slides_have_units_of_their_own_and_lines_fit(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    text = Path(ARM).read_text(encoding="utf-8").replace('effort="2"', 'effort="1500"', 1)
+    text = text.replace('name="shoulder" type="revolute"', 'name="shoulder" type="prismatic"')
+    Path("arm.urdf").write_text(text, encoding="utf-8")
+    words = ["scenes", "import", "arm.urdf", "--tip", "hand", *CARRIED, *AS_IT_IS]
+    assert main(words) == SUCCESS
+    lines = capsys.readouterr().out.splitlines()
+    assert all(len(line) <= 60 for line in lines if "`" not in line)
+    printed = " ".join(" ".join(lines).split())
+    assert "joints 2 N m; slides 1500 N;" in printed
+    assert re.search(r"joints at [0-9.]+ rad, slides at [0-9.]+ m;", printed)
+    assert main([*words, "--passive", "elbow", "--force"]) == SUCCESS
+    assert "slides 1500 N; passive: forearm;" in " ".join(capsys.readouterr().out.split())
+
+
+def test_light_dampers_that_whole_steps_follow_are_no_matter(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = Path(ARM).read_text(encoding="utf-8").replace("<limit", '<dynamics damping="3"/><limit')
+    Path("arm.urdf").write_text(text, encoding="utf-8")
+    assert main(["scenes", "import", "arm.urdf", "--tip", "hand", *CARRIED]) == SUCCESS
+    simulation = load_scene("arm.yaml").simulation
+    assert simulation.dt * joint_motion(load_scene("arm.yaml")).decay > 1.0
+    assert (simulation.integrator, simulation.dt) == ("rk4", 0.015)
+    assert "dampers" not in capsys.readouterr().out
+
+
 def test_torques_that_the_user_gives_stay(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = Path(ARM).read_text(encoding="utf-8").replace('effort="2"', 'effort="0"', 1)
     text = text.replace('effort="2"', 'effort="870"')
@@ -107,7 +137,7 @@ def test_wheels_and_jets_are_in_size_for_the_spacecraft(
 ) -> None:
     words = [*CARRIED, "--wheels", "pyramid", "--thrusters", "jets", "--base-force", "4", "--no-measure"]
     assert main(["scenes", *HAND, *words]) == SUCCESS
-    assert "8 jets of 2 N; 4 wheels of 0.15" in capsys.readouterr().out
+    assert "8 jets of 2 N; 4 wheels of 0.15" in " ".join(capsys.readouterr().out.split())
     scene = load_scene("small-arm.yaml")
     assert scene.actuators.base_force is scene.actuators.base_torque is None
     for axis in np.vstack([np.eye(6), -np.eye(6)]):
@@ -144,8 +174,10 @@ def test_stiff_dampers_take_short_steps_or_a_stiff_method(
         assert simulation.steps * simulation.dt == pytest.approx(15.0)
         division = round(0.015 / simulation.dt)
         assert division == parts or (parts is None and division > 1)
-        printed = capsys.readouterr().out
+        printed = " ".join(capsys.readouterr().out.split())
         assert ("--no-dampers leaves them out" in printed) == (damping > 0)
+        assert ("this is taken" in printed) == (damping == 0)
+        assert ("the last one is taken" in printed) == (damping > 0)
         if method == "rk4" and damping:
             used = simulation.dt * joint_motion(found).decay
             assert used < 2.785 < 2.0 * used
