@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import click
+from click.core import ParameterSource
 
 from dq_space_arm_env.command_line.names import SCENE, PartOf, description_of, given, scene_files
 from dq_space_arm_env.command_line.verb import json_option, print_document
@@ -201,7 +202,8 @@ def _write(path: Path, text: str) -> None:
     type=float,
     nargs=3,
     metavar="XX YY ZZ",
-    help="Its inertia about its center of mass, which is the base link's origin, kg m^2.",
+    help="Its inertia about its center of mass, which is the base link's origin unless --mount moves it, "
+    "kg m^2.",
 )
 @click.option(
     "--mount",
@@ -341,6 +343,13 @@ def import_(
         raise click.UsageError(
             "--mount places the arm on a spacecraft: give --spacecraft-mass and --spacecraft-inertia",
             click.get_current_context(),
+        )
+    context = click.get_current_context()
+    if wheels != "ideal" and context.get_parameter_source("base_torque") is ParameterSource.COMMANDLINE:
+        raise click.UsageError(
+            f"--base-torque limits ideal wheels, and those of --wheels {wheels} are in size for the base: "
+            "leave one of them out",
+            context,
         )
     if spacecraft:
         spacecraft["mount"] = scene_exchange.mounted(mount, mount_rotation)

@@ -223,6 +223,10 @@ def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -
         ([*HAND, "--spacecraft-mass", "80"], "--spacecraft-inertia need each other"),
         ([*HAND, *CARRIED, "--passive", "j"], "--passive: 'j' is not .* shoulder, elbow"),
         ([*HAND, "--mount", "0", "0", "1"], "--mount places the arm on a spacecraft: give --spacecraft-mass"),
+        (
+            [*HAND, *CARRIED, "--wheels", "pyramid", "--base-torque", "3"],
+            "--base-torque limits ideal wheels, and those of --wheels pyramid are in size for the base",
+        ),
         ([*HAND, *CARRIED, "--joint-torque", "0"], "--joint-torque = 0.0: must be a number"),
         (["import", ARM, "--tip", "mount", "--base", "hand"], "choose link '.*', or .* above it, as --base$"),
         (["import", "nowhere.urdf", "--tip", "hand"], "nowhere.urdf: there is no such file"),
