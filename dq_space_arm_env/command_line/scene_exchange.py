@@ -15,13 +15,10 @@ from pathlib import Path
 from shlex import quote
 from typing import Any, Literal
 
-import numpy as np
-
 from dq_space_arm_env import Scene, SceneError, load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
-from dq_space_arm_env.algebra import dual_quaternion, poses, rotations
+from dq_space_arm_env.algebra import rotations
+from dq_space_arm_env.command_line.scene_warnings import way_to_target
 from dq_space_arm_env.common.files import json_value
-from dq_space_arm_env.dynamics import kinematics
-from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.dynamics.step_stability import joint_motion
 from dq_space_arm_env.interoperability.bus_actuators import with_jets, with_wheels
 from dq_space_arm_env.interoperability.exporting import joint_limits
@@ -29,7 +26,6 @@ from dq_space_arm_env.interoperability.first_maneuver import with_scaled_limits
 from dq_space_arm_env.interoperability.step_choice import StepTrial, measured_steps, needs_stiff_method
 from dq_space_arm_env.interoperability.urdf_elements import read_robot, without_effort
 from dq_space_arm_env.scene import Link, Simulation
-from dq_space_arm_env.scene.path import shown_target
 
 _OPTIONS = {
     r"spacecraft=\{'mass': \.\.\., 'inertia': \.\.\.\}": "--spacecraft-mass and --spacecraft-inertia",
@@ -150,7 +146,7 @@ def _tips(path: Path) -> str:
 def record(imported: Imported, file: str, source: str) -> dict[str, Any]:
     """Describe an imported scene for programs."""
     scene = imported.scene
-    degrees, meters = _way(scene)
+    degrees, meters = way_to_target(scene)
     return {
         "file": file,
         "name": scene.name,
@@ -166,9 +162,9 @@ def record(imported: Imported, file: str, source: str) -> dict[str, Any]:
     }
 
 
-def summary(imported: Imported, file: str, added: bool) -> Iterator[str]:
+def summary(imported: Imported, file: str) -> Iterator[str]:
     """Summarize an imported scene, and what its user will want to change, in lines for the terminal."""
-    for line in _lines(imported, file, added):
+    for line in _lines(imported, file):
         yield from _wrapped(line)
 
 
@@ -183,14 +179,13 @@ def _wrapped(line: str) -> list[str]:
     return [part.replace("\u00a0", " ") for part in broken]
 
 
-def _lines(imported: Imported, file: str, added: bool) -> Iterator[str]:
+def _lines(imported: Imported, file: str) -> Iterator[str]:
     scene = imported.scene
-    degrees, meters = _way(scene)
+    degrees, meters = way_to_target(scene)
     links = ", ".join(f"{link.name} {_number(link.mass, 4)} kg" for link in scene.links)
     joints = "1 joint" if len(scene.links) == 1 else f"{len(scene.links)} joints"
     yield f"{file}: {scene.name}, {joints}"
-    more = "" if added else "; --spacecraft-mass adds the spacecraft"
-    yield f"  base    {_number(scene.base.mass, 4)} kg{more}"
+    yield f"  base    {_number(scene.base.mass, 4)} kg"
     yield f"  links   {links}"
     yield f"  limits  {'; '.join(_limits(scene)) or 'no motors'}; edit actuators and links"
     yield from _scaled(imported)
@@ -296,17 +291,6 @@ def _limits(scene: Scene) -> Iterator[str]:
         passive = [link.name for link in scene.links if not link.torque_limit]
         if passive:
             yield f"passive: {', '.join(passive)}"
-
-
-def _way(scene: Scene) -> tuple[float, float]:
-    """Attitude [deg] and distance [m] from the tip at the start to the target."""
-    start = scene.initial_state
-    base = start.base_pose.dual_quaternion
-    tip = kinematics.tip_pose(KinematicTree.from_scene(scene), base, start.joint_angles, start.wrist_angles)
-    target = np.atleast_2d(shown_target(scene)[0])[0]
-    way = dual_quaternion.multiply(dual_quaternion.conjugate(tip), tuple(target.tolist()))
-    rotation, position = poses.to_rotation_and_position(way)
-    return math.degrees(2.0 * math.atan2(math.hypot(*rotation[1:]), abs(rotation[0]))), math.hypot(*position)
 
 
 def export(scene: str, language: str, wrist: Literal["refuse", "fixed"]) -> str:

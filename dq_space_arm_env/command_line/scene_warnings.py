@@ -3,39 +3,44 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.dynamics import kinematics
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree
 from dq_space_arm_env.interoperability.exporting import joint_limits
 from dq_space_arm_env.interoperability.swing_efforts import swing_efforts
-from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene import Link, Scene, StateLayout
 from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.path import shown_target
 
 _FAR = 50.0  # m, between a joint and the next: no arm in space is as long
 _ROUNDS = 4.0 * math.pi  # rad, of angles and their limits
 _FAST = 50.0  # rad/s
+_QUICK = 20.0  # rad/s, of limits
 _LIGHT = 0.005  # kg
-_GYRATION = 3.0  # radius of gyration of a body relative to the reach of the arm, or 1 m
-_THIN = 1e-3  # m, smallest radius of gyration
+_GYRATION = 3.0  # radius of gyration of a base relative to the reach of the arm, or 1 m
+_DENSE = 1e5  # kg/m^3, of the cube with a body's mass and inertia: five times tungsten
+_STEP = 1.0  # s
+_SPEEDS = 0.5, 45.0  # m/s and degrees/s, on the mean way to the target
 _TOO_STRONG, _TOO_WEAK = 100.0, 0.03  # limits of torques, relative to the efforts of a swing
 
 
 def warnings_of(scene: Scene) -> list[str]:
     """List what is unwise in a valid scene, a sentence each, which names the key and says what would help."""
-    return [*_units(scene), *_masses(scene), *_limits(scene), *_start(scene), *_reach(scene)]
+    checks = (_units, _masses, _limits, _start, _times, _reach)
+    return [sentence for check in checks for sentence in check(scene)]
 
 
 def _units(scene: Scene) -> Iterator[str]:
     """Lengths that look like millimeters, angles that look like degrees."""
-    for index, link in enumerate(scene.links):
-        if math.hypot(*link.joint.position) > _FAR:
-            length = f"{math.hypot(*link.joint.position):g} m"
-            yield f"links[{index}].joint.position: {length} from {link.name!r} to its parent: millimeters?"
+    yield from _together(
+        (f"links[{i}].joint.position", f"{length:g} m from {link.name!r} to its parent: millimeters?")
+        for i, link in enumerate(scene.links)
+        if (length := math.hypot(*link.joint.position)) > _FAR
+    )
     if math.hypot(*scene.tip.position) > _FAR:
         yield f"tip.position: {math.hypot(*scene.tip.position):g} m from the last joint: millimeters?"
     start = scene.initial_state
@@ -45,33 +50,55 @@ def _units(scene: Scene) -> Iterator[str]:
             if turns and abs(value) > most:
                 yield f"initial_state.{name}: {value:g} {unit}: degrees?"
                 break
+    degrees = []
     for link, (lower, upper, rate) in zip(scene.links, joint_limits(scene), strict=True):
         wide = [bound for bound in (lower, upper) if _ROUNDS < abs(bound) < math.inf]
-        if link.turns and (wide or _FAST < rate < math.inf):
+        if link.turns and (wide or _QUICK < rate < math.inf):
             found = f"{wide[0]:g} rad" if wide else f"{rate:g} rad/s"
-            yield f"constraints: limits of {link.name!r}: {found}: degrees?"
+            degrees.append((repr(link.name), f"{found}: degrees?"))
+    yield from (f"constraints: limits of {sentence}" for sentence in _together(degrees))
     if max(scene.spread.joint_angles, scene.spread.base_rotation, scene.spread.wrist_angles) > math.pi:
         yield "spread: draws of angles by more than half a turn, rad: degrees?"
 
 
 def _masses(scene: Scene) -> Iterator[str]:
     """Masses of grams, and inertias that do not fit mass and size."""
+    arm = sum(link.mass for link in scene.links)
+    if scene.base.mass < arm:
+        yield (
+            f"base.mass: {scene.base.mass:.3g} kg, lighter than the arm of {arm:.3g} kg: is the spacecraft "
+            "missing? --spacecraft-mass of `scenes import` adds it"
+        )
     reach = max(min(_length(scene), _FAR), 1.0)
+    light, wide, dense = [], [], []
     bodies = [("base", scene.base)] + [(f"links[{i}]", link) for i, link in enumerate(scene.links)]
     for place, body in bodies:
         if body.mass < _LIGHT:
-            yield f"{place}.mass: {1e3 * body.mass:g} g: was it meant in other units than kg?"
+            light.append((f"{place}.mass", f"{1e3 * body.mass:g} g: was it meant in other units than kg?"))
         gyration = math.sqrt(np.trace(np.array(body.inertia)) / (2.0 * body.mass))
-        if gyration > _GYRATION * reach:
-            yield (
-                f"{place}.inertia: of a body of {body.mass:g} kg that is {gyration:.3g} m wide, where the "
-                f"arm is {reach:.3g} m long: kg mm^2 or kg cm^2, or a mass in tons?"
+        size = f"of a body of {body.mass:g} kg that is"
+        # A link may be longer than the arm, as a panel: its center of mass is then far from its joint.
+        widest = (
+            reach + 2.0 * math.hypot(*body.center_of_mass) if isinstance(body, Link) else _GYRATION * reach
+        )
+        if gyration > widest:
+            sentence = (
+                f"{size} {gyration:.3g} m wide, where the arm is {reach:.3g} m long: kg mm^2 or kg cm^2"
             )
-        elif gyration < _THIN:
-            yield (
-                f"{place}.inertia: of a body of {body.mass:g} kg that is {1e3 * gyration:.2g} mm wide: a "
-                "mass in grams, or inertia in other units?"
-            )
+            wide.append((f"{place}.inertia", f"{sentence}, or a mass in tons?"))
+        elif body.mass > _DENSE * (2.0 * gyration) ** 3:
+            sentence = f"{size} {1e3 * gyration:.2g} mm wide: a mass in grams, or inertia in other units?"
+            dense.append((f"{place}.inertia", sentence))
+    for found in (light, wide, dense):
+        yield from _together(found)
+
+
+def _together(found: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """The first place and what is wrong there, and the names of the others with the same."""
+    places = list(found)
+    if places:
+        others = ", ".join(place for place, _ in places[1:])
+        yield ": ".join(places[0]) + (f" Likewise {others}" if others else "")
 
 
 def _limits(scene: Scene) -> Iterator[str]:
@@ -113,6 +140,33 @@ def _start(scene: Scene) -> Iterator[str]:
                 f"initial_state.joint_angles: {link.name!r} starts at {angles[0]:g} {link.unit}, beyond its "
                 f"limits of {lower:g} to {upper:g}"
             )
+
+
+def _times(scene: Scene) -> Iterator[str]:
+    """Steps of seconds, and episodes that are too short for the way."""
+    simulation = scene.simulation
+    if simulation.dt > _STEP:
+        yield f"simulation.dt: {simulation.dt:g} s: milliseconds?"
+    seconds, (degrees, meters) = simulation.steps * simulation.dt, way_to_target(scene)
+    drifts = any(scene.initial_state.base_velocity) or any(scene.initial_state.joint_rates)
+    if not drifts and (meters / seconds > _SPEEDS[0] or degrees / seconds > _SPEEDS[1]):
+        yield (
+            f"simulation.steps: an episode of {seconds:.3g} s for {meters:.3g} m and {degrees:.3g} degrees "
+            "to the target: is it long enough?"
+        )
+
+
+def way_to_target(scene: Scene) -> tuple[float, float]:
+    """Attitude [deg] and distance [m] from the tip at the start to the target."""
+    start = scene.initial_state
+    base = start.base_pose.dual_quaternion
+    layout, tree = StateLayout.of(scene), KinematicTree.from_scene(scene)
+    angles = tree.coordinates(layout.initial_state[layout.state.joint_angles].tolist())
+    tip = kinematics.tip_pose(tree, base, angles, start.wrist_angles or (0.0, 0.0, 0.0))
+    target = np.atleast_2d(shown_target(scene)[0])[0]
+    way = dual_quaternion.multiply(dual_quaternion.conjugate(tip), tuple(target.tolist()))
+    rotation, position = poses.to_rotation_and_position(way)
+    return math.degrees(2.0 * math.atan2(math.hypot(*rotation[1:]), abs(rotation[0]))), math.hypot(*position)
 
 
 def _reach(scene: Scene) -> Iterator[str]:

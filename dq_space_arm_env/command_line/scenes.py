@@ -368,7 +368,7 @@ def import_(
     if as_json:
         print_document(scene_exchange.record(imported, str(path), robot))
     else:
-        for line in scene_exchange.summary(imported, str(path), bool(spacecraft)):
+        for line in scene_exchange.summary(imported, str(path)):
             say(line)
     if replay:
         from dq_space_arm_env.command_line.replaying import show_maneuver
