@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from dq_space_arm_env import Scene, SceneError, load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
 from dq_space_arm_env.algebra import rotations
-from dq_space_arm_env.command_line.scene_warnings import way_to_target
+from dq_space_arm_env.command_line.scene_warnings import warnings_of, way_to_target
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.dynamics.step_stability import joint_motion
 from dq_space_arm_env.interoperability.bus_actuators import with_jets, with_wheels
@@ -109,9 +109,10 @@ def import_urdf(
         scene = with_jets(scene, 0.5 * max(scene.actuators.base_force.limit))
     scene = scene.replace(spread=_spread(scene, proposals.spread))
     steps = tuple(measured_steps(scene)) if proposals.measured else ()
+    scene = steps[-1].of(scene) if steps else scene
     messages = (str(each.message).removeprefix("URDF: ") for each in caught)
     efforts = tuple(link.torque_limit for link in own.links)
-    return Imported(steps[-1].of(scene) if steps else scene, tuple(messages), efforts, steps)
+    return Imported(scene, (*messages, *warnings_of(scene)), efforts, steps)
 
 
 def _spread(scene: Scene, width: float) -> dict[str, float]:

@@ -75,6 +75,7 @@ def test_the_import_proposes_what_free_flight_takes(here: Path, capsys: pytest.C
     assert main(["scenes", "validate", "strong.yaml"]) == SUCCESS
     assert capsys.readouterr().out == "strong.yaml: valid\n"
     assert main([*words, "--full-efforts", "--force"]) == SUCCESS
+    assert "Warning: torque limits: " in capsys.readouterr().err
     assert main(["scenes", "validate", "strong.yaml"]) == SUCCESS
     assert "warning: torque limits: " in capsys.readouterr().out
 
