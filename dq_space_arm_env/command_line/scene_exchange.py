@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 import shutil
@@ -16,7 +17,7 @@ from shlex import quote
 from typing import Any, Literal
 
 from dq_space_arm_env import Scene, SceneError, load_scene, scene_from_urdf, scene_to_mjcf, scene_to_urdf
-from dq_space_arm_env.algebra import rotations
+from dq_space_arm_env.algebra import dual_quaternion, poses, rotations
 from dq_space_arm_env.command_line.scene_warnings import warnings_of, way_to_target
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.dynamics.step_stability import joint_motion
@@ -24,6 +25,7 @@ from dq_space_arm_env.interoperability.bus_actuators import with_jets, with_whee
 from dq_space_arm_env.interoperability.exporting import joint_limits
 from dq_space_arm_env.interoperability.first_maneuver import with_scaled_limits
 from dq_space_arm_env.interoperability.step_choice import StepTrial, measured_steps, needs_stiff_method
+from dq_space_arm_env.interoperability.urdf_arm import HERE, UrdfTree
 from dq_space_arm_env.interoperability.urdf_elements import read_robot, without_effort
 from dq_space_arm_env.scene import Link, Simulation
 
@@ -40,6 +42,9 @@ _OPTIONS = {
     r"as base$": "as --base",
 }
 """Options for the Python arguments that messages mention."""
+
+
+_MOST_ENDS = 12  # of arms that are listed
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,9 @@ def import_urdf(
     """
     path = Path(file)
     if tip is None:
-        raise SceneError(f"--tip LINK is missing, the link that is to reach the target; {_tips(path)}")
+        with in_options():
+            tips = _tips(path, arguments.get("base"))
+        raise SceneError(f"--tip LINK is missing, the link that is to reach the target:\n{tips}")
     with warnings.catch_warnings(record=True) as caught, in_options():
         warnings.simplefilter("always")
         own = scene_from_urdf(path, tip, **arguments)
@@ -136,12 +143,26 @@ def mounted(position: tuple[float, ...] | None, degrees: tuple[float, ...] | Non
     return {"position": position or (0.0, 0.0, 0.0), "rotation": rotations.from_euler_321(yaw, pitch, roll)}
 
 
-def _tips(path: Path) -> str:
+def _tips(path: Path, base: str | None) -> str:
+    """Ends of arms, with what is between them and the base, and the other links."""
     robot = read_robot(path)
     parents = {joint.parent for joint in robot.joints.values()}
-    ends = [name for name in robot.links if name not in parents]
-    others = [name for name in robot.links if name in parents]
-    return f"links at the end of {path} are {', '.join(ends)}; the others {', '.join(others)}"
+    ways = {}
+    for name, joints in UrdfTree(robot).ways(base).items():
+        pose = functools.reduce(dual_quaternion.multiply, (joint.origin for joint in joints), HERE)
+        mimics = any(joint.mimics for joint in joints)  # no tip hangs on these
+        moving = 0 if mimics else sum(joint.type != "fixed" for joint in joints)
+        ways[name] = moving, math.hypot(*poses.to_rotation_and_position(pose)[1])
+    ends = [name for name, (moving, _) in ways.items() if name not in parents and moving]
+    ends = sorted(ends, key=ways.__getitem__, reverse=True)[:_MOST_ENDS]
+    width = max((len(name) for name in ends), default=0)
+    rows = [
+        f"  {name:{width}}  {moving} joint{'s' * (moving > 1)}, {meters:.2f} m from the base"
+        for name in ends
+        for moving, meters in [ways[name]]
+    ]
+    others = [name for name in robot.links if name not in ends]
+    return "\n".join([*rows, *_wrapped(f"  others  {', '.join(others)}")])
 
 
 def record(imported: Imported, file: str, source: str) -> dict[str, Any]:

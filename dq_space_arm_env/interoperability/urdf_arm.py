@@ -101,6 +101,13 @@ class UrdfTree:
             link = joint.parent
         return path[::-1]
 
+    def ways(self, base: str | None) -> dict[str, list[UrdfJoint]]:
+        """Joints from the base, by default the root, to each link above which it is."""
+        base = self.root if base is None else base
+        self._known(base, "base")
+        before = len(self._path(base))
+        return {link: self._path(link)[before:] for link in self._below(base)}
+
     def _known(self, link: str, argument: str) -> None:
         if link in self.robot.links:
             return

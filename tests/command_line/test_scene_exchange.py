@@ -218,7 +218,15 @@ def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["import", ARM], "--tip LINK is missing, .* links at the end of .* are hand; the others mount, "),
+        (
+            ["import", ARM],
+            "--tip LINK is missing, .*\n  hand  2 joints, [0-9.]+ m from the base\n  others  mount, upper ",
+        ),
+        (
+            ["import", ARM, "--base", "forearm"],
+            "reach the target:\n  others  mount, upper arm, forearm, hand$",
+        ),
+        (["import", ARM, "--base", "arm"], "--base: 'arm' is not a link of"),
         (["import", ARM, "--tip", "hnd"], "--tip: 'hnd' is not a link of 'small arm'; did you mean 'hand'"),
         (HAND, "give the spacecraft .*, --spacecraft-mass and --spacecraft-inertia$"),
         ([*HAND, "--spacecraft-mass", "80"], "--spacecraft-inertia need each other"),
