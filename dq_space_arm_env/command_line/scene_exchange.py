@@ -162,7 +162,7 @@ def _tips(path: Path, base: str | None) -> str:
         for moving, meters in [ways[name]]
     ]
     others = [name for name in robot.links if name not in ends]
-    return "\n".join([*rows, *_wrapped(f"  others  {', '.join(others)}")])
+    return "\n".join([*rows, *wrapped(f"  others  {', '.join(others)}")])
 
 
 def record(imported: Imported, file: str, source: str) -> dict[str, Any]:
@@ -187,10 +187,10 @@ def record(imported: Imported, file: str, source: str) -> dict[str, Any]:
 def summary(imported: Imported, file: str) -> Iterator[str]:
     """Summarize an imported scene, and what its user will want to change, in lines for the terminal."""
     for line in _lines(imported, file):
-        yield from _wrapped(line)
+        yield from wrapped(line)
 
 
-def _wrapped(line: str) -> list[str]:
+def wrapped(line: str) -> list[str]:
     """Break a line where the terminal ends, but neither commands nor numbers and their units."""
     whole = re.sub(r"`[^`]*`|\d N m|\d \w", lambda found: found[0].replace(" ", "\u00a0"), line)
     indent = " " * (10 if line.startswith(" ") else 2)

@@ -364,7 +364,8 @@ def import_(
     imported = scene_exchange.import_urdf(robot, tip, arguments, proposals)
     _write(path, commented_yaml(imported.scene))
     for warning in imported.warnings:
-        complain(warning, label="Warning: ")
+        first, *others = scene_exchange.wrapped(f"Warning: {warning}")
+        complain("\n".join([first.removeprefix("Warning: "), *others]), label="Warning: ")
     if as_json:
         print_document(scene_exchange.record(imported, str(path), robot))
     else:

@@ -75,7 +75,9 @@ def test_the_import_proposes_what_free_flight_takes(here: Path, capsys: pytest.C
     assert main(["scenes", "validate", "strong.yaml"]) == SUCCESS
     assert capsys.readouterr().out == "strong.yaml: valid\n"
     assert main([*words, "--full-efforts", "--force"]) == SUCCESS
-    assert "Warning: torque limits: " in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "Warning: torque limits: " in said
+    assert all(len(line) <= 80 for line in said.splitlines())
     assert main(["scenes", "validate", "strong.yaml"]) == SUCCESS
     assert "warning: torque limits: " in capsys.readouterr().out
 
