@@ -49,6 +49,8 @@ def report(scene: str, quick: bool, out: Path | None, as_json: bool) -> int:
     console = message_console() if as_json else table_console()
     with keeping(f"the finished parts are in {folder}; repeat the command to resume"):
         page = measure(loaded, folder, console, quick=quick)
+    if page.shortcomings:
+        console.print(f"Exit status 1: {' '.join(page.shortcomings)}", markup=False)
     if as_json:
         print_document(page.record)
     return FAILURE if page.shortcomings else SUCCESS

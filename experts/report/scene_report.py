@@ -91,7 +91,10 @@ def _measured(name: str, scene: Scene, effort: Effort, console: Console) -> dict
             rows: dict[str, Any] = json_value(PARTS[name].measure(scene, effort, announce))
         except ValueError as error:  # for example, the environment refuses actuators without a limit
             rows = {"refused": str(error)}
-    console.print(f"{name}: measured in {perf_counter() - began:.0f} s", markup=False)
+    if "refused" in rows:
+        console.print(f"{name}: NOT measured: {rows['refused']}", markup=False)
+    else:
+        console.print(f"{name}: measured in {perf_counter() - began:.0f} s", markup=False)
     return rows
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
-from dq_space_arm_env import Scene
+from dq_space_arm_env import Scene, SceneError
 from dq_space_arm_env.scene import Pose
 from dq_space_arm_env.scene.bodies import freedoms
-from dq_space_arm_env.scene.constraints import Propellant, TorqueSpeed, WheelLimits
+from dq_space_arm_env.scene.constraints import ControlRate
+from dq_space_arm_env.scene.parameters import ACTUATORS
 
 _TIP_WRENCH = {"force": [0.2, 0.0, -0.1], "torque": [0.05, 0.0, 0.02]}
 _SPRING = {"stiffness": 10.0, "damping": 1.0}  # N m/rad, N m s/rad
@@ -23,8 +25,6 @@ _ACTUATORS = {
     "thrusters": "thrusters",
     "tank": "tank",
 }
-# Of actuators that are there.
-_CONSTRAINTS = {"wheels": WheelLimits, "joint_torque": TorqueSpeed, "tank": Propellant}
 
 
 def feature_variants(scene: Scene) -> dict[str, Scene]:
@@ -33,9 +33,8 @@ def feature_variants(scene: Scene) -> dict[str, Scene]:
     if scene.wrist:
         variants["without wrist"] = without_wrist(scene)
     if scene.payload:
-        variants["without payload"] = _with_spread(scene, payload_mass=0.0, payload_inertia=0.0).replace(
-            payload=None
-        )
+        none = {"payload_mass": 0.0, "payload_inertia": 0.0}
+        variants["without payload"] = _changed(scene, payload=None, spread=none)
     for name, title in _ACTUATORS.items():
         if getattr(scene.actuators, name):
             variants[f"without {title}"] = without_actuators(scene, name)
@@ -43,16 +42,16 @@ def feature_variants(scene: Scene) -> dict[str, Scene]:
         both = without_actuators(scene, "base_force", "base_torque")
         variants["without base force and torque"] = both
     if any(link.motor for link in scene.links):
-        rest = [each for each in scene.constraints if not isinstance(each, TorqueSpeed)]
-        variants["without motors"] = _with_link_fields(scene.replace(constraints=rest), motor=None)
+        variants["without motors"] = _with_link_fields(scene, motor=None)
     if late := _with_actuator_fields(scene, time_constant=None, delay=0, slew_limit=None):
         variants["without lags, delays and slew limits"] = late
     if scene.other_tips:
-        variants["without other tips"] = scene.replace(other_tips=())
+        variants["without other tips"] = _changed(scene, other_tips=())
     if scene.tip_wrench:
         variants["without tip wrench"] = scene.replace(tip_wrench=None)
     elif scene.base.motion == "spatial":
-        variants["with a tip wrench"] = scene.replace(tip_wrench=_TIP_WRENCH)
+        with suppress(SceneError):  # momentum in the wheels alone
+            variants["with a tip wrench"] = scene.replace(tip_wrench=_TIP_WRENCH)
     variants |= _spring_variants(scene)
     variants |= _spread_variants(scene)
     for count in reversed(range(len(scene.links))):
@@ -72,7 +71,37 @@ def _spring_variants(scene: Scene) -> dict[str, Scene]:
 
 
 def _with_link_fields(scene: Scene, **fields: Any) -> Scene:
-    return scene.replace(links=[link.model_copy(update=fields) for link in scene.links])
+    return _changed(scene, links=[link.model_copy(update=fields) for link in scene.links])
+
+
+def _changed(scene: Scene, **changes: Any) -> Scene:
+    """Change a scene; of its phases, constraints and parameters keep those that still fit."""
+    start = {**changes.pop("initial_state", {}), "previous_controls": ()}
+    changed = scene.replace(phases=(), constraints=(), parameters=(), initial_state=start, **changes)
+    for payload in (True, False):
+        if scene.phases and not changed.phases:
+            with suppress(SceneError):
+                changed = changed.replace(phases=scene.phases if payload else _emptied(scene))
+    for each in scene.constraints:
+        if isinstance(each, ControlRate):
+            gone = [part for part in ACTUATORS.values() if getattr(changed.actuators, part) is None]
+            each = each.model_copy(update=dict.fromkeys(gone))
+        with suppress(SceneError):
+            changed = changed.replace(constraints=[*changed.constraints, each])
+    for path in scene.parameters:
+        with suppress(SceneError):
+            changed = changed.replace(parameters=[*changed.parameters, path])
+    return changed
+
+
+def _emptied(scene: Scene) -> list[Any]:
+    """The phases of a scene without its payload."""
+    return [
+        phase.model_copy(
+            update={"catch": None, "changes": tuple(each for each in phase.changes if each[0] != "payload")}
+        )
+        for phase in scene.phases
+    ]
 
 
 def _with_actuator_fields(scene: Scene, **fields: Any) -> Scene | None:
@@ -102,7 +131,8 @@ def _spread_variants(scene: Scene) -> dict[str, Scene]:
         if drawn.keys() & widths.keys():
             variants[f"without {title}"] = _with_spread(scene, **dict.fromkeys(widths, 0.0))
         else:
-            variants[f"with {title}"] = _with_spread(scene, **widths)
+            with suppress(SceneError):  # of what phases change, nothing is drawn
+                variants[f"with {title}"] = _with_spread(scene, **widths)
     return variants
 
 
@@ -117,17 +147,16 @@ def without_actuators(scene: Scene, *names: str) -> Scene:
     if "joint_torque" in names:
         links = tuple(link.model_copy(update={"torque_limit": None}) for link in links)
     changes: dict[str, Any] = {"actuators": dict.fromkeys(names), "links": links}
-    theirs = tuple(kind for name, kind in _CONSTRAINTS.items() if name in names)
-    changes["constraints"] = [each for each in scene.constraints if not isinstance(each, theirs)]
     if "wheels" in names:
         changes |= {"initial_state": {"wheel_speeds": ()}, "spread": {"wheel_speeds": 0.0}}
-    return scene.replace(**changes)
+    return _changed(scene, **changes)
 
 
 def without_wrist(scene: Scene) -> Scene:
     """Lock the wrist at zero angles; the tip stays where it is if it is the wrist's frame."""
     assert scene.wrist is not None
-    return scene.replace(
+    return _changed(
+        scene,
         wrist=None,
         tip=scene.wrist.frame,
         actuators={"wrist_rate": None},
@@ -160,10 +189,9 @@ def with_links(scene: Scene, count: int) -> Scene | None:
         if scene.payload:
             return None
         changes["actuators"] = {"joint_torque": None}
-        changes["constraints"] = [each for each in scene.constraints if not isinstance(each, TorqueSpeed)]
         none = ("joint_angles", "joint_rates", "link_masses", "link_inertias")
         changes["spread"] = dict.fromkeys(none, 0.0)
-    return scene.replace(**changes)
+    return _changed(scene, **changes)
 
 
 def in_the_plane(scene: Scene) -> Scene:
@@ -193,6 +221,7 @@ def in_the_plane(scene: Scene) -> Scene:
         "other_tips": (),
         "target": {
             "pose": _flat_pose(flat.target.pose),
+            "motion": _flat_motion(flat.target.motion),
             "grasp": _flat_pose(flat.target.grasp),
             "base_velocity": _flat_twist(flat.target.base_velocity),
         },
@@ -210,7 +239,7 @@ def in_the_plane(scene: Scene) -> Scene:
         }
     if wrench:
         changes["tip_wrench"] = {"force": _flat_vector(wrench.force), "torque": (0.0, 0.0, wrench.torque[2])}
-    return flat.replace(**changes)
+    return _changed(flat, **changes)
 
 
 def _flat_joints(scene: Scene, values: Sequence[float]) -> list[float]:
@@ -229,6 +258,21 @@ def _flat_pose(pose: Pose) -> Pose:
     tilted = any(pose.rotation[1:3])
     rotation = (1.0, 0.0, 0.0, 0.0) if tilted else pose.rotation
     return Pose(position=_flat_vector(pose.position), rotation=rotation)
+
+
+def _flat_motion(motion: Any) -> Any:
+    if motion is None:
+        return None
+    if motion.kind == "waypoints":
+        points = [point.model_copy(update={"pose": _flat_pose(point.pose)}) for point in motion.points]
+        return motion.model_copy(update={"points": tuple(points)})
+    fields = {
+        "angular_velocity": (0.0, 0.0, motion.angular_velocity[2]),
+        "linear_velocity": (*motion.linear_velocity[:2], 0.0),
+    }
+    if motion.kind == "tumbling":
+        fields["inertia"] = _flat_inertia(motion.inertia)
+    return motion.model_copy(update=fields)
 
 
 def _flat_twist(twist: tuple[float, ...]) -> tuple[float, ...]:

@@ -242,7 +242,10 @@ def test_an_interrupted_report_keeps_its_parts_and_resumes(
 
 
 def test_a_part_that_refuses_the_scene_says_so(
-    short_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_scene: Scene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(scene_report, "PARTS", {"expert": expert_trials})
     actuators = {"base_torque": {"limit": math.inf}, "joint_torque": {"limit": 0.5}}
@@ -250,4 +253,12 @@ def test_a_part_that_refuses_the_scene_says_so(
     page = scene_report.report(endless, tmp_path, Console(), quick=True)
     assert "finite limit" in page.shortcomings[0]
     assert "finite limit" in (tmp_path / "report.md").read_text()
+    file = tmp_path / "endless.yaml"
+    endless.to_yaml(file)
+    capsys.readouterr()
+    assert main(["report", str(file), "--quick", "--out", str(tmp_path)]) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert "expert: NOT measured: " in said
+    assert "measured in" not in said
+    assert "Exit status 1: expert is not measured: " in said
     assert main(["report", "paper", "--out", "/dev/null/report"]) == 2

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dq_space_arm_env import Scene, compile_scene, load_scene
+from dq_space_arm_env import Scene, compile_scene, list_scenes, load_scene
 from dq_space_arm_env.scene import StateLayout
 from experts.report.scene_variants import feature_variants, in_the_plane, with_links, without_wrist
 from scripts.benchmarks.robots import robots
@@ -50,6 +50,39 @@ def test_parts_of_every_robot_make_scenes(name: str) -> None:
     assert len(variants) >= (7 if branches else 10)
     hashes = {variant.content_hash() for variant in variants.values()}
     assert len(hashes - {whole.content_hash()}) == len(variants)
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_parts_of_every_scene_make_scenes(name: str) -> None:
+    """With constraints, phases, and targets that move."""
+    assert len(feature_variants(load_scene(name))) > 10
+
+
+def test_constraints_go_with_what_they_need_and_others_stay() -> None:
+    clear = {"frame": "target", "radius": 0.1}
+    rates = {"kind": "control_rate", "name": "rates", "base_force": 5.0, "joint_torque": 3.0}
+    plume = {"kind": "plume", "name": "gas", "angle_deg": 20.0, "keeps_clear": clear}
+    scene = load_scene("no-wrist").replace(
+        constraints=[rates, plume],
+        parameters=["actuators.base_force", "base.mass"],
+        initial_state={"previous_controls": [0.1] * 6},
+    )
+    variants = feature_variants(scene)
+    (kept,) = variants["without base force"].constraints
+    assert (kept.name, kept.base_force, kept.joint_torque) == ("rates", None, (3.0,))
+    assert variants["without base force"].parameters == ("base.mass",)
+    assert [each.name for each in variants["without joint torques"].constraints] == ["rates", "gas"]
+    assert [each.name for each in variants["with 0 links"].constraints] == ["rates", "gas"]
+    joints = scene.replace(
+        constraints=[{**rates, "base_force": None}], initial_state={"previous_controls": ()}
+    )
+    assert feature_variants(joints)["without joint torques"].constraints == ()
+
+
+def test_without_payload_the_phases_stay() -> None:
+    without = feature_variants(load_scene("capture-and-detumble"))["without payload"]
+    assert [phase.name for phase in without.phases] == ["approach", "latch", "detumble"]
+    assert not any(phase.catch for phase in without.phases)
 
 
 def test_features_that_a_scene_has_are_left_out_and_others_added(short_scene: Scene) -> None:
