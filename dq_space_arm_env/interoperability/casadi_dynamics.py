@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import casadi
@@ -19,7 +20,7 @@ from dq_space_arm_env.dynamics.vector_field import split_state
 from dq_space_arm_env.integrators.method import program_inputs
 from dq_space_arm_env.interoperability.traced_functions import evaluated, step_of_fixed_stages
 from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
-from dq_space_arm_env.scene import Scene, StateLayout
+from dq_space_arm_env.scene import Scene, StateLayout, load_scene
 
 Scalar = Any
 
@@ -65,11 +66,11 @@ class CasadiDynamics:
     terminal_constraints: casadi.Function
 
 
-def casadi_dynamics(scene: Scene, integrator: str | None = None) -> CasadiDynamics:
+def casadi_dynamics(scene: Scene | str | Path, integrator: str | None = None) -> CasadiDynamics:
     """Write a scene's dynamics as CasADi functions.
 
     Args:
-        scene: A validated scene.
+        scene: A scene, the name of a shipped one, or a path to a YAML file.
         integrator: Name of the integrator of `step`; the scene's by default. One that takes a fixed number
             of stages: CasADi cannot differentiate a loop that ends when tolerances are met.
 
@@ -79,6 +80,7 @@ def casadi_dynamics(scene: Scene, integrator: str | None = None) -> CasadiDynami
     Raises:
         ValueError: If the integrator is unknown, adaptive or implicit.
     """
+    scene = load_scene(scene)
     programs = ScenePrograms(scene)
     step = step_of_fixed_stages(programs, integrator, "CasADi")
     return CasadiDynamics(

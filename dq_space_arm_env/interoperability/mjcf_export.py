@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import islice
+from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -21,14 +22,14 @@ from dq_space_arm_env.interoperability.exporting import (
     words,
 )
 from dq_space_arm_env.interoperability.mjcf_looks import placed
-from dq_space_arm_env.scene import Base, Link, Payload, Scene, StateLayout
+from dq_space_arm_env.scene import Base, Link, Payload, Scene, StateLayout, load_scene
 from dq_space_arm_env.scene.bodies import freedoms
 
 _FORCE_GEARS = ("1 0 0 0 0 0", "0 1 0 0 0 0", "0 0 1 0 0 0")
 _TORQUE_GEARS = ("0 0 0 1 0 0", "0 0 0 0 1 0", "0 0 0 0 0 1")
 
 
-def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
+def scene_to_mjcf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
     """Write a scene's robot as MJCF.
 
     There is no gravity, and nothing collides. Geoms are there to be seen, and weigh nothing: the scene's
@@ -55,7 +56,7 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     changes no acceleration, but the tip cannot turn.
 
     Args:
-        scene: A validated scene.
+        scene: A scene, the name of a shipped one, or a path to a YAML file.
         wrist: "refuse" makes a wrist an error, "fixed" writes it at its initial angles.
 
     Returns:
@@ -66,6 +67,7 @@ def scene_to_mjcf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
             joint, reaction wheels, an elastic gear, a rotor that turns with the body before its joint, an
             actuator that lags or delays, or phases that change masses.
     """
+    scene = load_scene(scene)
     refuse(scene, "MJCF", wrist, at_once=True)
     root = Element("mujoco", model=scene.name)
     SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")

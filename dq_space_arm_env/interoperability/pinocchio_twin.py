@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Placement, RigidBody, Screw
 from dq_space_arm_env.interoperability.exporting import coupled_rotors, tip_on_its_body
-from dq_space_arm_env.scene import Scene, SceneError, StateLayout
+from dq_space_arm_env.scene import Scene, SceneError, StateLayout, load_scene
 from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.scene.start import unit_quaternions
@@ -21,7 +22,7 @@ from dq_space_arm_env.scene.start import unit_quaternions
 Array = NDArray[np.float64]
 
 
-def pinocchio_model(scene: Scene) -> Any:
+def pinocchio_model(scene: Scene | str | Path) -> Any:
     """Build a scene's robot as a `pinocchio.Model`.
 
     Joint `base` is a free flyer (planar scenes: a planar joint) with the frame e0, at the center of mass;
@@ -32,7 +33,8 @@ def pinocchio_model(scene: Scene) -> Any:
     (dw, dv) are the scene's base accelerations.
 
     Args:
-        scene: A validated scene; its nominal masses and inertias, the payload part of the tip's link.
+        scene: A scene, the name of a shipped one, or a path to a YAML file; its nominal
+            masses and inertias, the payload part of the tip's link.
 
     Returns:
         The model; nv = 6 + n for n degrees of freedom of joints, 3 + n in a planar scene.
@@ -42,6 +44,7 @@ def pinocchio_model(scene: Scene) -> Any:
         SceneError: If the scene has reaction wheels, or a rotor is coupled to the body that carries it.
     """
     pin = _pinocchio()
+    scene = load_scene(scene)
     tree = _equations(scene).tree
     problems = [*coupled_rotors(scene)]
     if problems:
@@ -82,11 +85,11 @@ def _joint(pin: Any, screw: Screw) -> Any:
     return pin.JointModelHZ(screw.slide) if screw.slide else pin.JointModelRZ()
 
 
-def to_pinocchio(scene: Scene, x: ArrayLike) -> tuple[Array, Array]:
+def to_pinocchio(scene: Scene | str | Path, x: ArrayLike) -> tuple[Array, Array]:
     """Write a state as Pinocchio's configuration and velocity.
 
     Args:
-        scene: A validated scene.
+        scene: A scene, the name of a shipped one, or a path to a YAML file.
         x: State, shape (n_x,), units of the state; the wrist's angles are not part of the model.
 
     Returns:
@@ -99,6 +102,7 @@ def to_pinocchio(scene: Scene, x: ArrayLike) -> tuple[Array, Array]:
     Raises:
         ValueError: If x has another shape, or the scene reaction wheels (`SceneError`).
     """
+    scene = load_scene(scene)
     equations, entries = _equations(scene), StateLayout.of(scene).state
     values = _checked("x", x, equations.n_x)
     pose = tuple(equations.pose.full(values[entries.pose].tolist()))
@@ -115,11 +119,13 @@ def to_pinocchio(scene: Scene, x: ArrayLike) -> tuple[Array, Array]:
     return np.array([*base, *values[entries.joint_angles]]), np.array([*velocity, *motion.joint_rates])
 
 
-def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: ArrayLike = ()) -> Array:
+def from_pinocchio(
+    scene: Scene | str | Path, q: ArrayLike, v: ArrayLike, wrist_angles: ArrayLike = ()
+) -> Array:
     """Write Pinocchio's configuration and velocity as a state, the inverse of `to_pinocchio`.
 
     Args:
-        scene: A validated scene.
+        scene: A scene, the name of a shipped one, or a path to a YAML file.
         q: Configuration as of `to_pinocchio`, m and rad.
         v: Velocity, shape (6 + n,), or (3 + n,) in a planar scene, m/s and rad/s.
         wrist_angles: psi, theta, phi, shape (3,), rad; shape (0,) without a wrist.
@@ -131,6 +137,7 @@ def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: Array
     Raises:
         ValueError: If a shape is wrong.
     """
+    scene = load_scene(scene)
     layout = StateLayout.of(scene)
     n, planar = layout.n_joints, layout.planar
     quaternions = unit_quaternions(scene)
@@ -154,11 +161,11 @@ def from_pinocchio(scene: Scene, q: ArrayLike, v: ArrayLike, wrist_angles: Array
     return x
 
 
-def generalized_forces(scene: Scene, x: ArrayLike, u: ArrayLike) -> Array:
+def generalized_forces(scene: Scene | str | Path, x: ArrayLike, u: ArrayLike) -> Array:
     """Collect inputs, joint springs and dampers, and the tip wrench as Pinocchio's generalized forces tau.
 
     Args:
-        scene: A validated scene.
+        scene: A scene, the name of a shipped one, or a path to a YAML file.
         x: State, shape (n_x,), units of the state.
         u: Inputs, shape (n_u,), units of the inputs; the wrist's rates do no work.
 
@@ -169,6 +176,7 @@ def generalized_forces(scene: Scene, x: ArrayLike, u: ArrayLike) -> Array:
     Raises:
         ValueError: If x or u has another shape.
     """
+    scene = load_scene(scene)
     equations, entries = _equations(scene), StateLayout.of(scene).state
     values = _checked("x", x, equations.n_x)
     motion = equations.motion(values[entries.pose.stop :].tolist())

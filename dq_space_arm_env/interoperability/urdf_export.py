@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -17,12 +18,12 @@ from dq_space_arm_env.interoperability.exporting import (
     words,
 )
 from dq_space_arm_env.interoperability.urdf_elements import UNLIMITED
-from dq_space_arm_env.scene import Base, Link, Payload, Scene, Shape
+from dq_space_arm_env.scene import Base, Link, Payload, Scene, Shape, load_scene
 from dq_space_arm_env.scene.shapes import COLORS, color_of
 from dq_space_arm_env.validation.fields import Three
 
 
-def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
+def scene_to_urdf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"] = "refuse") -> str:
     """Write a scene's robot as URDF.
 
     The root link `base` has the frame e0, at the center of mass; tell the simulator that it floats
@@ -40,7 +41,7 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     no acceleration, but the tip cannot turn.
 
     Args:
-        scene: A validated scene.
+        scene: A scene, the name of a shipped one, or a path to a YAML file.
         wrist: "refuse" makes a wrist an error, "fixed" writes it at its initial angles.
 
     Returns:
@@ -49,6 +50,7 @@ def scene_to_urdf(scene: Scene, *, wrist: Literal["refuse", "fixed"] = "refuse")
     Raises:
         SceneError: If URDF lacks a feature of the scene.
     """
+    scene = load_scene(scene)
     refuse(scene, "URDF", wrist, springs=True, planar=True, rotors=True, spherical=True)
     root = Element("robot", name=scene.name)
     names = [link.name for link in scene.links]
