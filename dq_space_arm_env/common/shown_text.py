@@ -2,18 +2,26 @@
 
 import re
 import unicodedata
+from itertools import islice
 from reprlib import Repr
 from typing import Any
 
 LONGEST = 120
 """Characters of a value in a message."""
 _LARGEST_BITS = 1023  # integers up to there are written with all digits
+_KEY = re.compile(r"[\w.]{1,60}", re.ASCII)
 _PLAIN = re.compile(r"[\w .,:;()+/%°=-]*")
 
 
 def shortened(value: object, longest: int = LONGEST) -> str:
     """Write a value for a message, cut off with "..."; a huge value takes no longer than a small one."""
     text = _Cut(longest).repr(value)
+    return text if len(text) <= longest else f"{text[:longest]}..."
+
+
+def yaml_like(value: object, longest: int = LONGEST) -> str:
+    """Write a value as `shortened` does, but mappings, null, true and false as YAML has them."""
+    text = _YAMLCut(longest).repr(value)
     return text if len(text) <= longest else f"{text[:longest]}..."
 
 
@@ -39,6 +47,28 @@ class _Cut(Repr):
 
     def repr_str(self, x: str, level: int) -> str:
         return repr(x[: self.maxstring])
+
+
+class _YAMLCut(_Cut):
+    def repr1(self, x: Any, level: int) -> str:
+        if hasattr(type(x), "model_fields"):  # a model, by what was given of it
+            x = {name: getattr(x, name) for name in type(x).model_fields if name in x.model_fields_set}
+        return super().repr1(x, level)
+
+    def repr_NoneType(self, x: None, level: int) -> str:
+        return "null"
+
+    def repr_bool(self, x: bool, level: int) -> str:
+        return str(x).lower()
+
+    def repr_dict(self, x: dict[Any, Any], level: int) -> str:
+        if x and level <= 0:
+            return "{...}"
+        entries = []
+        for key, value in islice(x.items(), self.maxdict):
+            plain = isinstance(key, str) and _KEY.fullmatch(key)
+            entries.append(f"{key if plain else self.repr1(key, level - 1)}: {self.repr1(value, level - 1)}")
+        return f"{{{', '.join(entries)}{', ...' if len(x) > self.maxdict else ''}}}"
 
 
 def printable(text: str) -> str:

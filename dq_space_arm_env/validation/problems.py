@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple, NoReturn, Self
 from pydantic import BaseModel, ConfigDict, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from dq_space_arm_env.common.shown_text import printable, shortened
+from dq_space_arm_env.common.shown_text import printable, yaml_like
 from dq_space_arm_env.common.suggestions import did_you_mean
 
 _KIND = "scene_problem"
@@ -111,7 +111,7 @@ def _rethrow(model: type[Model], error: ValidationError) -> NoReturn:
 
 
 def _shown(value: object) -> str:
-    return f" = {shortened(value)}"
+    return f" = {yaml_like(value)}"
 
 
 def _meaning(model: type[BaseModel], name: str | int) -> str:

@@ -130,6 +130,4 @@ def test_one_mistake_gives_one_sentence(
 
 def test_geometry_is_a_list(data: dict[str, Any], change: Change, refusals: Refusals) -> None:
     (sentence,) = refusals(change(data, "base.geometry", CUBE))
-    assert sentence.startswith(
-        "base.geometry = {'box': [1, 1, 1]}: must be a list (shapes that pictures draw"
-    )
+    assert sentence.startswith("base.geometry = {box: [1, 1, 1]}: must be a list (shapes that pictures draw")
