@@ -4,13 +4,16 @@ A phase changes numbers of the scene, which thereby become parameters of the sta
 code. At its start the payload may be caught.
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from itertools import pairwise
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 from pydantic import BeforeValidator, Field, PlainSerializer
 
+from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.maneuver import Success
 from dq_space_arm_env.scene.parameters import (
     ACTUATORS,
@@ -18,6 +21,7 @@ from dq_space_arm_env.scene.parameters import (
     drawn_factors,
     has_target_spread,
     numbers,
+    parents,
     target_numbers,
 )
 from dq_space_arm_env.validation.fields import Name, Steps
@@ -201,10 +205,19 @@ def phase_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem((*here, posed), dict(phase.changes)[posed], sentence)
         held.append(scene.payload is not None and "payload" not in removed)
         gains = held[-2:] == [False, True]
-        if gains != (phase.catch is not None):
+        if gains and phase.catch is None:
             sentence = (
-                "must be given where the phase before holds no payload and this one does, and only there"
+                "must be given: the phase before holds no payload and this one does; its tolerances, such as "
+                "position_error: 0.01, say within what the payload is caught"
             )
+            yield Problem(("phases", index, "catch"), None, sentence)
+        elif phase.catch is not None and not gains:
+            if not held[-1]:
+                sentence = "must be absent: this phase holds no payload"
+            elif len(held) == 1:
+                sentence = "must be absent: the first phase holds the payload from the start"
+            else:
+                sentence = "must be absent: the phase before already holds the payload"
             yield Problem(("phases", index, "catch"), phase.catch, sentence)
         elif gains and any(held[:-1]):
             sentence = (
@@ -212,7 +225,7 @@ def phase_problems(scene: Scene) -> Iterator[Problem]:
                 "move with the target"
             )
             yield Problem(("phases", index, "catch"), phase.catch, sentence)
-    if scene.payload is not None and held and not any(held):
+    if valid and scene.payload is not None and held and not any(held):
         yield Problem(("phases",), len(held), "never hold the payload: leave it out of the scene")
     if valid:
         yield from _drawn_problems(scene)
@@ -230,8 +243,33 @@ def _change_problems(
         elif value is not None and _is_in(path, ("payload",)):
             yield Problem((*here, path), value, "the payload is held as it is, or not at all: payload: null")
         elif value is not None and not _may_change(path, names):
-            sentence = "leads to no number that phases change; such are base.mass, links.0, target.pose"
-            yield Problem((*here, path), value, sentence)
+            yield Problem((*here, path), value, _why_not(scene, path, names))
+
+
+def _why_not(scene: Scene, path: str, names: set[str]) -> str:
+    """Say why phases cannot change what a path leads to."""
+    such = "such are base.mass, links.0.mass, cost.pose, target.pose"
+    present = _value_at(scene, path)
+    if present is None:
+        paths = {part for name in names for part in parents(name) if _may_change(part, names)}
+        known = sorted(part for part in paths if _value_at(scene, part) is not None)
+        return f"leads to no number that phases change; {did_you_mean(path, known)}{such}"
+    if _is_in(path, ("cost",)) and not np.any(present):
+        return "its weight is 0 in the scene, which leaves the term out: give it a small number there"
+    return f"is the same in all phases; they change other numbers: {such}; an actuator may be null"
+
+
+def _value_at(scene: Scene, path: str) -> Any:
+    """What a path leads to in the scene; None for nothing."""
+    here: Any = scene
+    for key in path.split("."):
+        if isinstance(here, tuple) and key.isdecimal() and int(key) < len(here):
+            here = here[int(key)]
+        elif isinstance(here, Model) and key in type(here).model_fields:
+            here = getattr(here, key)
+        else:
+            return None
+    return here
 
 
 def _drawn_problems(scene: Scene) -> Iterator[Problem]:
@@ -252,5 +290,5 @@ def _may_change(path: str, names: set[str]) -> bool:
         return True
     if _is_in(path, ("actuators", "target", "phases", "parameters", "spread")):
         return False
-    inner = path.rstrip("0123456789").rstrip(".")  # an entry of a list has a name
+    inner = re.sub(r"(\.\d+)+$", "", path)  # an entry of a list has a name
     return any(_is_in(name, (inner,)) or _is_in(inner, (name,)) for name in names)

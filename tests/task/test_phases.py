@@ -348,8 +348,35 @@ def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
         ({"phases.1.changes": {"payload": None, "base.mass": float("nan")}}, "must be a finite number"),
         ({"phases.1.changes": {"payload": None, "base": None}}, "may be null"),
         ({"phases.1.changes": [1]}, "must be a mapping from paths"),
-        ({"phases.2.catch": None}, "must be given where the phase before holds no payload"),
-        ({"phases.0.catch": {}}, "and only there"),
+        ({"phases.1.changes": {"payload": None, "cost.tippose": 3}}, "such are base.mass"),
+        (
+            {"phases.1.changes": {"payload": None, "cost.jointtorque": 3}},
+            "did you mean 'cost.joint_torque'?",
+        ),
+        (
+            {"cost": {"tip_twist": 0, "terminal_tip_twist": 0}},
+            "phases[2].changes.cost.tip_twist = 300: its weight is 0 in the scene",
+        ),
+        (
+            {"phases.1.changes": {"payload": None, "actuators.base_force.limit": 3}},
+            "actuators.base_force.limit = 3: is the same in all phases",
+        ),
+        ({"phases.1.changes": {"payload": None, "simulation.dt": 0.1}}, "is the same in all phases"),
+        (
+            {"phases.2.catch": None},
+            "catch = null: must be given: the phase before holds no payload",
+        ),
+        ({"phases.1.catch": {}}, "catch = {}: must be absent: this phase holds no payload"),
+        (
+            {"phases.1.catch": {"position_error": 0.5}, "phases.1.changes": {"cost.pose": 1.0}},
+            "phases[2].catch = {attitude_error_deg: 180.0, position_error: 100.0, "
+            "angular_velocity_error_deg: null, velocity_error: null}: must be absent: the phase before "
+            "already holds the payload",
+        ),
+        (
+            {"phases.0.catch": {}, "phases.0.changes": {"cost.pose": 1.0}},
+            "must be absent: the first phase holds the payload from the start",
+        ),
         ({"phases.0.changes": {"base.mass": 100.0}}, "no phase after one that holds the payload"),
         ({"phases.2.catch": None, "phases.2.changes": {"payload": None}}, "never hold the payload"),
         ({"phases.2.changes": {"target.motion": None, "cost.tip_twist": 0}}, "adds or removes a term"),
@@ -382,3 +409,8 @@ def test_scenes_with_phases_survive_their_yaml() -> None:
         again = load_scene(scene.model_dump())
         assert again == scene
         assert again.content_hash() == scene.content_hash()
+
+
+def test_an_entry_of_an_inertia_may_change() -> None:
+    changed = SCENES["release"].replace({"phases.1.changes.base.inertia.0.0": 11.0})
+    assert changed.staged.values["base.inertia.xx"][1] == 11.0
