@@ -108,7 +108,15 @@ class _Composer(Composer):
 
 
 class _Constructor(SafeConstructor):
-    """Gives the place of texts that are no value of their kind, such as the 45th of a month."""
+    """Gives the places of equal keys, and of texts that are no value of their kind: the 45th of a month."""
+
+    def check_mapping_key(self, node: Any, key_node: Any, mapping: Any, key: Any, value: Any) -> bool:
+        if key not in mapping:
+            return True
+        first = next(each for each, _ in node.value if self.construct_object(each, deep=True) == key)
+        lines = f"lines {first.start_mark.line + 1} and {key_node.start_mark.line + 1}"
+        said = f"the key {shortened(key, 40)} stands twice, in {lines}: keep one"
+        raise ConstructorError(None, None, said, key_node.start_mark)
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
         text = node.value if isinstance(node, ScalarNode) else ""

@@ -55,7 +55,7 @@ def test_installed_package_uses_scenes_inside_it(tmp_path: Path, monkeypatch: py
     ("name", "sentence"),
     [
         ("papre", r"no scene is named 'papre'; did you mean 'paper'\? The scenes are approach-corridor, "),
-        ("zzz", r"no scene is named 'zzz'; The scenes are .*paper.*ending in \.yaml"),
+        ("zzz", r"no scene is named 'zzz'; the scenes are .*paper.*ending in \.yaml"),
     ],
 )
 def test_unknown_name(name: str, sentence: str) -> None:
@@ -83,7 +83,11 @@ def test_missing_file(tmp_path: Path) -> None:
         ("- a\n- b\n", "must be a mapping .* not a list"),
         ("base: [1, 2\ntarget: 3\n", "not valid YAML: line 2, column 7: while parsing a flow sequence"),
         ("name: box\n\tbase: 1\n", "not valid YAML: line 2, column 1: .*"),
-        ("name: box\nname: bax\n", 'line 2, column 1: .*duplicate key "name"'),
+        (
+            "name: box\nname: bax\n",
+            "line 2, column 1: the key 'name' stands twice, in lines 1 and 2",
+        ),
+        ("1: a\n1.0: b\n", "the key 1.0 stands twice, in lines 1 and 2: keep one"),
         ("{[1, 2]: 3}", "keys must be text"),
         ("name: !!python/object:os.system x", "could not determine a constructor"),
         ("a: 1\n---\nb: 1\n", "expected a single document"),
