@@ -114,10 +114,9 @@ def _of_its_class(data: Mapping[str, Any], origin: str) -> AgentConfiguration:
     algorithm = data.get("algorithm")
     name = algorithm.get("name") if isinstance(algorithm, Mapping) else None
     if not isinstance(name, str) or name not in _CLASSES:
-        hint = did_you_mean(name, _CLASSES) if isinstance(name, str) else ""
-        raise ConfigurationError(
-            f"{origin}: algorithm.name = {shortened(name)}: {hint}it must be one of {', '.join(_CLASSES)}"
-        )
+        known = f"it must be one of {', '.join(_CLASSES)}"
+        known = did_you_mean(name, _CLASSES, known) if isinstance(name, str) else known
+        raise ConfigurationError(f"{origin}: algorithm.name = {shortened(name)}: {known}")
     return _validated(_CLASSES[name], dict(data), origin)
 
 

@@ -80,8 +80,8 @@ class Suite(Model):
     def scene(self, task: str) -> Scene:
         """The scene of a task; SuiteError if it is not what the suite was made of."""
         if task not in self.tasks:
-            suggestion = did_you_mean(task, self.tasks)
-            raise SuiteError(f"task: {task!r} is unknown; {suggestion}Choose from {', '.join(self.tasks)}")
+            known = did_you_mean(task, self.tasks, f"choose from {', '.join(self.tasks)}")
+            raise SuiteError(f"task: {task!r} is unknown; {known}")
         scene, expected = load_scene(task), self.tasks[task]
         found = scene.content_hash()
         if not found.startswith(expected):

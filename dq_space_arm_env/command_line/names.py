@@ -76,8 +76,8 @@ class OneOf(Named):
         """Refuse an unknown word."""
         names = list(self._names())
         if value not in names:
-            suggestion = did_you_mean(str(value), names)
-            self.fail(f"{value!r} is unknown; {suggestion}Choose from {', '.join(names)}", param, ctx)
+            known = did_you_mean(str(value), names, f"choose from {', '.join(names)}")
+            self.fail(f"{value!r} is unknown; {known}", param, ctx)
         return str(value)
 
 

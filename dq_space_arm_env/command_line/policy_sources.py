@@ -61,10 +61,12 @@ def load_policy(
             f"{policy} is not a policy: give a solution (.npz), an exported policy (.npz, .onnx), a model "
             f"(.zip), the folder of a training run, or one of {', '.join(known)}"
         )
-    raise ValueError(
-        f"no policy is named {policy!r}, and there is no such file; {did_you_mean(policy, known)}The "
-        f"policies are {', '.join(known)}; give your own as a file (.npz, .onnx, .zip) or the folder of "
+    policies = (
+        f"the policies are {', '.join(known)}; give your own as a file (.npz, .onnx, .zip) or the folder of "
         "its run"
+    )
+    raise ValueError(
+        f"no policy is named {policy!r}, and there is no such file; {did_you_mean(policy, known, policies)}"
     )
 
 

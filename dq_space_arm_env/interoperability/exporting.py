@@ -32,10 +32,8 @@ def integrator_name(scene: Scene, integrator: str | None) -> str:
     """The scene's integrator, or the named one; ValueError if it is unknown."""
     name = scene.simulation.integrator if integrator is None else integrator
     if name not in INTEGRATORS:
-        raise ValueError(
-            f"integrator: {name!r} is unknown; {did_you_mean(name, INTEGRATORS)}It must be one of "
-            f"{', '.join(INTEGRATORS)}"
-        )
+        known = f"it must be one of {', '.join(INTEGRATORS)}"
+        raise ValueError(f"integrator: {name!r} is unknown; {did_you_mean(name, INTEGRATORS, known)}")
     return name
 
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, StrictBool
 
+from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.bodies import Link, freedoms
 from dq_space_arm_env.validation.fields import (
     ANGLES,
@@ -367,7 +368,8 @@ def _read_constraint(value: Any) -> Any:
         return value
     kind = value.get("kind") if isinstance(value, dict) else None
     if not isinstance(kind, str) or kind not in _KINDS:
-        raise problem(f"must be a mapping whose kind is one of {', '.join(_KINDS)}")
+        wanted = f"must be a mapping whose kind is one of {', '.join(_KINDS)}"
+        raise problem(did_you_mean(str(kind), _KINDS, wanted))
     return _KINDS[kind].model_validate(value)
 
 

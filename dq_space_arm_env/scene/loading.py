@@ -66,10 +66,8 @@ def load_scene(source: str | Path | Mapping[str, Any] | Scene) -> Scene:
         )
     names = list_scenes()
     if source not in names:
-        raise SceneError(
-            f"no scene is named {shortened(source)}; {did_you_mean(source, names)}The scenes are "
-            f"{', '.join(names)}; give your own file by its path, ending in .yaml"
-        )
+        known = f"the scenes are {', '.join(names)}; give your own file by its path, ending in .yaml"
+        raise SceneError(f"no scene is named {shortened(source)}; {did_you_mean(source, names, known)}")
     return _shipped(source, (scenes_directory() / f"{source}.yaml").read_text(encoding="utf-8"))
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_text
+from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.bodies import Inertia
 from dq_space_arm_env.scene.pose import Pose
 from dq_space_arm_env.validation.fields import MOST_WAYPOINTS, Finite, Rates3
@@ -94,7 +95,8 @@ def _read_motion(value: Any) -> Any:
     if kind == "file":
         return _read_file(value)
     if not isinstance(kind, str) or kind not in _KINDS:
-        raise problem(f"must be a mapping whose kind is one of {', '.join(_KINDS)}, file; or absent: at rest")
+        wanted = f"must be a mapping whose kind is one of {', '.join(_KINDS)}, file; or absent: at rest"
+        raise problem(did_you_mean(str(kind), [*_KINDS, "file"], wanted))
     return _KINDS[kind].model_validate(value)
 
 

@@ -253,7 +253,7 @@ def _why_not(scene: Scene, path: str, names: set[str]) -> str:
     if present is None:
         paths = {part for name in names for part in parents(name) if _may_change(part, names)}
         known = sorted(part for part in paths if _value_at(scene, part) is not None)
-        return f"leads to no number that phases change; {did_you_mean(path, known)}{such}"
+        return f"leads to no number that phases change; {did_you_mean(path, known, such)}"
     if _is_in(path, ("cost",)) and not np.any(present):
         return "its weight is 0 in the scene, which leaves the term out: give it a small number there"
     return f"is the same in all phases; they change other numbers: {such}; an actuator may be null"

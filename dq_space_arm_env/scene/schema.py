@@ -327,9 +327,9 @@ class Scene(Model):
             if not any(is_part(name, path) for name in names):
                 paths = dict.fromkeys(part for name in names for part in parents(name))
                 sentence = (
-                    f"leads to no number that may vary; {did_you_mean(path, paths)}"
                     "such are target.pose, base, links.0, payload, cost, actuators, and what is in them"
                 )
+                sentence = f"leads to no number that may vary; {did_you_mean(path, paths, sentence)}"
                 yield Problem(("parameters", index), path, sentence)
 
     def _previous_control_problems(self) -> Iterator[Problem]:

@@ -37,7 +37,8 @@ def _read_edges(value: Any) -> Three:
 def _read_color(value: Any) -> str:
     color = value.lower() if isinstance(value, str) else ""
     if color not in COLORS and not _HEXADECIMAL.fullmatch(color):
-        raise problem(f'unknown color; {did_you_mean(color, COLORS)}It must be a name or "#rrggbb"')
+        wanted = did_you_mean(color, COLORS, 'it must be a name or "#rrggbb"')
+        raise problem(f"unknown color; {wanted}")
     return color
 
 

@@ -65,9 +65,8 @@ class Simulation(Model):
     @classmethod
     def _is_known(cls, name: str) -> str:
         if name not in INTEGRATORS:
-            raise problem(
-                f"unknown; {did_you_mean(name, INTEGRATORS)}It must be one of {', '.join(INTEGRATORS)}"
-            )
+            known = f"it must be one of {', '.join(INTEGRATORS)}"
+            raise problem(f"unknown; {did_you_mean(name, INTEGRATORS, known)}")
         return name
 
     def _problems(self) -> Iterator[Problem]:

@@ -126,7 +126,8 @@ def _sentence(model: type[Model], detail: ErrorDetails) -> str:
         return f"missing; it is required{_meaning(model, location[-1])}"
     if kind == "extra_forbidden":
         known = [*model.model_fields, *model._other_keys]
-        return f"unknown key; {did_you_mean(str(location[-1]), known)}Known keys here: {', '.join(known)}"
+        here = f"known keys here: {', '.join(known)}"
+        return f"unknown key; {did_you_mean(str(location[-1]), known, here)}"
     known_sentence = _SENTENCES.get(kind)
     return known_sentence(detail.get("ctx", {})) if known_sentence else detail["msg"]
 

@@ -29,8 +29,8 @@ TILTED: list[list[float]] = [[2, 0.5, 0], [0.5, 3, 0], [0, 0, 4]]
 
 REFUSED = [  # path, value, what the sentence says
     # unknown and missing keys, texts
-    ("mas", 3, "Known keys here: name, description, base"),
-    ("bas", 3, "did you mean 'base'?"),
+    ("kk", 3, "kk: unknown key; known keys here: name, description, base"),
+    ("bas", 3, "unknown key; did you mean 'base'? Known keys here: name"),
     ("target.pose.dual_quat", [1] * 8, "did you mean 'dual_quaternion'?"),
     ("name", "", "must not be empty"),
     ("description", True, "must be text"),

@@ -264,6 +264,7 @@ def test_pairs_that_cannot_touch_have_no_row():
 
 MISTAKES = [
     ({"kind": "wall"}, "must be a mapping whose kind is one of joint_limits, distance"),
+    ({"kind": "joint_limit"}, r"did you mean 'joint_limits'\? Must be a mapping whose kind is one of"),
     ({"kind": "joint_limits", "lower": [0.0, 0.0]}, "one per link: the scene has 3 links"),
     ({"kind": "joint_limits", "lower": 1.0, "upper": 0.5}, "must be above the lower limit of link 0"),
     ({"kind": "joint_limits"}, "must bound something"),

@@ -348,7 +348,10 @@ def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
         ({"phases.1.changes": {"payload": None, "base.mass": float("nan")}}, "must be a finite number"),
         ({"phases.1.changes": {"payload": None, "base": None}}, "may be null"),
         ({"phases.1.changes": [1]}, "must be a mapping from paths"),
-        ({"phases.1.changes": {"payload": None, "cost.tippose": 3}}, "such are base.mass"),
+        (
+            {"phases.1.changes": {"payload": None, "cost.tippose": 3}},
+            "did you mean 'cost.pose'? Such are base.mass",
+        ),
         (
             {"phases.1.changes": {"payload": None, "cost.jointtorque": 3}},
             "did you mean 'cost.joint_torque'?",
