@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import zip_longest
 from typing import Any
 
 from rich.console import Console
 from rich.text import Text
 
+from dq_space_arm_env.common.shown_text import yaml_like
 from dq_space_arm_env.common.tables import TextTable
-from dq_space_arm_env.scene import Link, Pose, Scene, StateLayout
+from dq_space_arm_env.scene import Link, Pose, Scene, StateLayout, Success
 from dq_space_arm_env.scene.constraint_rows import path_rows
+from dq_space_arm_env.scene.parameters import is_part
 from dq_space_arm_env.scene.path import first_velocity
 from dq_space_arm_env.task.step_report import observation_entries
 
@@ -84,14 +87,17 @@ def print_scene(console: Console, scene: Scene) -> None:
         )
     ]
     heading = ("entry", "", "limit", "unit", "weight")
-    _print(console, f"Inputs, {layout.n_u} numbers", heading, inputs, right=(2, 4))
+    jets = scene.actuators.thrusters is not None
+    title = f"Inputs, {layout.n_u} numbers{'; forces of thrusters are 0 or more' if jets else ''}"
+    _print(console, title, heading, inputs, right=(2, 4))
     observed = [(str(i), *entry) for i, entry in enumerate(observation_entries(scene))]
     title = f"Observation, {len(observed)} numbers; actions are inputs over their limits, in [-1, 1]"
+    title += "; thrusters are off at 0 and below" if jets else ""
     _print(console, title, ("entry", "", "unit"), observed)
     varies = layout.parameters
     if varies.names:
         rows = [
-            (str(i), name, f"{nominal:g}", unit)
+            (str(i), name, f"{_whole(nominal) if is_part(name, 'target') else nominal:g}", unit)
             for i, (name, nominal, unit) in enumerate(
                 zip(varies.names, varies.nominal, varies.units, strict=True)
             )
@@ -99,6 +105,9 @@ def print_scene(console: Console, scene: Scene) -> None:
         title = f"Parameters, {layout.n_p} numbers that vary"
         _print(console, title, ("entry", "", "nominal", "unit"), rows, right=(2,))
     _print(console, "Task", ("", ""), list(_task(scene)))
+    if scene.phases:
+        headings = ("", "steps", "changes", "caught within")
+        _print(console, "Phases", headings, list(_phases(scene)), right=(1,))
     absent = [(part,) for part in left_out(scene)] or [("nothing",)]
     _print(console, "Not in this scene: no states, no operations", ("",), absent)
 
@@ -223,16 +232,32 @@ def _task(scene: Scene) -> Iterator[tuple[str, str]]:
         twist = first_velocity(scene)
         at_start = f"{_vector(twist[:3])} rad/s, {_vector(twist[3:])} m/s at the start, body axes"
         yield "target's motion", f"{scene.target.motion.kind}, {at_start}"
-    largest = [f"{success.attitude_error_deg:g} degrees", f"{success.position_error:g} m"]
-    if success.angular_velocity_error_deg is not None:
-        largest.append(f"{success.angular_velocity_error_deg:g} deg/s")
-    if success.velocity_error is not None:
-        largest.append(f"{success.velocity_error:g} m/s")
+    largest = _tolerances(success)
     yield "success", f"within {', '.join(largest[:-1])} and {largest[-1]} at the end"
     for constraint in scene.constraints:
         rows = len(path_rows(scene.model_copy(update={"constraints": (constraint,)})))
         what = f", {rows} row{'s' * (rows > 1)} along the path" if rows else ", at the end"
         yield "constraint", f"{constraint.name}: {constraint.kind.replace('_', ' ')}{what}"
+
+
+def _tolerances(success: Success) -> list[str]:
+    largest = [f"{success.attitude_error_deg:g} degrees", f"{success.position_error:g} m"]
+    if success.angular_velocity_error_deg is not None:
+        largest.append(f"{success.angular_velocity_error_deg:g} deg/s")
+    if success.velocity_error is not None:
+        largest.append(f"{success.velocity_error:g} m/s")
+    return largest
+
+
+def _phases(scene: Scene) -> Iterator[tuple[str, str, str, str]]:
+    """Name and steps of each phase, beside and below them a change or a tolerance of its catch a row."""
+    for phase in scene.phases:
+        changes = [f"{path}: {yaml_like(value)}" for path, value in phase.changes] or ["nothing"]
+        caught = [] if phase.catch is None else _tolerances(phase.catch)
+        first = phase.name, str(phase.steps)
+        for change, tolerance in zip_longest(changes, caught, fillvalue=""):
+            yield *first, change, tolerance
+            first = "", ""
 
 
 def _range(part: slice) -> str:
@@ -241,7 +266,12 @@ def _range(part: slice) -> str:
 
 
 def _vector(values: Sequence[float]) -> str:
-    return f"({', '.join(f'{value:.6g}' for value in values)})"
+    return f"({', '.join(f'{_whole(value):.6g}' for value in values)})"
+
+
+def _whole(value: float) -> float:
+    """A coordinate of a pose or a velocity without what rounding leaves of a zero."""
+    return round(value, 15) + 0.0
 
 
 def _limit(limit: float) -> str:

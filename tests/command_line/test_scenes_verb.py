@@ -62,6 +62,32 @@ def test_show_has_states_and_inputs(name: str, capsys: pytest.CaptureFixture[str
     assert f"Inputs, {layout.n_u} numbers" in output
 
 
+def test_show_has_phases(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenes", "show", "capture-and-detumble"]) == SUCCESS
+    shown = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["approach", "799", "payload:", "null"] in shown
+    assert ["detumble", "700", "cost.base_velocity:", "300", "0.5", "degrees"] in shown
+    assert ["cost.pose:", "50", "0.01", "m"] in shown
+
+
+def test_show_says_that_thrusters_only_push(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("thrusters", "planar"):
+        assert main(["scenes", "show", name]) == SUCCESS
+        output = " ".join(capsys.readouterr().out.split())
+        assert ("numbers; forces of thrusters are 0 or more" in output) == (name == "thrusters")
+        assert ("in [-1, 1]; thrusters are off at 0 and below" in output) == (name == "thrusters")
+
+
+def test_show_has_zeros_for_what_rounding_leaves_of_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turned = {"pose": {"position": [1.7, 1.7, 1.7], "rotation": {"axis": [0, 0, 1], "angle": 90}}}
+    file = tmp_path / "turned.yaml"
+    load_scene("paper").replace(target=turned, parameters=["target.pose"]).to_yaml(file)
+    assert main(["scenes", "show", str(file)]) == SUCCESS
+    assert "e-1" not in capsys.readouterr().out
+
+
 def test_what_is_left_out_is_said() -> None:
     paper, wheels, payload = (set(left_out(load_scene(n))) for n in ("paper", "reaction-wheels", "payload"))
     assert "wrist" in payload - paper
