@@ -123,7 +123,8 @@ def _limit_note(actuator: ActuatorHistory, drawn: list[float]) -> str:
     limits = sorted(set(actuator.limits.tolist()))
     if len(limits) > 1:
         return "dashed: limits" if drawn else "limits off the scale"
-    written = f"±{limits[0]:g} {actuator.unit}"
+    sides = "0 to " if actuator.name == "thruster_force" else "±"
+    written = f"{sides}{limits[0]:g} {actuator.unit}"
     return f"dashed: limit {written}" if drawn else f"limit {written}, off the scale"
 
 

@@ -28,6 +28,7 @@ LINE_STYLES: tuple[Any, ...] = (
     (0, (2.6, 1.2)),
     (0, (6, 1.3, 1.2, 1.3, 1.2, 1.3)),
 )
+_MOST_BESIDE = 8  # entries of a legend in a row
 LIMIT_STYLE: dict[str, Any] = {"color": GRAY, "linewidth": 0.8, "linestyle": (0, (4, 2)), "zorder": 1}
 """Style of limits and tolerances."""
 
@@ -78,12 +79,17 @@ def as_png(make: Callable[[], Figure]) -> bytes:
 
 
 def finish_panel(axes: Axes, title: str, label: str) -> None:
-    """Add title (left) and legend (right) above a panel, and the label of its y axis."""
-    axes.set_title(title, loc="left", fontsize=9.5)
+    """Add title (left) and legend (right, in the panel if too wide) above it, and the label of its y axis."""
+    above = axes.set_title(title, loc="left", fontsize=9.5)
     axes.set_ylabel(label)
     handles, _ = axes.get_legend_handles_labels()
     if len(handles) > 1:
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.025), ncols=len(handles))
+        legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.025), ncols=len(handles))
+        if legend.get_window_extent().x0 < above.get_window_extent().x1:
+            rows = -(-len(handles) // _MOST_BESIDE)
+            low, high = axes.get_ylim()
+            axes.set_ylim(low, high + 0.17 * rows * (high - low))
+            axes.legend(loc="upper right", ncols=min(len(handles), _MOST_BESIDE))
 
 
 def draw_curves(
@@ -91,17 +97,15 @@ def draw_curves(
 ) -> None:
     """Draw the columns of `values`, shape (n, curves), as curves in the order of colors and line styles."""
     for index, (column, symbol) in enumerate(zip(values.T, symbols, strict=True), first):
-        axes.plot(time, column, color=COLORS[index % 6], linestyle=LINE_STYLES[index % 6], label=symbol)
+        axes.plot(time, column, label=symbol, **_look(index))
 
 
 def draw_steps(axes: Axes, edges: FloatArray, values: FloatArray, symbols: Sequence[str]) -> None:
     """Draw the columns of `values`, shape (n, inputs), constant between edges, shape (n + 1,)."""
     for index, (column, symbol) in enumerate(zip(values.T, symbols, strict=True)):
-        axes.stairs(
-            column,
-            edges,
-            baseline=None,
-            color=COLORS[index % 6],
-            linestyle=LINE_STYLES[index % 6],
-            label=symbol,
-        )
+        axes.stairs(column, edges, baseline=None, label=symbol, **_look(index))
+
+
+def _look(index: int) -> dict[str, Any]:
+    """Color and line style of a curve; the seventh has the first color and the second style."""
+    return {"color": COLORS[index % 6], "linestyle": LINE_STYLES[(index + index // 6) % 6]}

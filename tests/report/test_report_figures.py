@@ -19,6 +19,7 @@ from experts.figures.maneuver_curves import convergence_figure, figure_3, figure
 from experts.figures.schematic import Schematic  # noqa: E402
 from experts.figures.snapshots import best_view, figure_2, snapshot_stages  # noqa: E402
 from experts.figures.space import Grid  # noqa: E402
+from experts.figures.style import house_style  # noqa: E402
 from experts.report import Maneuver, ManeuverRun  # noqa: E402
 
 
@@ -65,6 +66,21 @@ def test_figure_6_shows_limits_that_are_near(paper_maneuver: Maneuver) -> None:
     assert len(joints.patches) == len(wrist.patches) == 3
     low, high = joints.get_ylim()
     assert low < -2.0 < 2.0 < high
+
+
+def test_eight_thrusters_look_different_and_leave_the_title_free() -> None:
+    scene = load_scene("thrusters")
+    maneuver = still(scene)
+    maneuver.controls[:, StateLayout.of(scene).control.thruster_force] = 3.0
+    with house_style():
+        figure = figure_5(maneuver)
+    (axes,) = figure.axes
+    assert "limit 0 to 5 N" in axes.get_title(loc="left")
+    looks = {(patch.get_edgecolor(), str(patch.get_linestyle())) for patch in axes.patches}
+    assert len(looks) == len(axes.patches) == 8
+    box, title = axes.get_legend().get_window_extent(), axes._left_title.get_window_extent()
+    assert not box.overlaps(title)
+    assert axes.transData.inverted().transform(box.min)[1] > 5.0
 
 
 def test_panels_of_absent_actuators_are_left_out() -> None:
