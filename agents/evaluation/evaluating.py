@@ -219,8 +219,8 @@ def evaluate(
         label: Name in tables.
         trust: Whether to execute the code in a model's file (.zip) where its tensors do not suffice; only if
             you trust whoever made it.
-        normalize: File of the `VecNormalize` that a Stable-Baselines3 model (.zip) was trained in, as its
-            `save` writes it.
+        normalize: File of the `VecNormalize` that a Stable-Baselines3 model was trained in, as its `save`
+            writes it, if the model is a file (.zip) or was loaded without it.
         progress: Called now and then.
 
     Returns:

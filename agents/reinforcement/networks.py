@@ -6,6 +6,7 @@ The units are part of the model: a saved one needs no file of statistics, and ac
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -93,7 +94,12 @@ class ScaledActionsPolicy(ActorCriticPolicy):
         return values.float()
 
 
-def export_policy(model: BaseAlgorithm, metadata: Mapping[str, Any] | None = None) -> ExportedPolicy:
+def export_policy(
+    model: BaseAlgorithm,
+    metadata: Mapping[str, Any] | None = None,
+    *,
+    normalize: str | Path | None = None,
+) -> ExportedPolicy:
     """Export the deterministic policy of a model to arrays, which fly without Stable-Baselines3.
 
     Statistics of `VecNormalize` and the rescaling of actions in `agents.SB3VecEnv` become part of the policy.
@@ -101,13 +107,16 @@ def export_policy(model: BaseAlgorithm, metadata: Mapping[str, Any] | None = Non
     Args:
         model: PPO, A2C, SAC, TQC, TD3 or DDPG, with its environment.
         metadata: JSON values to keep with the policy.
+        normalize: File of the `VecNormalize` that the model was trained in, as its `save` writes it, if the
+            model was loaded without it.
 
     Returns:
         The policy of raw observations and of the environment's own actions.
 
     Raises:
-        ValueError: If the model acts in another way than by plain layers.
+        ValueError: If the model acts in another way than by plain layers, or its normalization is missing.
     """
+    statistics = statistics_of(model, normalize)
     modules, squash = _layers(model)
     linear = [module for module in modules if isinstance(module, nn.Linear)]
     weights = [layer.weight.detach().double().numpy().T for layer in linear]
@@ -141,7 +150,6 @@ def export_policy(model: BaseAlgorithm, metadata: Mapping[str, Any] | None = Non
         scale=factor,
         metadata={**(metadata or {}), "observation": kind},
     )
-    statistics = statistics_of(model.get_vec_normalize_env())
     return exported if statistics is None else statistics.of(exported)
 
 

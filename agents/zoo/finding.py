@@ -18,6 +18,7 @@ from agents.zoo.model_archive import (
     environment_scale,
     read_attributes,
     read_model,
+    sees_normalized,
 )
 from agents.zoo.normalization import ObservationStatistics, StatisticsError, read_statistics, statistics_of
 from agents.zoo.onnx_model import OnnxModel, OnnxModelError
@@ -58,8 +59,8 @@ def as_policy(
             observations, shape (B, n_obs), to actions, shape (B, n_u).
         label: Its name in tables; the file or class by default.
         trust: Whether to execute the code in a model's file where its tensors do not suffice.
-        normalize: File of the `VecNormalize` that a model's file (.zip) was trained in, as its `save` writes
-            it; nothing in it is executed. A model in memory has its own.
+        normalize: File of the `VecNormalize` that a model was trained in, as its `save` writes it, if the
+            model is a file (.zip) or was loaded without it; nothing in it is executed.
 
     Returns:
         The policy.
@@ -76,20 +77,22 @@ def as_policy(
         if normalize is None:
             return as_policy(read_policy(path, trust=trust), name)
         return _as_normalized(path, name, trust, Path(normalize))
-    if normalize is not None:
-        raise PolicyError("normalize: is for the file of a model (.zip); a model in memory has its own")
     if isinstance(policy, ExportedPolicy | ChunkingPolicy):
+        if normalize is not None:
+            raise PolicyError("normalize: the policy already holds its normalization")
         name = label or str(policy.metadata.get("agent", "exported policy"))
         sizes = policy.n_observation, policy.n_action
         if isinstance(policy, ExportedPolicy) and sees_goals(policy):
             act = _on_goals(policy, joined=True)
             return ActingPolicy(name, act, act, True, policy.metadata, sizes)
         return ActingPolicy(name, policy, policy, False, policy.metadata, sizes)
+    if callable(getattr(policy, "predict", None)):
+        predict = _predictor(policy, _statistics(policy, normalize))
+        return ActingPolicy(label or type(policy).__name__, predict, predict, True, {})
+    if normalize is not None:
+        raise PolicyError("normalize: is for models of Stable-Baselines3")
     if isinstance(policy, OnnxModel):
         return ActingPolicy(label or "ONNX model", policy, policy, True, {}, policy.sizes)
-    if callable(getattr(policy, "predict", None)):
-        predict = _predictor(policy, _own_statistics(policy))
-        return ActingPolicy(label or type(policy).__name__, predict, predict, True, {})
     if callable(policy):
         name = label or str(getattr(policy, "__name__", type(policy).__name__))
         return ActingPolicy(name, policy, policy, True, {})
@@ -106,6 +109,8 @@ def _as_normalized(path: Path, label: str, trust: bool, file: Path) -> ActingPol
     try:
         statistics = read_statistics(file)
         loaded = read_policy(path, trust=trust, normalized=True)
+        if statistics is not None and not sees_normalized(read_attributes(path)):
+            raise PolicyError(f"normalize: {path} was trained on plain observations, and flies without")
         if isinstance(loaded, ExportedPolicy):
             return as_policy(loaded if statistics is None else statistics.of(loaded), label)
     except StatisticsError as error:
@@ -114,11 +119,10 @@ def _as_normalized(path: Path, label: str, trust: bool, file: Path) -> ActingPol
     return ActingPolicy(label, predict, predict, True, {})
 
 
-def _own_statistics(model: Any) -> ObservationStatistics | None:
-    """Statistics of the environment that a model in memory is trained in."""
-    normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
+def _statistics(model: Any, file: str | Path | None) -> ObservationStatistics | None:
+    """Statistics of the observations of a model in memory."""
     try:
-        return statistics_of(normalizer)
+        return statistics_of(model, file)
     except StatisticsError as error:
         raise PolicyError(f"policy: {error}") from error
 

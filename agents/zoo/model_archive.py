@@ -103,7 +103,7 @@ def read_model(path: Path, *, normalized: bool = False) -> ExportedPolicy:
     """
     try:
         attributes = read_attributes(path)
-        if not normalized and _sees_normalized(attributes):
+        if not normalized and sees_normalized(attributes):
             raise NeedsStatisticsError(
                 f"{path}: its observations were normalized by VecNormalize, whose statistics are in a file "
                 "of their own: --normalize FILE, in Python normalize=FILE, takes them"
@@ -128,7 +128,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
     return attributes
 
 
-def _sees_normalized(attributes: Mapping[str, Any]) -> bool:
+def sees_normalized(attributes: Mapping[str, Any]) -> bool:
     """Whether a model was trained on normalized observations.
 
     Stable-Baselines3 keeps original observations beside a `VecNormalize` alone, which may still leave them as
@@ -140,7 +140,8 @@ def _sees_normalized(attributes: Mapping[str, Any]) -> bool:
         last = read_pickled(base64.b64decode(attributes["_last_obs"][":serialized:"]))
     except (LookupError, TypeError, ValueError, PickledError):
         return True
-    return are_missing(last, attributes["observation_space"])
+    bounds = str(attributes["observation_space"].get("high", "")).strip("[]").split()[:4]
+    return are_missing(last, [float(bound) for bound in bounds])
 
 
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,9 +80,45 @@ def read_statistics(path: str | Path) -> ObservationStatistics | None:
         raise StatisticsError(f"{path} is damaged: it has no {error}") from error
 
 
-def statistics_of(normalizer: Any) -> ObservationStatistics | None:
-    """Statistics of a `VecNormalize`; None if it is none, or normalizes rewards alone."""
-    return None if normalizer is None else _statistics(vars(normalizer))
+def statistics_of(model: Any, file: str | Path | None = None) -> ObservationStatistics | None:
+    """Statistics of the observations of a model in memory, its own or those of a file.
+
+    Args:
+        model: A model of Stable-Baselines3, or anything that acts.
+        file: What `VecNormalize.save` wrote, for a model that was loaded without its `VecNormalize`.
+
+    Returns:
+        The statistics; None if it sees observations as they are.
+
+    Raises:
+        StatisticsError: If they are missing, or given to a model that has no use for them.
+    """
+    normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
+    if normalizer is not None:
+        if file is not None:
+            raise StatisticsError("the model has its VecNormalize in memory: leave normalize out")
+        return _statistics(vars(normalizer))
+    normalized = _sees_normalized(model)
+    if file is None and normalized:
+        raise StatisticsError(
+            "the model's observations were normalized by VecNormalize, which it was loaded without: "
+            "normalize=FILE takes the file of the statistics"
+        )
+    statistics = None if file is None else read_statistics(file)
+    if statistics is not None and normalized is False:
+        raise StatisticsError("the model was trained on plain observations: leave normalize out")
+    return statistics
+
+
+def _sees_normalized(model: Any) -> bool | None:
+    """Whether a model without a `VecNormalize` was trained in one; None if that cannot be told."""
+    if getattr(model, "_last_original_obs", None) is None:
+        return False
+    if model._last_obs is None:  # by `set_env`; algorithms off policy keep originals in any case
+        return None if hasattr(model, "replay_buffer_class") else True
+    if model.get_env() is not None:
+        return False  # it has learned there
+    return are_missing(model._last_obs, np.asarray(getattr(model.observation_space, "high", ())).tolist())
 
 
 def _statistics(state: Mapping[str, Any]) -> ObservationStatistics | None:
@@ -119,25 +155,22 @@ def _moment(part: Any, name: str) -> NDArray[np.float64]:
     return array.reshape(-1)
 
 
-def are_missing(observation: Any, space: Mapping[str, Any]) -> bool:
-    """Whether a model's last observation, pickled, was normalized: its unit quaternion has another length.
+def are_missing(observation: Any, high: Sequence[float]) -> bool:
+    """Whether a model's last observation was normalized: its unit quaternion has another length.
 
     Args:
-        observation: What `read_pickled` found, an array or arrays by name.
-        space: The observation space as a model's file describes it.
+        observation: An array or arrays by name, as they are or as `read_pickled` finds them.
+        high: Upper bounds of the observation space, empty if it has parts.
 
     Returns:
         True also where that cannot be told.
     """
     if isinstance(observation, dict):
-        seen, length = as_array(observation.get("achieved_goal")), 4
+        observation, length = observation.get("achieved_goal"), 4
     else:
-        bounds = [float(number) for number in str(space.get("high", "")).strip("[]").split()[:4]]
-        units = [math.isclose(bound, 1.0 + 1e-5, abs_tol=1e-7) for bound in bounds]
-        seen, length = (
-            as_array(observation),
-            next((i for i, unit in enumerate(units) if not unit), len(units)),
-        )
+        units = [math.isclose(bound, 1.0 + 1e-5, abs_tol=1e-7) for bound in high[:4]]
+        length = next((i for i, unit in enumerate(units) if not unit), len(units))
+    seen = observation if isinstance(observation, np.ndarray) else as_array(observation)
     if seen is None or not length or not seen.size:
         return True
     sizes = np.linalg.norm(seen[..., :length], axis=-1)

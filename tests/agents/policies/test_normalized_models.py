@@ -73,6 +73,38 @@ def test_a_normalized_model_is_refused_without_its_statistics(normalized, small_
     assert "belongs to one model (.zip), and there are 2" in capsys.readouterr().err
 
 
+def test_a_model_that_was_loaded_lacks_its_statistics_until_they_are_given(normalized, small_scene):
+    _, file, statistics = normalized
+    seen = observations(small_scene)
+    expected = as_policy(file, normalize=statistics).act(seen)
+    plain = DQSpaceArmVecEnv(2, small_scene)
+    for loaded in (PPO.load(file), PPO.load(file, env=plain)):
+        for way in (as_policy, export_policy):
+            with pytest.raises(ValueError, match=r"normalized by VecNormalize.*normalize=FILE"):
+                way(loaded)
+        exported = export_policy(loaded, normalize=statistics)
+        for acting in (as_policy(exported), as_policy(loaded, normalize=statistics)):
+            np.testing.assert_allclose(acting.act(seen), expected, rtol=0.0, atol=2e-6)
+    with pytest.raises(PolicyError, match="the policy already holds its normalization"):
+        as_policy(exported, normalize=statistics)
+    with pytest.raises(PolicyError, match="is for models"):
+        as_policy(lambda batch: batch, normalize=statistics)
+    with pytest.raises(ValueError, match="in memory: leave normalize out"):
+        export_policy(normalized[0], normalize=statistics)
+
+
+@pytest.mark.parametrize("kind", [PPO, SAC])
+def test_a_model_of_plain_observations_takes_no_statistics(kind, normalized, small_scene, tmp_path):
+    environment = DQSpaceArmVecEnv(2, small_scene)
+    model, file = trained(environment, kind), tmp_path / "plain.zip"
+    model.save(file)
+    for way in (model, file, kind.load(file)):
+        as_policy(way)
+        with pytest.raises(PolicyError, match="was trained on plain observations"):
+            as_policy(way, normalize=normalized[2])
+    export_policy(kind.load(file, env=environment))
+
+
 @pytest.mark.parametrize("verb", ["simulate", "replay", pytest.param("compare", marks=pytest.mark.slow)])
 def test_every_verb_takes_the_statistics_of_a_model(verb, normalized, small_file, tmp_path, capsys):
     file, statistics = (str(each) for each in normalized[1:])
