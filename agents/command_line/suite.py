@@ -85,13 +85,15 @@ def suite(
     difference. Trainings by Stable-Baselines3 need the extra `agents`.
     """
     executor = chosen_executor(workers, ray)
-    from agents.suite.running import run_suite
-    from agents.suite.suite_page import check, check_columns, published, suite_page
+    from agents.suite.running import entrant_names, run_suite
+    from agents.suite.suite_page import check, check_columns, comparable, suite_page
+    from agents.suite.tasks import load_suite
     from dq_space_arm_env.common.progress import ProgressDisplay
     from dq_space_arm_env.common.tables import tabulate
 
     if other is not None:
-        published(other)  # what cannot be read ends the run before it begins
+        flown = load_suite(version)  # what cannot be compared ends the run before it begins
+        comparable(other, flown, tasks or flown.tasks, entrant_names(entrants, flown))
     written = destination(out, as_json, picture)
     chosen = given(tasks=tasks, seeds=seeds, workers=workers, executor=executor)
     with (

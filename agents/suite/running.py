@@ -185,7 +185,8 @@ def run_suite(
     fitting = {name for found in fliers.values() for name, _ in found}
     for name, path in files.items():
         if name not in fitting and name != ZOO:
-            raise SuiteError(f"{path}: fits no task, or there is no such file")
+            why = "there is no such file" if TASK in path else "fits no task"
+            raise SuiteError(f"{path}: {why}, whichever the task")
     plans = {(agent, task): chosen.training(agent, task) for agent in agents for task in scenes}
     notes: list[str] = []
     trained = _train(
@@ -240,6 +241,14 @@ def _fly(
 def agent_name(agent: str) -> str:
     """Name of a trained agent in tables."""
     return Path(agent).stem if agent.endswith((".yaml", ".yml")) else agent
+
+
+def entrant_names(entrants: Sequence[str], suite: Suite) -> list[str]:
+    """Names of entrants in tables, before anything flies; all that ship with the package by default."""
+    controllers, agents, files = _sorted_out(entrants or (*CONTROLLERS, *suite.agents, ZOO), suite)
+    shelf = [f"{each} ({ZOO})" for each in list_policies()] if ZOO in files else []
+    named = [name for name in files if name != ZOO]
+    return [*(CONTROLLERS[each] for each in controllers), *map(agent_name, agents), *named, *shelf]
 
 
 def _check_names(names: Sequence[str]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 
 from agents.evaluation.comparison_tables import COLUMNS, percent
 from agents.suite.running import Score, SuiteRun
-from agents.suite.tasks import SuiteError
+from agents.suite.tasks import Suite, SuiteError
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.provenance import provenance
@@ -88,6 +88,30 @@ def published(file: str | Path) -> tuple[dict[str, Any], dict[tuple[str, str, st
         raise SuiteError(f"{file}: is not the JSON file of a suite: {error}") from error
 
 
+def comparable(
+    file: str | Path, suite: Suite, tasks: Iterable[str], names: Sequence[str]
+) -> dict[tuple[str, str, str], Row]:
+    """Read the JSON file of another run, which has to have scores of these names in these tasks.
+
+    Raises:
+        SuiteError: If the file is not one, is of another suite, or has no such score.
+    """
+    theirs_suite, theirs = published(file)
+    mine = suite.model_dump(mode="json", include={"name", "starts", "tasks"})
+    if any(theirs_suite.get(key) != mine[key] for key in ("name", "starts", "tasks")):
+        raise SuiteError(f"{file}: is of {theirs_suite.get('name')!r}, should be of {suite.name!r}")
+    flown = set(tasks)
+    known = dict.fromkeys(name for task, _, name in theirs if task in flown)
+    if not known:
+        raise SuiteError(f"{file}: has no score in {', '.join(sorted(flown))}")
+    if known.keys().isdisjoint(names):
+        raise SuiteError(
+            f"{file}: has no score of {', '.join(names)} in these tasks, but of {', '.join(known)}: put one "
+            "of these names and = before the path of a policy"
+        )
+    return theirs
+
+
 def check(run: SuiteRun, file: str | Path) -> list[Row]:
     """Compare scores with those in the JSON file of another run.
 
@@ -98,10 +122,7 @@ def check(run: SuiteRun, file: str | Path) -> list[Row]:
     Raises:
         SuiteError: If the file is not one, or they have no score in common.
     """
-    suite, theirs = published(file)
-    mine = run.suite.model_dump(mode="json", include={"name", "starts", "tasks"})
-    if any(suite.get(key) != mine[key] for key in ("name", "starts", "tasks")):
-        raise SuiteError(f"{file}: is of {suite.get('name')!r}, should be of {run.suite.name!r}")
+    theirs = comparable(file, run.suite, (score.task for score in run.scores), run.entrants)
     rows: list[Row] = []
     for score in run.scores:
         other = theirs.get((score.task, score.condition, score.entrant))
@@ -111,7 +132,7 @@ def check(run: SuiteRun, file: str | Path) -> list[Row]:
             worst = max(verdicts, key=("equal", "agrees", "differs").index)
             found = {f"their_{name}": other.get(name) for name in _MEASURES}
             rows.append({**record, **found, "verdict": worst})
-    if not rows:
+    if not rows:  # the names fly, each in other tasks
         raise SuiteError(f"{file}: has no score of {', '.join(run.entrants)} in these tasks")
     return rows
 

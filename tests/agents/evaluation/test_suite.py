@@ -15,7 +15,8 @@ from agents.evaluation.evaluating import Evaluation
 from agents.evaluation.expert_costs import OptimalCosts
 from agents.policies.flying import Flights
 from agents.suite import Score, Suite, SuiteError, SuiteRun, list_suites, load_suite, run_suite
-from agents.suite.suite_page import check, overall_rows, suite_page
+from agents.suite.running import entrant_names
+from agents.suite.suite_page import check, comparable, overall_rows, suite_page
 from agents.zoo.finding import PolicyError
 from dq_space_arm_env import load_scene
 from experts.demonstrations import SerialExecutor
@@ -92,7 +93,7 @@ def test_unknown_names_are_refused(content):
         run_suite(["gains"], suite, tasks=["nowhere"])
     with pytest.raises(PolicyError, match="zoo has no policy 'magic'"):
         run_suite(["magic"], suite)
-    with pytest.raises(SuiteError, match="fits no task, or there is no such file"):
+    with pytest.raises(SuiteError, match="there is no such file"):
         run_suite(["nowhere/{task}.npz"], suite)
     for entrants, policies in (
         (["a=x.npz", "a=y.npz"], {}),
@@ -212,6 +213,23 @@ def test_a_check_tells_equal_from_like_and_other(content, tmp_path):
     file.write_text("{}")
     with pytest.raises(SuiteError, match="is not the JSON file of a suite"):
         check(of(fine), file)
+
+
+def test_a_check_that_compares_nothing_is_refused_before_anybody_flies(content, tmp_path, monkeypatch):
+    suite, task = Suite.model_validate(content), next(iter(content["tasks"]))
+    run = SuiteRun(suite, (made([[True]], [[0.0]], task=task, entrant="mine"),), {task: ""}, ())
+    file, theirs = tmp_path / "suite.yaml", tmp_path / "theirs.json"
+    file.write_text(json.dumps(content))
+    theirs.write_text(json.dumps(suite_page(run, picture=False).record))
+    monkeypatch.setattr("agents.suite.running.run_suite", lambda *_, **__: pytest.fail("flown"))
+    verb = ["gains", "other=a.npz", "--suite", str(file), "--out", str(tmp_path), "--check", str(theirs)]
+    with pytest.raises(SuiteError, match="of plan with gains, other in these tasks, but of mine"):
+        CliRunner().invoke(suite_verb, verb, catch_exceptions=False)
+    other = list(content["tasks"])[1]
+    with pytest.raises(SuiteError, match=r"has no score in .*task-2"):
+        comparable(theirs, suite, [other], ["mine"])
+    assert len(comparable(theirs, suite, suite.tasks, ["mine"])) == 1
+    assert "apg (zoo)" in entrant_names((), suite)
 
 
 @pytest.mark.slow
