@@ -29,6 +29,13 @@ def check_repeat(repeat: int, reward: str, discount: float) -> None:
         raise ValueError(f"discount: {discount!r}, should be above 0 and at most 1")
 
 
+def held_metadata(metadata: dict[str, Any], repeat: int) -> dict[str, Any]:
+    """Metadata of an environment whose pictures, one for each decision, are `repeat` time steps apart."""
+    if "render_fps" not in metadata:
+        return metadata
+    return {**metadata, "render_fps": metadata["render_fps"] / repeat}
+
+
 def shrunk(space: spaces.Space[Any], scene: Any, scale: ArrayLike | Mapping[str, float]) -> spaces.Box:
     """The box of an environment's actions with its bounds multiplied by `scale`, see `ShrinkActionSpace`."""
     if not isinstance(space, spaces.Box):

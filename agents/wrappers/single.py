@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike
 
-from agents.wrappers.shaping import HeldReward, Shaping, check_repeat, shrunk
+from agents.wrappers.shaping import HeldReward, Shaping, check_repeat, held_metadata, shrunk
 
 Env = gymnasium.Env[Any, Any]
 Result = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
@@ -59,6 +59,7 @@ class RepeatAction(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         gymnasium.Wrapper.__init__(self, env)
         self.repeat, self.steps_taken, self.largest_cost = int(repeat), 0, 0.0
         self._sum, self._discount, self._step_infos = reward == "sum", discount, step_infos
+        self.metadata = held_metadata(env.metadata, self.repeat)
 
     def step(self, action: Any) -> Result:
         """Hold an action, see `gymnasium.Env.step`."""

@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv, Vect
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from agents.wrappers.shaping import HeldReward, Shaping, check_repeat, shrunk
+from agents.wrappers.shaping import HeldReward, Shaping, check_repeat, held_metadata, shrunk
 from agents.wrappers.vector_infos import Info, Rows, merged, single_infos, with_rows
 
 Mask = NDArray[np.bool_]
@@ -75,6 +75,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         self.repeat, self.steps_taken = int(repeat), np.zeros(env.num_envs, dtype=np.int64)
         self.collected, self.largest_cost = np.zeros(env.num_envs), np.zeros(env.num_envs)
         self._sum, self._discount, self._step_infos = reward == "sum", discount, step_infos
+        self.metadata = held_metadata(env.metadata, self.repeat)
 
     def step(self, actions: Any) -> Result:
         """Hold actions, see `gymnasium.vector.VectorEnv.step`."""

@@ -117,6 +117,13 @@ def test_rewards_are_discounted_within_a_decision_if_asked():
     assert rewards == {1.0: first + second, 0.5: first + 0.5 * second}
 
 
+def test_pictures_of_decisions_are_as_far_apart_as_decisions():
+    native = gymnasium.make_vec("DQSpaceArm-v0", 2, scene=EIGHT_STEPS)
+    for env in (held(4), vector.RepeatAction(native, 4)):
+        assert env.metadata["render_fps"] == env.env.metadata["render_fps"] / 4
+    assert vector.RepeatAction(native, 4).metadata["autoreset_mode"] is native.metadata["autoreset_mode"]
+
+
 def test_the_last_reward_counts_alone_where_it_is_that_of_a_place():
     env = RepeatAction(gymnasium.make("DQSpaceArmGoal-v0", scene=EIGHT_STEPS), 4, reward="last")
     env.reset(seed=0)
