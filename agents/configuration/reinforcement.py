@@ -23,10 +23,16 @@ class ActionScale(Model):
     base_torque: Positive = Field(default=1.0, description="fraction of the limit, at most 1")
     joint_torque: Positive = Field(default=1.0, description="fraction of the limit, at most 1")
     wrist_rate: Positive = Field(default=1.0, description="fraction of the limit, at most 1")
+    wheel_torque: Positive | None = Field(
+        default=None, description="fraction of the limit, at most 1, in a scene with wheels; absent: 1"
+    )
+    thruster_force: Positive | None = Field(
+        default=None, description="fraction of the limit, at most 1, in a scene with thrusters; absent: 1"
+    )
 
     def _problems(self) -> Iterator[Problem]:
         for name, value in self:
-            if value > 1.0:
+            if value is not None and value > 1.0:
                 yield Problem((name,), value, "must be at most 1, where the actuator's limit is")
 
 

@@ -13,6 +13,7 @@ from agents import configuration as c
 from agents.reinforcement.lagrangian import Lagrangian
 from agents.vec_env import SB3VecEnv
 from agents.wrappers import vector
+from agents.wrappers.shaping import actuators
 from dq_space_arm_env import DQSpaceArmGoalVectorEnv, DQSpaceArmVectorEnv, Scene
 
 
@@ -25,7 +26,7 @@ def make_environment(configuration: c.Configuration, scene: Scene) -> SB3VecEnv 
         return _charged(configuration.algorithm, environment, scene)
     native = DQSpaceArmGoalVectorEnv(practice.copies, scene, hindsight.reward_type, AutoresetMode.SAME_STEP)
     held = vector.RepeatAction(native, practice.action_repeat, reward="last")
-    return SB3VecEnv(vector.ShrinkActionSpace(held, dict(practice.action_scale)))
+    return SB3VecEnv(vector.ShrinkActionSpace(held, largest_actions(practice.action_scale, scene)))
 
 
 def native_environment(configuration: c.Configuration, scene: Scene, copies: int) -> SB3VecEnv:
@@ -34,13 +35,29 @@ def native_environment(configuration: c.Configuration, scene: Scene, copies: int
     native = DQSpaceArmVectorEnv(copies, scene, autoreset_mode=AutoresetMode.SAME_STEP)
     held = held_environment(native, practice.action_repeat)
     shaped = vector.ShapeReward(
-        vector.ShrinkActionSpace(held, dict(practice.action_scale)),
+        vector.ShrinkActionSpace(held, largest_actions(practice.action_scale, scene)),
         practice.reward_scale,
         practice.cost_power,
         success_reward=practice.success_reward,
         end_error_cost=practice.end_error_cost,
     )
     return SB3VecEnv(shaped)
+
+
+def largest_actions(given: c.ActionScale, scene: Scene) -> dict[str, float]:
+    """Scales of the scene's actuators.
+
+    Wheels and thrusters that it lacks are refused. The others are for any scene: those that ship leave the
+    base little, and fly in scenes that cannot push it.
+    """
+    scales, own = given.model_dump(exclude_none=True), actuators(scene)
+    for name in ("wheel_torque", "thruster_force"):
+        if name in scales and name not in own:
+            raise c.ConfigurationError(
+                f"environment.action_scale.{name} = {scales[name]:g}: must be left out: scene {scene.name!r} "
+                f"has {', '.join(own)}"
+            )
+    return {name: scale for name, scale in scales.items() if name in own}
 
 
 def _charged(algorithm: c.Algorithm, environment: SB3VecEnv, scene: Scene) -> SB3VecEnv | Lagrangian:

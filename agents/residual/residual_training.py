@@ -18,7 +18,7 @@ from agents.policies import ExportedPolicy
 from agents.reinforcement.callback import TrainingCallback
 from agents.reinforcement.networks import export_policy
 from agents.reinforcement.reinforcement_training import Trained, make_learner, train_learner
-from agents.reinforcement.training_environment import held_environment
+from agents.reinforcement.training_environment import held_environment, largest_actions
 from agents.reinforcement.training_progress import Progress
 from agents.residual.corrections import correction
 from agents.residual.environment import ResidualVectorEnv
@@ -78,7 +78,7 @@ def make_residual_environment(
 ) -> SB3VecEnv:
     """The environment that a correction is trained in."""
     practice = configuration.environment
-    scale = action_scale(dict(practice.action_scale), scene)
+    scale = action_scale(largest_actions(practice.action_scale, scene), scene)
     environment = ResidualVectorEnv(
         demonstrations,
         scene,
@@ -130,7 +130,9 @@ class ResidualCallback(TrainingCallback):
         return super().metadata() | {
             "configuration": self._residual.model_dump(mode="json", exclude_none=True),
             "residual": {
-                "action_scale": action_scale(dict(practice.action_scale), self._scene).tolist(),
+                "action_scale": action_scale(
+                    largest_actions(practice.action_scale, self._scene), self._scene
+                ).tolist(),
                 "repeat": practice.action_repeat,
                 "memory": practice.memory,
                 "full_authority": practice.full_authority,

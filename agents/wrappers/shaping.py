@@ -52,15 +52,22 @@ def shrunk(space: spaces.Space[Any], scene: Any, scale: ArrayLike | Mapping[str,
 def action_scale(scale: Mapping[str, float], scene: Scene) -> NDArray[np.float32]:
     """Expand the scale of each actuator to its inputs, shape (n_u,), fractions of the limits."""
     layout = StateLayout.of(scene)
-    values = np.ones(layout.n_u, dtype=np.float32)
+    values, own = np.ones(layout.n_u, dtype=np.float32), actuators(scene)
     for name, value in scale.items():
         if name not in CONTROL_UNITS:
             raise ValueError(
-                f"scale: no actuator is named {name!r}; {did_you_mean(name, CONTROL_UNITS)}choose from "
-                f"{', '.join(CONTROL_UNITS)}"
+                f"scale: no actuator is named {name!r}; {did_you_mean(name, own)}choose from {', '.join(own)}"
             )
+        if name not in own:
+            raise ValueError(f"scale: scene {scene.name!r} has no {name}; choose from {', '.join(own)}")
         values[getattr(layout.control, name)] = value
     return values
+
+
+def actuators(scene: Scene) -> list[str]:
+    """Names of the actuators that a scene has."""
+    control = StateLayout.of(scene).control
+    return [name for name in CONTROL_UNITS if (part := getattr(control, name)).stop > part.start]
 
 
 class Shaping(NamedTuple):

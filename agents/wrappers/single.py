@@ -98,7 +98,7 @@ class ShrinkActionSpace(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
 
         Raises:
             TypeError: If the action space is no box.
-            ValueError: If the scale is out of range, or names no actuator.
+            ValueError: If the scale is out of range, or names an actuator that the scene lacks.
         """
         plain = dict(scale) if isinstance(scale, Mapping) else np.asarray(scale).tolist()
         RecordConstructorArgs.__init__(self, scale=plain)

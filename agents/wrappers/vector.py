@@ -190,7 +190,7 @@ class ShrinkActionSpace(VectorWrapper[Any, Any, Any, Any, Any]):
 
         Raises:
             TypeError: If the action space is no box.
-            ValueError: If the scale is out of range, or names no actuator.
+            ValueError: If the scale is out of range, or names an actuator that the scene lacks.
         """
         super().__init__(env)
         scene = getattr(env.unwrapped, "scene", None)

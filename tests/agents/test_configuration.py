@@ -91,6 +91,7 @@ def test_unknown_keys_are_refused_with_a_suggestion():
             "top_quantiles_to_drop_per_net = 2: must be less than n_quantiles",
         ),
         ({"environment": {"action_scale": {"base_force": 2.0}}}, "base_force = 2.0: must be at most 1"),
+        ({"environment": {"action_scale": {"wheel_torque": 2}}}, "wheel_torque = 2.0: must be at most 1"),
         ({"network": {"activation": "sigmoid"}}, "network.activation = 'sigmoid': must be"),
         ({"schedule": {}}, "schedule.total_steps: missing"),
         ({"seed": -1}, "seed = -1"),

@@ -403,6 +403,16 @@ def test_lengths_that_do_not_fit_the_scene_are_named(algorithm, part, changes, s
         make_environment(load_configuration(content), load_scene(scene_file))
 
 
+def test_wheels_are_scaled_where_the_scene_has_them(scene_file):
+    content = configuration("PPO", scene_file).model_dump(exclude_none=True)
+    content["environment"]["action_scale"] = {"base_force": 0.5, "wheel_torque": 0.25}
+    checked = load_configuration(content)
+    high = make_environment(checked, load_scene("wheels")).action_space.high
+    assert high.min() == 0.25
+    with pytest.raises(ConfigurationError, match=r"action_scale\.wheel_torque = 0\.25: must be left out"):
+        make_environment(checked, load_scene(scene_file))
+
+
 def test_the_same_seed_gives_the_same_agent(scene_file, tmp_path):
     runs = [train(configuration("PPO", scene_file, total_steps=800), tmp_path / name) for name in "ab"]
     other = train(configuration("PPO", scene_file, total_steps=800, seed=1), tmp_path / "c")

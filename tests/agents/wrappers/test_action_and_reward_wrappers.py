@@ -213,6 +213,7 @@ def test_vector_wrappers_pickle_with_their_episodes():
         (lambda env: ShrinkActionSpace(env, 1.5), ValueError, "scale: 1.5, should be numbers above 0"),
         (lambda env: ShrinkActionSpace(env, [0.5] * 3), ValueError, "one for each of the 12 actions"),
         (lambda env: ShrinkActionSpace(env, {"base_fource": 0.5}), ValueError, "did you mean 'base_force'"),
+        (lambda env: ShrinkActionSpace(env, {"wheel_torque": 0.5}), ValueError, "has no wheel_torque"),
         (lambda env: ShapeReward(env, scale=-1.0), ValueError, "scale: -1.0, should be a positive"),
         (lambda env: ShapeReward(env, power=2.0), ValueError, "power: 2.0, should be above 0"),
         (lambda env: ShapeReward(env, success_reward=-1.0), ValueError, "success_reward: -1.0"),
