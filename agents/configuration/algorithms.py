@@ -87,6 +87,12 @@ class PPO(_Common):
                 "must be at least 2: advantages are normalized per minibatch",
             )
 
+    def batch_problems(self, copies: int) -> Iterator[Problem]:
+        """Tell whether a minibatch is larger than the decisions of all copies between updates."""
+        if self.batch_size > (most := self.n_steps * copies):
+            sentence = f"must be at most {most:,}, n_steps times environment.copies"
+            yield Problem(("algorithm", "batch_size"), self.batch_size, sentence)
+
 
 class Hindsight(Model):
     """Hindsight experience replay (Andrychowicz et al., NeurIPS 2017), on the goal environment."""

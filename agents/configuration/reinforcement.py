@@ -97,6 +97,8 @@ class Configuration(AgentConfiguration):
                 f"all copies gather {decisions:,} decisions, at most {MOST_IN_MEMORY:,} fit into memory"
             )
             yield Problem(("environment", "copies"), self.environment.copies, sentence)
+        if isinstance(self.algorithm, PPO):
+            yield from self.algorithm.batch_problems(self.environment.copies)
         if isinstance(self.algorithm, OffPolicy) and self.algorithm.layer_norm and not self.network.hidden:
             yield Problem(
                 ("network", "hidden"), [], "must have a layer for algorithm.layer_norm to normalize"

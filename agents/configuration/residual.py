@@ -80,6 +80,8 @@ class ResidualConfiguration(AgentConfiguration):
                 copies,
                 f"must be at least {len(factors)}, one for each mass factor",
             )
+        if isinstance(self.algorithm, PPO):
+            yield from self.algorithm.batch_problems(copies)
         for name in ("hindsight", "demonstrations", "lagrangian"):
             if getattr(self.algorithm, name, None) is not None:
                 yield Problem(

@@ -120,9 +120,10 @@ def _number_or_off(value: Any) -> float | str:
 
 
 def count_up_to(most: int) -> BeforeValidator:
-    """Accept a whole number from 1 to a largest one."""
+    """Accept a whole number from 1 to a largest one, also written as 8e3."""
 
     def read(value: Any) -> int:
+        value = int(value) if isinstance(value, float) and value.is_integer() else value
         if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
             raise problem("must be a whole number, 1 or greater")
         number = int(value)

@@ -94,7 +94,12 @@ def test_unknown_keys_are_refused_with_a_suggestion():
         ({"environment": {"action_scale": {"wheel_torque": 2}}}, "wheel_torque = 2.0: must be at most 1"),
         ({"network": {"activation": "sigmoid"}}, "network.activation = 'sigmoid': must be"),
         ({"schedule": {}}, "schedule.total_steps: missing"),
+        ({"schedule": {"total_steps": 8000.5}}, "total_steps = 8000.5: must be a whole number"),
         ({"seed": -1}, "seed = -1"),
+        (
+            {"environment": {"copies": 2}, "algorithm": {"name": "PPO", "n_steps": 50}},
+            "algorithm.batch_size = 4096: must be at most 100, n_steps times environment.copies",
+        ),
         ({"algorithm": {"name": "PPO", "batch_size": 1}}, "batch_size = 1: must be at least 2"),
         (
             {"algorithm": {"name": "TD3", "layer_norm": True}, "network": {"hidden": []}},
@@ -120,6 +125,13 @@ def test_wrong_values_are_named_with_what_would_be_right(changes, sentence):
 
 
 IMITATION = {"name": "small", "algorithm": {"name": "cloning"}}
+
+
+def test_whole_numbers_may_be_written_with_an_exponent(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text("{name: a, algorithm: {name: PPO}, schedule: {total_steps: 8e3}}")
+    total = load_configuration(file).schedule.total_steps
+    assert (total, type(total)) == (8000, int)
 
 
 def test_the_algorithm_decides_about_the_class():

@@ -66,7 +66,7 @@ REFUSED = [  # path, value, what the sentence says
     ("spread.base_rotation", -0.1, "0 or greater"),
     ("success.position_error", 0, "greater than 0"),
     ("simulation.dt", 0, "greater than 0 (time step, s)"),
-    ("simulation.steps", 10.0, "whole number, 1 or greater"),
+    ("simulation.steps", 10.5, "whole number, 1 or greater"),
     ("simulation.integrator", "rk44", "did you mean 'rk4'?"),
     ("simulation.integrator", "euler", "must be one of symplectic_euler, rk4"),
     ("base.motion", "flat", "'spatial' or 'planar'"),

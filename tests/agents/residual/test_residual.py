@@ -339,6 +339,7 @@ MINIMAL = {"name": "small", "algorithm": {"name": "residual-PPO"}, "schedule": {
     ("changes", "sentence"),
     [
         ({"environment": {"copies": 2}}, "must be at least 5, one for each mass factor"),
+        ({"environment": {"copies": 20}}, "batch_size = 4096: must be at most 1,000"),
         ({"algorithm": {"name": "residual-TD3"}}, "TD3, APG, cloning, dagger, act, residual-PPO"),
         ({"algorithm": {"name": "residual-SAC", "hindsight": {}}}, "must be left out"),
         (
