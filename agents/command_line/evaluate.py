@@ -36,6 +36,7 @@ def policies_options(
     conditions: Callable[[], Iterable[str]] = _conditions,
     changes: str = "Changes of the scene, several or all.  [default: training, none]",
     starts: str = "Number of evaluation starts.  [default: all 500]",
+    scene: str | None = "paper",
 ) -> Callable[[Function], Function]:
     """Add policies, --policy, --scene, -n, --condition, --workers and --ray to a verb."""
 
@@ -49,7 +50,10 @@ def policies_options(
             click.option("--condition", "conditions", type=condition, multiple=True, help=changes),
             click.option("-n", type=int, help=starts),
             click.option(
-                "--scene", type=SCENE, default="paper", show_default=True, help="Name or YAML file."
+                "--scene",
+                type=SCENE,
+                default=scene,
+                help=f"Name or YAML file.  [default: {scene or 'that of the policies, or paper'}]",
             ),
             click.option(
                 "--policy", "more", type=TRAINED_POLICY, multiple=True, help="Same as POLICY, several."
@@ -90,7 +94,7 @@ def evaluate() -> None:
           dq-space-arm evaluate policies a.npz b.npz -n 50 --json
     """,
 )
-@policies_options()
+@policies_options(scene=None)
 @click.option(
     "--expert/--no-expert", default=True, help="Whether to compare with the expert's optimal costs."
 )
@@ -105,7 +109,7 @@ def evaluate() -> None:
 def policies_verb(
     policies: tuple[str, ...],
     more: tuple[str, ...],
-    scene: str,
+    scene: str | None,
     n: int | None,
     conditions: tuple[str, ...],
     workers: int | None,

@@ -25,6 +25,8 @@ from agents.evaluation.evaluating import Advance, evaluate
 from agents.evaluation.expert_costs import EVALUATION_SEEDS
 from agents.evaluation.plan_followers import CONTROLLERS
 from agents.evaluation.training_runs import groups
+from agents.zoo.finding import as_policy, check_fit, scene_of
+from dq_space_arm_env import load_scene
 from dq_space_arm_env.command_line.policy_sources import statistics_by_model
 from dq_space_arm_env.common.console import message_console
 from dq_space_arm_env.common.files import write_atomically
@@ -48,7 +50,7 @@ def progress_bar() -> Iterator[Callable[[Advance], None]]:
 def evaluate_policies(
     console: Console,
     policies: Sequence[str],
-    scene: str = "paper",
+    scene: str | None = None,
     n: int = EVALUATION_SEEDS,
     *,
     conditions: Sequence[str] = ("training",),
@@ -61,24 +63,26 @@ def evaluate_policies(
     """Evaluate policies, print a table for each condition, and return the summaries.
 
     A folder `out` receives a JSON file for each evaluation, with its episodes, and one for agents with
-    several training seeds. Statistics in `normalize` are
-    those of the one model (.zip) among the policies.
+    several training seeds. The scene is that of the policies by default, if they have one in common, else
+    "paper". Statistics in `normalize` are those of the one model (.zip) among the policies.
     """
     summaries = []
     statistics = statistics_by_model(policies, normalize)
+    acting = [as_policy(each, trust=trust, normalize=statistics.get(each)) for each in policies]
+    given = load_scene(scene or scene_of(acting))
+    for each in acting:
+        check_fit(each, given)
     for condition in CONDITIONS if ALL in conditions else conditions:
         evaluations = []
         with progress_bar() as show:
-            for number, policy in enumerate(policies, 1):
+            for number, policy in enumerate(acting, 1):
                 evaluation = evaluate(
                     policy,
-                    scene,
+                    given,
                     n,
                     condition=condition,
                     expert=expert,
                     executor=executor,
-                    trust=trust,
-                    normalize=statistics.get(policy),
                     progress=show,
                 )
                 evaluations.append(evaluation)

@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from agents.evaluation.beside_expert import SideBySide, fly_beside_expert
-from agents.zoo.finding import as_policy
+from agents.zoo.finding import as_policy, scene_of
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.common.files import to_json, write_atomically
 from dq_space_arm_env.common.provenance import provenance
@@ -47,7 +47,7 @@ def show(
     if gif is not None and find_spec("PIL") is None:
         raise ModuleNotFoundError('--gif: needs Pillow: pip install "dq-space-arm[plots]"')
     console, acting = destination.console(120), as_policy(policy, trust=trust, normalize=normalize)
-    flown = load_scene(scene or str(acting.metadata.get("scene", "paper")))
+    flown = load_scene(scene or scene_of([acting]))
     first = 0 if seed is None else seed + 1
     pairs = fly_beside_expert(acting, flown, [seed, *range(first, first + n - 1)])
     console.print(_table(pairs).for_terminal())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +25,8 @@ from agents.zoo.onnx_model import OnnxModel, OnnxModelError
 from agents.zoo.shelf import ZooError, policy_file
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
+from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.task.step_report import n_observations
 
 POLICY_OF_A_RUN = "policy.npz"
 
@@ -151,11 +153,9 @@ def check_fit(policy: ActingPolicy, scene: Scene) -> None:
         raise PolicyError(f"{policy.label} needs {kind!r} observations, which no environment has")
     if policy.sizes is None:
         return
-    environment = DQSpaceArmVectorEnv(1, scene)
-    space, layout = environment.single_observation_space, environment.kernels.layout
-    assert space.shape is not None
+    layout = StateLayout.of(scene)  # nothing compiles for a policy that is refused
     moving = 6 if layout.parameters.moving else 0
-    seen = layout.n_x + moving + 16 if kind == "goal" else space.shape[0]
+    seen = layout.n_x + moving + 16 if kind == "goal" else n_observations(scene)
     if policy.sizes != (seen, layout.n_u):
         origin = policy.metadata.get("scene")
         made = f" (it was trained for scene {origin!r})" if origin else ""
@@ -163,6 +163,16 @@ def check_fit(policy: ActingPolicy, scene: Scene) -> None:
             f"{policy.label} maps {policy.sizes[0]} observations to {policy.sizes[1]} inputs{made}; scene "
             f"{scene.name!r} has {seen} and {layout.n_u}: evaluate it on its own scene"
         )
+
+
+def scene_of(policies: Iterable[ActingPolicy]) -> str:
+    """The scene that policies were trained in, a name or file; "paper" if they differ or none is known."""
+    scenes = set()
+    for policy in policies:
+        configuration = policy.metadata.get("configuration")
+        settings = configuration if isinstance(configuration, Mapping) else {}
+        scenes.add(str(settings.get("scene") or policy.metadata.get("scene", "paper")))
+    return scenes.pop() if len(scenes) == 1 else "paper"
 
 
 def sees_goals(policy: ExportedPolicy) -> bool:

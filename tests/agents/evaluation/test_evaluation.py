@@ -340,6 +340,23 @@ def test_the_command_writes_a_table_json_and_every_episode(tmp_path, capsys):
     assert summaries[0]["success_rate"][0] == 0.0
 
 
+def test_policies_fly_in_the_scene_that_they_were_trained_in(tmp_path, capsys, monkeypatch):
+    SHORT.to_yaml(tmp_path / "short.yaml")
+    settings = {"scene": str(tmp_path / "short.yaml")}
+    for number in range(2):
+        exported(scene="short", configuration=settings).save(tmp_path / f"{number}.npz")
+    arguments = ["-n", "2", "--no-expert", "--json"]
+    both = [str(tmp_path / f"{number}.npz") for number in range(2)]
+    assert main(["evaluate", *both, *arguments]) == 0
+    assert {summary["scene"] for summary in json.loads(capsys.readouterr().out)} == {"short"}
+    exported(14, 6, scene="planar").save(tmp_path / "other.npz")
+    monkeypatch.setattr("agents.evaluation.evaluation_verbs.evaluate", lambda *_, **__: pytest.fail("flown"))
+    vector = "dq_space_arm_env.environment.vector"
+    monkeypatch.setattr(f"{vector}.compile_scene", lambda *_: pytest.fail("compiled"))
+    assert main(["evaluate", *both, str(tmp_path / "other.npz"), *arguments]) == 2
+    assert "maps 14 observations to 6 inputs" in capsys.readouterr().err
+
+
 def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
     assert main(["evaluate", str(tmp_path / "policy.npz"), "--no-expert"]) == 2
     assert "there is no such file or folder" in capsys.readouterr().err
