@@ -53,6 +53,7 @@ COLUMNS = {
         Column("episodes", "starts"),
         Column("success_rate", "success\n%", percent),
         Column("median_cost_gap", "cost gap\n%", percent),
+        Column("median_cost", "median\ncost J", ".4g"),
         Column("tail_cost_gap", "95th perc.\n%", percent),
         Column("saving", "saves\n%", percent, missing=""),
         Column("attitude_error", "angle\ndeg", ".2f"),
@@ -72,6 +73,7 @@ COLUMNS = {
 """Columns of all tables, by the keys of the rows."""
 PROFILE = (0.001, 0.01, 0.1, 1.0)
 """Cost gaps of the performance profiles in tables."""
+_GAP, _COST = "median_cost_gap", "median_cost"
 _VIOLATIONS = ("violating_episodes", "constraint_violations")
 _FLIGHTS = (
     *("attitude_error", "position_error", "effort", "base_turn"),
@@ -79,7 +81,7 @@ _FLIGHTS = (
     "action_seconds",
 )
 _TRAINING = ("training_steps", "training_seconds")
-_COMPARED = ("policy", "episodes", "success_rate", "median_cost_gap", "tail_cost_gap", *_FLIGHTS)
+_COMPARED = ("policy", "episodes", "success_rate", _GAP, _COST, "tail_cost_gap", *_FLIGHTS)
 _MISMATCH = (
     *("condition", "policy", "episodes", "success_rate", "median_cost_gap", "saving"),
     *("attitude_error", "position_error", *_VIOLATIONS, "action_seconds"),
@@ -169,18 +171,18 @@ def mismatch_table(comparison: Comparison) -> TextTable:
 def groups_table(groups: Sequence[Group]) -> TextTable:
     """A table of agents with several training runs."""
     title = "All training runs of an agent; cost gap: interquartile mean over runs and starts"
-    rows = (group_record(group) | {"runs": ", ".join(map(str, group.seeds))} for group in groups)
-    columns = (
-        *(Column("agent", ""), Column("runs", "seeds"), COLUMNS["success_rate"]),
-        Column("interquartile_mean_cost_gap", "cost gap\n%", percent),
-    )
+    rows = [group_record(group) | {"runs": ", ".join(map(str, group.seeds))} for group in groups]
+    columns = [Column("agent", ""), Column("runs", "seeds"), COLUMNS["success_rate"]]
+    if any(row["interquartile_mean_cost_gap"] is not None for row in rows):
+        columns.append(Column("interquartile_mean_cost_gap", "cost gap\n%", percent))
     return replace(tabulate(title, rows, columns), right=2)
 
 
 def _table(title: str, rows: Iterable[Row], keys: Iterable[str], right: int = 1) -> TextTable:
+    """Tabulate rows; columns are left out that are empty in all of them, and costs where gaps are known."""
     found = list(rows)
-    without = all(row.get("constraint_violations") is None for row in found)
-    shown = (COLUMNS[key] for key in keys if not (without and key in _VIOLATIONS))
+    known = {key for row in found for key, value in row.items() if value is not None}
+    shown = (COLUMNS[key] for key in keys if key in known and not (key == _COST and _GAP in known))
     return replace(tabulate(title, found, shown), right=right)
 
 

@@ -1,5 +1,6 @@
 """The evaluation protocol: what it counts, on which starts, and what it compares with."""
 
+import dataclasses
 import json
 import math
 
@@ -12,6 +13,7 @@ from agents.evaluation import CONDITIONS, EVALUATION_SEEDS, evaluation_seeds, fl
 from agents.evaluation.comparison_tables import evaluation_table, remarks
 from agents.evaluation.conditions import FlightDisturbance, physics_hash
 from agents.evaluation.evaluating import Evaluation, fly_under
+from agents.evaluation.expert_costs import OptimalCosts
 from agents.evaluation.statistics import wilson_interval
 from agents.policies import ExportedPolicy
 from agents.zoo.finding import PolicyError, as_policy
@@ -185,6 +187,17 @@ def test_violations_have_intervals_and_columns():
     plain = evaluate(gentle, SHORT, 2, expert=False)
     assert plain.summary()["violating_episodes"] is plain.summary()["constraint_violations"] is None
     assert "violat" not in str(evaluation_table([plain]).headings)
+
+
+def test_a_table_shows_costs_where_no_gap_is_known_and_no_empty_column():
+    plain = evaluate(gentle, SHORT, 2, expert=False)
+    optimal = OptimalCosts(plain.seeds, np.ones(2), np.ones(2, bool), np.zeros(2))
+    found = {}
+    for name, evaluation in (("plain", plain), ("compared", dataclasses.replace(plain, optimal=optimal))):
+        found[name] = {heading.replace("\n", " ") for heading in evaluation_table([evaluation]).headings}
+    assert found["plain"] - found["compared"] == {"median cost J"}
+    assert found["compared"] - found["plain"] == {"cost gap %", "95th perc. %"}
+    assert "training time" not in found["plain"]
 
 
 def test_conditions_change_what_they_say():
