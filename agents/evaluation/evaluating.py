@@ -69,6 +69,14 @@ class Evaluation:
     metadata: dict[str, Any]
     same_scene: bool | None = None
 
+    def __repr__(self) -> str:
+        rate, gap = self.success_rate.value, self.median_cost_gap.value
+        beside = "" if np.isnan(gap) else f", median cost gap {100.0 * gap:.3g} %"
+        return (
+            f"<Evaluation of {self.policy} in {self.scene!r}, {self.condition}: {len(self.seeds)} flights, "
+            f"{100.0 * rate:.3g} % reach the target{beside}>"
+        )
+
     @cached_property
     def success_rate(self) -> Interval:
         """Share of the episodes that end within the tolerances, with Wilson's interval."""

@@ -165,6 +165,11 @@ class ExportedPolicy:
     def _adopt(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
 
+    def __repr__(self) -> str:
+        sizes = (self.n_observation, *(len(bias) for bias in self.biases))
+        trained = f", trained in {self.metadata['scene']!r}" if "scene" in self.metadata else ""
+        return f"<ExportedPolicy {' -> '.join(map(str, sizes))}, {self.activation}{trained}>"
+
     @property
     def n_observation(self) -> int:
         """Number of entries of an observation."""

@@ -73,6 +73,10 @@ class Demonstration:
     scene: Scene
     facts: Mapping[str, Any]
 
+    def __repr__(self) -> str:
+        episode = f"seed {self.seed}, J = {self.cost:.6g}, {len(self.actions)} steps"
+        return f"<Demonstration {self.index} in {self.scene.name!r}: {episode}>"
+
     @property
     def episode_scene(self) -> Scene:
         """The scene with everything drawn as plain numbers, as `env.unwrapped.episode_scene` has it.
@@ -184,6 +188,9 @@ class Demonstrations(Sequence[Demonstration]):
             files = _Files(path, manifest["shards"], self.scene)
             selection = files, np.arange(manifest["demonstrations"], dtype=np.int64)
         self._files, self._places = selection
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} Demonstrations in {self.scene.name!r}, {str(self.path)!r}>"
 
     @property
     def kernels(self) -> Kernels:

@@ -27,6 +27,15 @@ def test_shapes(whole: Demonstrations):
     np.testing.assert_array_equal(whole[0].constraint_costs(), np.zeros(150))  # nothing to violate
 
 
+def test_they_are_shown_in_a_line(whole: Demonstrations):
+    first, where = whole[0], whole.scene.name
+    assert repr(whole) == f"<18 Demonstrations in {where!r}, {str(whole.path)!r}>"
+    expected = (
+        f"<Demonstration {first.index} in {where!r}: seed {first.seed}, J = {first.cost:.6g}, 150 steps>"
+    )
+    assert repr(first) == expected
+
+
 def test_arrays_are_views_of_mapped_files(whole: Demonstrations):
     demonstration = load_demonstrations(whole.path)[5]
     for array in (demonstration.states, demonstration.feedback_gains):

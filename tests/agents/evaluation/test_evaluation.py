@@ -198,6 +198,9 @@ def test_a_table_shows_costs_where_no_gap_is_known_and_no_empty_column():
     assert found["plain"] - found["compared"] == {"median cost J"}
     assert found["compared"] - found["plain"] == {"cost gap %", "95th perc. %"}
     assert "training time" not in found["plain"]
+    shown = "<Evaluation of gentle in 'short', training: 2 flights, 0 % reach the target>"
+    assert repr(plain) == shown
+    assert "median cost gap" in repr(evaluation)
 
 
 def test_conditions_change_what_they_say():

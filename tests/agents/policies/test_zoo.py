@@ -26,6 +26,10 @@ def test_the_zoo_fits_into_the_repository():
     assert there == expected
 
 
+def test_policies_are_shown_in_a_line():
+    assert repr(load_policy("ppo")) == "<ExportedPolicy 24 -> 128 -> 128 -> 12, tanh, trained in 'paper'>"
+
+
 @pytest.mark.parametrize("name", list_policies())
 def test_a_policy_of_the_zoo_is_what_its_card_says(name):
     policy, record = load_policy(name), load_record(name)
