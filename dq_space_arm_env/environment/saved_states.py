@@ -15,14 +15,15 @@ Array = NDArray[Any]
 
 
 class PicklesEpisodes(EzPickle):
-    """Pickles the arguments of an environment, and its running episodes."""
+    """Pickles the arguments of an environment, its specification, and its running episodes."""
 
     def __getstate__(self: Any) -> dict[str, Any]:
         running = self.get_state() if self._begun else None
-        return {**EzPickle.__getstate__(self), "state": running}
+        return {**EzPickle.__getstate__(self), "spec": self.spec, "state": running}
 
     def __setstate__(self: Any, d: dict[str, Any]) -> None:
         EzPickle.__setstate__(self, d)
+        self.spec = d["spec"]
         if d["state"] is not None:
             self.set_state(d["state"])
 

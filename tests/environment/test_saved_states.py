@@ -65,6 +65,16 @@ def check(env, other, *, seed):
         assert_same(fly(again, 2 * LENGTH), expected)
 
 
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_copies_know_their_specification(make):
+    env = make("DQSpaceArm-v0", scene=DRAWN)
+    for again in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        assert again.spec == env.spec
+        assert again.spec.id == "DQSpaceArm-v0"
+    alone = DQSpaceArmEnv(DRAWN)
+    assert copy.deepcopy(alone).spec is alone.spec is None
+
+
 @pytest.mark.sampled
 @pytest.mark.parametrize("name", list_scenes())
 def test_a_single_environment_goes_on(name):
