@@ -80,8 +80,9 @@ def evaluate() -> None:
     """Evaluate each POLICY on the evaluation starts of a scene, beside the expert's optimal costs.
 
     A policy is a file (.npz, .onnx, .zip), the folder of a training run, or a name of the zoo. The first use
-    computes the expert's costs, in minutes, and caches them. Policies that differ only in their training
-    seeds are also aggregated. Exit status 1: the expert had to stop, or the file of a policy is damaged.
+    computes the expert's costs, in minutes, and caches them. Three or more policies that differ only in their
+    training seeds are also aggregated. Exit status 1: the expert had to stop, or the file of a policy is
+    damaged.
     """
 
 

@@ -24,7 +24,7 @@ from agents.evaluation.conditions import CONDITIONS
 from agents.evaluation.evaluating import Advance, evaluate
 from agents.evaluation.expert_costs import EVALUATION_SEEDS
 from agents.evaluation.plan_followers import CONTROLLERS
-from agents.evaluation.training_runs import groups
+from agents.evaluation.training_runs import groups, pairs
 from agents.zoo.finding import as_policy, check_fit, scene_of
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.command_line.policy_sources import statistics_by_model
@@ -95,7 +95,7 @@ def evaluate_policies(
         console.print(evaluation_table(evaluations).for_terminal())
         if together := groups(evaluations):
             console.print(groups_table(together).for_terminal())
-        for sentence in remarks(evaluations):
+        for sentence in (*remarks(evaluations), *pairs(evaluations)):
             console.print(sentence, markup=False)
         if out is not None and together:
             seeds = {"groups": [group_record(group) for group in together], "provenance": provenance()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,17 +37,27 @@ class Group(NamedTuple):
 
 def groups(evaluations: Sequence[Evaluation]) -> list[Group]:
     """Aggregate agents with at least 3 training runs, condition by condition."""
+    found = _by_agent(evaluations)
+    return [_group(condition, runs) for (condition, _), runs in found.items() if len(runs) >= FEWEST_RUNS]
+
+
+def pairs(evaluations: Sequence[Evaluation]) -> Iterator[str]:
+    """Tell of agents with two training runs, which are too few to aggregate."""
+    agents = {agent: runs for (_, agent), runs in _by_agent(evaluations).items() if len(runs) == 2}
+    for runs in agents.values():
+        name = runs[0].metadata.get("agent")
+        yield f"{name}: two training seeds are too few to be aggregated, which takes {FEWEST_RUNS}."
+
+
+def _by_agent(evaluations: Sequence[Evaluation]) -> dict[tuple[str, str], tuple[Evaluation, ...]]:
+    """Evaluations of training runs by condition and agent."""
     found: dict[tuple[str, str], dict[str, Evaluation]] = {}
     for evaluation in evaluations:
         agent = agent_of(evaluation.metadata)
         if agent is not None and seed_of(evaluation.metadata) is not None:
             run = json.dumps(evaluation.metadata["configuration"], sort_keys=True)
             found.setdefault((evaluation.condition, agent), {})[run] = evaluation
-    return [
-        _group(condition, tuple(members.values()))
-        for (condition, _), members in found.items()
-        if len(members) >= FEWEST_RUNS
-    ]
+    return {key: tuple(members.values()) for key, members in found.items()}
 
 
 def _group(condition: str, members: tuple[Evaluation, ...]) -> Group:

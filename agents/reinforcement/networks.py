@@ -114,8 +114,13 @@ def export_policy(
         The policy of raw observations and of the environment's own actions.
 
     Raises:
+        TypeError: If it is no model of Stable-Baselines3.
         ValueError: If the model acts in another way than by plain layers, or its normalization is missing.
     """
+    if not isinstance(model, BaseAlgorithm):
+        raise TypeError(
+            f"model: {model!r}, should be a model of Stable-Baselines3: load a file first, as PPO.load does"
+        )
     statistics = statistics_of(model, normalize)
     modules, squash = _layers(model)
     linear = [module for module in modules if isinstance(module, nn.Linear)]

@@ -36,6 +36,11 @@ def policy_file(name: str, shelf: Path | None = None) -> Path:
     names = list_policies(shelf)
     if name in names:
         return (shelf or SHELF) / f"{name}.npz"
+    if Path(name).suffix == ".npz" or len(Path(name).parts) > 1:
+        there = (
+            f"to load it, ExportedPolicy.load({name!r})" if Path(name).exists() else "there is no such file"
+        )
+        raise ZooError(f"{name}: is a path, should be a name of the zoo; {there}")
     close = did_you_mean(name, names)
     known = f"It has {', '.join(names)}" if names else "It is empty"
     raise ZooError(

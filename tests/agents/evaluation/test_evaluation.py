@@ -344,6 +344,8 @@ def test_the_command_writes_a_table_json_and_every_episode(tmp_path, capsys):
     out = ["--out", str(tmp_path / "out")]
     assert main(["evaluate", "--policy", *policies, *arguments, *out]) == 0
     assert "All training runs of an agent" in capsys.readouterr().out
+    assert main(["evaluate", "--policy", *policies[:2], *arguments]) == 0
+    assert "stub: two training seeds are too few to be aggregated" in capsys.readouterr().out
     records = [json.loads(path.read_text()) for path in sorted((tmp_path / "out").glob("[1-3]-*"))]
     seeds = json.loads((tmp_path / "out" / "seeds-training.json").read_text())
     assert [group["seeds"] for group in seeds["groups"]] == [[0, 1, 2]]

@@ -93,6 +93,11 @@ def test_a_model_that_was_loaded_lacks_its_statistics_until_they_are_given(norma
         export_policy(normalized[0], normalize=statistics)
 
 
+def test_a_file_is_no_model_to_export(normalized):
+    with pytest.raises(TypeError, match=r"should be a model of Stable-Baselines3: load a file first"):
+        export_policy(str(normalized[1]))
+
+
 @pytest.mark.parametrize("kind", [PPO, SAC])
 def test_a_model_of_plain_observations_takes_no_statistics(kind, normalized, small_scene, tmp_path):
     environment = DQSpaceArmVecEnv(2, small_scene)

@@ -26,6 +26,14 @@ def test_the_zoo_fits_into_the_repository():
     assert there == expected
 
 
+def test_a_path_is_told_from_a_name(tmp_path):
+    with pytest.raises(ZooError, match=r"is a path, should be a name of the zoo; there is no such file"):
+        load_policy("results/x/policy.npz")
+    (tmp_path / "policy.npz").touch()
+    with pytest.raises(ZooError, match=r"to load it, ExportedPolicy\.load"):
+        load_policy(str(tmp_path / "policy.npz"))
+
+
 def test_policies_are_shown_in_a_line():
     assert repr(load_policy("ppo")) == "<ExportedPolicy 24 -> 128 -> 128 -> 12, tanh, trained in 'paper'>"
 
