@@ -90,18 +90,22 @@ def train(
 
 def _train_one(checked: AgentConfiguration, out: Path | None, as_json: bool) -> int:
     from agents import training
+    from agents.experiments.training_task import TrainingTask
     from dq_space_arm_env.common.progress import ProgressDisplay
 
     folder = out or training.default_folder(checked)
     check_writable(folder)
     kept = f"run the same command to resume at the last checkpoint in {folder}"
-    with keeping(kept), ProgressDisplay(message_console()) as shown:
-        training.train(checked, folder, report=shown.update)
+    finished = TrainingTask(checked, folder, Path()).is_trained()
+    if not finished:
+        with keeping(kept), ProgressDisplay(message_console()) as shown:
+            training.train(checked, folder, report=shown.update)
     if as_json:
         facts = {"agent": checked.name, "seed": checked.seed, "folder": str(folder)}
         print_document({**facts, "policy": str(folder / "policy.npz")})
     else:
-        table_console().print(f"{folder}: the policy is in policy.npz", markup=False, soft_wrap=True)
+        before = "finished before, and not trained again; " if finished else ""
+        table_console().print(f"{folder}: {before}the policy is in policy.npz", markup=False, soft_wrap=True)
     return SUCCESS
 
 

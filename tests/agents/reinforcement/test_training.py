@@ -447,12 +447,16 @@ def test_a_plain_model_of_stable_baselines3_is_exported_and_evaluated(tmp_path):
     np.testing.assert_allclose(as_policy(tmp_path / "model.zip").act(joined), expected, rtol=0.0, atol=1e-6)
 
 
-def test_the_command_trains_and_names_what_is_wrong(scene_file, tmp_path, capsys):
+def test_the_command_trains_and_names_what_is_wrong(scene_file, tmp_path, capsys, monkeypatch):
     path, out = tmp_path / "ppo.yaml", str(tmp_path / "run")
     content = configuration("PPO", scene_file).model_dump(mode="json", exclude_none=True)
     path.write_text(json.dumps(content))  # JSON is YAML
     assert main(["train", "--config", str(path), "--out", out, "--total-steps", "800"]) == 0
     assert "800 of 800 steps" in capsys.readouterr().err
+    with monkeypatch.context() as patched:
+        patched.setattr("agents.training.train", lambda *_, **__: pytest.fail("trained again"))
+        assert main(["train", "--config", str(path), "--out", out, "--total-steps", "800"]) == 0
+    assert "finished before" in capsys.readouterr().out
     assert main(["train", "pppo", "--out", out]) == 2
     assert "did you mean 'ppo'" in capsys.readouterr().err
 
