@@ -365,6 +365,7 @@ def test_copies_are_drawn_with_a_render_mode():
     assert not np.array_equal(*pictures)
     np.testing.assert_array_equal(pictures, venv.vector_env.render())
     assert venv.render().shape == (96, 64, 3)  # Stable-Baselines3 tiles them
+    assert venv.metadata["render_fps"] == venv.vector_env.metadata["render_fps"]
 
 
 @pytest.mark.parametrize("duplicate", [lambda venv: pickle.loads(pickle.dumps(venv)), copy.deepcopy])
