@@ -50,7 +50,7 @@ def reproduce(
     loaded = load_scene(scene)
     if integrator is not None:
         loaded = loaded.replace(simulation={"integrator": integrator})
-    folder = out or reproduction.results_folder(loaded)
+    folder = out or reproduction.results_folder(scene)
     check_writable(folder)
     if readme_picture is not None:
         check_writable_file(readme_picture)
