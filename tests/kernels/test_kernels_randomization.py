@@ -171,7 +171,7 @@ def test_a_drawn_target_is_turned_in_its_axes_and_moved_in_inertial_ones():
     [
         ({"base_mass": 1.0}, r"spread.base_mass = 1.*must be a fraction: 0 or greater, and less than 1"),
         ({"payload_mass": 0.1}, "spread.payload_mass = 0.1.*must be 0: the scene has no payload"),
-        ({"observed": True}, "spread.observed = True: must be false: neither masses nor inertias are drawn"),
+        ({"observed": True}, "spread.observed = true: must be false: neither masses nor inertias are drawn"),
         ({"target_position": -1}, "spread.target_position = -1.*0 or greater"),
     ],
 )

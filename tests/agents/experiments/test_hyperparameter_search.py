@@ -208,7 +208,7 @@ def test_more_successes_win_and_a_tie_goes_to_the_lower_cost() -> None:
             "algorithm.copies: the value 0.5 is not possible",
         ),
         ("{algorithm.copies: {low: 8, high: 8}}", r"high = 8: must be larger than low, which is 8"),
-        ("{algorithm.copies: {low: 8}}", "high = None: is missing: give low and high, or choices"),
+        ("{algorithm.copies: {low: 8}}", "high = null: is missing: give low and high, or choices"),
         ("{algorithm.copies: {low: eight, high: 9}}", r"low = 'eight': must be a finite number"),
         (
             "{algorithm.copies: {low: 0, high: 9, log: true}}",

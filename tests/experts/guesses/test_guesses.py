@@ -31,6 +31,7 @@ from experts.problems.arm_problem import ArmProblem
 from scripts.benchmarks.solvers.runs import roll_out
 
 ELSEWHERE = np.array([0.6, 0.8, -0.2, 0.7])  # another start of the unicycle
+SHIFT = np.array([0.0, 0.0, 0.3, 0.3])
 
 
 def names(solution):
@@ -149,7 +150,7 @@ def test_an_arm_needs_no_library():
 def test_a_solution_depends_on_nothing_but_its_start(unicycle):
     solver = GuidedDDP(unicycle)
     first = solver.solve(ELSEWHERE)
-    solver.solve(ELSEWHERE + 0.3)
+    solver.solve(ELSEWHERE + SHIFT)
     for other in (solver.solve(ELSEWHERE), GuidedDDP(unicycle).solve(ELSEWHERE)):
         np.testing.assert_array_equal(other.states, first.states)
         np.testing.assert_array_equal(other.feedback_gains, first.feedback_gains)
@@ -164,14 +165,14 @@ def test_converged_solutions_are_remembered_up_to_a_number(unicycle):
     again = solver.solve(ELSEWHERE)
     assert (again.metadata["guess"], again.iterations) == ("policy 1", 0)
     assert len(solver.library) == 2  # nothing new in what took no iteration
-    second = solver.solve(ELSEWHERE + 0.3)
-    assert solver.solve(ELSEWHERE - 0.3).converged
+    second = solver.solve(ELSEWHERE + SHIFT)
+    assert solver.solve(ELSEWHERE - SHIFT).converged
     assert solver.library[1:] == (first, second)
 
 
 @pytest.mark.parametrize("attempts", [1, 2, 3, 4])
 def test_guesses_are_tried_until_one_converges_and_the_cheapest_is_kept(unicycle, attempts):
-    library = [BoxDDP(unicycle).solve(), BoxDDP(unicycle).solve(ELSEWHERE + 0.3)]
+    library = [BoxDDP(unicycle).solve(), BoxDDP(unicycle).solve(ELSEWHERE + SHIFT)]
     solver = GuidedDDP(unicycle, library=library, attempts=attempts, max_iterations=1)
     solution = solver.solve(ELSEWHERE)
     expected = ["policy 1", "policy 0", "zero controls"] if attempts > 2 else ["policy 1", "zero controls"]
