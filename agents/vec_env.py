@@ -74,7 +74,8 @@ class SB3VecEnv(VecEnv):
         self._repeater = next((env for env in reversed(self._chain) if isinstance(env, RepeatAction)), None)
         space = _in_single_precision(vector_env.single_observation_space)
         VecEnv.__init__(self, vector_env.num_envs, space, _noted_actions(self._chain))
-        self.metadata = {**vector_env.metadata, **self.metadata}  # recorders read how fast pictures follow
+        # Recorders read how fast pictures follow.
+        self.metadata = {**vector_env.metadata, **vars(self)["metadata"]}
         self._actions: NDArray[Any] | None = None
         self._step_infos = step_infos
         self._start_time = time.time()
