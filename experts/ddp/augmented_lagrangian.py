@@ -69,10 +69,10 @@ PATIENCE = 8
 """Updates without progress at the largest penalty after which a problem counts as infeasible."""
 PROGRESS = 0.9
 """Largest share of the smallest violation so far that counts as progress."""
-
-
-NOTABLE = 0.1  # violation, relative to the tolerance, that messages name besides the worst
+NOTABLE = 0.1
+"""Violation, relative to the tolerance, that messages name besides the worst."""
 MOST_NAMED = 4
+"""Rows that they name."""
 
 
 class ConstraintReport(NamedTuple):

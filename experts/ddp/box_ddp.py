@@ -350,8 +350,8 @@ class BoxDDP:
         lower, upper = stage_bounds(problem)
         state = np.asarray(problem.initial_state if x0 is None else x0, dtype=np.float64)
         check_array("x0", state, (problem.n_states,))
-        if x0 is not None and problem.has_retraction:
-            self._multiple_shooting().projected("x0", state[None].copy())
+        if x0 is not None and (check_state := getattr(problem, "check_state", None)) is not None:
+            check_state("x0", state)
         shape = (problem.horizon, problem.n_controls)
         if u_init is None:
             return state, np.clip(0.0, lower, upper)

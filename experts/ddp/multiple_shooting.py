@@ -115,11 +115,6 @@ class MultipleShooting:
         problem = self.work.problem
         given = np.ascontiguousarray(x_init, dtype=np.float64)
         check_array("x_init", given, (problem.horizon + 1, problem.n_states))
-        return self.projected("x_init", given)
-
-    def projected(self, name: str, given: FloatArray) -> FloatArray:
-        """Project states, shape (M, n_x), onto the manifold of states; ValueError if they are far from it."""
-        problem = self.work.problem
         states, still = given, np.zeros((len(given), problem.n_tangent))
         for _ in range(3):  # each one squares the error
             result = np.zeros_like(states)
@@ -129,9 +124,8 @@ class MultipleShooting:
         off = ~(np.abs(states - given) <= LARGEST_PROJECTION)
         if off.any():
             k, i = (int(index[0]) for index in np.nonzero(off))
-            row = name if len(given) == 1 else f"{name}[{k}]"
             raise ValueError(
-                f"{row} is no state: its entry {i}, {given[k, i]}, is more than {LARGEST_PROJECTION} "
+                f"x_init[{k}] is no state: its entry {i}, {given[k, i]}, is more than {LARGEST_PROJECTION} "
                 "off the valid ones; a pose must be a unit dual quaternion"
             )
         return states

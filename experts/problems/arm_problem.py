@@ -26,6 +26,7 @@ from dq_space_arm_env.scene.constraints import ControlRate
 from dq_space_arm_env.scene.layout import StateLayout
 from dq_space_arm_env.scene.parameters import CATCH, PHASE
 from dq_space_arm_env.scene.pose import PLANAR_POSE, PLANAR_TWIST
+from dq_space_arm_env.scene.start import unit_quaternions
 from experts.problems.shooting_problem import (
     FloatArray,
     Kernel,
@@ -36,6 +37,9 @@ from experts.problems.shooting_problem import (
     check_problem,
 )
 from experts.problems.stage_constraints import StageConstraints
+
+NO_STATE = 1e-3
+"""How far a given start may be from unit quaternions, as `multiple_shooting.LARGEST_PROJECTION`."""
 
 
 class ArmProblem:
@@ -240,6 +244,21 @@ class ArmProblem:
     def carried(self, states: FloatArray, parameters: FloatArray) -> FloatArray | None:
         """See `carried_along`, with the present parameters."""
         return carried_along(self.kernels.layout, states, parameters, self.parameters.rows)
+
+    def check_state(self, name: str, state: FloatArray) -> None:
+        """Raise ValueError if poses and rotations of a state, shape (n_x,), are far from unit ones."""
+        layout = self.kernels.layout
+        pose = state[layout.state.pose]
+        real, dual = np.split(pose, 2)
+        units = [real, *(state[where] for where in unit_quaternions(self.scene))]
+        overlap = 0.0 if layout.planar else float(real @ dual) / (1.0 + float(np.linalg.norm(dual)))
+        lengths = [float(np.linalg.norm(unit)) for unit in units]
+        if max(abs(overlap), *(abs(length - 1.0) for length in lengths)) > NO_STATE:
+            found = ", ".join(f"{length:.4g}" for length in lengths)
+            raise ValueError(
+                f"{name} is no state: its rotations have the lengths {found}, and q_r . q_d of its pose is "
+                f"{float(real @ dual):.3g}; a pose must be a unit dual quaternion"
+            )
 
     def misses(self, state: FloatArray) -> float:
         """Largest of the tip's errors at a final state, each relative to its tolerance."""
