@@ -468,7 +468,7 @@ def test_a_relative_velocity_without_weights_is_not_computed() -> None:
     ):
         assert compile_scene(follows).operation_count(program) == compile_scene(free).operation_count(program)
     assert "base_velocity_relative" not in free.to_yaml()
-    with pytest.raises(SceneError, match="base_velocity_relative = True: must be false: the target has no"):
+    with pytest.raises(SceneError, match="base_velocity_relative = true: must be false: the target has no"):
         load_scene("paper").replace({"target.base_velocity_relative": True})
 
 
