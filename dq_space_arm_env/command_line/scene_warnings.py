@@ -14,7 +14,11 @@ from dq_space_arm_env.interoperability.exporting import joint_limits
 from dq_space_arm_env.interoperability.swing_efforts import swing_efforts
 from dq_space_arm_env.scene import Link, Scene, StateLayout
 from dq_space_arm_env.scene.bodies import freedoms
+from dq_space_arm_env.scene.constraint_rows import path_rows
+from dq_space_arm_env.scene.parameters import parameters
 from dq_space_arm_env.scene.path import shown_target
+from dq_space_arm_env.task.constraint_residuals import state_residuals
+from dq_space_arm_env.task.equations import SceneEquations
 
 _FAR = 50.0  # m, between a joint and the next: no arm in space is as long
 _ROUNDS = 4.0 * math.pi  # rad, of angles and their limits
@@ -131,15 +135,17 @@ def _several(where: str, found: list[tuple[float, str, float]]) -> str:
 
 
 def _start(scene: Scene) -> Iterator[str]:
-    """A start beyond the limits of the joints."""
-    coordinates = iter(scene.initial_state.joint_angles or [0.0] * len(freedoms(scene.links)))
-    for link, (lower, upper, _) in zip(scene.links, joint_limits(scene), strict=True):
-        angles = [next(coordinates) for _ in range(link.freedoms)]
-        if len(angles) == 1 and not lower <= angles[0] <= upper:
-            yield (
-                f"initial_state.joint_angles: {link.name!r} starts at {angles[0]:g} {link.unit}, beyond its "
-                f"limits of {lower:g} to {upper:g}"
-            )
+    """A start that violates constraints."""
+    equations = SceneEquations.of(scene, [number.nominal for number in parameters(scene)])
+    x = StateLayout.of(scene).initial_state.tolist()
+    residuals = state_residuals(equations, equations.base_pose(x), equations.y(x))
+    rows = [row for row in path_rows(scene) if not row.has_input]
+    violated = [
+        (repr(row.name), f"violated by {float(c):.3g}{'' if row.unit == '1' else f' {row.unit}'}")
+        for row, c in zip(rows, residuals, strict=True)
+        if float(c) > row.tolerance
+    ]
+    yield from (f"initial_state: constraint {sentence}" for sentence in _together(violated))
 
 
 def _times(scene: Scene) -> Iterator[str]:

@@ -64,7 +64,7 @@ def _plan(start: Start, console: Console) -> Solution:
     from experts.ddp.solution import uninterrupted
     from experts.report import SolveProgress
 
-    with SolveProgress(console) as progress:
+    with SolveProgress(console, start.scene) as progress:
         solver = GuidedDDP(start.scene)
         found = solver.solve(start.state, callback=progress.update, parameters=start.parameters)
         return uninterrupted(found)

@@ -84,7 +84,7 @@ def solve(
     """Solve a scene."""
     limits: dict[str, Any] = {} if max_iterations is None else {"max_iterations": max_iterations}
     began = perf_counter()
-    with SolveProgress(console) as progress:
+    with SolveProgress(console, scene) as progress:
         begun = begin(scene, seed, start)
         solver: BoxDDP | GuidedDDP = GuidedDDP(scene, **limits) if guided else BoxDDP(scene, **limits)
         before = None

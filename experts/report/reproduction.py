@@ -48,7 +48,7 @@ def run(
         raise ValueError('figures need matplotlib: pip install "dq-space-arm[plots]", or give --no-figures')
     console = table_console(stderr=as_json)
     folder.mkdir(parents=True, exist_ok=True)
-    with SolveProgress(console) as progress:
+    with SolveProgress(console, scene) as progress:
         maneuver = run_maneuver(scene, max_iterations, progress.start, progress.update)
     try:
         files = _save(maneuver, folder)

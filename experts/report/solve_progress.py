@@ -6,6 +6,7 @@ from typing import Self
 
 from rich.console import Console
 
+from dq_space_arm_env import Scene
 from dq_space_arm_env.common.progress import ProgressDisplay
 from experts.ddp.solution import IterationRecord
 
@@ -15,7 +16,8 @@ LINES_EVERY = 10  # iterations, without a terminal
 class SolveProgress:
     """Shows the iterations of a solve; use it as a context, and `update` as the solver's callback."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, scene: Scene) -> None:
+        self._minimized = "J + penalties" if scene.constraints else "J"
         self._display, self._started = ProgressDisplay(console, bar=False), perf_counter()
         self._every = 1 if console.is_terminal else LINES_EVERY
 
@@ -39,7 +41,7 @@ class SolveProgress:
             return
         step = f"step {record.alpha:<6.3g}" if record.alpha > 0.0 else "no step    "
         self._display.show(
-            f"iteration {record.iteration:3d}   J {record.cost:<10.8g}   {step}   "
+            f"iteration {record.iteration:3d}   {self._minimized} {record.cost:<10.8g}   {step}   "
             f"damping {record.regularization:<7.2g}   {perf_counter() - self._started:5.2f} s",
             now=True,
         )

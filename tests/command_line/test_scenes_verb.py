@@ -151,6 +151,14 @@ def test_shipped_scenes_come_without_warnings_but_for_light_hands() -> None:
 MANY = {"name": "l", "kind": "joint_limits", "lower": -170, "upper": [170, 0.5, 1]}
 
 
+NEAR = {
+    "name": "ball",
+    "kind": "distance",
+    "bodies": [{"frame": "base", "to": [0.75, 0, 0], "radius": 0.05}],
+    "obstacles": [{"frame": "inertial", "position": [0.5, 0, 0], "radius": 0.1}],
+}
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -184,7 +192,11 @@ MANY = {"name": "l", "kind": "joint_limits", "lower": -170, "upper": [170, 0.5, 
         ({"links.0.torque_limit": 0.01}, "torque limits: 0.01 N m of 'link 1', 0.00[0-9]+ of what .* crawl"),
         (
             {"constraints": [{"name": "l", "kind": "joint_limits", "lower": 0.0}]},
-            "initial_state.joint_angles: 'link 1' starts at -0.6 rad, beyond its limits of 0 to inf",
+            "initial_state: constraint 'l: link 1 lower': violated by 0.6 rad Likewise 'l: link 3 lower'$",
+        ),
+        (
+            {"constraints": [NEAR]},
+            "initial_state: constraint 'ball: base 0 to inertial 0': violated by 0.15 m$",
         ),
         (
             {"actuators.base_force": None, "target.pose.position": [9, 0, 0]},
