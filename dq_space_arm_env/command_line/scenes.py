@@ -184,11 +184,10 @@ def _write(path: Path, text: str) -> None:
     epilog="""\b
         Examples:
           dq-space-arm scenes import robot.urdf --tip hand  # robot.yaml
-          dq-space-arm scenes import arm.urdf --tip tool0 --spacecraft-mass 80 --spacecraft-inertia 8 8 6
           dq-space-arm scenes import robot.urdf             # which links there are
-          dq-space-arm scenes import panda.urdf --tip panda_hand --lock-branches --out free-panda.yaml
-          dq-space-arm scenes import arm.urdf --tip tool0 --spacecraft-mass 80 --spacecraft-inertia 8 8 6 \
-            --mount 0 0 0.4 --wheels pyramid --replay         # on the bus, first maneuver in the browser
+          dq-space-arm scenes import panda.urdf --tip panda_hand --lock-branches
+          dq-space-arm scenes import a.urdf --tip tool --spacecraft-mass 80 --spacecraft-inertia 8 8 6
+          dq-space-arm scenes import a.urdf --tip tool --wheels pyramid --replay
     """,
 )
 @click.argument("robot", type=click.Path())

@@ -76,7 +76,7 @@ def refuse(
             "it at its initial angles, which changes no acceleration but holds the tip"
         )
     if scene.tip_wrench is not None:
-        problems.append("it has no constant wrench at the tip: leave it out with replace(tip_wrench=None)")
+        problems.append("it has no constant wrench at the tip: set tip_wrench to null")
     stiff = [link.name for link in scene.links if link.stiffness]
     if springs and stiff:
         problems.append(f"it has no joint springs, and link {stiff[0]!r} has one: set its stiffness to 0")
@@ -89,11 +89,11 @@ def refuse(
     if spherical and balls:
         problems.append(f"it has no spherical joints, and link {balls[0]!r} has one")
     if scene.actuators.wheels is not None:
-        problems.append("it has no reaction wheels: leave them out with replace({'actuators.wheels': None})")
+        problems.append("it has no reaction wheels: set actuators.wheels to null")
     if scene.actuators.tank is not None:
-        problems.append("it has no tank that empties: leave it out with replace({'actuators.tank': None})")
+        problems.append("it has no tank that empties: set actuators.tank to null")
     if phases_change_masses(scene):
-        problems.append("its masses stay, and phases change some: leave them out with replace(phases=())")
+        problems.append("its masses stay, and phases change some: set phases to []")
     geared = [link.name for link in scene.links if link.motor is not None and link.motor.inertia]
     if rotors and geared and not any(link.is_elastic for link in scene.links):
         problems.append(f"it has no rotors, and link {geared[0]!r} has one: set its motor's inertia to 0")

@@ -302,9 +302,9 @@ def test_a_link_may_be_called_base():
 @pytest.mark.parametrize(
     ("name", "wrist", "sentence"),
     [
-        ("release", "fixed", r"its masses stay, and phases change some: leave them out with replace\(phases"),
+        ("release", "fixed", r"its masses stay, and phases change some: set phases to \[\]"),
         ("paper", "refuse", r"written as MJCF:\n  - the wrist has joints without mass.*wrist='fixed'"),
-        ("tip-load", "fixed", r"no constant wrench at the tip: leave it out with replace\(tip_wrench"),
+        ("tip-load", "fixed", r"no constant wrench at the tip: set tip_wrench to null"),
         ("paper", "free", "wrist: 'free', it must be 'refuse' or 'fixed'"),
     ],
 )
