@@ -126,7 +126,7 @@ def _draw_profiles(axes: Axes, comparison: Comparison, looks: Looks) -> None:
     top = max(100.0, float(np.percentile(known, 99.0))) if known.size else 100.0
     thresholds = np.geomspace(FLOOR, top, _THRESHOLDS)
     for _, members in comparison.entrants(condition):
-        shares = performance_profile([row.evaluation.cost_gaps for row in members], thresholds / 100.0)
+        shares = performance_profile([row.evaluation.valid_cost_gaps for row in members], thresholds / 100.0)
         if shares:
             value, low, high = 100.0 * np.array(shares).T
             color = looks[members[0].name]["color"]

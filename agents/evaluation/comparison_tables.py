@@ -113,10 +113,10 @@ def comparison_tables(comparison: Comparison) -> list[TextTable]:
 
 
 def profile_rows(comparison: Comparison, condition: str) -> list[Row]:
-    """Shares of flights within cost gaps, with their intervals, of all that have known gaps."""
+    """Shares of valid flights within cost gaps, with their intervals, of all that have known gaps."""
     rows: list[Row] = []
     for name, members in comparison.entrants(condition):
-        shares = performance_profile([row.evaluation.cost_gaps for row in members], PROFILE)
+        shares = performance_profile([row.evaluation.valid_cost_gaps for row in members], PROFILE)
         if shares:
             found = [list(share) for share in shares]
             rows.append({"condition": condition, "policy": name, "cost_gaps": list(PROFILE), "shares": found})

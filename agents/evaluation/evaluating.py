@@ -91,6 +91,12 @@ class Evaluation:
             return np.asarray(self.flights.cost / self.optimal.cost - 1.0)
 
     @cached_property
+    def valid_cost_gaps(self) -> NDArray[np.float64]:
+        """Cost gaps, but inf where a flight misses the target or violates a constraint; NaN where unknown."""
+        valid = self.flights.is_success & ~(self.flights.constraint_violations > 0.0)
+        return np.where(valid | np.isnan(self.cost_gaps), self.cost_gaps, np.inf)
+
+    @cached_property
     def median_cost_gap(self) -> Interval:
         """Median of the known cost gaps, with a bootstrap interval."""
         return bootstrap_interval(self._known_gaps, lambda gaps: float(np.median(gaps)))

@@ -64,9 +64,7 @@ class Score:
 
     def within(self, gaps: ArrayLike) -> list[Interval]:
         """Shares of the flights that reach the target within cost gaps and violate nothing."""
-        valid = np.array([row.evaluation.flights.is_success for row in self.rows]) & ~self._violates
-        found = np.array([row.evaluation.cost_gaps for row in self.rows])
-        return performance_profile(list(np.where(valid | np.isnan(found), found, np.inf)), gaps)
+        return performance_profile([row.evaluation.valid_cost_gaps for row in self.rows], gaps)
 
     def solves(self, limits: Limits) -> bool:
         """Whether the entrant keeps to the limits of the suite; estimates count, not their intervals."""

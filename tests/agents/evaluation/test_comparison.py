@@ -183,11 +183,11 @@ def test_agents_meet_all_others_flight_by_flight(comparison):
     assert found[1]["probability"][0] == pytest.approx(np.mean(np.array(stubs) < gains))
     blind, *_, stub = profile_rows(comparison, "training")
     assert blind["shares"][0][0] == 1.0  # plans cost the optimum
-    gaps = np.array(
-        [row.evaluation.cost_gaps for row in comparison.under("training") if row.facts["is_agent"]]
-    )
-    known = gaps[:, ~np.isnan(gaps).any(axis=0)]
-    assert [share[0] for share in stub["shares"]] == [np.mean(known <= gap) for gap in stub["cost_gaps"]]
+    flown = [row.evaluation for row in comparison.under("training") if row.facts["is_agent"]]
+    gaps = np.array([each.cost_gaps for each in flown])
+    known, reached = ~np.isnan(gaps).any(axis=0), np.array([each.flights.is_success for each in flown])
+    shares = [np.mean((reached & (gaps <= gap))[:, known]) for gap in stub["cost_gaps"]]
+    assert [share[0] for share in stub["shares"]] == shares
 
 
 def test_curves_are_relative_to_the_optima_of_their_own_starts(comparison, counting, quick):
