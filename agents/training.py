@@ -15,6 +15,7 @@ from agents.configuration import (
 )
 from agents.configuration.gradients import GradientConfiguration
 from agents.configuration.residual import ResidualConfiguration
+from dq_space_arm_env import load_scene
 from dq_space_arm_env.common.progress import Advance
 
 if TYPE_CHECKING:
@@ -60,6 +61,22 @@ def train(
 
     with reserved(folder):
         return run()
+
+
+def is_trained(configuration: AgentConfiguration, folder: Path) -> bool:
+    """Whether a folder holds the policy with which the training of a configuration ends."""
+    from agents.policies import PolicyFileError
+    from agents.policies.chunking import load_exported
+    from agents.run_folder import POLICY
+
+    try:
+        kept = load_exported(folder / POLICY).metadata
+        there = load_configuration(kept["configuration"]).resolved()
+        scene_hash = load_scene(configuration.scene).content_hash()
+    except (PolicyFileError, KeyError, TypeError, ValueError):
+        return False
+    same = there.model_copy(update={"description": configuration.description})
+    return same == configuration.resolved() and kept.get("scene_hash") == scene_hash
 
 
 def _run(

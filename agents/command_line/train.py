@@ -90,13 +90,12 @@ def train(
 
 def _train_one(checked: AgentConfiguration, out: Path | None, as_json: bool) -> int:
     from agents import training
-    from agents.experiments.training_task import TrainingTask
     from dq_space_arm_env.common.progress import ProgressDisplay
 
     folder = out or training.default_folder(checked)
     check_writable(folder)
     kept = f"run the same command to resume at the last checkpoint in {folder}"
-    finished = TrainingTask(checked, folder, Path()).is_trained()
+    finished = training.is_trained(checked, folder)
     if not finished:
         with keeping(kept), ProgressDisplay(message_console()) as shown:
             training.train(checked, folder, report=shown.update)

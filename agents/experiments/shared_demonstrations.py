@@ -13,6 +13,7 @@ from agents.configuration.residual import ResidualConfiguration
 from agents.demonstrations import prepare_demonstrations
 from agents.experiments.training_task import TrainingTask
 from agents.run_folder import DEMONSTRATIONS
+from agents.training import is_trained
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.common.files import temporary_name
 from dq_space_arm_env.common.progress import Advance
@@ -37,7 +38,7 @@ class SharedDemonstrations:
             return task
         scene = load_scene(task.configuration.scene)
         key = json.dumps([scene.content_hash(), source.model_dump(mode="json")])
-        if task.is_trained():
+        if is_trained(task.configuration, task.folder):
             if (place / _MANIFEST).is_file():
                 self._made.setdefault(key, place)
         elif key not in self._made:

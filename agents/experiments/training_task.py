@@ -12,12 +12,10 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, NamedTuple
 
-from agents.configuration import AgentConfiguration, load_configuration
+from agents.configuration import AgentConfiguration
 from agents.evaluation.planned_flights import agents_source
-from agents.policies import PolicyFileError
-from agents.policies.chunking import load_exported
-from agents.run_folder import CONFIGURATION, EVALUATIONS, LOCK, POLICY, DivergedError, RunFolderError, learned
-from agents.training import train
+from agents.run_folder import CONFIGURATION, EVALUATIONS, LOCK, DivergedError, RunFolderError, learned
+from agents.training import is_trained, train
 from dq_space_arm_env import DQSpaceArmVectorEnv, SceneError, load_scene
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mapping
 from dq_space_arm_env.common.files import write_atomically
@@ -72,7 +70,7 @@ class TrainingTask(NamedTuple):
                     "cluster need a file system that all of its machines share"
                 )
             with chdir(self.place):
-                if not self.is_trained():
+                if not is_trained(self.configuration, self.folder):
                     self._train()
             if not learned(self.folder):
                 raise RunFolderError(f"{self.folder / EVALUATIONS} is missing: train in another folder")
@@ -99,17 +97,6 @@ class TrainingTask(NamedTuple):
             with suppress(PackageNotFoundError):
                 found["versions"][package] = version(package)
         return {**found, "agents": agents_source((".",))}
-
-    def is_trained(self) -> bool:
-        """Whether the folder holds the policy that this training would end with."""
-        try:
-            kept = load_exported(self.folder / POLICY).metadata
-            there = load_configuration(kept["configuration"]).resolved()
-            scene_hash = load_scene(self.configuration.scene).content_hash()
-        except (PolicyFileError, KeyError, TypeError, ValueError):
-            return False
-        same = there.model_copy(update={"description": self.configuration.description})
-        return same == self.configuration.resolved() and kept.get("scene_hash") == scene_hash
 
     def progress(self) -> Status:
         """How far the training has come, as it was noted."""

@@ -26,6 +26,7 @@ from agents.experiments.shared_demonstrations import SharedDemonstrations
 from agents.experiments.training_task import PROGRESS
 from agents.policies import ExportedPolicy
 from agents.run_folder import DivergedError, learned
+from agents.training import is_trained
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.common import worker_process
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, UNUSABLE
@@ -160,13 +161,13 @@ def test_a_policy_of_another_configuration_is_not_taken_for_this_training(
 ) -> None:
     train_seeds([configuration], 1, tmp_path, executor=SerialExecutor())
     task = training_task(configuration, tmp_path)
-    assert task.is_trained()
-    assert task._replace(configuration=configuration.model_copy(update={"description": "same"})).is_trained()
+    assert is_trained(configuration, task.folder)
+    assert is_trained(configuration.model_copy(update={"description": "same"}), task.folder)
     network = configuration.network.model_copy(update={"hidden": (9,)})
     wider = configuration.model_copy(update={"network": network})
     (task.folder / "evaluations.jsonl").unlink()
     assert "evaluations.jsonl is missing" in task.run()["failure"]
-    assert not task._replace(configuration=wider).is_trained()
+    assert not is_trained(wider, task.folder)
     row = task._replace(configuration=wider).run()
     assert row["outcome"] == "failed"
     assert "was started with another configuration: network.hidden" in row["failure"]
@@ -183,7 +184,7 @@ def test_a_clone_is_trained_once(small_file: Path, tmp_path: Path) -> None:
     task.folder.mkdir()
     row = task.run()
     assert row["outcome"] == "trained", row["failure"]
-    assert task.is_trained()
+    assert is_trained(task.configuration, task.folder)
 
 
 def test_progress_is_that_of_all(configuration: AgentConfiguration, tmp_path: Path) -> None:
