@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import KernelCall
 from dq_space_arm_env.kernels.library import KernelLibrary
+from dq_space_arm_env.scene.parameters import CATCH
 from dq_space_arm_env.scene.start import unit_quaternions
 
 Array = NDArray[Any]
@@ -28,6 +29,7 @@ SMALLEST_FACTOR, LARGEST_FACTOR = 0.2, 10.0
 FINER = 1 / 32
 """Tolerances of the companion of `global_error`, relative to its own."""
 STRETCH = 1.01
+CATCH_NOW = f"{CATCH}.now"
 
 
 class MotionCurve:
@@ -143,6 +145,7 @@ def integrate(
     """See `Kernels.integrate`."""
     start, held = _checked(kernels, x, u)
     parameters = kernels.parameter_rows(p, len(held))
+    _check_smooth(kernels, parameters)
     tolerances = np.array([_positive("rtol", rtol), _positive("atol", atol)], kernels.dtype)
     if not np.isfinite(duration) or duration == 0.0:
         raise ValueError(f"duration: {duration} should be a finite time in s other than zero")
@@ -218,6 +221,19 @@ def _checked(kernels: KernelLibrary, x: ArrayLike, u: ArrayLike) -> tuple[Array,
         if not np.isfinite(array).all():
             raise ValueError(f"{name}: {array[~np.isfinite(array)][0]} is not a finite number")
     return start, held
+
+
+def _check_smooth(kernels: KernelLibrary, parameters: Array) -> None:
+    """Refuse what happens from time step to time step, where steps have any length."""
+    if chains := kernels.layout.chains:
+        raise ValueError(
+            f"scene {kernels.scene.name!r}: {chains[0].name} delays or lags by time steps, which adaptive "
+            "steps do not follow: use simulate"
+        )
+    now = kernels.parameters.names.index(CATCH_NOW) if CATCH_NOW in kernels.parameters.names else None
+    if now is not None and parameters[:, now].any():
+        part = int(parameters[:, now].argmax())
+        raise ValueError(f"p: a payload is caught at the end of part {part}, should be 0: use simulate")
 
 
 def _positive(name: str, value: float) -> float:

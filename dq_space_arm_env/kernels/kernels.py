@@ -229,7 +229,8 @@ class Kernels(DerivativeKernels):
             Times, states, numbers of steps, and the state at any time between as a function.
 
         Raises:
-            ValueError: If an argument is not finite or out of range.
+            ValueError: If an argument is not finite or out of range, a control of the scene delays or lags,
+                or parameters say that a payload is caught.
             RuntimeError: If the motion cannot be followed to its end within the tolerances or max_steps.
         """
         from dq_space_arm_env.kernels.adaptive import integrate

@@ -166,6 +166,9 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
             speed = transposed_matrix_vector(rotations.to_matrix(target[:4]), speed)
         twist = (*turning_rate, *speed)
         drawn |= {number.name: twist[index] for number, index in _indexed_velocity(scene)}
+    at_rest = scene.staged.resting[0] if scene.phases else None  # where the first phase has it
+    if at_rest is not None and (motion is not None or not has_target_spread(scene)):
+        target = at_rest
     grasp: Sequence[Scalar] = scene.target.grasp.dual_quaternion
     if has_grasp_spread(scene):
         grasp = spread_out_pose(scene.target.grasp, spread.grasp_rotation, spread.grasp_position)

@@ -44,7 +44,7 @@ from dq_space_arm_env.task.equations import (
     weighted_square,
 )
 from dq_space_arm_env.task.step_report import MEMORY, STATE_LIMIT, has_twist_errors, report_names
-from dq_space_arm_env.task.worst_case import WorstCase
+from dq_space_arm_env.task.worst_case import worst_cost
 
 Scalar = Any
 Scalars = Sequence[Scalar]
@@ -144,7 +144,7 @@ def step(
     # charged, so ending early never pays.
     stage = [*state_terms, before.effort(u), *before.twist_cost_terms(x, u)]
     terminal = [casadi.if_else(terminated, term, 0.0) for term in after.terminal_cost_terms(x_kept)]
-    worst = total([WorstCase(each).cost(x, remaining) for each in _every_phase(before)])
+    worst = worst_cost(before, _every_phase(before), x, remaining)
     reward = -casadi.if_else(finished, total(stage) + total(terminal), worst)
 
     success = casadi.logic_and(finished, is_success(scene, errors))
@@ -235,26 +235,33 @@ def _catch(equations: SceneEquations, x: Scalars, stage: Scalar, held: Scalar) -
 
 def _resting(scene: Scene, stage: Scalar, rest: Scalars) -> list[Scalar]:
     """The rest of the memory where a phase has the target at rest."""
-    resting = scene.staged.resting if scene.phases and moving_numbers(scene) else ()
     found = list(rest)
-    for start, pose in zip(scene.staged.starts if resting else (), resting, strict=True):
-        if pose is not None:
-            still = [*(pose[i] for i in target_entries(scene)), *[0.0] * len(velocity_entries(scene))]
-            found[: len(still)] = [
-                casadi.if_else(stage >= start, a, b) for a, b in zip(still, found, strict=False)
-            ]
+    for index, start in enumerate(scene.staged.starts if scene.phases else ()):
+        still = list(_at_rest(scene, index).values())
+        found[: len(still)] = [
+            casadi.if_else(stage >= start, a, b) for a, b in zip(still, found, strict=False)
+        ]
     return found
 
 
+def _at_rest(scene: Scene, phase: int) -> dict[str, float]:
+    """The numbers of a target that moves in other phases and is at rest in this one; none if it moves."""
+    names, pose = [number.name for number in moving_numbers(scene)], scene.staged.resting[phase]
+    if not names or pose is None:
+        return {}
+    still = [*(pose[i] for i in target_entries(scene)), *[0.0] * len(velocity_entries(scene))]
+    return dict(zip(names, still, strict=True))
+
+
 def _every_phase(equations: SceneEquations) -> list[SceneEquations]:
-    """The equations with the numbers of each phase."""
+    """The equations with the numbers of each phase, and with its target where that is at rest."""
     scene = equations.scene
     if not scene.phases:
         return [equations]
     found = []
     for index in range(len(scene.phases)):
         own = {name: values[index] for name, values in scene.staged.values.items()}
-        given = {**equations.given, **own}
+        given = {**equations.given, **own, **_at_rest(scene, index)}
         found.append(SceneEquations.of(scene, [given[number.name] for number in all_parameters(scene)]))
     return found
 

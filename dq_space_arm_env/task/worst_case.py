@@ -6,12 +6,17 @@ Dampers, friction and burnt propellant only take energy away. The center of mass
 forces give, and the arm reaches no farther from it than when it is stretched out; a tank that empties moves
 that center, and there the base is as fast as its energy allows. A target on a screw keeps its speed; one that
 tumbles keeps its energy, so its rate grows at most by the root of the ratio of its moments of inertia.
+
+Of phases, each is charged for all steps, with the most energy and speed that any of them allows. A catch
+brings the payload's energy, and loses some of it. Where masses change, the base is as fast as the energy
+allows. What a phase adds by raising a mass or a stiffness is not counted.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import casadi
@@ -26,6 +31,8 @@ from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, RigidBody
 from dq_space_arm_env.dynamics.minimal import deflections
 from dq_space_arm_env.scene.motion import Tumbling, Waypoints
 from dq_space_arm_env.scene.path import given_path
+from dq_space_arm_env.scene.phases import phases_change_masses
+from dq_space_arm_env.task.catching import has_catch
 from dq_space_arm_env.task.equations import SceneEquations, body_pose, body_velocity, grasp_pose, total
 
 Scalar = Any
@@ -34,8 +41,24 @@ Scalars = Sequence[Scalar]
 _Z = (0.0, 0.0, 1.0)
 
 
+def worst_cost(now: SceneEquations, phases: Sequence[SceneEquations], x: Scalars, steps: Scalar) -> Scalar:
+    """Bound of the cost of a number of steps from a state, terminal cost included.
+
+    Args:
+        now: The equations of the present stage.
+        phases: Those of every phase, with the target as it is now, or at rest where the phase has it so.
+        x: State, n_x scalars.
+        steps: Number of time steps.
+    """
+    cases = [WorstCase(each) for each in phases]
+    caught = WorstCase(now).payload_speeds() if has_catch(now.scene) else ()
+    found = [case.speeds(x, steps * now.scene.simulation.dt, caught) for case in cases]
+    most = found[0] if len(found) == 1 else [reduce(casadi.fmax, each) for each in zip(*found, strict=True)]
+    return total([case.cost(x, steps, *most) for case in cases])
+
+
 class WorstCase:
-    """Bounds of one scene's motions over the rest of an episode."""
+    """Bounds of one scene's motions over the rest of an episode, or of those of one phase."""
 
     def __init__(self, equations: SceneEquations) -> None:
         self.equations, self.tree = equations, equations.tree
@@ -44,7 +67,6 @@ class WorstCase:
         self.bodies = self.tree.bodies
         self.last = self.bodies[self.tree.tip_body]  # it carries the tip
         self.mass = total([body.mass for body in self.bodies])
-        # Of any point of the arm from the base's center of mass.
         places = [*(link.joint for link in self.tree.links), self.tree.wrist, self.tree.tip]
         places += [frame for _, frame in self.tree.other_tips]
         lengths = [norm(place.position) for place in places if place is not None]
@@ -65,24 +87,37 @@ class WorstCase:
             torques.append(fixed * total([norm(inputs.force), *map(casadi.fabs, sizes)]))
         return total([norm(inputs.force), *map(casadi.fabs, sizes)]), total(torques)
 
-    def cost(self, x: Scalars, steps: Scalar) -> Scalar:
-        """Bound of the cost of a number of steps from a state, terminal cost included."""
+    def payload_speeds(self) -> tuple[Scalar, Scalar]:
+        """Bounds of angular velocity and velocity of a payload that moves with the target."""
+        payload, (turning, moving) = self.equations.scene.payload, self._target_speeds()
+        return turning, moving + turning * math.hypot(*payload.center_of_mass)
+
+    def speeds(self, x: Scalars, duration: Scalar, caught: Scalars = ()) -> tuple[Scalar, Scalar]:
+        """Bounds of s, and of the base's speed, some time after a state; `caught` is what may be caught."""
+        motion = self.equations.field.motion(self.equations.y(x))
+        turning = norm(motion.angular) + total(_parts(self.tree, motion.joint_rates, 0))
+        sliding = total(_parts(self.tree, motion.joint_rates, 1))
+        moving = norm(motion.linear) + self._reach(motion) * turning + sliding
+        if caught:  # as if the arm moved so fast besides
+            turning, moving = turning + caught[0], moving + caught[1]
+        speed = self._root_energy(motion, moving, turning) + duration * self._growth()
+        if self.tree.tank is not None or phases_change_masses(self.equations.scene):
+            return speed, speed / casadi.sqrt(self.tree.base.mass)
+        wrench = self.tree.tip_wrench or (0.0,) * 6
+        return speed, moving + duration * (self.force + norm(wrench[:3])) / self.mass
+
+    def _reach(self, motion: Motion) -> Scalar:
+        """Of any point of the arm from the base's center of mass."""
+        return self.reach + total(_parts(self.tree, motion.joint_angles, 1))
+
+    def cost(self, x: Scalars, steps: Scalar, speed: Scalar, drift: Scalar) -> Scalar:
+        """Bound of the cost of a number of steps from a state, terminal cost included, at such speeds."""
         equations, base = self.equations, self.tree.base
         duration = steps * equations.scene.simulation.dt
-        motion = equations.field.motion(equations.y(x))
-        turning = norm(motion.angular) + total(_parts(self.tree, motion.joint_rates, 0))
-        reach = self.reach + total(_parts(self.tree, motion.joint_angles, 1))
-        sliding = total(_parts(self.tree, motion.joint_rates, 1))
-        moving = norm(motion.linear) + reach * turning + sliding
-        speed = self._root_energy(motion, moving, turning)
-        speed = speed + duration * self._growth()
+        reach = self._reach(equations.field.motion(equations.y(x)))
         if any(link.screw.slide for link in self.tree.links):  # bodies move apart: the tip's by so much
             fastest = total([speed / casadi.sqrt(body.mass) for body in (base, self.last)])
             reach = reach + duration * fastest
-        wrench = self.tree.tip_wrench or (0.0,) * 6
-        drift = moving + duration * (self.force + norm(wrench[:3])) / self.mass
-        if self.tree.tank is not None:
-            drift = speed / casadi.sqrt(base.mass)
         # The dual part of a pose has half the length of its position; unit quaternions are at most 2 apart.
         gaps = 2.0, 0.5 * (self._apart(x, duration) + duration * drift + 2.0 * reach)
         references = equations.scene.target.base_velocity

@@ -152,3 +152,17 @@ def test_the_global_error_is_estimated(arm):
         assert np.abs(estimate - true).max() < 0.2 * np.abs(true).max()
     with pytest.raises(ValueError, match="rtol"):
         kernels.integrate(x, u, 0.1, rtol=1e-15, atol=1e-15).global_error()
+
+
+@pytest.mark.slow
+def test_what_happens_step_by_step_is_refused(arm):
+    late = compile_scene(arm[0].scene.replace({"actuators.base_torque.delay": 2}))
+    with pytest.raises(ValueError, match=r"base torque x delays or lags by time steps, .*: use simulate"):
+        late.integrate(late.layout.initial_state, np.zeros(late.n_u), 1.0)
+    catching = compile_scene("capture-and-detumble")
+    rows = catching.stage_parameters()
+    (stage,) = np.flatnonzero(rows[:, catching.parameters.names.index("catch.now")])
+    x, u = catching.layout.initial_state, np.zeros((stage + 1, catching.n_u))
+    with pytest.raises(ValueError, match=f"p: a payload is caught at the end of part {stage}, should be 0"):
+        catching.integrate(x, u, 1.0, p=rows[: stage + 1])
+    assert catching.integrate(x, u[:stage], 0.1, p=rows[:stage]).t[-1] == 0.1

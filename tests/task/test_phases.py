@@ -198,6 +198,26 @@ def test_derivatives_across_a_catch() -> None:
         assert np.abs(found[:, column] - expected).max() < 1e-11
 
 
+def test_a_start_has_the_sign_of_the_first_phases_target() -> None:
+    """The pose of the scene itself, half a turn away, is that of the second phase."""
+    turned = {"rotation": {"axis": [0, 0, 1], "angle": -120}}
+    first = {"name": "first", "steps": 10, "changes": {"target.pose.rotation": turned["rotation"]}}
+    scene = load_scene("planar").replace(
+        {
+            "initial_state.base_pose.rotation": {"axis": [0, 0, 1], "angle": 100},
+            "initial_state.joint_angles": [0, 0, 0],
+            "target.pose.rotation": [1, 0, 0, 0],
+            "simulation.steps": 20,
+            "phases": [first, {"name": "second", "steps": 10}],
+        }
+    )
+    env = gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped
+    drawn, _ = env.reset(seed=0)
+    nominal, _ = env.reset(options={"nominal": True})
+    assert drawn[0] >= 0.0
+    assert nominal[0] >= 0.0
+
+
 def test_a_catch_outside_the_tolerances_fails() -> None:
     scene = shortened("capture-and-detumble").replace({"phases.2.catch.position_error": 0.01})
     env = gymnasium.make("DQSpaceArm-v0", scene=scene).unwrapped

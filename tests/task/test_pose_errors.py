@@ -17,7 +17,7 @@ from dq_space_arm_env.kernels.programs.scene_programs import ScenePrograms
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.task import episode
 from dq_space_arm_env.task.step_report import observation_entries
-from dq_space_arm_env.task.worst_case import WorstCase
+from dq_space_arm_env.task.worst_case import worst_cost
 from experts.problems.paper_problem import PaperProblem
 
 interpreter = pytest.importorskip("graph_interpreter")
@@ -183,7 +183,7 @@ def test_a_common_rigid_motion_changes_nothing(name: str) -> None:
     charge = trace(
         "charge",
         {"x": layout.n_x},
-        lambda x: {"most": [WorstCase(equations).cost(x, 10.0)]},
+        lambda x: {"most": [worst_cost(equations, [equations], x, 10.0)]},
         parameters=equations.field.parameters,
     )
     bounds = [

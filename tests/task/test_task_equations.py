@@ -16,7 +16,7 @@ from dq_space_arm_env.scene.start import episode_scene, number_of_draws
 from dq_space_arm_env.task import episode
 from dq_space_arm_env.task.equations import SceneEquations
 from dq_space_arm_env.task.step_report import FLAGS, REPORT, n_observations, observation_entries
-from dq_space_arm_env.task.worst_case import WorstCase
+from dq_space_arm_env.task.worst_case import worst_cost
 
 interpreter = pytest.importorskip("graph_interpreter")
 
@@ -141,7 +141,7 @@ def test_a_step_to_what_is_no_state_stays_and_pays_for_all_that_is_left(
     given = {"x": x, "x_next": x_next, "u": u, "memory": [taken, *before]}
     done = run(partial(episode.step, equations), **given)
     terminal = state_costs(equations, x, terminal=True)
-    reward = -float(casadi.DM(WorstCase(equations).cost(x.tolist(), STEPS - taken)))
+    reward = -float(casadi.DM(worst_cost(equations, [equations], x.tolist(), STEPS - taken)))
     assert reward < -(STEPS - taken) * (sum(before) + effort) - sum(terminal)
     np.testing.assert_allclose(done["report"][:6], [reward, *before, effort, *terminal], rtol=1e-12)
     assert done["flags"].tolist() == [True, False, True]

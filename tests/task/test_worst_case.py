@@ -7,7 +7,7 @@ import pytest
 from dq_space_arm_env import DQSpaceArmEnv, compile_scene, load_scene
 from dq_space_arm_env.scene import list_scenes
 from dq_space_arm_env.task.equations import SceneEquations
-from dq_space_arm_env.task.worst_case import WorstCase
+from dq_space_arm_env.task.worst_case import worst_cost
 
 STEPS = 100
 
@@ -16,7 +16,7 @@ def charge(scene, states, steps):
     """The bound for a batch of states, shape (B,)."""
     equations = SceneEquations.of(scene, compile_scene(scene).layout.parameters.nominal.tolist())
     x = casadi.SX.sym("x", equations.field.n_x)
-    bound = casadi.Function("bound", [x], [WorstCase(equations).cost(casadi.vertsplit(x), steps)])
+    bound = casadi.Function("bound", [x], [worst_cost(equations, [equations], casadi.vertsplit(x), steps)])
     return np.array([float(bound(state)) for state in states])
 
 
@@ -77,3 +77,83 @@ def test_a_simulation_that_diverges_pays_more_than_the_true_motion():
             diverged += 1
             assert returns[0] < returns[1]
     assert diverged >= 3
+
+
+BODY = {
+    "base": {"motion": "planar", "mass": 10.0, "inertia": [1, 1, 1]},
+    "actuators": {"base_force": {"limit": 0.1}, "base_torque": {"limit": 0.1}},
+    "simulation": {"steps": 20, "dt": 0.1},
+}
+PHASES = ({"name": "first", "steps": 10}, {"name": "second", "steps": 10})
+
+
+def obstacle(place):
+    """A place that no body may touch, or the episode ends."""
+    bodies, there = (
+        [{"frame": "base", "radius": 0.1}],
+        {"frame": "inertial", "position": place, "radius": 0.15},
+    )
+    ends = {"name": "keep", "kind": "distance", "bodies": bodies, "obstacles": [there]}
+    return {**ends, "terminates": True, "tolerance": 0.01}
+
+
+@pytest.mark.slow
+def test_ending_early_does_not_save_the_way_to_where_the_target_comes_to_rest():
+    away = {"target.motion": None, "target.pose.position": [3000, 0, 0]}
+    scene = load_scene(
+        {
+            **BODY,
+            "name": "rests far away",
+            "target": {
+                "pose": {"position": [0.5, 0, 0]},
+                "motion": {"kind": "screw", "linear_velocity": [0.01, 0, 0]},
+            },
+            "phases": [PHASES[0], {**PHASES[1], "changes": away}],
+            "constraints": [obstacle([0, 0.3, 0])],
+        }
+    )
+    check_that_ending_early_costs_more(scene, "base v_y", 1.2)
+
+
+@pytest.mark.slow
+def test_ending_early_does_not_save_what_a_caught_body_brings():
+    """A body of a tonne at 5 m/s takes the robot along."""
+    boom = {"name": "boom", "mass": 1.0, "inertia": [0.1, 0.1, 0.1], "center_of_mass": [0.5, 0, 0]}
+    caught = {"attitude_error_deg": 5, "position_error": 0.05}
+    scene = load_scene(
+        {
+            **BODY,
+            "name": "caught by a tonne",
+            "links": [{**boom, "joint": {"position": [0.5, 0, 0]}}],
+            "tip": {"position": [1.0, 0, 0]},
+            "payload": {"mass": 1000.0, "inertia": [100, 100, 100]},
+            "actuators": {**BODY["actuators"], "joint_torque": {"limit": 0.1}},
+            "target": {
+                "pose": {"position": [1.5, -5, 0]},
+                "motion": {"kind": "screw", "linear_velocity": [0, 5, 0]},
+            },
+            "cost": {"pose": 0.0, "terminal_pose": 0.0, "base_velocity": [0, 0, 0, 100, 100, 100]},
+            "phases": [{**PHASES[0], "changes": {"payload": None}}, {**PHASES[1], "catch": caught}],
+            "constraints": [obstacle([-0.257, 0, 0])],
+        }
+    )
+    info = check_that_ending_early_costs_more(scene, "base v_x", -0.1)
+    assert info["caught"] == 1.0
+
+
+def check_that_ending_early_costs_more(scene, velocity, toward_the_obstacle):
+    """Fly on without an action, and into the obstacle; returns the last info of the former."""
+    env, ends = DQSpaceArmEnv(scene), []
+    for speed in (0.0, toward_the_obstacle):
+        x = env.kernels.layout.initial_state.copy()
+        x[env.kernels.layout.state.names.index(velocity)] += speed
+        env.reset(options={"initial_state": x})
+        total, over = 0.0, False
+        while not over:
+            _, reward, over, _, info = env.step(np.zeros(env.action_space.shape))
+            total += reward
+        ends.append((total, env.get_state()["memory"][0], info))
+    (flown, steps, info), (ended, few, _) = ends
+    assert (steps, few < steps) == (scene.simulation.steps, True)
+    assert ended < flown
+    return info
