@@ -302,7 +302,8 @@ class GuidedDDP:
             if callback is not None:
                 callback(record._replace(**costs))
 
-        found = coarse.solve(start, report, parameters=self.problem.parameters.rows[::factor])
+        rows = cast(ArmProblem, coarse.problem).in_long_steps(self.problem.parameters.rows)
+        found = coarse.solve(start, report, parameters=rows)
         policy = refined(found, self.problem)
         trial = follow(policy, self.problem, start)
         interrupted = found.stop_reason is StopReason.INTERRUPTED

@@ -35,7 +35,7 @@ def coarsened(solution: Solution, problem: ArmProblem) -> Solution:
         states=states,
         controls=controls,
         feedback_gains=solution.feedback_gains[::factor],
-        parameters=solution.parameters[::factor],
+        parameters=problem.in_long_steps(solution.parameters),
         multipliers=solution.multipliers[::factor],
         cost=solution.cost / factor,
     )

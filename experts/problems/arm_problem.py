@@ -162,11 +162,16 @@ class ArmProblem:
 
     def _in_stages(self, parameters: FloatArray) -> FloatArray:
         """Parameters of the stages, (N + 1, n_p), from those at the start: the target moves."""
-        factor = self.scene.simulation.steps // self.horizon
-        rows = self.kernels.stage_parameters(parameters)
+        return self.in_long_steps(self.kernels.stage_parameters(parameters))
+
+    def in_long_steps(self, rows: FloatArray) -> FloatArray:
+        """Parameters of this problem's stages, (N + 1, n_p), from those of shorter ones, (factor N + 1, n_p).
+
+        A long step has the mean weights of its stages, and the catch at its end.
+        """
+        factor = (len(rows) - 1) // self.horizon
         found = rows[::factor].copy()
         if factor > 1 and self.kernels.parameters.staged:
-            # A long step has the mean weights of its stages, and the catch at its end.
             blocks = rows[:-1].reshape(self.horizon, factor, -1)
             weights, caught = (self.kernels.parameters.indices(path) for path in ("cost", CATCH))
             found[:-1, weights] = blocks[:, :, weights].mean(axis=1)

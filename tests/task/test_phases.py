@@ -353,6 +353,7 @@ def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
     assert np.array_equal(long_rows[start - 1, weights], rows[795:800, weights].mean(axis=0))
     assert np.array_equal(long_rows[start - 1, catch], rows[799, catch])
     assert long_rows[:, catch[0]].sum() == 1.0
+    np.testing.assert_array_equal(coarse.in_long_steps(rows), long_rows)
     assert not problem.can_coarsen(3)
     with pytest.raises(ValueError, match="phases that change the robot"):
         problem.coarsened(3)
