@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dq_space_arm_env import Scene
+from dq_space_arm_env import Scene, list_scenes
 
 sys.path.append(str(Path(__file__).parent / "compiler"))
 
@@ -16,12 +16,39 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+# Shipped scenes that have all parts between them: joints, gears, tips, actuators, phases, constraints, draws.
+IN_CI = (
+    "capture-and-detumble",
+    "dual-arm",
+    "elastic-joints",
+    "heavy-wrist",
+    "motors",
+    "paper",
+    "planar",
+    "random-masses",
+    "servicing",
+    "sliding",
+    "thrusters",
+    "wheels",
+)
+
+
 @pytest.hookimpl(tryfirst=True)  # before slow ones are left out
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
-    """Of the cases of a test with the mark `sampled` that are not slow anyway, all but one are."""
+    """Of the cases of tests with the mark `sampled`, leave out scenes not `IN_CI`; all but one are slow.
+
+    With `sampled(scenes="all")` no scene is left out.
+    """
     families: dict[str, list[pytest.Function]] = defaultdict(list)
+    left_out = {*list_scenes()}.difference(IN_CI)
     for item in items:
-        if item.get_closest_marker("sampled") and not item.get_closest_marker("slow"):
+        if not (mark := item.get_closest_marker("sampled")):
+            continue
+        cases = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        scenes = {str(getattr(each, "name", each)) for each in cases}
+        if scenes & left_out and mark.kwargs.get("scenes") != "all":
+            item.add_marker(pytest.mark.endurance)
+        elif not item.get_closest_marker("slow"):
             families[item.nodeid.partition("[")[0]].append(item)
     for cases in families.values():
         sample = next((case for case in cases if "paper" in case.name.partition("[")[2]), cases[0])

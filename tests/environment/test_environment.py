@@ -46,7 +46,7 @@ assert not heavy & set(sys.modules)
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(scenes="all")
 @pytest.mark.parametrize("scene", list_scenes())
 def test_check_env_has_no_complaint(scene):
     with warnings.catch_warnings():

@@ -26,7 +26,13 @@ def twins(scene, copies, mode, reward_type="sparse"):
 
 
 OTHERS = [
-    pytest.param(short(name, 5), "dense", AutoresetMode.SAME_STEP, id=name, marks=pytest.mark.slow)
+    pytest.param(
+        short(name, 5),
+        "dense",
+        AutoresetMode.SAME_STEP,
+        id=name,
+        marks=(pytest.mark.slow, pytest.mark.sampled),
+    )
     for name in list_scenes()
     if name not in ("random-target", "capture-and-detumble", "dual-arm")
 ]

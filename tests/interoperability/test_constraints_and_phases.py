@@ -119,6 +119,7 @@ def test_gradients_of_residuals_of_tensors(name, function, torch):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize("function", FUNCTIONS)
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_jax_gives_residuals_and_jacobians_of_the_kernels(name, function, jax):

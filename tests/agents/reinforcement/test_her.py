@@ -117,7 +117,7 @@ def success_rate(model, episodes=100):
     return successes / episodes
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 @pytest.mark.parametrize("environment", [make(TURNING_TIP), make_many(4, TURNING_TIP)], ids=["one", "four"])
 @pytest.mark.parametrize(
     ("buffer", "least", "most"), [(HerReplayBuffer, 0.8, 1.0), (None, 0.0, 0.2)], ids=["hindsight", "without"]
