@@ -90,6 +90,7 @@ class WorstCase:
     def payload_speeds(self) -> tuple[Scalar, Scalar]:
         """Bounds of angular velocity and velocity of a payload that moves with the target."""
         payload, (turning, moving) = self.equations.scene.payload, self._target_speeds()
+        assert payload is not None
         return turning, moving + turning * math.hypot(*payload.center_of_mass)
 
     def speeds(self, x: Scalars, duration: Scalar, caught: Scalars = ()) -> tuple[Scalar, Scalar]:
