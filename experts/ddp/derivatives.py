@@ -105,23 +105,18 @@ def find_costates(derivatives: Derivatives, costates: FloatArray) -> None:
 
 
 @compiled
-def change_by_rounding(derivatives: Derivatives, states: FloatArray) -> float:
-    """Estimate the change of the cost by roundings of the states, shape (N + 1, n_x).
+def change_by_rounding(derivatives: Derivatives, sizes: FloatArray) -> float:
+    """Estimate the change of the cost by roundings of the states.
 
-    Every tangent coordinate is taken to be off by a rounding of the state's largest entry; half the trace of
-    lxx is the expected second-order cost of random errors.
+    Every tangent coordinate is taken to be off by a rounding of a number of given size, shape (N + 1, n_t);
+    half the trace of lxx is the expected second-order cost of random errors.
     """
     horizon, n_tangent = derivatives.lx.shape
     change = 0.0
     for k in range(horizon + 1):
         lx = derivatives.lx[k] if k < horizon else derivatives.terminal_lx[0]
         lxx = derivatives.lxx[k] if k < horizon else derivatives.terminal_lxx[0]
-        largest, slope, bend = 0.0, 0.0, 0.0
-        for i in range(states.shape[1]):
-            largest = max(largest, abs(states[k, i]))
         for i in range(n_tangent):
-            slope += abs(lx[i])
-            bend += lxx[i, i]
-        digit = EPSILON * largest
-        change += digit * (slope + 0.5 * digit * bend)
+            digit = EPSILON * sizes[k, i]
+            change += digit * (abs(lx[i]) + 0.5 * digit * lxx[i, i])
     return change

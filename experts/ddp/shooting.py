@@ -258,8 +258,15 @@ class ShootingWorkspace:
         return bounds, follows
 
     def cost_rounding(self) -> float:
-        """Estimate how much rounding of the states changes the cost; smaller changes mean nothing."""
-        return change_by_rounding(self.derivatives, self.current.states)
+        """Estimate how much rounding of the states changes the cost; smaller changes mean nothing.
+
+        Plain numbers are off by a rounding of their own. Directions of a pose mix its entries, so that all of
+        them are taken to be off by one of the state's largest.
+        """
+        sizes, n_tangent = np.abs(self.current.states), self.problem.n_tangent
+        if n_tangent != self.problem.n_states:
+            sizes = np.repeat(sizes.max(axis=1, keepdims=True), n_tangent, axis=1)
+        return change_by_rounding(self.derivatives, sizes)
 
     def restore_update(self) -> None:
         """Go back to the update before the last completed backward pass."""

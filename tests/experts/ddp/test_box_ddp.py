@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.optimize import lsq_linear, minimize
 
 from experts.ddp.backward_pass import PASS_COMPLETED
@@ -282,6 +283,23 @@ def test_a_predicted_reduction_below_rounding_is_none(double_integrator):
     solution = BoxDDP(shifted).solve()
     assert solution.converged
     assert solution.cost > 0.0
+
+
+def test_a_large_number_beside_the_cost_hides_no_reduction(double_integrator):
+    """A clock in the state is off by seconds; position and velocity have all their digits."""
+    plain = double_integrator
+    timed = replace(
+        plain,
+        A=block_diag(plain.A, 1.0),
+        B=np.vstack([plain.B, [[0.0]]]),
+        Q=block_diag(plain.Q, 0.0),
+        P=block_diag(plain.P, 0.0),
+        initial_state=np.append(plain.initial_state, 1e15),
+    )
+    expected, solution = BoxDDP(plain.problem()).solve(), BoxDDP(timed.problem()).solve()
+    assert solution.converged
+    assert solution.iterations == expected.iterations
+    assert solution.cost == pytest.approx(expected.cost, rel=1e-12)
 
 
 def test_cost_that_no_regularization_makes_convex(double_integrator):
