@@ -28,7 +28,7 @@ from experts.guesses.guided import RESERVE, GuidedDDP
 from experts.identification import ModelWatch
 from experts.maneuver_plan import ManeuverPlan
 from experts.problems.arm_problem import ArmProblem, as_problem
-from experts.problems.shooting_problem import FloatArray, check_array, check_at_least, stage_bounds
+from experts.problems.shooting_problem import FloatArray, check_array, check_whole, stage_bounds
 from experts.problems.window_problem import WindowProblem
 
 PREDICTIONS = 40
@@ -99,10 +99,11 @@ class RecedingHorizonExpert:
 
         Raises:
             SceneError: If the scene cannot be loaded.
-            ValueError: If a setting is too small, or the scene has no actuators or one without a limit.
+            ValueError: If a setting is too small or no whole number, or the scene has no actuators or one
+                without a limit.
         """
-        check_at_least("horizon", horizon, 1)
-        check_at_least("iterations", iterations, 0)
+        check_whole("horizon", horizon, 1)
+        check_whole("iterations", iterations, 0)
         self.maneuver = ArmProblem(scene)
         as_problem(self.maneuver)
         if not np.isfinite(self.maneuver.kernels.layout.control_limit).all():

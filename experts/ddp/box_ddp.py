@@ -39,6 +39,7 @@ from experts.problems.shooting_problem import (
     check_array,
     check_at_least,
     check_control_weights,
+    check_whole,
     stage_bounds,
 )
 from experts.problems.stage_constraints import StageConstraints
@@ -79,15 +80,15 @@ class BoxDDP:
 
         Raises:
             TypeError: If scene_or_problem is neither a scene nor a problem.
-            ValueError: If a setting is out of range, second_order is unknown or asks for derivatives that the
-                problem does not have, or the problem contradicts itself.
+            ValueError: If a setting is out of range or no whole number, second_order is unknown or asks for
+                derivatives that the problem does not have, or the problem contradicts itself.
         """
-        check_at_least("max_iterations", max_iterations, 0)
+        check_whole("max_iterations", max_iterations, 0)
         check_at_least("tolerance", tolerance, 0.0)
         check_at_least("plateau_decrease", plateau_decrease, 0.0)
-        check_at_least("plateau_iterations", plateau_iterations, 1)
+        check_whole("plateau_iterations", plateau_iterations, 1)
         check_at_least("initial_regularization", initial_regularization, 0.0)
-        check_at_least("threads", threads, 1)
+        check_whole("threads", threads, 1)
         self.problem: ShootingProblem = as_problem(scene_or_problem)
         self.max_iterations = max_iterations
         self.tolerance = tolerance

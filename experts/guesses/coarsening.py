@@ -64,7 +64,7 @@ def find_coarsening(solver: S) -> tuple[tuple[int, ...], S | None]:
 def checked_factors(given: int | Sequence[int], problem: ShootingProblem) -> tuple[int, ...]:
     """Return the factors that are more than 1; raise ValueError if one is no multiple of the next."""
     factors = tuple(given) if isinstance(given, Sequence) else (given,)
-    for factor, next_one in zip(factors, (*factors[1:], 1), strict=True):
+    for factor, next_one in zip(factors, [*factors, 1][1:], strict=True):
         if not isinstance(factor, int | np.integer) or factor < 1 or factor % next_one:
             raise ValueError(
                 f"coarsening is {factors}; it must be whole numbers of steps, each a multiple of the next"

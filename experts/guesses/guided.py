@@ -36,7 +36,7 @@ from experts.guesses.policies import coarsened, follow, refined, track
 from experts.guesses.preparation import Preparation, keep_preparation, preparation_key, read_preparation
 from experts.guesses.screw_motion import screw_motion as guess_screw_motion
 from experts.problems.arm_problem import ArmProblem
-from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array, check_at_least
+from experts.problems.shooting_problem import FloatArray, ShootingProblem, check_array, check_whole
 from experts.problems.window_problem import WindowProblem
 
 START_REGULARIZATIONS = (1e2, 1e3, 1e4, 1e5)
@@ -98,9 +98,9 @@ class GuidedDDP:
                 that converges within the tolerances. In long steps they are always compared.
             coarsening: Steps in a long one, in which a maneuver is solved first; it divides the number of
                 stages. Several are solved in one after another, the longest first, each a multiple of the
-                next. 1 leaves that out. None tries 8 and less on first use, also halved before the problem's
-                own steps, and takes the first that is fine enough for the problem's own initial state; arms
-                only.
+                next. 1 or none at all leaves that out. None tries 8 and less on first use, also halved before
+                the problem's own steps, and takes the first that is fine enough for the problem's own initial
+                state; arms only.
             max_iterations: Most iterations from one guess.
             tolerance: See `BoxDDP`.
             second_order: See `BoxDDP`; where long steps are tried and Gauss-Newton's model creeps, None takes
@@ -108,11 +108,11 @@ class GuidedDDP:
 
         Raises:
             TypeError: If scene_or_problem is neither a scene nor a problem.
-            ValueError: If a setting is out of range or unknown, the problem contradicts itself, or a solution
-                of the library is not finite or has other sizes than the problem.
+            ValueError: If a setting is out of range, no whole number or unknown, the problem contradicts
+                itself, or a solution of the library is not finite or has other sizes than the problem.
         """
-        check_at_least("remember", remember, 0)
-        check_at_least("attempts", attempts, 1)
+        check_whole("remember", remember, 0)
+        check_whole("attempts", attempts, 1)
         if not 0.0 <= reserve < 0.5:
             raise ValueError(f"reserve is {reserve}; it must be at least 0 and less than 0.5")
         self._settings: dict[str, Any] = {

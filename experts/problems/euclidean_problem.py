@@ -21,6 +21,7 @@ from experts.problems.shooting_problem import (
     StageParameters,
     check_array,
     check_problem,
+    check_whole,
 )
 
 Matrix = Any
@@ -70,8 +71,7 @@ class EuclideanProblem(ABC):
         parameters: ArrayLike,
     ) -> None:
         for name, size in (("n_controls", n_controls), ("horizon", horizon)):
-            if not isinstance(size, int | np.integer) or size < 1:
-                raise ValueError(f"{name} is {size!r}; it must be a whole number, at least 1")
+            check_whole(name, size, 1)
         self.initial_state: FloatArray = np.array(real_array("initial_state", initial_state, np.float64))
         if self.initial_state.ndim != 1:
             raise ValueError(f"initial_state has shape {self.initial_state.shape}; expected (n_x,)")

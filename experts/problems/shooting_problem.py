@@ -263,6 +263,13 @@ def check_problem(problem: ShootingProblem) -> None:
         if bound.shape not in ((problem.n_controls,), (problem.horizon, problem.n_controls)):
             raise ValueError(f"{name} has shape {bound.shape}; expected ({problem.n_controls},)")
     lower, upper = stage_bounds(problem)
+    closed = np.argwhere((lower == np.inf) | (upper == -np.inf))
+    if len(closed):
+        k, i = closed[0]
+        raise ValueError(
+            f"input {i} has bounds [{lower[k, i]}, {upper[k, i]}]; no finite number is within them, "
+            "-inf and inf stand for none"
+        )
     crossed = np.argwhere(~(lower <= upper))
     if len(crossed):
         k, i = crossed[0]
@@ -299,9 +306,15 @@ def check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
 
 
 def check_at_least(name: str, value: float, smallest: float) -> None:
-    """Refuse a setting that is too small or NaN."""
-    if not value >= smallest:
-        raise ValueError(f"{name} is {value}; it must be at least {smallest}")
+    """Refuse a setting that is too small, infinite or NaN."""
+    if not smallest <= value < np.inf:
+        raise ValueError(f"{name} is {value}; it must be finite, at least {smallest}")
+
+
+def check_whole(name: str, value: int, smallest: int) -> None:
+    """Refuse a setting that is no whole number, or too small."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < smallest:
+        raise ValueError(f"{name} is {value!r}; it must be a whole number, at least {smallest}")
 
 
 def check_control_weights(luu: FloatArray) -> None:

@@ -390,7 +390,7 @@ def test_wrong_input_is_named(paper):
         paper(np.append(state, 15.0))
     with pytest.raises(ValueError, match="base quaternion of the state is zero"):
         paper(np.zeros(23))
-    for setting in ({"horizon": 0}, {"iterations": -1}):
+    for setting in ({"horizon": 0}, {"horizon": 50.5}, {"iterations": -1}):
         with pytest.raises(ValueError, match=next(iter(setting))):
             RecedingHorizonExpert("paper", **setting)
 

@@ -373,8 +373,11 @@ def test_wrong_start_is_refused(pendulum, arguments, message):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"max_iterations": -1}, "max_iterations is -1; it must be at least 0"),
+        ({"max_iterations": -1}, "max_iterations is -1; it must be a whole number, at least 0"),
+        ({"max_iterations": 2.5}, "max_iterations is 2.5; it must be a whole number"),
+        ({"threads": True}, "threads is True; it must be a whole number, at least 1"),
         ({"tolerance": np.nan}, "tolerance is nan"),
+        ({"tolerance": np.inf}, "tolerance is inf; it must be finite, at least 0"),
         ({"plateau_decrease": -1e-9}, "plateau_decrease is -1e-09"),
         ({"plateau_iterations": 0}, "plateau_iterations is 0"),
         ({"initial_regularization": -1.0}, "initial_regularization is -1.0"),
@@ -393,6 +396,7 @@ def test_wrong_setting_is_refused(pendulum, settings, message):
         ({"control_lower": np.zeros(2)}, r"control_lower has shape \(2,\); expected \(1,\)"),
         ({"control_lower": np.array([6.0])}, r"input 0 has bounds \[6\.0, 5\.0\]"),
         ({"control_upper": np.array([np.nan])}, r"input 0 has bounds \[-5\.0, nan\]"),
+        ({"control_lower": np.array([np.inf]), "control_upper": np.array([np.inf])}, "no finite number"),
     ],
 )
 def test_problem_that_contradicts_itself_is_refused(pendulum, changes, message):

@@ -240,8 +240,9 @@ def test_an_interrupt_leaves_no_half_made_library(unicycle, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"remember": -1}, "remember is -1; it must be at least 0"),
-        ({"attempts": 0}, "attempts is 0; it must be at least 1"),
+        ({"remember": -1}, "remember is -1; it must be a whole number, at least 0"),
+        ({"attempts": 0}, "attempts is 0; it must be a whole number, at least 1"),
+        ({"attempts": 1.5}, "attempts is 1.5; it must be a whole number"),
         ({"max_iterations": -1}, "max_iterations is -1"),
         ({"second_order": "some"}, "second_order is 'some'"),
     ],
@@ -554,6 +555,7 @@ def test_delays_count_steps_and_leave_no_long_ones():
 
 
 def test_only_scenes_have_long_steps(unicycle):
+    assert GuidedDDP(unicycle, coarsening=[]).coarsening == ()
     with pytest.raises(
         ValueError, match=r"coarsening is \(2,\); only the maneuver of a scene has long steps"
     ):

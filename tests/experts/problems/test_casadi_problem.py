@@ -238,6 +238,7 @@ def test_parameters_may_differ_from_stage_to_stage():
         ({"control_upper": -1.0}, ValueError, "the lower one must not exceed the upper one"),
         ({"control_upper": "1"}, TypeError, "control_upper: of type"),
         ({"horizon": 0}, ValueError, "horizon is 0"),
+        ({"horizon": True}, ValueError, "horizon is True; it must be a whole number"),
         ({"horizon": 10.0}, ValueError, r"horizon is 10\.0; it must be a whole number"),
         ({"n_controls": -1}, ValueError, "n_controls is -1"),
         ({"time_step": -0.1}, ValueError, "time_step is -0.1"),
