@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dq_space_arm_env.common.real_arrays import real_array
 from experts.ddp.backward_pass import PASS_NOT_FINITE, PassResult
 from experts.ddp.directions import Directions
 from experts.ddp.multiple_shooting import MultipleShooting
@@ -139,6 +140,7 @@ class BoxDDP:
             Its cost is without penalties.
 
         Raises:
+            TypeError: If one of these arrays is masked or not of real numbers.
             ValueError: If x0, u_init, x_init, parameters or multipliers have the wrong shape, are not finite
                 or out of bounds, an input has no cost of its own, or states are given and the problem has no
                 retraction.
@@ -178,9 +180,10 @@ class BoxDDP:
         if self._constrained is None:
             raise ValueError("multipliers are given, but the problem has no constraints; leave them out")
         lagrangian = self._constrained.lagrangian
-        check_array("multipliers", multipliers, lagrangian.constraints.multipliers.shape)
-        if multipliers.any():
-            lagrangian.begin_with(multipliers)
+        given = real_array("multipliers", multipliers, np.float64)
+        check_array("multipliers", given, lagrangian.constraints.multipliers.shape)
+        if given.any():
+            lagrangian.begin_with(given)
         else:
             lagrangian.begin()
 
@@ -349,14 +352,14 @@ class BoxDDP:
         """Return the initial state and the first controls, or say what is wrong with them."""
         problem = self.problem
         lower, upper = stage_bounds(problem)
-        state = np.asarray(problem.initial_state if x0 is None else x0, dtype=np.float64)
+        state = real_array("x0", problem.initial_state if x0 is None else x0, np.float64)
         check_array("x0", state, (problem.n_states,))
         if x0 is not None and (check_state := getattr(problem, "check_state", None)) is not None:
             check_state("x0", state)
         shape = (problem.horizon, problem.n_controls)
         if u_init is None:
             return state, np.clip(0.0, lower, upper)
-        controls = np.asarray(u_init, dtype=np.float64)
+        controls = real_array("u_init", u_init, np.float64)
         check_array("u_init", controls, shape)
         outside = (controls < lower) | (controls > upper)
         if np.any(outside):

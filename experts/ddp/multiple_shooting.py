@@ -33,6 +33,7 @@ from time import perf_counter
 
 import numpy as np
 
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.kernels.bound import buffer_table, run_kernel
 from experts.ddp.backward_pass import Update
 from experts.ddp.derivatives import Derivatives
@@ -113,7 +114,7 @@ class MultipleShooting:
     def check(self, x_init: FloatArray) -> FloatArray:
         """Return a guess of the states, shape (N + 1, n_x), projected onto the manifold of states."""
         problem = self.work.problem
-        given = np.ascontiguousarray(x_init, dtype=np.float64)
+        given = np.ascontiguousarray(real_array("x_init", x_init, np.float64))
         check_array("x_init", given, (problem.horizon + 1, problem.n_states))
         states, still = given, np.zeros((len(given), problem.n_tangent))
         for _ in range(3):  # each one squares the error

@@ -19,6 +19,7 @@ from typing import Any, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dq_space_arm_env.common.real_arrays import real_array
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.solution import Callback, IterationRecord, Solution, StopReason, uninterrupted
 from experts.guesses.attempts import Attempt, best_solution, is_known
@@ -199,6 +200,7 @@ class GuidedDDP:
             steps before.
 
         Raises:
+            TypeError: If x0 or parameters are masked or not of real numbers.
             ValueError: If x0 or parameters have the wrong shape or are not finite, or an input has no cost of
                 its own.
             KeyboardInterrupt: If the user interrupts the preparation of the library.
@@ -208,7 +210,7 @@ class GuidedDDP:
         if self._coarse is None:
             _ = self.library
         self.problem.parameters.set(given)
-        start = np.asarray(self.problem.initial_state if x0 is None else x0, dtype=np.float64)
+        start = real_array("x0", self.problem.initial_state if x0 is None else x0, np.float64)
         check_array("x0", start, (self.problem.n_states,))
         attempts: list[Attempt] = []
         long_steps: tuple[dict[str, Any], ...] = ()

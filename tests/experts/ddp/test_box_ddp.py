@@ -371,6 +371,22 @@ def test_wrong_start_is_refused(pendulum, arguments, message):
 
 
 @pytest.mark.parametrize(
+    "arguments",
+    [
+        {"x0": ["1", "2"]},
+        {"x0": [1.0 + 1.0j, 0.0]},
+        {"x0": np.ma.masked_array([1.0, 5.0], mask=[False, True])},
+        {"u_init": [["0"]] * 120},
+        {"x_init": [["0", "0"]] * 121},
+    ],
+)
+def test_a_start_of_anything_but_real_numbers_is_refused(pendulum, arguments):
+    problem = replace(pendulum, retract=lambda x, dx: x + dx)
+    with pytest.raises(TypeError, match=f"{next(iter(arguments))}: .*, should be real numbers"):
+        BoxDDP(problem).solve(**arguments)
+
+
+@pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"max_iterations": -1}, "max_iterations is -1; it must be a whole number, at least 0"),

@@ -193,6 +193,8 @@ def test_multipliers_of_another_problem_are_refused():
     scene = load_scene("paper").replace(constraints=[LIMITS])
     with pytest.raises(ValueError, match="multipliers has shape"):
         BoxDDP(scene).solve(multipliers=np.zeros((1001, 99)))
+    with pytest.raises(TypeError, match="multipliers: of type <U3, should be real numbers"):
+        BoxDDP(scene).solve(multipliers=np.full((1001, 3), "0.0"))
 
 
 @pytest.mark.parametrize(

@@ -252,6 +252,11 @@ def test_bad_settings_are_refused(unicycle, settings, message):
         GuidedDDP(unicycle, **settings)
 
 
+def test_a_start_of_text_is_refused(unicycle):
+    with pytest.raises(TypeError, match="x0: of type <U1, should be real numbers"):
+        GuidedDDP(unicycle).solve(["1", "0", "0", "0"])
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
