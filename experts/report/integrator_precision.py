@@ -23,6 +23,7 @@ from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.solution import uninterrupted
 from experts.problems.shooting_problem import FloatArray
 from experts.report.effort import Announce, Effort
+from experts.report.maneuver_run import in_substeps
 from experts.report.timing import time_in_turns
 
 ACCURACIES = (1e-3, 1e-6, 1e-9)
@@ -46,6 +47,7 @@ class Motion:
     scene: Scene  # in double precision
     start: FloatArray  # shape (n_x,)
     controls: FloatArray  # shape (holds, n_u)
+    parameters: FloatArray | None = None  # what varies, shape (holds, n_p); nominal if None
 
     def end(self, kernels: Kernels, integrator: str, per_hold: int) -> FloatArray:
         """State at the end, shape (n_x,), with a number of steps for each input."""
@@ -56,8 +58,9 @@ class Motion:
         """States along the motion."""
         controls = np.repeat(self.controls, per_hold, axis=0)
         dt = self.scene.simulation.dt / per_hold
+        p = None if self.parameters is None else in_substeps(kernels, self.parameters, per_hold)
         with np.errstate(all="ignore"):
-            states = kernels.simulate(self.start, controls, len(controls), dt, integrator, every)
+            states = kernels.simulate(self.start, controls, len(controls), dt, integrator, every, p)
         return np.asarray(states)
 
 
@@ -71,7 +74,7 @@ def expert_motion(scene: Scene, max_iterations: int) -> Motion:
     scene = with_simulation(scene, precision="float64")
     solution = uninterrupted(BoxDDP(scene, max_iterations=max_iterations).solve())
     controls = solution.controls if np.isfinite(solution.cost) else np.zeros_like(solution.controls)
-    return Motion(scene, np.array(solution.states[0]), np.array(controls))
+    return Motion(scene, np.array(solution.states[0]), np.array(controls), solution.parameters[:-1])
 
 
 def tip_error(kernels: Kernels, x: FloatArray, reference: FloatArray) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
-from dq_space_arm_env.kernels import compile_scene
+from dq_space_arm_env.kernels import Kernels, compile_scene
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.parameters import CATCH
 from experts.ddp.box_ddp import BoxDDP
@@ -131,12 +131,18 @@ def errors_with_finer_steps(
         return None
     kernels, dt = compile_scene(scene), scene.simulation.dt / substeps
     finer = np.repeat(controls, substeps, axis=0)
-    rows = np.repeat(kernels.stage_parameters()[: len(controls)], substeps, axis=0)
-    for entry in kernels.parameters.indices(CATCH):  # at the end of a step alone
-        rows[np.arange(len(rows)) % substeps < substeps - 1, entry] = 0.0
+    rows = in_substeps(kernels, kernels.stage_parameters()[: len(controls)], substeps)
     with np.errstate(all="ignore"):
         start = kernels.layout.initial_state
         end = kernels.simulate(start, finer, len(finer), dt, "rk4", every=len(finer), p=rows)[-1]
     tip = tuple(kernels.tip_pose(end).tolist())
     target = tuple(kernels.layout.target_with(kernels.stage_parameters()[-1]).tolist())
     return math.degrees(poses.error_angle(tip, target)), poses.error_distance(tip, target)
+
+
+def in_substeps(kernels: Kernels, rows: FloatArray, substeps: int) -> FloatArray:
+    """Parameters of shorter steps, shape (N substeps, n_p), from those of N stages, (N, n_p)."""
+    finer: FloatArray = np.repeat(rows, substeps, axis=0)
+    for entry in kernels.parameters.indices(CATCH):  # at the end of a stage alone
+        finer[np.arange(len(finer)) % substeps < substeps - 1, entry] = 0.0
+    return finer

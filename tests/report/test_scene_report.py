@@ -14,10 +14,17 @@ from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.report_page import Section
 from dq_space_arm_env.common.tables import Row
 from dq_space_arm_env.scene import INTEGRATORS
-from experts import GuidedDDP
+from experts import BoxDDP, GuidedDDP
 from experts.report import expert_trials, integrator_precision, part_costs, scene_report, stability_envelope
 from experts.report.effort import Announce, Effort
-from experts.report.integrator_precision import Motion, observed_order, reference_end, step_call
+from experts.report.integrator_precision import (
+    Motion,
+    expert_motion,
+    observed_order,
+    reference_end,
+    step_call,
+    tip_error,
+)
 from experts.report.stability_envelope import SLOW, largest, on_springs
 
 pytestmark = pytest.mark.slow  # every integrator and variant of a scene is compiled
@@ -71,6 +78,15 @@ def test_stiff_joints_get_a_stiff_reference(short_scene: Scene) -> None:
     end, uncertainty = reference_end(Motion(stiff, start, np.zeros((60, 2))))
     assert np.isfinite(end).all()
     assert uncertainty < 1e-9
+
+
+def test_integrators_follow_the_expert_through_phases() -> None:
+    """What is caught weighs from then on, in shorter steps too."""
+    scene = load_scene("capture-and-detumble")
+    solution, motion = BoxDDP(scene, max_iterations=1).solve(), expert_motion(scene, 1)
+    kernels, method = compile_scene(motion.scene), scene.simulation.integrator
+    np.testing.assert_array_equal(motion.end(kernels, method, 1), solution.states[-1])
+    assert tip_error(kernels, motion.end(kernels, method, 4), solution.states[-1]) < 1e-5
 
 
 def test_stiffness_ends_where_the_stability_polynomial_says(short_scene: Scene, limits: Limits) -> None:
