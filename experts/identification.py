@@ -65,7 +65,7 @@ def doubtful_numbers(maneuver: ArmProblem) -> list[Doubtful]:
     """Stiffness and damping of the joints, mass and inertia of the load; none that a phase changes.
 
     A spring may take the joint's largest torque at 1 rad, 1 N m without a motor; a damper a tenth at 1 rad/s;
-    a mass may be half as large again.
+    a mass may be half as large again as the maneuver has been told, or as the scene has it.
     """
     scene, layout, found = maneuver.scene, maneuver.kernels.layout, []
     limits = layout.control_limit[layout.control.joint_torque]
@@ -74,9 +74,11 @@ def doubtful_numbers(maneuver: ArmProblem) -> list[Doubtful]:
     for index, torque in largest.items():
         found.append(Doubtful(f"links.{index}.stiffness", torque, -np.inf))
         found.append(Doubtful(f"links.{index}.damping", 0.1 * torque, -np.inf))
+    told = dict(zip(layout.parameters.names, maneuver.parameters.rows.min(axis=0).tolist(), strict=True))
     for number in load_numbers(scene):
-        least = (LEAST_SHARE - 1.0) * number.nominal if number.nominal > 0.0 else -np.inf
-        found.append(Doubtful(number.name, 0.5 * abs(number.nominal), least))
+        value = told.get(number.name, number.nominal)
+        least = (LEAST_SHARE - 1.0) * value if value >= 0.0 else -np.inf
+        found.append(Doubtful(number.name, 0.5 * abs(value or number.nominal), least))
     staged = {layout.parameters.names[index] for index in layout.parameters.staged}
     return [number for number in found if number.name not in staged]
 
@@ -158,8 +160,6 @@ class Identification:
         self.names = tuple(number.name for number in doubtful)
         self._known = [names.index(name) for name in known]
         self._estimated = [names.index(name) for name in self.names]
-        self._deviations = np.array([number.deviation for number in doubtful])
-        self._least = np.array([number.least for number in doubtful])
         self._maneuver = maneuver
         self._shared = [(i, known.index(name)) for i, name in enumerate(self.names) if name in known]
         self._stored, self._rates = velocity_entries(maneuver)
@@ -169,10 +169,17 @@ class Identification:
         """Know nothing but the scatter of the measured velocities, shape (n_v,)."""
         self.estimates, self._planned = np.zeros((2, len(self.names)))
         self._told: FloatArray | None = None
+        self._doubt()
         self._covariance = np.diag(self._deviations**2)
         self._variance = np.maximum(variance, LEAST_SCATTER**2)
         self._waited, self._wait, self._is_outlier = 0, FIRST_WAIT, False
         self.tell()
+
+    def _doubt(self) -> None:
+        """Find how far off the numbers may be that the maneuver knows now."""
+        doubtful = doubtful_numbers(self._maneuver)
+        self._deviations = np.array([number.deviation for number in doubtful])
+        self._least = np.array([number.least for number in doubtful])
 
     def tell(self) -> None:
         """Give the problem what is known of the maneuver, and the estimates.
@@ -181,6 +188,8 @@ class Identification:
         """
         rows, told = self.problem.parameters.rows, self._maneuver.parameters.rows
         before = told if self._told is None else self._told
+        if not np.array_equal(told, before):
+            self._doubt()
         for i, column in self._shared:
             if not np.array_equal(told[:, column], before[:, column]):
                 self.estimates[i] = self._planned[i] = 0.0

@@ -5,7 +5,7 @@ import pytest
 
 from dq_space_arm_env import load_scene
 from experts import GuidedDDP, RecedingHorizonExpert
-from experts.identification import MismatchDetector, doubtful_numbers
+from experts.identification import Identification, MismatchDetector, doubtful_numbers
 from experts.problems.arm_problem import ArmProblem
 
 SPRINGS = {f"links.{index}.stiffness": 2.0 for index in range(3)}
@@ -88,6 +88,23 @@ def test_what_is_told_in_mid_flight_is_not_estimated_on_top(experts):
             assert expert.estimates["links.2.mass"] == pytest.approx(
                 p[kernels.parameters.names.index("links.2.mass")], rel=1e-2
             )
+
+
+def test_a_mass_stays_a_share_of_the_told_one(varying_scene):
+    """Also where that is less than the scene's: a share of the scene's would allow negative ones."""
+    maneuver, rng = ArmProblem(varying_scene), np.random.default_rng(0)
+    kernels, name = maneuver.kernels, "links.2.mass"
+    told, p = (world(kernels, {}, {name: factor}) for factor in (0.5, 1e-3))
+    maneuver.parameters.set(told)
+    found = Identification(maneuver)
+    found.begin(np.full(6, 1e-8))
+    x = kernels.layout.initial_state
+    for k in range(60):
+        u = kernels.layout.control_limit * rng.uniform(-1.0, 1.0, kernels.n_u)
+        landed = kernels.step(x, u, p=p)
+        found.update(x, u, landed, k)
+        x = landed
+    assert found.values[name] == pytest.approx(0.1 * told[kernels.parameters.names.index(name)])
 
 
 def test_where_the_scene_is_right_actions_are_the_same_bits(experts):
