@@ -56,7 +56,8 @@ class IterationRecord(NamedTuple):
 
     Attributes:
         iteration: Counts from 1.
-        cost: Cost after the iteration; while gaps are open, of a trajectory that is not feasible.
+        cost: Cost after the iteration, with the penalties of constraints, which may be violated; while gaps
+            are open, of a trajectory that is not feasible.
         alpha: Accepted step length, 0 if none was accepted.
         exact: Whether the update used exact second derivatives, or else Gauss-Newton's.
         regularization: mu, in multiples of the control weights.

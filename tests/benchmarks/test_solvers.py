@@ -14,6 +14,7 @@ from experts.problems.arm_problem import ArmProblem
 from experts.problems.shooting_problem import FloatArray
 from scripts.benchmarks.effort import QUICK
 from scripts.benchmarks.harness import Row, select, shortcomings
+from scripts.benchmarks.solvers import _compare
 from scripts.benchmarks.solvers import accuracy as contenders_module
 from scripts.benchmarks.solvers.accuracy import OURS, Contender, best_costs, compare_solvers, contenders
 from scripts.benchmarks.solvers.iterations import measure_iterations
@@ -168,6 +169,12 @@ def test_solvers_that_are_not_there_are_named(
 
 
 # Iterations ------------------------------------------------------------------------------------------------
+
+
+def test_times_to_a_cost_leave_out_scenes_with_constraints(guided: GuidedDDP) -> None:
+    """Their iterations violate constraints, below the cost of any maneuver that keeps to them."""
+    (row,) = _compare(ArmProblem("joint-limits"), guided, SHORT)
+    assert "leave out scene joint-limits" in row["note"]
 
 
 def test_iterations_are_those_of_the_solver(problem: ArmProblem) -> None:

@@ -94,7 +94,16 @@ def measure(effort: Effort) -> Iterator[Row]:
 
 
 def _compare(problem: ArmProblem, guided: GuidedDDP, effort: Effort) -> Iterator[Row]:
-    """Compare on the nominal start with each integrator, on random ones with the scene's own."""
+    """Compare on the nominal start with each integrator, on random ones with the scene's own.
+
+    Scenes with constraints are left out: iterations have penalties in their cost, and may violate them.
+    """
+    if problem.constraints is not None:
+        yield note(
+            f"The times to the best known cost leave out scene {problem.scene.name}: costs on the way to its "
+            "constraints do not compare."
+        )
+        return
     chosen = problem.scene.simulation.integrator
     states = draw_starts(problem, effort.compared_starts, effort.seed)
     for integrator in dict.fromkeys((*COMPARED_INTEGRATORS, chosen)):
