@@ -16,6 +16,7 @@ from dq_space_arm_env.scene.parameters import CATCH
 from experts.ddp.box_ddp import BoxDDP
 from experts.ddp.solution import IterationRecord, Solution, uninterrupted
 from experts.maneuver import Maneuver
+from experts.problems.arm_problem import in_double_precision
 from experts.problems.shooting_problem import FloatArray
 
 REPLAY_TOLERANCE = 1e-9
@@ -72,7 +73,7 @@ def run_maneuver(
     on_start: Callable[[], None] = lambda: None,
     on_iteration: Callable[[IterationRecord], None] | None = None,
 ) -> ManeuverRun:
-    """Solve a scene from zero controls and replay the plan.
+    """Solve a scene from zero controls and replay the plan, both in double precision.
 
     Args:
         scene: The scene.
@@ -88,8 +89,9 @@ def run_maneuver(
         ValueError: If the environment refuses the scene, or the number of iterations is negative.
     """
     started = perf_counter()
+    exact = in_double_precision(scene)
     # First of all: a scene that cannot be replayed is refused before the solve.
-    nothing = replay(scene, np.zeros((scene.simulation.steps, StateLayout.of(scene).n_u)))
+    nothing = replay(exact, np.zeros((scene.simulation.steps, StateLayout.of(scene).n_u)))
     _compile_solver(scene)
     solver = BoxDDP(scene) if max_iterations is None else BoxDDP(scene, max_iterations=max_iterations)
     prepared = perf_counter()
@@ -100,8 +102,8 @@ def run_maneuver(
     return ManeuverRun(
         scene=scene,
         solution=solution,
-        replay=replay(scene, solution.controls),
-        finer_errors=errors_with_finer_steps(scene, solution.controls),
+        replay=replay(exact, solution.controls),
+        finer_errors=errors_with_finer_steps(exact, solution.controls),
         zero_control_cost=float(nothing.cost[0]),
         tolerance=solver.tolerance,
         preparation_seconds=prepared - started,

@@ -12,7 +12,7 @@ from dq_space_arm_env import Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion
 from dq_space_arm_env.environment.rollouts import StateFeedback, rollout
 from dq_space_arm_env.scene import StateLayout
-from experts.report import Maneuver, ManeuverRun, integrator_precision, replay
+from experts.report import Maneuver, ManeuverRun, integrator_precision, replay, run_maneuver
 from experts.report.effort import QUICK
 from experts.report.maneuver_run import errors_with_finer_steps
 from experts.report.maneuver_summary import print_tables, summarize
@@ -114,6 +114,14 @@ def test_replay_flies_and_charges_what_the_solver_planned(short_run: ManeuverRun
     assert short_run.replay_difference < 1e-12
     assert short_run.replay_agrees
     assert sum(short_run.cost_terms.values()) == pytest.approx(short_run.solution.cost, rel=1e-12)
+
+
+def test_scenes_in_single_precision_are_replayed_in_double(short_run: ManeuverRun) -> None:
+    """As they are solved: their rounding is no fault of solver or environment."""
+    run = run_maneuver(short_run.scene.replace(simulation={"precision": "float32"}))
+    assert run.replay_agrees
+    assert run.replay_cost == short_run.replay_cost
+    assert run.finer_errors == short_run.finer_errors
 
 
 def test_finer_steps_show_the_error_of_a_poor_integrator(short_scene: Scene) -> None:
