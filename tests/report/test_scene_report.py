@@ -186,6 +186,13 @@ def test_success_is_that_of_the_environment_where_the_target_moves(short_scene: 
     assert not expert_trials.solve_episode(GuidedDDP(strict, reach_target=False), env, 0)["success"]
 
 
+def test_a_missed_catch_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    expert = GuidedDDP("capture-and-detumble", library=[], screw_motion=False, coarsening=1, max_iterations=0)
+    monkeypatch.setattr(expert_trials, "misses", lambda *given: 0.0)  # the tip ends within the tolerances
+    env = DQSpaceArmEnv("capture-and-detumble")
+    assert not expert_trials.solve_episode(expert, env, 0)["success"]
+
+
 def test_starts_that_fail_are_listed_by_seed(spread_scene: Scene) -> None:
     rows = expert_trials.measure(spread_scene, Effort(starts=2, max_iterations=1), announce)["starts"]
     section = expert_trials.section(spread_scene, {"starts": rows})
