@@ -118,11 +118,18 @@ class Folder:
             file.write(json.dumps(entry) + "\n")
 
     def complete(self) -> bool:
-        """Write the manifest if all shards exist, those of other parts included; tell whether they do."""
+        """Write the manifest if all shards exist, those of other parts included; tell whether they do.
+
+        Raises DemonstrationsError if one of another part is damaged; those of this part have been checked.
+        """
         paths = sorted(path for path in (self.path / SHARDS).iterdir() if SHARD_NAME.fullmatch(path.name))
         shards = {int(path.name.partition("-")[0]): path for path in paths}
         if len(shards) < self.settings.n_shards:
             return False
+        for number, path in shards.items():
+            if number not in self.shards and sha256_of(path) != path.stem.partition("-")[2]:
+                part = f"{number % self.part.of + 1} of {self.part.of}"
+                raise DemonstrationsError(f"{path} is damaged: run part {part} again, which makes it anew")
         manifest = manifest_of(self.path / SETTINGS, [shards[i] for i in range(self.settings.n_shards)])
         write_atomically(self.path / MANIFEST, manifest_text(manifest), durable=True)
         return True

@@ -106,10 +106,11 @@ def generate_demonstrations(
 
     Raises:
         SceneError: If the scene cannot be loaded.
-        ValueError: If an argument is out of range, or the scene is unsuitable for demonstrations.
+        ValueError: If an argument is out of range or no whole number, or the scene is unsuitable for
+            demonstrations.
         DemonstrationsError: If another run is writing to the folder, the folder was made with other settings,
-            the disk is full, or processes are killed repeatedly. Finished shards remain; repeat the call to
-            resume.
+            a file of another part is damaged, the disk is full, or processes are killed repeatedly. Finished
+            shards remain; repeat the call to resume.
         KeyboardInterrupt: If the user interrupts the run; finished shards remain likewise.
     """
     settings = Settings.of(scene, n, seed, shard_size)

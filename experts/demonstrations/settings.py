@@ -39,8 +39,11 @@ class Settings:
     def of(cls, scene: Scene | str | Path, n: int, seed: int, shard_size: int) -> Self:
         """Validate the request of a user."""
         for name, value, least in (("n", n, 1), ("seed", seed, 0), ("shard_size", shard_size, 1)):
+            if isinstance(value, bool) or not isinstance(value, int | np.integer):
+                raise ValueError(f"{name}: {value!r}, should be a whole number of at least {least}")
             if value < least:
                 raise ValueError(f"{name}: {value}, should be at least {least}")
+        n, seed, shard_size = int(n), int(seed), int(shard_size)  # `settings.json` has no NumPy
         if seed >= 2**63:  # `settings.json` could not be read again
             raise ValueError(f"seed: {seed}, should be less than 2**63")
         resolved = in_double_precision(load_scene(scene))

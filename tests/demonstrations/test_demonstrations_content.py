@@ -119,6 +119,8 @@ def test_single_precision_is_taken_in_double(quick_scene: Scene, tmp_path: Path)
     ("changes", "sentence"),
     [
         ({"n": 0}, "n: 0, should be at least 1"),
+        ({"n": True}, "n: True, should be a whole number of at least 1"),
+        ({"n": 2.0}, "n: 2.0, should be a whole number of at least 1"),
         ({"seed": -1}, "seed: -1, should be at least 0"),
         ({"seed": 2**63}, r"seed: 9223372036854775808, should be less than 2\*\*63"),
         ({"shard_size": 0}, "shard_size: 0, should be at least 1"),

@@ -93,6 +93,24 @@ def test_a_part_leaves_the_shards_of_others_alone(quick_scene: Scene, tmp_path: 
         assert not damaged.exists()
 
 
+def test_nothing_is_complete_with_a_damaged_shard_of_another_part(quick_scene: Scene, tmp_path: Path) -> None:
+    first, second = (folder_of(quick_scene, tmp_path, Part(number, 2)) for number in (1, 2))
+    with first.opened():
+        first.write(shard(0))
+        first.write(shard(2))
+        assert not first.complete()
+    damaged = next((tmp_path / "shards").glob("000002-*"))
+    content = damaged.read_bytes()
+    damaged.write_bytes(content[:-1] + b"?")
+    with second.opened():
+        second.write(shard(1))
+        with pytest.raises(DemonstrationsError, match=f"{damaged.name} is damaged: run part 1 of 2 again"):
+            second.complete()
+        assert not (tmp_path / "manifest.json").exists()
+        damaged.write_bytes(content)
+        assert second.complete()
+
+
 def test_a_second_run_waits_for_its_turn(quick_scene: Scene, tmp_path: Path) -> None:
     folder = folder_of(quick_scene, tmp_path)
     again, part = folder_of(quick_scene, tmp_path), folder_of(quick_scene, tmp_path, Part(1, 2))
