@@ -110,6 +110,8 @@ def read_log(demonstrations: Demonstrations) -> Log:
                 machine = str(entry["host"]) + processors.get(entry["host"], "")
                 timed = {str(part): float(value) for part, value in entry["seconds"].items()}
                 solves = [float(value) for value in entry["solve_seconds"]]
+                if not (solves and math.isfinite(sum(solves)) and 0.0 < sum(timed.values()) < math.inf):
+                    continue  # damaged
                 # A repeated one counts once.
                 entries[int(entry["shard"])] = {"machine": machine, "seconds": timed, "solve_seconds": solves}
             except (ValueError, KeyError, TypeError, AttributeError, OverflowError):

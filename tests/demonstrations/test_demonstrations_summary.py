@@ -1,6 +1,7 @@
 """The summary of a data set: the page shows its numbers and failures, and the card follows from the data."""
 
 import json
+import math
 import re
 import shutil
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from experts import generate_demonstrations, load_demonstrations
 from experts.demonstrations import Demonstrations, SerialExecutor, shard
 from experts.demonstrations import facts as tables
 from experts.demonstrations.data_card import MEANINGS, data_card
-from experts.demonstrations.facts import Facts, gather
+from experts.demonstrations.facts import Facts, gather, read_log
 from experts.demonstrations.shard import PARAMETERS, SUMMARIES, TRAJECTORIES
 from experts.problems.shooting_problem import FloatArray
 from experts.report.data_set_summary import sections, shortcomings, write_summary
@@ -83,6 +84,16 @@ def test_the_log_counts_each_shard_once(folder: Path):
     assert len(found.solve_seconds) == 18
     rest = sum(json.loads(line)["seconds"]["solves"] for line in lines[1:])
     assert found.seconds["solves"] == pytest.approx(8.0 + rest)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "solves"), [({}, []), ({"solves": 0.0}, [0.0]), ({"solves": 1.0}, [math.nan])]
+)
+def test_a_log_without_times_is_none(folder: Path, seconds: dict[str, float], solves: list[float]):
+    log = next((folder / "log").glob("*.jsonl"))
+    entry = {"shard": 0, "host": "host", "seconds": seconds, "solve_seconds": solves}
+    log.write_text(json.dumps(entry))
+    assert read_log(load_demonstrations(folder)).shards == 0
 
 
 @pytest.mark.slow
