@@ -120,6 +120,7 @@ class _Files:
     """The shards of a folder, some of them mapped."""
 
     def __init__(self, folder: Path, shards: Sequence[Mapping[str, Any]], scene: Scene) -> None:
+        self._made_of = folder, shards, scene
         self.scene, self.layout = scene, StateLayout.of(scene)
         self._sizes = [int(shard["demonstrations"]) for shard in shards]
         self.paths = [folder / SHARDS / shard["file"] for shard in shards]
@@ -130,6 +131,10 @@ class _Files:
     @cached_property
     def kernels(self) -> Kernels:
         return compile_scene(self.scene)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what they are made of: another process maps the files itself."""
+        return type(self), self._made_of
 
     def _map(self, shard: int) -> Tensors:
         tensors, path = map_tensors(self.paths[shard]), self.paths[shard]
@@ -157,7 +162,7 @@ class _Files:
 
 
 class Demonstrations(Sequence[Demonstration]):
-    """The demonstrations of a folder, or some of them.
+    """The demonstrations of a folder, or some of them; a copy or pickle opens the files anew.
 
     Attributes:
         path: The folder.
@@ -280,10 +285,10 @@ class Demonstrations(Sequence[Demonstration]):
             The parts, each in the order of the problems.
 
         Raises:
-            ValueError: If a fraction is negative, or they exceed 1 together.
+            ValueError: If a fraction is negative or NaN, or they exceed 1 together.
         """
         ends = np.cumsum(fractions)
-        if not fractions or min(fractions) < 0.0 or ends[-1] > 1.0 + 1e-9:
+        if not fractions or not all(each >= 0.0 for each in fractions) or ends[-1] > 1.0 + 1e-9:
             raise ValueError(f"fractions: {fractions}, should be positive and at most 1 together")
         shuffled = np.random.default_rng(seed).permutation(len(self))
         bounds = [0, *np.rint(ends * len(self)).astype(np.int64).tolist()]

@@ -1,5 +1,7 @@
 """Reading maps files, goes through them in batches, and splits them by problem."""
 
+import copy
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +73,15 @@ def test_it_is_a_sequence(whole: Demonstrations):
         whole[18]
 
 
+def test_copies_and_pickles_open_the_files_anew(whole: Demonstrations):
+    some = whole.select([9, 2])
+    some[0]  # maps a file
+    for twin in (pickle.loads(pickle.dumps(some)), copy.deepcopy(some)):
+        assert twin.column("index").tolist() == [9, 2]
+        np.testing.assert_array_equal(twin[0].actions, some[0].actions)
+        assert twin.scene == some.scene
+
+
 def test_a_split_shares_no_problem(whole: Demonstrations):
     train, test, rest = whole.split(0.5, 0.25, 0.25, seed=1)
     assert (len(train), len(test), len(rest)) == (9, 5, 4)
@@ -78,7 +89,7 @@ def test_a_split_shares_no_problem(whole: Demonstrations):
     assert sorted(together) == list(range(18))
     assert train.column("index").tolist() == whole.split(0.5, seed=1)[0].column("index").tolist()
     assert train.column("index").tolist() != whole.split(0.5, seed=2)[0].column("index").tolist()
-    for fractions in ((), (0.7, 0.7), (-0.1,)):
+    for fractions in ((), (0.7, 0.7), (-0.1,), (np.nan,), (0.5, np.nan)):
         with pytest.raises(ValueError, match="should be positive and at most 1 together"):
             whole.split(*fractions)
 
