@@ -13,6 +13,7 @@ steps, with a share of them kept free for disturbances.
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -122,6 +123,12 @@ class RecedingHorizonExpert:
         self._model_state = np.zeros((1, self.maneuver.n_states))
         self._model_gradient = np.zeros((1, self.maneuver.n_tangent))
         self._model_hessian = np.zeros((1, self.maneuver.n_tangent, self.maneuver.n_tangent))
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a RecedingHorizonExpert cannot be copied or pickled, its work arrays are its own: make another "
+            "one of the same scene"
+        )
 
     def reset(
         self, observation_or_state: ArrayLike | None = None, *, parameters: ArrayLike | None = None

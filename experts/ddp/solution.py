@@ -4,12 +4,12 @@ import json
 import os
 import platform
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, NoReturn, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +123,7 @@ class Solution:
             (N + 1, m), see `StageConstraints`; empty without constraints.
         constraints: How the trajectory keeps to its constraints; None without.
         metadata: JSON values to be saved along, for example the resolved scene.
-        problem: The problem solved; None after `load`.
+        problem: The problem solved; None after `load`, in deep copies and in other processes.
     """
 
     states: FloatArray
@@ -140,6 +140,13 @@ class Solution:
     constraints: ConstraintReport | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
     problem: ShootingProblem | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the problem, as files do: its machine code belongs to this process."""
+        return {**self.__dict__, "problem": None}
+
+    def __copy__(self) -> Self:
+        return replace(self)
 
     @property
     def converged(self) -> bool:
@@ -318,7 +325,7 @@ class FeedbackPolicy:
                 f"the solution has gains {solution.feedback_gains.shape} and states {solution.states.shape}, "
                 f"the problem needs gains {expected} and states ({horizon + 1}, {problem.n_states})"
             )
-        self._solution = solution
+        self._solution, self._problem = solution, problem
         # Limits may be among the parameters; without any, the solution was made with constants.
         with problem.parameters.being(solution.parameters if solution.parameters.size else None):
             self._lower, self._upper = stage_bounds(problem)
@@ -330,17 +337,36 @@ class FeedbackPolicy:
         self._buffers = buffer_table(self._reference, self._state, self._deviation)
         self._find_deviation = one_row_call(self._difference.address, address_of(self._buffers))
 
+    def __copy__(self) -> Self:
+        """Make another one, with its own buffers."""
+        return type(self)(self._solution, self._problem)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self.__copy__()
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a feedback policy cannot be pickled, its machine code belongs to this process: pickle or save "
+            "its solution, and call policy(problem) of that"
+        )
+
     def __call__(self, state: FloatArray, k: int) -> FloatArray:
-        """Compute the control, shape (n_u,), at a state, shape (n_x,), and a stage."""
+        """Compute the control, shape (n_u,), at a state, shape (n_x,), and a stage; NaN where the state is.
+
+        Raises IndexError for a stage that there is not, and ValueError for a state of another shape.
+        """
         horizon = self._solution.controls.shape[0]
         if not 0 <= k < horizon:
             raise IndexError(f"stage {k} is outside the trajectory, which has stages 0 to {horizon - 1}")
+        given = np.asarray(state)
+        if given.shape != self._state[0].shape:  # it would be spread over the whole state
+            raise ValueError(f"state has shape {given.shape}; expected {self._state[0].shape}")
         self._reference[0] = self._solution.states[k]
-        self._state[0] = state
+        self._state[0] = given
         self._find_deviation()
         control = self._solution.controls[k] + self._solution.feedback_gains[k] @ self._deviation[0]
         # Twice as fast as np.clip.
         control = np.asarray(np.minimum(np.maximum(control, self._lower[k]), self._upper[k]))
         if self._rates.change.size:
-            within_rates(control, state[self._rates.states], self._rates)
+            within_rates(control, given[self._rates.states], self._rates)
         return control

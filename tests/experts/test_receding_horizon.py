@@ -1,5 +1,8 @@
 """The receding-horizon expert: optimal when undisturbed, and better than its plan when pushed."""
 
+import copy
+import pickle
+
 import gymnasium
 import numpy as np
 import pytest
@@ -393,6 +396,12 @@ def test_wrong_input_is_named(paper):
     for setting in ({"horizon": 0}, {"horizon": 50.5}, {"iterations": -1}):
         with pytest.raises(ValueError, match=next(iter(setting))):
             RecedingHorizonExpert("paper", **setting)
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_an_expert_is_neither_copied_nor_pickled(paper, duplicate):
+    with pytest.raises(TypeError, match="make another one of the same scene"):
+        duplicate(paper)
 
 
 def bad_states(state):

@@ -1,4 +1,6 @@
+import copy
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -115,6 +117,33 @@ def test_loaded_solution_needs_a_problem_for_its_policy(solution, unicycle, pend
         loaded.policy(pendulum)
     state = solution.states[3] * 1.01
     np.testing.assert_array_equal(loaded.policy(unicycle)(state, 3), solution.policy()(state, 3))
+
+
+def test_copies_and_pickles_are_those_of_a_file(solution, unicycle):
+    state = solution.states[3] * 1.01
+    for twin in (pickle.loads(pickle.dumps(solution)), copy.deepcopy(solution)):
+        assert twin.problem is None
+        assert twin.stop_reason is solution.stop_reason
+        np.testing.assert_array_equal(twin.policy(unicycle)(state, 3), solution.policy()(state, 3))
+    assert copy.copy(solution).problem is unicycle
+
+
+def test_copies_of_a_policy_have_their_own_buffers_and_pickles_are_refused(solution):
+    policy = solution.policy()
+    state = solution.states[3] * 1.01
+    expected = policy(state, 3)
+    for twin in (copy.copy(policy), copy.deepcopy(policy)):
+        policy(solution.states[9], 9)
+        np.testing.assert_array_equal(twin(state, 3), expected)
+        assert not np.shares_memory(twin._state, policy._state)
+    with pytest.raises(TypeError, match=r"pickle or save its solution, and call policy\(problem\)"):
+        pickle.dumps(policy)
+
+
+@pytest.mark.parametrize("state", [0.0, np.zeros(1), np.zeros((1, 4)), np.zeros(3)])
+def test_policy_refuses_states_of_another_shape(solution, state):
+    with pytest.raises(ValueError, match=r"state has shape \(.*\); expected \(4,\)"):
+        solution.policy()(state, 0)
 
 
 @pytest.mark.parametrize("k", [-1, 80])
