@@ -157,7 +157,8 @@ class Solution:
         """Make the feedback policy u = clip(u_k + K_k (x (-) x_k)).
 
         Args:
-            problem: Problem or scene, for the difference of states and the bounds; needed after `load`.
+            problem: Problem or scene, for the difference of states and the bounds; needed where the solution
+                has none.
 
         Returns:
             Function of a state, shape (n_x,), and a stage k in [0, N); it returns a control, shape (n_u,).
@@ -167,7 +168,9 @@ class Solution:
         """
         given = self.problem if problem is None else as_problem(problem)
         if given is None:
-            raise ValueError("a loaded solution has no problem: call policy(problem) or policy(scene)")
+            raise ValueError(
+                "a loaded, copied or unpickled solution has no problem: call policy(problem) or policy(scene)"
+            )
         return FeedbackPolicy(self, given)
 
     def save(self, path: str | os.PathLike[str]) -> None:
