@@ -45,11 +45,25 @@ _ROW = np.zeros(1, dtype=np.int64)  # of the one state
 _StepCall = tuple[Any, Callable[[], None]]
 
 
-def _step_call(kernel: BoundKernel, arrays: Mapping[str, Array]) -> _StepCall:
-    """Bind a step to the arrays of an environment, and to one of its own for actions of the kernel's type."""
+def _step_call(kernel: BoundKernel, arrays: Mapping[str, Array], before: Array | None) -> _StepCall:
+    """Bind a step to the arrays of an environment, and to one of its own for actions of the kernel's type.
+
+    It copies the memory to `before` first, if there is such an array.
+    """
     (spec,) = (spec for spec in kernel.inputs if spec.name == "action")
     action: Any = np.zeros(spec.stride, spec.dtype)
-    return memoryview(action), KernelCall(kernel, {**arrays, "action": action}).of_one_row()
+    take_step = KernelCall(kernel, {**arrays, "action": action}).of_one_row()
+    if before is None:
+        return memoryview(action), take_step
+    kept: Any = before
+    memory: Any = arrays["memory"]
+    source, target = memoryview(memory), memoryview(kept)
+
+    def keep_memory_and_step() -> None:
+        target[:] = source
+        take_step()
+
+    return memoryview(action), keep_memory_and_step
 
 
 class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
@@ -309,9 +323,12 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         # A step reads state and memory before it writes them: they stay where they are.
         arrays["x_kept"], arrays["memory_kept"] = arrays["x"], arrays["memory"]
         self._start, self._observe = KernelCall(start, arrays), KernelCall(observe, arrays)
-        self._arrays, self._step = arrays, _step_call(step, arrays)
         self._x, self._draws = arrays["x"], arrays["draws"]
         self._memory = arrays["memory"]
+        # A step that diverges changes only what depends on the stage: a target that moves, and phases.
+        staged = self._memory.size > len(MEMORY) or self.scene.phases
+        self._memory_before = np.zeros_like(self._memory) if staged else None
+        self._arrays, self._step = arrays, _step_call(step, arrays, self._memory_before)
         self._parameters = arrays.get("parameters", np.zeros(0, dtype=self.kernels.dtype))
         self._path = given_path(self.scene, self.scene.simulation.steps) if "following" in arrays else None
         self._following = arrays.get("following", np.zeros(0))
@@ -320,7 +337,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
     @cached_property
     def _step_of_doubles(self) -> _StepCall:
         """The step for actions of any type but that of the action space."""
-        return _step_call(self.kernels.kernel("environment_step", lanes=1), self._arrays)
+        kernel = self.kernels.kernel("environment_step", lanes=1)
+        return _step_call(kernel, self._arrays, self._memory_before)
 
     @property
     def state(self) -> Array:
@@ -411,7 +429,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         Raises:
             ResetNeeded: Before the first reset, and after the end of an episode.
             TypeError: If the action is masked, or not of real numbers.
-            ValueError: If the action has a wrong shape or a NaN.
+            ValueError: If the action has a wrong shape or a NaN; nothing has moved then.
         """
         if self._over:
             state = "is over" if self._begun else "has not begun"
@@ -432,6 +450,8 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
         row = self._unpack(self._numbers)
         over = row[-3]
         if over and np.isnan(action).any():
+            if self._memory_before is not None:
+                self._memory[...] = self._memory_before
             raise ValueError(f"action: {action!r} holds NaN, should be numbers in [-1, 1]")
         self._over = over
         if self._payloads is not None and self._memory[0] in self._payloads.releases:

@@ -198,6 +198,20 @@ def test_bad_options_are_refused(change, message):
         env.reset(options={"nominal": True, "initial_state": x})
 
 
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_an_action_of_nan_moves_nothing(precision):
+    env = make("tracking").unwrapped  # whose target moves
+    env.reset(seed=0)
+    for _ in range(2):
+        before = env.get_state()
+        with pytest.raises(ValueError, match="holds NaN"):
+            env.step(np.full(12, np.nan, precision))
+        after = env.get_state()
+        for name, array in before.items():
+            np.testing.assert_array_equal(after[name], array)
+        env.step(np.zeros(12, precision))
+
+
 def test_bad_actions_are_refused_and_large_ones_clipped():
     env = make().unwrapped
     env.reset(seed=0)
