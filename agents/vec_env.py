@@ -347,8 +347,8 @@ class DQSpaceArmVecEnv(SB3VecEnv, EzPickle):
             SceneError: If the scene cannot be loaded.
             ValueError: If `DQSpaceArmVectorEnv` rejects an argument.
         """
-        EzPickle.__init__(self, num_envs, scene, seed, step_infos=step_infos, **kwargs)
         native = DQSpaceArmVectorEnv(num_envs, scene, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs)
+        EzPickle.__init__(self, num_envs, native.scene, seed, step_infos=step_infos, **kwargs)
         SB3VecEnv.__init__(self, native, seed, step_infos=step_infos)
 
 

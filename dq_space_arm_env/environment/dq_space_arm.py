@@ -22,7 +22,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.common.real_arrays import DOUBLE, SINGLE, real_array
 from dq_space_arm_env.compiler.random_draws import generator_of, generator_state
 from dq_space_arm_env.environment.reset_options import GivenStart, check_scene, given_start, saved_state
-from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
+from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
 from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.kernels import compile_scene
 from dq_space_arm_env.kernels.bound import BoundKernel, KernelCall
@@ -257,12 +257,13 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             ValueError: If the scene has no actuator, or one without a finite limit, or starts too far from the origin; if the
                 render mode is unknown; or if size or camera of the pictures is invalid.
         """
-        PicklesEpisodes.__init__(self, scene, render_mode, width, height, default_camera_config)
         self._picture = PictureFormat.checked(width, height, default_camera_config)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             modes = ", ".join(self.metadata["render_modes"])
             raise ValueError(f"render_mode: {render_mode!r} is unknown; choose from {modes}, or None")
         self.scene = load_scene(scene)
+        picture = width, height, default_camera_config
+        PicklesEpisodes.__init__(self, scene_to_copy(scene, self.scene), render_mode, *picture)
         self.kernels = compile_scene(self.scene)
         layout = self.kernels.layout
         unlimited = [
@@ -395,7 +396,7 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             state: What `get_state` returned, arrays of its shapes.
 
         Raises:
-            ValueError: If an array is missing, or has another shape or type; nothing is changed then.
+            ValueError: If an array is missing, has another shape or type, or is not finite; nothing is changed then.
         """
         expected = {
             **self._kept(),

@@ -21,7 +21,7 @@ from dq_space_arm_env.environment.goal_rewards import (
     show_goals,
 )
 from dq_space_arm_env.environment.reset_options import saved_state
-from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
+from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
 from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.task.step_report import OBSERVATION_LIMIT
@@ -173,9 +173,10 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
             ValueError: If the reward type or the render mode is unknown, `DQSpaceArmEnv` refuses the scene, it has other tips,
                 or a constraint of it terminates episodes.
         """
-        PicklesEpisodes.__init__(self, scene, reward_type, render_mode, width, height, default_camera_config)
         self._env = DQSpaceArmEnv(scene, render_mode, width, height, default_camera_config)
         self.scene, self.kernels = self._env.scene, self._env.kernels
+        picture = width, height, default_camera_config
+        PicklesEpisodes.__init__(self, scene_to_copy(scene, self.scene), reward_type, render_mode, *picture)
         if self.scene.other_tips:
             raise ValueError(
                 f"scene {self.scene.name!r} has tips besides the main one, and a goal is the pose of one tip: use "
@@ -241,7 +242,7 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
             state: What `get_state` returned, arrays of its shapes.
 
         Raises:
-            ValueError: If an array is missing, or has another shape or type.
+            ValueError: If an array is missing, has another shape or type, or is not finite.
         """
         expected = {"truncated": np.array(True)}
         truncated = checked_state(state, expected, self.scene.simulation.steps)["truncated"]

@@ -19,7 +19,7 @@ from dq_space_arm_env.environment.goal_rewards import (
     RewardType,
     show_goals,
 )
-from dq_space_arm_env.environment.saved_states import PicklesEpisodes
+from dq_space_arm_env.environment.saved_states import PicklesEpisodes, scene_to_copy
 from dq_space_arm_env.environment.sub_environments import Rows, StepResult, SubEnvironments
 from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
 from dq_space_arm_env.kernels import Kernels
@@ -64,7 +64,8 @@ class DQSpaceArmGoalVectorEnv(ComputesRewards, DQSpaceArmVectorEnv):
         """
         self.reward_type = reward_type
         super().__init__(num_envs, scene, autoreset_mode, **kwargs)
-        PicklesEpisodes.__init__(self, num_envs, scene, reward_type, autoreset_mode, **kwargs)
+        copied = scene_to_copy(scene, self.scene)
+        PicklesEpisodes.__init__(self, num_envs, copied, reward_type, autoreset_mode, **kwargs)
         self._seen = None  # a state that is shown again gives the same bits
 
     def _make_single(self, scene: Scene | Mapping[str, Any] | str | Path) -> DQSpaceArmGoalEnv:

@@ -10,30 +10,52 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from dq_space_arm_env.common.shown_text import shortened
+from dq_space_arm_env.scene import Scene, list_scenes
 
 Array = NDArray[Any]
 
+# Attributes of Gymnasium's environments that hold random generators, and the seed.
+_RANDOM = (
+    "_np_random",
+    "_np_random_seed",
+    "action_space",
+    "observation_space",
+    "single_action_space",
+    "single_observation_space",
+)
+
 
 class PicklesEpisodes(EzPickle):
-    """Pickles the arguments of an environment, its specification, and its running episodes."""
+    """Pickles the arguments of an environment, its specification, its running episodes and its generators."""
 
     def __getstate__(self: Any) -> dict[str, Any]:
         running = self.get_state() if self._begun else None
-        return {**EzPickle.__getstate__(self), "spec": self.spec, "state": running}
+        random = {name: self.__dict__[name] for name in _RANDOM if name in self.__dict__}
+        return {**EzPickle.__getstate__(self), "spec": self.spec, "state": running, "random": random}
 
     def __setstate__(self: Any, d: dict[str, Any]) -> None:
         EzPickle.__setstate__(self, d)
         self.spec = d["spec"]
         if d["state"] is not None:
             self.set_state(d["state"])
+        self.__dict__.update(d["random"])
+
+
+def scene_to_copy(given: object, loaded: Scene) -> Scene | str:
+    """The scene from which copies are made: the one loaded, since its file or its mapping may change.
+
+    A shipped one keeps its name: copies take longer from a scene, which is validated again.
+    """
+    return given if isinstance(given, str) and given in list_scenes() else loaded
 
 
 def checked_state(state: Mapping[str, Any], expected: Mapping[str, Array], steps: int) -> dict[str, Array]:
     """Arrays of a saved state with the names, shapes and types of those expected; others are passed over.
 
     Raises:
-        ValueError: If the state is no mapping, an array is missing, or has another shape or type, or the
-            memory counts a number of steps that an episode of so many does not have.
+        ValueError: If the state is no mapping, an array is missing, has another shape or type, or numbers
+            that are not finite, or the memory counts a number of steps that an episode of so many does not
+            have.
     """
     if not isinstance(state, Mapping):
         raise ValueError(f"state: {shortened(state)}, should be what get_state() returns")
@@ -51,4 +73,8 @@ def checked_state(state: Mapping[str, Any], expected: Mapping[str, Array], steps
     taken = found.get("memory", np.zeros(1))[..., 0]
     if not ((taken >= 0.0) & (taken <= steps) & (taken % 1.0 == 0.0)).all():
         raise ValueError(f"state: memory counts {taken} steps, should be whole numbers up to {steps}")
+    for name, array in found.items():
+        # A payload that the tip has not let go is adrift since NaN.
+        if name != "adrift" and array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"state: {name} {shortened(array)}, should be finite numbers")
     return found

@@ -19,7 +19,7 @@ from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.environment.reset_options import GivenStart, given_start, saved_state
-from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state
+from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
 from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
 from dq_space_arm_env.kernels import compile_scene
@@ -104,7 +104,6 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
                 "episodes off, vectorization_mode='sync'"
             )
         picture = width, height, default_camera_config
-        PicklesEpisodes.__init__(self, num_envs, scene, autoreset_mode, render_mode, threads, *picture)
         if not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise ValueError(f"num_envs: {num_envs!r}, should be a whole number of at least 1")
         if render_mode not in (None, "rgb_array"):
@@ -115,6 +114,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         self._picture = PictureFormat.checked(*picture)
         single = self._make_single(scene)
         self.scene, self.kernels = single.scene, compile_scene(single.scene, threads)
+        copied = scene_to_copy(scene, self.scene)
+        PicklesEpisodes.__init__(self, num_envs, copied, autoreset_mode, render_mode, threads, *picture)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = type(self).metadata | {
@@ -388,8 +389,8 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
 
         Raises:
             ResetNeeded: For some of the sub-environments, before the first reset of all.
-            ValueError: If there is no such sub-environment, or an array is missing, or has another shape or
-                type; nothing is changed then.
+            ValueError: If there is no such sub-environment, or an array is missing, has another shape or
+                type, or is not finite; nothing is changed then.
         """
         chosen = self._checked_rows(rows)
         if not self._begun and len(chosen) < self.num_envs:

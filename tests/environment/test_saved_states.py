@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -9,7 +10,13 @@ import pytest
 from gymnasium.error import ResetNeeded
 from short_scenes import short
 
-from dq_space_arm_env import DQSpaceArmEnv, DQSpaceArmGoalVectorEnv, DQSpaceArmVectorEnv, list_scenes
+from dq_space_arm_env import (
+    DQSpaceArmEnv,
+    DQSpaceArmGoalEnv,
+    DQSpaceArmGoalVectorEnv,
+    DQSpaceArmVectorEnv,
+    list_scenes,
+)
 
 LENGTH, MODES = 12, ("NextStep", "SameStep", "Disabled")
 DRAWN = short("random-target", LENGTH)
@@ -206,6 +213,11 @@ def test_bad_states_are_refused_and_change_nothing():
                 ValueError, match=r"state: memory counts .* steps, should be whole numbers up to"
             ):
                 each.set_state({**state, "memory": counted})
+        for name in ("x", "memory", "parameters"):
+            bad = state[name].copy()
+            bad[..., -1] = np.nan
+            with pytest.raises(ValueError, match=f"(?s)state: {name} .*should be finite numbers"):
+                each.set_state({**state, name: bad})
         assert_same(each.get_state(), state)
     for rows in ([3], [0, 0], [[True]], "x"):
         with pytest.raises(ValueError, match="rows: "):
@@ -221,6 +233,39 @@ def test_what_has_not_begun_is_copied_too():
         with pytest.raises(ResetNeeded):
             copied.step(np.zeros(env.action_space.shape))
         assert_same(copied.reset(seed=1), env.reset(seed=1))
+
+
+def test_copies_keep_generators():
+    env = DQSpaceArmEnv(DRAWN)
+    env.np_random = np.random.Generator(np.random.PCG64(1))
+    assert_same(copy.deepcopy(env).reset(), env.reset())
+    for env in (DQSpaceArmEnv(DRAWN), DQSpaceArmVectorEnv(2, DRAWN), DQSpaceArmGoalEnv(DRAWN)):
+        env.reset(seed=1)
+        env.action_space.seed(5)
+        env.observation_space.seed(6)
+        seed = env.np_random_seed
+        copied = pickle.loads(pickle.dumps(env))
+        assert copied.np_random_seed == seed
+        assert_same(copied.action_space.sample(), env.action_space.sample())
+        assert_same(copied.observation_space.sample(), env.observation_space.sample())
+        assert_same(copied.reset(), env.reset())
+
+
+@pytest.mark.parametrize("kind", ["path", "mapping"])
+@pytest.mark.parametrize(
+    "make",
+    [DQSpaceArmEnv, DQSpaceArmGoalEnv, partial(DQSpaceArmVectorEnv, 2), partial(DQSpaceArmGoalVectorEnv, 2)],
+)
+def test_copies_fly_in_the_scene_that_was_loaded(make, kind, tmp_path):
+    scene, file = short("planar", LENGTH), tmp_path / "mine.yaml"
+    scene.to_yaml(file)
+    given = file if kind == "path" else scene.model_dump()
+    env = make(scene=given)
+    file.unlink()
+    if kind == "mapping":
+        given["base"]["mass"] = 1000.0
+    for again in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        assert again.scene == env.scene == scene
 
 
 def test_a_planner_of_others_branches_an_episode():
