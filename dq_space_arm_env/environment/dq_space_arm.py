@@ -21,7 +21,13 @@ from numpy.typing import ArrayLike, NDArray
 from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.common.real_arrays import DOUBLE, SINGLE, real_array
 from dq_space_arm_env.compiler.random_draws import generator_of, generator_state
-from dq_space_arm_env.environment.reset_options import GivenStart, check_scene, given_start, saved_state
+from dq_space_arm_env.environment.reset_options import (
+    GivenStart,
+    check_scene,
+    checked_options,
+    given_start,
+    saved_state,
+)
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
 from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.kernels import compile_scene
@@ -498,16 +504,18 @@ class DQSpaceArmEnv(gymnasium.Env[Array, NDArray[Any]], PicklesEpisodes):
             Observation and info.
 
         Raises:
-            ValueError: If an option is unknown or excludes another; if state or target has a wrong shape, is not finite, or its pose is not a unit dual quaternion; or if the
-                scene's target does not vary; or if no scene may have the parameters (`SceneError`).
+            ValueError: If the options are no mapping, or one is unknown or excludes another; if state or target has a wrong shape, is not finite, or its pose is not a unit
+                dual quaternion; if actuators keep what is beyond their limits in the state, or a tank less than nothing; if the scene's target does not vary; or if no scene
+                may have the parameters (`SceneError`).
         """
-        saved = saved_state(options or {})
+        given = checked_options(options)
+        saved = saved_state(given)
         if saved is not None:
             self.set_state(saved)
             super().reset(seed=seed)
         else:
             super().reset(seed=seed)
-            self._begin(given_start(self.kernels, options or {}))
+            self._begin(given_start(self.kernels, given))
         memory = self._memory.copy()
         self._observe.on_rows(_ROW)
         if saved is not None:  # its costs are those of the step before, which may be rounded otherwise

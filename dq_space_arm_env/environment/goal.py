@@ -20,7 +20,7 @@ from dq_space_arm_env.environment.goal_rewards import (
     RewardType,
     show_goals,
 )
-from dq_space_arm_env.environment.reset_options import saved_state
+from dq_space_arm_env.environment.reset_options import checked_options, saved_state
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
 from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.scene import Scene
@@ -264,7 +264,7 @@ class DQSpaceArmGoalEnv(ComputesRewards, gymnasium.Env[Observation, NDArray[Any]
         Raises:
             ValueError: If an option is wrong.
         """
-        saved = saved_state(options or {})
+        saved = saved_state(checked_options(options))
         if saved is None:
             self._truncated = False
         else:

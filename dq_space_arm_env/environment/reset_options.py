@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -11,10 +12,11 @@ from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import dual_quaternion, poses
 from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.motion import Waypoints
-from dq_space_arm_env.scene.parameters import TARGET, target_entries
+from dq_space_arm_env.scene.parameters import TARGET, VELOCITY, target_entries
 from dq_space_arm_env.scene.path import given_path
 from dq_space_arm_env.scene.pose import PLANAR_POSE, Pose
 from dq_space_arm_env.scene.start import episode_scene, unit_quaternions
@@ -49,6 +51,17 @@ class GivenStart(NamedTuple):
             _give_sign_of_target(kernels, x, kernels.layout.target_with(parameters))
 
 
+def checked_options(options: Any) -> dict[str, Any]:
+    """The options of a reset as a dictionary, empty without any; ValueError for anything but a mapping."""
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise ValueError(
+            f"options: {shortened(options)}, should be a mapping from names, such as {{'nominal': True}}"
+        )
+    return dict(options)
+
+
 def saved_state(options: dict[str, Any]) -> Any:
     """The option "state", which excludes the others; None without it."""
     state = options.get("state")
@@ -62,26 +75,28 @@ def given_start(kernels: Kernels, options: dict[str, Any]) -> GivenStart:
     """Check the options of `DQSpaceArmEnv.reset`.
 
     Raises:
-        ValueError: If an option is unknown; if a number is missing or not finite; if the pose of the base or
-            the target is not a unit dual quaternion; if the scene's target is a constant; or if no scene may
-            have the parameters (`SceneError`).
+        ValueError: If an option is unknown; if nominal is not a bool; if a number is missing or not finite;
+            if the pose of the base or the target is not a unit dual quaternion; if actuators keep what is
+            beyond their limits, or a tank less than nothing; if the scene's target is a constant; or if no
+            scene may have the parameters (`SceneError`).
     """
     unknown = set(options) - set(_OPTIONS)
     if unknown:
         raise ValueError(f"options: {sorted(unknown)} unknown; choose from {', '.join(_OPTIONS)}")
-    state, target = options.get("initial_state"), options.get("target")
+    state, target, parameters = (options.get(name) for name in ("initial_state", "target", "parameters"))
+    nominal = options.get("nominal")
+    if not isinstance(nominal, bool | np.bool_ | None):
+        raise ValueError(f"options: nominal {shortened(nominal)}, should be True or False")
+    if parameters is not None:
+        parameters = _checked_parameters(kernels, parameters)
     if state is not None:
-        if options.get("nominal", False):
+        if nominal:
             raise ValueError("options: nominal and initial_state exclude each other")
         state = _checked_state(kernels, state)
-    elif options.get("nominal", False):
+        _check_actuators(kernels, state, parameters)
+    elif nominal:
         state = kernels.layout.initial_state
-    parameters = options.get("parameters")
-    return GivenStart(
-        state,
-        None if target is None else _checked_target(kernels, target),
-        None if parameters is None else _checked_parameters(kernels, parameters),
-    )
+    return GivenStart(state, None if target is None else _checked_target(kernels, target), parameters)
 
 
 def _checked_state(kernels: Kernels, state: Any) -> Array:
@@ -102,6 +117,27 @@ def _checked_state(kernels: Kernels, state: Any) -> Array:
         x[where] /= length
     check_size("options: initial_state", x)
     return x
+
+
+def _check_actuators(kernels: Kernels, x: Array, parameters: Array | None) -> None:
+    """Raise ValueError for a state in which actuators keep more than their limits, or a tank less than 0."""
+    layout, entries = kernels.layout, range(kernels.n_x)
+    most = layout.control_limit
+    if parameters is not None:
+        most = np.maximum(most, layout.limits_with(parameters))
+    least = layout.lower_limits(most)
+    kept = [*layout.previous_controls, *(chain.control for chain in layout.chains for _ in chain.names)]
+    where = [*entries[layout.state.actuators], *entries[layout.state.drives]]
+    bounds = [*zip(where, least[kept], most[kept], strict=True)]
+    bounds += [(index, 0.0, math.inf) for index in entries[layout.state.propellant]]
+    for index, low, high in bounds:
+        rounding = 1e-6 * (high if high < math.inf else 1.0)
+        if not low - rounding <= x[index] <= high + rounding:
+            allowed = f"from {low:g} to {high:g}" if high < math.inf else f"at least {low:g}"
+            raise ValueError(
+                f"options: initial_state has {layout.state.names[index]} = {x[index]:g} (entry {index}), "
+                f"should be {allowed}"
+            )
 
 
 def check_size(name: str, state: Array) -> None:
@@ -140,8 +176,13 @@ def check_scene(scene: Scene) -> None:
     }
     if scene.wrist is not None:
         lengths["wrist.frame.position"] = scene.wrist.frame.position
-    lengths |= {"tip.position": scene.tip.position, "target.pose.position": scene.target.pose.position}
+    lengths["tip.position"] = scene.tip.position
+    for index, tip in enumerate(scene.other_tips):
+        lengths[f"other_tips[{index}].frame.position"] = tip.frame.position
+        lengths[f"other_tips[{index}].goal.position"] = tip.goal.position
     sizes = {name: math.hypot(*position) for name, position in lengths.items()}
+    where, distance = max(_target_distances(scene), key=lambda each: each[1])
+    sizes[where] = distance
     sizes["spread.target_position"] = math.sqrt(3.0) * spread.target_position
     if scene.target.grasp != Pose() or spread.grasp_position:
         grasp = math.hypot(*scene.target.grasp.position) + math.sqrt(3.0) * spread.grasp_position
@@ -154,6 +195,14 @@ def check_scene(scene: Scene) -> None:
             f"scene {scene.name!r}: {name}: {size:.3g} m; lengths of the arm and distance of the target "
             f"should add up to at most {STATE_LIMIT:g} m, for observations to hold them"
         )
+
+
+def _target_distances(scene: Scene) -> Iterator[tuple[str, float]]:
+    """Distances of the target's poses from the origin, m: at the start, and at rest in phases."""
+    yield "target.pose.position", math.hypot(*scene.target.pose.position)
+    for index, pose in enumerate(scene.staged.resting):
+        if pose is not None:
+            yield f"phases[{index}].changes.target.pose.position", math.hypot(*poses.position(pose))
 
 
 def _target_way(scene: Scene) -> float:
@@ -201,6 +250,14 @@ def _checked_parameters(kernels: Kernels, parameters: Any) -> Array:
             f"options: parameters; {names[index]} is {values[index]:g}, should be {nominal[index]:g}: it is "
             "the phases that change it"
         )
+    if isinstance(kernels.scene.target.motion, Waypoints):
+        for index in kernels.parameters.indices(VELOCITY):
+            if abs(values[index] - nominal[index]) > 1e-6 * (1.0 + abs(nominal[index])):
+                raise ValueError(
+                    f"options: parameters; {names[index]} is {values[index]:g}, should be "
+                    f"{nominal[index]:g}: the waypoints say how fast the target moves"
+                )
+            values[index] = nominal[index]
     _check_values(kernels, tuple(values.tolist()))
     return values
 

@@ -18,7 +18,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
-from dq_space_arm_env.environment.reset_options import GivenStart, given_start, saved_state
+from dq_space_arm_env.environment.reset_options import GivenStart, checked_options, given_start, saved_state
 from dq_space_arm_env.environment.saved_states import PicklesEpisodes, checked_state, scene_to_copy
 from dq_space_arm_env.environment.specification import PlainSpec
 from dq_space_arm_env.environment.sub_environments import StepResult, SubEnvironments
@@ -185,7 +185,7 @@ class DQSpaceArmVectorEnv(VectorEnv[Any, NDArray[Any], NDArray[Any]], PicklesEpi
         Raises:
             ValueError: If an option or the number of seeds is wrong.
         """
-        rest = dict(options or {})
+        rest = checked_options(options)
         mask = self._checked_mask(rest.pop("reset_mask", None))
         rows, others = np.flatnonzero(mask), np.flatnonzero(~mask)
         saved = saved_state(rest)

@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 import warnings
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -196,6 +197,56 @@ def test_bad_options_are_refused(change, message):
         env.reset(options={"initial_state": change(x)})
     with pytest.raises(ValueError, match="exclude each other"):
         env.reset(options={"nominal": True, "initial_state": x})
+
+
+@pytest.mark.parametrize("make_one", [make, partial(gymnasium.make_vec, "DQSpaceArm-v0", num_envs=2)])
+def test_options_are_a_mapping_and_nominal_a_bool(make_one):
+    env = make_one(scene=short("planar"))
+    for bad in (["nominal"], "nominal", 3):
+        with pytest.raises(ValueError, match=r"options: .*, should be a mapping from names"):
+            env.reset(options=bad)
+    for bad in ("no", 1, [True]):
+        with pytest.raises(ValueError, match=r"options: nominal .*, should be True or False"):
+            env.reset(options={"nominal": bad})
+    env.reset(options={"nominal": np.True_, "target": None})
+
+
+def test_actuators_and_tank_start_with_what_they_can_have():
+    actuators = {
+        "base_force": {"limit": 1.0, "time_constant": 0.3, "delay": 1},
+        "base_torque": {"limit": 0.1, "slew_limit": 1.0},
+        "thrusters": [
+            {"position": [-0.5, 0, 0], "direction": [1, 0, 0], "force": 2, "specific_impulse": 200}
+        ],
+        "tank": {"propellant": 5.0},
+    }
+    env = make(short("planar").replace(actuators=actuators)).unwrapped
+    layout = env.kernels.layout
+    for name, bad, allowed in (
+        ("previous base torque z", 1e4, "from -0.1 to 0.1"),
+        ("base force x commanded 1 before", -1.1, "from -1 to 1"),
+        ("base force y output", 2.0, "from -1 to 1"),
+        ("propellant mass", -9.0, "at least 0"),
+    ):
+        index = layout.state.names.index(name)
+        x = np.where(np.arange(env.kernels.n_x) == index, bad, layout.initial_state)
+        message = rf"initial_state has {name} = {bad:g} \(entry {index}\), should be {allowed}"
+        with pytest.raises(ValueError, match=message):
+            env.reset(options={"initial_state": x})
+    env.reset(options={"initial_state": layout.initial_state})
+    for _ in range(5):
+        env.step(np.ones(layout.n_u))
+    env.reset(options={"initial_state": env.state})
+
+
+def test_goals_of_phases_and_of_other_tips_are_within_observations():
+    far = {"position": [5e6, 0, 0]}
+    phases = [{"name": "a", "steps": 6}, {"name": "b", "steps": 6, "changes": {"target.pose": far}}]
+    with pytest.raises(ValueError, match=r"phases\[1\]\.changes\.target\.pose\.position: 5e\+06 m"):
+        make(short("planar").replace(phases=phases))
+    tips = [tip.model_dump() | {"goal": far} for tip in load_scene("dual-arm").other_tips]
+    with pytest.raises(ValueError, match=r"other_tips\[0\]\.goal\.position: 5e\+06 m"):
+        make(short("dual-arm").replace(other_tips=tips))
 
 
 @pytest.mark.parametrize("precision", [np.float32, np.float64])

@@ -109,6 +109,18 @@ def test_parameters_that_no_scene_may_have_are_refused(scene, name, parameters, 
     np.testing.assert_array_equal(env.state, before["x"])
 
 
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_waypoints_say_how_fast_the_target_moves(precision):
+    points = [{"time": 0.0, "pose": {}}, {"time": 6.0, "pose": {"position": [1, 0, 0]}}]
+    motion = {"kind": "waypoints", "points": points}
+    env = make(short("planar", 5, precision).replace({"target.motion": motion}))
+    env.reset(seed=0)
+    env.reset(options={"parameters": env.parameters})
+    fast = given(env.kernels, target__velocity__v_x=1e5)
+    with pytest.raises(ValueError, match=r"target\.velocity\.v_x is 100000, should be 0\.166667: the waypo"):
+        env.reset(options={"parameters": fast})
+
+
 def test_what_is_drawn_is_told_by_name_at_reset():
     env = gymnasium.make("DQSpaceArm-v0", scene="random-masses")
     _, info = env.reset(seed=4)
