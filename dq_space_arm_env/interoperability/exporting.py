@@ -11,7 +11,7 @@ from dq_space_arm_env.scene import INTEGRATORS, Scene, SceneError
 from dq_space_arm_env.scene.actuator_chains import chains
 from dq_space_arm_env.scene.constraint_rows import sides
 from dq_space_arm_env.scene.constraints import JointLimits
-from dq_space_arm_env.scene.phases import phases_change_masses
+from dq_space_arm_env.scene.parameters import is_part
 from dq_space_arm_env.validation import did_you_mean
 
 
@@ -48,6 +48,15 @@ def coupled_rotors(scene: Scene) -> Iterator[str]:
                 "it has no rotors that turn with the body before the joint, and "
                 f"link {link.name!r} has one: set its motor's coupling to armature"
             )
+            return
+
+
+def changed_robots(scene: Scene) -> Iterator[str]:
+    """Say of a robot that phases change, in its bodies, joints or motors, that it stays as it is."""
+    for name in scene.staged.values:
+        of_robot = any(is_part(name, part) for part in ("base", "links", "payload"))
+        if of_robot and not name.endswith((".torque_limit", ".torque_weight")):
+            yield f"its robot stays as it is, and phases change {name}: set phases to []"
             return
 
 
@@ -92,8 +101,7 @@ def refuse(
         problems.append("it has no reaction wheels: set actuators.wheels to null")
     if scene.actuators.tank is not None:
         problems.append("it has no tank that empties: set actuators.tank to null")
-    if phases_change_masses(scene):
-        problems.append("its masses stay, and phases change some: set phases to []")
+    problems += changed_robots(scene)
     geared = [link.name for link in scene.links if link.motor is not None and link.motor.inertia]
     if rotors and geared and not any(link.is_elastic for link in scene.links):
         problems.append(f"it has no rotors, and link {geared[0]!r} has one: set its motor's inertia to 0")

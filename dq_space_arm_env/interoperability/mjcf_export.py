@@ -39,7 +39,8 @@ def scene_to_mjcf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     Body `base` has the frame e0 and a free joint, called `base joint`; in a planar scene it slides along x
     and y and turns about z. Each link is a body with the frame of its joint, a hinge about z or a slide along
     it or a ball, called by the link's name and " joint", with the scene's damping, spring and limits of the
-    joint; fixed links have none. Where arms branch, MuJoCo's coordinates follow one arm after the other.
+    joint; fixed links have none. A link called `world`, as MuJoCo's own body is, becomes `world_`.
+    Where arms branch, MuJoCo's coordinates follow one arm after the other.
     A rotor is an armature, Coulomb friction a friction loss, which MuJoCo has without the smoothing speed.
     MuJoCo pushes joints back from their limits, the scene's kernels do not, and it has no limits of rates.
     Site `tip` has the frame G, body `payload` is held at the tip; other tips have sites by their names.
@@ -65,7 +66,7 @@ def scene_to_mjcf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     Raises:
         SceneError: If the scene has a wrist that is not to be fixed, a constant wrench at the tip, a screw
             joint, reaction wheels, an elastic gear, a rotor that turns with the body before its joint, an
-            actuator that lags or delays, or phases that change masses.
+            actuator that lags or delays, or phases that change the robot.
     """
     scene = load_scene(scene)
     refuse(scene, "MJCF", wrist, at_once=True)
@@ -84,7 +85,8 @@ def scene_to_mjcf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     bodies = [base]
     limits = joint_limits(scene)
     for link, parent, (lower, upper, _) in zip(scene.links, scene.parent_bodies, limits, strict=True):
-        body = _add_body(bodies[parent], link.name, link.joint.dual_quaternion)
+        name = free_name("world", ["world", *names]) if link.name == "world" else link.name
+        body = _add_body(bodies[parent], name, link.joint.dual_quaternion)
         bodies.append(body)
         if not link.is_fixed:
             _add_joint(body, link, lower, upper)

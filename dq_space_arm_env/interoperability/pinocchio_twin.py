@@ -13,7 +13,7 @@ from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Placement, RigidBody, Screw
-from dq_space_arm_env.interoperability.exporting import coupled_rotors, tip_on_its_body
+from dq_space_arm_env.interoperability.exporting import changed_robots, coupled_rotors, tip_on_its_body
 from dq_space_arm_env.scene import Scene, SceneError, StateLayout, load_scene
 from dq_space_arm_env.scene.bodies import freedoms
 from dq_space_arm_env.scene.pose import PLANAR_POSE
@@ -41,12 +41,13 @@ def pinocchio_model(scene: Scene | str | Path) -> Any:
 
     Raises:
         ImportError: If Pinocchio is not installed.
-        SceneError: If the scene has reaction wheels, or a rotor is coupled to the body that carries it.
+        SceneError: If the scene has reaction wheels or a tank, a rotor is coupled to the body that carries
+            it, or phases change the robot.
     """
     pin = _pinocchio()
     scene = load_scene(scene)
     tree = _equations(scene).tree
-    problems = [*coupled_rotors(scene)]
+    problems = [*coupled_rotors(scene), *changed_robots(scene)]
     if problems:
         raise SceneError("\n  - ".join([f"scene {scene.name!r} cannot be a Pinocchio model:", *problems]))
     model = pin.Model()

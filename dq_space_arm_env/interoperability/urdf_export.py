@@ -36,7 +36,7 @@ def scene_to_urdf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     visuals.
 
     Features that URDF lacks and that change the motion are refused: joint springs, rotors, screw and
-    spherical joints, a wrench at the tip, a planar base, reaction wheels, phases that change masses. The
+    spherical joints, a wrench at the tip, a planar base, reaction wheels, phases that change the robot. The
     massless wrist as three joints would have infinite accelerations; fixed at its initial angles it changes
     no acceleration, but the tip cannot turn.
 

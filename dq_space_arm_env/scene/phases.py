@@ -185,15 +185,14 @@ def phase_problems(scene: Scene) -> Iterator[Problem]:
             continue
         own_names = {number.name for number in numbers(own)}
         rests = scene.target.motion is not None and own.target.motion is None
-        if (
-            own_names | ({name for name in names if _is_in(name, ("target.velocity",))} if rests else set())
-            != names
-        ):
+        still = {name for name in names if _is_in(name, ("target.velocity",))} if rests else set[str]()
+        if unlike := sorted((own_names | still) ^ names):
             valid = False
-            sentence = (
-                "adds or removes a term of the cost: give its weight a number other than 0 in the scene"
-            )
-            yield Problem(here, dict(phase.changes), sentence)
+            if _is_in(unlike[0], ("cost",)):
+                what = "a term of the cost: give its weight a number other than 0 in the scene"
+            else:
+                what = f"{unlike[0]}: give it a number other than 0, however small"
+            yield Problem(here, dict(phase.changes), f"adds or removes {what}")
         if not rests and not moves:
             yield Problem(
                 here, dict(phase.changes), "moves a target that came to rest: keep target.motion null"
@@ -240,6 +239,8 @@ def _change_problems(
             yield Problem((*here, path), value, "only payload, actuators or target.motion may be null")
         elif path == "payload" and scene.payload is None:
             yield Problem((*here, path), value, "the scene has no payload")
+        elif value is None and path.startswith(_ACTUATORS) and _value_at(scene, path) is None:
+            yield Problem((*here, path), value, f"the scene has no {path}")
         elif value is not None and _is_in(path, ("payload",)):
             yield Problem((*here, path), value, "the payload is held as it is, or not at all: payload: null")
         elif value is not None and not _may_change(path, names):

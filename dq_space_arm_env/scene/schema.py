@@ -19,7 +19,7 @@ from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.bodies import BASE, Base, Link, Payload, Wrist, freedoms, parent_bodies
 from dq_space_arm_env.scene.constraint_problems import constraint_problems
 from dq_space_arm_env.scene.constraint_rows import previous_controls
-from dq_space_arm_env.scene.constraints import AnyConstraint
+from dq_space_arm_env.scene.constraints import FRAMES, AnyConstraint
 from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
 from dq_space_arm_env.scene.maneuver import (
     Actuators,
@@ -215,7 +215,7 @@ class Scene(Model):
         if self.tip_link is not None and self.tip_link not in (BASE, *names):
             sentence = f"must be one of {', '.join([BASE, *names])}"
             yield Problem(("tip_link",), self.tip_link, sentence)
-        taken = [BASE, *names, "tip"]
+        taken = [*names]
         for index, tip in enumerate(self.other_tips):
             here: _Location = ("other_tips", index)
             if tip.link not in (BASE, *names):
@@ -224,7 +224,10 @@ class Scene(Model):
             elif tip.link == BASE and tip.payload is not None:
                 sentence = "the tip is on the base: add the payload's mass and inertia to the base's"
                 yield Problem((*here, "payload"), tip.payload, sentence)
-            if tip.name in taken:
+            if tip.name in FRAMES:
+                sentence = "is a frame of every scene, which constraints name: rename the tip"
+                yield Problem((*here, "name"), tip.name, sentence)
+            elif tip.name in taken:
                 yield Problem((*here, "name"), tip.name, "another tip, a link or the base has this name")
             taken.append(tip.name)
 

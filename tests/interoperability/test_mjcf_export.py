@@ -294,15 +294,16 @@ def test_every_tip_holds_its_payload():
     check_accelerations(scene, samples=2)
 
 
-def test_a_link_may_be_called_base():
-    scene = load_scene("no-wrist").replace({"links.0.name": "base"})
+@pytest.mark.parametrize("names", [("base", "link 2"), ("world", "world_")])
+def test_links_may_be_called_as_bodies_of_mujoco(names):
+    scene = load_scene("no-wrist").replace({"links.0.name": names[0], "links.1.name": names[1]})
     check_accelerations(scene, samples=1)
 
 
 @pytest.mark.parametrize(
     ("name", "wrist", "sentence"),
     [
-        ("release", "fixed", r"its masses stay, and phases change some: set phases to \[\]"),
+        ("release", "fixed", r"its robot stays as it is, and phases change payload.mass: set phases to \[\]"),
         ("paper", "refuse", r"written as MJCF:\n  - the wrist has joints without mass.*wrist='fixed'"),
         ("tip-load", "fixed", r"no constant wrench at the tip: set tip_wrench to null"),
         ("paper", "free", "wrist: 'free', it must be 'refuse' or 'fixed'"),
@@ -311,3 +312,13 @@ def test_a_link_may_be_called_base():
 def test_what_mjcf_cannot_hold_is_refused(name, wrist, sentence):
     with pytest.raises((SceneError, ValueError), match=sentence):
         scene_to_mjcf(load_scene(name), wrist=wrist)
+
+
+def test_phases_may_change_the_task_but_not_the_joints():
+    scene = load_scene("no-wrist").replace({"links.0.damping": 0.5})
+    half = {"steps": scene.simulation.steps // 2}
+    phases = [{"name": "a", **half}, {"name": "b", **half, "changes": {"cost.pose": 3.0}}]
+    assert scene_to_mjcf(scene.replace(phases=phases)) == scene_to_mjcf(scene)
+    phases = [{"name": "a", **half}, {"name": "b", **half, "changes": {"links.0.damping": 50.0}}]
+    with pytest.raises(SceneError, match=r"its robot stays as it is, and phases change links\.0\.damping"):
+        scene_to_mjcf(scene.replace(phases=phases))

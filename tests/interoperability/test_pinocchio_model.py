@@ -7,7 +7,7 @@ import pytest
 from foreign_robots import accelerations, drawn, relative_error, tip_pose
 
 from dq_space_arm_env import from_pinocchio, generalized_forces, load_scene, pinocchio_model, to_pinocchio
-from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene import SceneError, StateLayout
 
 pin = pytest.importorskip("pinocchio")
 
@@ -60,6 +60,13 @@ def test_wrong_shapes_are_refused():
         generalized_forces(scene, np.zeros(20), np.zeros(2))
     with pytest.raises(ValueError, match=r"wrist_angles: shape \(3,\), it must be \(0,\)"):
         from_pinocchio(scene, np.zeros(10), np.zeros(9), np.zeros(3))
+
+
+def test_phases_that_change_the_robot_are_refused():
+    scene = load_scene("capture-and-detumble")
+    with pytest.raises(SceneError, match=r"its robot stays as it is, and phases change payload\.mass"):
+        pinocchio_model(scene)
+    assert pinocchio_model(scene.replace(phases=())).nv > 0
 
 
 def test_without_pinocchio_it_says_what_to_install(monkeypatch):

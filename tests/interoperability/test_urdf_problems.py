@@ -390,7 +390,7 @@ def test_names_of_our_own_make_way():
         ("paper", {}, "the wrist has joints without mass"),
         ("tip-load", {}, "no constant wrench at the tip"),
         ("planar", {}, "no base that moves in a plane"),
-        ("release", {}, "its masses stay, and phases change some"),
+        ("release", {}, "its robot stays as it is, and phases change payload.mass"),
         ("no-wrist", {"stiffness": 1.0}, "no joint springs, and link 'link 1' has one"),
     ],
 )

@@ -277,3 +277,11 @@ class TestContentHash:
         change(data, "links.0.center_of_mass", [0.3, -0.0, 0])
         assert Scene.model_validate(data).content_hash() == before
         assert len(before) == 64
+
+
+@pytest.mark.parametrize("name", ["target", "grasp", "inertial", "tip", "base"])
+def test_no_other_tip_hides_a_frame(name: str) -> None:
+    scene = load_scene("dual-arm")
+    tips = [tip.model_dump() | {"name": name} for tip in scene.other_tips]
+    with pytest.raises(SceneError, match=rf"other_tips\[0\]\.name = '{name}': is a frame of every scene"):
+        scene.replace(other_tips=tips)

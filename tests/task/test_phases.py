@@ -406,6 +406,10 @@ def test_long_steps_have_mean_weights_and_catch_at_their_end() -> None:
         ({"phases.2.changes": {"target.motion": None, "cost.tip_twist": 0}}, "adds or removes a term"),
         ({"spread.payload_mass": 0.1}, "it can have no spread"),
         ({"payload": None}, "the scene has no payload"),
+        (
+            {"phases.1.changes": {"payload": None, "actuators.wheels": None}},
+            "phases[1].changes.actuators.wheels = null: the scene has no actuators.wheels",
+        ),
         ({"phases.0.changes": {"payload": None, "target.motion": None}}, "keep target.motion null"),
         (
             {"phases.0.changes": {"payload": None, "target.pose.position": [1, 2, 3]}},
@@ -426,6 +430,15 @@ def test_mistakes_are_named(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(SceneError, match="phases") as error:
         SCENES["capture-and-detumble"].replace(changes)
     assert words in str(error.value)
+
+
+def test_a_phase_takes_no_friction_away() -> None:
+    scene = load_scene("motors")
+    steps = scene.simulation.steps // 2
+    changes = {"links.0.motor.friction": 0.0}
+    phases = [{"name": "a", "steps": steps}, {"name": "b", "steps": steps, "changes": changes}]
+    with pytest.raises(SceneError, match=r"adds or removes links\.0\.motor\.friction: give it a number"):
+        scene.replace(phases=phases)
 
 
 def test_scenes_with_phases_survive_their_yaml() -> None:
