@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field
 
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.scene.constraints import Direction
 from dq_space_arm_env.scene.integrator_registry import INTEGRATORS
-from dq_space_arm_env.scene.parameters import thruster_names
+from dq_space_arm_env.scene.parameters import control_numbers, thruster_names
 from dq_space_arm_env.validation.fields import Limit, Name, Position, Positive, Three
 from dq_space_arm_env.validation.problems import Model, Problem, problem
 
@@ -157,20 +158,23 @@ def allocate(scene: Scene, force: ArrayLike, torque: ArrayLike) -> Array:
         forces give the wanted ones.
 
     Raises:
+        TypeError: If force or torque is masked, or not of real numbers.
         ValueError: If the scene has no thrusters, a shape is wrong, or a number is not finite.
     """
     thrusters = scene.actuators.thrusters
     if not thrusters:
         raise ValueError(f"scene {scene.name!r} has no thrusters to allocate forces to")
-    wanted = np.concatenate(
-        np.broadcast_arrays(*(np.asarray(v, np.float64) for v in (force, torque))), axis=-1
-    )
-    if wanted.ndim > 2 or wanted.shape[-1] != 6:
-        raise ValueError(f"force, torque: shapes {np.shape(force)}, {np.shape(torque)}, must end in 3")
+    parts = real_array("force", force, np.float64), real_array("torque", torque, np.float64)
+    batches = {part.shape[:-1] for part in parts} - {()}
+    if any(part.shape[-1:] != (3,) or part.ndim > 2 for part in parts) or len(batches) > 1:
+        shapes = " and ".join(str(part.shape) for part in parts)
+        raise ValueError(f"force, torque: shapes {shapes}, should be (3,) or (B, 3)")
+    wanted = np.concatenate(np.broadcast_arrays(*parts), axis=-1)
     if not np.isfinite(wanted).all():
         raise ValueError(f"force, torque: {wanted}, should be finite")
     wrenches = np.array([[*each.unit_direction, *each.moment] for each in thrusters]).T
     forces = np.array([_non_negative(wrenches, each) for each in np.atleast_2d(wanted)])
+    forces = forces.reshape(-1, len(thrusters))
     share = np.array([each.force for each in thrusters]) / np.maximum(forces, 1e-300)
     forces *= np.minimum(share.min(axis=1, keepdims=True), 1.0)
     return forces[0] if wanted.ndim == 1 else forces
@@ -211,10 +215,19 @@ def fuel_used(scene: Scene, controls: ArrayLike) -> float:
 
     Returns:
         The fuel, kg.
+
+    Raises:
+        TypeError: If the controls are masked, or not of real numbers.
+        ValueError: If the controls have a wrong shape, or a thruster a force below 0.
     """
-    thrusters = scene.actuators.thrusters or ()
-    forces = np.asarray(controls, np.float64)[:, -len(thrusters) :].sum(axis=0) if thrusters else ()
-    used = 0.0
+    thrusters, given = scene.actuators.thrusters or (), real_array("controls", controls, np.float64)
+    n_u = sum(map(len, control_numbers(scene).values()))
+    if given.ndim != 2 or given.shape[1] != n_u:
+        raise ValueError(f"controls: shape {given.shape}, should be (N, {n_u})")
+    jets = given[:, n_u - len(thrusters) :]
+    if (least := jets.min(initial=0.0)) < -1e-9:
+        raise ValueError(f"controls: {least:g} N for a thruster, should be 0 or greater")
+    used, forces = 0.0, jets.sum(axis=0)
     for each, total in zip(thrusters, forces, strict=True):
         used += float(total) * scene.simulation.dt * each.mass_flow
     return used

@@ -127,6 +127,26 @@ def test_fuel_is_impulse_by_specific_impulse() -> None:
     assert fuel_used(load_scene("paper"), np.zeros((3, 12))) == 0.0
 
 
+def test_fuel_and_allocation_check_their_arrays() -> None:
+    scene = planar()
+    assert allocate(scene, np.zeros((0, 3)), [0.0, 0.0, 0.0]).shape == (0, 4)
+    for force, torque in (
+        (np.zeros((2, 3)), np.zeros((3, 3))),
+        (1.0, np.zeros(3)),
+        (np.zeros(2), np.zeros(4)),
+    ):
+        with pytest.raises(ValueError, match=r"force, torque: shapes .*, should be \(3,\) or \(B, 3\)"):
+            allocate(scene, force, torque)
+    for call in (lambda: allocate(scene, [1j, 0, 0], np.zeros(3)), lambda: fuel_used(scene, [[1j] * 4])):
+        with pytest.raises(TypeError, match="should be real numbers"):
+            call()
+    for wrong in (np.zeros(4), np.zeros((2, 3)), np.zeros((1, 2, 4))):
+        with pytest.raises(ValueError, match=r"controls: shape .*, should be \(N, 4\)"):
+            fuel_used(scene, wrong)
+    with pytest.raises(ValueError, match="controls: -1 N for a thruster, should be 0 or greater"):
+        fuel_used(scene, [[0.0, -1.0, 0.0, 0.0]])
+
+
 def test_names_limits_and_weights_are_those_of_the_jets() -> None:
     scene = planar(**{"actuators.thrusters.1": {**JETS[1], "name": "aft"}, "parameters": ["actuators"]})
     layout = StateLayout.of(scene)
