@@ -103,6 +103,11 @@ class ChosenDisturbances(Disturbances):
         super().__init__(scene, rng, **settings)
         self._flights = np.array(flights, dtype=np.int64)
 
+    @property
+    def episodes(self) -> int:
+        """Number of flights that `draw` disturbs."""
+        return len(self._flights)
+
     def draw(self) -> Disturbance:
         """Draw the disturbances of the next step."""
         return Disturbance(*(None if part is None else part[self._flights] for part in super().draw()))

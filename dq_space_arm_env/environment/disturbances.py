@@ -65,6 +65,11 @@ class Disturbances:
         self._probability = pushes / steps
         self._interval = max(steps // int(pushes + 1), 1) if evenly else 0
 
+    @property
+    def episodes(self) -> int:
+        """Number of episodes that `draw` disturbs."""
+        return self.count
+
     def _column(self, sigma: ArrayLike) -> FloatArray:
         """A standard deviation for each episode, shape (B, 1), or for each of its numbers, (B, n)."""
         given = np.asarray(sigma, dtype=np.float64)

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances
 from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
 from dq_space_arm_env.kernels import compile_scene
@@ -176,16 +177,27 @@ def rollout(
         The rollout.
 
     Raises:
-        ValueError: If actions have a wrong shape, delay is negative, or both seeds and starts are given.
+        TypeError: If actions are masked, or not of real numbers.
+        ValueError: If actions have a wrong shape, delay is negative, steps are no whole number of at least 1,
+            disturbances are those of another number of episodes, or both seeds and starts are given.
     """
     if seeds is not None and starts is not None:
         raise ValueError("seeds and starts exclude each other")
     if delay < 0:
         raise ValueError(f"delay: {delay}, should be at least 0 steps")
+    if steps is None:
+        steps = scene.simulation.steps
+    elif isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+        raise ValueError(f"steps: {steps!r}, should be a whole number of at least 1, or None")
     environment, observation, info = _begin(scene, seeds, starts, parameters)
+    if disturbances is not None and disturbances.episodes != environment.num_envs:
+        raise ValueError(
+            f"disturbances: those of {disturbances.episodes} episodes, should be of {environment.num_envs}: "
+            f"make them with count={environment.num_envs}"
+        )
     if (begin := getattr(policy, "begin", None)) is not None:
         begin(environment)
-    log = _Log(environment, observation, info, steps or scene.simulation.steps, record)
+    log = _Log(environment, observation, info, steps, record)
     observes = record or not isinstance(policy, StateFeedback)
     idle = np.zeros((len(log.state), environment.kernels.n_u))
     waiting = deque([idle] * delay)  # actions on their way, the oldest first
@@ -202,7 +214,7 @@ def rollout(
         began = perf_counter()
         asked = policy.act(measured, step) if isinstance(policy, StateFeedback) else policy(observation)
         log.action_seconds[step] = perf_counter() - began
-        waiting.append(np.array(asked))
+        waiting.append(np.array(real_array("actions of the policy", asked)))
         actions = log.before_step(step, observation, waiting.popleft(), disturbance.inputs)
         observation, reward, terminated, _, info = environment.step(actions)
         log.after_step(step, reward, terminated, info)

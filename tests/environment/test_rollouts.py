@@ -178,6 +178,27 @@ def test_a_base_alone_has_no_mass_to_change(scene):
     assert with_loads(bare, [1.0])[0] == bare
 
 
+def test_disturbances_are_those_of_all_episodes(scene):
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match="those of 1 episodes, should be of 3: make them with count=3"):
+        rollout(wave, scene, [0, 1, 2], disturbances=Disturbances(scene, rng, inputs=0.1))
+    noisy = Disturbances(scene, rng, inputs=0.1, count=3)
+    flown = rollout(wave, scene, [0, 1, 2], disturbances=noisy, record=True, steps=2)
+    assert not np.array_equal(flown.noise[0], flown.noise[1])
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2.5, True])
+def test_a_rollout_takes_a_step_at_least(scene, steps):
+    with pytest.raises(ValueError, match=f"steps: {steps}, should be a whole number of at least 1"):
+        rollout(wave, scene, [0], steps=steps)
+
+
+@pytest.mark.parametrize("actions", [np.ma.masked_array(np.ones((1, 6)), mask=True), [[None] * 6]])
+def test_actions_of_policies_are_real_numbers(scene, actions):
+    with pytest.raises(TypeError, match=r"actions of the policy: .*, should be real numbers"):
+        rollout(lambda seen: actions, scene, [0])
+
+
 def test_equal_generators_draw_equal_disturbances(scene):
     one, other = (
         Disturbances(scene, np.random.default_rng(3), push=[0.1, 0.2], pushes=6, measurement=[0.0, 0.1])
