@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.kernels import Kernels
 from dq_space_arm_env.kernels.bound import KernelCall
 
@@ -94,10 +96,33 @@ class ComputesRewards:
 
         Raises:
             TypeError: If a goal is masked, or not of real numbers.
-            ValueError: If the goals have wrong or different shapes.
+            ValueError: If the goals have wrong or different shapes, one is not finite or has a real part of
+                zero, or there are not as many infos as goals.
         """
-        rewards = self._goals.of(self._goals.compare(achieved_goal, desired_goal), _diverged(info))
+        comparison, diverged = self._goals.compare(achieved_goal, desired_goal), _diverged(info)
+        _check_poses(comparison, achieved_goal=achieved_goal, desired_goal=desired_goal)
+        try:
+            rewards = self._goals.of(comparison, diverged)
+        except ValueError:
+            shapes = (
+                f"{np.shape(diverged)}, should be one dictionary or of shape {comparison.pose_cost.shape}"
+            )
+            raise ValueError(f"info: of shape {shapes}, as the goals are") from None
         return rewards if rewards.ndim else float(rewards)
+
+
+def _check_poses(comparison: Comparison, **goals: ArrayLike) -> None:
+    """Raise ValueError for goals, shape (..., 8), that are no poses, as zeros of a buffer are none."""
+    # Zeros have the attitude of any other goal; to look closer only then costs batches little.
+    finite = all(math.isfinite(np.vdot(values, values)) for values in goals.values())
+    if finite and comparison.attitude_error.all():
+        return
+    for name, values in goals.items():
+        rows = np.asarray(values)
+        if not (np.isfinite(rows).all() and rows[..., :4].any(axis=-1).all()):
+            raise ValueError(
+                f"{name}: {shortened(values)}, should be poses: finite numbers, with a real part other than 0"
+            )
 
 
 def _diverged(info: Info | Sequence[Info] | NDArray[Any] | None) -> bool | NDArray[np.bool_]:

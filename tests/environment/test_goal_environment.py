@@ -247,6 +247,20 @@ def test_goals_alone_and_in_batches():
         env.compute_reward(achieved, desired[:, 0], None)
 
 
+@pytest.mark.parametrize("reward_type", ["sparse", "dense"])
+def test_goals_that_are_no_poses_are_refused(reward_type):
+    env = DQSpaceArmGoalEnv(short("random-target"), reward_type)
+    sound = np.tile(env.reset(seed=0)[0]["desired_goal"], (3, 1))
+    for row in (np.zeros(8), np.full(8, np.nan), [1, 0, 0, 0, np.inf, 0, 0, 0]):
+        wrong = np.vstack([sound[:2], row])
+        with pytest.raises(ValueError, match=r"(?s)achieved_goal: .*, should be poses"):
+            env.compute_reward(wrong, sound, {})
+        with pytest.raises(ValueError, match=r"(?s)desired_goal: .*, should be poses"):
+            env.compute_reward(sound, wrong, {})
+    with pytest.raises(ValueError, match=r"info: of shape \(2,\), should be .* of shape \(3,\)"):
+        env.compute_reward(sound, sound, [{}, {}])
+
+
 def test_a_goal_that_is_held_is_a_success_and_does_not_end_the_episode():
     env = make(short("random-target", 5))
     observation, _ = env.reset(options={"nominal": True})
