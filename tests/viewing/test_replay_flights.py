@@ -242,3 +242,26 @@ def test_a_solution_of_a_scene_with_phases_is_shown_with_the_target_of_each_phas
         np.testing.assert_allclose(shown.target[stage], scene.staged.resting[phase], atol=1e-15)
     resting = prepare([make_flight(load_scene("refuelling"))], load_scene("refuelling"))[0]
     assert resting.target.shape == (8,)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("no-wrist", {"links.0.joint_type": "prismatic"}),
+        ("dual-arm", {"other_tips.0.frame.position": [0.0, 0.1, 0.0]}),
+        ("dual-arm", {"other_tips": []}),
+    ],
+)
+def test_robots_that_move_otherwise_are_not_shown_together(name, change):
+    scene = load_scene(name)
+    flights = []
+    for own in (scene, scene.replace({**change, "name": "changed"})):
+        layout = compile_scene(own).layout
+        states, controls = np.tile(layout.initial_state, (2, 1)), np.zeros((1, layout.n_u))
+        flights.append(Trajectory(own.name, states, controls, scene=own))
+    with pytest.raises(
+        ValueError, match=r"'changed' is one of another robot .*: show them on separate pages"
+    ):
+        common_scene(flights)
+    same = scene.replace({"base.mass": 200.0, "name": "heavy"})
+    assert common_scene([flights[0], replace(flights[0], scene=same)])[1] == scene

@@ -102,5 +102,6 @@ def _check_same_robot(label: str, own: Scene, scene: Scene) -> None:
 
 def _frames(scene: Scene) -> tuple[object, ...]:
     """How the frames of a scene's robot are placed."""
-    joints = [link.joint for link in scene.links], scene.parent_bodies
-    return scene.base.motion, joints, scene.tip_body, scene.wrist, scene.tip
+    joints = [(link.joint, link.joint_type, link.pitch) for link in scene.links], scene.parent_bodies
+    tips = [(scene.body_named(tip.link), tip.frame) for tip in scene.other_tips]
+    return scene.base.motion, joints, scene.tip_body, scene.wrist, scene.tip, tips
