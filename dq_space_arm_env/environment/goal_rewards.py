@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -113,15 +112,14 @@ class ComputesRewards:
 
 def _check_poses(comparison: Comparison, **goals: ArrayLike) -> None:
     """Raise ValueError for goals, shape (..., 8), that are no poses, as zeros of a buffer are none."""
+    given = {name: np.asarray(values) for name, values in goals.items()}
     # Zeros have the attitude of any other goal; to look closer only then costs batches little.
-    finite = all(math.isfinite(np.vdot(values, values)) for values in goals.values())
-    if finite and comparison.attitude_error.all():
+    if comparison.attitude_error.all() and all(np.isfinite(rows).all() for rows in given.values()):
         return
-    for name, values in goals.items():
-        rows = np.asarray(values)
+    for name, rows in given.items():
         if not (np.isfinite(rows).all() and rows[..., :4].any(axis=-1).all()):
             raise ValueError(
-                f"{name}: {shortened(values)}, should be poses: finite numbers, with a real part other than 0"
+                f"{name}: {shortened(rows)}, should be poses: finite numbers, with a real part other than 0"
             )
 
 
