@@ -35,7 +35,7 @@ from dq_space_arm_env.common.bounded_reading import read_bytes, read_mapping
 
 LEARNER, ARRAYS, STATE = "learner.pth", "arrays.npz", "state.json"
 MOST_BYTES = 1 << 30
-"""Largest parameters and optimizers that are read."""
+"""Largest parameters and optimizers that are read, beside those of the learner's networks."""
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "step_factor")
 _COLUMNS = (
     "observations",
@@ -47,7 +47,6 @@ _COLUMNS = (
     "ep_start",
     "ep_length",
 )
-_SPARE = 1 << 26  # bytes that an archive has beside what is known of it
 
 
 def write_checkpoint(folder: Path, model: BaseAlgorithm, progress: Progress) -> None:
@@ -84,9 +83,10 @@ def read_checkpoint(folder: Path, model: BaseAlgorithm) -> Progress:
         )
     try:
         state = read_mapping(folder / STATE)
-        parts = read_tensors(read_bytes(folder / LEARNER, MOST_BYTES))
-        expected = sum(8 * array.size for _, array in _columns(model))
-        arrays = read_arrays(folder / ARRAYS, most=expected + _SPARE)
+        # Adam keeps two numbers beside each parameter.
+        networks = 3 * sum(parameter.nbytes for parameter in model.policy.parameters())
+        parts = read_tensors(read_bytes(folder / LEARNER, networks + MOST_BYTES))
+        arrays = read_arrays(folder / ARRAYS, most=_claimed(folder / ARRAYS))
         return _restored(model, state, parts, arrays)
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error).partition("\n")[0]
@@ -112,6 +112,11 @@ def _restored(
     model._last_episode_starts = arrays["episode_starts"]
     _seed_again(model, state["generators"], parts["generator"])
     return progress
+
+
+def _claimed(path: Path) -> int:
+    """Bytes that an archive stands for at most: nothing in it is compressed, and a bool counts as 8 bytes."""
+    return 8 * path.stat().st_size if path.exists() else 0
 
 
 def _variables(model: BaseAlgorithm) -> dict[str, torch.Tensor]:

@@ -10,10 +10,11 @@ import torch
 
 from agents import ExportedPolicy
 from agents.configuration import load_configuration
-from agents.reinforcement.checkpoint import read_checkpoint
+from agents.reinforcement.checkpoint import read_checkpoint, write_checkpoint
 from agents.reinforcement.reinforcement_training import make_environment, make_learner
 from agents.reinforcement.sac import DemonstrationBuffer
 from agents.reinforcement.training_environment import native_environment
+from agents.reinforcement.training_progress import Progress
 from agents.reinforcement.warm_start import fly_again
 from agents.run_folder import RunFolder
 from agents.training import train
@@ -175,3 +176,16 @@ def test_a_run_resumes_with_both_buffers(trained, demonstrations, small_scene, s
     more = train(configuration(demonstrations, small_file, total_steps=1800), trained.folder)
     assert more.model.num_timesteps * REPEAT == 1800
     assert isinstance(more.model.replay_buffer, DemonstrationBuffer)
+
+
+def test_demonstrations_larger_than_the_buffer_are_resumed(demonstrations, small_scene, small_file, tmp_path):
+    settings = configuration(demonstrations, small_file)
+    environment = make_environment(settings, small_scene)
+    model, again = (make_learner(settings, environment, blank=True) for _ in range(2))
+    model._last_obs, model._last_episode_starts = environment.reset(), np.ones(COPIES, dtype=bool)
+    n_obs, n_u = environment.observation_space.shape[0], environment.action_space.shape[0]
+    sizes = n_obs, n_u, n_obs, 1, 1
+    model.replay_buffer._demonstrated = tuple(np.zeros((160_000, n), dtype=np.float32) for n in sizes)
+    write_checkpoint(tmp_path, model, Progress(1200))
+    assert read_checkpoint(tmp_path, again) == Progress(1200)
+    assert [column.shape[1] for column in again.replay_buffer._demonstrated] == [*sizes]
