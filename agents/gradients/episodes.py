@@ -286,6 +286,8 @@ class Episodes:
         above, below = (self._wanted > self._high[:decisions]), (self._wanted < self._low[:decisions])
         is_limited: Array = np.any(above | below, axis=(1, 2))
         units, scales = self.units * self._high / kept, scale * kept
+        # Late outputs of one phase may act in the next, whose limits are others.
+        is_late = self._met.delays is not None and len(self._firsts) > 1
         steep = STEEP_PENALTIES if self.penalties.are_strict else STEEP
         for k in range(decisions - 1, -1, -1):
             further: Array | float = 0.0
@@ -300,8 +302,9 @@ class Episodes:
                 slope[(above[k] & (slope < 0.0)) | (below[k] & (slope > 0.0))] = 0.0
             if any_lost:
                 slope[lost] = 0.0
-            self._arrivals[k].back(slope, self._by_output)
-            back = self._layers.backward(k, self._by_output[k] * units[k] + by_roughness[k])
+            self._arrivals[k].back(slope * units[k] if is_late else slope, self._by_output)
+            by_output = self._by_output[k] if is_late else self._by_output[k] * units[k]
+            back = self._layers.backward(k, by_output + by_roughness[k])
             np.multiply(back, scales, out=self._by_observation)
             self._calls[k]["observation_vjp"](rows)
             self._cotangents[k] += self._by_state
