@@ -36,7 +36,7 @@ from agents.run_folder import (
 )
 from agents.zoo.starting import load_start, spent_before
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, load_scene
-from dq_space_arm_env.common.bounded_formats import read_arrays
+from dq_space_arm_env.common.bounded_formats import ARRAY_BYTES, read_arrays
 from dq_space_arm_env.common.bounded_reading import UnreadableError
 from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.progress import Advance, Status
@@ -355,8 +355,8 @@ class _Learner:
         self._episodes.units[:], self._end_weight = arrays["units"], float(arrays["end_weight"])
         self._episodes.penalties.prices[:] = arrays["prices"]
 
-    def _write(self, path: Path) -> None:
-        stream = io.BytesIO()
+    def _everything(self) -> dict[str, Array]:
+        """The arrays of a checkpoint by name."""
         numbers = {name: getattr(self, name) for name in _NUMBERS}
         arrays = {**self._state(), **{name: np.array(each) for name, each in numbers.items()}}
         for copy in _COPIES:
@@ -364,7 +364,11 @@ class _Learner:
         arrays |= {"mean": self._mean, "scale": self._scale, "substeps": self._episodes.substeps}
         arrays["cost"] = np.array(self._episodes.penalties.cost)
         arrays["roughness"] = np.array(self._episodes.roughness)
-        np.savez(stream, **arrays)  # type: ignore[arg-type]
+        return arrays
+
+    def _write(self, path: Path) -> None:
+        stream = io.BytesIO()
+        np.savez(stream, **self._everything())  # type: ignore[arg-type]
         write_atomically(path / CHECKPOINT, stream.getvalue())
 
     def resume(self, folder: RunFolder) -> None:
@@ -373,7 +377,8 @@ class _Learner:
         if place is None:
             return
         try:
-            arrays = read_arrays(place / CHECKPOINT)
+            expected = sum(8 * each.size for each in self._everything().values())
+            arrays = read_arrays(place / CHECKPOINT, most=expected + ARRAY_BYTES)
             self._restore(arrays)
             for copy in _COPIES:
                 start = f"{copy}."

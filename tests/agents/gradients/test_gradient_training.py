@@ -275,6 +275,13 @@ def trained_curve(folder):
     return RunFolder(folder, load_configuration(folder / "config.yaml")).evaluations()
 
 
+def test_checkpoints_may_be_as_large_as_their_network_asks_for(small_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(gradient_training, "ARRAY_BYTES", 0)  # what they may have beside
+    first, again = (train_by_gradients(settings(small_file, updates=3), tmp_path).policy for _ in range(2))
+    for one, other in zip(first.weights, again.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_a_damaged_checkpoint_is_refused(small_file, tmp_path):
     train_by_gradients(settings(small_file, updates=20), tmp_path)
     (checkpoint,) = (tmp_path / "checkpoints").glob("*/checkpoint.npz")
