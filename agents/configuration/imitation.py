@@ -15,6 +15,7 @@ from agents.configuration.schema import (
     Few,
     Many,
     Width,
+    weight_problems,
 )
 from dq_space_arm_env.validation import Count, Finite, Model, NonNegative, Positive, Problem, count_up_to
 
@@ -123,6 +124,7 @@ class ActionChunking(Fit):
         yield from super()._problems()
         if self.width % self.heads:
             yield Problem(("heads",), self.heads, f"must divide width, {self.width}")
+        yield from weight_problems("width", self.width, 12 * self.layers * self.width**2)
         steps = (self.chunk - 1) * self.spacing + 1
         if steps > LONGEST_CHUNK:
             sentence = f"{self.chunk} actions are {steps:,} time steps, must be at most {LONGEST_CHUNK:,}"

@@ -1,6 +1,7 @@
 """Settings shared by all agents: name, scene, seed, network, and demonstrations."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import Field, StrictInt, StrictStr
@@ -27,7 +28,16 @@ StartFrom = Annotated[
 MOST_IN_MEMORY = 100_000_000
 """Largest number of decisions in memory, some ten gigabytes."""
 MOST_LAYERS = 32
+MOST_WEIGHTS = 2**24
+"""Largest number of weights between hidden layers: exported policies have room for as many more."""
 _Part = TypeVar("_Part", bound=Model)
+
+
+def weight_problems(key: str, value: object, weights: int) -> Iterator[Problem]:
+    """Tell whether layers of some sizes have more weights between them than a policy's file may have."""
+    if weights > MOST_WEIGHTS:
+        sentence = f"makes {weights:,} weights between layers, must make at most {MOST_WEIGHTS:,}"
+        yield Problem((key,), value, sentence)
 
 
 class Network(Model):
@@ -37,6 +47,9 @@ class Network(Model):
         default=(128, 128), max_length=MOST_LAYERS, description="sizes of the hidden layers"
     )
     activation: Literal["tanh", "relu", "silu"] = Field(default="tanh", description="between the layers")
+
+    def _problems(self) -> Iterator[Problem]:
+        yield from weight_problems("hidden", list(self.hidden), sum(a * b for a, b in pairwise(self.hidden)))
 
 
 class AgentConfiguration(Model):

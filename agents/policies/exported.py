@@ -250,6 +250,9 @@ class ExportedPolicy:
 
         Args:
             path: The file, `.npz` by convention.
+
+        Raises:
+            PolicyFileError: If the network is larger than what `load` reads.
         """
         arrays: dict[str, NDArray[Any]] = {
             "activation": np.array(self.activation),

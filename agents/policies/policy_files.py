@@ -19,7 +19,7 @@ from dq_space_arm_env.common.files import write_atomically
 from dq_space_arm_env.common.shown_text import shortened
 
 FORMAT = 1  # version of the files
-MOST_BYTES = 64 * 2**20  # 8 million weights, hundreds of times those of a policy of the zoo
+MOST_BYTES = 256 * 2**20  # 33 million weights; twice as many as configurations allow between layers
 
 
 class PolicyFileError(Exception):
@@ -32,9 +32,15 @@ def metadata_text(metadata: Mapping[str, Any]) -> NDArray[Any]:
 
 
 def write_policy(path: str | os.PathLike[str], kind: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write the version of a kind of files, and arrays, atomically."""
-    content = io.BytesIO()
-    np.savez_compressed(content, allow_pickle=False, **{kind: np.array(FORMAT), **arrays})
+    """Write the version of a kind of files, and arrays, atomically; PolicyFileError if they are too large."""
+    content, versioned = io.BytesIO(), {kind: np.array(FORMAT), **arrays}
+    size = sum(array.size * max(array.itemsize, 8) for array in versioned.values())
+    if size > MOST_BYTES:
+        raise PolicyFileError(
+            f"{path} would have {size:,} bytes, 8 per number, at most {MOST_BYTES:,} are read: make the "
+            "network smaller"
+        )
+    np.savez_compressed(content, allow_pickle=False, **versioned)
     write_atomically(Path(path), content.getvalue())
 
 

@@ -93,6 +93,10 @@ def test_unknown_keys_are_refused_with_a_suggestion():
         ({"environment": {"action_scale": {"base_force": 2.0}}}, "base_force = 2.0: must be at most 1"),
         ({"environment": {"action_scale": {"wheel_torque": 2}}}, "wheel_torque = 2.0: must be at most 1"),
         ({"network": {"activation": "sigmoid"}}, "network.activation = 'sigmoid': must be"),
+        (
+            {"network": {"hidden": [8192, 8192]}},
+            "network.hidden = [8192, 8192]: makes 67,108,864 weights between layers, must make at most",
+        ),
         ({"schedule": {}}, "schedule.total_steps: missing"),
         ({"schedule": {"total_steps": 8000.5}}, "total_steps = 8000.5: must be a whole number"),
         ({"seed": -1}, "seed = -1"),

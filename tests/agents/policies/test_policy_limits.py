@@ -84,6 +84,15 @@ def test_a_small_file_does_not_unpack_to_gigabytes(tmp_path: Path) -> None:
     assert "at most" in sentence
 
 
+def test_what_could_not_be_read_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, path = ExportedPolicy(**parts()), tmp_path / "policy.npz"
+    policy.save(path)
+    monkeypatch.setattr("agents.policies.policy_files.MOST_BYTES", 200)  # 28 weights and biases and units
+    with pytest.raises(PolicyFileError, match=r"policy.npz would have \d+ bytes, .* at most 200 are read"):
+        policy.save(path)
+    assert "it should have at most" in refusal(path)
+
+
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
