@@ -81,8 +81,9 @@ def suite(
     ship with the package by default.
 
     The output folder receives the page, suite.html and suite.md, suite.json, pictures, trainings, and
-    finished rows. Re-run the command to resume. Exit status 1: a training failed, or --check found a
-    difference. Trainings by Stable-Baselines3 need the extra `agents`.
+    finished rows. Re-run the command to resume. Exit status 1: a training failed, the file of a task is
+    missing, or --check found a difference or a score that was not flown. Trainings by Stable-Baselines3 need
+    the extra `agents`.
     """
     executor = chosen_executor(workers, ray)
     from agents.suite.running import entrant_names, run_suite
@@ -111,4 +112,5 @@ def suite(
     if rows:
         console.print(tabulate(f"Beside {other}", rows, check_columns()).for_terminal())
     written.print(page.record)
-    return FAILURE if run.notes or any(row["verdict"] == "differs" for row in rows) else SUCCESS
+    is_confirmed = all(row["verdict"] in ("equal", "agrees") for row in rows)
+    return SUCCESS if is_confirmed and not run.notes else FAILURE

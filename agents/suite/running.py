@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -186,7 +186,7 @@ def run_suite(
             why = "there is no such file" if TASK in path else "fits no task"
             raise SuiteError(f"{path}: {why}, whichever the task")
     plans = {(agent, task): chosen.training(agent, task) for agent in agents for task in scenes}
-    notes: list[str] = []
+    notes = [*_missing(files, scenes)]
     trained = _train(
         plans, chosen.seeds if seeds is None else seeds, out / TRAININGS, executor, workers, progress, notes
     )
@@ -296,6 +296,15 @@ def _from_files(
                 raise
             continue
         yield name, path
+
+
+def _missing(files: Mapping[str, str], tasks: Iterable[str]) -> Iterator[str]:
+    """A note on each entrant that lacks the files of some tasks."""
+    for name, file in files.items():
+        own = [Path(task).stem for task in tasks] if TASK in file else []
+        lacking = [task for task in own if not policy_path(file.replace(TASK, task)).exists()]
+        if lacking:
+            yield f"{name}: there is no file {file} for {', '.join(lacking)}"
 
 
 def _train(

@@ -17,6 +17,7 @@ from dq_space_arm_env.common.bounded_reading import UnreadableError, read_mappin
 from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.report_page import Page, Section
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.common.tables import Column, Row, tabulate
 
 WITHIN = (0.001, 0.01, 0.1)
@@ -81,6 +82,8 @@ def published(file: str | Path) -> tuple[dict[str, Any], dict[tuple[str, str, st
     """
     try:
         tasks = read_mapping(file)["parts"]["tasks"]
+        if not isinstance(tasks["suite"], dict):
+            raise TypeError(f"parts.tasks.suite: {shortened(tasks['suite'])}, should be a mapping")
         return tasks["suite"], {
             (row["task"], row["condition"], row["entrant"]): row for row in tasks["scores"]
         }
@@ -117,12 +120,12 @@ def check(run: SuiteRun, file: str | Path) -> list[Row]:
 
     Returns:
         A row for each score that both have: `verdict` is "equal", "agrees" if all 95 % intervals overlap, or
-        "differs".
+        "differs". Then a row for each score of these tasks and entrants that the file alone has: "not flown".
 
     Raises:
         SuiteError: If the file is not one, or they have no score in common.
     """
-    theirs = comparable(file, run.suite, (score.task for score in run.scores), run.entrants)
+    theirs = comparable(file, run.suite, run.descriptions, run.entrants)
     rows: list[Row] = []
     for score in run.scores:
         other = theirs.get((score.task, score.condition, score.entrant))
@@ -134,7 +137,18 @@ def check(run: SuiteRun, file: str | Path) -> list[Row]:
             rows.append({**record, **found, "verdict": worst})
     if not rows:  # the names fly, each in other tasks
         raise SuiteError(f"{file}: has no score of {', '.join(run.entrants)} in these tasks")
-    return rows
+    return [*rows, *_not_flown(run, theirs)]
+
+
+def _not_flown(run: SuiteRun, theirs: dict[tuple[str, str, str], Row]) -> Iterator[Row]:
+    """Rows of the scores that others have in the tasks of a run, of its entrants, and that it lacks."""
+    flown = {(score.task, score.condition, score.entrant) for score in run.scores}
+    for key, other in theirs.items():
+        task, condition, entrant = key
+        if key not in flown and task in run.descriptions and entrant in run.entrants:
+            found = {f"their_{name}": other.get(name) for name in _MEASURES}
+            row = {"task": task, "condition": condition, "entrant": entrant, **found}
+            yield {**row, **dict.fromkeys(_MEASURES), "verdict": "not flown"}
 
 
 def check_columns() -> list[Column]:

@@ -15,10 +15,11 @@ from agents.evaluation.evaluating import Evaluation
 from agents.evaluation.expert_costs import OptimalCosts
 from agents.policies.flying import Flights
 from agents.suite import Score, Suite, SuiteError, SuiteRun, list_suites, load_suite, run_suite
-from agents.suite.running import entrant_names
-from agents.suite.suite_page import check, comparable, overall_rows, suite_page
+from agents.suite.running import _missing, entrant_names
+from agents.suite.suite_page import check, check_columns, comparable, overall_rows, suite_page
 from agents.zoo.finding import PolicyError
 from dq_space_arm_env import load_scene
+from dq_space_arm_env.common.tables import tabulate
 from experts.demonstrations import SerialExecutor
 
 LIMITS = {"success": 0.9, "violating": 0.1, "cost_gap": 0.05}
@@ -106,6 +107,13 @@ def test_unknown_names_are_refused(content):
         Suite.model_validate({**content, "agents": {"tiny": {}}}).training(
             "tiny", next(iter(content["tasks"]))
         )
+
+
+def test_missing_files_of_tasks_are_told(tmp_path):
+    (tmp_path / "one.npz").touch()
+    files = {"mine": f"{tmp_path}/{{task}}.npz", "other": "anywhere.npz"}
+    (note,) = _missing(files, ["scenes/one.yaml", "two", "three"])
+    assert note == f"mine: there is no file {files['mine']} for two, three"
 
 
 def still(scene):
@@ -208,8 +216,22 @@ def test_a_check_tells_equal_from_like_and_other(content, tmp_path):
     near, far = made([[True] * 50], [[0.01] * 24 + [0.03] * 26]), made([[False] * 50], [[0.5] * 50])
     found = [check(of(score), file)[0]["verdict"] for score in (fine, near, far)]
     assert found == ["equal", "agrees", "differs"]
+    near_b = made([[True] * 50], [[0.01] * 50], task="b")
+    both = SuiteRun(suite, (fine, near_b), {"a": "", "b": ""}, ())
+    file.write_text(json.dumps(suite_page(both, picture=False).record))
+    (one,) = check(of(fine), file)  # b is none of its tasks
+    rows = check(SuiteRun(suite, (fine,), both.descriptions, ()), file)
+    assert [(row["task"], row["verdict"]) for row in (one, *rows)] == [
+        ("a", "equal"),
+        ("a", "equal"),
+        ("b", "not flown"),
+    ]
+    tabulate("check", rows, check_columns()).for_terminal()
     with pytest.raises(SuiteError, match="has no score of y"):
         check(of(made([[True]], [[0.0]], entrant="y")), file)
+    file.write_text('{"parts": {"tasks": {"suite": [], "scores": []}}}')
+    with pytest.raises(SuiteError, match=r"suite: \[\], should be a mapping"):
+        check(of(fine), file)
     file.write_text("{}")
     with pytest.raises(SuiteError, match="is not the JSON file of a suite"):
         check(of(fine), file)
