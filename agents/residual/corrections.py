@@ -45,8 +45,8 @@ class CorrectionObserver:
     def reset(self, parameters: FloatArray | None = None) -> None:
         """Clear the average; what varies in the plans' scene, shape (B, n_p), is nominal unless given."""
         self.average, self._parameters = None, parameters
-        self._stages = None  # parameters by stage, shape (B, N + 1, n_p), of targets that move
-        if self._kernels.parameters.moving:
+        self._stages = None  # parameters by stage, shape (B, N + 1, n_p), of moving targets or phases
+        if self._kernels.parameters.moving or self._kernels.parameters.staged:
             known = [None] if parameters is None else list(parameters)
             self._stages = np.stack([self._kernels.stage_parameters(each) for each in known])
 

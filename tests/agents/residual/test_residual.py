@@ -314,6 +314,22 @@ def test_corrections_see_the_target_of_each_plan(drawing):
     np.testing.assert_allclose(seen[:, : kernels.n_x + 1], expected, rtol=1e-6, atol=1e-6)
 
 
+def test_corrections_see_the_target_of_each_phase(small_scene):
+    changed = {"target.pose.position": [1.0, 0.5, 0.0]}
+    phases = [{"name": "there", "steps": 1}, {"name": "back", "steps": 149, "changes": changed}]
+    scene = small_scene.replace(phases=phases)
+    environment = DQSpaceArmVectorEnv(2, scene)
+    expected, _ = environment.reset(seed=[0, 1])
+    kernels = environment.kernels
+    still = Followed(np.zeros((2, kernels.n_u)), np.zeros((2, kernels.n_t)))
+    observer = CorrectionObserver(scene, memory=0.5, full_authority=0.1)
+    observer.reset(environment.parameters)
+    for stage in range(3):
+        seen = observer(stage, environment.states, still)
+        np.testing.assert_allclose(seen[:, : expected.shape[1]], expected, rtol=1e-6, atol=1e-6)
+        expected = environment.step(still.action)[0]
+
+
 def test_the_receding_horizon_plans_with_what_it_is_told(drawing):
     scene, drawn = drawing
     expert = RecedingHorizon(scene, 20)
