@@ -176,12 +176,10 @@ class SB3VecEnv(VecEnv):
 
     def _unshaped(self, rewards: NDArray[Any]) -> NDArray[Any]:
         """Rewards of the environment inside the innermost wrapper that changes them."""
-        for env in reversed(self._chain):
-            if isinstance(env, RepeatAction):
-                return env.collected
-            if isinstance(env, ShapeReward):
-                return env.unshaped
-        return rewards
+        if self._repeater is not None:
+            return self._repeater.collected
+        shapers = (env for env in reversed(self._chain) if isinstance(env, ShapeReward))
+        return next((env.unshaped for env in shapers), rewards)
 
     def _end_episodes(
         self, copies: NDArray[np.intp], truncated: NDArray[np.bool_], info: Info, infos: list[Info]

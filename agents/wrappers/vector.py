@@ -39,7 +39,8 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         repeat: Number of time steps for which an action is held.
         steps_taken: Number of time steps of the last decision in each sub-environment, shape (num_envs,);
             fewer where its episode ended, 0 where the step was a reset.
-        collected: Sum of the rewards of these time steps, of whatever reward the decision has.
+        collected: Sum of the rewards of these time steps, of whatever reward the decision has; not shaped
+            where `ShapeReward` is inside.
         largest_cost: Largest constraint cost of these time steps, `info["cost"]`, dimensionless, shape
             (num_envs,); 0 where the step was a reset, and without constraints.
     """
@@ -72,6 +73,7 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         check_repeat(repeat, reward, discount)
         super().__init__(env)
         _check_restorable(env)
+        self._shaper = _innermost_shaper(env)
         self.repeat, self.steps_taken = int(repeat), np.zeros(env.num_envs, dtype=np.int64)
         self.collected, self.largest_cost = np.zeros(env.num_envs), np.zeros(env.num_envs)
         self._sum, self._discount, self._step_infos = reward == "sum", discount, step_infos
@@ -90,7 +92,8 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
         for step in range(self.repeat):
             observations, rewards, terminated, truncated, info = self.env.step(actions)
             total = np.where(resting, total, total + weight * rewards if self._sum else rewards)
-            collected = np.where(resting, collected, collected + rewards)
+            plain = rewards if self._shaper is None else self._shaper.unshaped
+            collected = np.where(resting, collected, collected + plain)
             weight *= self._discount
             if "cost" in info:  # of a scene with constraints
                 cost = _constraint_cost(info, terminated | truncated)
@@ -134,6 +137,15 @@ def _check_restorable(env: Env) -> None:
                 "has ended waits for the others: put it around RepeatAction"
             )
         env = env.env
+
+
+def _innermost_shaper(env: Env) -> ShapeReward | None:
+    """The wrapper that shapes rewards first."""
+    found = None
+    while isinstance(env, VectorWrapper):
+        found = env if isinstance(env, ShapeReward) else found
+        env = env.env
+    return found
 
 
 def _constraint_cost(info: Info, over: Mask) -> Any:

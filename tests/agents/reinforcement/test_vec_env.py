@@ -144,6 +144,20 @@ def test_wrapped_copies_are_those_of_wrapped_single_environments(step_infos):
     assert ends >= 15
 
 
+def test_returns_are_those_of_the_environment_whether_steps_or_decisions_are_shaped():
+    wrap = [lambda env: vector.RepeatAction(env, 3), lambda env: vector.ShapeReward(env, 0.1, 0.5)]
+    both = [same_step(DIVERGING, *each, seed=7) for each in (wrap, wrap[::-1])]
+    rng, statistics = np.random.default_rng(0), []
+    for env in both:
+        env.reset()
+    for _ in range(12):
+        actions = rng.uniform(-1.0, 1.0, (5, 12)).astype(np.float32)
+        infos = [env.step(actions)[3] for env in both]
+        statistics += [[info["episode"]["r"] for info in each if info] for each in infos]
+    assert statistics[::2] == statistics[1::2]
+    assert sum(map(len, statistics)) >= 30
+
+
 def test_any_vector_environment_is_adapted_time_limits_included():
     def single():
         return gymnasium.make("DQSpaceArmGoal-v0", scene=SHORT)
