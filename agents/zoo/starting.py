@@ -29,6 +29,9 @@ def load_start(
     ]
     if policy.normalized_limit != float("inf"):
         problems.append("normalized observations are clipped there and are not here")
+    scale = policy.action_scale
+    if scale is not None and (scale != 1.0).any():  # of a model whose actions were rescaled
+        problems.append(f"action_scale is {scale.min():.3g} there, where actions are clipped, and 1 here")
     if problems:
         raise ConfigurationError(f"start_from: {start_from} does not fit: {'; '.join(problems)}")
     return policy

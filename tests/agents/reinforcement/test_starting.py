@@ -1,6 +1,7 @@
 """PPO that begins with an exported policy: it acts like that one, and its critic may learn first."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -129,7 +130,7 @@ def test_steps_follow_the_divergence_that_they_cause(start, scene_file, tmp_path
     assert factors[1] == 1.0
 
 
-def test_policies_that_do_not_fit_are_refused(start, scene_file):
+def test_policies_that_do_not_fit_are_refused(start, scene_file, tmp_path):
     def refusal(**changes):
         settings = configuration(start, scene_file, **changes)
         with pytest.raises(ConfigurationError) as caught:
@@ -142,5 +143,9 @@ def test_policies_that_do_not_fit_are_refused(start, scene_file):
         network={"hidden": list(HIDDEN), "activation": "relu"}
     )
     assert "dq-space-arm train cloning-with-gains" in refusal(start_from="nowhere/policy.npz")
+    scaled = tmp_path / "scaled.npz"
+    replace(ExportedPolicy.load(start), action_scale=np.full(N_ACTION, 0.05)).save(scaled)
+    said = refusal(start_from=str(scaled))
+    assert "action_scale is 0.05 there, where actions are clipped, and 1 here" in said
     with pytest.raises(ConfigurationError, match="is for PPO, not for SAC"):
         configuration(start, scene_file, algorithm={"name": "SAC"})
