@@ -21,9 +21,9 @@ _BUDGET = {"total_steps": "--total-steps", "minutes": "--minutes"}
 
 
 class Group(NamedTuple):
-    """Training runs of one agent that differ in their seeds."""
+    """Training runs of one agent that differ in their seeds, each with one policy."""
 
-    name: str
+    name: str  # with a remark where a later policy of each run is in another group
     condition: str
     seeds: tuple[int, ...]
     runs: Runs
@@ -38,32 +38,51 @@ class Group(NamedTuple):
 def groups(evaluations: Sequence[Evaluation]) -> list[Group]:
     """Aggregate agents with at least 3 training runs, condition by condition."""
     found = _by_agent(evaluations)
-    return [_group(condition, runs) for (condition, _), runs in found.items() if len(runs) >= FEWEST_RUNS]
+    return [
+        _group(condition, age, runs)
+        for (condition, _, age), runs in found.items()
+        if len(runs) >= FEWEST_RUNS
+    ]
 
 
 def pairs(evaluations: Sequence[Evaluation]) -> Iterator[str]:
     """Tell of agents with two training runs, which are too few to aggregate."""
-    agents = {agent: runs for (_, agent), runs in _by_agent(evaluations).items() if len(runs) == 2}
+    agents = {key[1:]: runs for key, runs in _by_agent(evaluations).items() if len(runs) == 2}
     for runs in agents.values():
         name = runs[0].metadata.get("agent")
         yield f"{name}: two training seeds are too few to be aggregated, which takes {FEWEST_RUNS}."
 
 
-def _by_agent(evaluations: Sequence[Evaluation]) -> dict[tuple[str, str], tuple[Evaluation, ...]]:
-    """Evaluations of training runs by condition and agent."""
-    found: dict[tuple[str, str], dict[str, Evaluation]] = {}
+def _by_agent(evaluations: Sequence[Evaluation]) -> dict[tuple[str, str, int], list[Evaluation]]:
+    """Evaluations of training runs by condition, agent, and how many later policies their run has here.
+
+    A run has `best.npz` beside `policy.npz`. The same policy twice, which costs the same, counts once.
+    """
+    runs: dict[tuple[str, str, str], dict[bytes, Evaluation]] = {}
     for evaluation in evaluations:
         agent = agent_of(evaluation.metadata)
         if agent is not None and seed_of(evaluation.metadata) is not None:
             run = json.dumps(evaluation.metadata["configuration"], sort_keys=True)
-            found.setdefault((evaluation.condition, agent), {})[run] = evaluation
-    return {key: tuple(members.values()) for key, members in found.items()}
+            flown = evaluation.flights.cost.tobytes()
+            runs.setdefault((evaluation.condition, agent, run), {})[flown] = evaluation
+    found: dict[tuple[str, str, int], list[Evaluation]] = {}
+    for (condition, agent, _), policies in runs.items():
+        for age, each in enumerate(sorted(policies.values(), key=_seconds, reverse=True)):
+            found.setdefault((condition, agent, age), []).append(each)
+    return found
 
 
-def _group(condition: str, members: tuple[Evaluation, ...]) -> Group:
+def _seconds(evaluation: Evaluation) -> float:
+    """Time of the training, s; 0 if the metadata lack it."""
+    seconds = evaluation.summary()["training_seconds"]
+    return float(seconds) if isinstance(seconds, int | float) else 0.0
+
+
+def _group(condition: str, age: int, members: Sequence[Evaluation]) -> Group:
     seeds = tuple(seed for each in members if (seed := seed_of(each.metadata)) is not None)
     runs = compare_runs([each.flights.is_success for each in members], [each.cost_gaps for each in members])
-    return Group(str(members[0].metadata.get("agent")), condition, seeds, runs, members)
+    name = f"{members[0].metadata.get('agent')}{' (earlier)' * age}"
+    return Group(name, condition, seeds, runs, tuple(members))
 
 
 def learning_curve(policy: Path) -> list[dict[str, Any]]:

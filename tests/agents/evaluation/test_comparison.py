@@ -26,7 +26,7 @@ from agents.evaluation.comparison_tables import (
 from agents.evaluation.expert_costs import validation_costs
 from agents.evaluation.plan_followers import FEEDBACK, OPEN_LOOP, RECEDING
 from agents.evaluation.planned_flights import fly_plans
-from agents.evaluation.training_runs import agent_of, learning_curve, seed_of, training_command
+from agents.evaluation.training_runs import agent_of, groups, learning_curve, seed_of, training_command
 from agents.policies import ExportedPolicy
 from agents.run_folder import validation_seeds
 from dq_space_arm_env import DQSpaceArmVectorEnv
@@ -173,6 +173,22 @@ def test_runs_of_one_agent_are_taken_together(comparison):
         {"configuration": {"name": "a", **entry}} for entry in ({"seed": 1}, {"seed": 2}, {"x": 1})
     )
     assert agent_of(one) == agent_of(same) != agent_of(other)
+
+
+def test_best_and_last_policies_of_runs_make_two_groups(comparison):
+    last = [row.evaluation for row in comparison.under("training") if row.facts["is_agent"]]
+    earlier = {"training": {"seconds": 50.0}}
+    dearer = [each.flights._replace(cost=each.flights.cost + 1.0) for each in last]
+    best = [
+        replace(each, flights=flights, metadata=each.metadata | earlier)
+        for each, flights in zip(last, dearer, strict=True)
+    ]
+    found = groups([best[0], *last, *best[1:], best[0]])  # one of them twice
+    assert [(group.name, group.seeds) for group in found] == [
+        ("stub", (0, 1, 2)),
+        ("stub (earlier)", (0, 1, 2)),
+    ]
+    assert [list(group.evaluations) for group in found] == [last, best]
 
 
 def test_agents_meet_all_others_flight_by_flight(comparison):
