@@ -8,7 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
+from gymnasium import wrappers
+from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
 
 from agents.policies import ExportedPolicy
@@ -91,8 +94,10 @@ def statistics_of(model: Any, file: str | Path | None = None) -> ObservationStat
         The statistics; None if it sees observations as they are.
 
     Raises:
-        StatisticsError: If they are missing, or given to a model that has no use for them.
+        StatisticsError: If they are missing, or given to a model that has no use for them; or if wrappers of
+            its environment change observations or actions without its knowledge.
     """
+    _check_wrappers(model)
     normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
     if normalizer is not None:
         if file is not None:
@@ -108,6 +113,34 @@ def statistics_of(model: Any, file: str | Path | None = None) -> ObservationStat
     if statistics is not None and normalized is False:
         raise StatisticsError("the model was trained on plain observations: leave normalize out")
     return statistics
+
+
+def _check_wrappers(model: Any) -> None:
+    """Refuse Gymnasium's wrappers that change what a model in memory sees or does without its knowledge."""
+    environment = getattr(model, "get_env", lambda: None)()
+    while hasattr(environment, "venv"):
+        environment = environment.venv
+    env = getattr(environment, "vector_env", next(iter(getattr(environment, "envs", ())), None))
+    while isinstance(env, gymnasium.Wrapper | VectorWrapper):
+        if isinstance(env, wrappers.NormalizeObservation | wrappers.vector.NormalizeObservation):
+            raise StatisticsError(
+                "the model's observations pass Gymnasium's NormalizeObservation, whose statistics are not "
+                "read: train in VecNormalize of Stable-Baselines3"
+            )
+        if isinstance(env, gymnasium.ActionWrapper) and _changes_actions(env):
+            raise StatisticsError(
+                f"the model's actions pass {type(env).__name__} of a single environment, which it does not "
+                "note: train in agents.SB3VecEnv with gymnasium.wrappers.vector.RescaleAction"
+            )
+        env = env.env
+
+
+def _changes_actions(env: gymnasium.ActionWrapper[Any, Any, Any]) -> bool:
+    """Whether a wrapper does more than to clip actions."""
+    if isinstance(env, wrappers.ClipAction):
+        return False
+    space: Any = env.action_space
+    return not all(np.allclose(env.action(end), end, rtol=1e-6) for end in (space.low, space.high))
 
 
 def _sees_normalized(model: Any) -> bool | None:

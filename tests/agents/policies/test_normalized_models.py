@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
+from gymnasium import wrappers
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RescaleAction, TransformAction
 from stable_baselines3 import PPO, SAC
@@ -16,6 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import DQSpaceArmVecEnv, SB3VecEnv, compare, evaluate, export_policy
 from agents.policies.pickled_arrays import as_array, read_pickled
+from agents.wrappers import ShrinkActionSpace as SingleShrinkActionSpace
 from agents.wrappers.vector import ShrinkActionSpace
 from agents.zoo.finding import PolicyError, as_policy
 from dq_space_arm_env.command_line import main
@@ -41,6 +43,29 @@ def normalized(small_scene, tmp_path_factory):
     model.save(folder / "model.zip")
     environment.save(folder / "vecnormalize.pkl")
     return model, folder / "model.zip", folder / "vecnormalize.pkl"
+
+
+def test_wrappers_of_single_environments_that_a_model_does_not_note_are_refused(small_scene):
+    def model_in(*wrap):
+        env = gymnasium.make("DQSpaceArm-v0", scene=small_scene)
+        for each in wrap:
+            env = each(env)
+        return PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu", policy_kwargs=dict(SMALL))
+
+    def rescaled(env):
+        return wrappers.RescaleAction(env, -1, 1)
+
+    small = model_in(lambda env: SingleShrinkActionSpace(env, 0.1), rescaled)
+    seen = model_in(wrappers.NormalizeObservation)
+    for model, said in (
+        (small, "actions pass RescaleAction of a single"),
+        (seen, "pass Gymnasium's Normalize"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            export_policy(model)
+        with pytest.raises(PolicyError, match=said):
+            as_policy(model)
+    assert export_policy(model_in(rescaled)).action_scale.tolist() == [1.0] * 6  # which changes nothing
 
 
 def observations(scene):
