@@ -8,6 +8,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.evaluation.comparing import Comparison
 from agents.evaluation.comparing import Row as ComparedRow
@@ -132,12 +133,17 @@ def improvement_rows(comparison: Comparison, condition: str) -> list[Row]:
         if _is_agent(members):
             starts = min(len(row.evaluation.seeds) for row in (*members, *others))
             costs, costs_of_other = (
-                np.array([row.evaluation.flights.cost[:starts] for row in each]) for each in (members, others)
+                np.array([_costs(row.evaluation)[:starts] for row in each]) for each in (members, others)
             )
             found = list(probability_of_improvement(costs, costs_of_other))
             row = {"condition": condition, "policy": name, "over": other}
             rows.append({**row, "episodes": starts, "probability": found})
     return rows
+
+
+def _costs(evaluation: Evaluation) -> NDArray[np.float64]:
+    """Costs of flights, infinite where the policy gave NaN: drifting may cost less than flying."""
+    return np.where(evaluation.flights.policy_failed, np.inf, evaluation.flights.cost)
 
 
 def _is_agent(members: Sequence[ComparedRow]) -> bool:

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents import compare
+from agents import compare, evaluate
 from agents.command_line.compare import compare as compare_verb
 from agents.command_line.evaluate import evaluate as evaluate_verb
 from agents.configuration import load_configuration
 from agents.evaluation import CONTROLLERS, evaluation_seeds, fly, optimal_costs, scene_under
-from agents.evaluation.comparing import Comparison
+from agents.evaluation.comparing import Comparison, Row
 from agents.evaluation.comparison_tables import (
     comparison_tables,
     group_record,
@@ -204,6 +204,20 @@ def test_agents_meet_all_others_flight_by_flight(comparison):
     known, reached = ~np.isnan(gaps).any(axis=0), np.array([each.flights.is_success for each in flown])
     shares = [np.mean((reached & (gaps <= gap))[:, known]) for gap in stub["cost_gaps"]]
     assert [share[0] for share in stub["shares"]] == shares
+
+
+def test_a_policy_that_gives_nan_costs_more_than_any_other(quick):
+    def drifting(observations):
+        return np.full((len(observations), 6), np.nan)
+
+    def pushing(observations):
+        return np.ones((len(observations), 6))
+
+    broken, wild = (evaluate(policy, quick, 3, expert=False) for policy in (drifting, pushing))
+    assert (broken.flights.cost < wild.flights.cost).all()
+    found = Comparison(quick.name, tuple(Row(each, {"is_agent": True}) for each in (broken, wild)))
+    (row,) = improvement_rows(found, "training")
+    assert row["probability"][0] == 0.0
 
 
 def test_curves_are_relative_to_the_optima_of_their_own_starts(comparison, counting, quick):
