@@ -5,6 +5,7 @@ Some change the scene, others disturb the flights in it.
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -34,6 +35,7 @@ _WIDENED = (
     "base_angular_velocity",
     "base_linear_velocity",
     "joint_rates",
+    "wheel_speeds",
 )
 _MEASURED = ("training", "wide_starts", "spin")
 """Conditions that change nothing but the start, which a controller measures."""
@@ -45,9 +47,10 @@ def scene_under(scene: Scene, condition: str) -> Scene:
     Args:
         scene: The scene that agents are trained in.
         condition: One of `CONDITIONS`: "training" changes nothing; "wide_starts" spreads starts 1.5 times as
-            far; "light_payload" and "heavy_payload" change mass and inertia of the payload by 30 %, or, where
-            there is no payload, as with the paper's massless wrist, of the last link; "spin" starts with a
-            turning base; "delay", "noise" and "push" change nothing but the name, see `disturbance_under`.
+            far, those of wheels up to their largest speeds; "light_payload" and "heavy_payload" change mass
+            and inertia of the payload by 30 %, or, where there is no payload, as with the paper's massless
+            wrist, of the last link; "spin" starts with a turning base; "delay", "noise" and "push" change
+            nothing but the name, see `disturbance_under`.
 
     Returns:
         The scene to evaluate in.
@@ -126,7 +129,11 @@ def physics_hash(scene: Scene) -> str:
 
 
 def _wide_starts(scene: Scene) -> Scene:
-    return scene.replace(spread={name: WIDER * getattr(scene.spread, name) for name in _WIDENED})
+    spread = {name: WIDER * getattr(scene.spread, name) for name in _WIDENED}
+    wheels = scene.actuators.wheels or ()
+    speeds = scene.initial_state.wheel_speeds or [0.0] * len(wheels)
+    left = (wheel.speed - abs(speed) for wheel, speed in zip(wheels, speeds, strict=True))
+    return scene.replace(spread={**spread, "wheel_speeds": min(spread["wheel_speeds"], *left, math.inf)})
 
 
 def _with_load(factor: float) -> Callable[[Scene], Scene]:

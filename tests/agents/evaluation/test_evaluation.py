@@ -207,6 +207,9 @@ def test_conditions_change_what_they_say():
     changed = {condition: scene_under(PAPER, condition) for condition in CONDITIONS}
     assert changed["training"] is PAPER
     assert changed["wide_starts"].spread.joint_angles == 0.75
+    for speed, wide in ((60.0, 90.0), (120.0, 160.0)):  # rad/s, around 380 of 540
+        wheels = load_scene("wheels").replace(spread={"wheel_speeds": speed})
+        assert scene_under(wheels, "wide_starts").spread.wheel_speeds == wide
     masses = [changed[name].links[2].mass for name in ("light_payload", "heavy_payload")]
     assert masses == pytest.approx([7.0, 13.0])
     assert changed["heavy_payload"].links[2].inertia[1][1] == pytest.approx(0.65)
