@@ -28,6 +28,9 @@ _IDENTITY = ("name", "description", "scene", "seed", "threads")
 """Keys of a configuration that are no hyperparameters."""
 
 
+_BETWEEN = 0.5 * (5.0**0.5 - 1.0)  # place in a range whose value is hardly ever a whole number
+
+
 def _number(value: object) -> object:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise problem("must be a finite number")
@@ -67,9 +70,12 @@ class Parameter(Model):
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     @property
-    def ends(self) -> tuple[Any, ...]:
-        """Values that all have to be valid for those between them to be."""
-        return (self.low, self.high) if self.choices is None else self.choices
+    def examples(self) -> tuple[Any, ...]:
+        """Values that all have to be valid for the others to be."""
+        if self.choices is not None:
+            return self.choices
+        between = () if self.is_whole else (self.low + _BETWEEN * (self.high - self.low),)
+        return (self.low, self.high, *between)
 
 
 class SearchSpace(Model):
@@ -91,8 +97,8 @@ def load_search_space(path: str | Path, configuration: AgentConfiguration) -> Se
         The space.
 
     Raises:
-        ConfigurationError: If it cannot be read, a key is no hyperparameter of the configuration, or one of
-            its values is not allowed there.
+        ConfigurationError: If it cannot be read, a key is no hyperparameter of the configuration or part of
+            another, or one of its values is not allowed there.
     """
     try:
         data = read_yaml(path)
@@ -106,7 +112,10 @@ def load_search_space(path: str | Path, configuration: AgentConfiguration) -> Se
     for key, parameter in space.search.items():
         if key.partition(".")[0] in _IDENTITY:
             raise ConfigurationError(f"{path}: search.{key}: {key} is no hyperparameter: leave it out")
-        for value in parameter.ends:
+        for other in space.search:
+            if other.startswith(f"{key}."):
+                raise ConfigurationError(f"{path}: search.{other}: is part of search.{key}: give one of them")
+        for value in parameter.examples:
             try:
                 with_values(configuration, {key: value})
             except ConfigurationError as error:

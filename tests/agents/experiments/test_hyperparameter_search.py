@@ -208,6 +208,11 @@ def test_more_successes_win_and_a_tie_goes_to_the_lower_cost() -> None:
             "algorithm.copies: the value 0.5 is not possible",
         ),
         ("{algorithm.copies: {low: 8, high: 8}}", r"high = 8: must be larger than low, which is 8"),
+        ("{algorithm.copies: {low: 4.0, high: 8}}", r"algorithm.copies: the value 6\.47\d* is not possible"),
+        (
+            "{network: {choices: [{hidden: [8]}, {hidden: [9]}]}, network.hidden: {choices: [[4], [5]]}}",
+            r"search.network.hidden: is part of search.network: give one of them",
+        ),
         ("{algorithm.copies: {low: 8}}", "high = null: is missing: give low and high, or choices"),
         ("{algorithm.copies: {low: eight, high: 9}}", r"low = 'eight': must be a finite number"),
         (
