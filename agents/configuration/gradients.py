@@ -20,7 +20,7 @@ class AnalyticPolicyGradient(Model):
     copies: Many = Field(default=64, description="episodes of an update")
     decisions: Many = Field(
         default=200,
-        description="decisions of an episode in training, at least 2; flights decide at every time step",
+        description="decisions of an episode in training, at least 3; flights decide at every time step",
     )
     crowding: NonNegative = Field(
         default=0.8,
