@@ -161,6 +161,9 @@ class Dagger(Model):
     def _problems(self) -> Iterator[Problem]:
         if self.share >= 1.0:
             yield Problem(("share",), self.share, "must be less than 1: the rest are demonstrations")
+        if self.optimization.batch_size < 2:
+            sentence = "must be at least 2: a labeled state and a demonstrated one"
+            yield Problem(("optimization", "batch_size"), self.optimization.batch_size, sentence)
 
 
 class LearningCurve(Model):
