@@ -15,6 +15,7 @@ from agents.configuration import (
 )
 from agents.configuration.gradients import GradientConfiguration
 from agents.configuration.residual import ResidualConfiguration
+from agents.configuration.schema import name_in
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.common.progress import Advance
 
@@ -119,7 +120,7 @@ def with_changes(
     if seed is not None:
         content["seed"] = seed
     if scene is not None:
-        content |= {"scene": scene, "name": f"{configuration.name}-{Path(scene).stem}"}
+        content |= {"scene": scene, "name": name_in(configuration.name, scene)}
     for name, value in (("total_steps", total_steps), ("minutes", minutes)):
         if value is not None:
             if "schedule" not in content:

@@ -1,7 +1,9 @@
 """Settings shared by all agents: name, scene, seed, network, and demonstrations."""
 
+import re
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import Field, StrictInt, StrictStr
@@ -30,6 +32,7 @@ MOST_IN_MEMORY = 100_000_000
 MOST_LAYERS = 32
 MOST_WEIGHTS = 2**24
 """Largest number of weights between hidden layers: exported policies have room for as many more."""
+_NO_NAME = r"[^\w.-]"
 _Part = TypeVar("_Part", bound=Model)
 
 
@@ -120,6 +123,11 @@ class Mismatch(Model):
         default=0.02, description="largest standard deviation of jumps of the base velocities, rad/s, m/s"
     )
     pushes: Count = Field(default=6, description="mean number of these jumps per episode, at random times")
+
+
+def name_in(name: str, scene: str) -> str:
+    """Name of an agent in a scene, a name or file; what no name may have becomes a hyphen."""
+    return f"{name}-{re.sub(_NO_NAME, '-', Path(scene).stem)}"
 
 
 def _with_demonstrations_drawn(model: _Part, seed: int) -> _Part:

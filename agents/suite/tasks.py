@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import Field, StrictStr, ValidationError
 
 from agents.configuration import AgentConfiguration, load_configuration
-from agents.configuration.schema import Few
+from agents.configuration.schema import Few, name_in
 from agents.evaluation.conditions import CONDITIONS
 from agents.evaluation.expert_costs import EVALUATION_SEEDS
 from agents.evaluation.plan_followers import CONTROLLERS
@@ -98,7 +98,7 @@ class Suite(Model):
         else:
             given = load_configuration(agent)
             content, name = given.model_dump(exclude_none=True, exclude={"description"}), given.name
-        return load_configuration({**content, "name": f"{name}-{Path(task).stem}", "scene": task})
+        return load_configuration({**content, "name": name_in(name, task), "scene": task})
 
 
 def list_suites() -> list[str]:

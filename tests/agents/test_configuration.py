@@ -131,6 +131,11 @@ def test_wrong_values_are_named_with_what_would_be_right(changes, sentence):
 IMITATION = {"name": "small", "algorithm": {"name": "cloning"}}
 
 
+def test_names_of_scenes_in_names_of_agents_lose_what_no_name_may_have():
+    changed = with_changes(load_configuration("apg"), scene="some folder/my arm (1).yaml")
+    assert (changed.name, changed.scene) == ("apg-my-arm--1-", "some folder/my arm (1).yaml")
+
+
 def test_whole_numbers_may_be_written_with_an_exponent(tmp_path):
     file = tmp_path / "a.yaml"
     file.write_text("{name: a, algorithm: {name: PPO}, schedule: {total_steps: 8e3}}")
@@ -155,6 +160,10 @@ def test_the_algorithm_decides_about_the_class():
         ({"algorithm": {"name": "clonin"}}, "algorithm.name = 'clonin': did you mean 'cloning'"),
         ({"algorithm": {"name": ["cloning"]}}, "algorithm.name = ['cloning']: it must be one of PPO"),
         ({"algorithm": {"name": "dagger", "share": 1.0}}, "share = 1.0: must be less than 1"),
+        (
+            {"algorithm": {"name": "dagger", "optimization": {"batch_size": 1}}},
+            "algorithm.dagger.optimization.batch_size = 1: must be at least 2: a labeled state",
+        ),
         ({"algorithm": {"name": "act", "width": 50}}, "heads = 4: must divide width, 50"),
         ({"algorithm": {"name": "act", "chunk": 1002, "spacing": 10}}, "1002 actions are 10,011 time steps"),
         (
