@@ -117,7 +117,7 @@ def statistics_of(model: Any, file: str | Path | None = None) -> ObservationStat
 
 def _check_wrappers(model: Any) -> None:
     """Refuse Gymnasium's wrappers that change what a model in memory sees or does without its knowledge."""
-    environment = getattr(model, "get_env", lambda: None)()
+    environment: Any = getattr(model, "get_env", lambda: None)()
     while hasattr(environment, "venv"):
         environment = environment.venv
     env = getattr(environment, "vector_env", next(iter(getattr(environment, "envs", ())), None))
