@@ -340,6 +340,8 @@ def test_disturbed_decisions_fly_as_at_every_time_step(without):
 class Pushed:
     """The jumps of an episode's decisions at the time steps in which these begin."""
 
+    episodes = 1
+
     def __init__(self, jumps, times, step):
         self.steps, self.jumps, self.step = np.rint(times[:-1] / step), jumps, -1
 
