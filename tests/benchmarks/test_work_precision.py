@@ -318,6 +318,7 @@ def test_the_maneuver_of_a_scene_is_followed() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", [*robots(), *OTHER_MOTIONS])
 def test_the_integrator_of_each_robot_follows_from_the_errors(name: str) -> None:
     case = scene_case(name)

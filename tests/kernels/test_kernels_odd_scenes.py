@@ -61,7 +61,7 @@ def odd_scenes_and_integrators():
     for name in ("base", "wrist", "one link", "wheels and jets", "no actuator", "wrist without motor"):
         for integrator in INTEGRATORS:
             is_slow = not INTEGRATORS[integrator].has_curvature and name != "one link"
-            yield pytest.param(name, integrator, marks=[pytest.mark.slow] if is_slow else [])
+            yield pytest.param(name, integrator, marks=[pytest.mark.endurance] if is_slow else [])
 
 
 @pytest.mark.parametrize(("name", "integrator"), list(odd_scenes_and_integrators()))

@@ -128,6 +128,7 @@ def test_saddle_is_not_a_minimum(pendulum):
 
 
 @pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize("scene", [*robots(), *OTHER_MOTIONS])
 def test_hybrid_ends_no_higher_than_gauss_newton(scene):
     hybrid = BoxDDP(scene).solve()
