@@ -42,7 +42,7 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
         if not (mark := item.get_closest_marker("sampled")):
             continue
         cases = item.callspec.params.values() if hasattr(item, "callspec") else ()
-        scenes = {str(getattr(each, "name", each)) for each in cases}
+        scenes = {str(getattr(each, "scene", getattr(each, "name", each))) for each in cases}
         if scenes & left_out and mark.kwargs.get("scenes") != "all":
             item.add_marker(pytest.mark.endurance)
         elif not item.get_closest_marker("slow"):

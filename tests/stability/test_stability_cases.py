@@ -16,6 +16,7 @@ CASES = [pytest.param(case, id=f"{case.group}: {case.title}") for case in all_ca
 
 
 @pytest.mark.slow  # their machine code takes minutes
+@pytest.mark.sampled
 @pytest.mark.parametrize("case", CASES)
 def test_case(case: Case) -> None:
     row, *_ = case.rows(QUICK)
