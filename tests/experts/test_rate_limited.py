@@ -92,7 +92,7 @@ def test_receding_horizon_keeps_to_the_rates():
     assert charge <= 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 @pytest.mark.parametrize(("name", "rates"), [("wheels", {"wheels": 0.02}), ("thrusters", {"thrusters": 2.0})])
 def test_wheels_and_thrusters_keep_to_their_rates(name, rates):
     limited = load_scene(name)

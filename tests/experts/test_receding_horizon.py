@@ -56,7 +56,7 @@ def test_it_flies_through_a_phase_without_actuators():
     assert not actions[799][:9].any()  # the latch opens
     assert flown.is_success[0]
     assert expert.fallbacks == 0
-    assert flown.cost[0] == pytest.approx(expert.plan.solution.cost, rel=1e-9)
+    assert flown.cost[0] == pytest.approx(expert.plan.solution.cost, rel=1e-7)  # it plans on
 
 
 def open_loop(plan):
@@ -283,7 +283,7 @@ def test_what_lies_beyond_the_horizon_costs_what_the_plan_says_of_its_end(short_
     assert np.abs(plan.Vxx[1:] - plan.Vxx[:-1]).max(axis=(1, 2)).min() > 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 @pytest.mark.parametrize("factor", [0.8, 1.2])
 def test_a_payload_of_another_mass_costs_hardly_more_than_to_who_knows_it(factor, plans, experts):
     """The optimum of this scene itself ends 2.5 to 3 degrees off, so what counts is the cost."""

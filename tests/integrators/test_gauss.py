@@ -128,7 +128,7 @@ def test_the_energy_does_not_drift(stiffness):
     assert np.abs(walked(kernels, x, 100_000, "rk4")).max() > 2e-8
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 @pytest.mark.parametrize("joint_rate", [0.3, 1.0])
 def test_the_energy_over_a_million_steps_of_winding_joints(joint_rate):
     """Joints turn by thousands of radians; what rounding cuts off their angles is handed on."""
@@ -140,7 +140,7 @@ def test_the_energy_over_a_million_steps_of_winding_joints(joint_rate):
     assert np.abs(change).max() < 1e-10
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_fast_joints_never_stall_over_a_million_steps():
     """At 4 rad/s some steps turn a joint by half a radian: the passes settle to some fifty roundings."""
     kernels = compile_scene("paper")

@@ -76,7 +76,7 @@ def test_momentum_over_many_steps(name, steps):
     assert np.ptp(states[:, kernels.layout.state.joint_angles], axis=0).min() > 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 @pytest.mark.parametrize("name", METHODS)
 def test_a_million_steps_foretell_ten_million(name):
     """A bias of the steps moves the mean momentum from one half of them to the other, above all rounding.

@@ -172,9 +172,12 @@ def test_every_feature_is_in_some_scene():
 
 
 def for_scenes(count):
-    """Call a test with each of the first scenes."""
-    scenes = [scene for scene, _ in MIXED[:count]]
-    return pytest.mark.parametrize("scene", scenes, ids=["-".join(names) for _, names in MIXED[:count]])
+    """Call a test with each of the first scenes; the later ones are endurance tests."""
+    cases = [
+        pytest.param(scene, id="-".join(names), marks=() if index < 7 else pytest.mark.endurance)
+        for index, (scene, names) in enumerate(MIXED[:count])
+    ]
+    return pytest.mark.parametrize("scene", cases)
 
 
 def under_way(scene):

@@ -39,7 +39,7 @@ def arguments(demonstrations, small_scene, small_file, tmp_path_factory):
     return [str(part) for pair in given.items() for part in pair]
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_it_measures_draws_and_goes_on(arguments, tmp_path, capsys):
     command = [*arguments, "--out", str(tmp_path), "--counts", "8", "3"]
     assert main(["compare", "cloning", *command]) == 0

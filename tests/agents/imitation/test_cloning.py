@@ -119,7 +119,7 @@ def test_a_stationary_policy_does_without_the_time_left(demonstrations, quick):
     assert np.abs(quick.export()(later) - quick.export()(seen)).max() > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_gains_teach_more_than_actions_alone(demonstrations):
     """From eight demonstrations, flights from other starts cost less with gains than without."""
     few, others = demonstrations[:8], demonstrations[8:]

@@ -334,7 +334,7 @@ def test_a_library_serves_the_same_scene_with_another_target(seed):
     assert solution.cost <= 1.01 * alone.cost
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_fifty_random_starts(paper):
     """Convergence, success, effort, and cost beside the best that either expert finds.
 
@@ -478,7 +478,7 @@ def test_long_steps_whose_policy_strays_are_not_halved(monkeypatch):
     assert len(solver.solve().metadata["long_steps"]) == 2  # in steps of one length
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_solves_of_six_joints_converge():
     solver = GuidedDDP("six-joint")
     solutions = [solver.solve(random_start("six-joint", seed)) for seed in range(8)]
