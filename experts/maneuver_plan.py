@@ -74,7 +74,7 @@ class ManeuverPlan:
             raise RuntimeError(f"there is no plan from the state at stage {stage}: {solution.message}")
         hessians = _convex_part(work.update.Vxx_all)
         held = problem.parameters.more.copy()
-        reached = solution.converged and maneuver.is_success(solution.states[-1])
+        reached = solution.converged and maneuver.is_success(solution.states, solution.controls)
         policy = solution.policy()
         return cls(stage, solution, policy, maneuver, reached, held, work.update.Vx_all, hessians)
 
@@ -83,7 +83,7 @@ class ManeuverPlan:
         problem = WindowProblem(self.maneuver, self.maneuver.horizon - stage)
         problem.begin_at(stage)
         flight = follow(_last_stages(self.solution, problem.horizon), problem, state)
-        return bool(np.isfinite(flight.cost)) and self.maneuver.is_success(flight.states[-1])
+        return bool(np.isfinite(flight.cost)) and self.maneuver.is_success(flight.states, flight.controls)
 
 
 def _last_stages(solution: Solution, count: int) -> Solution:

@@ -95,7 +95,7 @@ def fly_beside_expert(policy: ActingPolicy, scene: Scene, seeds: list[int | None
         solution = uninterrupted(solver.solve(path.states[0], parameters=parameters))
         seconds = perf_counter() - started
         maneuver = Maneuver(flown_in, solution.states, solution.controls)
-        success = problem.is_success(solution.states[-1])
+        success = problem.is_success(solution.states, solution.controls)
         expert = Side("expert", maneuver, solution.cost, success, seconds)
         pairs.append(SideBySide(seed, agent, expert, solution.converged))
     return pairs

@@ -86,6 +86,6 @@ def _solved(
     return {
         "seed": seed,
         "cost": solution.cost if solution.converged else None,
-        "is_success": bool(problem.is_success(solution.states[-1])),
+        "is_success": problem.is_success(solution.states, solution.controls),
         "seconds": perf_counter() - began,
     }

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rich.console import ConsoleRenderable
 
     from dq_space_arm_env import Scene
-    from dq_space_arm_env.command_line.simulated_episode import Catch
+    from dq_space_arm_env.environment.catches import Catch
     from dq_space_arm_env.task.trajectory import Trajectory
 
 
@@ -90,9 +90,9 @@ def simulate(
     from dq_space_arm_env import load_scene
     from dq_space_arm_env.command_line.simulated_episode import (
         begin,
-        catches,
         drowned_inputs,
         final_errors,
+        flown_catches,
         fly,
         numerical_error,
         read_noise,
@@ -117,7 +117,7 @@ def simulate(
         return
     console = table_console()
     inputs = flight.controls if flight.noise is None else flight.controls + flight.noise
-    caught = catches(begun, flight.states, inputs)
+    caught = flown_catches(begun, flight.states, inputs)
     console.print(_table(loaded, flight, final_errors(begun, flight), error, caught))
     if out is not None:
         console.print(f"{out}: watch it with `dq-space-arm replay {out}`", markup=False, soft_wrap=True)
@@ -126,7 +126,7 @@ def simulate(
 def _table(
     scene: Scene, flight: Trajectory, errors: Sequence[float], error: float, caught: Sequence[Catch]
 ) -> ConsoleRenderable:
-    from dq_space_arm_env.command_line.simulated_episode import error_rows
+    from dq_space_arm_env.command_line.simulated_episode import catch_rows, error_rows
     from dq_space_arm_env.common.tables import plain_table
 
     verdict = "DIVERGED" if flight.diverged else "success" if flight.is_success else "NO success"
@@ -138,7 +138,7 @@ def _table(
         ("start", flight.start, ""),
         ("cost J", f"{flight.cost:.6f}", "minus the sum of the rewards" + charged),
         ("steps", str(len(flight.controls)), f"{1e6 * flight.action_seconds:.0f} us for an action"),
-        *(row for catch in caught for row in catch.rows()),
+        *(row for catch in caught for row in catch_rows(catch)),
         *error_rows(scene.success, errors),
         ("numerical error", f"{error:.1e}", trusted),
         ("end", verdict, ""),

@@ -10,18 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.common.bounded_formats import read_array, read_arrays
 from dq_space_arm_env.common.bounded_reading import read_json
 from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.environment import DQSpaceArmEnv
+from dq_space_arm_env.environment.catches import Catch, catches
 from dq_space_arm_env.environment.disturbances import Disturbances
 from dq_space_arm_env.environment.rollouts import Policy, StateFeedback, rollout
 from dq_space_arm_env.kernels import compile_scene
-from dq_space_arm_env.kernels.stages import target_path
 from dq_space_arm_env.scene import Scene, StateLayout
 from dq_space_arm_env.scene.maneuver import Success
-from dq_space_arm_env.scene.parameters import CATCH
 from dq_space_arm_env.scene.start import episode_scene
 from dq_space_arm_env.task.trajectory import Trajectory
 
@@ -148,50 +146,18 @@ def final_errors(start: Start, flight: Trajectory) -> tuple[float, ...]:
     return tuple(kernels.tip_errors(flight.states[-1], p=row).tolist())
 
 
-class Catch(NamedTuple):
-    """What a phase finds that begins with a catch."""
-
-    phase: str
-    errors: tuple[float, ...]  # of the tip, deg, m, deg/s and m/s relative to the target
-    tolerances: Success
-
-    @property
-    def is_met(self) -> bool:
-        """Whether the payload is caught."""
-        return all(e <= most for e, most in zip(self.errors, self.tolerances.tolerances, strict=True))
-
-    def rows(self) -> Iterator[tuple[str, str, str]]:
-        """Rows of a table."""
-        missed = "MISSED", "nothing is held from then on"
-        yield f"catch, {self.phase}", *(("caught", "") if self.is_met else missed)
-        for name, error, note in error_rows(self.tolerances, self.errors):
-            yield f"  {name}", error, note
+def flown_catches(start: Start, states: ArrayLike, inputs: ArrayLike) -> list[Catch]:
+    """Judge the catches of an episode by states (N + 1, n_x) and inputs (N, n_u)."""
+    kernels = compile_scene(start.scene)
+    return catches(kernels, kernels.stage_parameters(start.parameters), states, inputs)
 
 
-def catches(start: Start, states: ArrayLike, inputs: ArrayLike) -> list[Catch]:
-    """Judge the catches of an episode by states (N + 1, n_x) and inputs (N, n_u), as environments do."""
-    kernels, scene = compile_scene(start.scene), start.scene
-    staged, entries, layout = scene.staged, kernels.parameters, kernels.layout
-    if not any(staged.catches):
-        return []
-    stages, moving, found = kernels.stage_parameters(start.parameters), list(entries.moving), []
-    states, inputs = np.asarray(states), np.asarray(inputs)
-    for index, (phase, stage) in enumerate(zip(scene.phases, staged.starts, strict=True)):
-        if phase.catch is None or stage > len(inputs):
-            continue
-        p = stages[stage - 1].copy()
-        p[entries.indices(CATCH)] = 0.0  # before the impact
-        acting = kernels.applied_inputs(states[stage - 1], inputs[stage - 1], p=p)
-        x = kernels.step(states[stage - 1], acting, p=p)
-        if moving and staged.resting[index - 1] is None:
-            p[moving] = target_path(kernels, stages[0, moving])[stage]
-        tip, target = (tuple(each.tolist()) for each in (kernels.tip_pose(x, p=p), layout.target_with(p)))
-        twist = kernels.relative_twist(x, p=p)
-        angles = poses.error_angle(tip, target), np.linalg.norm(twist[:3])
-        (turned, turning), moved = np.degrees(angles), poses.error_distance(tip, target)
-        errors = (turned, moved, turning, np.linalg.norm(twist[3:]))
-        found.append(Catch(phase.name, tuple(map(float, errors)), phase.catch))
-    return found
+def catch_rows(catch: Catch) -> Iterator[tuple[str, str, str]]:
+    """Rows of a table."""
+    missed = "MISSED", "nothing is held from then on"
+    yield f"catch, {catch.phase}", *(("caught", "") if catch.is_met else missed)
+    for name, error, note in error_rows(catch.tolerances, catch.errors):
+        yield f"  {name}", error, note
 
 
 def error_rows(success: Success, errors: Sequence[float]) -> Iterator[tuple[str, str, str]]:

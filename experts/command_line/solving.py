@@ -13,15 +13,16 @@ from rich.console import Console, ConsoleRenderable
 
 from dq_space_arm_env import Scene
 from dq_space_arm_env.command_line.simulated_episode import (
-    Catch,
     Start,
     begin,
-    catches,
+    catch_rows,
     error_rows,
+    flown_catches,
 )
 from dq_space_arm_env.common.files import json_value, to_json, write_atomically
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.tables import plain_table
+from dq_space_arm_env.environment.catches import Catch, ends_held
 from dq_space_arm_env.scene import StateLayout
 from experts import BoxDDP, GuidedDDP, Solution, StopReason
 from experts.problems.arm_problem import ArmProblem
@@ -51,7 +52,7 @@ class SolveRun:
     @property
     def is_success(self) -> bool:
         """Whether the payload is caught where it is to be, and all tips end within the tolerances."""
-        return self.ends_within and all(catch.is_met for catch in self.catches)
+        return self.ends_within and ends_held(self.catches)
 
     @property
     def ends_within(self) -> bool:
@@ -96,7 +97,7 @@ def solve(
         solution = solver.solve(begun.state, callback=progress.update, parameters=begun.parameters)
     solved = perf_counter()
     errors = _final_errors(scene, solution)
-    caught = catches(begun, solution.states, solution.controls)
+    caught = flown_catches(begun, solution.states, solution.controls)
     # The files are of the episode's scene, where what was drawn is constant; what changes on the way is not.
     every, kept = (StateLayout.of(each).parameters.names for each in (scene, begun.episode_scene))
     solution.parameters = solution.parameters[:, [every.index(name) for name in kept]]
@@ -187,6 +188,6 @@ def table(run: SolveRun) -> ConsoleRenderable:
         ("iterations", str(solution.iterations), seconds),
     ]
     (name, error, tolerance), *others = error_rows(run.scene.success, run.final_errors)
-    rows += [row for catch in run.catches for row in catch.rows()]
+    rows += [row for catch in run.catches for row in catch_rows(catch)]
     rows += [(name, error, f"{tolerance}; {reached}"), *others]
     return plain_table(f"Scene {run.scene.name}", ("", "", ""), rows)

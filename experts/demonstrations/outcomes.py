@@ -129,7 +129,7 @@ def solve_again(expert: Expert, outcomes: list[Outcome], retries: list[Retry]) -
 
 def _judge(problem: ArmProblem, solution: Solution) -> str:
     """Return the reason of an outcome: `CONVERGED` for a demonstration."""
-    missed = solution.converged and not problem.is_success(solution.states[-1])
+    missed = solution.converged and not problem.is_success(solution.states, solution.controls)
     return MISSED_TARGET if missed else solution.stop_reason.value
 
 

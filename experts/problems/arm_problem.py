@@ -12,6 +12,7 @@ import numpy as np
 from dq_space_arm_env import Kernels, Scene, compile_scene, load_scene
 from dq_space_arm_env.algebra import dual_quaternion as dq
 from dq_space_arm_env.algebra import dual_vectors, poses
+from dq_space_arm_env.environment.catches import catches, ends_held
 from dq_space_arm_env.kernels.library import PENALIZED
 from dq_space_arm_env.kernels.parallel_compilation import Request, compiling_aside
 from dq_space_arm_env.scene import INTEGRATORS
@@ -269,9 +270,14 @@ class ArmProblem:
         """Largest of the tip's errors at a final state, each relative to its tolerance."""
         return float(misses(self.kernels, state, self.parameters.rows[-1]))
 
-    def is_success(self, state: FloatArray) -> bool:
-        """Whether an episode that ends in a state is a success."""
-        return self.misses(state) <= 1.0
+    def is_success(self, states: FloatArray, controls: FloatArray) -> bool:
+        """Whether an episode is a success by its last states, (M + 1, n_x), and inputs, (M, n_u).
+
+        The tip ends within the tolerances; what is to be caught in these stages is caught.
+        """
+        first, rows = self.horizon - len(controls), self.parameters.rows
+        caught = ends_held(catches(self.kernels, rows, states, controls, first))
+        return caught and self.misses(states[-1]) <= 1.0
 
     def kernel(self, name: str, *, batched: bool = False) -> Kernel:
         """Return a kernel of `ShootingProblem`."""

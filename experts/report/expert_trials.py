@@ -8,14 +8,13 @@ from typing import cast
 
 import numpy as np
 
-from dq_space_arm_env.command_line.simulated_episode import Start, catches
 from dq_space_arm_env.common.report_page import Section
 from dq_space_arm_env.common.tables import Column, Row
 from dq_space_arm_env.environment.dq_space_arm import DQSpaceArmEnv
 from dq_space_arm_env.scene import Scene
 from experts.ddp.solution import uninterrupted
 from experts.guesses.guided import GuidedDDP
-from experts.problems.arm_problem import ArmProblem, misses
+from experts.problems.arm_problem import ArmProblem
 from experts.report.effort import Announce, Effort
 
 _QUANTILES = {"least": 0.0, "median": 0.5, "90 %": 0.9, "most": 1.0}
@@ -42,18 +41,14 @@ def solve_episode(expert: GuidedDDP, env: DQSpaceArmEnv, seed: int) -> Row:
     state = np.asarray(env.state, dtype=np.float64)
     solution = uninterrupted(expert.solve(state, parameters=env.parameters))
     seconds = perf_counter() - began
-    kernels = cast(ArmProblem, expert.problem).kernels
-    end, p = solution.states[-1], solution.parameters[-1]
-    angle, distance = kernels.tip_errors(end, p=p)[:2].tolist()
+    problem = cast(ArmProblem, expert.problem)
+    errors = problem.kernels.tip_errors(solution.states[-1], p=solution.parameters[-1])
+    angle, distance = errors[:2].tolist()
     attempts = solution.metadata.get("attempts", ())
-    start = Start(state, env.scene, np.asarray(env.parameters, dtype=np.float64), f"seed {seed}")
-    succeeds = bool(misses(kernels, end, p) <= 1.0) and all(
-        catch.is_met for catch in catches(start, solution.states, solution.controls)
-    )
     return {
         "seed": seed,
         "converged": solution.converged,
-        "success": succeeds,
+        "success": problem.is_success(solution.states, solution.controls),
         "iterations": sum(attempt["iterations"] for attempt in attempts) or solution.iterations,
         "long_step_iterations": sum(a["iterations"] for a in solution.metadata.get("long_steps", ())),
         "seconds": seconds,

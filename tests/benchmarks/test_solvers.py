@@ -239,7 +239,7 @@ def test_random_starts_are_the_episodes_of_the_environment(problem: ArmProblem, 
         env.reset(seed=row["seed"])
         solution = guided.solve(np.asarray(env.state, dtype=np.float64), parameters=env.parameters)
         assert row["cost"] == solution.cost
-        assert row["success"] == problem.is_success(solution.states[-1])
+        assert row["success"] == problem.is_success(solution.states, solution.controls)
         assert row["gap"] >= 0.0
     assert (summary["starts"], summary["preparation_s"]) == (2, 1.5)
     assert len(select(rows, table="claims")) == 2

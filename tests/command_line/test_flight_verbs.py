@@ -14,8 +14,8 @@ from dq_space_arm_env.command_line import main
 from dq_space_arm_env.command_line.policy_sources import load_policy
 from dq_space_arm_env.command_line.simulated_episode import (
     begin,
-    catches,
     drowned_inputs,
+    flown_catches,
     fly,
     read_noise,
     read_state,
@@ -145,7 +145,7 @@ def test_catches_are_judged_as_environments_judge_them() -> None:
             *_, info = env.step(action)
             states.append(env.state)
         commanded = env.kernels.layout.to_control(inputs, env.kernels.stage_parameters()[:-1])
-        (found,) = catches(begin(scene), states, commanded)
+        (found,) = flown_catches(begin(scene), states, commanded)
         return found, bool(info["caught"])
 
     names = ("attitude_error_deg", "position_error", "angular_velocity_error_deg", "velocity_error")

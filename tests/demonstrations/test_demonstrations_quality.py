@@ -32,7 +32,7 @@ def solved(quick_scene: Scene) -> tuple[Expert, list[Outcome]]:
 def spoil(expert: Expert, outcome: Outcome) -> Outcome:
     """Solve from zero controls with long first steps, which wind the joints up."""
     solution = BoxDDP(expert.problem, initial_regularization=1.0).solve(outcome.start)
-    success = solution.converged and expert.problem.is_success(solution.states[-1])
+    success = solution.converged and expert.problem.is_success(solution.states, solution.controls)
     reason = StopReason.CONVERGED.value if success else MISSED_TARGET
     return Outcome(outcome.index, outcome.seed, outcome.start, solution, "zero controls", reason)
 

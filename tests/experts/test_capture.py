@@ -6,6 +6,7 @@ import pytest
 
 import dq_space_arm_env
 from experts import GuidedDDP
+from experts.problems.arm_problem import ArmProblem
 
 
 @pytest.mark.parametrize(
@@ -36,3 +37,25 @@ def test_plans_across_phases_succeed_in_the_environment(name: str) -> None:
         if "caught" in info:
             assert info["caught"] == 1.0
             assert 0.0 < shock < 0.05  # N s: they meet at rest
+
+
+@pytest.mark.slow
+def test_an_end_within_the_tolerances_is_no_success_without_the_catch() -> None:
+    """The answers of the environment, from every stage of the flight on."""
+    lengths = {f"phases.{index}.steps": steps for index, steps in enumerate((6, 1, 5))}
+    names = ("attitude_error_deg", "position_error", "angular_velocity_error_deg", "velocity_error")
+    wide = dict.fromkeys(names, 180.0)
+    scene = dq_space_arm_env.load_scene("capture-and-detumble")
+    scene = scene.replace({**lengths, "simulation.steps": 12, "success": wide})
+    for found, expected in ((wide, True), ({**wide, "position_error": 1e-3}, False)):
+        env = dq_space_arm_env.DQSpaceArmEnv(scene.replace({"phases.2.catch": found}))
+        env.reset(options={"nominal": True})
+        states, controls = [env.state], np.zeros((12, env.kernels.n_u))
+        for _ in controls:
+            *_, info = env.step(np.zeros(env.kernels.n_u))
+            states.append(env.state)
+        problem = ArmProblem(env.scene)
+        assert problem.misses(states[-1]) < 1.0
+        assert problem.is_success(np.array(states), controls) == info["is_success"] == expected
+        assert problem.is_success(np.array(states[6:]), controls[6:]) == expected  # it is caught in step 7
+        assert problem.is_success(np.array(states[7:]), controls[7:])

@@ -87,7 +87,7 @@ def mismatches(world: ArmProblem) -> Iterator[Mismatch]:
 
 def _flights(subject: _Subject, start: FloatArray, mismatch: Mismatch) -> dict[str, Any]:
     solved = uninterrupted(subject.informed.solve(start, parameters=mismatch.parameters))
-    knows = solved.converged and subject.world.is_success(solved.states[-1])
+    knows = solved.converged and subject.world.is_success(solved.states, solved.controls)
     found: dict[str, Any] = {"informed": knows}
     for identifies, expert in subject.experts.items():
         flight = subject.fly(expert, start, mismatch)

@@ -50,9 +50,9 @@ def test_a_maneuver_whose_minimum_misses_the_target_reaches_it_for_a_little_more
 ):
     problem = paper.problem
     assert cheapest.converged
-    assert not problem.is_success(cheapest.states[-1])
+    assert not problem.is_success(cheapest.states, cheapest.controls)
     assert solution.converged
-    assert problem.is_success(solution.states[-1])
+    assert problem.is_success(solution.states, solution.controls)
     assert 0.998 < problem.misses(solution.states[-1]) < 1.0
     assert cheapest.cost < solution.cost < 1.001 * cheapest.cost
     assert [attempt["constrained"] for attempt in solution.metadata["attempts"]] == [True]
