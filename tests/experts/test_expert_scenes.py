@@ -13,7 +13,7 @@ from experts.problems.paper_problem import PaperProblem
 from scripts.benchmarks.stability.expert import at_target
 
 COMPILED_ANYWAY = ("no-wrist", "paper", "planar")
-OF_A_KIND = ("dual-arm", "elastic-joints", "free-floating", "motors", "servicing", "six-joint", "sliding")
+OF_A_KIND = ("dual-arm", "elastic-joints", "free-floating", "keep-out", "motors", "six-joint", "sliding")
 OF_A_KIND += ("thrusters", "tumbling", "wheels")
 EVERY_SCENE = [
     pytest.param(
