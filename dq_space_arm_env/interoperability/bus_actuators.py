@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from dq_space_arm_env.scene import Scene
+from dq_space_arm_env.viewing.rendering.spacecraft import equivalent_box
 
 _BUS = 105.0  # mass of the bus that these wheels are for, kg; others are in proportion
 _WHEEL = {"inertia": 0.0075, "torque": 0.2, "power": 80.0}  # kg m^2, N m, W
@@ -63,8 +62,7 @@ def with_jets(scene: Scene, force: float) -> Scene:
     Returns:
         The scene; the forces of the thrusters are inputs.
     """
-    moments = np.diag(np.array(scene.base.inertia))
-    edges = [math.sqrt(6.0 * (moments.sum() - 2.0 * moment) / scene.base.mass) for moment in moments]
+    edges, _ = equivalent_box(scene.base.mass, np.diag(np.diag(scene.base.inertia)))
     jets = [
         {
             "position": [

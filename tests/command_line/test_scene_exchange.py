@@ -156,6 +156,15 @@ def test_wheels_and_jets_are_in_size_for_the_spacecraft(
     assert main(["scenes", "validate", "small-arm.yaml"]) == SUCCESS
 
 
+def test_jets_sit_on_flat_spacecraft_too(here: Path) -> None:
+    """One moment is the sum of the others, which rounding may pass."""
+    flat = ["--spacecraft-mass", "80", "--spacecraft-inertia", "6.41", "6.97", "13.38"]
+    assert main(["scenes", *HAND, *flat, "--thrusters", "jets", "--no-measure"]) == SUCCESS
+    scene = load_scene("small-arm.yaml")
+    jets = np.array([[*jet.unit_direction, *jet.moment] for jet in scene.actuators.thrusters])
+    assert np.linalg.matrix_rank(jets) == 6
+
+
 def test_stiff_dampers_take_short_steps_or_a_stiff_method(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
