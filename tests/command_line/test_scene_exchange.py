@@ -165,6 +165,16 @@ def test_jets_sit_on_flat_spacecraft_too(here: Path) -> None:
     assert np.linalg.matrix_rank(jets) == 6
 
 
+def test_starts_are_drawn_within_the_limits(here: Path) -> None:
+    text = Path(ARM).read_text(encoding="utf-8").replace('lower="-3" upper="3"', 'lower="0" upper="0.1992"')
+    Path("arm.urdf").write_text(text, encoding="utf-8")
+    words = ["scenes", "import", "arm.urdf", "--tip", "hand", *CARRIED, "--spread", "0.1", "--no-measure"]
+    assert main(words) == SUCCESS
+    scene = load_scene("arm.yaml")
+    assert scene.initial_state.joint_angles[0] == pytest.approx(0.0996)
+    assert 0.09 < scene.spread.joint_angles < 0.0996
+
+
 def test_stiff_dampers_take_short_steps_or_a_stiff_method(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
