@@ -18,6 +18,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from dq_space_arm_env.algebra import poses, rotations
+from dq_space_arm_env.algebra.quaternion import normalize
 from dq_space_arm_env.common.bounded_formats import parse_xml
 from dq_space_arm_env.common.bounded_reading import UnreadableError, read_bytes
 from dq_space_arm_env.common.shown_text import printable, shortened
@@ -30,6 +31,7 @@ TYPES = (*MOVABLE, "fixed", "planar", "floating")
 _MOST = 10_000  # links or joints, a hundred times those of a humanoid
 _LONGEST_NAME = 200  # characters
 _LARGEST = 1e15  # number, whose square times another's has digits to spare
+_UNIT_TOLERANCE = 1e-3  # of the norm of a quaternion, which files write with few digits
 
 UNLIMITED = 1e4
 """Limit of an angle, a rate or an effort, rad, rad/s and N m, from which it limits nothing."""
@@ -238,11 +240,19 @@ def _origin(element: Element, where: str) -> Pose:
     origin = _only(element, "origin", where)
     if origin is None:
         return poses.from_rotation_and_position((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    where = f"{where}, <origin>"
     position, (roll, pitch, yaw) = (
-        _vector(origin, key, f"{where}, <origin>") if key in origin.attrib else (0.0, 0.0, 0.0)
-        for key in ("xyz", "rpy")
+        _vector(origin, key, where) if key in origin.attrib else (0.0, 0.0, 0.0) for key in ("xyz", "rpy")
     )
-    return poses.from_rotation_and_position(rotations.from_euler_321(yaw, pitch, roll), position)
+    if "quat_xyzw" not in origin.attrib:
+        return poses.from_rotation_and_position(rotations.from_euler_321(yaw, pitch, roll), position)
+    if "rpy" in origin.attrib:
+        raise SceneError(f"URDF: {where}: rpy and quat_xyzw both say how it is turned: keep one")
+    x, y, z, w = _vector(origin, "quat_xyzw", where, 4)
+    if abs(math.hypot(w, x, y, z) - 1.0) > _UNIT_TOLERANCE:
+        text = shortened(origin.get("quat_xyzw"))
+        raise SceneError(f"URDF: {where}: quat_xyzw = {text}, it must be a unit quaternion within 1e-3")
+    return poses.from_rotation_and_position(normalize((w, x, y, z)), position)
 
 
 def _name(element: Element) -> str:
@@ -289,8 +299,8 @@ def _direction(element: Element, where: str) -> tuple[float, ...]:
     return _numbers(_required(element, "xyz", where), 3, "xyz", where, largest=math.inf)
 
 
-def _vector(element: Element, key: str, where: str) -> tuple[float, ...]:
-    return _numbers(_required(element, key, where), 3, key, where)
+def _vector(element: Element, key: str, where: str, count: int = 3) -> tuple[float, ...]:
+    return _numbers(_required(element, key, where), count, key, where)
 
 
 def _numbers(text: str, count: int, key: str, where: str, *, largest: float = _LARGEST) -> tuple[float, ...]:

@@ -9,6 +9,7 @@ import pytest
 from foreign_robots import accelerations, drawn, relative_error
 
 from dq_space_arm_env import SceneError, load_scene, scene_from_urdf, scene_to_urdf
+from dq_space_arm_env.algebra import rotations
 from dq_space_arm_env.scene import StateLayout
 
 INERTIA = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
@@ -67,6 +68,11 @@ FINGERS = (
         (robot(*GOOD, joint("j2", "arm", "b", "hinge"), B), "joint 'j2': type = 'hinge', it must be"),
         (arm(content='<axis xyz="0 0 0"/>'), "joint 'j1': the axis has zero length"),
         (arm(content='<origin xyz="0 0"/>'), "'j1', <origin>: xyz = '0 0', it must be 3 finite numbers"),
+        (
+            arm(content='<origin rpy="0 0 0" quat_xyzw="0 0 0 1"/>'),
+            "'j1', <origin>: rpy and quat_xyzw both say",
+        ),
+        (arm(content='<origin quat_xyzw="0 0 0 2"/>'), "quat_xyzw = '0 0 0 2', it must be a unit quaternion"),
         (arm(content='<dynamics damping="-1"/>'), "joint 'j1': damping = -1, it must be 0 or greater"),
         (arm(content='<limit lower="1" upper="0"/>'), "'j1': lower = 1 rad is greater than upper = 0 rad"),
         (robot(*GOOD, joint("j2", "arm", "bb"), B), "its child link 'bb' does not exist; did you"),
@@ -195,6 +201,18 @@ def test_the_length_of_an_axis_does_not_matter(length):
     text = robot(*GOOD).replace("<limit", f'<axis xyz="{length} {length} 0"/><limit')
     unit = robot(*GOOD).replace("<limit", '<axis xyz="1 1 0"/><limit')
     assert scene_from_urdf(text, "arm") == scene_from_urdf(unit, "arm")
+
+
+def test_origins_may_be_turned_by_quaternions():
+    """As URDF 1.1 has it, scalar last; few digits are enough."""
+    angles = '<origin xyz="1 2 3" rpy="0.3 -0.4 0.5"/>'
+    w, *vector = rotations.from_euler_321(0.5, -0.4, 0.3)
+    turned = angles.replace('rpy="0.3 -0.4 0.5"', f'quat_xyzw="{" ".join(f"{n:.6f}" for n in (*vector, w))}"')
+    poses = [
+        np.array(scene_from_urdf(arm(content=f'{origin}<limit effort="1"/>'), "arm").links[0].joint.rotation)
+        for origin in (angles, turned)
+    ]
+    np.testing.assert_allclose(*poses, atol=1e-5)
 
 
 def test_a_long_file_is_read_in_a_moment():
