@@ -98,8 +98,9 @@ def _inline(value: Any) -> str:
         return _number(value)
     if isinstance(value, int):
         return str(value)
-    # JSON's text is YAML's; what YAML would take for the end of a line is escaped.
-    return json.dumps(str(value), ensure_ascii=not str(value).isprintable())
+    # JSON's text is YAML's, but for pairs of surrogates; what YAML takes for the end of a line is escaped.
+    text = json.dumps(str(value), ensure_ascii=False)
+    return "".join(each if each.isprintable() else f"\\U{ord(each):08x}" for each in text)
 
 
 def _untyped(value: Any) -> str:

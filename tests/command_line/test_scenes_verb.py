@@ -233,7 +233,18 @@ def test_a_new_file_is_the_scene_with_comments(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ['a "b" \\ c', "two\nlines", "tab\t", "next\u0085line", "1e3", "true", "手/ü", "#a: b"]
+    "text",
+    [
+        'a "b" \\ c',
+        "two\nlines",
+        "tab\t",
+        "next\u0085line",
+        "1e3",
+        "true",
+        "手/ü",
+        "#a: b",
+        "\U0001f680\ntwo",
+    ],
 )
 def test_a_description_may_be_any_text_and_a_name_any_that_can_be_shown(text: str) -> None:
     scene = load_scene("planar").replace(name=" ".join(text.split()), description=text)
