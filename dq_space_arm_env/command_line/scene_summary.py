@@ -138,28 +138,13 @@ def left_out(scene: Scene) -> Iterator[str]:
         yield "springs and dampers of the joints"
     if scene.links and not any(link.motor for link in scene.links):
         yield "rotors, friction and elastic gears of the joints"
-    spread = scene.spread.model_dump()
-    fixed = {
-        "start": not any(spread[name] for name in _START),
-        "target": not (spread["target_rotation"] or spread["target_position"]),
-        "masses and inertias": not any(
-            value for name, value in spread.items() if "mass" in name or "inertia" in name
-        ),
-    }
-    same = [name for name, is_fixed in fixed.items() if is_fixed]
+    drawn = {name for name, width in scene.spread.model_dump(exclude={"observed"}).items() if width}
+    target = {name for name in drawn if name.startswith(("target", "grasp"))}
+    masses = {name for name in drawn if "mass" in name or "inertia" in name}
+    groups = {"start": drawn - target - masses, "target": target, "masses and inertias": masses}
+    same = [part for part, names in groups.items() if not names]
     if same:
         yield f"random draws of {' and of '.join(same)}: the same in every episode"
-
-
-_START = (
-    "base_rotation",
-    "base_position",
-    "joint_angles",
-    "wrist_angles",
-    "base_angular_velocity",
-    "base_linear_velocity",
-    "joint_rates",
-)
 
 
 def _bodies(scene: Scene) -> Iterator[tuple[str, float, str]]:

@@ -13,7 +13,7 @@ from dq_space_arm_env.command_line.scene_summary import left_out
 from dq_space_arm_env.command_line.scene_template import commented_yaml
 from dq_space_arm_env.command_line.scene_warnings import warnings_of
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, UNUSABLE
-from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.scene import Spread, StateLayout
 from dq_space_arm_env.validation import parse_yaml
 
 BROKEN = """\
@@ -93,6 +93,20 @@ def test_what_is_left_out_is_said() -> None:
     assert "wrist" in payload - paper
     assert "payload" in paper - payload
     assert "thrusters: no force on the base" in wheels - paper
+
+
+@pytest.mark.parametrize(
+    ("name", "drawn", "same"),
+    [
+        ("wheels", "wheel_speeds", "target and of masses and inertias"),
+        ("tumbling-target", "target_angular_velocity", "start and of masses and inertias"),
+        ("tumbling-target", "grasp_position", "start and of masses and inertias"),
+        ("payload", "payload_mass", "start and of target"),
+    ],
+)
+def test_what_is_not_drawn_is_said(name: str, drawn: str, same: str) -> None:
+    scene = load_scene(name).replace(spread=Spread(**{drawn: 0.01}))
+    assert f"random draws of {same}: the same in every episode" in left_out(scene)
 
 
 def test_problems_come_with_their_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
