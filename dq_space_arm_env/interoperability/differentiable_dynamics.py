@@ -145,8 +145,9 @@ class DifferentiableDynamics(ABC, Generic[ArrayT]):
                 other ones: N exceeds the scene's steps, or dt is not the scene's.
         """
         given = {"x": self._checked("x", x), "u": self._checked("u", u)}
+        self._require(given, {"x": (1, 2), "u": (2, 3)})
         given["p"] = self._parameters(self._stages(len(given["u"])) if p is None else p)
-        self._require(given, {"x": (1, 2), "u": (2, 3), "p": (1, 2, 3)})
+        self._require({"p": given["p"]}, {"p": (1, 2, 3)})
         steps = len(given["u"])
         if every < 1 or steps < 1 or steps % every:
             raise ValueError(f"every: {every}, the {steps} steps of u should be one or more times as many")
@@ -177,9 +178,8 @@ class DifferentiableDynamics(ABC, Generic[ArrayT]):
         sizes = {"x": self.layout.n_x, "u": self.layout.n_u, "p": self.layout.n_p}
         for name, array in given.items():
             if array.ndim not in ranks[name] or array.shape[-1] != sizes[name]:
-                axes = (
-                    ("", "B, ", "N, B, ") if name != "u" or ranks[name] == (1, 2) else ("", "N, ", "N, B, ")
-                )
+                in_time = name == "u" and ranks[name] != (1, 2)
+                axes = ("", "N, ", "N, B, ") if in_time else ("", "B, ", "N + 1, B, ")
                 shapes = " or ".join(f"({axes[rank - 1]}{sizes[name]})" for rank in ranks[name])
                 raise ValueError(f"{name}: shape {tuple(array.shape)}, should be {shapes}")
 

@@ -173,6 +173,10 @@ def test_misuse_of_tensors_is_named(torch):
         dynamics.step(x, u[0, :, :2])
     with pytest.raises(ValueError, match=r"u: shape \(6,\), should be \(N, 6\) or \(N, B, 6\)"):
         dynamics.rollout(x, u[0, 0])
+    with pytest.raises(ValueError, match=r"u: shape \(\), should be \(N, 6\) or \(N, B, 6\)"):
+        dynamics.rollout(x, u[0, 0, 0])
+    with pytest.raises(ValueError, match=r"p: shape \(2,\), should be \(0\) or \(B, 0\) or \(N \+ 1, B, 0\)"):
+        dynamics.rollout(x, u, p=x[0, :2])
     with pytest.raises(ValueError, match="batches differ in length"):
         dynamics.step(x[:2], u[0])
     with pytest.raises(ValueError, match="every: 4, the 6 steps"):
