@@ -92,14 +92,16 @@ def scene_to_mjcf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
             _add_joint(body, link, lower, upper)
         _add_inertial(body, link, link.center_of_mass)
     looks.add_arm(bodies, scene)
+    target = free_name("target", [*names, base.get("name", "")])
+    sites = ["e0", "tip", target]
     names += [free_name("payload", names)]
     _add_tip(bodies[scene.tip_body], scene, "tip", tip_on_its_body(scene), (names[-1], scene.payload))
     for other in scene.other_tips:
         names += [free_name(f"{other.name} payload", names)]
         body, frame = bodies[scene.body_named(other.link)], other.frame.dual_quaternion
-        site = free_name(other.name, ("e0", "tip", "target"))
-        _add_tip(body, scene, site, frame, (names[-1], other.payload))
-    looks.add_target(world, scene, free_name("target", [*names, base.get("name", "")]))
+        sites += [free_name(other.name, sites)]
+        _add_tip(body, scene, sites[-1], frame, (names[-1], other.payload))
+    looks.add_target(world, scene, target)
     _add_actuators(root, scene)
     _add_start(root, scene)
     ElementTree.indent(root)

@@ -54,7 +54,8 @@ def scene_to_urdf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     refuse(scene, "URDF", wrist, springs=True, planar=True, rotors=True, spherical=True)
     root = Element("robot", name=scene.name)
     names = [link.name for link in scene.links]
-    bodies = [free_name("base", names), *names]
+    others = [tip.name for tip in scene.other_tips]
+    bodies = [free_name("base", [*names, *others]), *names]
     _add_link(root, bodies[0], scene.base, (0.0, 0.0, 0.0))
     limits = joint_limits(scene)
     for link, parent, effort, bounds in zip(
@@ -62,7 +63,7 @@ def scene_to_urdf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     ):
         _add_link(root, link.name, link, link.center_of_mass)
         _add_joint(root, link, bodies[parent], effort, bounds)
-    tip = free_name("tip", [*names, *(other.name for other in scene.other_tips)])
+    tip = free_name("tip", [*names, *others])
     _add_tip(root, tip, bodies[scene.tip_body], tip_on_its_body(scene), scene.payload)
     for other in scene.other_tips:
         body = bodies[scene.body_named(other.link)]

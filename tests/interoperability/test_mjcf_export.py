@@ -300,6 +300,18 @@ def test_links_may_be_called_as_bodies_of_mujoco(names):
     check_accelerations(scene, samples=1)
 
 
+def test_names_of_tips_are_not_given_twice():
+    """Nor are the base's and the target's, which make way for links of these names."""
+    tip = {"name": "target_", "link": "base", "goal": {}}
+    scene = load_scene("no-wrist").replace(
+        {"links.0.name": "base", "links.1.name": "target"}, other_tips=[tip, {**tip, "name": "base_"}]
+    )
+    mujoco.MjModel.from_xml_string(scene_to_mjcf(scene))
+    root = ElementTree.fromstring(scene_to_urdf(scene))
+    names = [link.get("name") for link in root.findall("link")]
+    assert len({*names}) == len(names) == 7
+
+
 @pytest.mark.parametrize(
     ("name", "wrist", "sentence"),
     [
