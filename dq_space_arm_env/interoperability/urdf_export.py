@@ -31,8 +31,8 @@ def scene_to_urdf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     name; its joint turns about z, or slides along it, and is called by the link's name and " joint". A link
     `tip` without mass, or with that of the payload, has the frame G; so have other tips, by their names.
     Torque limits become efforts, 0 for a joint without motor. The scene's joint limits, without their
-    margins, make a joint revolute, others are continuous; 1e4 rad (m) and rad/s (m/s) stand for none where
-    URDF asks for a number. It has no thrusters, wheels, start, task or other constraints. Shapes become
+    margins, make a joint revolute, others are continuous; 1e4 rad (m), rad/s (m/s) and N m (N) stand for none
+    where URDF asks for a number. It has no thrusters, wheels, start, task or other constraints. Shapes become
     visuals.
 
     Features that URDF lacks and that change the motion are refused: joint springs, rotors, screw and
@@ -134,14 +134,17 @@ def _add_joint(
     has_range = has_range or kind == "prismatic"  # URDF wants one
     if has_range or math.isfinite(effort) or math.isfinite(rate):
         # URDF wants effort and velocity in every <limit>.
-        limit = SubElement(joint, "limit", effort=words([min(effort, UNLIMITED)]))
-        limit.set("velocity", words([min(rate, UNLIMITED)]))
+        numbers = {"effort": effort, "velocity": rate}
         if has_range:
-            limit.set("lower", words([max(lower, -UNLIMITED)]))
-            limit.set("upper", words([min(upper, UNLIMITED)]))
+            numbers |= {"lower": lower, "upper": upper}
+        SubElement(joint, "limit", {key: words([_finite(value)]) for key, value in numbers.items()})
     rubbing = {"damping": link.damping, "friction": link.motor.friction if link.motor else 0.0}
     if any(rubbing.values()):
         SubElement(joint, "dynamics", {key: words([value]) for key, value in rubbing.items() if value})
+
+
+def _finite(limit: float) -> float:
+    return limit if math.isfinite(limit) else math.copysign(UNLIMITED, limit)
 
 
 def _connect(joint: Element, parent: str, child: str, pose: Sequence[float]) -> None:

@@ -1,6 +1,7 @@
 """Joint limits from URDF, to URDF and to MJCF, against Pinocchio's and MuJoCo's own reading."""
 
 import math
+import re
 import warnings
 from pathlib import Path
 
@@ -166,6 +167,18 @@ def test_the_tightest_limits_are_written(limited):
     unlimited = limited.replace(actuators={"joint_torque": {"limit": INF}})
     for scene, more in ((limited, {}), (unlimited, {"joint_torque": 1.0})):
         assert joint_limits(scene_from_urdf(scene_to_urdf(scene), "tip", **more)) == TIGHTEST
+
+
+def test_large_limits_are_written_as_they_are(limited):
+    """Also those that an import takes for placeholders; 1e4 stands for none."""
+    limits = {"kind": "joint_limits", "name": "a", "lower": [-INF, -2e4, -1], "rate": [3e4, 1, INF]}
+    efforts = {"links.0.torque_limit": 5e4, "links.1.torque_limit": INF}
+    text = scene_to_urdf(limited.replace({"constraints": [limits], **efforts}))
+    assert re.findall("<limit .*>", text) == [
+        '<limit effort="50000" velocity="30000" />',
+        '<limit effort="10000" velocity="1" lower="-20000" upper="10000" />',
+        '<limit effort="2" velocity="10000" lower="-1" upper="10000" />',
+    ]
 
 
 def test_pinocchio_reads_the_limits(limited):
