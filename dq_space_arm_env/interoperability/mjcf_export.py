@@ -47,8 +47,9 @@ def scene_to_mjcf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
 
     Actuators are motors with the names, limits and order of the scene's inputs, without the wrist's rates;
     forces and torques act in base axes at e0. MuJoCo clips controls at the limits, the scene's kernels do
-    not. Key frame `start` holds the nominal start. The time step is the scene's; the integrator is MuJoCo's
-    RK4, which on rotations is not the scene's to the last digit.
+    not. What else the environment clips is left out: what exceeds a `slew_limit` or a motor's torque at its
+    speed, pulses of thrusters that are too short. Key frame `start` holds the nominal start. The time step is
+    the scene's; the integrator is MuJoCo's RK4, which on rotations is not the scene's to the last digit.
 
     State: with (w, v) the base twist in base axes, R from base to inertial axes, MuJoCo's free joint has
     qpos = (position, quaternion scalar first) and qvel = (R v, w), and qacc = (R (dv + w x v), dw).
@@ -65,8 +66,8 @@ def scene_to_mjcf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
 
     Raises:
         SceneError: If the scene has a wrist that is not to be fixed, a constant wrench at the tip, a screw
-            joint, reaction wheels, an elastic gear, a rotor that turns with the body before its joint, an
-            actuator that lags or delays, or phases that change the robot.
+            joint, reaction wheels, a tank, an elastic gear, a rotor that turns with the body before its
+            joint, an actuator that lags or delays, or phases that change the robot.
     """
     scene = load_scene(scene)
     refuse(scene, "MJCF", wrist, at_once=True)

@@ -168,7 +168,8 @@ def generalized_forces(scene: Scene | str | Path, x: ArrayLike, u: ArrayLike) ->
     Args:
         scene: A scene, the name of a shipped one, or a path to a YAML file.
         x: State, shape (n_x,), units of the state.
-        u: Inputs, shape (n_u,), units of the inputs; the wrist's rates do no work.
+        u: Inputs that act, shape (n_u,), units of the inputs: of actuators with a lag or a delay the outputs,
+            not the commands; the wrist's rates do no work.
 
     Returns:
         Force at e0, N, torque, N m, both in base axes, joint torques, N m, shape (6 + n,) (planar: f_x, f_y,

@@ -36,9 +36,9 @@ def scene_to_urdf(scene: Scene | str | Path, *, wrist: Literal["refuse", "fixed"
     visuals.
 
     Features that URDF lacks and that change the motion are refused: joint springs, rotors, screw and
-    spherical joints, a wrench at the tip, a planar base, reaction wheels, phases that change the robot. The
-    massless wrist as three joints would have infinite accelerations; fixed at its initial angles it changes
-    no acceleration, but the tip cannot turn.
+    spherical joints, a wrench at the tip, a planar base, reaction wheels, a tank, phases that change the
+    robot. The massless wrist as three joints would have infinite accelerations; fixed at its initial angles
+    it changes no acceleration, but the tip cannot turn.
 
     Args:
         scene: A scene, the name of a shipped one, or a path to a YAML file.
