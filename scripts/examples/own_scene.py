@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
         except SceneError as error:
             parser.error(str(error))
     options.out.mkdir(parents=True, exist_ok=True)
-    scene.to_yaml(options.out / f"{scene.name}.yaml")  # every key, for editing
+    scene.to_yaml(options.out / "own_scene.yaml")  # every key, for editing
     solution = GuidedDDP(scene).solve()
     flown = Maneuver(scene, solution.states, solution.controls)
     print(f"{scene.name}: {solution.message}\n{'':6} {'attitude, deg':>14} {'position, m':>12}")
@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
         axes.imshow(env.render())
         axes.set(title=title, xticks=[], yticks=[])
     figure.savefig(options.out / "own_scene.png", dpi=120)
-    print(f"files: {options.out / scene.name}.yaml, {options.out / 'own_scene.png'}")
+    print(f"files: {options.out / 'own_scene.yaml'}, {options.out / 'own_scene.png'}")
 
 
 if __name__ == "__main__":

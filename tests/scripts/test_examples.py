@@ -78,7 +78,7 @@ def test_own_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     printed = capsys.readouterr().out
     assert "base.mass" in printed
     [[angle, distance]] = rows(printed, r"^end +([\d.]+) +([\d.]+)$")
-    scene = load_scene(tmp_path / "inspector.yaml")
+    scene = load_scene(tmp_path / "own_scene.yaml")
     assert angle < scene.success.attitude_error_deg
     assert distance < scene.success.position_error
     assert is_picture(tmp_path / "own_scene.png")
