@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.dynamics import minimal
 from dq_space_arm_env.dynamics.equations_of_motion import EquationsOfMotion
 from dq_space_arm_env.dynamics.kinematic_tree import KinematicTree, Placement, RigidBody, Screw
@@ -20,6 +21,8 @@ from dq_space_arm_env.scene.pose import PLANAR_POSE
 from dq_space_arm_env.scene.start import unit_quaternions
 
 Array = NDArray[np.float64]
+
+_UNIT_TOLERANCE = 1e-6
 
 
 def pinocchio_model(scene: Scene | str | Path) -> Any:
@@ -101,7 +104,8 @@ def to_pinocchio(scene: Scene | str | Path, x: ArrayLike) -> tuple[Array, Array]
         v_x, v_y, omega_z, joint rates, (3 + n,)).
 
     Raises:
-        ValueError: If x has another shape, or the scene reaction wheels (`SceneError`).
+        TypeError: If x is masked, or not of real numbers.
+        ValueError: If x has another shape, or the scene reaction wheels or a tank (`SceneError`).
     """
     scene = load_scene(scene)
     equations, entries = _equations(scene), StateLayout.of(scene).state
@@ -136,7 +140,8 @@ def from_pinocchio(
         with a scalar part of at least 0. What else the state has, as previous controls, is zero.
 
     Raises:
-        ValueError: If a shape is wrong.
+        TypeError: If something is masked, or not of real numbers.
+        ValueError: If a shape is wrong, or a quaternion (planar: cosine and sine) no unit one within 1e-6.
     """
     scene = load_scene(scene)
     layout = StateLayout.of(scene)
@@ -157,6 +162,9 @@ def from_pinocchio(
         twist, rates = [*velocity[3:6], *velocity[:3]], velocity[6:]
     previous = np.zeros(layout.n_x - layout.state.joint_rates.stop)
     x = np.array([*base, *angles, *wrist, *twist, *rates, *previous], dtype=np.float64)
+    for part in (configuration[2:4] if planar else configuration[3:7], *(x[where] for where in quaternions)):
+        if not abs(np.linalg.norm(part) - 1.0) <= _UNIT_TOLERANCE:
+            raise ValueError(f"q: {part} has norm {np.linalg.norm(part):.9g}, it must be 1 within 1e-6")
     for where in quaternions:
         x[where] = np.roll(x[where], 1)
     return x
@@ -176,7 +184,8 @@ def generalized_forces(scene: Scene | str | Path, x: ArrayLike, u: ArrayLike) ->
         tau_z, joint torques, (3 + n,)).
 
     Raises:
-        ValueError: If x or u has another shape.
+        TypeError: If x or u is masked, or not of real numbers.
+        ValueError: If x or u has another shape, or the scene reaction wheels or a tank (`SceneError`).
     """
     scene = load_scene(scene)
     equations, entries = _equations(scene), StateLayout.of(scene).state
@@ -212,7 +221,7 @@ def _equations(scene: Scene) -> EquationsOfMotion:
 
 
 def _checked(name: str, values: ArrayLike, size: int) -> Array:
-    array = np.asarray(values, dtype=np.float64)
+    array = real_array(name, values, np.float64)
     if array.shape != (size,):
         raise ValueError(f"{name}: shape {array.shape}, it must be ({size},)")
     return array

@@ -62,6 +62,24 @@ def test_wrong_shapes_are_refused():
         from_pinocchio(scene, np.zeros(10), np.zeros(9), np.zeros(3))
 
 
+@pytest.mark.parametrize(
+    ("name", "q"),
+    [("no-wrist", [0, 0, 0, 0, 0, 0, 2, 0, 0, 0]), ("planar", [0, 0, 0, 0, 0, 0, 0])],
+)
+def test_configurations_that_turn_nowhere_are_refused(name, q):
+    scene = load_scene(name)
+    with pytest.raises(ValueError, match=r"q: .* has norm [02], it must be 1 within 1e-6"):
+        from_pinocchio(scene, q, np.zeros(len(q) - 1))
+
+
+def test_what_is_no_real_number_is_refused():
+    """NumPy drops imaginary parts and masks."""
+    zeros = np.zeros(13)
+    for wrong in (zeros + 1j, np.ma.masked_array(zeros, mask=True), ["a"] * 13):
+        with pytest.raises(TypeError, match=r"x: .*should be real numbers"):
+            to_pinocchio("planar", wrong)
+
+
 def test_phases_that_change_the_robot_are_refused():
     scene = load_scene("capture-and-detumble")
     with pytest.raises(SceneError, match=r"its robot stays as it is, and phases change payload\.mass"):
