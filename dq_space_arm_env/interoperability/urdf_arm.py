@@ -166,7 +166,7 @@ class UrdfTree:
             if name not in known:
                 raise SceneError(
                     f"lock_branches: {name!r} is not a joint beside the way from base to tip; "
-                    f"{did_you_mean(name, known)}these are {_some(known)}"
+                    f"{did_you_mean(name, known)}{f'these are {_some(known)}' if known else 'there is none'}"
                 )
         rank = {name: index for index, name in enumerate(self.robot.joints)}
         found: list[UrdfJoint] = []

@@ -103,9 +103,10 @@ def scene_from_urdf(
     """
     robot = read_robot(source)
     extra, mount = (None, HERE) if spacecraft is None else _spacecraft(spacecraft)
-    if isinstance(lock_branches, str):
+    if isinstance(lock_branches, str) or not isinstance(lock_branches, bool | Collection):
         raise SceneError(f"lock_branches = {lock_branches!r}: must be a list of names of joints, or True")
-    if joint_torque is not None and not (isinstance(joint_torque, int | float) and joint_torque > 0):
+    is_number = isinstance(joint_torque, int | float | np.number) and joint_torque is not True
+    if joint_torque is not None and not (is_number and joint_torque > 0):
         raise SceneError(f"joint_torque = {joint_torque!r}: must be a number greater than 0, N m")
     motorless = passive if joint_torque is None else robot.joints
     arm = arm_of(robot, tip, base, lock_branches, extra, mount, balance_inertias, motorless)
@@ -164,7 +165,7 @@ def _spacecraft(fields: Mapping[str, Any]) -> tuple[Body, tuple[float, ...]]:
 
 
 def _check_passive(arm: Arm, passive: Collection[str]) -> None:
-    if isinstance(passive, str):
+    if isinstance(passive, str) or not isinstance(passive, Collection):
         raise SceneError(f"passive = {passive!r}: must be a list of names of joints")
     joints = [part.joint.name for part in arm.joints]
     unknown = [name for name in passive if name not in joints]

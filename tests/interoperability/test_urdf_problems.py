@@ -141,8 +141,11 @@ def test_what_no_scene_can_be_made_of_is_refused(text, sentence):
         ({"tip": "arm", "passive": ["j2"]}, "'j2' is not a joint that moves a mass; these are j1"),
         (
             {"tip": "arm", "lock_branches": ["j1"]},
-            "lock_branches: 'j1' is not a joint beside the way from base to tip",
+            "lock_branches: 'j1' is not a joint beside the way from base to tip; there is none$",
         ),
+        ({"tip": "arm", "lock_branches": 1}, "lock_branches = 1: must be a list of names of joints, or True"),
+        ({"tip": "arm", "passive": None}, "passive = None: must be a list of names of joints"),
+        ({"tip": "arm", "joint_torque": True}, "joint_torque = True: must be a number greater than 0, N m"),
         ({"tip": "arm", "lock_branches": "j1"}, "lock_branches = 'j1': must be a list of names of joints"),
         ({"tip": "arm", "joint_torque": -1}, "joint_torque = -1: must be a number greater than 0, N m"),
         ({"tip": "arm", "spacecraft": 80}, "spacecraft = 80: must be a mapping"),
@@ -329,7 +332,7 @@ def test_friction_is_left_out_with_a_warning():
 
 def test_what_drives_the_arm_is_an_option():
     text = robot(*GOOD, joint("j2", "arm", "hand", content=""), link("hand"))
-    scene = scene_from_urdf(text, "hand", base_force=None, base_torque=[1, 2, 3], joint_torque=4)
+    scene = scene_from_urdf(text, "hand", base_force=None, base_torque=[1, 2, 3], joint_torque=np.int64(4))
     layout = StateLayout.of(scene)
     assert layout.control.names[:3] == ("base torque x", "base torque y", "base torque z")
     assert layout.control_limit.tolist() == [1.0, 2.0, 3.0, 1.0, 4.0]
