@@ -204,9 +204,9 @@ def _mass_points(scene: Scene) -> tuple[list[float], list[tuple[float, ...]]]:
     wrist = start.wrist_angles or (0.0, 0.0, 0.0)
     frames = kinematics.frame_poses(tree, start.base_pose.dual_quaternion, angles, wrist)
     bodies = [(scene.base.mass, (0.0, 0.0, 0.0), frames[0])]
-    bodies += [(each.mass, each.center_of_mass, frames[i]) for i, each in enumerate(scene.links, 1)]
-    if scene.payload is not None:
-        bodies.append((scene.payload.mass, scene.payload.center_of_mass, frames[-1]))
+    others = [tip.payload for tip in scene.other_tips]  # whose frames follow those of the links
+    held = [*zip([*scene.links, *others], frames[1:], strict=False), (scene.payload, frames[-1])]
+    bodies += [(each.mass, each.center_of_mass, frame) for each, frame in held if each is not None]
     centers = []
     for _, center, frame in bodies:
         rotation, position = poses.to_matrix(tuple(frame))

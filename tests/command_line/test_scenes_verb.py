@@ -105,7 +105,7 @@ def test_what_is_left_out_is_said() -> None:
     ],
 )
 def test_what_is_not_drawn_is_said(name: str, drawn: str, same: str) -> None:
-    scene = load_scene(name).replace(spread=Spread(**{drawn: 0.01}))
+    scene = load_scene(name).replace(spread=Spread.model_validate({drawn: 0.01}))
     assert f"random draws of {same}: the same in every episode" in left_out(scene)
 
 
@@ -225,6 +225,16 @@ NEAR = {
 def test_the_unwise_is_warned_of(change: dict[str, object], sentence: str) -> None:
     found = warnings_of(load_scene("no-wrist").replace(change))
     assert any(re.match(sentence, each) for each in found), found
+
+
+def test_thrusters_also_move_what_other_tips_hold() -> None:
+    scene = load_scene("dual-arm").replace({"target.pose.position": [60, 0, 0]})
+    held = {"mass": 768.0, "inertia": [9, 9, 9]}  # kg: with the robot 1000
+    moved = [
+        float(re.findall(r"thrusters move it by ([0-9.]+) m", warnings_of(each)[-1])[0])
+        for each in (scene, scene.replace({"other_tips.0.payload": held}))
+    ]
+    assert moved[1] == pytest.approx(0.232 * moved[0], rel=0.01)
 
 
 @pytest.mark.parametrize(
