@@ -33,10 +33,11 @@ def main(arguments: list[str] | None = None) -> None:
     solution = BoxDDP(options.scene).solve()
     horizon = RecedingHorizonExpert(options.scene)
     layout, twist = kernels.layout, kernels.layout.tangent.base_velocity
+    rows = solution.parameters  # of the stages: what phases and targets change
     controllers: dict[str, Callable[[NDArray[np.float64], int], NDArray[np.float64]]] = {
         "plan alone": lambda x, k: solution.controls[k],
         "with gains": solution.policy(),
-        "receding horizon": lambda x, k: layout.to_control(horizon(x)),
+        "receding horizon": lambda x, k: layout.to_control(horizon(x), rows[k]),
     }
     steps, success = len(solution.controls), kernels.scene.success
     flights: dict[str, Maneuver] = {}
@@ -55,7 +56,7 @@ def main(arguments: list[str] | None = None) -> None:
                 seconds -= perf_counter()
                 u = controller(x, k)
                 seconds += perf_counter()
-                states.append(kernels.step(x, u))
+                states.append(kernels.step(x, u, p=rows[k]))
             flights[name] = flown = Maneuver(kernels.scene, np.array(states), solution.controls)
             angle, distance = np.degrees(flown.angle[-1]), flown.distance[-1]
             arrives = angle <= success.attitude_error_deg and distance <= success.position_error

@@ -56,6 +56,21 @@ def test_feedback_under_disturbance(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert is_picture(tmp_path / "feedback_under_disturbance.png")
 
 
+@pytest.mark.slow
+def test_feedback_in_a_scene_with_phases(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Undisturbed, the plan ends as planned: each step has the masses of its phase."""
+    scene = load_scene("planar")
+    half = scene.simulation.steps // 2
+    lighter = {"base.mass": 0.7 * scene.base.mass}
+    phases = [{"name": "full", "steps": half}, {"name": "empty", "steps": half, "changes": lighter}]
+    scene.replace(phases=phases).to_yaml(file := tmp_path / "phases.yaml")
+    run("feedback_under_disturbance", "--scene", str(file), "--pushes", "0", "--out", str(tmp_path))
+    printed = capsys.readouterr().out
+    names = ("plan alone", "with gains", "receding horizon")
+    ends = [rows(printed, rf"{name} +([\d.]+) +([\d.]+)")[0] for name in names]
+    assert ends[1] == ends[2] == ends[0]
+
+
 def test_compare_integrators(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("compare_integrators", "--scene", "planar", "--out", str(tmp_path))
     printed = capsys.readouterr().out
