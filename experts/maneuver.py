@@ -11,6 +11,7 @@ from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.parameters import CONTROL_UNITS
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.viewing.payload_places import payload_path
+from dq_space_arm_env.viewing.replay.curves import unit_of
 from dq_space_arm_env.viewing.replay.flights import frame_poses, target_during, tip_errors
 from experts.problems.shooting_problem import FloatArray
 
@@ -113,7 +114,7 @@ class Maneuver:
                 continue
             history = ActuatorHistory(
                 name,
-                layout.control.units[entries.start],
+                unit_of(layout, entries),
                 layout.control.names[entries],
                 self.controls[:, entries],
                 layout.control_limit[entries],

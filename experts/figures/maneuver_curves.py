@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from dq_space_arm_env.scene import StateLayout
+from dq_space_arm_env.viewing.replay.curves import unit_of
 from experts.ddp.solution import Solution
 from experts.figures.style import (
     BLACK,
@@ -115,7 +116,9 @@ def _draw_actuator(axes: Axes, maneuver: Maneuver, actuator: ActuatorHistory) ->
         for side in (0.0 if actuator.name == "thruster_force" else -limit, limit):
             axes.axhline(scale * side, **LIMIT_STYLE)
     title, quantity = _TITLES[actuator.name]
-    finish_panel(axes, f"{title} ({_limit_note(actuator, near)})", f"{quantity} [{prefix}{actuator.unit}]")
+    layout = StateLayout.of(maneuver.scene)
+    unit = unit_of(layout, getattr(layout.control, actuator.name), prefix)
+    finish_panel(axes, f"{title} ({_limit_note(actuator, near)})", f"{quantity} [{unit}]")
 
 
 def _limit_note(actuator: ActuatorHistory, drawn: list[float]) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import rotations
 from dq_space_arm_env.scene import Pose, StateLayout
+from dq_space_arm_env.viewing.replay.curves import unit_of
 
 Value = float | str | tuple[float, ...]
 
@@ -148,5 +149,5 @@ def _limits(scene: Scene) -> str:
         if len(limits):
             value = _collapsed(limits)
             text = f"{value:g}" if isinstance(value, float) else numbers(limits)
-            texts.append(f"{name} {text} {layout.control.units[place.start]}")
+            texts.append(f"{name} {text} {unit_of(layout, place)}")
     return "; ".join(texts)

@@ -90,6 +90,15 @@ def test_panels_of_absent_actuators_are_left_out() -> None:
     assert axes.get_title(loc="left").startswith("Torque on the base")
 
 
+def test_motors_that_turn_and_motors_that_slide_have_both_units() -> None:
+    maneuver = still(load_scene("sliding"))
+    for largest, label in ((0.01, "torque [mN m or mN]"), (1.0, "torque [N m or N]")):
+        maneuver.controls[:, StateLayout.of(maneuver.scene).control.joint_torque] = largest
+        figure = figure_6(maneuver)
+        assert figure.axes[0].get_ylabel() == label
+    assert maneuver.actuator("joint_torque").unit == "N m or N"
+
+
 def test_different_limits_are_all_drawn() -> None:
     maneuver = still(load_scene("six-joint"))
     maneuver.controls[1, 6:12] = 2.0, 2.0, 2.0, 2.0, 2.0, 0.5

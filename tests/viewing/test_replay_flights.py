@@ -226,6 +226,14 @@ def test_small_inputs_are_shown_in_thousandths(paper, make_flight):
     np.testing.assert_allclose(force.curves[0], flight.controls[:, :3].T)
 
 
+def test_motors_that_turn_and_motors_that_slide_have_both_units(make_flight):
+    scene = load_scene("sliding")
+    flight = make_flight(scene)
+    weak = replace(flight, controls=1e-3 * flight.controls)
+    units = [panels(prepare([each], scene), scene)[4].unit for each in (flight, weak)]
+    assert units == ["N m or N", "mN m or mN"]
+
+
 def test_absent_actuators_have_no_panel(make_flight):
     scene = load_scene("planar")
     shown = panels(prepare([make_flight(scene)], scene), scene)

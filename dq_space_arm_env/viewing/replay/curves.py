@@ -63,15 +63,16 @@ def _error(
 def _inputs(
     actuator: str, title: str, entries: slice, layout: StateLayout, flights: Sequence[ShownFlight]
 ) -> Panel:
-    unit, limits = layout.control.units[entries.start], layout.control_limit[entries]
+    limits = layout.control_limit[entries]
     inputs = [each for flight in flights for each in (flight.controls, flight.noise) if each is not None]
     largest = max(float(np.abs(each[:, entries]).max()) for each in inputs)
     scale, prefix = (1e3, "m") if 0.0 < largest < _SMALL else (1.0, "")
     sides = (0.0, 1.0) if actuator == "thruster_force" else (-1.0, 1.0)
+    unit = unit_of(layout, entries)
     bounds = sorted({side * scale * limit for limit in limits[np.isfinite(limits)] for side in sides})
     return Panel(
         title=title,
-        unit=prefix + unit,
+        unit=unit_of(layout, entries, prefix),
         note=_limit_note(limits, f" {unit}" if prefix else "", "" if sides[0] == 0.0 else "±"),
         names=_names(actuator, entries, layout),
         steps=True,
@@ -82,6 +83,20 @@ def _inputs(
             for flight in flights
         ),
     )
+
+
+def unit_of(layout: StateLayout, entries: slice, prefix: str = "") -> str:
+    """Find the unit of some controls.
+
+    Args:
+        layout: Layout of a scene.
+        entries: Place of the controls.
+        prefix: Prefix of the unit, such as "m".
+
+    Returns:
+        The unit; two of motors of which some turn and others slide, such as "N m or N".
+    """
+    return " or ".join(prefix + unit for unit in dict.fromkeys(layout.control.units[entries]))
 
 
 def _limit_note(limits: FloatArray, unit: str, sign: str) -> str:
