@@ -272,4 +272,16 @@ def test_robots_that_move_otherwise_are_not_shown_together(name, change):
     ):
         common_scene(flights)
     same = scene.replace({"base.mass": 200.0, "name": "heavy"})
+    same = same.replace({"actuators.base_force.limit": 3.0})
     assert common_scene([flights[0], replace(flights[0], scene=same)])[1] == scene
+
+
+@pytest.mark.parametrize("name", ["thrusters", "free-floating", "motors"])
+def test_flights_of_other_actuators_are_not_shown_together(paper, make_flight, name):
+    """Six thrusters are as many numbers as force and torque on the base."""
+    other = load_scene(name)
+    if other.actuators.thrusters:
+        other = other.replace({"actuators.thrusters": list(other.actuators.thrusters[:6])})
+    flights = [replace(make_flight(scene), scene=scene) for scene in (paper, other)]
+    with pytest.raises(ValueError, match=f"other states or inputs \\('{name}'\\) than the scene"):
+        common_scene(flights)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 
 from dq_space_arm_env.common.entry_points import entry_points, load
+from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.schema import Scene
 from dq_space_arm_env.task.trajectory import Trajectory
 from dq_space_arm_env.viewing.replay.flights import aimed
@@ -49,7 +50,8 @@ def common_scene(flights: Sequence[Trajectory], scene: Scene | None = None) -> t
         The flights, each with the target of its own scene; and the scene.
 
     Raises:
-        ValueError: If no scene is known, or a flight has another robot or time step.
+        ValueError: If no scene is known, or a flight has another robot, time step, or
+            other states or inputs.
     """
     scene = scene or next((flight.scene for flight in flights if flight.scene is not None), None)
     if scene is None:
@@ -73,7 +75,8 @@ def by_scene(flights: Sequence[Trajectory]) -> list[tuple[list[Trajectory], Scen
         For each scene, in the order of the flights, what `common_scene` finds.
 
     Raises:
-        ValueError: If no scene is known, or flights of one scene have different robots or time steps.
+        ValueError: If no scene is known, or flights of one scene have different robots, time steps,
+            states or inputs.
     """
     first = next((flight.scene for flight in flights if flight.scene is not None), None)
     groups: dict[str, list[Trajectory]] = {}
@@ -98,6 +101,11 @@ def _check_same_robot(label: str, own: Scene, scene: Scene) -> None:
             f"flight {label!r} is one of another robot ({own.name!r}) than that of the scene {scene.name!r}: "
             "show them on separate pages"
         )
+    if _entries(own) != _entries(scene):
+        raise ValueError(
+            f"flight {label!r} has other states or inputs ({own.name!r}) than the scene {scene.name!r}: show "
+            "them on separate pages"
+        )
 
 
 def _frames(scene: Scene) -> tuple[object, ...]:
@@ -105,3 +113,10 @@ def _frames(scene: Scene) -> tuple[object, ...]:
     joints = [(link.joint, link.joint_type, link.pitch) for link in scene.links], scene.parent_bodies
     tips = [(scene.body_named(tip.link), tip.frame) for tip in scene.other_tips]
     return scene.base.motion, joints, scene.tip_body, scene.wrist, scene.tip, tips
+
+
+def _entries(scene: Scene) -> tuple[object, ...]:
+    """Places of a scene's states and inputs, and the joints that have a motor."""
+    layout = StateLayout.of(scene)
+    parts = [place for part in (layout.state, layout.control) for place in vars(part).values()]
+    return *(place for place in parts if isinstance(place, slice)), layout.actuated_joints
