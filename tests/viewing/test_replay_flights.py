@@ -182,6 +182,20 @@ def test_verdict_is_in_plain_numbers(paper, make_flight, angle, distance, expect
     assert verdict(ending, paper).startswith(expected + ":")
 
 
+@pytest.mark.parametrize("name", ["tracking", "release"])
+def test_flights_beyond_the_end_of_a_scene_need_a_target_where_it_moves(make_flight, name):
+    scene = load_scene(name)
+    steps = scene.simulation.steps + 1
+    flight = make_flight(scene, steps=steps)
+    sentence = rf"has {steps} steps, .* for {steps - 1}: give the flight a target of its own"
+    with pytest.raises(ValueError, match=sentence):
+        prepare([flight], scene)
+    with pytest.raises(ValueError, match=sentence):
+        common_scene([replace(flight, scene=scene)])
+    own = np.tile(scene.target.pose.dual_quaternion, (steps + 1, 1))
+    assert prepare([replace(flight, target=own)], scene)[0].steps == steps
+
+
 def test_unusable_flights_are_refused_in_a_sentence(paper, make_flight):
     good = make_flight(paper)
     nan = np.full_like(good.states, np.nan)

@@ -51,7 +51,7 @@ def common_scene(flights: Sequence[Trajectory], scene: Scene | None = None) -> t
 
     Raises:
         ValueError: If no scene is known, or a flight has another robot, time step, or
-            other states or inputs.
+            other states or inputs, or goes on beyond its scene, whose target moves.
     """
     scene = scene or next((flight.scene for flight in flights if flight.scene is not None), None)
     if scene is None:

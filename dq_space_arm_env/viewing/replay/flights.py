@@ -72,10 +72,17 @@ def prepare(flights: Sequence[Trajectory], scene: Scene) -> list[ShownFlight]:
 
 
 def aimed(flight: Trajectory, scene: Scene) -> Trajectory:
-    """Give a flight that names no target the nominal one of a scene."""
+    """Give a flight that names no target the nominal one of a scene; ValueError if it goes on beyond that."""
     if flight.target is not None:
         return flight
-    target, body = target_during(scene, len(np.asarray(flight.states)) - 1)
+    steps = len(np.asarray(flight.states)) - 1
+    target, body = target_during(scene, steps)
+    if target.ndim == 2 and len(target) <= steps:
+        raise ValueError(
+            f"flight {flight.label!r} has {steps} steps, the scene {scene.name!r} knows where its target is "
+            f"for {len(target) - 1}: give the flight a target of its own, one pose for each of {steps + 1} "
+            "states"
+        )
     body = body if flight.target_body is None else flight.target_body
     return replace(flight, target=target, target_body=body)
 
