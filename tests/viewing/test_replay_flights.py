@@ -90,6 +90,18 @@ def test_success_is_that_of_the_environment(paper, make_flight):
         assert verdict(shown, paper).endswith(end)
 
 
+def test_a_plan_is_called_a_success_only_where_no_velocity_counts(paper, make_flight):
+    for success, end in (({}, "success"), ({"velocity_error": 0.01}, "pose within the tolerances")):
+        scene = paper.replace(success=success)
+        flight = prepare([make_flight(scene)], scene)[0]
+        plan = replace(flight, angle=np.zeros(61), distance=np.zeros(61))
+        assert verdict(plan, scene).endswith(f"from the target: {end}")
+        assert verdict(replace(plan, is_success=True), scene).endswith(": success")
+        assert verdict(replace(plan, is_success=False), scene).endswith(": no success")
+        far = replace(plan, distance=np.ones(61))
+        assert verdict(far, scene).endswith(": outside the tolerances")
+
+
 def test_states_that_are_no_poses_are_refused(paper, make_flight):
     flight = make_flight(paper)
     states = flight.states.copy()

@@ -280,8 +280,11 @@ def verdict(flight: ShownFlight, scene: Scene) -> str:
     if flight.note:
         return f"{flight.note}, {place}{thin}"
     within = angle <= scene.success.attitude_error_deg and distance <= scene.success.position_error
-    reached = within if flight.is_success is None else flight.is_success
-    end = "success" if reached else "no success" if within else "outside the tolerances"
+    reached = flight.is_success
+    if reached is None:  # a plan, of which the pose is known
+        reached = within and not np.isfinite(scene.success.tolerances[2:]).any()
+    short = "no success" if flight.is_success is False else "pose within the tolerances"
+    end = "success" if reached else short if within else "outside the tolerances"
     return f"ends {place}: {end}{thin}"
 
 
