@@ -81,7 +81,7 @@ def test_a_violation_of_one_step_stays_one(long_flight, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["paper", "dual-arm", "keep-out"])
+@pytest.mark.parametrize("name", ["paper", "dual-arm", "keep-out", "thrusters"])
 def test_the_page_of_a_hundred_thousand_steps_stays_below_five_megabytes(name, make_flight):
     scene = load_scene(name)
     flight = make_flight(scene, steps=100_000)

@@ -168,7 +168,7 @@ def _triangles(triangles: Triangles, blob: _Blob) -> dict[str, Any]:
 
 def _describe(flights: Sequence[Trajectory], scene: Scene) -> dict[str, Any]:
     """Content of the page as JSON values."""
-    shown = thinned(prepare(flights, scene))
+    shown = thinned(prepare(flights, scene), len(scene.actuators.thrusters or ()))
     view, blob = view_of(shown, scene), _Blob()
     data: dict[str, Any] = {
         "scene": {

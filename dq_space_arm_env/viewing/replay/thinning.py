@@ -15,7 +15,7 @@ LARGEST = 3_300_000
 """Bytes of poses and curves on a page; base 64 adds a third."""
 
 
-def thinned(flights: Sequence[ShownFlight]) -> list[ShownFlight]:
+def thinned(flights: Sequence[ShownFlight], thrusters: int = 0) -> list[ShownFlight]:
     """Leave out instants evenly, where all flights together would be too large.
 
     Poses and errors are those of the instants that stay, the ends among them. Of the inputs the smallest and
@@ -23,19 +23,22 @@ def thinned(flights: Sequence[ShownFlight]) -> list[ShownFlight]:
 
     Args:
         flights: As prepared, of any lengths.
+        thrusters: Number of thrusters, of which a page has the gas.
 
     Returns:
         The same flights, or ones with fewer steps, longer time steps, and `stride` set.
     """
-    stride = math.ceil(sum(_size(flight) for flight in flights) / LARGEST)
+    stride = math.ceil(sum(_size(flight, thrusters) for flight in flights) / LARGEST)
     return [_thinned(flight, min(stride, flight.steps)) if stride > 1 else flight for flight in flights]
 
 
-def _size(flight: ShownFlight) -> int:
+def _size(flight: ShownFlight, thrusters: int = 0) -> int:
     """Bytes in single precision, and one for each row of constraints."""
     moving = [each for each in (flight.target, flight.target_body, flight.payload) if each is not None]
     numbers = flight.frames.size + sum(each.size for each in moving) + 2 * len(flight.angle)
     numbers += flight.controls.size * (2 if flight.noise is not None else 1)
+    if thrusters:
+        numbers += 3 * (1 + thrusters) * len(flight.angle)
     return 4 * numbers + flight.violated.size
 
 
