@@ -279,6 +279,21 @@ def test_slider_reaches_the_end(open_flights, make_flight, paper, steps):
 
 
 @pytest.mark.slow
+def test_numbers_stay_while_panels_are_drawn_anew(open_page, page_file):
+    """While it plays, they change every 80 ms alone, and that time does not pass here."""
+    opened = open_page(page_file, motion="no-preference")
+    opened.page.evaluate(
+        """() => {
+          const [now, next] = [performance.now(), requestAnimationFrame];
+          requestAnimationFrame = draw => next(() => draw(now));
+        }"""
+    )
+    opened.page.click("#theme")
+    opened.page.wait_for_timeout(400)
+    assert "" not in opened.page.locator(".values > span > span").all_text_contents()
+
+
+@pytest.mark.slow
 def test_six_flights_leave_room_for_the_robot_on_a_phone(open_flights, make_flight, paper):
     flights = [make_flight(paper, f"flight {number}", 20) for number in range(6)]
     opened = open_flights(flights, paper, viewport={"width": 390, "height": 800})

@@ -292,6 +292,7 @@ export class Plots {
       panel.element.classList.toggle("timed", sparse || last);
     });
     for (const panel of this.panels) panel.draw(moment, style, pixel);
+    this.next = 0; // their numbers are to be written again
   }
 
   /** Follow the time; while it runs, numbers change no faster than one reads. */
