@@ -334,6 +334,27 @@ def test_brackets_typed_with_altgr_change_the_speed(open_page, page_file):
 
 
 @pytest.mark.slow
+def test_eight_thrusters_look_different(open_flights, make_flight):
+    scene = load_scene("thrusters")
+    opened = open_flights([make_flight(scene)], scene)
+    opened.page.evaluate(
+        """() => {
+          const stroke = CanvasRenderingContext2D.prototype.stroke;
+          window.looks = [];
+          CanvasRenderingContext2D.prototype.stroke = function () {
+            if (this.lineWidth > 1) window.looks.push(`${this.strokeStyle} ${this.getLineDash()}`);
+            stroke.apply(this);
+          };
+        }"""
+    )
+    opened.page.keyboard.press("t")  # draws all anew
+    opened.page.wait_for_timeout(400)
+    assert len(set(opened.page.evaluate("looks.slice(-8)"))) == 8
+    marks = opened.page.locator(".panel.last .values b")
+    assert [marks.nth(i).get_attribute("class") for i in range(8)] == [""] * 6 + ["dotted"] * 2
+
+
+@pytest.mark.slow
 def test_a_long_flight_is_drawn_fast_and_keeps_its_peaks(open_flights, make_flight, paper):
     """Of tens of thousands of steps each pixel shows many: among them one of 8 N for a single step."""
     flight = make_flight(paper, steps=20_000)

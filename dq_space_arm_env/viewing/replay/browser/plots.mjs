@@ -1,6 +1,8 @@
 // The curves: drawn once, with a cursor that moves over them and follows clicks.
 
 const LEFT = 44, RIGHT = 8, TOP = 5; // room around the curves, CSS pixels
+const COLORS = 6; // of curves
+// Of the first six curves of the solid flight and of ghosts, then of the next six, which have the same colors.
 const DASHES = [[], [5, 3], [2, 2], [8, 3, 2, 3], [1, 3], [10, 4]];
 const READING = 80; // ms
 const DENSEST = 8; // values per CSS pixel that are drawn one by one
@@ -97,7 +99,8 @@ class Panel {
       for (const flight of single && !this.panel.steps ? shown : [moment.solid]) {
         const entry = this.append(this.values, "span");
         const mark = single && !this.panel.steps ? "●" : this.panel.names[curve];
-        this.append(entry, "b", "", mark).style.color = this.colorName(curve, flight);
+        const name = this.append(entry, "b", curve < COLORS ? "" : "dotted", mark);
+        name.style.color = this.colorName(curve, flight);
         const value = this.append(entry, "span");
         value.style.minWidth = `${this.decimals + 3}ch`;
         this.readouts.push({ flight, curve, value });
@@ -106,7 +109,7 @@ class Panel {
   }
 
   colorName(curve, flight) {
-    return this.panel.steps ? `var(--curve-${(curve % 6) + 1})` : `var(--flight-${flight + 1})`;
+    return this.panel.steps ? `var(--curve-${(curve % COLORS) + 1})` : `var(--flight-${flight + 1})`;
   }
 
   follow() {
@@ -210,7 +213,7 @@ class Panel {
       }
       context.globalAlpha = solid ? 1 : 0.75;
       context.lineWidth = solid ? 1.7 : 1.3;
-      context.setLineDash(solid ? [] : DASHES[1]);
+      context.setLineDash(DASHES[(2 * Math.floor(curve / COLORS) + (solid ? 0 : 1)) % DASHES.length]);
       this.stroke(context, this.panel.curves[flight], curve, flight);
       context.setLineDash([]);
       context.globalAlpha = 1;
