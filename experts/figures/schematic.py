@@ -77,8 +77,9 @@ class Schematic:
             Mesh.joined([*self._bodies(), *self._arm(before, offsets)]), 0.06 * self.reach
         )
         target, target_body = shown_target(scene)
-        ends = [each if each.ndim == 1 else each[-1] for each in (target, target_body) if each is not None]
-        self._target_frames: FloatArray = np.array([ends[0], ends[-1]])
+        self._target_paths = [
+            np.atleast_2d(target if each is None else each) for each in (target, target_body)
+        ]
         self._tip_axes = _axes(_TIP_AXES * self.reach, 0.006 * self.reach)
         self._target = _axes(_TARGET_AXES * self.reach, 0.004 * self.reach)
         if scene.target.geometry:
@@ -101,9 +102,9 @@ class Schematic:
             ]
         )
 
-    def target(self) -> Faces:
-        """Place the target's axes at the end, longer and thinner than the tip's, and its body's shapes."""
-        matrices, origins = poses.to_matrix(tuple(self._target_frames.T))
+    def target(self, stage: int) -> Faces:
+        """Place the target's axes at a stage, longer and thinner than the tip's, and its body's shapes."""
+        matrices, origins = poses.to_matrix(tuple(self._target_frames(stage).T))
         rotations: FloatArray = np.moveaxis(np.array(matrices), 2, 0)
         return self._lit(self._target, rotations, np.array(origins).T)
 
@@ -121,9 +122,13 @@ class Schematic:
         ]
         return self._lit(_Solids.of(Mesh.joined(parts)), np.eye(3)[None], np.zeros((1, 3)))
 
-    def target_points(self) -> FloatArray:
-        """Origin of the target's axes and the ends of x, y and z, shape (4, 3), m."""
-        rotation, position = poses.to_matrix(tuple(self._target_frames[0].tolist()))
+    def _target_frames(self, stage: int) -> FloatArray:
+        """Poses of target and target's body at a stage, shape (2, 8), m."""
+        return np.array([path[min(stage, len(path) - 1)] for path in self._target_paths])
+
+    def target_points(self, stage: int) -> FloatArray:
+        """Origin of the target's axes at a stage and the ends of x, y and z, shape (4, 3), m."""
+        rotation, position = poses.to_matrix(tuple(self._target_frames(stage)[0].tolist()))
         origin = np.array(position)
         return np.vstack([origin, origin + _TARGET_AXES * self.reach * np.array(rotation).T])
 

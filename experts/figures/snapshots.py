@@ -65,7 +65,7 @@ class SnapshotPainter:
         self._maneuver = maneuver
         self._first = stages[0]
         self._schematic = Schematic(maneuver.scene, light)
-        self._target = self._schematic.target()
+        self._targets = {stage: self._schematic.target(stage) for stage in stages}
         self._tip_path = _origins(maneuver)[:, -1]
         payload = maneuver.payload
         self._spacecraft = {
@@ -74,7 +74,7 @@ class SnapshotPainter:
             )
             for stage in stages
         }
-        corners = [self._target.corners, *(faces.corners for faces in self._spacecraft.values())]
+        corners = [faces.corners for part in (self._targets, self._spacecraft) for faces in part.values()]
         points = np.concatenate(corners).reshape(-1, 3)
         self._grid = Grid.below(points)
         shown = self.view.project(np.concatenate([points, self._grid.corners()]))
@@ -95,11 +95,11 @@ class SnapshotPainter:
         axes.set_xlim(self._low[0], self._high[0])
         axes.set_ylim(self._low[1], self._high[1])
         path = self._schematic.path(self._tip_path[: stage + 1], 0.007 * self._schematic.reach)
-        faces = Faces.joined([self._spacecraft[stage], path, self._target])
+        faces = Faces.joined([self._spacecraft[stage], path, self._targets[stage]])
         self._draw_shadow(axes, faces)
         draw_grid(axes, self._grid, self.view)
         self._draw_faces(axes, faces)
-        self._name_target(axes)
+        self._name_target(axes, stage)
         if stage == self._first:
             self._name_tip(axes, stage)
             if self._numbered:
@@ -108,9 +108,9 @@ class SnapshotPainter:
             time = self._maneuver.time[stage]
             axes.text(0.5, 0.985, f"$t$ = {time:.1f} s", transform=axes.transAxes, ha="center", va="top")
 
-    def _name_target(self, axes: Axes) -> None:
+    def _name_target(self, axes: Axes, stage: int) -> None:
         """Name the target's axes, and dot them where something hides them."""
-        origin, *ends = self.view.project(self._schematic.target_points())
+        origin, *ends = self.view.project(self._schematic.target_points(stage))
         for name, color, end in zip("xyz", AXIS_COLORS, ends, strict=True):
             arrow = end - origin
             if np.linalg.norm(arrow) > self._spacing:  # else it points at the reader

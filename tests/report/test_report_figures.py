@@ -14,6 +14,7 @@ from matplotlib.image import imread  # noqa: E402
 from dq_space_arm_env import Scene, load_scene  # noqa: E402
 from dq_space_arm_env.algebra.poses import position, to_matrix  # noqa: E402
 from dq_space_arm_env.scene import StateLayout  # noqa: E402
+from dq_space_arm_env.scene.path import shown_target  # noqa: E402
 from experts.figures import write_figures, write_readme_picture  # noqa: E402
 from experts.figures.maneuver_curves import convergence_figure, figure_3, figure_4, figure_5, figure_6  # noqa: E402
 from experts.figures.schematic import Schematic  # noqa: E402
@@ -152,7 +153,7 @@ def test_shapes_of_bodies_are_placed_and_replace_what_is_derived(paper_maneuver:
     for faces, pose in (
         (found.spacecraft(frames), frames[0]),
         (found.spacecraft(frames), frames[1]),
-        (found.target(), np.array(scene.target.pose.dual_quaternion)),
+        (found.target(0), np.array(scene.target.pose.dual_quaternion)),
     ):
         rotation, origin = to_matrix(tuple(pose.tolist()))
         expected = np.array(origin) + np.array(rotation) @ [0.0, 0.0, 3.0]
@@ -160,7 +161,7 @@ def test_shapes_of_bodies_are_placed_and_replace_what_is_derived(paper_maneuver:
         centers = faces.corners[magenta].mean(axis=1)
         near = np.linalg.norm(centers - expected, axis=1) < 0.1
         assert centers[near].mean(axis=0) == pytest.approx(expected, abs=1e-9)
-    assert len(found.target().corners) > len(plain.target().corners)
+    assert len(found.target(0).corners) > len(plain.target(0).corners)
     assert len(found.spacecraft(frames).corners) < len(plain.spacecraft(frames).corners)
 
 
@@ -180,6 +181,19 @@ def test_a_payload_that_was_let_go_stays_behind_in_snapshots(paper_maneuver: Man
     ] @ np.array([0.35, 0.0, 0.0])
     assert left.corners[moved].reshape(-1, 3).mean(axis=0) == pytest.approx(center, abs=1e-9)
     assert 0 < moved.sum() < len(moved)
+
+
+def test_a_target_is_seen_where_it_is_at_the_time_of_a_snapshot() -> None:
+    scene = load_scene("tumbling-target")
+    path, body = shown_target(scene)
+    schematic = Schematic(scene, np.array([0.0, 0.0, 1.0]))
+    for stage in (0, 300, scene.simulation.steps):
+        assert schematic.target_points(stage)[0] == pytest.approx(position(tuple(path[stage])), abs=1e-12)
+    first, last = schematic.target(0), schematic.target(scene.simulation.steps)
+    (turn, origin), (turned, moved) = (to_matrix(tuple(body[stage])) for stage in (0, -1))
+    from_body = (first.corners - origin) @ np.array(turn)
+    shapes = np.abs(from_body @ np.array(turned).T + moved - last.corners).max(axis=(1, 2)) < 1e-9
+    assert shapes.sum() > 100
 
 
 def test_grid_lies_below_everything_at_round_numbers() -> None:
