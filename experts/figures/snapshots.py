@@ -1,6 +1,6 @@
 """Figure 2: snapshots of the spacecraft with the path of its tip and the target."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -82,6 +82,11 @@ class SnapshotPainter:
         self._spacing = 0.045 * float((high - low).max())
         self._ceiling = float(high[1])
         self._numbered = numbered
+        names = [place for stage in stages for *_, place in self._target_arrows(stage)]
+        low, high = (
+            limit(np.vstack([edge, *(place + side * self._spacing for place in names)]), axis=0)
+            for edge, side, limit in ((low, -0.8, np.min), (high, 0.8, np.max))
+        )
         # Room for numbers on the left and below, and for the time above.
         self._low = low - np.array([5.8, 3.3] if numbered else [0.5, 0.5]) * self._spacing
         self._high = high + np.array([1.4, 2.2]) * self._spacing
@@ -110,15 +115,19 @@ class SnapshotPainter:
 
     def _name_target(self, axes: Axes, stage: int) -> None:
         """Name the target's axes, and dot them where something hides them."""
+        for axis, line, (right, up) in self._target_arrows(stage):
+            color = AXIS_COLORS[axis]
+            axes.plot(*line.T, color=color, linestyle=":", linewidth=0.7, zorder=3)
+            axes.text(right, up, f"${'xyz'[axis]}_D$", color=color, ha="center", va="center")
+
+    def _target_arrows(self, stage: int) -> Iterator[tuple[int, FloatArray, FloatArray]]:
+        """Find the ends and the place of the name of each axis of the target that does not point at us."""
         origin, *ends = self.view.project(self._schematic.target_points(stage))
-        for name, color, end in zip("xyz", AXIS_COLORS, ends, strict=True):
-            arrow = end - origin
-            if np.linalg.norm(arrow) > self._spacing:  # else it points at the reader
-                axes.plot(
-                    *np.stack([origin, end], axis=1), color=color, linestyle=":", linewidth=0.7, zorder=3
-                )
-                right, up = end + 1.2 * self._spacing * arrow / np.linalg.norm(arrow)
-                axes.text(right, up, f"${name}_D$", color=color, ha="center", va="center")
+        for axis, end in enumerate(ends):
+            length = float(np.linalg.norm(end - origin))
+            if length > self._spacing:
+                place = end + 1.2 * self._spacing * (end - origin) / length
+                yield axis, np.array([origin, end]), place
 
     def _name_tip(self, axes: Axes, stage: int) -> None:
         """Name the tip where there is most room, away from its axes and the arm."""

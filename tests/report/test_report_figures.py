@@ -196,6 +196,23 @@ def test_a_target_is_seen_where_it_is_at_the_time_of_a_snapshot() -> None:
     assert shapes.sum() > 100
 
 
+def test_names_of_the_axes_of_a_target_leave_the_time_free() -> None:
+    """The target of this scene is above all else, in the middle."""
+    scene = load_scene("solar-panels")
+    layout = StateLayout.of(scene)
+    states = np.tile(layout.initial_state, (13, 1))
+    states[:, layout.state.joint_angles.stop - 2] += np.linspace(0.0, 1.0, 13)
+    with house_style():
+        figure = figure_2(Maneuver(scene, states, np.zeros((12, layout.n_u))))
+    assert len(figure.axes) == 6
+    for axes in figure.axes:
+        axes.apply_aspect()
+        names = [text for text in axes.texts if "_D" in text.get_text()]
+        (time,) = (text for text in axes.texts if text.get_text().startswith("$t$"))
+        assert len(names) == 3
+        assert not any(time.get_window_extent().overlaps(name.get_window_extent()) for name in names)
+
+
 def test_grid_lies_below_everything_at_round_numbers() -> None:
     points = np.random.default_rng(1).normal(size=(50, 3))
     grid = Grid.below(points)
