@@ -8,7 +8,6 @@ from time import perf_counter
 
 import numpy as np
 
-from dq_space_arm_env.algebra import poses
 from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback, rollout
 from dq_space_arm_env.kernels import Kernels, compile_scene
 from dq_space_arm_env.scene import Scene, StateLayout
@@ -125,7 +124,7 @@ def replay(scene: Scene, controls: FloatArray) -> Rollout:
 def errors_with_finer_steps(
     scene: Scene, controls: FloatArray, substeps: int = 4
 ) -> tuple[float, float] | None:
-    """Errors of the tip [deg, m] at the end of a plan that RK4 integrates with a shorter time step.
+    """Errors of the worst tip [deg, m] at the end of a plan that RK4 integrates with a shorter time step.
 
     None where an actuator has a delay: it is whole steps, and shorter in shorter ones.
     """
@@ -137,9 +136,8 @@ def errors_with_finer_steps(
     with np.errstate(all="ignore"):
         start = kernels.layout.initial_state
         end = kernels.simulate(start, finer, len(finer), dt, "rk4", every=len(finer), p=rows)[-1]
-    tip = tuple(kernels.tip_pose(end).tolist())
-    target = tuple(kernels.layout.target_with(kernels.stage_parameters()[-1]).tolist())
-    return math.degrees(poses.error_angle(tip, target)), poses.error_distance(tip, target)
+    attitude, position, *_ = kernels.tip_errors(end, p=kernels.stage_parameters()[-1]).tolist()
+    return attitude, position
 
 
 def in_substeps(kernels: Kernels, rows: FloatArray, substeps: int) -> FloatArray:

@@ -136,6 +136,13 @@ def test_finer_steps_show_the_error_of_a_poor_integrator(short_scene: Scene) -> 
     assert abs(finer_distance - distance) < 1e-6
 
 
+def test_finer_steps_show_the_worst_of_several_tips(short_scene: Scene) -> None:
+    far = {"name": "far", "link": "base", "relative_to": "inertial", "goal": {"position": [0.0, 3.0, 0.0]}}
+    scene = short_scene.replace(other_tips=[far])
+    _, distance = errors_with_finer_steps(scene, np.zeros((60, 2)))
+    assert distance == pytest.approx(3.0, abs=1e-9)
+
+
 def test_zero_controls_cost_is_that_of_staying(short_run: ManeuverRun) -> None:
     # At rest without gravity, nothing moves: N stage costs and a terminal cost of the initial state.
     kernels = compile_scene(short_run.scene)
