@@ -36,6 +36,7 @@ _EULER_RATES = (r"$\dot{\psi}$", r"$\dot{\theta}$", r"$\dot{\phi}$")
 _SMALL = 0.1  # below this, inputs are shown in thousandths of their unit
 _NEAR = 0.5  # from this share of a limit on, the limit is drawn
 
+_WIDE = 1e3  # costs that are numbered at powers of ten alone
 _MOST_MARKERS = 60  # iterations that are marked one by one
 
 
@@ -155,16 +156,19 @@ def convergence_figure(
     done = np.concatenate([[0], history["iteration"]])
     marked = len(history) <= _MOST_MARKERS
     line, cross = (".-", "x--") if marked else ("-", "--")
-    cost.semilogy(done, [start_cost, *history["cost"]], line, color=BLUE)
-    cost.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    costs = np.array([start_cost, *history["cost"]])
+    cost.semilogy(done, costs, line, color=BLUE)
+    is_wide = costs.max() > _WIDE * costs.min()  # with numbers between the powers of ten there would be none
+    cost.yaxis.set_major_locator(LogLocator(subs=(1.0,) if is_wide else (1.0, 2.0, 5.0)))
     cost.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     cost.yaxis.set_minor_formatter(NullFormatter())
-    finish_panel(cost, f"Cost, in the end {solution.cost:.6g}", "$J$ [$-$]")
+    minimized = "$J$" if solution.constraints is None else "$J$ + penalties"
+    finish_panel(cost, f"Cost {minimized}, in the end $J$ = {solution.cost:.6g}", f"{minimized} [$-$]")
     # Known before each iteration, and at the end.
     expected = np.array([*history["optimality"], solution.optimality])
     decrease.semilogy(done, np.where(expected > 0.0, expected, np.nan), line, color=BLUE)
     decrease.axhline(tolerance, **LIMIT_STYLE)
-    finish_panel(decrease, "Decrease that the model expects (dashed: tolerance)", "relative to $J$ [$-$]")
+    finish_panel(decrease, "Decrease that the model expects (dashed: tolerance)", "relative to cost [$-$]")
     for name, label, color, style in (
         ("alpha", "step length", BLUE, line),
         ("regularization", "damping", VERMILION, cross),

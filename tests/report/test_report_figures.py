@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,22 @@ def test_convergence_begins_with_doing_nothing(short_run: ManeuverRun) -> None:
     assert shown[0] == short_run.zero_control_cost
     assert shown[-1] == pytest.approx(short_run.solution.cost)
     assert len(shown) == len(decrease.lines[0].get_ydata()) == short_run.solution.iterations + 1
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e2, 1e4, 1e6, 1e9])
+def test_costs_of_any_range_are_numbered(short_run: ManeuverRun, factor: float) -> None:
+    figure = convergence_figure(short_run.solution, factor * short_run.zero_control_cost, 1e-7, 1.0)
+    cost = figure.axes[0]
+    low, high = cost.get_ylim()
+    assert sum(low <= tick <= high for tick in cost.get_yticks()) >= 2
+
+
+def test_convergence_under_constraints_has_penalties(short_run: ManeuverRun) -> None:
+    solution = copy(short_run.solution)
+    for constraints, label in ((None, "$J$ [$-$]"), (object(), "$J$ + penalties [$-$]")):
+        solution.constraints = constraints
+        cost = convergence_figure(solution, short_run.zero_control_cost, 1e-7, 1.0).axes[0]
+        assert cost.get_ylabel() == label
 
 
 def test_snapshots_are_spread_over_the_motion(short_run: ManeuverRun) -> None:
