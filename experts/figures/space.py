@@ -1,5 +1,6 @@
 """Space on paper: a parallel projection, and a numbered grid."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from matplotlib.collections import LineCollection
 from experts.figures.style import GRAY, LIGHT_GRAY
 from experts.problems.shooting_problem import FloatArray
 
-_CELLS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 25.0, 100.0)
+_CELLS = (1.0, 2.5, 5.0, 10.0)  # times a power of ten, m
 _MOST_CELLS = 8
 _NUMBER_SIZE = 7.0  # points
 
@@ -48,7 +49,9 @@ class Grid(NamedTuple):
         """A grid below points, shape (n, 3), m, that reaches beyond them."""
         low, high = points.min(axis=0), points.max(axis=0)
         extent = float((high - low)[:2].max())
-        cell = next((size for size in _CELLS if extent <= (_MOST_CELLS - 2) * size), _CELLS[-1])
+        smallest = extent / (_MOST_CELLS - 2)
+        power = 10.0 ** math.floor(math.log10(smallest))
+        cell = power * next((size for size in _CELLS if power * size >= smallest), _CELLS[-1])
         x0, y0 = np.floor(low[:2] / cell) * cell
         x1, y1 = np.ceil(high[:2] / cell) * cell
         return cls((x0, y0), (x1, y1), float(low[2]) - 0.03 * extent, cell)
