@@ -46,10 +46,13 @@ def _run(options: argparse.Namespace) -> int:
     config = {key: value for key, value in vars(options).items() if key in ("azimuth", "elevation")}
     picture = PictureFormat.checked(options.width, options.height, config)
     check_gif(options.fps, options.hold, options.colors)
-    is_strip = options.out.suffix == ".png"
+    ending = options.out.suffix.lower()
+    is_strip = ending == ".png"
     if is_strip and options.moments < 2:
         raise ValueError(f"moments: {options.moments}, should be at least 2: the start and the end")
     check_writable_file(options.out)
+    if ending not in (".gif", ".png"):
+        raise ValueError(f"out: {options.out}, should end in .gif or .png")
     scene = load_scene(options.scene)
     solution = uninterrupted(GuidedDDP(scene).solve())
     maneuver = Maneuver(scene, solution.states, solution.controls)

@@ -21,6 +21,7 @@ LARGEST, LARGEST_IN_ALL = 120_000, 2_500_000  # bytes
         (["--hold", "-1"], "hold: -1.0, should be 0 to 600 s"),
         (["--colors", "256"], "colors: 256, should be 2 to 255"),
         (["--width", "0"], "width: 0 is not a positive number of pixels"),
+        (["--out", "maneuver.webp"], "out: maneuver.webp, should end in .gif or .png"),
         (["--moments", "1", "--out", "strip.png"], "moments: 1, should be at least 2: the start and the end"),
     ],
 )
