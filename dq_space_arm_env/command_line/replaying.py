@@ -37,6 +37,8 @@ def collect_flights(
             recordings[place] = read_flight(source, label)
     if scene is None:
         scene = next((item.scene for item in recordings.values() if item.scene is not None), None)
+    if seed is not None and len(recordings) == len(sources):
+        raise ValueError(f"--seed: {seed} is where policies start, and no flight is one: leave it out")
     if len(recordings) < len(sources):
         if scene is None:
             raise ValueError("no file says which scene the policy should fly: give --scene")

@@ -83,6 +83,7 @@ def test_policy_flies_from_where_the_first_flight_starts(rollout: Path, scene: S
         (["{folder}/facts.npz"], "its facts are not a mapping"),
         (["{folder}"], "holds no demonstrations"),
         (["{folder}/swing.npz", "--scene", "paper"], "show them on separate pages"),
+        (["{folder}/swing.npz", "--seed", "3"], "--seed: 3 is where policies start, and no flight is one"),
     ],
 )
 def test_unusable_input_is_one_sentence(
