@@ -67,3 +67,9 @@ def test_a_robot_that_flies_away_does_not_shrink_the_picture(make_flight, paper)
     states[-8:, 4:8] *= 1e4  # the dual part of the base's pose: kilometers away
     away = view_of(prepare([type(flight)("away", states, flight.controls)], paper), paper)
     assert np.ptp(away.points, axis=0).max() < 2.0 * np.ptp(near.points, axis=0).max()
+
+
+def test_a_target_far_away_is_in_the_picture(make_flight, paper):
+    scene = paper.replace({"target.pose.position": (0.0, 30.0, 0.0)})
+    points = view_of(prepare([make_flight(scene)], scene), scene).points
+    assert np.linalg.norm(points - [0.0, 30.0, 0.0], axis=1).min() < 1.0

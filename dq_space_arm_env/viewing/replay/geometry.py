@@ -27,7 +27,7 @@ from dq_space_arm_env.viewing.replay.flights import FloatArray, ShownFlight, pos
 _CREASE = math.cos(math.radians(40.0))
 _STEPS_PER_METER = 1e5  # resolution of corners; equal ones share a vertex
 _INSTANTS = 9
-_FLOWN_AWAY = 3.0  # times the size of robot, reach and target
+_FLOWN_AWAY = 3.0  # times the size of robot, reach and target, and the way between them
 _AZIMUTHS = tuple(math.radians(angle) for angle in range(0, 360, 15))
 _ELEVATIONS = tuple(math.radians(angle) for angle in (12, 24, 36))
 _PLANAR_VIEW = (math.radians(-90.0), math.radians(62.0))
@@ -226,8 +226,9 @@ def _corners(model: SpacecraftModel, frames: FloatArray) -> FloatArray:
         points.append((rotations @ places)[..., 0] + np.array(positions).T[numbers])
     cloud = np.concatenate(points)
     offsets = np.linalg.norm(cloud - np.median(cloud, axis=0), axis=1)
-    _, radii = model.region
-    return np.asarray(cloud[offsets <= _FLOWN_AWAY * radii.sum()])
+    centers, radii = model.region
+    size = radii.sum() + np.linalg.norm(np.ptp(centers, axis=0))
+    return np.asarray(cloud[offsets <= _FLOWN_AWAY * size])
 
 
 def _outermost(points: FloatArray) -> FloatArray:
