@@ -24,7 +24,7 @@ from experts.ddp.solution import uninterrupted
 from experts.problems.shooting_problem import FloatArray
 from experts.report.effort import Announce, Effort
 from experts.report.maneuver_run import in_substeps
-from experts.report.timing import time_in_turns
+from experts.report.timing import three_digits, time_in_turns
 
 ACCURACIES = (1e-3, 1e-6, 1e-9)
 """Errors of the tip to reach, m and rad; also the relative tolerances of adaptive integrators."""
@@ -281,21 +281,20 @@ def _summaries(points: Sequence[Row], uncertainty: float) -> Iterator[Row]:
         }
 
 
-_digits: Callable[[float], str] = "{:,.3g}".format
 _CHOICE_COLUMNS = (
     Column("accuracy", "error\nm, rad", "g"),
     Column("way", ""),
     "integrator",
     Column("step", "step"),
-    Column("us", "µs", _digits),
+    Column("us", "µs", three_digits),
     Column("error", "its error", ".0e"),
 )
 _SUMMARY_COLUMNS = (
     "integrator",
     "order",
     Column("observed_order", "shown", ".1f"),
-    Column("single_step_ns", "ns/step\none", _digits),
-    Column("batch_step_ns", f"ns/step\nof {BATCH}", _digits),
+    Column("single_step_ns", "ns/step\none", three_digits),
+    Column("batch_step_ns", f"ns/step\nof {BATCH}", three_digits),
     Column("error_at_scene_step", "error at the\nscene's step", ".0e", "lost"),
     Column("least_error", "least\nerror", ".0e", "lost"),
     "at",

@@ -16,7 +16,7 @@ from experts.problems.shooting_problem import FloatArray
 from experts.report.effort import Announce, Effort
 from experts.report.integrator_precision import BATCH, step_call
 from experts.report.scene_variants import feature_variants
-from experts.report.timing import time_in_turns
+from experts.report.timing import three_digits, time_in_turns
 
 
 def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[Row]]:
@@ -83,7 +83,7 @@ def section(scene: Scene, found: dict[str, list[Row]]) -> Section:
             Column("step_operations", "step\noperations"),
             Column("operations_ratio", "ratio", ".2f"),
             Column("environment_operations", "environment's\nstep"),
-            Column("step_ns", "step\nns", ".3g"),
+            Column("step_ns", "step\nns", three_digits),
             Column("time_ratio", "ratio", ".2f"),
         ],
         "The scene with one part left out or added",

@@ -52,3 +52,8 @@ def _seconds(run: Callable[[], object], calls: int) -> float:
     finally:
         if collecting:
             gc.enable()
+
+
+def three_digits(value: float) -> str:
+    """Write a time with three digits, or all of them before the point."""
+    return f"{value:,.0f}" if abs(value) >= 99.95 else f"{value:#.3g}".rstrip(".")

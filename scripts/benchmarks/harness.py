@@ -24,6 +24,7 @@ from dq_space_arm_env.common.files import json_value, to_json, write_atomically
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.report_page import Page, Section
 from dq_space_arm_env.common.tables import Column, tabulate
+from experts.report.timing import three_digits
 from scripts.benchmarks.effort import Effort
 
 Row = dict[str, Any]
@@ -143,11 +144,6 @@ def _draw(picture: Picture, rows: Sequence[Row]) -> bytes:
     from experts.figures.plots import Plot  # matplotlib is optional
 
     return Plot(**picture.plot).png(rows)
-
-
-def three_digits(value: float) -> str:
-    """Three digits, or all of them before the point."""
-    return f"{value:,.0f}" if abs(value) >= 99.95 else f"{value:#.3g}".rstrip(".")
 
 
 def time_column(key: str, heading: str | None = None) -> Column:

@@ -14,6 +14,7 @@ from rich.console import Console
 from dq_space_arm_env.common.provenance import provenance
 from dq_space_arm_env.common.report_page import Figure, Page, Section
 from dq_space_arm_env.common.tables import Column, TextTable, tabulate
+from experts.report.timing import three_digits
 
 PNG = b"\x89PNG made up"
 TABLE = TextTable("A <title>\nexplained", ("", "m | s", "two\nlines"), (("a & b", "1", "2"),), right=1)
@@ -136,6 +137,13 @@ def test_rows_become_a_table() -> None:
     assert table.rows[1] == ("rk4", "lost", "2400", "no")
     assert table.rows[2] == ("euler", "2e-02", "3", "-")
     assert tabulate("All", ROWS).headings == ("method", "motion", "time us", "error", "fits")
+
+
+@pytest.mark.parametrize(
+    ("time", "text"), [(0.123456, "0.123"), (7.0, "7.00"), (152.7, "153"), (2111.5, "2,112")]
+)
+def test_times_have_three_digits_or_all_before_the_point(time: float, text: str) -> None:
+    assert three_digits(time) == text
 
 
 def test_a_page_is_saved_with_its_rows_as_json(tmp_path: Path, origin: dict[str, Any]) -> None:
