@@ -142,6 +142,8 @@ def _limits(scene: Scene) -> str:
         "base torque": layout.control.base_torque,
         "joint torque": layout.control.joint_torque,
         "Euler rate": layout.control.wrist_rate,
+        "wheel torque": layout.control.wheel_torque,
+        "thruster force": layout.control.thruster_force,
     }
     texts = []
     for name, place in entries.items():

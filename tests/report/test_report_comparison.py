@@ -1,5 +1,7 @@
 """What is said to be the paper's is the paper's, and what is not is shown."""
 
+import pytest
+
 from dq_space_arm_env import Scene, load_scene
 from experts.report.paper_numbers import ABSENT, compare_with_paper, own_choices
 
@@ -25,6 +27,13 @@ def test_changed_numbers_are_named() -> None:
 def test_what_another_robot_lacks_is_absent(short_scene: Scene) -> None:
     found = differing(short_scene)
     assert found["weight in R, base force"] == found["weight in R, Euler rates"] == ABSENT
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"), [("wheels", "wheel torque 0.2 N m"), ("thrusters", "thruster force 5 N")]
+)
+def test_limits_of_wheels_and_thrusters_are_own_choices(name: str, limit: str) -> None:
+    assert own_choices(load_scene(name))["limits"].endswith(f"; {limit}")
 
 
 def test_own_choices_are_those_of_the_scene() -> None:
