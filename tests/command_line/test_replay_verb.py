@@ -100,6 +100,14 @@ def test_unusable_input_is_one_sentence(
     assert not (tmp_path / "page.html").exists()
 
 
+def test_a_page_does_not_replace_a_flight(rollout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    content = rollout.read_bytes()
+    other = f"{rollout.parent}/../{rollout.parent.name}/{rollout.name}"
+    assert main(["replay", str(rollout), "--out", other]) == 2
+    assert "is one of the flights" in " ".join(capsys.readouterr().err.split())
+    assert rollout.read_bytes() == content
+
+
 def test_scenes_may_differ_in_masses_and_target(rollout: Path, scene: Scene) -> None:
     one = read_flight(rollout)
     heavy = scene.replace({"base.mass": 30.0, "target.pose.position": (0.5, 0.5, 0.0)})
