@@ -143,6 +143,14 @@ def test_finer_steps_show_the_worst_of_several_tips(short_scene: Scene) -> None:
     assert distance == pytest.approx(3.0, abs=1e-9)
 
 
+def test_a_pose_within_the_tolerances_may_be_no_success(short_run: ManeuverRun) -> None:
+    for flown, sentence in ((True, "within the tolerance "), (False, "within the tolerance, but NO success")):
+        run = replace(short_run, replay=replace(short_run.replay, is_success=np.array([flown])))
+        console = Console(width=200, record=True, file=io.StringIO())
+        print_tables(console, run)
+        assert f" {sentence}" in console.export_text()
+
+
 def test_zero_controls_cost_is_that_of_staying(short_run: ManeuverRun) -> None:
     # At rest without gravity, nothing moves: N stage costs and a terminal cost of the initial state.
     kernels = compile_scene(short_run.scene)
