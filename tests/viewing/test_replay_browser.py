@@ -385,8 +385,10 @@ def test_violated_constraints_are_red_and_can_be_switched_off(open_flights, make
     opened = open_flights([make_flight(scene)], scene)
     labels = "[...document.querySelectorAll('#constraints label')].map(l => [l.textContent, l.className])"
     assert opened.page.evaluate(labels) == [["sun", "broken"], ["limits", ""]]
+    boxes = opened.page.locator("#constraints input")
+    assert [boxes.nth(i).is_visible() for i in range(2)] == [True, False]  # of shapes alone
     seen = opened.picture()
-    opened.page.locator("#constraints input").first.uncheck()
+    boxes.first.uncheck()
     assert opened.picture() != seen
     assert open_flights([make_flight(paper)], paper).page.is_hidden("#constraints")
 

@@ -205,12 +205,13 @@ function buildFlights() {
   });
 }
 
-/** A row for each constraint: whether its shapes are seen, and whether the solid flight violates it. */
+/** A row for each constraint: whether its shapes, if any, are seen, and whether the solid flight violates it. */
 function buildConstraints() {
   find("constraints").hidden = false;
   constraints.names.forEach((name, index) => {
     const label = document.createElement("label");
     const box = Object.assign(document.createElement("input"), { type: "checkbox", checked: true });
+    if (!constraints.owners.includes(index)) box.style.visibility = "hidden"; // limits of joints have no shape
     box.addEventListener("change", () => {
       moment.shown[index] = box.checked;
       refresh();
