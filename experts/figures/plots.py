@@ -53,7 +53,7 @@ class Plot:
 
     def figure(self, rows: Sequence[Row]) -> Figure:
         """Make the figure; in the house style if called inside its context."""
-        facets = list(dict.fromkeys(row[self.facet] for row in rows)) if self.facet else [None]
+        facets = list(dict.fromkeys(row[self.facet] for row in rows)) if self.facet and rows else [None]
         curves = list(dict.fromkeys(row[self.color] for row in rows)) if self.color else [None]
         columns = min(len(facets), self.columns)
         bars = self._has_bars(rows)

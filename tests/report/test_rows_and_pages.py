@@ -169,6 +169,7 @@ def test_numbers_make_curves_and_text_makes_bars() -> None:
     assert [line.get_ydata()[0] for line in stiff.lines if line.get_linestyle() == "--"] == [1e-6]
     assert [axes.get_title(loc="left") for axes in (spin, stiff)] == ["spin", "stiff"]
     assert plot.png(ROWS).startswith(b"\x89PNG")
+    assert len(plot.figure([]).axes) == 1  # where nothing is known there is nothing in it
     (axes,) = Plot("time_us", "method", color="motion", log="x").figure(ROWS).axes
     assert [bar.get_width() for bar in axes.patches] == [12, 2400, 3]
 
