@@ -73,6 +73,8 @@ class Schematic:
         self._scene = scene
         self._light = light / np.linalg.norm(light)
         self._radius = 0.02 * self.reach
+        first = 1 + len(scene.links)
+        self._tips = [*range(first, first + len(scene.other_tips)), len(before)]  # the main one last
         self._spacecraft = _divided(
             Mesh.joined([*self._bodies(), *self._arm(before, offsets)]), 0.06 * self.reach
         )
@@ -80,14 +82,20 @@ class Schematic:
         self._target_paths = [
             np.atleast_2d(target if each is None else each) for each in (target, target_body)
         ]
-        self._tip_axes = _axes(_TIP_AXES * self.reach, 0.006 * self.reach)
-        self._target = _axes(_TARGET_AXES * self.reach, 0.004 * self.reach)
+        short, long = _TIP_AXES * self.reach, _TARGET_AXES * self.reach
+        self._tip_axes = _divided(_axes(short, 0.006 * self.reach), 0.25 * short)
+        axes = _axes(long, 0.004 * self.reach)
+        goals = [axes]
+        for tip in scene.other_tips:  # in the frame of the target's body, or in space
+            rotation, place = np.array(tip.goal.rotation_matrix), np.array(tip.goal.position)
+            goals.append(axes.moved(1 if tip.relative_to == "target" else 2, rotation, place))
+        self._target = _divided(Mesh.joined(goals), 0.25 * long)
         if scene.target.geometry:
             body = Mesh.joined(shape_meshes(1, scene.target.geometry, TARGET_COLOR))
             self._target = _Solids.joined([self._target, _divided(body, 0.06 * self.reach)])
 
     def spacecraft(self, frames: FloatArray, payload: FloatArray | None = None) -> Faces:
-        """Place base, arm, payload and the axes of the tip.
+        """Place base, arm, payloads and the axes of the tips.
 
         Given are the poses of all frames, shape (frames, 8), m, and the payload's, (8,); None: at the tip.
         """
@@ -95,15 +103,11 @@ class Schematic:
         matrices, origins = poses.to_matrix(tuple(all_frames.T))
         rotations: FloatArray = np.moveaxis(np.array(matrices), 2, 0)
         positions: FloatArray = np.array(origins).T
-        return Faces.joined(
-            [
-                self._lit(self._spacecraft, rotations, positions),
-                self._lit(self._tip_axes, rotations[-2:-1], positions[-2:-1]),
-            ]
-        )
+        axes = (self._lit(self._tip_axes, rotations[[tip]], positions[[tip]]) for tip in self._tips)
+        return Faces.joined([self._lit(self._spacecraft, rotations, positions), *axes])
 
     def target(self, stage: int) -> Faces:
-        """Place the target's axes at a stage, longer and thinner than the tip's, and its body's shapes."""
+        """Place the goals' axes at a stage, longer and thinner than the tips', and the target's shapes."""
         matrices, origins = poses.to_matrix(tuple(self._target_frames(stage).T))
         rotations: FloatArray = np.moveaxis(np.array(matrices), 2, 0)
         return self._lit(self._target, rotations, np.array(origins).T)
@@ -123,8 +127,8 @@ class Schematic:
         return self._lit(_Solids.of(Mesh.joined(parts)), np.eye(3)[None], np.zeros((1, 3)))
 
     def _target_frames(self, stage: int) -> FloatArray:
-        """Poses of target and target's body at a stage, shape (2, 8), m."""
-        return np.array([path[min(stage, len(path) - 1)] for path in self._target_paths])
+        """Poses of target and target's body at a stage, and that of space, shape (3, 8), m."""
+        return np.array([*(path[min(stage, len(path) - 1)] for path in self._target_paths), np.eye(8)[0]])
 
     def target_points(self, stage: int) -> FloatArray:
         """Origin of the target's axes at a stage and the ends of x, y and z, shape (4, 3), m."""
@@ -138,20 +142,21 @@ class Schematic:
         return np.vstack([position, np.array(position) + _TIP_AXES * self.reach * np.array(rotation).T])
 
     def _bodies(self) -> Iterable[Mesh]:
-        base, payload = self._scene.base, self._scene.payload
+        base = self._scene.base
         size, axes = equivalent_box(base.mass, base.inertia)
         if base.geometry:
             yield from shape_meshes(0, base.geometry, BASE_COLOR)
         else:
             yield box(0, np.zeros(3), size, BASE_COLOR, axes)
-        if payload is not None:
-            size, axes = equivalent_box(payload.mass, payload.inertia)
-            # After the tip's; a payload excludes a wrist.
-            own = 2 + len(self._scene.links) + len(self._scene.other_tips)
-            if payload.geometry:
+        # What the main tip holds has the frame after its own; a payload excludes a wrist.
+        held = [(self._tips[-1] + 1, self._scene.payload)]
+        held += [(tip, each.payload) for tip, each in zip(self._tips, self._scene.other_tips, strict=False)]
+        for own, payload in held:
+            if payload is not None and payload.geometry:
                 yield from shape_meshes(own, payload.geometry, PAYLOAD_COLOR)
-                return
-            yield box(own, payload.center_of_mass, size, PAYLOAD_COLOR, axes)
+            elif payload is not None:
+                size, axes = equivalent_box(payload.mass, payload.inertia)
+                yield box(own, payload.center_of_mass, size, PAYLOAD_COLOR, axes)
 
     def _arm(self, before: list[int], offsets: FloatArray) -> Iterable[Mesh]:
         """Links from each frame to the next, joints along their axes, a ball for the wrist."""
@@ -198,7 +203,7 @@ def _rod(
     return lathe(frame, start, direction, profile, color, sides)
 
 
-def _axes(length: float, radius: float) -> _Solids:
+def _axes(length: float, radius: float) -> Mesh:
     """Arrows along x, y and z."""
     neck = length - 6.0 * radius
     profile = [(0.0, 0.0), (0.0, radius), (neck, radius), (neck, 2.5 * radius), (length, 0.0)]
@@ -206,7 +211,7 @@ def _axes(length: float, radius: float) -> _Solids:
         lathe(0, np.zeros(3), direction, profile, color, 12)
         for direction, color in zip(np.eye(3), AXIS_COLORS, strict=True)
     ]
-    return _divided(Mesh.joined(arrows), 0.25 * length)
+    return Mesh.joined(arrows)
 
 
 def _divided(mesh: Mesh, longest: float) -> _Solids:

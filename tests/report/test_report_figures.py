@@ -13,6 +13,7 @@ matplotlib = pytest.importorskip("matplotlib")
 from matplotlib.image import imread  # noqa: E402
 
 from dq_space_arm_env import Scene, load_scene  # noqa: E402
+from dq_space_arm_env.algebra import dual_quaternion  # noqa: E402
 from dq_space_arm_env.algebra.poses import position, to_matrix  # noqa: E402
 from dq_space_arm_env.scene import StateLayout  # noqa: E402
 from dq_space_arm_env.scene.path import shown_target  # noqa: E402
@@ -211,6 +212,30 @@ def test_a_target_is_seen_where_it_is_at_the_time_of_a_snapshot() -> None:
     from_body = (first.corners - origin) @ np.array(turn)
     shapes = np.abs(from_body @ np.array(turned).T + moved - last.corners).max(axis=(1, 2)) < 1e-9
     assert shapes.sum() > 100
+
+
+def test_every_tip_has_axes_a_payload_and_a_goal() -> None:
+    """The ends of the arrows of the other tip and of its goal, with the target or in space."""
+    scene, light = load_scene("dual-arm"), np.array([0.0, 0.0, 1.0])
+    frames, (tip,), (grasp, body) = still(scene).frames[0], scene.other_tips, shown_target(scene)
+    held = {"mass": 1.0, "inertia": [0.1, 0.1, 0.1], "center_of_mass": [0.0, 0.0, 0.2]}
+    loaded = scene.replace({"other_tips.0.payload": held})
+    faces = [len(Schematic(each, light).spacecraft(frames).corners) for each in (scene, loaded)]
+    assert faces[0] < faces[1]
+    inertial = scene.replace({"other_tips.0.relative_to": "inertial"})
+    goal = tip.goal.dual_quaternion
+    shown = [
+        (Schematic(scene, light).spacecraft(frames), frames[1 + len(scene.links)], 0.15),
+        (Schematic(scene, light).spacecraft(frames), frames[-1], 0.15),
+        (Schematic(scene, light).target(0), grasp, 0.27),
+        (Schematic(scene, light).target(0), dual_quaternion.multiply(tuple(body), goal), 0.27),
+        (Schematic(inertial, light).target(0), goal, 0.27),
+    ]
+    for found, pose, length in shown:
+        rotation, origin = to_matrix(tuple(pose))
+        ends = np.array(origin) + length * Schematic(scene, light).reach * np.array(rotation).T
+        corners = found.corners.reshape(-1, 3)
+        assert np.linalg.norm(corners[:, None] - ends, axis=2).min(axis=0) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_names_of_the_axes_of_a_target_leave_the_time_free() -> None:
