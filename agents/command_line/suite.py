@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from agents.command_line.agent_policies import configuration_files
-from dq_space_arm_env.command_line.names import Named, OneOf, given, shipped_files, trust_option
+from dq_space_arm_env.command_line.names import Named, given, shipped_files, trust_option
 from dq_space_arm_env.command_line.results_options import destination, results_options
 from dq_space_arm_env.command_line.verb import keeping
 from dq_space_arm_env.common.console import FAILURE, SUCCESS, message_console
@@ -31,7 +31,7 @@ def _tasks() -> Iterable[str]:
     return scene_files()
 
 
-_SUITE, _TASK = Named("suite", _suites), OneOf("task", _tasks)
+_SUITE, _TASK = Named("suite", _suites), Named("task", _tasks)
 
 
 @click.command(
@@ -46,7 +46,7 @@ _SUITE, _TASK = Named("suite", _suites), OneOf("task", _tasks)
 )
 @click.argument("entrants", nargs=-1, type=Named("entrant", _entrants), metavar="[ENTRANT]...")
 @click.option("--suite", "version", type=_SUITE, default="v1", show_default=True, help="Version.")
-@click.option("--task", "tasks", type=_TASK, multiple=True, help="Some of its tasks, several.")
+@click.option("--task", "tasks", type=_TASK, multiple=True, help="Some of its tasks; may be repeated.")
 @click.option(
     "--seeds", type=click.IntRange(min=1), help="Trainings of an agent for a task.  [default: the suite's]"
 )
@@ -93,6 +93,10 @@ def suite(
     from dq_space_arm_env.common.tables import tabulate
 
     if other is not None:
+        if other.resolve() == (out / "suite.json").resolve():
+            raise click.UsageError(
+                f"--check: this run writes {other}: give another --out", click.get_current_context()
+            )
         flown = load_suite(version)  # what cannot be compared ends the run before it begins
         comparable(other, flown, tasks or flown.tasks, entrant_names(entrants, flown))
     written = destination(out, as_json, picture)

@@ -19,6 +19,7 @@ from agents.suite.running import _missing, entrant_names
 from agents.suite.suite_page import check, check_columns, comparable, overall_rows, suite_page
 from agents.zoo.finding import PolicyError
 from dq_space_arm_env import load_scene
+from dq_space_arm_env.common.console import UNUSABLE
 from dq_space_arm_env.common.tables import tabulate
 from experts.demonstrations import SerialExecutor
 
@@ -252,6 +253,27 @@ def test_a_check_that_compares_nothing_is_refused_before_anybody_flies(content, 
         comparable(theirs, suite, [other], ["mine"])
     assert len(comparable(theirs, suite, suite.tasks, ["mine"])) == 1
     assert "apg (zoo)" in entrant_names((), suite)
+    own = (tmp_path / "suite.json").write_bytes(theirs.read_bytes())  # would be compared with itself
+    verb = ["gains", "--suite", str(file), "--out", str(tmp_path), "--check", str(tmp_path / "suite.json")]
+    refused = CliRunner().invoke(suite_verb, verb)
+    assert refused.exit_code == UNUSABLE
+    assert "give another --out" in refused.output
+    assert (tmp_path / "suite.json").stat().st_size == own
+
+
+def test_tasks_of_a_suite_may_be_files(content, tmp_path, monkeypatch):
+    class FlownError(Exception):
+        pass
+
+    def fly(entrants, version, *, tasks, **_):
+        raise FlownError(tasks)
+
+    monkeypatch.setattr("agents.suite.running.run_suite", fly)
+    task = next(iter(content["tasks"]))
+    with pytest.raises(FlownError, match="task-1"):
+        CliRunner().invoke(
+            suite_verb, ["gains", "--task", task, "--out", str(tmp_path)], catch_exceptions=False
+        )
 
 
 @pytest.mark.slow
