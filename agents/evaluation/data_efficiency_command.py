@@ -35,6 +35,18 @@ class Options:
     demonstrations: Path | None = None
     test_demonstrations: Path | None = None
 
+    def __post_init__(self) -> None:
+        """Raise ValueError for numbers below 1, before demonstrations are generated."""
+        numbers = {
+            "counts": min(self.counts),
+            "seeds": self.seeds,
+            "updates": self.updates,
+            "tests": self.tests,
+        }
+        for name, number in numbers.items():
+            if number < 1:
+                raise ValueError(f"--{name}: {number}, should be at least 1")
+
 
 def run(destination: Destination, options: Options) -> None:
     """Measure, print the table and the verdict, and write the files; finished trainings are kept."""

@@ -93,8 +93,7 @@ def compare_under_mismatch(
         DemonstrationsError: If the demonstrations are of another scene.
         KeyboardInterrupt: If the user interrupts it; finished rows remain.
     """
-    if receding_starts < 0:
-        raise ValueError(f"receding_starts: {receding_starts}, should be at least 0, which leaves it out")
+    _check_starts(receding_starts)
     scene = scene or demonstrations.scene
     check_scene(demonstrations, scene)
     found = read_corrections(policies, scene)
@@ -119,6 +118,11 @@ def compare_under_mismatch(
         rows += _rows(condition, evaluations)
     notes = tuple(_notes(rows, list(found)))
     return Comparison(scene.name, tuple(rows), notes=notes)
+
+
+def _check_starts(receding: int) -> None:
+    if receding < 0:
+        raise ValueError(f"receding_starts: {receding}, should be at least 0, which leaves it out")
 
 
 def _controllers(
@@ -306,6 +310,7 @@ def compare_corrections(
     executor: Executor | None = None,
 ) -> None:
     """Plan, compare, print the table, and write the files; finished rows are read from the folder."""
+    _check_starts(receding_starts)  # before planning
     flown = load_scene(scene)
     corrections = read_corrections(policies, flown)  # refuse unusable policies before planning
     with progress_bar() as show:

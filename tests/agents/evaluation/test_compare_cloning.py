@@ -90,6 +90,13 @@ def test_what_cannot_be_measured_is_refused(arguments, demonstrations, tmp_path,
         assert sentence in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["counts", "seeds", "updates", "tests"])
+def test_numbers_are_checked_before_demonstrations_are_generated(option, tmp_path, capsys):
+    assert main(["compare", "cloning", f"--{option}", "0", "--out", str(tmp_path / "out")]) == UNUSABLE
+    assert f"--{option}: 0, should be at least 1" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def training(variant, count, seed, successes):
     named = {"variant": variant, "count": count, "seed": seed}
     reached = [int(flight < successes) for flight in range(100)]

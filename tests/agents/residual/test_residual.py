@@ -25,6 +25,7 @@ from agents.residual.mismatch import Condition, Worlds, fly_mismatched
 from agents.residual.mismatch_comparison import compare_under_mismatch, read_corrections
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.command_line import main
+from dq_space_arm_env.common.console import UNUSABLE
 from dq_space_arm_env.environment.rollouts import rollout
 from experts.demonstrations import DemonstrationsError
 from experts.demonstrations.shard import draw_starts
@@ -328,6 +329,14 @@ def test_corrections_see_the_target_of_each_phase(small_scene):
         seen = observer(stage, environment.states, still)
         np.testing.assert_allclose(seen[:, : expected.shape[1]], expected, rtol=1e-6, atol=1e-6)
         expected = environment.step(still.action)[0]
+
+
+def test_starts_of_the_receding_horizon_are_checked_before_planning(tmp_path, capsys):
+    assert (
+        main(["compare", "residual", "--receding-starts", "-1", "--out", str(tmp_path / "out")]) == UNUSABLE
+    )
+    assert "receding_starts: -1, should be at least 0" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_receding_horizon_plans_with_what_it_is_told(drawing):
