@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from shlex import quote
 from typing import Any, Literal
 
 import click
@@ -150,9 +151,8 @@ def new(file: str, source: str, name: str | None, force: bool, as_json: bool) ->
     if as_json:
         print_document({"file": str(path), "name": name or path.stem, "from": source})
     else:
-        message_console().print(
-            f"{path}: edit it, then `dq-space-arm scenes validate {path}`", markup=False, soft_wrap=True
-        )
+        sentence = f"{path}: edit it, then `dq-space-arm scenes validate {quote(str(path))}`"
+        message_console().print(sentence, markup=False, soft_wrap=True)
 
 
 def _scene_file(file: str, force: bool) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import click
@@ -120,7 +121,8 @@ def simulate(
     caught = flown_catches(begun, flight.states, inputs)
     console.print(_table(loaded, flight, final_errors(begun, flight), error, caught))
     if out is not None:
-        console.print(f"{out}: watch it with `dq-space-arm replay {out}`", markup=False, soft_wrap=True)
+        sentence = f"{out}: watch it with `dq-space-arm replay {quote(str(out))}`"
+        console.print(sentence, markup=False, soft_wrap=True)
 
 
 def _table(

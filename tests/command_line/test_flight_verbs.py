@@ -122,6 +122,16 @@ def test_zero_and_random_inputs(scene_file: str, tmp_path: Path, capsys: pytest.
     assert costs[0] == costs[1] != zero["cost"]
 
 
+def test_commands_to_copy_quote_their_files(
+    scene_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight, scene = tmp_path / "a flight.npz", tmp_path / "a scene.yaml"
+    assert main(["simulate", scene_file, "--policy", "zero", "--out", str(flight)]) == SUCCESS
+    assert f"`dq-space-arm replay '{flight}'`" in capsys.readouterr().out
+    assert main(["scenes", "new", str(scene)]) == SUCCESS
+    assert f"`dq-space-arm scenes validate '{scene}'`" in capsys.readouterr().err
+
+
 def test_solutions_fly_as_planned(solved: Path, scene_file: str, capsys: pytest.CaptureFixture[str]) -> None:
     cost = Solution.load(solved / "solution.npz").cost
     for policy in ("plan", "gains", "receding", str(solved / "solution.npz")):
