@@ -97,6 +97,7 @@ def replay(
 
 
 def _labeled(text: str) -> tuple[str | None, str]:
-    """Split LABEL=FLIGHT; a file may have "=" in its name."""
+    """Split LABEL=FLIGHT; a file, or the folder before "#3", may have "=" in its name."""
     label, mark, source = text.partition("=")
-    return (None, text) if not mark or Path(text).exists() else (label, source)
+    is_path = Path(text).exists() or Path(text.rpartition("#")[0] or text).exists()
+    return (None, text) if not mark or is_path else (label, source)

@@ -11,6 +11,7 @@ from rich.console import Console
 from agents import ExportedPolicy
 from dq_space_arm_env import DQSpaceArmVectorEnv, Scene, compile_scene
 from dq_space_arm_env.command_line import main
+from dq_space_arm_env.command_line.replay import _labeled as labeled
 from dq_space_arm_env.command_line.replaying import collect_flights
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.viewing.replay import Trajectory, by_scene, common_scene, read_flight
@@ -70,6 +71,13 @@ def test_policy_flies_from_where_the_first_flight_starts(rollout: Path, scene: S
     page = out.read_text(encoding="utf-8")
     for label, steps in (("swing", 8), ("again", 8), ("agent", 60)):
         assert f'"label":"{label}","steps":{steps}' in page
+
+
+def test_names_of_folders_with_demonstrations_may_have_an_equals_sign(tmp_path: Path) -> None:
+    folder = tmp_path / "rate=1"
+    folder.mkdir()
+    assert labeled("rate=a#3") == ("rate", "a#3")
+    assert labeled(f"{folder}#3") == (None, f"{folder}#3")
 
 
 @pytest.mark.parametrize(
