@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -111,14 +111,16 @@ def simulate(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         flight.save(out)
-    error = numerical_error(begun, flight)
+    inputs = flight.controls if flight.noise is None else flight.controls + flight.noise
+    caught = flown_catches(begun, flight.states, inputs)
+    error = numerical_error(begun, flight, caught)
     if as_json:
-        known = {"numerical_error": error if math.isfinite(error) else None}
+        known: dict[str, Any] = {"numerical_error": error if math.isfinite(error) else None}
+        if caught:
+            known["missed_catches"] = [catch.phase for catch in caught if not catch.is_met]
         print_document({**flight.facts(), **known, "file": None if out is None else str(out)})
         return
     console = table_console()
-    inputs = flight.controls if flight.noise is None else flight.controls + flight.noise
-    caught = flown_catches(begun, flight.states, inputs)
     console.print(_table(loaded, flight, final_errors(begun, flight), error, caught))
     if out is not None:
         sentence = f"{out}: watch it with `dq-space-arm replay {quote(str(out))}`"
@@ -133,7 +135,8 @@ def _table(
 
     verdict = "DIVERGED" if flight.diverged else "success" if flight.is_success else "NO success"
     charged = "" if flight.noise is None else "; noise is charged as inputs are"
-    trusted = "m or rad, of the tip at the end"
+    missed = not all(catch.is_met for catch in caught)
+    trusted = f"m or rad, of the tip {'before the missed catch' if missed else 'at the end'}"
     if not error <= min(math.radians(scene.success.attitude_error_deg), scene.success.position_error):
         trusted += ": the motion is too fast for the time step, and its numbers mean nothing"
     rows = (

@@ -174,14 +174,18 @@ def error_rows(success: Success, errors: Sequence[float]) -> Iterator[tuple[str,
         yield name, f"{error:.3g} {unit}", "; ".join(notes)
 
 
-def numerical_error(start: Start, flight: Trajectory) -> float:
-    """How far the tip ends from where the same inputs truly bring it, m or rad, whichever is larger."""
+def numerical_error(start: Start, flight: Trajectory, caught: Sequence[Catch] = ()) -> float:
+    """How far the tip ends from where the same inputs truly bring it, m or rad, whichever is larger.
+
+    Where it misses a catch, before that: the true motion is taken to hold the payload from then on.
+    """
     kernels = compile_scene(start.scene)
     inputs = flight.controls if flight.noise is None else flight.controls + flight.noise
     stages = kernels.stage_parameters(start.parameters)[: len(inputs)]
     inputs = kernels.applied_inputs(flight.states[:-1], inputs, p=stages)
     errors = kernels.numerical_error(flight.states, inputs, start.parameters)
-    return float(errors[-1])
+    last = next((catch.step for catch in caught if not catch.is_met), -1)
+    return float(errors[last])
 
 
 def read_state(text: str, size: int) -> NDArray[np.float64]:

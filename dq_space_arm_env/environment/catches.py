@@ -19,6 +19,7 @@ class Catch(NamedTuple):
     """What a phase finds that begins with a catch."""
 
     phase: str
+    step: int  # that ends with it
     errors: tuple[float, ...]  # of the tip, deg, m, deg/s and m/s relative to the target
     tolerances: Success
 
@@ -65,5 +66,5 @@ def catches(
         angles = poses.error_angle(tip, target), np.linalg.norm(twist[:3])
         (turned, turning), moved = np.degrees(angles), poses.error_distance(tip, target)
         errors = (turned, moved, turning, np.linalg.norm(twist[3:]))
-        found.append(Catch(phase.name, tuple(map(float, errors)), phase.catch))
+        found.append(Catch(phase.name, stage - 1, tuple(map(float, errors)), phase.catch))
     return found

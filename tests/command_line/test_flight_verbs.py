@@ -171,6 +171,22 @@ def test_catches_are_judged_as_environments_judge_them() -> None:
 
 
 @pytest.mark.slow
+def test_a_flight_that_misses_its_catch_is_compared_with_the_truth_before_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lengths = {f"phases.{index}.steps": steps for index, steps in enumerate((6, 1, 5))}
+    short = load_scene("capture-and-detumble").replace({**lengths, "simulation.steps": 12})
+    short.to_yaml(tmp_path / "short.yaml")
+    line = ["simulate", str(tmp_path / "short.yaml"), "--policy", "zero"]
+    assert main([*line, "--json"]) == SUCCESS
+    record = documents(capsys)
+    assert record["missed_catches"] == ["detumble"]
+    assert record["numerical_error"] < 1e-12  # it is at rest
+    assert main(line) == SUCCESS
+    assert "m or rad, of the tip before the missed catch" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_a_plan_that_misses_its_catch_is_no_success(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
