@@ -5,7 +5,7 @@ The folder of a search:
 | file | content |
 |---|---|
 | `journal.log` | the study: what was tried, and how good it was, by Optuna |
-| `trials/<name>-trial-<number>/` | the run folder of each trial |
+| `trials/<name>-trial-<number>-<seed>/` | the run folder of each trial |
 | `best.yaml` | the best configuration, which `train` takes |
 | `search.json`, `search.png` | table and picture of the trials |
 | `.lock` | locked while a process searches here |
