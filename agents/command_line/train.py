@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     """,
 )
 @click.argument("configurations", type=CONFIGURATION, nargs=-1, metavar="[CONFIGURATION]...")
-@click.option("--config", type=CONFIGURATION, help="The same as CONFIGURATION.")
+@click.option("--config", type=CONFIGURATION, help="Same as CONFIGURATION.")
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
@@ -71,7 +71,7 @@ def train(
     """
     chosen = (*configurations, *([config] if config is not None else []))
     context = click.get_current_context()
-    if not chosen or (config is not None and configurations):
+    if not chosen:
         raise click.UsageError(
             f"give a configuration: a YAML file, or one of {', '.join(configuration_files())}", context
         )

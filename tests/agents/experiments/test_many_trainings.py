@@ -261,6 +261,7 @@ def test_two_configurations_of_one_name_are_refused(
         (["apg", "--workers", "2"], "--workers and --ray are for several runs: give --seeds"),
         (["apg", "--seeds", "2", "--workers", "2", "--ray"], "--workers and --ray exclude each other"),
         (["apg", "--seeds", "2", "--workers", "0"], "workers: 0, should be at least 1"),
+        (["apg", "--config", "apg"], "two configurations are named 'apg'"),
         (["apg", "apgg", "--seeds", "2"], "no configuration is named 'apgg'; did you mean 'apg'?"),
         (["apg", "--seeds", "two"], "'two' is not a valid integer"),
     ],
