@@ -77,5 +77,11 @@ def _link(source: Path, target: Path) -> None:
         shutil.copy2(here, there)
 
     temporary = target.with_name(temporary_name(target.name))
-    shutil.copytree(source, temporary, copy_function=link)
-    temporary.rename(target)
+    try:
+        shutil.copytree(source, temporary, copy_function=link)
+        temporary.rename(target)
+    except OSError:
+        if not target.exists():  # else another run into the same folders was faster
+            raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

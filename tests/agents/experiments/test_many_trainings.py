@@ -2,10 +2,12 @@
 
 import json
 import os
+import shutil
 import signal
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ from agents.experiments.many_trainings import (
     training_executor,
     training_task,
 )
-from agents.experiments.shared_demonstrations import SharedDemonstrations
+from agents.experiments.shared_demonstrations import SharedDemonstrations, _link
 from agents.experiments.training_task import PROGRESS
 from agents.policies import ExportedPolicy
 from agents.run_folder import DivergedError, learned
@@ -234,6 +236,23 @@ def test_demonstrations_are_generated_once_and_linked(small_file: Path, tmp_path
     assert not (tmp_path / "clone-0" / "demonstrations" / "manifest.json").samefile(
         tmp_path / "clone-1" / "demonstrations" / "manifest.json"
     )
+
+
+def test_two_runs_may_link_the_same_demonstrations_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, target = tmp_path / "source", tmp_path / "target"
+    source.mkdir()
+    (source / "manifest.json").write_text("{}")
+    copy = shutil.copytree
+
+    def copy_as_another_does(here: Path, there: Path, **options: Any) -> None:
+        copy(here, there, **options)
+        copy(here, target)
+
+    monkeypatch.setattr("agents.experiments.shared_demonstrations.shutil.copytree", copy_as_another_does)
+    _link(source, target)
+    assert {path.name for path in tmp_path.iterdir()} == {"source", "target"}
 
 
 def test_threads_count_in_the_number_of_processes(
