@@ -73,6 +73,12 @@ class Suite(Model):
                 yield Problem(("conditions",), name, f"must be one of {', '.join(CONDITIONS)}")
             elif self.conditions.count(name) > 1:
                 yield Problem(("conditions",), name, "must stand there once")
+        first: dict[str, str] = {}
+        for task in self.tasks:
+            other = first.setdefault(Path(task).stem, task)
+            if other != task:
+                sentence = f"has the folders and policies of {other}, the same name: rename its file"
+                yield Problem(("tasks", task), task, sentence)
         for name in self.agents:
             if name in (*CONTROLLERS, ZOO):
                 yield Problem(("agents",), name, "is the name of a controller: choose another")

@@ -77,6 +77,7 @@ def test_a_scene_that_has_changed_is_refused(content):
         ({"conditions": ["training", "training"]}, "must stand there once"),
         ({"agents": {"gains": TINY}}, "is the name of a controller"),
         ({"tasks": {"paper": "xyz"}}, "tasks.paper = 'xyz'"),
+        ({"tasks": {"paper": "0" * 16, "mine/paper.yaml": "0" * 16}}, "folders and policies of paper, the"),
         ({"color": "red"}, "color"),
     ],
 )
