@@ -344,6 +344,8 @@ def import_(
             click.get_current_context(),
         )
     context = click.get_current_context()
+    if lock_branches and lock:
+        raise click.UsageError("--lock-branches holds all joints beside the arm: leave --lock out", context)
     if wheels != "ideal" and context.get_parameter_source("base_torque") is ParameterSource.COMMANDLINE:
         raise click.UsageError(
             f"--base-torque limits ideal wheels, and those of --wheels {wheels} are in size for the base: "

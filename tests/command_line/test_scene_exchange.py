@@ -251,6 +251,7 @@ def test_import_spoils_no_file(here: Path, capsys: pytest.CaptureFixture[str]) -
         (["import", ARM, "--tip", "hnd"], "--tip: 'hnd' is not a link of 'small arm'; did you mean 'hand'"),
         (HAND, "give the spacecraft .*, --spacecraft-mass and --spacecraft-inertia$"),
         ([*HAND, "--spacecraft-mass", "80"], "--spacecraft-inertia need each other"),
+        ([*HAND, "--lock-branches", "--lock", "finger"], "leave --lock out"),
         ([*HAND, *CARRIED, "--passive", "j"], "--passive: 'j' is not .* shoulder, elbow"),
         ([*HAND, "--mount", "0", "0", "1"], "--mount places the arm on a spacecraft: give --spacecraft-mass"),
         (
