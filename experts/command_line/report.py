@@ -8,7 +8,7 @@ import click
 
 from dq_space_arm_env.command_line.names import SCENE
 from dq_space_arm_env.command_line.verb import json_option, keeping, print_document
-from dq_space_arm_env.common.console import FAILURE, SUCCESS, message_console
+from dq_space_arm_env.common.console import FAILURE, SUCCESS, table_console
 from dq_space_arm_env.common.files import check_writable
 
 
@@ -38,7 +38,6 @@ def report(scene: str, quick: bool, out: Path | None, as_json: bool) -> int:
     when the command is repeated. Exit status 1: a part could not be measured.
     """
     from dq_space_arm_env import load_scene
-    from dq_space_arm_env.common.console import table_console
     from experts.report.reproduction import results_folder
     from experts.report.scene_report import report as measure
 
@@ -46,7 +45,7 @@ def report(scene: str, quick: bool, out: Path | None, as_json: bool) -> int:
     folder = out or results_folder(scene, "reports")
     check_writable(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    console = message_console() if as_json else table_console()
+    console = table_console(stderr=as_json)
     with keeping(f"the finished parts are in {folder}; repeat the command to resume"):
         page = measure(loaded, folder, console, quick=quick)
     if page.shortcomings:

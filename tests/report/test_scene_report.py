@@ -284,4 +284,7 @@ def test_a_part_that_refuses_the_scene_says_so(
     assert "expert: NOT measured: " in said
     assert "measured in" not in said
     assert "Exit status 1: expert is not measured: " in said
+    monkeypatch.delenv("COLUMNS", raising=False)
+    assert main(["report", str(file), "--quick", "--out", str(tmp_path), "--json"]) == 1
+    assert 80 < max(map(len, capsys.readouterr().err.splitlines())) <= 110  # as tables of other verbs
     assert main(["report", "paper", "--out", "/dev/null/report"]) == 2
