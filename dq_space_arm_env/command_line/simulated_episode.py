@@ -67,7 +67,11 @@ def begin(scene: Scene, seed: int | None = None, given: str | NDArray[np.float64
         title = f"drawn with seed {seed}"
     else:
         state = read_state(given, env.kernels.n_x) if isinstance(given, str) else given
-        env.reset(options={"initial_state": state})
+        try:
+            env.reset(options={"initial_state": state})
+        except ValueError as error:
+            where = "--start" if isinstance(given, str) else "the start"
+            raise ValueError(str(error).replace("options: initial_state", where)) from error
         title = "given"
     state, parameters = (np.asarray(each, dtype=np.float64) for each in (env.state, env.parameters))
     return Start(state, scene, parameters, title)

@@ -139,6 +139,7 @@ def test_every_verb_helps_with_examples_that_it_understands(path: tuple[str, ...
         (["simulate", "planar", "--seed", "1", "--start", "0,0"], "--seed and --start exclude each other"),
         (["simulate", "planar", "--seed", "-1"], "-1 is not in the range x>=0"),
         ([*FLIGHT, "--start", "1,2,3"], "--start: has shape (3,), should be the scene's (13,)"),
+        ([*FLIGHT, "--start", ",".join(13 * "0")], "--start has a base pose with |q_r| = 0"),
         ([*FLIGHT, "--start", "one"], "should be 13 numbers separated by commas"),
         ([*FLIGHT, "--noise", "-1"], "--noise is -1.0"),
         (["demonstrations", "generate", "--shard", "3/2"], "use I/K"),
