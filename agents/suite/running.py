@@ -185,6 +185,8 @@ def run_suite(
         if name not in fitting and name != ZOO:
             why = "there is no such file" if TASK in path else "fits no task"
             raise SuiteError(f"{path}: {why}, whichever the task")
+    if not (controllers or agents or fitting):
+        raise SuiteError(f"{ZOO}: no policy that ships was trained in {', '.join(scenes)}: nobody can fly")
     plans = {(agent, task): chosen.training(agent, task) for agent in agents for task in scenes}
     notes = [*_missing(files, scenes)]
     trained = _train(

@@ -190,7 +190,7 @@ def _together(run: SuiteRun, picture: bool) -> Section:
         "Flights within a cost gap reach the target, violate nothing, and cost at most so much more than the "
         "expert's optimum from the same start. Times are medians over tasks, of training their mean."
     )
-    if picture:
+    if picture and run.scores:
         section.add_figure("profiles", "Performance profiles: means over tasks", lambda: _draw_profiles(run))
         caption = "Cost gap over the time of an action; a marker for each task"
         section.add_figure("times", caption, lambda: _draw_times(run))

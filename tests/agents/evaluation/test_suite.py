@@ -98,6 +98,8 @@ def test_unknown_names_are_refused(content):
         run_suite(["magic"], suite)
     with pytest.raises(SuiteError, match="there is no such file"):
         run_suite(["nowhere/{task}.npz"], suite)
+    with pytest.raises(SuiteError, match="zoo: no policy that ships was trained in"):
+        run_suite(["zoo"], suite)
     for entrants, policies in (
         (["a=x.npz", "a=y.npz"], {}),
         (["one/b.yaml", "two/b.yaml"], {}),
@@ -275,6 +277,12 @@ def test_tasks_of_a_suite_may_be_files(content, tmp_path, monkeypatch):
         CliRunner().invoke(
             suite_verb, ["gains", "--task", task, "--out", str(tmp_path)], catch_exceptions=False
         )
+
+
+def test_a_suite_whose_trainings_all_failed_has_a_page(content, tmp_path):
+    page = suite_page(SuiteRun(Suite.model_validate(content), (), {"a": ""}, ("The training failed.",)))
+    assert page.save(tmp_path) == ["report.html", "report.md", "report.json"]
+    assert page.shortcomings == ["The training failed."]
 
 
 @pytest.mark.slow
