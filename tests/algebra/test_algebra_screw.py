@@ -90,11 +90,11 @@ class TestExponentialAndLogarithm:
         for twist in generator.normal(size=(20, 6)):
             placement = pinocchio.exp6(pinocchio.Motion(twist[3:], twist[:3]))
             matrix, position = poses.to_matrix(screw.exponential(twist))
-            np.testing.assert_allclose(matrix, placement.rotation, atol=1e-14)
-            np.testing.assert_allclose(position, placement.translation, atol=1e-14)
+            np.testing.assert_allclose(matrix, placement.rotation, rtol=0, atol=1e-14)
+            np.testing.assert_allclose(position, placement.translation, rtol=0, atol=1e-14)
             order = [3, 4, 5, 0, 1, 2]
             expected = pinocchio.Jexp6(pinocchio.Motion(twist[3:], twist[:3]))[np.ix_(order, order)]
-            np.testing.assert_allclose(screw.exponential_right_jacobian(twist), expected, atol=1e-13)
+            np.testing.assert_allclose(screw.exponential_right_jacobian(twist), expected, rtol=0, atol=1e-13)
 
 
 class TestInterpolation:
@@ -105,7 +105,7 @@ class TestInterpolation:
         whole = screw.logarithm(poses.error_pose(start, end))
         between = screw.interpolate(start, end, fraction)
         part = screw.logarithm(poses.error_pose(start, between))
-        np.testing.assert_allclose(part, dual_vectors.scale(fraction, whole), atol=1e-11)
+        np.testing.assert_allclose(part, dual_vectors.scale(fraction, whole), rtol=0, atol=1e-11)
         assert_same_pose(screw.interpolate(start, dual_quaternion.scale(-1.0, end), fraction), between)
 
     @REPRODUCIBLE
@@ -124,8 +124,8 @@ class TestInterpolation:
         q = screw.exponential(twist)
         root = screw.power(q, 1.0 / 3.0)
         cube = dual_quaternion.multiply(root, dual_quaternion.multiply(root, root))
-        np.testing.assert_allclose(cube, q, atol=1e-13)
-        np.testing.assert_allclose(screw.power(q, -1.0), dual_quaternion.conjugate(q), atol=1e-13)
+        np.testing.assert_allclose(cube, q, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(screw.power(q, -1.0), dual_quaternion.conjugate(q), rtol=0, atol=1e-13)
 
 
 class TestDerivativesUnderCasadi:
@@ -179,9 +179,9 @@ class TestDerivativesUnderCasadi:
             return screw.logarithm(dual_quaternion.multiply(dual_quaternion.conjugate(pose), moved))
 
         expected = np.array(screw.exponential_right_jacobian(tuple(twist)))
-        np.testing.assert_allclose(self.jacobian_of(difference, 6)(np.zeros(6)), expected, atol=1e-14)
+        np.testing.assert_allclose(self.jacobian_of(difference, 6)(np.zeros(6)), expected, rtol=0, atol=1e-14)
         jacobian = self.jacobian_of(after, 6)(np.zeros(6))
-        np.testing.assert_allclose(jacobian, np.linalg.inv(expected), atol=1e-13)
+        np.testing.assert_allclose(jacobian, np.linalg.inv(expected), rtol=0, atol=1e-13)
 
     @pytest.mark.parametrize("function", [poses.error_angle, poses.error_distance, screw.logarithm])
     def test_finite_without_error(self, function):
@@ -217,4 +217,6 @@ class TestDerivativesUnderCasadi:
             point = np.array([0.6 * angle, 0.0, 0.8 * angle, 1.0, 2.0, 3.0])
             shift = step * np.eye(6)[unit]
             difference = (gradient(point + shift) - gradient(point - shift)) / (2.0 * step)
-            np.testing.assert_allclose(hessian(point).full()[:, unit], difference.full()[:, 0], atol=1e-8)
+            np.testing.assert_allclose(
+                hessian(point).full()[:, unit], difference.full()[:, 0], rtol=0, atol=1e-8
+            )

@@ -66,7 +66,7 @@ def test_the_forces_that_the_accelerations_need_are_those_that_act(name: str, fo
     actual = np.array([*needed.force, *needed.torque, *needed.joints])
     if tree.planar:  # what holds the base in its plane
         actual[2:5] = 0.0
-    np.testing.assert_allclose(actual, expected, atol=1e-11)
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-11)
 
 
 def test_a_wrench_at_the_tip_replaces_the_scenes() -> None:
@@ -118,7 +118,7 @@ def test_derivatives_are_those_of_the_rates(name: str) -> None:
     found = [casadi.vertcat(*given), casadi.horzcat(by_y, by_u)]
     found.append(field.rates_hessian(*arguments, weights))
     for actual, wanted in zip(values(found, z, y + u), expected, strict=True):
-        np.testing.assert_allclose(actual, wanted, atol=1e-10 * max(1.0, np.abs(wanted).max()))
+        np.testing.assert_allclose(actual, wanted, rtol=0, atol=1e-10 * max(1.0, np.abs(wanted).max()))
 
 
 @pytest.mark.parametrize("name", ["planar", "tip-load"])
@@ -141,12 +141,12 @@ def test_momentum_changes_by_the_external_wrench_alone(name: str) -> None:
     found = values([*changes, *wanted], z, y)
     free = [0, 1] if field.tree.planar else [0, 1, 2]
     turning = [2] if field.tree.planar else [0, 1, 2]
-    np.testing.assert_allclose(found[0][free], found[2][free], atol=1e-10)
-    np.testing.assert_allclose(found[1][turning], found[3][turning], atol=1e-10)
+    np.testing.assert_allclose(found[0][free], found[2][free], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(found[1][turning], found[3][turning], rtol=0, atol=1e-10)
     twist = casadi.vertcat(*balance.base_twist(entries, linear_momentum, angular))
     motion = field.motion(y)
     (given_twist,) = values([twist], z, y)
-    np.testing.assert_allclose(given_twist.ravel(), [*motion.angular, *motion.linear], atol=1e-11)
+    np.testing.assert_allclose(given_twist.ravel(), [*motion.angular, *motion.linear], rtol=0, atol=1e-11)
     assert balance.mass == pytest.approx(sum(b.mass for b in bodies(field.tree)))
 
 
@@ -175,11 +175,13 @@ def test_a_pose_moves_by_the_exponential_and_stays_a_unit(name: str) -> None:
     increment[list(coordinates.directions)] = rng.normal(size=len(coordinates.directions))
     pose = field.layout.initial_state[field.layout.state.pose].tolist()
     expected = dq.multiply(coordinates.full(pose), screw.exponential(increment.tolist()))
-    np.testing.assert_allclose(coordinates.moved(pose, increment), coordinates.reduced(expected), atol=1e-14)
+    np.testing.assert_allclose(
+        coordinates.moved(pose, increment), coordinates.reduced(expected), rtol=0, atol=1e-14
+    )
     off = coordinates.moved([entry * (1.0 + 1e-7) for entry in pose], increment)
-    np.testing.assert_allclose(off, coordinates.reduced(expected), atol=1e-6)
+    np.testing.assert_allclose(off, coordinates.reduced(expected), rtol=0, atol=1e-6)
     unit = dq.multiply(dq.conjugate(coordinates.full(off)), coordinates.full(off))
-    np.testing.assert_allclose(unit, [1.0, *[0.0] * 7], atol=1e-13)
+    np.testing.assert_allclose(unit, [1.0, *[0.0] * 7], rtol=0, atol=1e-13)
 
 
 def test_a_wrench_on_a_base_alone() -> None:

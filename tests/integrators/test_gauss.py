@@ -19,8 +19,8 @@ def test_coefficients_are_those_of_collocation_at_gauss_points():
     for k in range(1, GAUSS_6.order + 1):
         assert b @ c ** (k - 1) == pytest.approx(1.0 / k, abs=1e-16)
     for k in range(1, GAUSS_6.stages + 1):
-        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, atol=1e-16)
-        np.testing.assert_allclose((b * c ** (k - 1)) @ a, b * (1.0 - c**k) / k, atol=1e-16)
+        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, rtol=0, atol=1e-16)
+        np.testing.assert_allclose((b * c ** (k - 1)) @ a, b * (1.0 - c**k) / k, rtol=0, atol=1e-16)
 
 
 @pytest.mark.sampled
@@ -188,7 +188,7 @@ def test_angles_of_many_turns_cost_no_digits():
     near[where.joint_angles] = turns.astype(np.float64)
     ends = [kernels.step(start, u, STEP, NAME) for start in (near, far)]
     rates = [end[where.joint_rates] for end in ends]
-    np.testing.assert_allclose(*rates, atol=1e-14)
+    np.testing.assert_allclose(*rates, rtol=0, atol=1e-14)
 
 
 def test_a_free_body_turns_by_the_exact_momentum():
