@@ -90,17 +90,27 @@ class Effort:
             except YAMLError as error:
                 raise ValueError(f"setting {name}: {text!r} is not a YAML value") from error
             old = known[name]
-            if isinstance(old, tuple):
-                items = value if isinstance(value, list) else [value]
-                if isinstance(old, Sampling) and len(items) != len(old):
-                    raise ValueError(f"setting {name}: {value!r} must be {len(old)} numbers")
-                value = Sampling(*items) if isinstance(old, Sampling) else tuple(items)
-            if not isinstance(value, type(old)) and not (isinstance(old, float) and isinstance(value, int)):
-                raise ValueError(f"setting {name}: {value!r} must be of type {type(old).__name__}")
-            if isinstance(value, int | float) and not 0 <= value < math.inf:
-                raise ValueError(f"setting {name}: {value}, must be finite and not negative")
-            changes[name] = value
+            if not isinstance(old, tuple):
+                changes[name] = _checked(name, value, old)
+                continue
+            items = value if isinstance(value, list) else [value]
+            if isinstance(old, Sampling) and len(items) != len(old):
+                raise ValueError(f"setting {name}: {value!r} must be {len(old)} numbers")
+            # A list has entries of one kind: names where the default is empty.
+            likes = old if isinstance(old, Sampling) else (*getattr(Effort, name), "")[:1] * len(items)
+            entries = [_checked(name, each, like) for each, like in zip(items, likes, strict=True)]
+            changes[name] = Sampling(*entries) if isinstance(old, Sampling) else tuple(entries)
         return replace(self, **changes)
+
+
+def _checked(name: str, value: Any, like: Any) -> Any:
+    """A value of the type of another, if it is a possible one."""
+    kinds = (int, float) if isinstance(like, float) else (type(like),)
+    if type(value) not in kinds:
+        raise ValueError(f"setting {name}: {value!r} must be of type {type(like).__name__}")
+    if isinstance(value, int | float) and not 0 <= value < math.inf:
+        raise ValueError(f"setting {name}: {value}, must be finite and not negative")
+    return value
 
 
 STANDARD = Effort()

@@ -89,6 +89,7 @@ def test_settings_override_the_effort() -> None:
     assert (changed.starts, changed.only, changed.scenes) == (3, ("masses", "poses"), ("payload",))
     assert (changed.duration, changed.peers, changed.name) == (2, False, "standard")
     assert STANDARD.changed(("kernel_timing=[3, 0.1]",)).kernel_timing == Sampling(3, 0.1)
+    assert QUICK.changed(("maneuvers=payload", "tolerances=[1, 1e-3]")).tolerances == (1, 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +102,12 @@ def test_settings_override_the_effort() -> None:
         "duration=-1.0",
         "duration=.nan",
         "kernel_timing=[1]",
+        "kernel_timing=[many, 0.1]",
         "peers=3",
+        "starts=true",
+        "batch_sizes=[8, many]",
+        "mass_ratios=[-1.0]",
+        "scenes=[3]",
         "only=[",
     ],
 )
