@@ -127,7 +127,7 @@ class TestEulerAngles:
         for rotation in transform.Rotation.random(50, random_state=2):
             q = np.roll(rotation.as_quat(), 1)
             np.testing.assert_allclose(
-                rotations.to_euler_321(q), rotation.as_euler("ZYX"), rtol=0, atol=1e-13
+                rotations.to_euler_321(q), rotation.as_euler("ZYX"), rtol=0, atol=4e-15
             )
 
 
@@ -195,7 +195,7 @@ class TestPoseError:
     def test_31(self, actual, desired):
         """q_{D/G} = q_{G/I}* q_{D/I}; its angle is 2 acos |q_r0|, its position is 2 q_d q_r*."""
         error = poses.error_pose(actual, desired)
-        np.testing.assert_allclose(dual_quaternion.multiply(actual, error), desired, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(dual_quaternion.multiply(actual, error), desired, rtol=0, atol=2e-14)
         in_reference_axes = np.subtract(poses.position(desired), poses.position(actual))
         in_body_axes = rotations.rotate(quaternion.conjugate(actual[:4]), in_reference_axes)
         np.testing.assert_allclose(poses.position(error), in_body_axes, rtol=0, atol=1e-13)

@@ -165,16 +165,16 @@ def test_accelerations_agree_with_pinocchio(joints):
         expected = pinocchio_accelerations(scene, y, u)
         for formulation in ("articulated_body", "minimal_coordinates"):
             found = EquationsOfMotion(tree, layout, (), formulation).accelerations(y.tolist(), u.tolist())
-            assert relative_error(found, expected) < 1e-12
+            assert relative_error(found, expected) < 5e-14
         if not any(tree.base.center_of_mass):  # nothing is fixed to the base
-            assert relative_error(papers_accelerations(scene, y, u), expected) < 1e-12
+            assert relative_error(papers_accelerations(scene, y, u), expected) < 5e-14
         equations = EquationsOfMotion(tree, layout)
         motion = equations.motion(y.tolist())
         driven = equations._driven(motion, equations.inputs(u.tolist()), None)
         for root in [0, *(i for i, link in enumerate(tree.links, 1) if link.spherical in (None, 2))]:
             inertia = ArticulatedBodies(tree, driven[0], root)
             solved = minimal_accelerations(tree, inertia, driven, motion)
-            assert relative_error(solved, expected) < 1e-12
+            assert relative_error(solved, expected) < 3e-14
 
 
 def papers_accelerations(scene, y, u):
@@ -217,7 +217,7 @@ def test_accelerations_agree_with_mujoco(joints):
         mujoco.mj_forward(model, data)
         turning = np.cross(motion.angular, motion.linear)
         expected = np.array([*data.qacc[3:6], *(data.qacc[:3] - turning), *data.qacc[order]])
-        assert relative_error(equations.accelerations(y.tolist(), u.tolist()), expected) < 1e-12
+        assert relative_error(equations.accelerations(y.tolist(), u.tolist()), expected) < 5e-14
 
 
 def mujoco_twin(scene):
@@ -244,7 +244,7 @@ def test_derivatives_of_both_orders_are_exact():
             np.array(each) for each in evaluate(*(rng.normal(size=each.shape[0]) for each in (y, u, m)))
         ]
         for actual_value, expected_value in zip(values[:3], values[3:], strict=True):
-            assert relative_error(actual_value, expected_value) < 1e-12
+            assert relative_error(actual_value, expected_value) < 1e-14
 
 
 def test_a_free_body_on_a_spherical_joint_at_its_center_of_mass_obeys_euler():
@@ -259,7 +259,7 @@ def test_a_free_body_on_a_spherical_joint_at_its_center_of_mass_obeys_euler():
     carried, inertia = rotation @ motion.angular, np.array(scene.links[0].inertia)
     omega = carried + rates
     alpha = rotation @ accelerations[:3] + np.cross(carried, rates) + accelerations[6:]
-    np.testing.assert_allclose(inertia @ alpha, -np.cross(omega, inertia @ omega), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(inertia @ alpha, -np.cross(omega, inertia @ omega), rtol=0, atol=1e-14)
 
 
 def test_a_fixed_link_keeps_its_frame_and_its_mass():
@@ -276,7 +276,7 @@ def test_a_fixed_link_keeps_its_frame_and_its_mass():
     for link, parent, frame in zip(scene.links, scene.parent_bodies, frames[1:], strict=False):
         if link.is_fixed:
             expected = dq.multiply(frames[parent], link.joint.dual_quaternion)
-            np.testing.assert_allclose(frame, expected, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(frame, expected, rtol=0, atol=1e-14)
 
 
 def test_fixed_links_are_written_as_urdf_and_read_as_parts_of_what_carries_them():
@@ -286,7 +286,7 @@ def test_fixed_links_are_written_as_urdf_and_read_as_parts_of_what_carries_them(
     assert text.count('type="fixed"') == 2  # the tip's besides
     trees = [KinematicTree.from_scene(each) for each in (scene, scene_from_urdf(text, tip="tip"))]
     matrices = [mass_matrix(tree, minimal.link_frames(tree, [0.3, -0.7])) for tree in trees]
-    np.testing.assert_allclose(*matrices, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(*matrices, rtol=1e-14, atol=1e-14)
 
 
 def test_what_spherical_and_fixed_joints_do_not_have_is_refused():

@@ -58,7 +58,7 @@ def test_a_payload_and_its_link_add_up() -> None:
     for point in np.eye(3):
         parts = [about(body, point) for body in (bare.links[-1].body, Moved)]
         for found, *expected in zip(about(held.links[-1].body, point), *parts, strict=True):
-            np.testing.assert_allclose(found, sum(expected), rtol=0, atol=1e-12)
+            np.testing.assert_allclose(found, sum(expected), rtol=0, atol=3e-13)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -73,14 +73,14 @@ def test_both_states_describe_the_same_motion(name: str) -> None:
     u = rng.normal(size=minimal.n_u).tolist()
     y = field.state_from_minimal(x.tolist())
     assert len(y) == field.n_y
-    np.testing.assert_allclose(field.minimal_from_state(y), x, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(field.minimal_from_state(y), x, rtol=0, atol=2e-15)
 
     rates = field.rates(y, u)
     assert len(rates) == field.n_y
     bodies = slice(field.rate_indices[0], field.rate_indices[-1] + 1)
     _, rest = split_state(minimal, x.tolist())
     expected = minimal.accelerations(rest, u)
-    np.testing.assert_allclose(field.free_accelerations(y, rates[bodies]), expected, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(field.free_accelerations(y, rates[bodies]), expected, rtol=0, atol=1e-13)
     assert [y[i] for i in field.base_twist] == list(minimal.motion(rest).angular) + list(
         minimal.motion(rest).linear
     )
@@ -99,9 +99,9 @@ def test_both_states_describe_the_same_motion(name: str) -> None:
     ]
     along = casadi.Function("along", [z], [tip, casadi.jtimes(tip, z, casadi.DM(moving))])
     at, rate = along([*pose, *motion.joint_angles, *motion.wrist_angles])
-    np.testing.assert_allclose(y[field.tip], np.array(at).ravel(), rtol=0, atol=1e-13)
-    np.testing.assert_allclose(rates[field.tip], np.array(rate).ravel(), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(rates[: 8 + count + wrist], moving, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(y[field.tip], np.array(at).ravel(), rtol=0, atol=2e-15)
+    np.testing.assert_allclose(rates[field.tip], np.array(rate).ravel(), rtol=0, atol=7e-15)
+    np.testing.assert_allclose(rates[: 8 + count + wrist], moving, rtol=0, atol=2e-15)
 
 
 @pytest.mark.slow
@@ -117,14 +117,14 @@ def test_the_papers_form_has_rotors_and_refuses_what_it_has_no_rows_for() -> Non
     rates = field.rates(y, u.tolist())
     bodies = slice(field.rate_indices[0], field.rate_indices[-1] + 1)
     expected = minimal.accelerations(split_state(minimal, x.tolist())[1], u.tolist())
-    np.testing.assert_allclose(field.free_accelerations(y, rates[bodies]), expected, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(field.free_accelerations(y, rates[bodies]), expected, rtol=0, atol=6e-14)
     symbols, inputs = casadi.SX.sym("y", field.n_y), casadi.SX.sym("u", field.n_u)
     found = field.linearized_rates(casadi.vertsplit(symbols), casadi.vertsplit(inputs))
     expected = casadi.vertcat(*field.rates(casadi.vertsplit(symbols), casadi.vertsplit(inputs)))
     jacobians = [*found[1:], casadi.jacobian(expected, symbols), casadi.jacobian(expected, inputs)]
     values = casadi.Function("values", [symbols, inputs], jacobians)(casadi.DM(list(y)), u)
     for own, other in zip(values[:2], values[2:], strict=True):
-        np.testing.assert_allclose(np.array(own), np.array(other), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(np.array(own), np.array(other), rtol=0, atol=7e-14)
     for name in ("elastic-joints", "motors"):
         with pytest.raises(ValueError, match=f"and scene {name!r} has some"):
             PaperPrograms(load_scene(name))

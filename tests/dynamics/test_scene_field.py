@@ -66,7 +66,7 @@ def test_the_forces_that_the_accelerations_need_are_those_that_act(name: str, fo
     actual = np.array([*needed.force, *needed.torque, *needed.joints])
     if tree.planar:  # what holds the base in its plane
         actual[2:5] = 0.0
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=2e-12)
 
 
 def test_a_wrench_at_the_tip_replaces_the_scenes() -> None:
@@ -118,7 +118,7 @@ def test_derivatives_are_those_of_the_rates(name: str) -> None:
     found = [casadi.vertcat(*given), casadi.horzcat(by_y, by_u)]
     found.append(field.rates_hessian(*arguments, weights))
     for actual, wanted in zip(values(found, z, y + u), expected, strict=True):
-        np.testing.assert_allclose(actual, wanted, rtol=0, atol=1e-10 * max(1.0, np.abs(wanted).max()))
+        np.testing.assert_allclose(actual, wanted, rtol=0, atol=8e-15 * max(1.0, np.abs(wanted).max()))
 
 
 @pytest.mark.parametrize("name", ["planar", "tip-load"])
@@ -141,12 +141,12 @@ def test_momentum_changes_by_the_external_wrench_alone(name: str) -> None:
     found = values([*changes, *wanted], z, y)
     free = [0, 1] if field.tree.planar else [0, 1, 2]
     turning = [2] if field.tree.planar else [0, 1, 2]
-    np.testing.assert_allclose(found[0][free], found[2][free], rtol=0, atol=1e-10)
-    np.testing.assert_allclose(found[1][turning], found[3][turning], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(found[0][free], found[2][free], rtol=0, atol=5e-14)
+    np.testing.assert_allclose(found[1][turning], found[3][turning], rtol=0, atol=2e-13)
     twist = casadi.vertcat(*balance.base_twist(entries, linear_momentum, angular))
     motion = field.motion(y)
     (given_twist,) = values([twist], z, y)
-    np.testing.assert_allclose(given_twist.ravel(), [*motion.angular, *motion.linear], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(given_twist.ravel(), [*motion.angular, *motion.linear], rtol=0, atol=5e-15)
     assert balance.mass == pytest.approx(sum(b.mass for b in bodies(field.tree)))
 
 
@@ -161,9 +161,9 @@ def test_factorizations_solve(n: int) -> None:
     definite, right = root @ root.T + np.eye(n), rng.normal(size=n)
     scaled = np.eye(n) + definite @ np.diag(rng.uniform(0.0, 2.0, n))
     by_ldl = linear.solve_ldl(linear.factorize_ldl(definite.tolist()), right.tolist())
-    np.testing.assert_allclose(by_ldl, np.linalg.solve(definite, right), rtol=1e-9)
+    np.testing.assert_allclose(by_ldl, np.linalg.solve(definite, right), rtol=3e-15)
     by_lu = linear.solve_lu(linear.factorize_lu(scaled.tolist()), right.tolist())
-    np.testing.assert_allclose(by_lu, np.linalg.solve(scaled, right), rtol=1e-9)
+    np.testing.assert_allclose(by_lu, np.linalg.solve(scaled, right), rtol=2e-15)
 
 
 @pytest.mark.parametrize("name", ["paper", "planar"])
@@ -197,4 +197,6 @@ def test_a_wrench_on_a_base_alone() -> None:
     scene = load_scene("paper").replace(**bare, actuators=actuators, tip_wrench=wrench)
     field = field_of(scene)
     found = field.accelerations([*field.layout.initial_state], [0.0] * 6)
-    np.testing.assert_allclose(found, np.array([0, 0, 0, 3, 0, -6]) / [1, 1, 1, *[scene.base.mass] * 3])
+    np.testing.assert_allclose(
+        found, np.array([0, 0, 0, 3, 0, -6]) / [1, 1, 1, *[scene.base.mass] * 3], rtol=1e-14
+    )

@@ -93,7 +93,7 @@ def test_a_motion_of_basilisk_is_reproduced() -> None:
             x = kernels.step(x, np.array([*force, *torque, *joints, *torques]), dt=0.0015)
     expected = basilisk_state(kernels, AFTER)
     expected[:8] *= np.sign(expected[:4] @ x[:4])
-    np.testing.assert_allclose(x, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(x, expected, rtol=0, atol=6e-14)
 
 
 def test_accelerations_are_those_of_wheels_as_bodies_of_their_own() -> None:
@@ -128,10 +128,10 @@ def test_accelerations_are_those_of_wheels_as_bodies_of_their_own() -> None:
         force, torque, joints, motors = np.split(u, [3, 6, 9])
         acceleration = pin.aba(model, model.createData(), q, v, np.array([*force, *torque, *joints, *motors]))
         expected = np.array([*acceleration[3:6], *acceleration[:3], *acceleration[6:9]])
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
         # h' = u
         change = acceleration[9:] + [np.dot(w.axis, acceleration[3:6]) for w in wheels]
-        np.testing.assert_allclose(MOMENTS * change, motors, rtol=0, atol=1e-11 * np.abs(expected).max())
+        np.testing.assert_allclose(MOMENTS * change, motors, rtol=0, atol=1e-15 * np.abs(expected).max())
 
 
 def test_motors_change_the_energy_by_their_power_and_no_total_momentum() -> None:
@@ -151,7 +151,7 @@ def test_motors_change_the_energy_by_their_power_and_no_total_momentum() -> None
                 powers.append(u[1:] @ speeds)
             work += 0.001 * (powers[0] + 4.0 * powers[1] + powers[2]) / 6.0
             x = ahead[-1]
-    np.testing.assert_allclose(kernels.momentum(x), momentum, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(kernels.momentum(x), momentum, rtol=0, atol=7e-14)
     assert abs(kernels.energy(x) - energy - work) < 1e-9 * energy
     assert abs(kernels.energy(x) - energy) > 0.1
 
@@ -165,11 +165,11 @@ def test_momentum_methods_keep_the_total_momentum(integrator: str) -> None:
     states = kernels.simulate(x, u, 2000, integrator=integrator, every=20)
     momentum = kernels.momentum(states)
     assert np.abs(states[-1] - x)[kernels.layout.state.wheel_momenta].min() > 0.01
-    assert np.abs(momentum - momentum[0]).max() < 1e-13
+    assert np.abs(momentum - momentum[0]).max() < 2e-14
     by_rk4 = kernels.momentum(kernels.simulate(x, u, 2000, integrator="rk4", every=20))
     assert np.abs(by_rk4 - by_rk4[0]).max() > 1e-12
     np.testing.assert_allclose(
-        states[-1], kernels.simulate(x, u, 2000, integrator="rk4", every=20)[-1], rtol=0, atol=1e-6
+        states[-1], kernels.simulate(x, u, 2000, integrator="rk4", every=20)[-1], rtol=0, atol=2e-11
     )
 
 

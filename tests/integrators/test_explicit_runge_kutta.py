@@ -123,7 +123,7 @@ def test_a_body_spun_about_its_middle_axis_flips_after_half_an_analytic_period()
     assert len(before) == 4
     share = values[before] / (values[before] - values[before + 1])
     crossings = times[before] + share * np.diff(times)[before]
-    np.testing.assert_allclose(np.diff(crossings), flip, rtol=1e-7)
+    np.testing.assert_allclose(np.diff(crossings), flip, rtol=1e-10)
 
 
 @pytest.mark.sampled

@@ -120,4 +120,4 @@ def test_derivatives_of_a_step_are_its_complex_steps(name: str, programs: SceneP
     inputs = [u] * layout.n_t + [u + 1j * TINY * row for row in np.eye(layout.n_u)]
     ends = stepped(programs, name, np.array(states).T, np.array(inputs).T, h, np.complex128)
     columns = np.array([tangent(end) for end in ends.T]).T
-    np.testing.assert_allclose(np.hstack([a, b]), columns, rtol=0, atol=1e-12 * np.abs(columns).max())
+    np.testing.assert_allclose(np.hstack([a, b]), columns, rtol=0, atol=1e-13 * np.abs(columns).max())

@@ -53,7 +53,7 @@ def center_of_mass(kernels, states):
 def test_internal_torques_keep_the_momentum_to_rounding(name, scene):
     kernels = compile_scene(scene)
     torques = internal_torques(kernels, 2000)
-    assert drift(kernels, slow_walk(kernels, torques, 2000, name, 10)) < 1e-13
+    assert drift(kernels, slow_walk(kernels, torques, 2000, name, 10)) < 4e-14
     # Explicit Runge-Kutta on the base's velocity is only accurate: this is no test of an arm at rest.
     by_rk4 = drift(kernels, slow_walk(kernels, torques, 2000, "rk4", 10))
     assert by_rk4 > 1e-10
@@ -113,7 +113,7 @@ def test_the_center_of_mass_moves_on_a_straight_line(name):
     times = np.arange(len(states)) * 20 * dt
     path = center_of_mass(kernels, states)
     expected = path[0] + times[:, None] * kernels.momentum(x)[:3] / mass
-    np.testing.assert_allclose(path, expected, rtol=0, atol=2e-13)
+    np.testing.assert_allclose(path, expected, rtol=0, atol=5e-14)
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -156,7 +156,7 @@ def test_single_precision_follows_double_precision(name):
     states = single.simulate(x, u, 1000, integrator=name, every=100)
     assert states.dtype == np.float32
     np.testing.assert_allclose(
-        states, double.simulate(x, u, 1000, integrator=name, every=100), rtol=0, atol=5e-4
+        states, double.simulate(x, u, 1000, integrator=name, every=100), rtol=0, atol=1e-4
     )
     states = single.simulate(x, np.zeros(double.n_u), 10_000, integrator=name, every=100)
     assert drift(single, states) < 1e-5
@@ -174,7 +174,7 @@ def test_masses_drawn_for_each_episode_reach_the_method(name):
         for _ in range(50):
             env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
         states[method] = env.state.copy()
-    np.testing.assert_allclose(states[name], states["rk4"], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(states[name], states["rk4"], rtol=0, atol=1e-10)
     assert np.abs(states[name] - states["rk4"]).max() > 0.0
 
 
@@ -208,7 +208,7 @@ def test_a_walk_gives_what_single_steps_give():
         expected = x
         for state, control in zip(states[1:], u, strict=True):
             expected = kernels.step(expected, control, integrator=name)
-            np.testing.assert_allclose(state, expected, rtol=1e-11, atol=1e-12)
+            np.testing.assert_allclose(state, expected, rtol=1e-13, atol=1e-14)
     constant = kernels.simulate(x, u[0], 300)
     np.testing.assert_array_equal(constant, kernels.simulate(x, np.tile(u[0], (300, 1)), 300))
 

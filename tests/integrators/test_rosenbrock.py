@@ -40,7 +40,7 @@ def test_tableaus_are_consistent_and_l_stable(name):
     for size in np.logspace(-3, 8, 400):
         assert abs(growth(1j * size)) < 1.0 + 1e-12
         assert abs(growth(-size)) < 1.0 + 1e-12
-    assert abs(growth(-1e12)) < 1e-9
+    assert abs(growth(-1e12)) < 1e-10
     errors = [abs(growth(z) - np.exp(z)) for z in (0.1, 0.2)]
     assert np.log2(errors[1] / errors[0]) > tableau.order + 0.8
 
@@ -209,7 +209,7 @@ def test_elimination_without_pivoting_keeps_the_digits_of_stiff_systems():
         right = system @ exact
         solved = np.array(solve_lu(factorize_lu(system.tolist()), right.tolist()))
         residual = (system @ solved - right) / (np.abs(system) @ np.abs(solved) + np.abs(right))
-        assert np.abs(residual).max() < 1e-13
+        assert np.abs(residual).max() < 3e-15
 
 
 @pytest.mark.parametrize("scene", ["planar", "paper", "tip-load", "six-joint", "reaction-wheels"])
@@ -233,9 +233,9 @@ def test_canonical_momenta_obey_the_given_equations_of_motion(scene):
         np.array(each) for each in casadi.Function("f", [y, u], outputs).call(values)
     )
     np.testing.assert_allclose(carried, right, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(again, right, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(back[:, 0], values[0], rtol=0, atol=1e-13)
-    assert np.abs(error).max() < 1e-11
+    np.testing.assert_allclose(again, right, rtol=0, atol=2e-14)
+    np.testing.assert_allclose(back[:, 0], values[0], rtol=0, atol=2e-14)
+    assert np.abs(error).max() < 1e-14
 
 
 # Finite deflections, beside the method of order 8 in steps that resolve them.
