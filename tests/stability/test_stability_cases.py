@@ -10,7 +10,7 @@ pytest.importorskip("mpmath")
 from scripts.benchmarks.effort import QUICK
 from scripts.benchmarks.harness import Status
 from scripts.benchmarks.stability import all_cases, reached
-from scripts.benchmarks.stability.cases import Case, Handled
+from scripts.benchmarks.stability.cases import Case, Handled, NotClaimed
 
 CASES = [pytest.param(case, id=f"{case.group}: {case.title}") for case in all_cases()]
 
@@ -31,7 +31,10 @@ def test_case(case: Case) -> None:
 
 
 def test_a_case_that_loses_a_digit_fails() -> None:
-    """Ten times the recorded error bounds a case; a workload that no table knows has its claim alone."""
+    """Ten times the recorded error bounds a case; a workload that no table knows has its claim alone.
+
+    What was handled once cannot be declared beyond the claim.
+    """
     case = all_cases(["masses"])[0]
     key = case.group, case.name, case.subject
     limit = reached.largest(QUICK, *key)
@@ -41,6 +44,9 @@ def test_a_case_that_loses_a_digit_fails() -> None:
     for error, status in ((0.9 * limit, Status.HANDLED), (1.1 * limit, Status.FAILED)):
         row = next(replace(case, run=lambda effort, error=error: Handled(error)).rows(QUICK))
         assert row["status"] == status
+    given_up = replace(case, run=lambda effort: NotClaimed("beyond it"))
+    assert next(given_up.rows(QUICK))["status"] == Status.FAILED
+    assert next(given_up.rows(replace(QUICK, samples=5)))["status"] == Status.NOT_CLAIMED
 
 
 def test_each_record_has_its_case() -> None:

@@ -2,7 +2,8 @@
 
 A case is *handled* if its error is a number below its bound and within ten times what it once reached,
 *refused* if the user is told so in a sentence, and *not claimed* beyond a documented limit of the method. All
-else *failed*: a larger error, a number that is not finite, a missing refusal, an unexpected exception.
+else *failed*: a larger error, a number that is not finite, a missing refusal, an unexpected exception, a case
+that was handled once.
 """
 
 from __future__ import annotations
@@ -92,7 +93,10 @@ class Case:
                 status, note = Status.REFUSED, outcome.sentence
             else:
                 status, note, curve = Status.NOT_CLAIMED, outcome.sentence, outcome.curve
-        bound = min(self.bound, reached.largest(effort, self.group, self.name, self.subject))
+        once = reached.largest(effort, self.group, self.name, self.subject)
+        if status == Status.NOT_CLAIMED and math.isfinite(once):
+            status, note = Status.FAILED, f"it was handled once. {note}"
+        bound = min(self.bound, once)
         yield claim(
             self.group,
             self.name,
