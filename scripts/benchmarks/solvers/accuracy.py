@@ -189,7 +189,6 @@ def _crocoddyl(problem: ArmProblem, effort: Effort) -> tuple[list[Contender], li
             f"Crocoddyl {title}",
             partial(solve, method),
             formulation=CROCODDYL,
-            is_slow=True,
             solve_from=partial(solve, method),
         )
         for method, title in methods.items()
