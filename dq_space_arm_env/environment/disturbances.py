@@ -64,6 +64,7 @@ class Disturbances:
         )
         self._probability = pushes / steps
         self._interval = max(steps // int(pushes + 1), 1) if evenly else 0
+        self._last = self._interval * int(pushes)  # the steps after the last of these have none
 
     @property
     def episodes(self) -> int:
@@ -91,7 +92,7 @@ class Disturbances:
             return None
         if not self._interval:
             struck = self._rng.random((self.count, 1)) < self._probability
-        elif self._step % self._interval == self._interval - 1:
+        elif self._step % self._interval == self._interval - 1 and self._step < self._last:
             struck = np.ones((self.count, 1), dtype=np.bool_)
         else:
             return None
