@@ -16,9 +16,8 @@ from dq_space_arm_env.command_line.verb import (
     MultiWordCommand,
     json_option,
     keeping,
-    print_document,
 )
-from dq_space_arm_env.common.console import FAILURE, SUCCESS
+from dq_space_arm_env.common.console import FAILURE, SUCCESS, print_document
 from dq_space_arm_env.common.files import check_writable, check_writable_file
 from experts.command_line.ray_option import chosen_executor, ray_option
 

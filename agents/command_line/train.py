@@ -9,8 +9,15 @@ import click
 
 from agents.command_line.agent_policies import CONFIGURATION, configuration_files
 from dq_space_arm_env.command_line.names import SCENE, given
-from dq_space_arm_env.command_line.verb import json_option, keeping, print_document
-from dq_space_arm_env.common.console import FAILURE, SUCCESS, complain, message_console, table_console
+from dq_space_arm_env.command_line.verb import json_option, keeping
+from dq_space_arm_env.common.console import (
+    FAILURE,
+    SUCCESS,
+    complain,
+    message_console,
+    print_document,
+    table_console,
+)
 from dq_space_arm_env.common.files import check_writable
 from experts.command_line.ray_option import chosen_executor, ray_option
 

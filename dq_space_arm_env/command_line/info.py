@@ -10,8 +10,8 @@ import click
 
 from dq_space_arm_env.command_line.names import package_folder, scene_files
 from dq_space_arm_env.command_line.policy_sources import policy_names
-from dq_space_arm_env.command_line.verb import json_option, print_document
-from dq_space_arm_env.common.console import table_console
+from dq_space_arm_env.command_line.verb import json_option
+from dq_space_arm_env.common.console import print_document, table_console
 from dq_space_arm_env.common.entry_points import entry_points, load
 from dq_space_arm_env.common.host_machine import processors
 

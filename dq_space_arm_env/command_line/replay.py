@@ -5,8 +5,8 @@ from pathlib import Path
 import click
 
 from dq_space_arm_env.command_line.names import SCENE, normalize_option, trust_option
-from dq_space_arm_env.command_line.verb import json_option, print_document
-from dq_space_arm_env.common.console import message_console, table_console
+from dq_space_arm_env.command_line.verb import json_option
+from dq_space_arm_env.common.console import message_console, print_document, table_console
 from dq_space_arm_env.common.files import check_writable_file
 
 

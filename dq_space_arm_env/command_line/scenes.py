@@ -11,8 +11,16 @@ import click
 from click.core import ParameterSource
 
 from dq_space_arm_env.command_line.names import SCENE, PartOf, description_of, given, scene_files
-from dq_space_arm_env.command_line.verb import json_option, print_document
-from dq_space_arm_env.common.console import FAILURE, SUCCESS, complain, message_console, say, table_console
+from dq_space_arm_env.command_line.verb import json_option
+from dq_space_arm_env.common.console import (
+    FAILURE,
+    SUCCESS,
+    complain,
+    message_console,
+    print_document,
+    say,
+    table_console,
+)
 from dq_space_arm_env.common.files import check_writable_file
 
 

@@ -18,8 +18,8 @@ from dq_space_arm_env.command_line.names import (
     trust_option,
 )
 from dq_space_arm_env.command_line.policy_sources import POLICY, load_policy
-from dq_space_arm_env.command_line.verb import json_option, print_document
-from dq_space_arm_env.common.console import complain, message_console, table_console
+from dq_space_arm_env.command_line.verb import json_option
+from dq_space_arm_env.common.console import complain, message_console, print_document, table_console
 from dq_space_arm_env.common.files import check_writable_file
 
 if TYPE_CHECKING:

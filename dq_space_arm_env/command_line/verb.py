@@ -1,30 +1,16 @@
 """What verbs share: --json, interrupts, options of several words, groups with a default verb."""
 
-import json
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import dropwhile
-from typing import Any
 
 import click
 
 from dq_space_arm_env.common.console import INTERRUPTED
-from dq_space_arm_env.common.files import json_value
-from dq_space_arm_env.common.shown_text import printable
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON document instead of tables."
 )
-
-
-def print_document(value: Any) -> None:
-    """Print JSON to standard output; infinities and NaN become null."""
-    text = json.dumps(json_value(value), indent=2, ensure_ascii=False, allow_nan=False)
-    # Terminals with another encoding get escapes, and all where they would obey a character.
-    if (sys.stdout.encoding or "").lower().replace("-", "") != "utf8" or printable(text) != text:
-        text = json.dumps(json_value(value), indent=2, allow_nan=False)
-    click.echo(text)
 
 
 class Interrupted(click.ClickException):

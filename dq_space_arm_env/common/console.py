@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from dq_space_arm_env.common.files import json_value
 from dq_space_arm_env.common.shown_text import printable
 
 if TYPE_CHECKING:
@@ -34,7 +36,7 @@ def _console_class() -> type[Console]:
 def table_console(width: int = 110, *, stderr: bool = False) -> Console:
     """Make a console for tables; `width` applies to files and pipes, which have none."""
     stream = sys.stderr if stderr else sys.stdout
-    known = stream.isatty() or "COLUMNS" in os.environ
+    known = stream.isatty() or os.environ.get("COLUMNS", "").strip("0").isdigit()
     return _console_class()(stderr=stderr, highlight=False, width=None if known else width)
 
 
@@ -48,6 +50,17 @@ def say(sentence: str) -> None:
     import click
 
     click.echo(printable(sentence))
+
+
+def print_document(value: Any) -> None:
+    """Print JSON to standard output; infinities and NaN become null."""
+    import click
+
+    text = json.dumps(json_value(value), indent=2, ensure_ascii=False, allow_nan=False)
+    # Terminals with another encoding get escapes, and all where they would obey a character.
+    if (sys.stdout.encoding or "").lower().replace("-", "") != "utf8" or printable(text) != text:
+        text = json.dumps(json_value(value), indent=2, allow_nan=False)
+    click.echo(text)
 
 
 def complain(sentence: str, *, label: str = "Error: ") -> None:

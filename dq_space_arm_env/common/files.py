@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import shutil
 import stat
 import time
 from pathlib import Path
@@ -50,7 +51,7 @@ def temporary_name(name: str) -> str:
 
 
 def remove_leftovers(folder: Path, name: str | None = None, *, age: float = 0.0) -> None:
-    """Remove temporary files that killed processes left in a folder.
+    """Remove temporary files and folders that killed processes left in a folder.
 
     Args:
         folder: Folder to look in.
@@ -65,7 +66,8 @@ def remove_leftovers(folder: Path, name: str | None = None, *, age: float = 0.0)
                 continue
             with contextlib.suppress(OSError):
                 if time.time() - entry.stat(follow_symlinks=False).st_mtime >= age:
-                    Path(entry).unlink()
+                    is_folder = entry.is_dir(follow_symlinks=False)
+                    shutil.rmtree(entry) if is_folder else Path(entry).unlink()
 
 
 def _replace(

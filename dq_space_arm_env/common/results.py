@@ -1,6 +1,5 @@
 """Destination of the results of a measuring command."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -9,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from dq_space_arm_env.common.console import table_console
+from dq_space_arm_env.common.console import print_document, table_console
 from dq_space_arm_env.common.files import to_json, write_atomically
 from dq_space_arm_env.common.report_page import NO_PICTURE
 
@@ -44,4 +43,4 @@ class Destination:
     def print(self, record: dict[str, Any]) -> None:
         """Print the document, if one is wanted."""
         if self.document:
-            sys.stdout.write(to_json(record))
+            print_document(record)

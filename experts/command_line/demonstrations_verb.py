@@ -6,8 +6,8 @@ from pathlib import Path
 import click
 
 from dq_space_arm_env.command_line.names import scene_option
-from dq_space_arm_env.command_line.verb import json_option, keeping, print_document
-from dq_space_arm_env.common.console import table_console
+from dq_space_arm_env.command_line.verb import json_option, keeping
+from dq_space_arm_env.common.console import print_document, table_console
 from dq_space_arm_env.common.files import check_writable
 from experts.command_line.ray_option import chosen_executor, ray_option
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from dq_space_arm_env.command_line.names import SCENE
-from dq_space_arm_env.command_line.verb import json_option, keeping, print_document
-from dq_space_arm_env.common.console import FAILURE, SUCCESS, table_console
+from dq_space_arm_env.command_line.verb import json_option, keeping
+from dq_space_arm_env.common.console import FAILURE, SUCCESS, print_document, table_console
 from dq_space_arm_env.common.files import check_writable
 
 

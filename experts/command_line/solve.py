@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from dq_space_arm_env.command_line.names import SCENE, seed_option, start_option
-from dq_space_arm_env.command_line.verb import Interrupted, json_option, print_document
-from dq_space_arm_env.common.console import FAILURE, SUCCESS, message_console, table_console
+from dq_space_arm_env.command_line.verb import Interrupted, json_option
+from dq_space_arm_env.common.console import FAILURE, SUCCESS, message_console, print_document, table_console
 from dq_space_arm_env.common.files import check_writable
 
 

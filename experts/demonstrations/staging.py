@@ -53,7 +53,7 @@ def staged(place: Path, staging: Path, *, marker: str, overwrite: bool, name: st
 def _check_free(place: Path, marker: str, overwrite: bool, name: str) -> None:
     """Raise DemonstrationsError if something is in the place that may not be overwritten."""
     if place.exists() and not (overwrite and (place / marker).exists()):
-        advice = "choose another name, or allow it to be overwritten"
+        advice = "choose another name, or allow it to be overwritten (--overwrite, in Python overwrite=True)"
         if overwrite:
             advice = f"it holds no {marker}, so it is not overwritten; choose another name"
         raise DemonstrationsError(f"{name} exists: {advice}")

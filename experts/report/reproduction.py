@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from dq_space_arm_env.command_line.verb import Interrupted, print_document
-from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, table_console
+from dq_space_arm_env.command_line.verb import Interrupted
+from dq_space_arm_env.common.console import FAILURE, INTERRUPTED, SUCCESS, print_document, table_console
 from dq_space_arm_env.common.files import to_json, write_atomically
 from dq_space_arm_env.scene import Scene
 from experts.ddp.solution import StopReason

@@ -263,6 +263,9 @@ def test_leftovers_of_killed_processes_are_removed_once_they_are_old(tmp_path: P
     os.utime(new)
     write_atomically(file, "text")
     assert set(tmp_path.iterdir()) == {file, new, others, *theirs}
+    unfinished = tmp_path / temporary_name("demonstrations")
+    unfinished.mkdir()
+    (unfinished / "shard").write_text("half of it")
     remove_leftovers(tmp_path)  # in a folder that is locked
     assert set(tmp_path.iterdir()) == {file, *theirs}
 

@@ -13,8 +13,15 @@ from rich.text import Text
 
 from dq_space_arm_env import load_scene
 from dq_space_arm_env.command_line import main
-from dq_space_arm_env.command_line.verb import print_document
-from dq_space_arm_env.common.console import FAILURE, UNUSABLE, complain, message_console, table_console
+from dq_space_arm_env.common.console import (
+    FAILURE,
+    UNUSABLE,
+    complain,
+    message_console,
+    print_document,
+    table_console,
+)
+from dq_space_arm_env.common.results import Destination
 from dq_space_arm_env.interoperability.mjcf_export import scene_to_mjcf
 from dq_space_arm_env.interoperability.urdf_export import scene_to_urdf
 from dq_space_arm_env.validation import parse_yaml
@@ -71,6 +78,16 @@ def test_documents_escape_what_json_does_not(
     assert json.loads(said) == {"name": RED}
     print_document({"name": "größe"})
     assert "größe" in capsys.readouterr().out
+    Destination(Path(), document=True).print({"name": RED})
+    assert "\x9b" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("columns", "width"), [("0", 110), ("wide", 110), ("", 110), ("47", 47)])
+def test_tables_are_as_wide_as_they_are_told(
+    columns: str, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    assert table_console().width == width
 
 
 @pytest.mark.parametrize("name", [HOSTILE, "größe 😀", "a\"b'c"])
