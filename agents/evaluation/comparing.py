@@ -171,6 +171,7 @@ def compare(
     """
     _check("controllers", controllers, tuple(CONTROLLERS))
     _check("conditions", conditions, CONDITIONS)
+    conditions = tuple(dict.fromkeys(conditions))
     given = load_scene(scene)
     evaluation_seeds(given, n)  # refuses a wrong n
     if receding_starts < 1:
@@ -409,13 +410,13 @@ def _notes(controllers: Sequence[str], conditions: Sequence[str]) -> Iterator[st
 
 def _commands(rows: Sequence[Row]) -> Iterator[str]:
     """Commands that train the agents, and those that fly each row under all of its conditions."""
-    found: dict[str, list[str]] = {}
+    found: dict[str, dict[str, None]] = {}
     for row in rows:
         if row.facts["training_command"] is not None:
-            found.setdefault(row.facts["training_command"], [])
+            found.setdefault(row.facts["training_command"], {})
         if row.facts["evaluation_command"] is not None:
             flying, _, condition = row.facts["evaluation_command"].rpartition(" ")
-            found.setdefault(flying, []).append(condition)
+            found.setdefault(flying, {})[condition] = None
     for command, conditions in found.items():
         yield " ".join([command, *conditions])
 

@@ -72,7 +72,7 @@ def evaluate_policies(
     given = load_scene(scene or scene_of(acting))
     for each in acting:
         check_fit(each, given)
-    for condition in CONDITIONS if ALL in conditions else conditions:
+    for condition in CONDITIONS if ALL in conditions else dict.fromkeys(conditions):
         evaluations = []
         with progress_bar() as show:
             for number, policy in enumerate(acting, 1):
