@@ -53,7 +53,7 @@ def test_observations_are_those_of_states_and_stages(made: Demonstrations) -> No
     for demonstration in made:
         rows = kernels.stage_parameters(demonstration.parameters)
         seen = kernels.observation(np.array(demonstration.states), left, p=rows)[0]
-        np.testing.assert_allclose(demonstration.observations, seen, atol=1e-12)
+        np.testing.assert_allclose(demonstration.observations, seen, rtol=0, atol=1e-12)
 
 
 def test_batches_hold_the_parameters_of_their_stages(made: Demonstrations) -> None:
@@ -64,7 +64,7 @@ def test_batches_hold_the_parameters_of_their_stages(made: Demonstrations) -> No
     for mixed in made.batches(64, names, seed=1):
         found = mixed.arrays
         again = made.kernels.state_from_observation(found["observations"], p=found["parameters"])
-        np.testing.assert_allclose(again, found["states"], atol=1e-12)
+        np.testing.assert_allclose(again, found["states"], rtol=0, atol=1e-12)
 
 
 def test_a_demonstration_is_shown_with_the_path_of_its_target(made: Demonstrations) -> None:

@@ -68,7 +68,7 @@ def test_minari_has_costs_and_phases(
         minari.load_dataset("space-arm/phases-v0").iterate_episodes(), reports, strict=True
     ):
         for name, expected in report.items():
-            np.testing.assert_allclose(episode.infos[name], expected, atol=ROUNDING, err_msg=name)
+            np.testing.assert_allclose(episode.infos[name], expected, rtol=0, atol=ROUNDING, err_msg=name)
     described = dataset.storage.metadata["description"]
     assert (
         ", cost (violations of constraints, each over its tolerance), phase (0: full, 1: light)" in described
@@ -82,7 +82,7 @@ def test_lerobot_has_costs_and_subtasks(made: Demonstrations, reports: list[Any]
     assert Scene.model_validate(settings["scene"]) == made.scene  # limits of -inf included
     rows = parquet.read_table(folder / "data").to_pydict()
     costs = np.concatenate([each["cost"][1:] for each in reports])
-    np.testing.assert_allclose(rows["next.cost"], costs, atol=ROUNDING)
+    np.testing.assert_allclose(rows["next.cost"], costs, rtol=0, atol=ROUNDING)
     assert rows["subtask_index"] == np.concatenate([each["phase"][:-1] for each in reports]).tolist()
     tables = {what: parquet.read_table(folder / "meta" / f"{what}s.parquet") for what in ("task", "subtask")}
     assert tables["task"].to_pydict() == {"task_index": [0], "task": [made.scene.description]}

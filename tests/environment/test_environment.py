@@ -122,7 +122,7 @@ def test_observation_is_what_the_documentation_says(scene):
         assert target == pytest.approx(desired, abs=1e-15)
     error = np.array(poses.error_pose(tuple(kernels.tip_pose(x)), target))  # (31)
     if kernels.layout.planar:
-        np.testing.assert_allclose(error[[1, 2, 4, 7]], 0.0, atol=1e-15)
+        np.testing.assert_allclose(error[[1, 2, 4, 7]], 0.0, rtol=0, atol=1e-15)
         error = error[[0, 3, 5, 6]]
     parts = (layout.base_velocity, layout.joint_angles, layout.wrist_angles, layout.joint_rates)
     parts += (layout.motor_angles, layout.motor_rates, layout.wheel_momenta)
@@ -146,7 +146,7 @@ def test_observation_is_what_the_documentation_says(scene):
     seen = [np.copysign(1.0, error[0]) * error for error in errors[1:]]
     state = [x[part] for part in parts]
     expected = np.concatenate([error, *state, phase, *seen, margins, *twists, [19 * 0.015]])
-    np.testing.assert_allclose(observation, expected, atol=1e-14)
+    np.testing.assert_allclose(observation, expected, rtol=0, atol=1e-14)
     angles = [poses.error_angle(*pair) for pair in zip(tips, goals, strict=True)]
     distances = [poses.error_distance(*pair) for pair in zip(tips, goals, strict=True)]
     assert info["attitude_error"] == pytest.approx(np.degrees(max(angles)))
@@ -175,7 +175,7 @@ def test_starts():
     drawn = env.unwrapped.state
     assert not np.array_equal(drawn, nominal)
     env.reset(options={"initial_state": drawn})
-    np.testing.assert_allclose(env.unwrapped.state, drawn, atol=1e-15)
+    np.testing.assert_allclose(env.unwrapped.state, drawn, rtol=0, atol=1e-15)
     env.reset(seed=1)
     assert not np.array_equal(env.unwrapped.state, drawn)
     assert env.reset(options={"nominal": True})[1].keys() == env.step(env.action_space.sample())[4].keys()

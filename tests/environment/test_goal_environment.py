@@ -176,7 +176,7 @@ def test_the_goal_is_the_target_of_the_episode():
         observation, _ = env.reset(seed=seed)
         goals.append(observation["desired_goal"])
         target = env.episode_scene.target.pose.dual_quaternion
-        np.testing.assert_allclose(observation["desired_goal"], target, atol=1e-14)
+        np.testing.assert_allclose(observation["desired_goal"], target, rtol=0, atol=1e-14)
         assert observation["achieved_goal"][:4] @ observation["desired_goal"][:4] >= 0.0
         after, *_ = env.step(env.action_space.sample())
         np.testing.assert_array_equal(after["desired_goal"], observation["desired_goal"])
@@ -265,7 +265,7 @@ def test_a_goal_that_is_held_is_a_success_and_does_not_end_the_episode():
     env = make(short("random-target", 5))
     observation, _ = env.reset(options={"nominal": True})
     observation, info = env.reset(options={"nominal": True, "target": observation["achieved_goal"]})
-    np.testing.assert_allclose(observation["achieved_goal"], observation["desired_goal"], atol=1e-15)
+    np.testing.assert_allclose(observation["achieved_goal"], observation["desired_goal"], rtol=0, atol=1e-15)
     assert info["is_success"]
     assert [info["attitude_error"], info["position_error"]] == pytest.approx([0, 0], abs=1e-13)
     for step in range(1, 6):
@@ -302,10 +302,10 @@ def test_goals_of_planar_scenes_are_poses_in_the_plane():
     for key in ("achieved_goal", "desired_goal"):
         np.testing.assert_array_equal(observation[key][[1, 2, 4, 7]], 0.0)
     target = env.episode_scene.target.pose.dual_quaternion
-    np.testing.assert_allclose(observation["desired_goal"], target, atol=1e-14)
+    np.testing.assert_allclose(observation["desired_goal"], target, rtol=0, atol=1e-14)
     goal = pose(Rotation.from_rotvec([0, 0, 1.0]), [1.5, 0.5, 0.0])
     observation, info = env.reset(options={"target": goal})
-    np.testing.assert_allclose(observation["desired_goal"], goal, atol=1e-15)
+    np.testing.assert_allclose(observation["desired_goal"], goal, rtol=0, atol=1e-15)
     angle, distance = expected_errors(observation["achieved_goal"], goal)
     assert [info["attitude_error"], info["position_error"]] == pytest.approx([angle, distance])
 

@@ -108,7 +108,7 @@ def test_trajectory_comes_back_from_its_file(scene, tmp_path):
     assert (back.cost, back.seed) == (flown.cost, 3)
     # What the actuators got moved the arm.
     kernels, u = compile_scene(scene), back.controls + back.noise
-    np.testing.assert_allclose(kernels.step(back.states[:-1], u), back.states[1:], atol=1e-12)
+    np.testing.assert_allclose(kernels.step(back.states[:-1], u), back.states[1:], rtol=0, atol=1e-12)
 
 
 def test_pushes_change_velocities_and_noise_only_what_is_measured(scene):
@@ -126,13 +126,13 @@ def test_pushes_change_velocities_and_noise_only_what_is_measured(scene):
     assert 1e-4 < np.abs(noise).mean() < 1e-2
     time_left = scene.simulation.dt * np.arange(25, 0, -1.0)[:, None]
     seen = kernels.observation(np.array(measured)[:, 0], time_left)[0]
-    np.testing.assert_allclose(flown.observations[0, :-1], seen, atol=1e-12)
+    np.testing.assert_allclose(flown.observations[0, :-1], seen, rtol=0, atol=1e-12)
     free = kernels.step(flown.states[0, :-1], np.zeros((25, 6)))
     jumps = flown.states[0, 1:] - free
     struck = np.flatnonzero(np.abs(jumps).max(axis=1) > 1e-9)
     assert struck.tolist() == [3, 8, 13, 18]  # a push comes before the step whose state it changes
     others = np.delete(jumps, np.r_[kernels.layout.state.base_velocity], axis=1)
-    np.testing.assert_allclose(others, 0.0, atol=1e-12)
+    np.testing.assert_allclose(others, 0.0, rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -70,7 +70,7 @@ def test_derivatives_are_those_of_the_kernels(start):
     # Beside the pose, tangent coordinates are the state's own entries.
     found, expected = np.array(by_u(x, u)), kernels.linearize(x, u)[1]
     beside = layout.n_x - layout.state.pose.stop
-    np.testing.assert_allclose(found[-beside:], expected[-beside:], atol=1e-13)
+    np.testing.assert_allclose(found[-beside:], expected[-beside:], rtol=0, atol=1e-13)
     both = casadi.vertcat(free_x, free_u)
     curvature = casadi.Function("h", [free_x, free_u], [casadi.hessian(casadi.sum1(step), both)[0]])
     for derivative in (found, np.array(curvature(x, u))):
@@ -100,7 +100,7 @@ def test_ipopt_solves_a_small_problem_with_them():
     kernels, flown = compile_scene(scene), start
     for control in inputs:
         flown = kernels.step(flown, control, dt=duration / steps)
-    np.testing.assert_allclose(flown, states[-1], atol=1e-6)
+    np.testing.assert_allclose(flown, states[-1], rtol=0, atol=1e-6)
     assert (np.abs(inputs) <= limit * (1 + 1e-6)).all()
     before, after = (float(kernels.terminal_cost(state)) for state in (start, flown))
     assert after < 0.05 * before

@@ -73,8 +73,8 @@ def check_accelerations(scene, samples=5):
         found = scene_accelerations(scene, x, data.qacc, matrix)
         assert relative_error(found, accelerations(scene, x, u)) < 1e-12
         rotation, position = tip_pose(scene, x)
-        np.testing.assert_allclose(data.site("tip").xmat.reshape(3, 3), rotation, atol=1e-13)
-        np.testing.assert_allclose(data.site("tip").xpos, position, atol=1e-13)
+        np.testing.assert_allclose(data.site("tip").xmat.reshape(3, 3), rotation, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(data.site("tip").xpos, position, rtol=0, atol=1e-13)
         applied = data.qfrc_actuator.copy()
         mujoco.mj_inverse(model, data)
         assert relative_error(data.qfrc_inverse, applied) < 1e-12
@@ -134,8 +134,8 @@ def test_the_start_is_a_key_frame(name):
     sign = np.ones(model.nq)
     if not StateLayout.of(scene).planar and key.qpos[3] * qpos[3] < 0:
         sign[3:7] = -1.0
-    np.testing.assert_allclose(key.qpos * sign, qpos, atol=1e-14)
-    np.testing.assert_allclose(key.qvel, qvel, atol=1e-14)
+    np.testing.assert_allclose(key.qpos * sign, qpos, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(key.qvel, qvel, rtol=0, atol=1e-14)
 
 
 def test_motors_have_the_names_and_limits_of_the_inputs():
@@ -212,8 +212,8 @@ def test_rods_join_the_joints_and_the_camera_sees_arm_and_target(name):
     mujoco.mj_forward(model, data)
     target = np.atleast_2d(shown_target(scene)[0])[0]
     rotation, position = poses.to_matrix(tuple(target))
-    np.testing.assert_allclose(data.site("target").xpos, position, atol=1e-14)
-    np.testing.assert_allclose(data.site("target").xmat.reshape(3, 3), rotation, atol=1e-14)
+    np.testing.assert_allclose(data.site("target").xpos, position, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(data.site("target").xmat.reshape(3, 3), rotation, rtol=0, atol=1e-14)
     camera = data.camera("overview")
     joints = [data.body(link.name).xpos for link in scene.links]
     seen = np.array([data.site("tip").xpos, data.site("target").xpos, *joints]) - camera.xpos

@@ -84,8 +84,8 @@ def test_linearization_agrees_with_complex_steps(scene, integrator, draw):
     program = ScenePrograms(kernels.scene).build("step", integrator)
     for k in range(3):
         expected_a, expected_b = complex_step_jacobians(kernels, program, states[k], inputs[k])
-        np.testing.assert_allclose(a[k], expected_a, atol=2e-13 * max(1.0, np.abs(expected_a).max()))
-        np.testing.assert_allclose(b[k], expected_b, atol=2e-13)
+        np.testing.assert_allclose(a[k], expected_a, rtol=0, atol=2e-13 * max(1.0, np.abs(expected_a).max()))
+        np.testing.assert_allclose(b[k], expected_b, rtol=0, atol=2e-13)
 
 
 @pytest.mark.sampled
@@ -120,15 +120,17 @@ def test_cost_derivatives_agree_with_complex_steps(scene, draw):
         along_x = {"x": np.array([moved(layout, x, row) for row in np.eye(kernels.n_t)]).T}
         along_u = {"u": np.array([u + 1j * H * row for row in np.eye(kernels.n_u)]).T}
         scale = np.abs(lx[k]).max()
-        np.testing.assert_allclose(lx[k], gradient(cost, along_x, {"u": u}), atol=1e-13 * scale)
+        np.testing.assert_allclose(lx[k], gradient(cost, along_x, {"u": u}), rtol=0, atol=1e-13 * scale)
         np.testing.assert_allclose(lu[k], gradient(cost, along_u, {"x": x}), rtol=1e-12)
         expected = gradient(terminal, along_x, {"emphasis": emphasis})
-        np.testing.assert_allclose(terminal_lx[k], expected, atol=1e-13 * np.abs(terminal_lx[k]).max())
+        np.testing.assert_allclose(
+            terminal_lx[k], expected, rtol=0, atol=1e-13 * np.abs(terminal_lx[k]).max()
+        )
     n_u = kernels.n_u
     np.testing.assert_array_equal(luu[0].reshape(n_u, n_u), np.diag(2.0 * layout.control_weight))
     for hessian in (*lxx, *terminal_lxx):
         matrix = hessian.reshape(kernels.n_t, kernels.n_t)
-        np.testing.assert_allclose(matrix, matrix.T, atol=max(1e-11, 1e-15 * np.abs(matrix).max()))
+        np.testing.assert_allclose(matrix, matrix.T, rtol=0, atol=max(1e-11, 1e-15 * np.abs(matrix).max()))
         eigenvalues = np.linalg.eigvalsh(matrix)
         assert eigenvalues[0] > -max(1e-10, 1e-15 * eigenvalues[-1])  # Gauss-Newton: never negative
 
@@ -148,4 +150,4 @@ def test_gauss_newton_hessian_is_exact_at_the_target():
             for sign in (1.0, -1.0)
         )
         numeric[:, i] = (plus - minus) / (2 * h)
-    np.testing.assert_allclose(lxx, numeric, atol=1e-6 * np.abs(lxx).max())
+    np.testing.assert_allclose(lxx, numeric, rtol=0, atol=1e-6 * np.abs(lxx).max())

@@ -99,7 +99,7 @@ def test_frame_poses_end_at_the_tip_27(scene, draw):
     frames, tips = kernels.frame_poses(states), kernels.tip_pose(states)
     scene = kernels.scene
     assert frames.shape == (10, 2 + len(scene.links) + len(scene.other_tips) + (scene.wrist is not None), 8)
-    np.testing.assert_allclose(frames[:, -1], tips, atol=1e-13)
+    np.testing.assert_allclose(frames[:, -1], tips, rtol=0, atol=1e-13)
 
 
 def test_cost_terms_follow_the_papers_formula(draw):

@@ -57,14 +57,14 @@ def test_gradients_agree_with_differences_of_the_costs(drawn: Any) -> None:
 
         expected = differences(cost, n_t + kernels.n_u)
         found = np.concatenate([slope, by_input])
-        np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
         final = kernels.call("terminal_cost_derivatives", x=x, emphasis=EMPHASIS)[0]
 
         def last(z: Any, x: Any = x) -> Any:
             return kernels.call("emphasized_terminal_cost", x=kernels.retract(x, z), emphasis=EMPHASIS)[0][0]
 
         expected = differences(last, n_t)
-        np.testing.assert_allclose(final, expected, atol=1e-9 * np.abs(expected).max())
+        np.testing.assert_allclose(final, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.sampled
@@ -88,11 +88,11 @@ def test_hessians_of_the_twist_are_gauss_newtons(drawn: Any) -> None:
         scale = np.abs(expected).max()
         lxx = square(kernels, found[2] - without[2], n_t)
         luu = square(kernels, found[3] - without[3], n_u)
-        np.testing.assert_allclose(lxx, expected[:n_t, :n_t], atol=1e-9 * scale)
-        np.testing.assert_allclose(luu, expected[n_t:, n_t:], atol=1e-9 * scale)
+        np.testing.assert_allclose(lxx, expected[:n_t, :n_t], rtol=0, atol=1e-9 * scale)
+        np.testing.assert_allclose(luu, expected[n_t:, n_t:], rtol=0, atol=1e-9 * scale)
         if len(found) == 5:
             lux = square(kernels, found[4], n_u)
-            np.testing.assert_allclose(lux, expected[n_t:, :n_t], atol=1e-9 * scale)
+            np.testing.assert_allclose(lux, expected[n_t:, :n_t], rtol=0, atol=1e-9 * scale)
             assert np.abs(lux).max() > 1.0
         else:  # without a wrist no input moves the tip at once
             assert kernels.scene.wrist is None
@@ -104,7 +104,7 @@ def test_hessians_of_the_twist_are_gauss_newtons(drawn: Any) -> None:
             k.call("terminal_cost_derivatives", x=x, emphasis=EMPHASIS)[1] for k in (kernels, plain)
         )
         hessian = square(kernels, last - other, n_t)
-        np.testing.assert_allclose(hessian, expected, atol=1e-9 * np.abs(expected).max())
+        np.testing.assert_allclose(hessian, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ def test_terminal_cost_hessian_agrees_with_differences_of_the_gradient(drawn: An
         expected = differences(gradient, kernels.n_t)
         hessian = kernels.call("terminal_cost_hessian", x=x, emphasis=EMPHASIS)[0]
         hessian = square(kernels, hessian, kernels.n_t)
-        np.testing.assert_allclose(hessian, expected, atol=1e-8 * np.abs(expected).max())
+        np.testing.assert_allclose(hessian, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
 
 
 @pytest.mark.sampled
@@ -139,7 +139,7 @@ def test_the_observation_changes_as_its_jacobian_says(drawn: Any) -> None:
 
         expected = differences(seen, kernels.n_t).T
         jacobian = kernels.observation_jacobian(x)
-        np.testing.assert_allclose(jacobian, expected, atol=1e-10 * np.abs(expected).max())
+        np.testing.assert_allclose(jacobian, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
         assert np.abs(jacobian[kernels.n_x : -1]).max() > 0.1
 
 
@@ -148,6 +148,6 @@ def test_derivatives_by_the_targets_numbers_agree_with_differences(draw: Any) ->
     x, u, p = states[0], inputs[0], kernels.parameters.nominal
     expected = differences(lambda change: kernels.cost(x, u, p=p + change), kernels.n_p)
     found = kernels.cost_by_parameters(x, u, p)
-    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
     velocity = kernels.parameters.indices("target.velocity")
     assert np.abs(expected[velocity]).min() > 1.0

@@ -47,11 +47,11 @@ def test_its_gauss_newton_hessian_is_convex_if_the_given_one_is(quadratic):
     kernels, x, gradient, hessian = quadratic
     n = kernels.n_t
     at_reference = evaluate("quadratic_cost_derivatives", kernels, x[0], x[0], gradient, hessian)
-    np.testing.assert_allclose(at_reference[0], gradient, atol=1e-12)
-    np.testing.assert_allclose(at_reference[1].reshape(n, n), hessian, atol=1e-12)
+    np.testing.assert_allclose(at_reference[0], gradient, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(at_reference[1].reshape(n, n), hessian, rtol=0, atol=1e-12)
     convex = hessian @ hessian
     away = evaluate("quadratic_cost_derivatives", kernels, x[1], x[0], gradient, convex)[1].reshape(n, n)
-    np.testing.assert_allclose(away, away.T, atol=1e-9)
+    np.testing.assert_allclose(away, away.T, rtol=0, atol=1e-9)
     assert np.linalg.eigvalsh(away).min() > -1e-9
 
 
@@ -59,7 +59,7 @@ def test_its_gauss_newton_hessian_is_convex_if_the_given_one_is(quadratic):
 def test_the_state_follows_from_the_observation(scene, draw):
     kernels, x, _ = draw(scene, 5)
     observation, _ = kernels.observation(x, np.full((5, 1), 3.0))
-    np.testing.assert_allclose(kernels.state_from_observation(observation), x, atol=1e-13)
+    np.testing.assert_allclose(kernels.state_from_observation(observation), x, rtol=0, atol=1e-13)
     n_pose = 4 if kernels.layout.planar else 8
     observation[:, :n_pose] *= 1.3
-    np.testing.assert_allclose(kernels.state_from_observation(observation), x, atol=1e-13)
+    np.testing.assert_allclose(kernels.state_from_observation(observation), x, rtol=0, atol=1e-13)

@@ -187,7 +187,7 @@ class TestParts:
         # q_d = 1/2 (2 i + 4 j) (cos 30 deg + k sin 30 deg) = i (cos 30 + 2 sin 30) + j (2 cos 30 - sin 30)
         cosine, sine = np.sqrt(3) / 2, 0.5
         expected = [cosine, sine, cosine + 2 * sine, 2 * cosine - sine, 0, 0.1, 0.2, 0.3, 0]
-        np.testing.assert_allclose(layout.initial_state, expected, atol=1e-15)
+        np.testing.assert_allclose(layout.initial_state, expected, rtol=0, atol=1e-15)
 
 
 class TestSignRule:
@@ -257,8 +257,8 @@ class TestDraw:
             offsets = (states[:, where] - nominal[where]) / half_width
             assert (np.abs(offsets) <= 1 + 1e-12).all()
             # mean and variance of a uniform draw from [-1, 1], within 5 standard errors
-            np.testing.assert_allclose(offsets.mean(axis=0), 0, atol=5 / np.sqrt(3 * 2000))
-            np.testing.assert_allclose(offsets.var(axis=0), 1 / 3, atol=5 * np.sqrt(4 / 45 / 2000))
+            np.testing.assert_allclose(offsets.mean(axis=0), 0, rtol=0, atol=5 / np.sqrt(3 * 2000))
+            np.testing.assert_allclose(offsets.var(axis=0), 1 / 3, rtol=0, atol=5 * np.sqrt(4 / 45 / 2000))
 
     def test_base_rotation_in_base_axes_and_position_in_inertial_axes(self) -> None:
         """The order of the draws is part of the meaning of a seed."""
@@ -270,13 +270,15 @@ class TestDraw:
         nominal = Rotation.from_quat(scene.initial_state.base_pose.rotation, scalar_first=True)
         rotation = nominal * Rotation.from_rotvec(0.15 * uniform[:3])
         drawn = Rotation.from_quat(x[:4], scalar_first=True)
-        np.testing.assert_allclose((rotation.inv() * drawn).magnitude(), 0, atol=1e-12)
+        np.testing.assert_allclose((rotation.inv() * drawn).magnitude(), 0, rtol=0, atol=1e-12)
         pose = Pose.model_validate({"dual_quaternion": x[:8]})
-        np.testing.assert_allclose(pose.position, np.array([1, 2, 3]) + 0.15 * uniform[3:6], atol=1e-14)
-        np.testing.assert_allclose(x[8:11], [-0.6, 0.9, -1.6] + 0.5 * uniform[6:9], atol=1e-15)
-        np.testing.assert_allclose(x[11:14], [0.3, 0.2, -0.3] + 0.3 * uniform[9:12], atol=1e-15)
-        np.testing.assert_allclose(x[14:20], 0.01 * uniform[12:18], atol=1e-17)
-        np.testing.assert_allclose(x[20:23], 0.05 * uniform[18:21], atol=1e-17)
+        np.testing.assert_allclose(
+            pose.position, np.array([1, 2, 3]) + 0.15 * uniform[3:6], rtol=0, atol=1e-14
+        )
+        np.testing.assert_allclose(x[8:11], [-0.6, 0.9, -1.6] + 0.5 * uniform[6:9], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(x[11:14], [0.3, 0.2, -0.3] + 0.3 * uniform[9:12], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(x[14:20], 0.01 * uniform[12:18], rtol=0, atol=1e-17)
+        np.testing.assert_allclose(x[20:23], 0.05 * uniform[18:21], rtol=0, atol=1e-17)
 
     def test_a_spread_of_zero_still_takes_its_draws(self) -> None:
         scene = load_scene("paper")
@@ -295,8 +297,8 @@ class TestTargets:
         scene, rng = load_scene("paper"), np.random.default_rng(1)
         errors = np.array([tip_errors(scene, draw_initial_state(scene, rng)) for _ in range(1000)])
         angle, distance = np.percentile(errors, [5, 95], axis=0).T
-        np.testing.assert_allclose(angle, [45, 111], atol=3)
-        np.testing.assert_allclose(distance, [0.87, 1.84], atol=0.03)
+        np.testing.assert_allclose(angle, [45, 111], rtol=0, atol=3)
+        np.testing.assert_allclose(distance, [0.87, 1.84], rtol=0, atol=0.03)
 
     @pytest.mark.parametrize(
         ("name", "joint_angles", "wrist_angles"),

@@ -76,27 +76,31 @@ def test_shapes_have_the_sizes_and_frames_of_the_constraints(constrained):
     body, obstacle = (shape.mesh.corners.reshape(-1, 3) for shape in far)
     axis = np.clip(body[:, 1], 0.0, 0.6)
     offsets = np.linalg.norm(body - np.stack([np.full_like(axis, 0.1), axis, 0 * axis], axis=1), axis=1)
-    np.testing.assert_allclose(offsets, 0.05, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(obstacle, axis=1), 6.0, atol=1e-12)
+    np.testing.assert_allclose(offsets, 0.05, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(obstacle, axis=1), 6.0, rtol=0, atol=1e-12)
     assert (far[1].place, far[1].axes) == (INERTIAL, INERTIAL)
     cone, needle = sun
     rim = cone.mesh.corners.reshape(-1, 3)
     rim = rim[np.linalg.norm(rim, axis=1) > 1e-9]
-    np.testing.assert_allclose(rim[:, 2] / np.linalg.norm(rim, axis=1), np.cos(np.radians(120)), atol=1e-12)
+    np.testing.assert_allclose(
+        rim[:, 2] / np.linalg.norm(rim, axis=1), np.cos(np.radians(120)), rtol=0, atol=1e-12
+    )
     assert (needle.place, needle.axes) == (0, INERTIAL)
     seen = camera[0].mesh.corners.reshape(-1, 3) - [0, 0, 0.5]
     seen = seen[np.linalg.norm(seen, axis=1) > 1e-9]
-    np.testing.assert_allclose(-seen[:, 1] / np.linalg.norm(seen, axis=1), np.cos(np.radians(30)), atol=1e-12)
+    np.testing.assert_allclose(
+        -seen[:, 1] / np.linalg.norm(seen, axis=1), np.cos(np.radians(30)), rtol=0, atol=1e-12
+    )
     wall = corridor[0].mesh.corners.reshape(-1, 3)
     radius = 0.1 - wall[:, 0] * np.tan(np.radians(25))
-    np.testing.assert_allclose(np.linalg.norm(wall[:, 1:], axis=1), radius, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(wall[:, 1:], axis=1), radius, rtol=0, atol=1e-12)
     assert limits == []
     assert gas[0].rows == gas[1].rows == (10,)
     assert (gas[1].place, gas[1].axes, gas[1].nozzle) == (0, GAS, (0.1, 0.0, -0.4))
     blown = gas[1].mesh.corners.reshape(-1, 3)
     blown = blown[np.linalg.norm(blown, axis=1) > 1e-9]
     np.testing.assert_allclose(
-        blown[:, 2] / np.linalg.norm(blown, axis=1), np.cos(np.radians(20)), atol=1e-12
+        blown[:, 2] / np.linalg.norm(blown, axis=1), np.cos(np.radians(20)), rtol=0, atol=1e-12
     )
 
 
@@ -115,7 +119,7 @@ def test_each_thruster_blows_at_its_place_as_it_fires(make_flight):
     assert drawn.nozzles == tuple(jet.position for jet in jets)
     fired = np.maximum(flight.controls[:, -8:], 0.0) / 5.0
     expected = -fired[:, :, None] * np.array([jet.unit_direction for jet in jets])
-    np.testing.assert_allclose(drawn.gas[0][:-1, 1:], expected, atol=1e-15)
+    np.testing.assert_allclose(drawn.gas[0][:-1, 1:], expected, rtol=0, atol=1e-15)
     assert not drawn.gas[0][-1].any()
     assert not drawn.violated[0].any()
     sphere = {"frame": "tip", "radius": 0.3}
@@ -212,6 +216,6 @@ def test_shapes_stand_in_space_where_their_frames_are(constrained):
                 np.hypot(along[:, 0], along[:, 2]).max(), 0.5 * own[:, 0].max(), rtol=0.01
             )
             continue
-        np.testing.assert_allclose(corners, expected, atol=1e-12)
+        np.testing.assert_allclose(corners, expected, rtol=0, atol=1e-12)
     quiet = [*shapes_in_space(shapes, frames, 0.0 * gas)]
     assert len(quiet) == len(shapes) - 1

@@ -103,15 +103,15 @@ def test_what_is_let_go_keeps_the_twist_of_the_tip():
     """The tip moves on with one twist here, and so does what it held; then the tip turns away."""
     turned = moving(5, TIPS[3], [0.4, 0.0, 0.0, 0.0, 0.0, 0.5])[1:]
     path = payload_path(RELEASE, np.vstack([TIPS[:4], turned]), TARGETS)
-    np.testing.assert_allclose(path, TIPS, atol=1e-12)
+    np.testing.assert_allclose(path, TIPS, rtol=0, atol=1e-12)
 
 
 def test_what_is_caught_comes_with_the_target_and_goes_on_with_the_tip():
     np.testing.assert_array_equal(payload_path(CAUGHT, TIPS, TARGETS), np.vstack([TARGETS[:3], TIPS[3:]]))
     rest = np.vstack([TARGETS[:3], np.tile(TARGETS[0], (5, 1))])
-    np.testing.assert_allclose(payload_path(CAUGHT, TIPS, rest, caught=False), TARGETS, atol=1e-12)
+    np.testing.assert_allclose(payload_path(CAUGHT, TIPS, rest, caught=False), TARGETS, rtol=0, atol=1e-12)
     still = payload_path(CAUGHT, TIPS, TARGETS[0], caught=False)
-    np.testing.assert_allclose(still, np.tile(TARGETS[0], (8, 1)), atol=1e-12)
+    np.testing.assert_allclose(still, np.tile(TARGETS[0], (8, 1)), rtol=0, atol=1e-12)
 
 
 def test_flights_shorter_than_the_phases_have_a_path():
@@ -135,7 +135,7 @@ def test_a_payload_is_drawn_at_the_tip_or_where_it_is_told():
         rotation, position = poses.to_matrix(tuple(pose))
         center = np.array(rotation) @ scene.payload.center_of_mass + np.array(position)
         seen = renderer.camera.project(center)[:2]
-        np.testing.assert_allclose([columns.mean(), rows.mean()], seen, atol=6.0)
+        np.testing.assert_allclose([columns.mean(), rows.mean()], seen, rtol=0, atol=6.0)
     renderer.aim_at(target)  # the payload is at the tip again
     np.testing.assert_array_equal(renderer.draw(frames, NO_TRAIL), held)
 
@@ -240,14 +240,14 @@ def test_a_rollout_knows_the_path_of_the_payload(scene):
     )
     path, tips = flown(scene)[3:5]
     signs = np.sign(np.sum(path[:, :4] * flight.payload[:, :4], axis=1))[:, None]
-    np.testing.assert_allclose(flight.payload, signs * path, atol=1e-9)
+    np.testing.assert_allclose(flight.payload, signs * path, rtol=0, atol=1e-9)
     shown = prepare([flight], scene)[0]
     np.testing.assert_array_equal(np.abs(shown.payload), np.abs(flight.payload))
     planned = prepare(common_scene([replace(flight, payload=None, target=None, target_body=None)])[0], scene)[
         0
     ]
     if scene is MISSED:  # a plan is taken at its word
-        np.testing.assert_allclose(np.abs(planned.payload[3:]), np.abs(tips[3:]), atol=1e-9)
+        np.testing.assert_allclose(np.abs(planned.payload[3:]), np.abs(tips[3:]), rtol=0, atol=1e-9)
 
 
 def test_a_page_has_the_path_of_the_payload_and_keeps_it_in_view(make_flight):

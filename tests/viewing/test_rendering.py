@@ -117,7 +117,7 @@ def test_link_is_seen_where_it_is(paper):
     middle = 0.5 * np.add(poses.position(frames[2]), poses.position(frames[3]))
     column, row = renderer.camera.project(middle)[:2].astype(int)
     color = renderer.draw(frames, NO_TRAIL)[row, column] / 255.0
-    np.testing.assert_allclose(color / color.max(), np.array(LINK) / max(LINK), atol=0.02)
+    np.testing.assert_allclose(color / color.max(), np.array(LINK) / max(LINK), rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize("name", ["paper", "payload", "six-joint", "planar", "random-target"])
@@ -149,8 +149,8 @@ def test_tip_is_projected_to_where_the_kernels_have_it(name):
     ends = np.array(position) + renderer._model.axis_length * np.array(rotation).T
     corners = renderer.camera.project(np.vstack([position, ends]))[:, :2]
     found = np.argwhere(drawn)[:, ::-1]
-    np.testing.assert_allclose(found.min(axis=0), corners.min(axis=0), atol=8.0)
-    np.testing.assert_allclose(found.max(axis=0), corners.max(axis=0), atol=8.0)
+    np.testing.assert_allclose(found.min(axis=0), corners.min(axis=0), rtol=0, atol=8.0)
+    np.testing.assert_allclose(found.max(axis=0), corners.max(axis=0), rtol=0, atol=8.0)
     column, row = corners[0].astype(int)
     assert drawn[row, column]
 
@@ -160,7 +160,7 @@ def test_camera_is_placed_by_the_scene_or_by_all_or_part_of_a_view(paper):
     assert own.axes[0, 2] == pytest.approx(0.0), "the horizon is level"
     assert own.axes[1, 2] < 0.0, "up is up"
     planar = Renderer(load_scene("planar")).camera
-    np.testing.assert_allclose(planar.axes, [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-15)
+    np.testing.assert_allclose(planar.axes, [[1, 0, 0], [0, -1, 0], [0, 0, -1]], rtol=0, atol=1e-15)
     turned = Renderer(paper, PictureFormat(view=View(azimuth=30.0))).camera
     assert turned.axes[2, 2] == pytest.approx(own.axes[2, 2]), "the elevation is the scene's"
     near = Renderer(paper, PictureFormat(view=View(distance=3.0))).camera
@@ -173,7 +173,7 @@ def test_camera_is_placed_by_the_scene_or_by_all_or_part_of_a_view(paper):
     view = View(azimuth=90.0, elevation=-30.0, distance=7.0, lookat=point)
     placed = Renderer(paper, PictureFormat(view=view)).camera
     expected = np.array(point) - 7.0 * np.array((0.0, np.cos(np.pi / 6), -0.5))
-    np.testing.assert_allclose(placed.position, expected, atol=1e-12)
+    np.testing.assert_allclose(placed.position, expected, rtol=0, atol=1e-12)
 
 
 def test_trail_is_drawn_where_the_tip_was(paper):

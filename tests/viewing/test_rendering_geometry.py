@@ -206,14 +206,14 @@ def test_cylinder_is_a_closed_prism(sides):
     volume, closure = volume_and_closure(mesh.corners)
     base = 0.5 * sides * 0.7**2 * math.sin(2.0 * math.pi / sides)
     assert volume == pytest.approx(base * np.linalg.norm(end - start))
-    np.testing.assert_allclose(closure, 0.0, atol=1e-12)
+    np.testing.assert_allclose(closure, 0.0, rtol=0, atol=1e-12)
 
 
 def test_ball_is_closed_and_its_volume_converges():
     errors = []
     for sides in (16, 32, 64):
         volume, closure = volume_and_closure(ball(0, (0.0, 1.0, 0.0), 2.0, RED, sides).corners)
-        np.testing.assert_allclose(closure, 0.0, atol=1e-11)
+        np.testing.assert_allclose(closure, 0.0, rtol=0, atol=1e-11)
         errors.append(4.0 / 3.0 * math.pi * 8.0 - volume)
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
     assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.05)
@@ -222,16 +222,16 @@ def test_ball_is_closed_and_its_volume_converges():
 @pytest.mark.parametrize("name", list_scenes())
 def test_solids_of_a_scene_have_planar_faces_with_unit_normals(name):
     mesh = SpacecraftModel(load_scene(name)).mesh
-    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, rtol=0, atol=1e-12)
     edges = np.diff(mesh.corners, axis=1)
-    np.testing.assert_allclose(np.einsum("fci,fi->fc", edges, mesh.normals), 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.einsum("fci,fi->fc", edges, mesh.normals), 0.0, rtol=0, atol=1e-9)
     assert ((mesh.colors >= 0.0) & (mesh.colors <= 1.0)).all()
 
 
 def test_normals_of_a_ball_point_away_from_its_center():
     center = np.array((1.0, -1.0, 2.0))
     mesh = ball(0, center, 0.5, RED, 32)
-    np.testing.assert_allclose(mesh.corner_normals, (mesh.corners - center) / 0.5, atol=0.01)
+    np.testing.assert_allclose(mesh.corner_normals, (mesh.corners - center) / 0.5, rtol=0, atol=0.01)
 
 
 def test_crumpled_box_is_a_box_but_for_its_light():
@@ -253,7 +253,7 @@ def test_mesh_moves_with_its_frames():
     placed = [meshes[0].moved(0, np.eye(3), origins[0]), meshes[1].moved(0, turn, origins[1])]
     by_hand = mesh_faces(Mesh.joined(placed), *STILL, FORWARD)
     for one, other in zip(by_frames, by_hand, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-12)
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
 
 
 @given(st.tuples(*[st.floats(0.2, 3.0)] * 3), st.floats(0.5, 100.0), st.integers(0, 10))

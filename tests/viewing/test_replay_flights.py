@@ -30,7 +30,7 @@ def test_frames_are_those_of_the_chain_one_state_at_a_time(name, make_flight):
         base[list(PLANAR_POSE) if layout.planar else list(range(8))] = state[layout.state.pose]
         joints, wrist = state[layout.state.joint_angles], state[layout.state.wrist_angles]
         expected = kinematics.frame_poses(tree, tuple(base.tolist()), tree.coordinates(joints), wrist)
-        np.testing.assert_allclose(shown.frames[instant], expected, atol=1e-14)
+        np.testing.assert_allclose(shown.frames[instant], expected, rtol=0, atol=1e-14)
         pairs = [(tuple(expected[-1]), tuple(targets[instant].tolist()))]
         for index, tip in enumerate(scene.other_tips, 1 + len(scene.links)):
             goal = dual_quaternion.multiply(scene.target.pose.dual_quaternion, tip.goal.dual_quaternion)
@@ -46,7 +46,7 @@ def test_neighboring_poses_have_the_same_sign(paper, make_flight):
     states = flight.states.copy()
     states[7:12, :8] *= -1.0
     frames = prepare([replace(flight, states=states)], paper)[0].frames
-    np.testing.assert_allclose(frames, prepare([flight], paper)[0].frames, atol=1e-14)
+    np.testing.assert_allclose(frames, prepare([flight], paper)[0].frames, rtol=0, atol=1e-14)
     assert (np.sum(frames[1:, :, :4] * frames[:-1, :, :4], axis=2) > 0.0).all()
 
 
@@ -158,7 +158,7 @@ def test_errors_refer_to_the_target_of_the_moment(paper, make_flight):
     target = drifting(paper.target.pose.dual_quaternion, 60)
     signs = np.where(np.arange(61) % 7 == 3, -1.0, 1.0)[:, None]
     shown = prepare([replace(flight, target=signs * target)], paper)[0]
-    np.testing.assert_allclose(shown.target, target, atol=1e-15)
+    np.testing.assert_allclose(shown.target, target, rtol=0, atol=1e-15)
     assert (np.sum(shown.target[1:, :4] * shown.target[:-1, :4], axis=1) > 0.0).all()
     for instant in (0, 3, 31, 60):
         alone = prepare([replace(flight, target=target[instant])], paper)[0]
@@ -172,7 +172,7 @@ def test_a_target_at_rest_is_one_pose_and_a_moving_one_is_cut_off_with_the_fligh
     target = drifting(paper.target.pose.dual_quaternion, 60)
     resting = prepare([replace(flight, target=np.tile(target[0], (61, 1)), target_body=target)], paper)[0]
     assert resting.target.shape == (8,)
-    np.testing.assert_allclose(resting.target_body, target, atol=1e-15)
+    np.testing.assert_allclose(resting.target_body, target, rtol=0, atol=1e-15)
     states = flight.states.copy()
     states[31:] = np.nan
     cut = prepare([replace(flight, states=states, target=target, target_body=target[0])], paper)[0]
@@ -273,7 +273,7 @@ def test_a_solution_of_a_scene_with_phases_is_shown_with_the_target_of_each_phas
     flight = replace(make_flight(scene, steps=steps), scene=scene)
     shown = prepare(common_scene([flight])[0], scene)[0]
     for stage, phase in ((0, 0), (start - 1, 0), (start, -1), (steps, -1)):
-        np.testing.assert_allclose(shown.target[stage], scene.staged.resting[phase], atol=1e-15)
+        np.testing.assert_allclose(shown.target[stage], scene.staged.resting[phase], rtol=0, atol=1e-15)
     resting = prepare([make_flight(load_scene("refuelling"))], load_scene("refuelling"))[0]
     assert resting.target.shape == (8,)
 

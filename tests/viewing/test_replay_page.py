@@ -154,11 +154,11 @@ def test_the_page_moves_target_body_and_payload_with_time(make_flight, paper, tm
     printed = subprocess.run(["node", str(script)], check=True, capture_output=True, text=True).stdout
     (moved, aim), (rest, _) = json.loads(printed)
     expected = [screw.interpolate(tuple(each[20]), tuple(each[21]), 0.25) for each in (target, body, payload)]
-    np.testing.assert_allclose(np.reshape(moved, (4, 8))[1:], expected, atol=1e-5)
-    np.testing.assert_allclose(aim, poses.position(expected[0]), atol=1e-5)
+    np.testing.assert_allclose(np.reshape(moved, (4, 8))[1:], expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(aim, poses.position(expected[0]), rtol=0, atol=1e-5)
     nominal = paper.target.pose.dual_quaternion
     tip, *others, held = np.reshape(rest, (4, 8))
-    np.testing.assert_allclose(others, [nominal, nominal], atol=1e-6)
+    np.testing.assert_allclose(others, [nominal, nominal], rtol=0, atol=1e-6)
     np.testing.assert_array_equal(held, tip)
 
 
@@ -195,9 +195,9 @@ def test_blended_poses_are_screw_motions(tmp_path):
     printed = subprocess.run(["node", str(script)], check=True, capture_output=True, text=True).stdout
     result = json.loads(printed)
     expected = screw.interpolate(start, end, 0.25)
-    np.testing.assert_allclose(result["blend"], expected, atol=1e-6)
+    np.testing.assert_allclose(result["blend"], expected, rtol=0, atol=1e-6)
     rotation, position = poses.to_matrix(expected)
-    np.testing.assert_allclose(result["position"], position, atol=1e-6)
+    np.testing.assert_allclose(result["position"], position, rtol=0, atol=1e-6)
     matrix = np.array(result["matrix"]).reshape(4, 4).T
-    np.testing.assert_allclose(matrix[:3, :3], rotation, atol=1e-6)
-    np.testing.assert_allclose(matrix[:3, 3], position, atol=1e-6)
+    np.testing.assert_allclose(matrix[:3, :3], rotation, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(matrix[:3, 3], position, rtol=0, atol=1e-6)

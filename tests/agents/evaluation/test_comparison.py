@@ -82,7 +82,7 @@ def test_plans_cost_the_optimum_where_nothing_differs(comparison):
         evaluation = row_of(comparison, name, "training").evaluation
         known = ~np.isnan(evaluation.cost_gaps)
         assert known.sum() >= N - 1
-        np.testing.assert_allclose(evaluation.cost_gaps[known], 0.0, atol=1e-9)
+        np.testing.assert_allclose(evaluation.cost_gaps[known], 0.0, rtol=0, atol=1e-9)
         assert evaluation.flights.is_success.tolist() == evaluation.optimal.is_success.tolist()
         assert evaluation.summary()["cheaper_than_expert"] == 0
         dearer = replace(evaluation, optimal=evaluation.optimal._replace(cost=1.01 * evaluation.optimal.cost))

@@ -231,7 +231,7 @@ def test_a_delayed_action_acts_steps_later():
     limits = compile_scene(SHORT).layout.control_limit
     asked = np.clip([policy(seen) for seen in flown.observations], -1.0, 1.0) * limits
     assert not flown.controls[:, :steps].any()
-    np.testing.assert_allclose(flown.controls[:, steps:], asked[:, : -steps - 1], atol=1e-7)
+    np.testing.assert_allclose(flown.controls[:, steps:], asked[:, : -steps - 1], rtol=0, atol=1e-7)
     with pytest.raises(ValueError, match="delay: -1, should be at least 0 steps"):
         rollout(policy, SHORT, delay=-1)
 
@@ -294,7 +294,7 @@ def test_a_policy_of_the_goal_environment_sees_what_that_shows():
         observation, _ = env.reset(seed=seed)
         for step in range(4):
             joined = np.concatenate([observation[key] for key in sorted(observation)]).astype(np.float32)
-            np.testing.assert_allclose(seen[step][copy], joined, atol=1e-6)
+            np.testing.assert_allclose(seen[step][copy], joined, rtol=0, atol=1e-6)
             observation = env.step(policy(joined))[0]
     first = seen[0]
     seen.clear()

@@ -67,7 +67,9 @@ def test_flights_of_the_expert_are_the_demonstrations(some):
 
 def test_on_its_own_way_the_expert_confirms_itself(some):
     labels = label_by_gains(some, flown(some))
-    np.testing.assert_allclose(labels.actions, np.concatenate([each.actions for each in some]), atol=1e-9)
+    np.testing.assert_allclose(
+        labels.actions, np.concatenate([each.actions for each in some]), rtol=0, atol=1e-9
+    )
 
 
 def test_gains_correct_a_flight_that_strays(some):
@@ -76,7 +78,7 @@ def test_gains_correct_a_flight_that_strays(some):
     states, gains = flights.states[0, 40], some[0].feedback_gains[40]
     deviation = some.kernels.difference(some[0].states[40], states)
     expected = np.clip(some[0].actions[40] + gains @ deviation, -1.0, 1.0)
-    np.testing.assert_allclose(labels.actions[40], expected, atol=1e-9)
+    np.testing.assert_allclose(labels.actions[40], expected, rtol=0, atol=1e-9)
     assert np.abs(expected - some[0].actions[40]).max() > 0.01
     clamped = np.abs(labels.actions) == 1.0
     assert clamped.any()
@@ -101,7 +103,7 @@ def test_new_plans_begin_where_the_flight_went_and_are_optimal(some):
     firsts = [*np.flatnonzero(np.diff(stages, prepend=-2) != 1), len(stages)]
     for demonstration, begin, end in zip(some, firsts[:-1], firsts[1:], strict=True):
         rest = demonstration.actions[stages[begin] :]
-        np.testing.assert_allclose(again.actions[begin:end], rest, atol=2e-3)
+        np.testing.assert_allclose(again.actions[begin:end], rest, rtol=0, atol=2e-3)
 
 
 def test_an_interrupted_plan_ends_the_labels(some, monkeypatch):
@@ -135,13 +137,13 @@ def plans_know_the_target_and_the_masses(drawn):
         for demonstration, begin, end in zip(drawn, firsts[:-1], firsts[1:], strict=True):
             rest = slice(stages[begin], -1)
             np.testing.assert_allclose(
-                labels.actions[begin:end], demonstration.actions[rest.start :], atol=2e-3
+                labels.actions[begin:end], demonstration.actions[rest.start :], rtol=0, atol=2e-3
             )
             np.testing.assert_allclose(
-                labels.observations[begin:end], demonstration.observations[rest], atol=1e-2
+                labels.observations[begin:end], demonstration.observations[rest], rtol=0, atol=1e-2
             )
             rows = drawn.kernels.stage_parameters(demonstration.parameters)[stages[begin:end]]
-            np.testing.assert_allclose(labels.parameters[begin:end], rows, atol=1e-12)
+            np.testing.assert_allclose(labels.parameters[begin:end], rows, rtol=0, atol=1e-12)
 
 
 def test_a_network_learns_from_flights_to_other_targets(drawn, tmp_path):
@@ -156,7 +158,7 @@ def test_labels_follow_the_dynamics(some):
     labels, _ = Solver(some.scene).label(some[:1], flown(some[:1], 0.02), 1, np.random.default_rng(0))
     limits = some.kernels.layout.control_limit
     after = some.kernels.step(labels.states[:-1], labels.actions[:-1] * limits)
-    np.testing.assert_allclose(after, labels.states[1:], atol=1e-9)
+    np.testing.assert_allclose(after, labels.states[1:], rtol=0, atol=1e-9)
 
 
 def corrections(count, value):

@@ -67,7 +67,7 @@ def test_the_derivative_of_the_observation_is_exact(scene):
     near, far = (moved(each) - moved(-each) for each in (step, 2.0 * step))
     reference = (8.0 * near - far) / (12.0 * step)
     found = observation_change(kernels, states, observations, directions)
-    np.testing.assert_allclose(found, reference, atol=1e-8)
+    np.testing.assert_allclose(found, reference, rtol=0, atol=1e-8)
     assert np.abs(reference).max() > 0.1
     np.testing.assert_array_equal(found[:, -1], 0.0)
 
@@ -85,7 +85,7 @@ def test_observations_around_a_demonstration_are_relative_to_its_own_target(draw
     step = 1e-4
     moved = drawn.kernels.retract(states, step * directions)
     after = drawn.kernels.observation(moved, observations[:, -1:], p=parameters)[0]
-    np.testing.assert_allclose((after - observations) / step, found, atol=1e-2)
+    np.testing.assert_allclose((after - observations) / step, found, rtol=0, atol=1e-2)
     nominal = observation_change(drawn.kernels, states, observations, directions)
     assert np.abs(nominal - found).max() > 0.05
     network = PolicyNetwork(observations.shape[1], drawn.kernels.n_u, hidden=())
@@ -98,11 +98,11 @@ def test_time_steps_have_the_target_and_the_masses_of_their_stage(staged):
         batch.arrays[name] for name in ("states", "observations", "parameters")
     )
     seen = kernels.observation(states, observations[:, -1:], p=parameters)[0]
-    np.testing.assert_allclose(seen, observations, atol=1e-12)
+    np.testing.assert_allclose(seen, observations, rtol=0, atol=1e-12)
     directions = np.random.default_rng(0).normal(size=(200, kernels.n_t))
     exact = kernels.observation_jacobian(states, p=parameters) @ directions[:, :, None]
     found = observation_change(kernels, states, observations, directions, parameters)
-    np.testing.assert_allclose(found, exact[:, :, 0], atol=1e-8)
+    np.testing.assert_allclose(found, exact[:, :, 0], rtol=0, atol=1e-8)
 
 
 def test_a_policy_with_the_right_gains_has_no_gain_loss(demonstrations, statistics, batch):
@@ -192,9 +192,9 @@ def test_augmentation_asks_for_the_action_that_the_gains_give(demonstrations, st
 def test_statistics_are_those_of_all_time_steps(demonstrations, statistics):
     observations = np.concatenate([each.observations[:-1] for each in demonstrations])
     actions = np.concatenate([each.actions for each in demonstrations])
-    np.testing.assert_allclose(statistics.observation_mean, observations.mean(axis=0), atol=1e-12)
-    np.testing.assert_allclose(statistics.observation_deviation, observations.std(axis=0), atol=1e-12)
-    np.testing.assert_allclose(statistics.action_deviation, actions.std(axis=0), atol=1e-12)
+    np.testing.assert_allclose(statistics.observation_mean, observations.mean(axis=0), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(statistics.observation_deviation, observations.std(axis=0), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(statistics.action_deviation, actions.std(axis=0), rtol=0, atol=1e-12)
     # The root mean square of G d over random deviations d.
     rng = np.random.default_rng(0)
     gains = np.concatenate([each.feedback_gains for each in demonstrations])

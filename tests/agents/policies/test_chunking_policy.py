@@ -58,7 +58,9 @@ def test_an_action_is_the_weighted_mean_of_all_predictions_of_it(weighting):
             share = between / spacing
             predictions.append((1 - share) * chunks[earlier, :, before] + share * chunks[earlier, :, after])
             weights.append(np.exp(weighting * age))
-        np.testing.assert_allclose(found, np.average(predictions, axis=0, weights=weights), atol=1e-12)
+        np.testing.assert_allclose(
+            found, np.average(predictions, axis=0, weights=weights), rtol=0, atol=1e-12
+        )
 
 
 def test_two_steps_are_averaged_as_by_hand():
@@ -77,7 +79,7 @@ def test_flights_of_a_batch_are_those_flown_alone():
     assert together.dtype == np.float32
     assert np.mean(np.abs(together) < 0.99) > 0.2
     for i in range(5):
-        np.testing.assert_allclose(flight(policy, seen[:, i]), together[:, i], atol=1e-6)
+        np.testing.assert_allclose(flight(policy, seen[:, i]), together[:, i], rtol=0, atol=1e-6)
 
 
 def test_it_remembers_within_an_episode_and_forgets_at_the_next():
@@ -99,7 +101,7 @@ def test_every_rollout_begins_anew(small_scene):
     flown = [rollout(acting.act, small_scene, [3, 4], steps=20, record=True).controls for _ in range(2)]
     np.testing.assert_array_equal(flown[0], flown[1])
     alone = rollout(acting.act, small_scene, [4], steps=20, record=True).controls
-    np.testing.assert_allclose(alone[0], flown[0][1], atol=1e-5)
+    np.testing.assert_allclose(alone[0], flown[0][1], rtol=0, atol=1e-5)
 
 
 def test_saved_and_loaded_it_is_the_same(tmp_path):

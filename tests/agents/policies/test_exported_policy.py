@@ -61,10 +61,10 @@ def test_actions_are_those_of_the_formula(activation, squash, limit):
     actions = policy(batch)
     assert actions.shape == (50, N_U)
     assert actions.dtype == np.float32
-    np.testing.assert_allclose(actions, expected(policy, batch), atol=1e-7)
+    np.testing.assert_allclose(actions, expected(policy, batch), rtol=0, atol=1e-7)
     assert np.mean(np.abs(actions) < 0.99) > 0.05
     for observation, action in zip(batch, actions, strict=True):
-        np.testing.assert_allclose(policy(observation), action, atol=1e-7)
+        np.testing.assert_allclose(policy(observation), action, rtol=0, atol=1e-7)
     for large in (1e6, -1e6):
         assert np.isfinite(policy(np.full(N_OBS, large))).all()
 

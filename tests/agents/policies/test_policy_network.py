@@ -37,8 +37,8 @@ def test_the_exported_policy_gives_the_same_actions(activation):
     actions = made.act(observations())
     policy = made.export({"scene": "none"})
     assert 0.02 < np.mean(np.abs(actions) == 1.0) < 0.98
-    np.testing.assert_allclose(policy(observations()), actions, atol=1e-6)
-    np.testing.assert_allclose([policy(each) for each in observations()], actions, atol=1e-6)
+    np.testing.assert_allclose(policy(observations()), actions, rtol=0, atol=1e-6)
+    np.testing.assert_allclose([policy(each) for each in observations()], actions, rtol=0, atol=1e-6)
     assert policy.metadata == {"scene": "none"}
 
 

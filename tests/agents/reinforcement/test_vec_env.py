@@ -281,7 +281,7 @@ def test_replay_buffer_holds_last_observations_as_terminal(wrapper):
     assert not buffer.timeouts.any()  # a target that looks beyond the end would be wrong here
     whole = SHORT.simulation.steps * SHORT.simulation.dt
     for row in last:
-        np.testing.assert_allclose(buffer.next_observations[row, :, -1], 0.0, atol=1e-5)
+        np.testing.assert_allclose(buffer.next_observations[row, :, -1], 0.0, rtol=0, atol=1e-5)
         np.testing.assert_allclose(buffer.observations[row + 1, :, -1], whole, rtol=1e-4)
 
 

@@ -83,7 +83,7 @@ def test_feedback_is_that_of_the_demonstrations(small_scene, demonstrations, pla
     for i, demonstration in enumerate(demonstrations):
         deviation = demonstrations.tangent(demonstration.states[stage], measured[i])
         wanted = demonstration.actions[stage] + demonstration.feedback_gains[stage] @ deviation
-        np.testing.assert_allclose(followed.action[i], np.clip(wanted, -1.0, 1.0), atol=1e-12)
+        np.testing.assert_allclose(followed.action[i], np.clip(wanted, -1.0, 1.0), rtol=0, atol=1e-12)
 
 
 def test_no_correction_leaves_the_plan_with_its_gains(small_scene, plans):
@@ -141,7 +141,7 @@ def test_corrections_count_the_more_the_farther_a_flight_is_from_its_plan(small_
     offset[:, -1] = sizes
     measured = kernels.retract(plans.states[:, 0], offset)
     observer(0, measured, plans.follow(kernels, 0, measured))
-    np.testing.assert_allclose(observer.authority()[:, 0], np.minimum(1.0, sizes / 0.2), atol=1e-9)
+    np.testing.assert_allclose(observer.authority()[:, 0], np.minimum(1.0, sizes / 0.2), rtol=0, atol=1e-9)
 
 
 def write_correction(folder, scene, value=0.02):

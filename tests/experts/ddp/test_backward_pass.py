@@ -104,10 +104,10 @@ def test_agrees_with_the_formulas(
     assert outcome.status == PASS_COMPLETED
     assert outcome.linear == pytest.approx(linear, rel=1e-8)
     assert outcome.quadratic == pytest.approx(quadratic, rel=1e-8)
-    np.testing.assert_allclose(update.k, k, atol=1e-8 * np.abs(k).max())
-    np.testing.assert_allclose(update.K, K, atol=1e-8 * max(np.abs(K).max(), 1.0))
-    np.testing.assert_allclose(update.Vx, Vx, atol=1e-8 * np.abs(Vx).max())
-    np.testing.assert_allclose(update.Vxx, Vxx, atol=1e-8 * np.abs(Vxx).max())
+    np.testing.assert_allclose(update.k, k, rtol=0, atol=1e-8 * np.abs(k).max())
+    np.testing.assert_allclose(update.K, K, rtol=0, atol=1e-8 * max(np.abs(K).max(), 1.0))
+    np.testing.assert_allclose(update.Vx, Vx, rtol=0, atol=1e-8 * np.abs(Vx).max())
+    np.testing.assert_allclose(update.Vxx, Vxx, rtol=0, atol=1e-8 * np.abs(Vxx).max())
 
 
 def test_clamped_inputs_follow_what_bounds_them() -> None:
@@ -136,12 +136,12 @@ def test_clamped_inputs_follow_what_bounds_them() -> None:
         free = np.ix_(~at_bound, ~at_bound)
         right = Qux[~at_bound] + Quu[np.ix_(~at_bound, at_bound)] @ K[at_bound]
         K[~at_bound] = -np.linalg.solve(Quu[free], right)
-        np.testing.assert_allclose(update.K[stage], K, atol=1e-9)
+        np.testing.assert_allclose(update.K[stage], K, rtol=0, atol=1e-9)
         Vx = Qx + K.T @ Quu @ k + K.T @ Qu + Qux.T @ k
         Vxx = Qxx + K.T @ Quu @ K + K.T @ Qux + Qux.T @ K
     assert followed > 10
-    np.testing.assert_allclose(update.Vx, Vx, atol=1e-9 * np.abs(Vx).max())
-    np.testing.assert_allclose(update.Vxx, Vxx, atol=1e-9 * np.abs(Vxx).max())
+    np.testing.assert_allclose(update.Vx, Vx, rtol=0, atol=1e-9 * np.abs(Vx).max())
+    np.testing.assert_allclose(update.Vxx, Vxx, rtol=0, atol=1e-9 * np.abs(Vxx).max())
 
 
 def random_hessians(d: Derivatives, seed: int) -> Hessians:
@@ -182,10 +182,10 @@ def test_second_derivatives_beyond_gauss_newton_enter_as_the_formulas_say(
     linear, quadratic, k, K, Vx, Vxx = reference_pass(d, controls, limit, 30.0, hessians)
     assert outcome.status == PASS_COMPLETED
     assert (outcome.linear, outcome.quadratic) == pytest.approx((linear, quadratic), rel=1e-7)
-    np.testing.assert_allclose(update.k, k, atol=1e-8 * np.abs(k).max())
-    np.testing.assert_allclose(update.K, K, atol=1e-8 * max(np.abs(K).max(), 1.0))
-    np.testing.assert_allclose(update.Vx, Vx, atol=1e-8 * np.abs(Vx).max())
-    np.testing.assert_allclose(update.Vxx, Vxx, atol=1e-8 * np.abs(Vxx).max())
+    np.testing.assert_allclose(update.k, k, rtol=0, atol=1e-8 * np.abs(k).max())
+    np.testing.assert_allclose(update.K, K, rtol=0, atol=1e-8 * max(np.abs(K).max(), 1.0))
+    np.testing.assert_allclose(update.Vx, Vx, rtol=0, atol=1e-8 * np.abs(Vx).max())
+    np.testing.assert_allclose(update.Vxx, Vxx, rtol=0, atol=1e-8 * np.abs(Vxx).max())
 
 
 @pytest.mark.parametrize("limit", [np.inf, 0.2])
@@ -250,8 +250,8 @@ def test_value_function_stays_symmetric_and_accurate_for_badly_scaled_inputs() -
     *_, Vx, Vxx = reference_pass(d, np.zeros(d.lu.shape), np.inf, 1e-2)
     assert outcome.status == PASS_COMPLETED
     np.testing.assert_array_equal(update.Vxx, update.Vxx.T)
-    np.testing.assert_allclose(update.Vxx, Vxx, atol=1e-9 * np.abs(Vxx).max())
-    np.testing.assert_allclose(update.Vx, Vx, atol=1e-8 * np.abs(Vx).max())
+    np.testing.assert_allclose(update.Vxx, Vxx, rtol=0, atol=1e-9 * np.abs(Vxx).max())
+    np.testing.assert_allclose(update.Vx, Vx, rtol=0, atol=1e-8 * np.abs(Vx).max())
 
 
 def test_horizon_of_time_invariant_system_reaches_the_riccati_solution() -> None:

@@ -45,7 +45,7 @@ def test_a_solve_is_that_of_the_scene_with_these_numbers(scene, solver):
     expected = BoxDDP(episode_scene(scene, p)).solve(solver.problem.initial_state)
     assert solution.converged
     assert solution.cost == pytest.approx(expected.cost, rel=1e-12)
-    np.testing.assert_allclose(solution.states, expected.states, atol=1e-8)
+    np.testing.assert_allclose(solution.states, expected.states, rtol=0, atol=1e-8)
     np.testing.assert_array_equal(solution.parameters, np.tile(p, (STEPS + 1, 1)))
     # Without parameters they are nominal again, whatever was solved before.
     nominal = solver.solve()
@@ -80,7 +80,7 @@ def test_stages_have_parameters_of_their_own(solver):
     solution = solver.solve(parameters=rows)
     assert solution.converged
     flown = kernels.simulate(solution.states[0], solution.controls, STEPS, p=rows[:-1])
-    np.testing.assert_allclose(solution.states, flown, atol=1e-12)
+    np.testing.assert_allclose(solution.states, flown, rtol=0, atol=1e-12)
     cost = kernels.cost(flown[:-1], solution.controls, p=rows[:-1]).sum()
     cost += kernels.terminal_cost(flown[-1], p=rows[-1])
     assert solution.cost == pytest.approx(cost, rel=1e-12)
@@ -148,9 +148,9 @@ def test_a_maneuver_moves_with_its_target(scene):
         problem.kernels.observation(x, [0.0], p=q)[1]
         for x, q in ((moved[-1], p), (solution.states[-1], None))
     ]
-    np.testing.assert_allclose(errors[0], errors[1], atol=1e-12)
+    np.testing.assert_allclose(errors[0], errors[1], rtol=0, atol=1e-12)
     flown = problem.kernels.simulate(moved[0], solution.controls, STEPS)
-    np.testing.assert_allclose(flown, moved, atol=1e-9)
+    np.testing.assert_allclose(flown, moved, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

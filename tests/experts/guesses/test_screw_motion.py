@@ -56,7 +56,7 @@ def test_the_jacobian_is_the_derivative_of_the_tip_pose(scene):
     change = np.zeros((4, layout.n_t))
     change[:, : layout.tangent.base_velocity.start] = 1e-5 * np.concatenate(parts, axis=1)
     before, after = (kernels.tip_pose(kernels.retract(states, sign * change)) for sign in (-1.0, 1.0))
-    np.testing.assert_allclose(found, relative_twists(before, after) / 2e-5, atol=1e-8)
+    np.testing.assert_allclose(found, relative_twists(before, after) / 2e-5, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("scene", TILTED)
@@ -80,12 +80,12 @@ def test_the_load_is_the_wrench_about_the_center_of_mass():
     load = arm.tip_load(states, arm.momentum_map(states))
     rotation = np.array(poses.to_matrix(kernels.tip_pose(states).T)[0])
     np.testing.assert_allclose(
-        load[:, :3], np.einsum("ijb,j->bi", rotation, problem.scene.tip_wrench.force), atol=1e-12
+        load[:, :3], np.einsum("ijb,j->bi", rotation, problem.scene.tip_wrench.force), rtol=0, atol=1e-12
     )
     still, dt = np.zeros((4, kernels.n_u)), 1e-4
     later, earlier = (kernels.step(states, still, dt=sign * dt) for sign in (1.0, -1.0))
     rate = (kernels.momentum(later) - kernels.momentum(earlier)) / (2.0 * dt)
-    np.testing.assert_allclose(load, rate, atol=1e-6)
+    np.testing.assert_allclose(load, rate, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("scene", TILTED)
@@ -96,7 +96,7 @@ def test_controls_give_the_accelerations_that_they_are_asked_for(scene):
     controls = np.random.default_rng(1).normal(size=(4, kernels.n_u))
     controls[:, wrist] = 0.0
     found = FreeFloatingArm(kernels).controls(states, kernels.forward_dynamics(states, controls))
-    np.testing.assert_allclose(found, controls, atol=1e-8)
+    np.testing.assert_allclose(found, controls, rtol=0, atol=1e-8)
 
 
 def test_missing_actuators_leave_the_nearest_accelerations():
@@ -127,12 +127,12 @@ def test_from_rest_the_path_is_one_screw_motion(scene):
     way = relative_twists(first[None], np.array([target]))[0]
     gone = relative_twists(np.broadcast_to(first, path.poses.shape), path.poses)
     share = gone @ way / (way @ way)
-    np.testing.assert_allclose(gone, share[:, None] * way, atol=1e-12)
+    np.testing.assert_allclose(gone, share[:, None] * way, rtol=0, atol=1e-12)
     assert np.all(np.diff(share) >= -1e-12)
     halfway = problem.horizon // 2
-    np.testing.assert_allclose(share[0], 0.0, atol=1e-12)
-    np.testing.assert_allclose(share[halfway // 2], 0.5, atol=1e-12)
-    np.testing.assert_allclose(share[halfway:], 1.0, atol=1e-12)
+    np.testing.assert_allclose(share[0], 0.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(share[halfway // 2], 0.5, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(share[halfway:], 1.0, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("scene", ["paper", "tumbling", "planar"])
@@ -140,7 +140,7 @@ def test_the_velocities_of_the_path_are_its_derivative(scene):
     problem = ArmProblem(scene)
     path = tip_path_of(problem, random_start(problem, 3), 0.4)
     slopes = relative_twists(path.poses[:-2], path.poses[2:]) / (2.0 * problem.time_step)
-    np.testing.assert_allclose(path.velocities[1:-1], slopes, atol=2e-3 * np.abs(slopes).max())
+    np.testing.assert_allclose(path.velocities[1:-1], slopes, rtol=0, atol=2e-3 * np.abs(slopes).max())
 
 
 @pytest.mark.parametrize("scene", ["tumbling", "planar"])
@@ -152,9 +152,9 @@ def test_the_path_begins_with_the_velocity_of_the_tip(scene):
     tips = problem.kernels.tip_pose(np.array([earlier, later]))
     expected = relative_twists(tips[:1], tips[1:])[0] / 2e-5
     path = tip_path_of(problem, start, 0.5)
-    np.testing.assert_allclose(path.velocities[0], expected, atol=1e-7)
+    np.testing.assert_allclose(path.velocities[0], expected, rtol=0, atol=1e-7)
     assert np.abs(expected).max() > 0.01
-    np.testing.assert_allclose(path.velocities[-1], 0.0, atol=1e-12)
+    np.testing.assert_allclose(path.velocities[-1], 0.0, rtol=0, atol=1e-12)
     error = poses.error_distance(path.poses[-1], problem.scene.target.pose.dual_quaternion)
     assert error < 1e-12
 
@@ -219,8 +219,10 @@ def test_the_guess_is_a_motion_of_the_robot(scene):
     moved = problem.kernels.difference(guess.states[:-1], guess.states[1:])
     mean = 0.5 * (guess.states[1:] + guess.states[:-1])
     base = slice(tangent.rotation.start, tangent.translation.stop)
-    np.testing.assert_allclose(moved[:, base], dt * mean[:, entries.base_velocity], atol=1e-6)
-    np.testing.assert_allclose(moved[:, tangent.joint_angles], dt * mean[:, entries.joint_rates], atol=1e-5)
+    np.testing.assert_allclose(moved[:, base], dt * mean[:, entries.base_velocity], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        moved[:, tangent.joint_angles], dt * mean[:, entries.joint_rates], rtol=0, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -231,7 +233,7 @@ def test_without_actuators_on_the_base_the_momentum_is_kept(seed):
     start[entries.base_velocity] = [0.02, -0.03, 0.01, 0.01, 0.02, -0.01]
     guess = screw_motion(problem, start, duration=problem.horizon * problem.time_step)
     momentum = problem.kernels.momentum(guess.states)
-    np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], momentum.shape), atol=1e-9)
+    np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], momentum.shape), rtol=0, atol=1e-9)
     assert np.abs(guess.states[-1, entries.base_velocity]).max() > 1e-3
 
 
@@ -240,9 +242,9 @@ def test_thrusters_are_spared_and_wheels_take_the_angular_momentum_out():
     guess = screw_motion(problem, duration=problem.horizon * problem.time_step)
     momentum = problem.kernels.momentum(guess.states)
     np.testing.assert_allclose(
-        momentum[:, :3], np.broadcast_to(momentum[0, :3], (len(momentum), 3)), atol=1e-9
+        momentum[:, :3], np.broadcast_to(momentum[0, :3], (len(momentum), 3)), rtol=0, atol=1e-9
     )
-    np.testing.assert_allclose(momentum[-1, 3:], 0.0, atol=1e-9)
+    np.testing.assert_allclose(momentum[-1, 3:], 0.0, rtol=0, atol=1e-9)
     assert np.linalg.norm(momentum[0, 3:]) > 1.0
     force = guess.controls[:, problem.kernels.layout.control.base_force]
     assert np.quantile(np.abs(force), 0.95) < 0.5
@@ -256,7 +258,7 @@ def test_the_wrist_keeps_its_rate_limit_and_moves_as_commanded():
     limits = problem.control_upper[layout.control.wrist_rate]
     assert np.mean(np.any(np.abs(rates) == limits, axis=1)) > 0.02
     moved = np.diff(guess.states[:, layout.state.wrist_angles], axis=0)
-    np.testing.assert_allclose(moved, problem.time_step * rates, atol=1e-12)
+    np.testing.assert_allclose(moved, problem.time_step * rates, rtol=0, atol=1e-12)
 
 
 def test_a_passive_joint_is_not_driven():
