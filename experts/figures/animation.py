@@ -12,13 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dq_space_arm_env.algebra import poses
+from dq_space_arm_env.scene import Scene
 from dq_space_arm_env.task.trajectory import Trajectory
-from dq_space_arm_env.viewing.constraint_shapes import REACH, constraint_shapes, gas_of, shapes_in_space
+from dq_space_arm_env.viewing.constraint_shapes import (
+    REACH,
+    constraint_shapes,
+    gas_of,
+    shapes_in_space,
+    thruster_shapes,
+)
 from dq_space_arm_env.viewing.picture_format import PictureFormat, View
 from dq_space_arm_env.viewing.rendering import Renderer
 from dq_space_arm_env.viewing.rendering.camera import Camera, camera_around
 from dq_space_arm_env.viewing.rendering.spacecraft import SpacecraftModel
-from dq_space_arm_env.viewing.replay.flights import prepare, target_during
+from dq_space_arm_env.viewing.replay.flights import ShownFlight, prepare, target_during
 from dq_space_arm_env.viewing.replay.geometry import view_of
 from experts.maneuver import Maneuver
 
@@ -44,7 +51,8 @@ def draw_maneuver(
     """Draw the first seconds of a maneuver in real time: RGB pictures, shape (height, width, 3).
 
     The camera stands where the environment has it, or, for a `whole` maneuver, where a replay has it: on the
-    side that shows most, with all of the motion in view; and constraints are drawn as shapes, too.
+    side that shows most, with all of the motion in view; and constraints and the gas of thrusters are drawn
+    as shapes, too.
     """
     for name, value in (("fps", fps), ("seconds", seconds)):
         if not value > 0.0:
@@ -53,10 +61,12 @@ def draw_maneuver(
         raise ValueError(f"fps: {fps}, should be finite")
     renderer = Renderer(maneuver.scene, picture)
     if whole:
-        renderer.camera = _camera_of_all(maneuver, picture)
+        shown = _shown(maneuver)
+        renderer.camera = _camera_of_all(shown, maneuver.scene, picture)
         length = REACH * SpacecraftModel(maneuver.scene).axis_length
-        shapes = [each for group in constraint_shapes(maneuver.scene, length) for each in group]
-        gas = gas_of(maneuver.scene, maneuver.controls)
+        groups = [*constraint_shapes(maneuver.scene, length), thruster_shapes(maneuver.scene, length)]
+        shapes = [each for group in groups for each in group]
+        gas = gas_of(maneuver.scene, shown.acting)
     tips = np.array(poses.position(maneuver.frames[:, -1].T)).T
     times = np.arange(0.0, min(seconds, maneuver.time[-1]) + 1e-9, 1.0 / fps)
     stages = np.searchsorted(maneuver.time, times - 0.5 * maneuver.scene.simulation.dt)
@@ -76,10 +86,15 @@ def draw_maneuver(
     return pictures
 
 
-def _camera_of_all(maneuver: Maneuver, picture: PictureFormat) -> Camera:
-    """The replay's side and points in view; its azimuth and elevation are those of the camera."""
+def _shown(maneuver: Maneuver) -> ShownFlight:
+    """The maneuver as a replay has it."""
     flight = Trajectory(maneuver.scene.name, maneuver.states, maneuver.controls, scene=maneuver.scene)
-    view = view_of(prepare([flight], maneuver.scene), maneuver.scene)
+    return prepare([flight], maneuver.scene)[0]
+
+
+def _camera_of_all(shown: ShownFlight, scene: Scene, picture: PictureFormat) -> Camera:
+    """The replay's side and points in view; its azimuth and elevation are those of the camera."""
+    view = view_of([shown], scene)
     toward = View(180.0 + math.degrees(view.azimuth), -math.degrees(view.elevation))
     margins = np.full(len(view.points), _MARGIN * float(np.ptp(view.points, axis=0).max()))
     return camera_around(view.points, margins, toward, picture.width, picture.height)

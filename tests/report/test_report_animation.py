@@ -109,7 +109,7 @@ def test_a_whole_maneuver_stays_in_the_picture(name):
     states = np.tile(layout.initial_state, (201, 1))
     states[:, layout.state.joint_angles] += np.linspace(0.0, 1.5, 201)[:, None]
     whole = Maneuver(scene, states, np.zeros((200, layout.n_u)))
-    camera = animation._camera_of_all(whole, SMALL)
+    camera = animation._camera_of_all(animation._shown(whole), scene, SMALL)
     tips = np.transpose(poses.position(whole.frames.reshape(-1, 8).T))
     x, y, _ = camera.project(tips).T
     assert ((x > 0) & (x < SMALL.width) & (y > 0) & (y < SMALL.height)).all()
