@@ -54,7 +54,8 @@ def measure(scene: Scene, effort: Effort, announce: Announce) -> dict[str, list[
         ("rate", "rad/s", _fast_motion(scene), 1.0, _RATE_RANGE),
     ]
     if _sprung_coordinates(scene):
-        searches.append(("stiffness", "N m/rad", _vibration(scene), 1.0, _STIFFNESS_RANGE))
+        springs = {"N m/rad" if link.unit == "rad" else "N/m" for link in scene.links if link.freedoms == 1}
+        searches.append(("stiffness", " or ".join(sorted(springs)), _vibration(scene), 1.0, _STIFFNESS_RANGE))
     rows: list[Row] = []
     for index, integrator in enumerate(INTEGRATORS):
         announce(integrator, index, len(INTEGRATORS))
@@ -204,6 +205,7 @@ def section(scene: Scene, found: dict[str, list[Row]]) -> Section:
         f"{SWINGS} of these steps. An integrator follows a motion if the tip ends within {CLOSE:g} m and rad "
         "of a precise solution.",
     )
+    units = {row["quantity"]: row["unit"] for row in rows}
     wide = []
     for integrator in dict.fromkeys(row["integrator"] for row in rows):
         own = [row for row in rows if row["integrator"] == integrator]
@@ -214,7 +216,7 @@ def section(scene: Scene, found: dict[str, list[Row]]) -> Section:
         for quantity, unit in (
             ("step", f"s\n{TURN:g} rad at {SLOW:g} rad/s"),
             ("rate", f"rad/s\nover {TURN:g} rad"),
-            ("stiffness", f"N m/rad\nswings of {DEFLECTION:g} rad"),
+            ("stiffness", f"{units.get('stiffness', 'N m/rad')}\nswings of {DEFLECTION:g} rad"),
         )
     ]
     made.add_rows("limits", wide, ["integrator", *columns], "The largest that each integrator holds")
