@@ -121,7 +121,10 @@ def test_gradients_of_residuals_of_tensors(name, function, torch):
 @pytest.mark.slow
 @pytest.mark.sampled
 @pytest.mark.parametrize("function", FUNCTIONS)
-@pytest.mark.parametrize("name", CONSTRAINED)
+@pytest.mark.parametrize(
+    "name",  # XLA compiles those of servicing for a minute
+    [pytest.param(each, marks=pytest.mark.endurance if each == "servicing" else ()) for each in CONSTRAINED],
+)
 def test_jax_gives_residuals_and_jacobians_of_the_kernels(name, function, jax):
     kernels, states, inputs, p = moving(name)
     n_x, batch = kernels.n_x, [states, inputs[0]][: len(FUNCTIONS[function])]
