@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dq_space_arm_env.common.real_arrays import real_array
+
 LARGEST = 8192
 """Largest width and height, pixels: guards against typos that would fill the memory."""
 
@@ -39,7 +41,7 @@ class View(NamedTuple):
             shape = (3,) if key == "lookat" else ()
             kind = "3 finite numbers, m" if key == "lookat" else "a finite number"
             try:
-                array = np.asarray(value, dtype=np.float64)
+                array = real_array(key, value, np.float64)
             except (TypeError, ValueError):
                 array = np.full(shape, np.nan)
             if array.shape != shape or not np.isfinite(array).all():

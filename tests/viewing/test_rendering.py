@@ -228,6 +228,7 @@ def test_wrong_shapes_are_refused(paper):
         ({"default_camera_config": "azimuth"}, "default_camera_config: 'azimuth', should be a mapping"),
         ({"default_camera_config": {"azimut": 3}}, "'azimut' is unknown; choose from azimuth, elevation"),
         ({"default_camera_config": {"elevation": np.inf}}, "elevation inf, should be a finite number"),
+        ({"default_camera_config": {"azimuth": "90"}}, "azimuth '90', should be a finite number"),
         ({"default_camera_config": {"distance": 0}}, "distance 0, should be positive, m"),
         ({"default_camera_config": {"lookat": (1, 2)}}, r"lookat \(1, 2\), should be 3 finite numbers, m"),
     ],
