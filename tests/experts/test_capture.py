@@ -1,5 +1,8 @@
 """The expert plans across catches, releases and changes of the base's mass."""
 
+import subprocess
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
@@ -59,3 +62,11 @@ def test_an_end_within_the_tolerances_is_no_success_without_the_catch() -> None:
         assert problem.is_success(np.array(states), controls) == info["is_success"] == expected
         assert problem.is_success(np.array(states[6:]), controls[6:]) == expected  # it is caught in step 7
         assert problem.is_success(np.array(states[7:]), controls[7:])
+        assert not problem.is_success(np.full((6, env.kernels.n_x), np.nan), controls[7:])
+
+
+def test_a_problem_loads_no_environment() -> None:
+    code = (
+        "import sys, experts.problems.arm_problem; assert 'dq_space_arm_env.environment' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
