@@ -11,7 +11,6 @@ from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.parameters import CONTROL_UNITS
 from dq_space_arm_env.scene.path import shown_target
 from dq_space_arm_env.viewing.payload_places import payload_path
-from dq_space_arm_env.viewing.replay.curves import unit_of
 from dq_space_arm_env.viewing.replay.flights import frame_poses, target_during, tip_errors
 from experts.problems.shooting_problem import FloatArray
 
@@ -114,7 +113,7 @@ class Maneuver:
                 continue
             history = ActuatorHistory(
                 name,
-                unit_of(layout, entries),
+                layout.control.unit(entries),
                 layout.control.names[entries],
                 self.controls[:, entries],
                 layout.control_limit[entries],

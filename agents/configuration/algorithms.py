@@ -3,12 +3,13 @@
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
-from pydantic import Field, StrictBool
+from pydantic import Field
 
 from agents.configuration.schema import MOST_IN_MEMORY, DemonstrationSource, Few, Many
 from dq_space_arm_env.validation import (
     Count,
     Finite,
+    Flag,
     Fraction,
     Model,
     NonNegative,
@@ -117,7 +118,7 @@ class OffPolicy(_Common):
     train_freq: Many = Field(default=1, description="decisions of each copy between updates")
     gradient_steps: Many = Field(default=1, description="gradient steps per update")
     n_critics: Few = Field(default=2, description="critics; the lowest value or quantiles count")
-    layer_norm: StrictBool = Field(default=False, description="whether critics are layer-normalized")
+    layer_norm: Flag = Field(default=False, description="whether critics are layer-normalized")
     hindsight: Hindsight | None = Field(
         default=None, description="learn on the goal environment, with hindsight; absent: neither"
     )

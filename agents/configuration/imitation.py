@@ -6,7 +6,7 @@
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
-from pydantic import Field, StrictBool, StrictInt
+from pydantic import Field, StrictInt
 
 from agents.configuration.schema import (
     MOST_LAYERS,
@@ -17,7 +17,16 @@ from agents.configuration.schema import (
     Width,
     weight_problems,
 )
-from dq_space_arm_env.validation import Count, Finite, Model, NonNegative, Positive, Problem, count_up_to
+from dq_space_arm_env.validation import (
+    Count,
+    Finite,
+    Flag,
+    Model,
+    NonNegative,
+    Positive,
+    Problem,
+    count_up_to,
+)
 
 SMOOTH_ACTIVATIONS = ("tanh", "silu")  # differentiable everywhere, as matching gains needs
 
@@ -90,7 +99,7 @@ class Cloning(Fit):
 
     name: Literal["cloning"] = "cloning"
     objective: ObjectiveWeights = Field(default_factory=ObjectiveWeights, description="the loss")
-    stationary: StrictBool = Field(
+    stationary: Flag = Field(
         default=False,
         description="whether the policy does without the time left: to the end it acts as in the middle of "
         "an episode, where an expert with a finite horizon lets go",

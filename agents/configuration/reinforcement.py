@@ -3,11 +3,11 @@
 import math
 from collections.abc import Iterator
 
-from pydantic import Field, StrictBool
+from pydantic import Field
 
 from agents.configuration.algorithms import PPO, Algorithm, Hindsight, OffPolicy
 from agents.configuration.schema import MOST_IN_MEMORY, AgentConfiguration, Many, StartFrom
-from dq_space_arm_env.validation import Count, Model, NonNegative, Positive, Problem
+from dq_space_arm_env.validation import Count, Flag, Model, NonNegative, Positive, Problem
 
 _REWARD_SHAPING = ("reward_scale", "cost_power", "success_reward", "end_error_cost")
 
@@ -57,7 +57,7 @@ class Practice(Model):
         description="cost of ending far off the target, not scaled by reward_scale; half of it where one "
         "error equals its tolerance and the others are zero",
     )
-    normalize_observations: StrictBool = Field(
+    normalize_observations: Flag = Field(
         default=True, description="whether networks see observations in units of their spread"
     )
 

@@ -8,12 +8,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, StrictBool, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError
 
 from agents.configuration import AgentConfiguration, ConfigurationError, load_configuration
 from dq_space_arm_env.common.bounded_reading import UnreadableError
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.validation import (
+    Flag,
     Model,
     Problem,
     YAMLError,
@@ -42,7 +43,7 @@ class Parameter(Model):
 
     low: Annotated[Any, BeforeValidator(_number)] = Field(default=None, description="smallest value")
     high: Annotated[Any, BeforeValidator(_number)] = Field(default=None, description="largest value")
-    log: StrictBool = Field(default=False, description="whether factors count rather than differences")
+    log: Flag = Field(default=False, description="whether factors count rather than differences")
     choices: tuple[Any, ...] | None = Field(default=None, description="values, two or more")
 
     def _problems(self) -> Iterator[Problem]:

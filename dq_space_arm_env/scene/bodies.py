@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, StrictBool
+from pydantic import BeforeValidator, Field
 
 from dq_space_arm_env.scene.drives import Motor
 from dq_space_arm_env.scene.pose import Matrix3, Pose
@@ -14,6 +14,7 @@ from dq_space_arm_env.validation.fields import (
     Angle,
     ControlWeight,
     Finite,
+    Flag,
     Limit,
     Mass,
     Name,
@@ -128,7 +129,7 @@ class Link(Model):
         exclude_if=lambda pitch: pitch == 0.0,
         description="slide of a screw joint along z per angle about z, m/rad",
     )
-    actuated: StrictBool = Field(
+    actuated: Flag = Field(
         default=True, description="whether a motor drives the joint; false: the joint is passive"
     )
     torque_limit: Limit | None = Field(

@@ -89,7 +89,8 @@ def _joint_limit_problems(
         yield Problem(here, limits, sentence)
     for index in range(count):
         if not lower[index] < upper[index]:
-            sentence = f"must be above the lower limit of link {index}, {lower[index]:g} rad"
+            least = f"{lower[index]:g} {scene.links[index].unit}"
+            sentence = f"must be above the lower limit of link {index}, {least}"
             yield Problem((*here, "upper"), upper[index], sentence)
         if not rate[index] > 0.0:
             yield Problem((*here, "rate"), rate[index], "must be greater than 0")

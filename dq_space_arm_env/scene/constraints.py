@@ -8,13 +8,14 @@ import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, StrictBool
+from pydantic import BeforeValidator, Field
 
 from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene.bodies import Link, freedoms
 from dq_space_arm_env.validation.fields import (
-    ANGLES,
     LENGTHS,
+    Bounds,
+    Flag,
     Limits,
     Limits3,
     Name,
@@ -38,18 +39,6 @@ _PER_AXIS = "one number for all three axes, or three; .inf or absent: any"
 _ONE_BY_ONE = "one number for all, or one for each; .inf or absent: any"
 
 
-def _read_bounds(value: Any) -> tuple[float, ...]:
-    """Read one bound, or one per link; infinite ones bound nothing."""
-    items = value if isinstance(value, list | tuple) else [value]
-    if not items or any(isinstance(item, bool) or not isinstance(item, int | float) for item in items):
-        raise problem(f"must be numbers, .inf for none: {PER_LINK}")
-    bounds = tuple(float(item) + 0.0 for item in items)
-    if any(math.isnan(bound) for bound in bounds):
-        raise problem(f"must be numbers, .inf for none: {PER_LINK}")
-    ANGLES.check(*bounds)
-    return bounds
-
-
 def _read_direction(value: Any) -> tuple[float, ...]:
     direction = read_numbers(value, 3, LENGTHS)
     if not math.hypot(*direction) > 0.0:
@@ -57,7 +46,6 @@ def _read_direction(value: Any) -> tuple[float, ...]:
     return direction
 
 
-Bounds = Annotated[tuple[float, ...], BeforeValidator(_read_bounds)]
 Direction = Annotated[Three, BeforeValidator(_read_direction)]
 
 
@@ -106,7 +94,7 @@ class Constraint(Model):
         default=0.01,
         description="violation that costs 1 in the environment, in the unit of the residual",
     )
-    terminates: StrictBool = Field(
+    terminates: Flag = Field(
         default=False, description="whether a violation beyond the tolerance ends the episode"
     )
     observed: Positive | None = Field(
@@ -121,20 +109,20 @@ class Constraint(Model):
 
 
 class JointLimits(Constraint):
-    """Least and greatest joint angles, and greatest joint rates; residuals in rad and rad/s.
+    """Least and greatest joint angles, and greatest joint rates; residuals in rad and rad/s (m and m/s).
 
     Joints of one coordinate have them: one number for all links passes over spherical and fixed ones.
     """
 
     kind: Literal["joint_limits"] = Field(description="'joint_limits'")
     lower: Bounds = Field(
-        default=(-math.inf,), description=f"least joint angle, rad, -.inf for none: {PER_LINK}"
+        default=(-math.inf,), description=f"least joint angle, rad (m), -.inf for none: {PER_LINK}"
     )
     upper: Bounds = Field(
-        default=(math.inf,), description=f"greatest joint angle, rad, .inf for none: {PER_LINK}"
+        default=(math.inf,), description=f"greatest joint angle, rad (m), .inf for none: {PER_LINK}"
     )
     rate: Bounds = Field(
-        default=(math.inf,), description=f"greatest joint rate, rad/s, .inf for none: {PER_LINK}"
+        default=(math.inf,), description=f"greatest joint rate, rad/s (m/s), .inf for none: {PER_LINK}"
     )
 
 

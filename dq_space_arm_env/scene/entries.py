@@ -110,6 +110,18 @@ class ControlEntries(_Entries):
     limits: tuple[str, ...]  # name of each control's limit in the scene
     weights: tuple[str, ...]  # name of each control's weight in the cost
 
+    def unit(self, entries: slice, prefix: str = "") -> str:
+        """Find the unit of some controls.
+
+        Args:
+            entries: Their place.
+            prefix: Prefix of the unit, such as "m".
+
+        Returns:
+            The unit; two of motors of which some turn and others slide, such as "N m or N".
+        """
+        return " or ".join(prefix + unit for unit in dict.fromkeys(self.units[entries]))
+
     @classmethod
     def of(cls, controls: Mapping[str, Sequence[ControlNumbers]]) -> Self:
         """Lay out the controls."""

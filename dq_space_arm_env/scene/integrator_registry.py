@@ -56,11 +56,6 @@ class IntegratorEntry:
         """Whether any stiffness and damping is bounded."""
         return isinf(self.imaginary_interval) and isinf(self.real_interval)
 
-    @property
-    def has_curvature(self) -> bool:
-        """Whether the method has second derivatives of its own."""
-        return self.curvature == self.name
-
 
 INTEGRATORS: Mapping[str, IntegratorEntry] = {
     entry.name: entry

@@ -3,7 +3,7 @@
 import math
 from typing import Literal
 
-from pydantic import Field, StrictBool
+from pydantic import Field
 
 from dq_space_arm_env.scene.bodies import Payload
 from dq_space_arm_env.scene.motion import Motion
@@ -17,6 +17,7 @@ from dq_space_arm_env.validation.fields import (
     ControlWeight,
     ControlWeights3,
     Delay,
+    Flag,
     Fraction,
     LengthSpread,
     Limit,
@@ -131,13 +132,13 @@ class Target(Model):
         default=_ZERO_TWIST,
         description="desired velocity of the base in base axes: angular (3) rad/s, linear (3) m/s",
     )
-    base_velocity_relative: StrictBool = Field(
+    base_velocity_relative: Flag = Field(
         default=False,
         exclude_if=lambda relative: not relative,
         description="whether base_velocity is relative to a target that moves: at 0 the base moves along as "
         "if fixed to it",
     )
-    observed: StrictBool = Field(
+    observed: Flag = Field(
         default=False,
         exclude_if=lambda observed: not observed,
         description="whether q_{D/I} is observed besides q_{D/G}: where the target varies, the cost with "
@@ -329,7 +330,7 @@ class Spread(Model):
     payload_inertia: Fraction = Field(
         default=0.0, description="inertia of the payload about its center of mass, as a fraction of it"
     )
-    observed: StrictBool = Field(
+    observed: Flag = Field(
         default=False,
         exclude_if=lambda observed: not observed,
         description="whether the relative changes of drawn masses and inertias are observed, one number for "

@@ -5,7 +5,7 @@ code. At its start the payload may be caught.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import Annotated, Any, NamedTuple
@@ -24,6 +24,7 @@ from dq_space_arm_env.scene.parameters import (
     parents,
     target_numbers,
 )
+from dq_space_arm_env.validation.changes import list_position
 from dq_space_arm_env.validation.fields import Name, Steps
 from dq_space_arm_env.validation.problems import Model, Problem, SceneError, problem
 
@@ -203,31 +204,34 @@ def phase_problems(scene: Scene) -> Iterator[Problem]:
             sentence = "has no effect on a target that moves: it needs target.motion: null beside it"
             yield Problem((*here, posed), dict(phase.changes)[posed], sentence)
         held.append(scene.payload is not None and "payload" not in removed)
-        gains = held[-2:] == [False, True]
-        if gains and phase.catch is None:
-            sentence = (
-                "must be given: the phase before holds no payload and this one does; its tolerances, such as "
-                "position_error: 0.01, say within what the payload is caught"
-            )
-            yield Problem(("phases", index, "catch"), None, sentence)
-        elif phase.catch is not None and not gains:
-            if not held[-1]:
-                sentence = "must be absent: this phase holds no payload"
-            elif len(held) == 1:
-                sentence = "must be absent: the first phase holds the payload from the start"
-            else:
-                sentence = "must be absent: the phase before already holds the payload"
-            yield Problem(("phases", index, "catch"), phase.catch, sentence)
-        elif gains and any(held[:-1]):
-            sentence = (
-                "must be in no phase after one that holds the payload: once let go, it drifts and does not "
-                "move with the target"
-            )
+        if sentence := _catch_flaw(phase.catch is not None, held):
             yield Problem(("phases", index, "catch"), phase.catch, sentence)
     if valid and scene.payload is not None and held and not any(held):
         yield Problem(("phases",), len(held), "never hold the payload: leave it out of the scene")
     if valid:
         yield from _drawn_problems(scene)
+
+
+def _catch_flaw(catches: bool, held: Sequence[bool]) -> str:
+    """Say what is wrong with the catch of the last of some phases, each of which holds the payload or not."""
+    gains = list(held[-2:]) == [False, True]
+    if gains and not catches:
+        return (
+            "must be given: the phase before holds no payload and this one does; its tolerances, such as "
+            "position_error: 0.01, say within what the payload is caught"
+        )
+    if gains and any(held[:-1]):
+        return (
+            "must be in no phase after one that holds the payload: once let go, it drifts and does not "
+            "move with the target"
+        )
+    if gains or not catches:
+        return ""
+    if not held[-1]:
+        return "must be absent: this phase holds no payload"
+    if len(held) == 1:
+        return "must be absent: the first phase holds the payload from the start"
+    return "must be absent: the phase before already holds the payload"
 
 
 def _change_problems(
@@ -264,8 +268,9 @@ def _value_at(scene: Scene, path: str) -> Any:
     """What a path leads to in the scene; None for nothing."""
     here: Any = scene
     for key in path.split("."):
-        if isinstance(here, tuple) and key.isdecimal() and int(key) < len(here):
-            here = here[int(key)]
+        position = list_position(key)
+        if isinstance(here, tuple) and position is not None and position < len(here):
+            here = here[position]
         elif isinstance(here, Model) and key in type(here).model_fields:
             here = getattr(here, key)
         else:

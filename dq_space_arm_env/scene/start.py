@@ -121,64 +121,21 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     position of the grasp frame, speeds of the wheels. A planar base, and its target, turn about z and move in
     x and y only.
     """
-    start, spread = scene.initial_state, scene.spread
-    turning, moving = free_axes(scene)
-    columns = iter(draws)
-
-    def spread_out(nominal: Sequence[float], half_width: float, components: Sequence[int]) -> list[Scalar]:
-        values: list[Scalar] = list(nominal)
-        for index in components:
-            values[index] = values[index] + half_width * next(columns)
-        return values
-
+    start, spread, around = scene.initial_state, scene.spread, _Draws(scene, draws)
+    turning, moving = around.axes
     joints, angles = range(len(start.joint_angles)), range(len(start.wrist_angles))
-    rotation_vector = spread_out((0.0, 0.0, 0.0), spread.base_rotation, turning)
-    rotation = multiply(start.base_pose.rotation, rotations.exponential(rotation_vector))
-    position = spread_out(start.base_pose.position, spread.base_position, moving)
-    turns = spread_out([0.0] * len(joints), spread.joint_angles, joints)
+    rotation, position = around.pose(start.base_pose, spread.base_rotation, spread.base_position)
+    turns = around([0.0] * len(joints), spread.joint_angles, joints)
     joint_angles = _coordinates(scene, start.joint_angles, turns)
-    wrist_angles = spread_out(start.wrist_angles, spread.wrist_angles, angles)
-    angular = spread_out(start.base_velocity[:3], spread.base_angular_velocity, turning)
-    linear = spread_out(start.base_velocity[3:], spread.base_linear_velocity, moving)
-    joint_rates: Sequence[Scalar] = spread_out(start.joint_rates, spread.joint_rates, joints)
-    target: Sequence[Scalar] = scene.target.pose.dual_quaternion
-    drawn: dict[str, Scalar] = {}
-
-    def spread_out_pose(nominal: Pose, half_angle: float, half_width: float) -> tuple[Scalar, ...]:
-        turned = rotations.exponential(spread_out((0.0, 0.0, 0.0), half_angle, turning))
-        moved = spread_out(nominal.position, half_width, moving)
-        return tuple(poses.from_rotation_and_position(multiply(nominal.rotation, turned), moved))
-
-    if has_target_spread(scene):
-        target = spread_out_pose(scene.target.pose, spread.target_rotation, spread.target_position)
-        drawn |= {number.name: target[index] for number, index in _indexed_target(scene)}
-    for half_width, numbers in drawn_factors(scene):
-        factor = 1.0 + half_width * next(columns)
-        drawn |= {number.name: factor * number.nominal for number in numbers}
-    motion = scene.target.motion
-    if isinstance(motion, ScrewMotion | Tumbling):
-        turning_rate: Sequence[Scalar] = motion.angular_velocity
-        speed: Sequence[Scalar] = motion.linear_velocity
-        if has_velocity_spread(scene):
-            turning_rate = spread_out(turning_rate, spread.target_angular_velocity, turning)
-            speed = spread_out(speed, spread.target_linear_velocity, moving)
-        if isinstance(motion, Tumbling):  # its velocity is given in inertial axes
-            speed = transposed_matrix_vector(rotations.to_matrix(target[:4]), speed)
-        twist = (*turning_rate, *speed)
-        drawn |= {number.name: twist[index] for number, index in _indexed_velocity(scene)}
-    at_rest = scene.staged.resting[0] if scene.phases else None  # where the first phase has it
-    if at_rest is not None and (motion is not None or not has_target_spread(scene)):
-        target = at_rest
-    grasp: Sequence[Scalar] = scene.target.grasp.dual_quaternion
-    if has_grasp_spread(scene):
-        grasp = spread_out_pose(scene.target.grasp, spread.grasp_rotation, spread.grasp_position)
-        drawn |= {number.name: grasp[index] for number, index in _indexed_grasp(scene)}
-    if has_grasp(scene):
-        target = multiply(target[:4], grasp[:4])
+    wrist_angles = around(start.wrist_angles, spread.wrist_angles, angles)
+    angular = around(start.base_velocity[:3], spread.base_angular_velocity, turning)
+    linear = around(start.base_velocity[3:], spread.base_linear_velocity, moving)
+    joint_rates: Sequence[Scalar] = around(start.joint_rates, spread.joint_rates, joints)
+    grasp, drawn = _drawn_goal(scene, around)
     # q and -q are one pose, but the cost |q_{G/I} - q_{D/I}|^2 sees two: the base quaternion gets the sign
     # for which the real part of q_{G/I} has a non-negative product with that of q_{D/I}.
     tip = multiply(rotation, _tip_rotation(scene, joint_angles, wrist_angles))
-    alignment = sum(a * b for a, b in zip(tip, target[:4], strict=True))
+    alignment = sum(a * b for a, b in zip(tip, grasp, strict=True))
     sign = select(alignment < 0.0, -1.0, 1.0)
     pose = [sign * entry for entry in poses.from_rotation_and_position(rotation, position)]
     velocity = angular + linear
@@ -187,7 +144,7 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
         velocity = [velocity[index] for index in PLANAR_TWIST]
     wheels, speeds = scene.actuators.wheels or (), list(start.wheel_speeds or [0.0] * len(wheel_names(scene)))
     if spread.wheel_speeds:
-        speeds = spread_out(speeds, spread.wheel_speeds, range(len(wheels)))
+        speeds = around(speeds, spread.wheel_speeds, range(len(wheels)))
     momenta = [
         w.inertia * (speed + dot(w.unit_axis, angular)) for w, speed in zip(wheels, speeds, strict=True)
     ]
@@ -203,6 +160,70 @@ def episode_start(scene: Scene, draws: Sequence[Scalar]) -> EpisodeStart:
     coordinates = [entry for joint in joint_angles for entry in joint]
     state = [*pose, *coordinates, *wrist_angles, *rates, *previous, *on_the_way]
     return EpisodeStart(state, drawn)
+
+
+class _Draws:
+    """Numbers in [-1, 1], spread out around nominal values one after another."""
+
+    def __init__(self, scene: Scene, draws: Sequence[Scalar]) -> None:
+        self.axes = free_axes(scene)
+        self._left = iter(draws)
+
+    def __call__(
+        self, nominal: Sequence[float], half_width: float, components: Sequence[int]
+    ) -> list[Scalar]:
+        """Values of which some components are spread out."""
+        values: list[Scalar] = list(nominal)
+        for index in components:
+            values[index] = values[index] + half_width * next(self._left)
+        return values
+
+    def pose(
+        self, nominal: Pose, half_angle: float, half_width: float
+    ) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
+        """Rotation and position: turned by a rotation vector, and moved."""
+        turning, moving = self.axes
+        turned = rotations.exponential(self((0.0, 0.0, 0.0), half_angle, turning))
+        position = self(nominal.position, half_width, moving)
+        return multiply(nominal.rotation, turned), position
+
+
+def _drawn_goal(scene: Scene, around: _Draws) -> tuple[Sequence[Scalar], dict[str, Scalar]]:
+    """Rotation of q_{D/I}, and drawn parameters by name: target, masses, velocity of the target, grasp."""
+    spread = scene.spread
+    target: Sequence[Scalar] = scene.target.pose.dual_quaternion
+    drawn: dict[str, Scalar] = {}
+
+    def around_pose(nominal: Pose, half_angle: float, half_width: float) -> tuple[Scalar, ...]:
+        return tuple(poses.from_rotation_and_position(*around.pose(nominal, half_angle, half_width)))
+
+    if has_target_spread(scene):
+        target = around_pose(scene.target.pose, spread.target_rotation, spread.target_position)
+        drawn |= {number.name: target[index] for number, index in _indexed_target(scene)}
+    for half_width, numbers in drawn_factors(scene):
+        (factor,) = around((1.0,), half_width, (0,))
+        drawn |= {number.name: factor * number.nominal for number in numbers}
+    motion = scene.target.motion
+    if isinstance(motion, ScrewMotion | Tumbling):
+        turning_rate: Sequence[Scalar] = motion.angular_velocity
+        speed: Sequence[Scalar] = motion.linear_velocity
+        if has_velocity_spread(scene):
+            turning, moving = around.axes
+            turning_rate = around(turning_rate, spread.target_angular_velocity, turning)
+            speed = around(speed, spread.target_linear_velocity, moving)
+        if isinstance(motion, Tumbling):  # its velocity is given in inertial axes
+            speed = transposed_matrix_vector(rotations.to_matrix(target[:4]), speed)
+        twist = (*turning_rate, *speed)
+        drawn |= {number.name: twist[index] for number, index in _indexed_velocity(scene)}
+    at_rest = scene.staged.resting[0] if scene.phases else None  # where the first phase has it
+    if at_rest is not None and (motion is not None or not has_target_spread(scene)):
+        target = at_rest
+    grasp: Sequence[Scalar] = scene.target.grasp.dual_quaternion
+    if has_grasp_spread(scene):
+        grasp = around_pose(scene.target.grasp, spread.grasp_rotation, spread.grasp_position)
+        drawn |= {number.name: grasp[index] for number, index in _indexed_grasp(scene)}
+    rotation = target[:4]
+    return (multiply(rotation, grasp[:4]) if has_grasp(scene) else rotation), drawn
 
 
 def parameter_values(scene: Scene, start: EpisodeStart) -> list[Scalar]:

@@ -53,7 +53,7 @@ def worst_cost(now: SceneEquations, phases: Sequence[SceneEquations], x: Scalars
     cases = [WorstCase(each) for each in phases]
     caught = WorstCase(now).payload_speeds() if has_catch(now.scene) else ()
     found = [case.speeds(x, steps * now.scene.simulation.dt, caught) for case in cases]
-    most = found[0] if len(found) == 1 else [reduce(casadi.fmax, each) for each in zip(*found, strict=True)]
+    most = [reduce(casadi.fmax, each) for each in zip(*found, strict=True)]
     return total([case.cost(x, steps, *most) for case in cases])
 
 

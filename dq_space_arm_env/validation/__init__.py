@@ -4,6 +4,7 @@ from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.validation.fields import (
     Count,
     Finite,
+    Flag,
     Fraction,
     NonNegative,
     Positive,
@@ -23,6 +24,7 @@ from dq_space_arm_env.validation.yaml_text import (
 __all__ = [
     "Count",
     "Finite",
+    "Flag",
     "Fraction",
     "Model",
     "NonNegative",

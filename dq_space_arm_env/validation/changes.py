@@ -1,10 +1,13 @@
 """Changes of a model: a mapping changes what it names, anything else replaces what is there."""
 
+import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.validation.problems import Model, field_path
+
+_MOST_DIGITS = 18  # of a position; Python refuses to read some thousands
 
 
 class ChangeError(ValueError):
@@ -48,18 +51,22 @@ def merged(present: Any, change: Any, location: tuple[str | int, ...] = ()) -> A
         return fields | {
             key: merged(fields.get(key), value, (*location, key)) for key, value in change.items()
         }
-    if isinstance(present, tuple) and all(_is_position(key) for key in change):
+    positions = [place for key in change if (place := list_position(key)) is not None]
+    if isinstance(present, tuple) and len(positions) == len(change):
         entries = list(present)
-        for key, value in change.items():
-            if int(key) >= len(entries):
+        for position, (key, value) in zip(positions, change.items(), strict=True):
+            if position >= len(entries):
                 here = field_path(location)
                 raise ChangeError(
                     f"{here} has {len(entries)} entries, the first is 0; there is no {shortened(key)}"
                 )
-            entries[int(key)] = merged(entries[int(key)], value, (*location, int(key)))
+            entries[position] = merged(entries[position], value, (*location, position))
         return entries
     return change
 
 
-def _is_position(key: Any) -> bool:
-    return (isinstance(key, int) and key >= 0) or (isinstance(key, str) and key.isdecimal())
+def list_position(key: Any) -> int | None:
+    """Position in a list that a key names, 0 for the first; None if it names none."""
+    if isinstance(key, str) and key.isdecimal():
+        return int(key) if len(key) <= _MOST_DIGITS else sys.maxsize
+    return key if isinstance(key, int) and key >= 0 else None

@@ -173,9 +173,17 @@ def _delay(value: Any) -> int:
     return steps
 
 
+def _flag(value: Any) -> bool:
+    """Accept true or false, as Python and NumPy have them."""
+    if not isinstance(value, bool | np.bool_):
+        raise problem("must be true or false")
+    return bool(value)
+
+
 _Rule = tuple[Callable[[float], bool], str, Range]
 _STATE_WEIGHT: _Rule = (lambda number: 0 <= number < math.inf, "finite and 0 or greater", STATE_WEIGHTS)
 _CONTROL_WEIGHT: _Rule = (lambda number: 0 < number < math.inf, "finite and greater than 0", CONTROL_WEIGHTS)
+_BOUND: _Rule = (lambda number: not math.isnan(number), "finite, or infinite for no bound", ANGLES)
 _LIMIT: _Rule = (lambda number: number > 0, "greater than 0, or .inf for no limit", FORCES)
 
 Three = tuple[float, float, float]
@@ -183,6 +191,7 @@ Six = tuple[float, float, float, float, float, float]
 Eight = tuple[float, float, float, float, float, float, float, float]
 
 Name = Annotated[StrictStr, Field(min_length=1), AfterValidator(_name)]
+Flag = Annotated[bool, BeforeValidator(_flag)]
 Finite = Annotated[float, _number(math.isfinite, "a finite number", UP_TO)]
 Positive = Annotated[float, positive(ANY)]
 PositiveOrOff = Annotated[float | Literal["off"], BeforeValidator(_number_or_off)]
@@ -209,6 +218,7 @@ AngleSpread = Annotated[float, non_negative(ANGLES)]
 RateSpread = Annotated[float, non_negative(RATES)]
 Limit = Annotated[float, _number(lambda n: n > 0, "a number greater than 0, or .inf for no limit", FORCES)]
 Limits3 = Annotated[Three, _per_component(3, *_LIMIT)]
+Bounds = Annotated[tuple[float, ...], _per_component(None, *_BOUND)]
 Limits = Annotated[tuple[float, ...], _per_component(None, *_LIMIT)]
 StateWeights8 = Annotated[Eight, _per_component(8, *_STATE_WEIGHT)]
 StateWeights6 = Annotated[Six, _per_component(6, *_STATE_WEIGHT)]

@@ -137,7 +137,6 @@ _SENTENCES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "dict_type": lambda context: "must be a mapping (key: value)",
     "invalid_key": lambda context: "keys must be text",
     "string_type": lambda context: "must be text; quote it if it looks like a number, a date or true/false",
-    "bool_type": lambda context: "must be true or false",
     "string_too_short": lambda context: "must not be empty",
     "tuple_type": lambda context: "must be a list",
     "literal_error": lambda context: f"must be {context['expected']}",

@@ -6,7 +6,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from dq_space_arm_env.scene import StateLayout
-from dq_space_arm_env.viewing.replay.curves import unit_of
 from experts.ddp.solution import Solution
 from experts.figures.style import (
     BLACK,
@@ -118,7 +117,7 @@ def _draw_actuator(axes: Axes, maneuver: Maneuver, actuator: ActuatorHistory) ->
             axes.axhline(scale * side, **LIMIT_STYLE)
     title, quantity = _TITLES[actuator.name]
     layout = StateLayout.of(maneuver.scene)
-    unit = unit_of(layout, getattr(layout.control, actuator.name), prefix)
+    unit = layout.control.unit(getattr(layout.control, actuator.name), prefix)
     finish_panel(axes, f"{title} ({_limit_note(actuator, near)})", f"{quantity} [{unit}]")
 
 

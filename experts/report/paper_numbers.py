@@ -9,7 +9,6 @@ import numpy as np
 from dq_space_arm_env import Scene
 from dq_space_arm_env.algebra import rotations
 from dq_space_arm_env.scene import Pose, StateLayout
-from dq_space_arm_env.viewing.replay.curves import unit_of
 
 Value = float | str | tuple[float, ...]
 
@@ -151,5 +150,5 @@ def _limits(scene: Scene) -> str:
         if len(limits):
             value = _collapsed(limits)
             text = f"{value:g}" if isinstance(value, float) else numbers(limits)
-            texts.append(f"{name} {text} {unit_of(layout, place)}")
+            texts.append(f"{name} {text} {layout.control.unit(place)}")
     return "; ".join(texts)

@@ -11,8 +11,8 @@ from dq_space_arm_env.scene.simulation import TOLERANCES
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_an_entry_says_of_its_method_what_is_so(name):
     entry, method = INTEGRATORS[name], integrator_of(Simulation(), name)
-    assert isinstance(method, TwiceDifferentiableIntegrator) == entry.has_curvature
-    assert entry.curvature is None or INTEGRATORS[entry.curvature].has_curvature
+    assert isinstance(method, TwiceDifferentiableIntegrator) == (entry.curvature == name)
+    assert entry.curvature is None or INTEGRATORS[entry.curvature].curvature == entry.curvature
     assert hasattr(method, "append_walk") == entry.keeps_momentum
     assert all(hasattr(method, key) for key in entry.tolerances)
     assert entry.is_adaptive == any(hasattr(method, key) for key in TOLERANCES["float64"])

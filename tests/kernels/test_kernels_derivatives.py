@@ -72,7 +72,7 @@ def scenes_and_integrators():
             continue
         if integrator == "rodas5p" and scene != "planar":
             continue  # it shares all but numbers with rodas4
-        if integrator == "rk4" or scene in STRUCTURES or INTEGRATORS[integrator].has_curvature:
+        if integrator == "rk4" or scene in STRUCTURES or INTEGRATORS[integrator].curvature == integrator:
             yield scene, integrator
 
 

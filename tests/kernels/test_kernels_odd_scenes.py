@@ -60,7 +60,7 @@ def odd_scenes_and_integrators():
     """All pairs; methods that share their code with others are fast for small scenes only."""
     for name in ("base", "wrist", "one link", "wheels and jets", "no actuator", "wrist without motor"):
         for integrator in INTEGRATORS:
-            is_slow = not INTEGRATORS[integrator].has_curvature and name != "one link"
+            is_slow = INTEGRATORS[integrator].curvature != integrator and name != "one link"
             yield pytest.param(name, integrator, marks=[pytest.mark.endurance] if is_slow else [])
 
 

@@ -11,7 +11,7 @@ from scripts.benchmarks.robots import robots
 
 STEP = 5e-4
 
-CURVED = [name for name, entry in INTEGRATORS.items() if entry.has_curvature]
+CURVED = [name for name, entry in INTEGRATORS.items() if entry.curvature == name]
 SCENES = (*robots(), "random-target")  # whose target is a parameter of the cost
 # Each of the others takes seconds to compile.
 ODD_SCENES = [s if s in ("base", "wrist") else pytest.param(s, marks=pytest.mark.slow) for s in ODD]

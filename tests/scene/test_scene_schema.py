@@ -19,6 +19,7 @@ from dq_space_arm_env.scene import (
     Spread,
     load_scene,
 )
+from dq_space_arm_env.scene.constraints import JointLimits
 
 Change = Callable[..., dict[str, Any]]
 Refusals = Callable[[dict[str, Any]], list[str]]
@@ -164,6 +165,20 @@ class TestValidScenes:
         assert type(scene.simulation.steps) is int
         assert scene.target.pose.position == (1.0, 0.0, 0.0)
 
+    def test_numpy_bounds_and_truths_are_as_pythons(self, data: dict[str, Any], change: Change) -> None:
+        change(data, "links.0.actuated", np.False_)
+        bounds = {
+            "kind": "joint_limits",
+            "name": "stops",
+            "lower": np.array([-1.0, -np.inf]),
+            "rate": np.float32(2),
+        }
+        scene = Scene.model_validate(data | {"constraints": [bounds]})
+        assert scene.links[0].actuated is False
+        (limits,) = scene.constraints
+        assert isinstance(limits, JointLimits)
+        assert (limits.lower, limits.rate) == ((-1.0, -INF), (2.0,))
+
     def test_scenes_are_hashable_immutable_and_picklable(self, data: dict[str, Any]) -> None:
         scene = Scene.model_validate(data)
         assert len({scene, Scene.model_validate(data), scene.replace(name="other")}) == 2
@@ -192,6 +207,15 @@ def test_replace_takes_models_and_plain_data_and_validates_both(data: dict[str, 
         scene.replace(base=scene.base.model_copy(update={"mass": -1}))
     with pytest.raises(SceneError, match=r"nam: unknown key; did you mean 'name'\?"):
         scene.replace(nam="x")
+
+
+def test_a_position_of_any_length_is_one_that_a_list_does_not_have() -> None:
+    scene = load_scene("refuelling")
+    with pytest.raises(SceneError, match="has 3 entries, the first is 0; there is no '9999"):
+        scene.replace({"links." + "9" * 5000 + ".mass": 1.0})
+    first, *rest = (phase.model_dump() for phase in scene.phases)
+    with pytest.raises(SceneError, match="leads to no number that phases change"):
+        scene.replace(phases=[first | {"changes": {"links." + "9" * 5000 + ".mass": 1.0}}, *rest])
 
 
 def test_replace_changes_what_a_mapping_names_and_nothing_else() -> None:

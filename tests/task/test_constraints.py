@@ -270,7 +270,8 @@ MISTAKES = [
     ({"kind": "joint_limits", "lower": [0.0, 0.0]}, "one per link: the scene has 3 links"),
     ({"kind": "joint_limits", "lower": 1.0, "upper": 0.5}, "must be above the lower limit of link 0"),
     ({"kind": "joint_limits"}, "must bound something"),
-    ({"kind": "joint_limits", "upper": math.nan}, "must be numbers, .inf for none"),
+    ({"kind": "joint_limits", "upper": math.nan}, "each finite, or infinite for no bound"),
+    ({"kind": "joint_limits", "upper": 10**400}, "each finite, or infinite for no bound"),
     ({"kind": "distance", "bodies": [], "obstacles": [FRAME]}, "must list at least one volume"),
     ({"kind": "distance", "bodies": [{**FRAME, "frame": "hand"}]}, "must be one of inertial, base, link 1"),
     ({"kind": "keep_out_direction", "angle_deg": 180}, "must be below 180 degrees"),
@@ -300,6 +301,12 @@ def test_a_bound_that_no_joint_has_is_refused():
     ball = load_scene("no-wrist").replace({"links": links, "initial_state.joint_angles": []})
     with pytest.raises(SceneError, match="no joint has one coordinate"):
         ball.replace(constraints=[{"kind": "joint_limits", "name": "it", "rate": 0.1}])
+
+
+def test_limits_of_slides_are_lengths():
+    crossed = {"kind": "joint_limits", "name": "it", "lower": [0, 0, 1.0, 0], "upper": [1, 1, 0.5, 1]}
+    with pytest.raises(SceneError, match=r"must be above the lower limit of link 2, 1 m$"):
+        load_scene("sliding").replace(constraints=[crossed])
 
 
 def test_wheels_of_changing_masses_store_what_nobody_knows():

@@ -68,11 +68,11 @@ def _inputs(
     largest = max(float(np.abs(each[:, entries]).max()) for each in inputs)
     scale, prefix = (1e3, "m") if 0.0 < largest < _SMALL else (1.0, "")
     sides = (0.0, 1.0) if actuator == "thruster_force" else (-1.0, 1.0)
-    unit = unit_of(layout, entries)
+    unit = layout.control.unit(entries)
     bounds = sorted({side * scale * limit for limit in limits[np.isfinite(limits)] for side in sides})
     return Panel(
         title=title,
-        unit=unit_of(layout, entries, prefix),
+        unit=layout.control.unit(entries, prefix),
         note=_limit_note(limits, f" {unit}" if prefix else "", "" if sides[0] == 0.0 else "±"),
         names=_names(actuator, entries, layout),
         steps=True,
@@ -83,20 +83,6 @@ def _inputs(
             for flight in flights
         ),
     )
-
-
-def unit_of(layout: StateLayout, entries: slice, prefix: str = "") -> str:
-    """Find the unit of some controls.
-
-    Args:
-        layout: Layout of a scene.
-        entries: Place of the controls.
-        prefix: Prefix of the unit, such as "m".
-
-    Returns:
-        The unit; two of motors of which some turn and others slide, such as "N m or N".
-    """
-    return " or ".join(prefix + unit for unit in dict.fromkeys(layout.control.units[entries]))
 
 
 def _limit_note(limits: FloatArray, unit: str, sign: str) -> str:
