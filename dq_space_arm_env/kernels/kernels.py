@@ -109,7 +109,7 @@ class Kernels(DerivativeKernels):
         return x_next, error[..., 0]
 
     def numerical_error(self, states: ArrayLike, u: ArrayLike, p: ArrayLike | None = None) -> Array:
-        """Tell how far the tip of a simulated motion is from where the same inputs truly bring it.
+        """Tell how far the tips of a simulated motion are from where the same inputs truly bring them.
 
         A companion follows the motion from its first state in double precision: with `rk8`, divided by a
         tolerance of 1e-8 or less, or with a hundredth of the scene's tolerances if those are adaptive.
@@ -122,8 +122,8 @@ class Kernels(DerivativeKernels):
             p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
 
         Returns:
-            Distance [m] or angle [rad] between the tips of both, whichever is larger, shape (N + 1,) or
-            (N + 1, B); NaN where one of the two is not finite.
+            Distance [m] or angle [rad] between the tips of both, the largest, shape (N + 1,) or (N + 1, B);
+            NaN where one of the two is not finite.
 
         Raises:
             ValueError: If the shapes do not fit.

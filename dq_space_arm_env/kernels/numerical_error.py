@@ -46,8 +46,8 @@ def numerical_error(finer: RobotKernels, states: ArrayLike, u: ArrayLike, p: Arr
     for step, control in enumerate(controls, start=1):
         own = p if stages is None else stages[step - 1]
         x = finer.call("checked_step", x=x, u=control, p=own)[0]
-        tips = [finer.tip_pose(each, p).T for each in (x, motion[step])]
-        errors[step] = np.maximum(poses.error_distance(*tips), poses.error_angle(*tips))
+        tips = [tuple(np.moveaxis(finer.tip_poses(each, p), -1, 0)) for each in (x, motion[step])]
+        errors[step] = np.maximum(poses.error_distance(*tips), poses.error_angle(*tips)).max(axis=-1)
     return errors
 
 

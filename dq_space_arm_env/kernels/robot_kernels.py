@@ -145,6 +145,21 @@ class RobotKernels(KernelLibrary):
         """
         return self.call("tip_pose", x=x, p=p)[0]
 
+    def tip_poses(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
+        """Poses of the tips of all arms in the inertial frame, q_{G/I} last.
+
+        Args:
+            x: States, shape (n_x,) or (B, n_x).
+            p: Parameters, shape (n_p,) or (B, n_p), units of `parameters`; nominal ones by default.
+
+        Returns:
+            Unit dual quaternions, shape (tips, 8) or (B, tips, 8), real part dimensionless, dual part m.
+        """
+        if not self.scene.other_tips:
+            return self.tip_pose(x, p)[..., None, :]
+        first = 1 + len(self.scene.links)
+        return self.frame_poses(x, p)[..., [*range(first, first + len(self.scene.other_tips)), -1], :]
+
     def frame_poses(self, x: ArrayLike, p: ArrayLike | None = None) -> Array:
         """Poses of base, joint frames, other tips, wrist frame (if any) and tip in the inertial frame.
 

@@ -78,11 +78,11 @@ def expert_motion(scene: Scene, max_iterations: int) -> Motion:
 
 
 def tip_error(kernels: Kernels, x: FloatArray, reference: FloatArray) -> float:
-    """Distance [m] or angle [rad], whichever is larger, between the tips of two states; inf if diverged."""
+    """Distance [m] or angle [rad], the largest, between the tips of two states; inf if diverged."""
     if not np.abs(x).max() < _FAR_OFF:  # NaN is not smaller either
         return float("inf")
-    tip, right = (tuple(kernels.tip_pose(each).tolist()) for each in (x, reference))
-    return max(float(poses.error_distance(tip, right)), float(poses.error_angle(tip, right)))
+    tips = [tuple(kernels.tip_poses(each).T) for each in (x, reference)]
+    return float(np.maximum(poses.error_distance(*tips), poses.error_angle(*tips)).max())
 
 
 def reference_end(motion: Motion) -> tuple[FloatArray, float]:

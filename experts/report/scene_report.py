@@ -67,9 +67,12 @@ def report(scene: Scene, folder: Path, console: Console, *, quick: bool = False)
         complaint="Not everything is measured",
     )
     for name, part in PARTS.items():
-        if name not in found:
+        section = None
+        if name in found:
+            section = _kept_section(part, name, scene, found[name], console)
+        if section is None:
             found[name] = _measured(name, scene, effort, console)
-        section = _section(part, name, scene, found[name])
+            section = _section(part, name, scene, found[name])
         section.record = {**found[name], **section.record}
         page.sections.append(section)
         files = page.save(folder, NAME)
@@ -105,6 +108,17 @@ def _section(part: ModuleType, name: str, scene: Scene, found: dict[str, Any]) -
     section: Section = part.section(scene, found)
     section.name = name  # by which a resumed report finds its rows
     return section
+
+
+def _kept_section(
+    part: ModuleType, name: str, scene: Scene, found: dict[str, Any], console: Console
+) -> Section | None:
+    """The section of rows that a file held; None if they are not what this part measures."""
+    try:
+        return _section(part, name, scene, found)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+        console.print(f"{name}: the kept rows are damaged, and measured again", markup=False)
+        return None
 
 
 def _unfinished(file: Path, request: dict[str, Any]) -> dict[str, dict[str, Any]]:

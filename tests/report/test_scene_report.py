@@ -90,6 +90,17 @@ def test_integrators_follow_the_expert_through_phases() -> None:
     assert tip_error(kernels, motion.end(kernels, method, 4), solution.states[-1]) < 1e-5
 
 
+@pytest.mark.parametrize("joint", ["left hand", "right hand"])
+def test_errors_are_those_of_every_tip(joint: str) -> None:
+    kernels = compile_scene(load_scene("dual-arm"))
+    x = np.array(kernels.layout.initial_state)
+    moved = x.copy()
+    moved[kernels.layout.state.names.index(f"{joint} angle")] += 1e-3
+    assert tip_error(kernels, moved, x) == pytest.approx(1e-3, rel=1e-9)
+    motion, still = np.stack([x, moved]), np.zeros((1, kernels.n_u))
+    assert kernels.numerical_error(motion, still)[-1] == pytest.approx(1e-3, rel=1e-9)
+
+
 def test_stiffness_ends_where_the_stability_polynomial_says(short_scene: Scene, limits: Limits) -> None:
     # The fastest vibration, from accelerations of the sprung arm slightly deflected.
     kernels, deflection = compile_scene(on_springs(short_scene)), 1e-6
@@ -246,10 +257,16 @@ def test_an_interrupted_report_keeps_its_parts_and_resumes(
     with pytest.raises(KeyboardInterrupt):
         scene_report.report(short_scene, tmp_path, Console(), quick=True)
     assert "Made up" in (tmp_path / "report.html").read_text()
-    console = Console(record=True, width=110)
+    file, console = tmp_path / "report.json", Console(record=True, width=110)
+    interrupted = file.read_text()
     scene_report.report(short_scene, tmp_path, console, quick=True)
     assert "Resuming: first" in console.export_text()
     assert (first.measured, second.measured) == (1, 2)
+    # What is damaged is measured again.
+    file.write_text(interrupted.replace('"rows"', '"row"'))
+    scene_report.report(short_scene, tmp_path, console, quick=True)
+    assert "first: the kept rows are damaged, and measured again" in console.export_text()
+    assert (first.measured, second.measured) == (2, 3)
     # A finished report, and one of another scene or effort, is measured anew.
     for scene, quick in (
         (short_scene, True),
