@@ -146,14 +146,8 @@ def integrate(
     start, held = _checked(kernels, x, u)
     parameters = kernels.parameter_rows(p, len(held))
     _check_smooth(kernels, parameters)
-    tolerances = np.array([_positive("rtol", rtol), _positive("atol", atol)], kernels.dtype)
-    if not np.isfinite(duration) or duration == 0.0:
-        raise ValueError(f"duration: {duration} should be a finite time in s other than zero")
-    smallest = np.finfo(kernels.dtype).eps
-    if rtol < 4.0 * smallest:
-        raise ValueError(f"rtol: {rtol}, should be at least {4.0 * smallest:.1e} in {kernels.dtype}")
-    if max_steps < 1:
-        raise ValueError(f"max_steps: {max_steps}, should be at least 1")
+    _check_accuracy(kernels, duration, rtol, atol, max_steps)
+    tolerances = np.array([rtol, atol], kernels.dtype)
     stepper = _Stepper(kernels, start, tolerances, kernels.scene.simulation.dt)
     ends, states = [0.0], [start]
     coefficients: list[Array] = []
@@ -236,7 +230,17 @@ def _check_smooth(kernels: KernelLibrary, parameters: Array) -> None:
         raise ValueError(f"p: a payload is caught at the end of part {part}, should be 0: use simulate")
 
 
-def _positive(name: str, value: float) -> float:
-    if not (np.isfinite(value) and value > 0.0):
-        raise ValueError(f"{name}: {value}, should be a positive number")
-    return value
+def _check_accuracy(
+    kernels: KernelLibrary, duration: float, rtol: float, atol: float, max_steps: int
+) -> None:
+    """Refuse a time, tolerances or a number of steps with which no motion can be followed."""
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise ValueError(f"{name}: {value}, should be a positive number")
+    if not np.isfinite(duration) or duration == 0.0:
+        raise ValueError(f"duration: {duration} should be a finite time in s other than zero")
+    smallest = np.finfo(kernels.dtype).eps
+    if rtol < 4.0 * smallest:
+        raise ValueError(f"rtol: {rtol}, should be at least {4.0 * smallest:.1e} in {kernels.dtype}")
+    if max_steps < 1:
+        raise ValueError(f"max_steps: {max_steps}, should be at least 1")
