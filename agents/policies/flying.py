@@ -31,7 +31,8 @@ class Flights(NamedTuple):
             failed.
         diverged: Whether the simulation blew up, shape (B,).
         policy_failed: Whether the policy gave NaN; the episode then continued with zero inputs, shape (B,).
-        length: Steps until the episode ended, shape (B,); all of the scene's unless it diverged.
+        length: Steps until the episode ended, shape (B,); all of the scene's unless it diverged, or a
+            constraint ended it.
         attitude_error: Of the tip at the end, shape (B,), deg.
         position_error: Of the tip at the end, shape (B,), m.
         effort: Sum of the control cost, shape (B,), dimensionless.
@@ -96,7 +97,8 @@ def time_per_action(policy: Policy | StateFeedback, scene: Scene, *, batched: bo
     """
     timed = policy if batched else _Single(policy)
     steps = min(_WARM_UP + TIMED_ACTIONS, scene.simulation.steps)
-    seconds = rollout(timed, scene, [0], steps=steps).action_seconds
+    flown = rollout(timed, scene, [0], steps=steps)
+    seconds = flown.action_seconds[: flown.length[0]]
     if isinstance(timed, _Single):
         seconds = np.array(timed.seconds)
     return float(np.median(seconds[min(_WARM_UP, len(seconds) // 2) :]))

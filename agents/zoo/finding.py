@@ -154,8 +154,9 @@ def check_fit(policy: ActingPolicy, scene: Scene) -> None:
     if policy.sizes is None:
         return
     layout = StateLayout.of(scene)  # nothing compiles for a policy that is refused
-    moving = 6 if layout.parameters.moving else 0
-    seen = layout.n_x + moving + 16 if kind == "goal" else n_observations(scene)
+    seen = n_observations(scene)
+    if kind == "goal":  # beside two poses
+        seen = layout.goal_observation(layout.initial_state, layout.parameters.nominal).size + 16
     if policy.sizes != (seen, layout.n_u):
         origin = policy.metadata.get("scene")
         made = f" (it was trained for scene {origin!r})" if origin else ""

@@ -16,7 +16,8 @@ from agents.evaluation.evaluating import Evaluation, fly_under
 from agents.evaluation.expert_costs import OptimalCosts
 from agents.evaluation.statistics import wilson_interval
 from agents.policies import ExportedPolicy
-from agents.zoo.finding import PolicyError, as_policy
+from agents.policies.flying import time_per_action
+from agents.zoo.finding import PolicyError, as_policy, check_fit
 from dq_space_arm_env import compile_scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.environment.disturbances import Disturbances
@@ -309,6 +310,30 @@ def test_a_policy_of_another_scene_is_refused_in_a_sentence(tmp_path, quick):
         evaluate(policy, quick, 3, expert=False)
     with pytest.raises(PolicyError, match=r"cannot fly alone: use `dq-space-arm compare residual`"):
         evaluate(exported(agent="stub", observation="residual"), SHORT, 3, expert=False)
+
+
+def test_a_policy_of_the_goal_environment_fits_a_scene_with_phases_and_a_moving_target():
+    env = gymnasium.make("DQSpaceArmGoal-v0", scene="capture-and-detumble")
+    seen = sum(part.shape[0] for part in env.observation_space.values())
+    acting = as_policy(exported(seen, env.action_space.shape[0], observation="goal"))
+    check_fit(acting, env.unwrapped.scene)
+    with pytest.raises(PolicyError, match=f"maps {seen} observations"):
+        check_fit(acting, SHORT)
+
+
+def test_the_time_of_an_action_is_that_of_actions_before_the_end():
+    """A constraint ends the episode after a few of the timed steps."""
+    scene = load_scene("planar")
+    joints = len(scene.links)
+    stop = {"kind": "joint_limits", "name": "stop", "upper": [0.1] * joints, "lower": [-1.0] * joints}
+    ending = {**stop, "tolerance": 0.01, "terminates": True}
+    scene = scene.replace(initial_state={"joint_angles": [0.0] * joints}, constraints=[ending])
+
+    def push(observations):
+        return np.ones((len(observations), compile_scene(scene).n_u))
+
+    assert rollout(push, scene, [0], steps=320).length[0] < 100
+    assert time_per_action(push, scene) > 0.0
 
 
 @pytest.mark.slow
