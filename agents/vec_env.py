@@ -70,7 +70,7 @@ class SB3VecEnv(VecEnv):
             )
         self.vector_env = vector_env
         self._chain = _chain(vector_env)
-        self._given = frozenset(dir(vector_env.unwrapped))
+        self._given = frozenset(name for env in self._chain for name in dir(env))
         self._repeater = next((env for env in reversed(self._chain) if isinstance(env, RepeatAction)), None)
         space = _in_single_precision(vector_env.single_observation_space)
         VecEnv.__init__(self, vector_env.num_envs, space, _noted_actions(self._chain))
@@ -218,8 +218,9 @@ class SB3VecEnv(VecEnv):
             ValueError: If an array is missing, or has another shape or type.
         """
         for name in ("returns", "lengths"):
-            if name not in state or state[name].shape != (self.num_envs,):
-                raise ValueError(f"state: {name} is missing, or not of shape ({self.num_envs},)")
+            values = np.asarray(state.get(name))
+            if values.shape != (self.num_envs,) or values.dtype.kind not in "fiu":
+                raise ValueError(f"state: {name} is missing, or not numbers of shape ({self.num_envs},)")
         home: Any = self.vector_env.unwrapped
         home.set_state(state)
         self._returns[:], self._lengths[:] = state["returns"], state["lengths"]

@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env import Scene
+from dq_space_arm_env.common.real_arrays import real_array
 from dq_space_arm_env.common.suggestions import did_you_mean
 from dq_space_arm_env.scene import StateLayout
 from dq_space_arm_env.scene.parameters import CONTROL_UNITS
@@ -20,11 +21,12 @@ HeldReward = Literal["sum", "last"]
 
 
 def check_repeat(repeat: int, reward: str, discount: float) -> None:
-    """Raise ValueError unless these are arguments of `RepeatAction`."""
+    """Raise ValueError or TypeError unless these are arguments of `RepeatAction`."""
     if isinstance(repeat, bool) or not isinstance(repeat, int | np.integer) or repeat < 1:
         raise ValueError(f"repeat: {repeat!r}, should be a whole number of time steps, at least 1")
     if reward not in get_args(HeldReward):
         raise ValueError(f"reward: {reward!r}, should be 'sum' or 'last'")
+    real_array("discount", discount)
     if not 0.0 < discount <= 1.0:
         raise ValueError(f"discount: {discount!r}, should be above 0 and at most 1")
 
@@ -40,7 +42,9 @@ def shrunk(space: spaces.Space[Any], scene: Any, scale: ArrayLike | Mapping[str,
     """The box of an environment's actions with its bounds multiplied by `scale`, see `ShrinkActionSpace`."""
     if not isinstance(space, spaces.Box):
         raise TypeError(f"action space: {space}, should be a Box, whose bounds can be scaled")
-    factors = action_scale(scale, scene) if isinstance(scale, Mapping) else np.asarray(scale, np.float32)
+    factors = (
+        action_scale(scale, scene) if isinstance(scale, Mapping) else real_array("scale", scale, np.float32)
+    )
     if factors.shape not in ((), space.shape) or not ((factors > 0.0) & (factors <= 1.0)).all():
         raise ValueError(
             f"scale: {scale!r}, should be numbers above 0 and at most 1: one, one for each of the "
@@ -55,12 +59,11 @@ def action_scale(scale: Mapping[str, float], scene: Scene) -> NDArray[np.float32
     values, own = np.ones(layout.n_u, dtype=np.float32), actuators(scene)
     for name, value in scale.items():
         if name not in CONTROL_UNITS:
-            raise ValueError(
-                f"scale: no actuator is named {name!r}; {did_you_mean(name, own)}choose from {', '.join(own)}"
-            )
+            close = did_you_mean(str(name), own)
+            raise ValueError(f"scale: no actuator is named {name!r}; {close}choose from {', '.join(own)}")
         if name not in own:
             raise ValueError(f"scale: scene {scene.name!r} has no {name}; choose from {', '.join(own)}")
-        values[getattr(layout.control, name)] = value
+        values[getattr(layout.control, name)] = real_array(f"scale of {name}", value)
     return values
 
 
@@ -91,12 +94,15 @@ class Shaping(NamedTuple):
         success_reward: float,
         end_error_cost: float,
     ) -> Shaping:
-        """Check the arguments of `ShapeReward`; ValueError if one is out of range."""
+        """Check the arguments of `ShapeReward`; ValueError or TypeError for those that are wrong."""
+        ends = {"success_reward": success_reward, "end_error_cost": end_error_cost}
+        for name, value in {"scale": scale, "power": power, **ends}.items():
+            real_array(name, value)
         if not (np.isfinite(scale) and scale > 0.0):
             raise ValueError(f"scale: {scale!r}, should be a positive number")
         if not 0.0 < power <= 1.0:
             raise ValueError(f"power: {power!r}, should be above 0 and at most 1, the reward itself")
-        for name, value in (("success_reward", success_reward), ("end_error_cost", end_error_cost)):
+        for name, value in ends.items():
             if not (np.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name}: {value!r}, should be a number of at least 0")
         tolerances: tuple[float | None, ...] = ()

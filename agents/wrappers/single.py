@@ -50,6 +50,7 @@ class RepeatAction(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
             step_infos: Whether `info` holds those of all time steps of the decision as a list, "step_infos".
 
         Raises:
+            TypeError: If the discount is no number.
             ValueError: If an argument is out of range.
         """
         check_repeat(repeat, reward, discount)
@@ -97,7 +98,7 @@ class ShrinkActionSpace(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
                 "joint_torque", "wrist_rate", "wheel_torque", "thruster_force") to numbers, 1 by default.
 
         Raises:
-            TypeError: If the action space is no box.
+            TypeError: If the action space is no box, or the scale not of numbers.
             ValueError: If the scale is out of range, or names an actuator that the scene lacks.
         """
         plain = dict(scale) if isinstance(scale, Mapping) else np.asarray(scale).tolist()
@@ -141,6 +142,7 @@ class ShapeReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 and the others are zero.
 
         Raises:
+            TypeError: If an argument is no number.
             ValueError: If an argument is out of range, or `end_error_cost` is asked for without a scene.
         """
         settings: dict[str, Any] = {

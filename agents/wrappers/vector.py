@@ -67,7 +67,8 @@ class RepeatAction(VectorWrapper[Any, Any, Any, Any, Any]):
                 dictionaries for each sub-environment; slow, for they are made one by one.
 
         Raises:
-            TypeError: If the environment cannot save and restore states, or is in a wrapper that cannot.
+            TypeError: If the environment cannot save and restore states, or is in a wrapper that cannot; or
+                if the discount is no number.
             ValueError: If an argument is out of range.
         """
         check_repeat(repeat, reward, discount)
@@ -201,7 +202,7 @@ class ShrinkActionSpace(VectorWrapper[Any, Any, Any, Any, Any]):
                 array of shape (n_u,), or a mapping by actuator, see `agents.wrappers.ShrinkActionSpace`.
 
         Raises:
-            TypeError: If the action space is no box.
+            TypeError: If the action space is no box, or the scale not of numbers.
             ValueError: If the scale is out of range, or names an actuator that the scene lacks.
         """
         super().__init__(env)
@@ -237,6 +238,7 @@ class ShapeReward(VectorWrapper[Any, Any, Any, Any, Any]):
                 and the others are zero.
 
         Raises:
+            TypeError: If an argument is no number.
             ValueError: If an argument is out of range, or `end_error_cost` is asked for without a scene.
         """
         super().__init__(env)

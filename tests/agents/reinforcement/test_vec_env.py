@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from agents import DQSpaceArmVecEnv, SB3VecEnv
 from agents.wrappers import RepeatAction, ShapeReward, ShrinkActionSpace, vector
-from dq_space_arm_env import load_scene
+from dq_space_arm_env import DQSpaceArmVectorEnv, load_scene
 
 pytestmark = pytest.mark.agents
 
@@ -369,6 +369,27 @@ def test_attributes_and_methods_are_shared_by_the_copies():
     assert venv.env_method("close") == [None] * 3
     assert venv.env_is_wrapped(Monitor) == [True] * 3
     assert venv.env_is_wrapped(gymnasium.wrappers.TimeLimit, indices=[0]) == [False]
+
+
+def test_attributes_of_wrappers_are_as_fixed_as_those_of_the_environment():
+    native = DQSpaceArmVectorEnv(2, SHORT, autoreset_mode=AutoresetMode.SAME_STEP)
+    venv = SB3VecEnv(vector.RepeatAction(native, 4))
+    with pytest.raises(AttributeError, match="attribute 'repeat' is fixed"):
+        venv.set_attr("repeat", 2)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"returns": np.zeros(3)}, {"returns": "x"}, {"lengths": np.array(["1"] * 2)}]
+)
+def test_statistics_of_another_kind_are_refused_with_nothing_changed(wrong):
+    venv = DQSpaceArmVecEnv(2, SHORT, seed=0)
+    venv.reset()
+    saved = venv.get_state()
+    venv.step(np.ones((2, 12)))
+    states = venv.vector_env.states
+    with pytest.raises(ValueError, match=r"(returns|lengths) is missing, or not numbers of shape \(2,\)"):
+        venv.set_state({**saved, **wrong})
+    np.testing.assert_array_equal(venv.vector_env.states, states)
 
 
 def test_copies_are_drawn_with_a_render_mode():
