@@ -287,7 +287,7 @@ def _from_files(
                 if load_policy(each).metadata.get("scene_hash") == scene.content_hash():
                     yield f"{each} ({ZOO})", each
             continue
-        path = policy_path(file.replace(TASK, Path(task).stem))
+        path = _path_in(file, task)
         if TASK in file and not path.exists():
             continue
         acting = as_policy(path, trust=trust)
@@ -303,10 +303,15 @@ def _from_files(
 def _missing(files: Mapping[str, str], tasks: Iterable[str]) -> Iterator[str]:
     """A note on each entrant that lacks the files of some tasks."""
     for name, file in files.items():
-        own = [Path(task).stem for task in tasks] if TASK in file else []
-        lacking = [task for task in own if not policy_path(file.replace(TASK, task)).exists()]
+        own = tasks if TASK in file else ()
+        lacking = [Path(task).stem for task in own if not _path_in(file, task).exists()]
         if lacking:
             yield f"{name}: there is no file {file} for {', '.join(lacking)}"
+
+
+def _path_in(file: str, task: str) -> Path:
+    """Path of a policy in a task; what has the task in it is no name of the zoo."""
+    return policy_path(Path(file.replace(TASK, Path(task).stem)) if TASK in file else file)
 
 
 def _train(

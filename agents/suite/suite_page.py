@@ -84,11 +84,23 @@ def published(file: str | Path) -> tuple[dict[str, Any], dict[tuple[str, str, st
         tasks = read_mapping(file)["parts"]["tasks"]
         if not isinstance(tasks["suite"], dict):
             raise TypeError(f"parts.tasks.suite: {shortened(tasks['suite'])}, should be a mapping")
-        return tasks["suite"], {
-            (row["task"], row["condition"], row["entrant"]): row for row in tasks["scores"]
-        }
+        return tasks["suite"], {_checked_key(row): row for row in tasks["scores"]}
     except (UnreadableError, KeyError, TypeError) as error:
         raise SuiteError(f"{file}: is not the JSON file of a suite: {error}") from error
+
+
+def _checked_key(row: Row) -> tuple[str, str, str]:
+    """Task, condition and entrant of a score, whose measures are intervals; KeyError or TypeError if not."""
+    key = row["task"], row["condition"], row["entrant"]
+    if not all(isinstance(part, str) for part in key):
+        raise TypeError(f"parts.tasks.scores: {shortened(list(key))}, should be texts")
+    for name in _MEASURES:
+        value = row.get(name)
+        numbers = value if isinstance(value, list) else [value]
+        is_interval = len(numbers) == 3 and all(isinstance(each, int | float) for each in numbers)
+        if value is not None and not is_interval:
+            raise TypeError(f"{name} of {key[2]} in {key[0]}: {shortened(value)}, should be three numbers")
+    return key
 
 
 def comparable(

@@ -16,6 +16,7 @@ from agents.evaluation.expert_costs import EVALUATION_SEEDS
 from agents.evaluation.plan_followers import CONTROLLERS
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.bounded_reading import UnreadableError
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.validation import (
     Fraction,
     Model,
@@ -127,6 +128,8 @@ def load_suite(source: str | Path | Suite = "v1") -> Suite:
     if isinstance(source, Suite):
         return source
     shipped = list_suites()
+    if not isinstance(source, str | Path):
+        raise SuiteError(f"suite: {shortened(source)}, should be one of {', '.join(shipped)}, or a YAML file")
     path = _directory() / f"{source}.yaml" if source in shipped else Path(source)
     if source not in shipped and path.suffix not in (".yaml", ".yml"):
         raise SuiteError(f"suite: {str(source)!r}, should be one of {', '.join(shipped)}, or a YAML file")

@@ -15,7 +15,7 @@ from agents.evaluation.evaluating import Evaluation
 from agents.evaluation.expert_costs import OptimalCosts
 from agents.policies.flying import Flights
 from agents.suite import Score, Suite, SuiteError, SuiteRun, list_suites, load_suite, run_suite
-from agents.suite.running import _missing, entrant_names
+from agents.suite.running import _from_files, _missing, entrant_names
 from agents.suite.suite_page import check, check_columns, comparable, overall_rows, suite_page
 from agents.zoo.finding import PolicyError
 from dq_space_arm_env import load_scene
@@ -113,11 +113,45 @@ def test_unknown_names_are_refused(content):
         )
 
 
+def test_what_is_no_suite_is_named():
+    with pytest.raises(SuiteError, match="suite: 3, should be one of v1"):
+        load_suite(3)
+
+
 def test_missing_files_of_tasks_are_told(tmp_path):
     (tmp_path / "one.npz").touch()
     files = {"mine": f"{tmp_path}/{{task}}.npz", "other": "anywhere.npz"}
     (note,) = _missing(files, ["scenes/one.yaml", "two", "three"])
     assert note == f"mine: there is no file {files['mine']} for two, three"
+
+
+def test_a_missing_run_folder_beside_is_told_as_any_file_is(tmp_path, monkeypatch):
+    """Its name alone looks like one of the zoo."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine-one").mkdir()
+    (tmp_path / "mine-one" / "policy.npz").touch()
+    (note,) = _missing({"mine": "mine-{task}"}, ["one", "two"])
+    assert note == "mine: there is no file mine-{task} for two"
+    assert not [*_from_files({"mine": "mine-{task}"}, "two", load_scene("planar"), trust=False)]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"success_rate": "high"}, "success_rate of mine in .*: 'high', should be three numbers"),
+        ({"success_rate": [0.5]}, "success_rate of mine"),
+        ({"violating_episodes": [0.0, None, 1.0]}, "violating_episodes of mine"),
+        ({"entrant": None}, "should be texts"),
+    ],
+)
+def test_a_file_with_other_values_is_refused_before_anybody_flies(content, tmp_path, change, said):
+    suite, task = Suite.model_validate(content), next(iter(content["tasks"]))
+    run = SuiteRun(suite, (made([[True]], [[0.0]], task=task, entrant="mine"),), {task: ""}, ())
+    record = suite_page(run, picture=False).record
+    record["parts"]["tasks"]["scores"][0] |= change
+    (tmp_path / "theirs.json").write_text(json.dumps(record))
+    with pytest.raises(SuiteError, match=said):
+        comparable(tmp_path / "theirs.json", suite, suite.tasks, ["mine"])
 
 
 def still(scene):
