@@ -59,11 +59,12 @@ def run(destination: Destination, options: Options) -> None:
         from agents.evaluation.data_efficiency import Effort, measure, points
     except ModuleNotFoundError as error:
         raise ValueError(f'this needs {error.name}: pip install "dq-space-arm[agents]"') from error
-    effort = Effort(tuple(sorted(set(options.counts))), options.seeds, options.updates)
     folder, console = destination.folder, destination.console()
     folder.mkdir(parents=True, exist_ok=True)
     with ProgressDisplay(message_console()) as shown:
-        demonstrations, tests = _data(configuration, options, folder, max(effort.counts), shown)
+        demonstrations, tests, most = _data(configuration, options, folder, shown)
+        counts = tuple(sorted({min(count, most) for count in options.counts}))
+        effort = Effort(counts, options.seeds, options.updates)
         trainings = measure(configuration, effort, demonstrations, tests, folder, shown.update)
     measured = points(trainings)
     title = f"Cloning: {effort.updates} updates, flights from {len(tests)} starts"
@@ -81,9 +82,13 @@ def run(destination: Destination, options: Options) -> None:
 
 
 def _data(
-    configuration: ImitationConfiguration, options: Options, folder: Path, count: int, shown: ProgressDisplay
-) -> tuple[list[Demonstrations], Demonstrations]:
-    """Demonstrations to learn from, for each seed or for all, and to fly from."""
+    configuration: ImitationConfiguration, options: Options, folder: Path, shown: ProgressDisplay
+) -> tuple[list[Demonstrations], Demonstrations, int]:
+    """Demonstrations to learn from, for each seed or for all; to fly from; and most to learn from.
+
+    Problems fail now and then: of generated demonstrations each seed has a few less than were asked for.
+    """
+    most = max(options.counts)
     scene, source = load_scene(configuration.scene), configuration.resolved().demonstrations
     if options.demonstrations is not None:
         source = DemonstrationSource(folder=str(options.demonstrations))
@@ -92,7 +97,7 @@ def _data(
         first = source.seed or 0
         learned = {
             f"demonstrations-{seed}" if seed else "demonstrations": source.model_copy(
-                update={"problems": count, "seed": first + seed}
+                update={"problems": most, "seed": first + seed}
             )
             for seed in range(options.seeds)
         }
@@ -103,7 +108,9 @@ def _data(
         prepare_demonstrations(given, scene, folder / name, progress=shown.update)
         for name, given in {**learned, "tests": tests}.items()
     )
-    return pools, flown[: options.tests]
+    if source.folder is None and source.minari is None:
+        most = min(most, *map(len, pools))
+    return pools, flown[: options.tests], most
 
 
 def _columns() -> list[Column]:

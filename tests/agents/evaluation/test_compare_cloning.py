@@ -97,6 +97,26 @@ def test_numbers_are_checked_before_demonstrations_are_generated(option, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
+def test_generated_demonstrations_may_be_a_few_less_than_asked_for(
+    arguments, demonstrations, tmp_path, monkeypatch
+):
+    """One problem of 25 fails with one seed, and two with the other."""
+    command, asked = "agents.evaluation.data_efficiency_command", []
+
+    def prepare(source, scene, folder, progress):
+        return demonstrations[: {"demonstrations": 24, "demonstrations-1": 23, "tests": 4}[folder.name]]
+
+    def measure(configuration, effort, pools, tests, folder, progress):
+        asked.append((effort.counts, [len(pool) for pool in pools]))
+        return []
+
+    monkeypatch.setattr(f"{command}.prepare_demonstrations", prepare)
+    monkeypatch.setattr("agents.evaluation.data_efficiency.measure", measure)
+    own = [*arguments[:2], "--seeds", "2", "--out", str(tmp_path), "--no-picture"]
+    assert main(["compare", "cloning", *own, "--counts", "5", "24", "25"]) == 0
+    assert asked == [((5, 23), [24, 23])]
+
+
 def training(variant, count, seed, successes):
     named = {"variant": variant, "count": count, "seed": seed}
     reached = [int(flight < successes) for flight in range(100)]
