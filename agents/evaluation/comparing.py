@@ -174,8 +174,8 @@ def compare(
     conditions = tuple(dict.fromkeys(conditions))
     given = load_scene(scene)
     evaluation_seeds(given, n)  # refuses a wrong n
-    if receding_starts < 1:
-        raise ValueError(f"receding_starts: {receding_starts}, should be at least 1")
+    if not isinstance(receding_starts, int | np.integer) or receding_starts < 1:
+        raise ValueError(f"receding_starts: {receding_starts!r}, should be a whole number of at least 1")
     if not policies and not controllers:
         raise ValueError("there is nothing to compare: name a policy or a controller")
     work = _Work(

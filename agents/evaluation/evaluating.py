@@ -17,6 +17,7 @@ from agents.evaluation.conditions import disturbance_under, scene_under
 from agents.evaluation.expert_costs import EVALUATION_SEEDS, OptimalCosts, evaluation_seeds, optimal_costs
 from agents.evaluation.statistics import Interval, bootstrap_interval, wilson_interval
 from agents.policies.flying import Flights, Policy, fly, from_json_list, json_list, time_per_action
+from agents.policies.policy_files import noted_effort
 from agents.zoo.finding import as_policy, check_fit
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.environment.rollouts import StateFeedback
@@ -136,7 +137,7 @@ class Evaluation:
             Rates and gaps with their intervals; medians of angle [deg], distance [m], effort and base turn
             [deg]; time per action [s]; and the effort of the training.
         """
-        flights, training = self.flights, self.metadata.get("training", {})
+        flights, spent = self.flights, noted_effort(self.metadata)
         return {
             "policy": self.policy,
             "scene": self.scene,
@@ -163,9 +164,9 @@ class Evaluation:
             "constraint_violations": known_interval(self.constraint_violations),
             "action_seconds": self.action_seconds,
             "wall_seconds": self.wall_seconds,
-            "training_steps": training.get("environment_steps"),
-            "training_seconds": training.get("seconds"),
-            "expert_solves": training.get("expert_solves"),
+            "training_steps": spent.get("environment_steps"),
+            "training_seconds": spent.get("seconds"),
+            "expert_solves": spent.get("expert_solves"),
         }
 
     def record(self) -> dict[str, Any]:

@@ -67,10 +67,10 @@ def evaluation_seeds(scene: Scene, n: int = EVALUATION_SEEDS) -> list[int]:
         The seeds.
 
     Raises:
-        ValueError: If n is not in [1, EVALUATION_SEEDS].
+        ValueError: If n is no whole number in [1, EVALUATION_SEEDS].
     """
-    if not 1 <= n <= EVALUATION_SEEDS:
-        raise ValueError(f"n: {n}, should be from 1 to {EVALUATION_SEEDS}, the number of evaluation seeds")
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or not 1 <= n <= EVALUATION_SEEDS:
+        raise ValueError(f"n: {n!r}, should be from 1 to {EVALUATION_SEEDS}, the number of evaluation seeds")
     settings = Settings(scene, EVALUATION_SEEDS, RESERVED_SEED, GROUP)
     return [settings.problem_seed(problem) for problem in range(n)]
 

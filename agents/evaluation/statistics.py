@@ -94,11 +94,13 @@ def rate_over_runs(scores: ArrayLike) -> Interval:
         scores: Successes or shares in [0, 1], shape (runs, starts), or (runs, runs of another, starts).
 
     Raises:
-        ValueError: If there is no score.
+        ValueError: If there is no score, or one is not in [0, 1].
     """
     values = np.asarray(scores, dtype=np.float64)
-    if values.size == 0:
+    if values.size == 0 or values.ndim == 0:
         raise ValueError(f"scores have shape {values.shape}: should be at least one run and one start")
+    if not ((values >= 0.0) & (values <= 1.0)).all():
+        raise ValueError(f"scores from {values.min()} to {values.max()}: should be in [0, 1]")
     rate, variance, quantile = _crossed(values)
     n = float(values.shape[-1]) if variance == 0.0 else min(values.size, rate * (1.0 - rate) / variance)
     return _score_interval(rate, n, quantile)

@@ -93,8 +93,8 @@ def search(
         RunFolderError: If the folder is for another search, or damaged, or another process searches there.
         ExecutorError: If the cluster cannot be used.
     """
-    if trials < 1:
-        raise ConfigurationError(f"trials: {trials}, should be at least 1")
+    if not isinstance(trials, int | np.integer) or trials < 1:
+        raise ConfigurationError(f"trials: {trials!r}, should be a whole number of at least 1")
     with reserved(out):
         study = _opened(out, prune)
         _check_identity(study, configuration, space, out)

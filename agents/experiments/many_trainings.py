@@ -132,8 +132,8 @@ def train_seeds(
         ExecutorError: If the cluster cannot be used.
         ImportError: If an extra is not installed; finished runs remain.
     """
-    if count < 1:
-        raise ConfigurationError(f"seeds: {count}, should be at least 1")
+    if not isinstance(count, int | np.integer) or count < 1:
+        raise ConfigurationError(f"seeds: {count!r}, should be a whole number of at least 1")
     names = [each.name for each in configurations]
     shared = next((name for name in names if names.count(name) > 1), None)
     if shared is not None:

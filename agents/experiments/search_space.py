@@ -63,7 +63,7 @@ class Parameter(Model):
     @property
     def labels(self) -> dict[str, Any]:
         """Choices by a text for each, as a study keeps them."""
-        return {json.dumps(choice): choice for choice in self.choices or ()}
+        return {json.dumps(choice, default=str): choice for choice in self.choices or ()}
 
     @property
     def is_whole(self) -> bool:

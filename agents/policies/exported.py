@@ -253,6 +253,7 @@ class ExportedPolicy:
 
         Raises:
             PolicyFileError: If the network is larger than what `load` reads.
+            TypeError: If the metadata are no JSON values.
         """
         arrays: dict[str, NDArray[Any]] = {
             "activation": np.array(self.activation),

@@ -27,8 +27,11 @@ class PolicyFileError(Exception):
 
 
 def metadata_text(metadata: Mapping[str, Any]) -> NDArray[Any]:
-    """Metadata of JSON values as an array, for `write_policy`."""
-    return np.array(json.dumps(dict(metadata), sort_keys=True))
+    """Metadata as an array, for `write_policy`; TypeError for what is no JSON value."""
+    try:
+        return np.array(json.dumps(dict(metadata), sort_keys=True))
+    except TypeError as error:
+        raise TypeError(f"metadata: {error}; should be JSON values, with texts as keys") from error
 
 
 def write_policy(path: str | os.PathLike[str], kind: str, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -67,6 +70,15 @@ def read_metadata(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     if not isinstance(metadata, dict):
         raise ValueError("metadata: should be a mapping")
     return metadata
+
+
+def noted_effort(metadata: Mapping[str, Any]) -> dict[str, float]:
+    """Numbers that a policy's metadata has on its training; others may have noted anything there."""
+    training = metadata.get("training")
+    found = training.items() if isinstance(training, Mapping) else ()
+    return {
+        name: value for name, value in found if isinstance(value, int | float) and not isinstance(value, bool)
+    }
 
 
 @contextmanager

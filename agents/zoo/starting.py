@@ -5,6 +5,7 @@ from __future__ import annotations
 from agents.configuration import ConfigurationError
 from agents.configuration.schema import Network
 from agents.policies import ExportedPolicy, PolicyFileError
+from agents.policies.policy_files import noted_effort
 from agents.zoo.finding import PolicyError, policy_path
 
 
@@ -39,8 +40,8 @@ def load_start(
 
 def spent_before(start_from: str | None) -> tuple[int, float]:
     """Problems that the expert solved for the policy of `start_from`, and seconds it took; 0 without one."""
-    training = {} if start_from is None else _load(start_from).metadata.get("training", {})
-    return int(training.get("expert_solves") or 0), float(training.get("seconds") or 0.0)
+    spent = {} if start_from is None else noted_effort(_load(start_from).metadata)
+    return int(spent.get("expert_solves", 0)), float(spent.get("seconds", 0.0))
 
 
 def _load(source: str) -> ExportedPolicy:

@@ -90,7 +90,7 @@ def test_evaluation_seeds_are_fixed_and_their_own():
     assert seeds[:7] == evaluation_seeds(PAPER, 7)
     training = Settings(PAPER, 1000, 0, 32)
     assert not set(seeds) & {training.problem_seed(problem) for problem in range(1000)}
-    for n in (0, 501):
+    for n in (0, 501, 2.0, "3", True):
         with pytest.raises(ValueError, match="should be from 1 to 500"):
             evaluation_seeds(PAPER, n)
 
@@ -266,6 +266,14 @@ def test_files_functions_and_objects_are_one_policy(tmp_path):
     assert summaries[0]["policy"] == "stub"
     assert summaries[1]["training_steps"] == 7
     assert summaries[1]["expert_solves"] == 2
+
+
+@pytest.mark.parametrize("training", [None, "two hours", {"seconds": "long", "expert_solves": True}])
+def test_what_a_policy_says_of_its_training_in_words_counts_as_unknown(training):
+    evaluation = evaluate(exported(training=training), SHORT, 2, expert=False)
+    for name in ("training_steps", "training_seconds", "expert_solves"):
+        assert evaluation.summary()[name] is None
+    assert evaluation_table([evaluation]).rows
 
 
 def test_what_is_no_policy_is_refused(tmp_path):

@@ -162,3 +162,6 @@ def test_impossible_counts_and_too_few_or_unequal_runs_are_refused():
         compare_runs([np.ones(4), np.ones(5), np.ones(4)], [np.ones(4)] * 3)
     with pytest.raises(ValueError, match=r"shape \(3, 0\): should be at least one run and one start"):
         rate_over_runs(np.ones((3, 0)))
+    for scores in ([[1.0, np.nan]], [[1.0, 2.0]], [[0.5, -0.1]]):
+        with pytest.raises(ValueError, match=r"should be in \[0, 1\]"):
+            rate_over_runs(scores)

@@ -223,6 +223,7 @@ def test_more_successes_win_and_a_tie_goes_to_the_lower_cost() -> None:
         ("{network.hidden: {choices: [[8]]}}", "must be two or more, all different"),
         ("{network.hidden: {choices: [[8], 9]}}", r"network.hidden = 9: must be a list"),
         ("{network.hidden: {choices: [[8], [9]], low: 1}}", "must stand alone"),
+        ("{network.activation: {choices: [tanh, 2020-01-01]}}", r"network.activation: the value .*2020"),
         ("{seed: {low: 0, high: 9}}", "search.seed: seed is no hyperparameter: leave it out"),
         ("{}", "search"),
         ("3", "search = 3: must be a mapping"),

@@ -270,7 +270,7 @@ def test_two_configurations_of_one_name_are_refused(
 ) -> None:
     with pytest.raises(ConfigurationError, match="two configurations are named 'quick'"):
         train_seeds([configuration, configuration], 1, tmp_path)
-    with pytest.raises(ConfigurationError, match="seeds: 0, should be at least 1"):
+    with pytest.raises(ConfigurationError, match="seeds: 0, should be a whole number"):
         train_seeds([configuration], 0, tmp_path)
 
 

@@ -84,6 +84,14 @@ def test_a_small_file_does_not_unpack_to_gigabytes(tmp_path: Path) -> None:
     assert "at most" in sentence
 
 
+@pytest.mark.parametrize("metadata", [{"runs": np.int64(3)}, {"a": {1, 2}}, {1: "a", "b": "c"}])
+def test_metadata_of_other_values_are_named(metadata: dict[Any, Any], tmp_path: Path) -> None:
+    policy = ExportedPolicy(**parts(metadata=metadata))
+    with pytest.raises(TypeError, match=r"metadata: .* should be JSON values, with texts as keys"):
+        policy.save(tmp_path / "policy.npz")
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_could_not_be_read_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, path = ExportedPolicy(**parts()), tmp_path / "policy.npz"
     policy.save(path)

@@ -16,6 +16,7 @@ from agents.reinforcement.networks import export_policy
 from agents.reinforcement.ppo import GROWTH
 from agents.reinforcement.reinforcement_training import make_environment, make_learner
 from agents.training import train
+from agents.zoo.starting import spent_before
 from dq_space_arm_env import load_scene
 
 pytestmark = pytest.mark.agents
@@ -24,6 +25,16 @@ REPEAT, COPIES = 4, 4
 N_OBSERVATION, N_ACTION, HIDDEN = 24, 12, (256, 256)
 WARM_UP = 2
 DECISIONS = 40  # of an update
+
+
+@pytest.mark.parametrize("training", [None, "two hours", {"seconds": "long", "expert_solves": None}])
+def test_what_a_policy_says_of_its_training_in_words_has_taken_nothing(training, tmp_path):
+    plain = np.zeros((3, 2)), np.zeros(2), np.zeros(3)
+    policy = ExportedPolicy(
+        (plain[0],), (plain[1],), "tanh", plain[2], plain[2], metadata={"training": training}
+    )
+    policy.save(tmp_path / "policy.npz")
+    assert spent_before(str(tmp_path)) == (0, 0.0)
 
 
 @pytest.fixture(scope="module")
