@@ -86,6 +86,15 @@ def check_scene(demonstrations: Demonstrations, scene: Scene) -> None:
         )
 
 
+def check_gains(demonstrations: Demonstrations, need: str) -> None:
+    """Refuse demonstrations without feedback gains, as Minari may give them; `need` tells who needs them."""
+    if len(demonstrations) and not demonstrations[0].feedback_gains.any():
+        raise ValueError(
+            f"{demonstrations.path}: these demonstrations have no feedback gains, which {need}, or export "
+            "with gains"
+        )
+
+
 def _check_seed(seed: int) -> None:
     if seed == RESERVED_SEED:
         raise DemonstrationsError(

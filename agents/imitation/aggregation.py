@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.configuration.imitation import Dagger
+from agents.demonstrations import check_gains
 from agents.imitation.cloning import Cloned, Making, fingerprint
 from agents.imitation.labels import Solver, label_by_gains
 from agents.imitation.objective import Objective
@@ -95,9 +96,11 @@ def aggregate(
     Raises:
         CheckpointError: If the folder holds another run, or a damaged file.
         DemonstrationsError: If the expert finds no plan from any visited state.
+        ValueError: If labels are to follow from gains that are missing.
     """
     settings, making = settings or Dagger(), making or Making()
     starts = demonstrations if starts is None else starts
+    check_labels(settings, starts)
     chosen = settings.model_dump(mode="json", exclude={"cloning"})
     facts = {**cloned.facts, "aggregation": {**chosen, "starts": fingerprint(starts)}}
     network = copy.deepcopy(cloned.network)
@@ -127,6 +130,12 @@ def aggregate(
             trainer.train(mixture, None, place, identity, progress=progress, watch=watch)
         history += trainer.history
     return Aggregated(network, rounds, history, facts)
+
+
+def check_labels(settings: Dagger, starts: Demonstrations) -> None:
+    """Refuse demonstrations without the gains that labels are to follow from."""
+    if settings.labels == "gains":
+        check_gains(starts, "labels: gains follows: give labels: solve")
 
 
 def _spent(last: Record, done: Round, environment_steps: int) -> Spent:

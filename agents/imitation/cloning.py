@@ -13,7 +13,7 @@ import torch
 
 from agents.configuration.imitation import Cloning, Fit
 from agents.configuration.schema import Network
-from agents.demonstrations import check_scene
+from agents.demonstrations import check_gains, check_scene
 from agents.imitation.objective import Objective
 from agents.imitation.samples import Statistics
 from agents.imitation.trainer import N, Progress, Record, Trainer, Watch, torch_threads
@@ -153,11 +153,8 @@ def divide(
             f"{count} demonstrations, {aside} of them for the validation, are too few: training needs one, "
             "or two with gains, whose spread is the unit of deviations"
         )
-    if gains and not demonstrations[0].feedback_gains.any():
-        raise ValueError(
-            f"{demonstrations.path}: these demonstrations have no feedback gains, which gain_weight and "
-            "augmentation_weight need: set both to 0, or export with gains"
-        )
+    if gains:
+        check_gains(demonstrations, "gain_weight and augmentation_weight need: set both to 0")
     if not aside:
         return demonstrations, None
     training, validation = demonstrations.split(1.0 - aside / count, aside / count, seed=seed)

@@ -10,7 +10,7 @@ from torch.utils.tensorboard import SummaryWriter
 from agents.configuration.imitation import ActionChunking, Dagger, ImitationConfiguration
 from agents.demonstrations import expert_seconds, prepare_demonstrations
 from agents.imitation.action_chunking import clone_chunks
-from agents.imitation.aggregation import aggregate
+from agents.imitation.aggregation import aggregate, check_labels
 from agents.imitation.cloning import Making, clone
 from agents.imitation.trainer import Record
 from agents.policies.chunking import Exported
@@ -47,6 +47,8 @@ def train_by_imitation(
     demonstrations = prepare_demonstrations(
         configuration.demonstrations, scene, folder.path / DEMONSTRATIONS, progress=report
     )
+    if isinstance(configuration.algorithm, Dagger):
+        check_labels(configuration.algorithm, demonstrations)  # before the cloning
     making = Making(configuration.network, configuration.seed, configuration.threads)
     algorithm, place = configuration.algorithm, folder.path / CHECKPOINTS
     solved_in, solves = expert_seconds(demonstrations), demonstrations.settings["problems"]

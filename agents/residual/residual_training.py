@@ -11,7 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from agents.configuration.residual import ResidualConfiguration
-from agents.demonstrations import expert_seconds, prepare_demonstrations
+from agents.demonstrations import check_gains, expert_seconds, prepare_demonstrations
 from agents.evaluation.plan_followers import follower
 from agents.evaluation.plans import Plans
 from agents.policies import ExportedPolicy
@@ -48,6 +48,7 @@ def train_residual(
     demonstrations = prepare_demonstrations(
         configuration.demonstrations, scene, folder.path / DEMONSTRATIONS, progress=report
     )
+    check_gains(demonstrations, "corrected plans fly with: generate others")
     practiced, kept = split(demonstrations, configuration.schedule.evaluation_episodes)
     environment = make_residual_environment(configuration, scene, practiced)
     learner = configuration.learner()

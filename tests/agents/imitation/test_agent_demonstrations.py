@@ -75,8 +75,8 @@ def test_what_minari_gives_back_is_what_was_exported(demonstrations, datasets, t
 
 def test_without_gains_they_can_be_cloned_plainly_only(demonstrations, datasets, tmp_path):
     pytest.importorskip("torch")
-    from agents.configuration.imitation import Cloning, ObjectiveWeights, Optimization
-    from agents.imitation import clone
+    from agents.configuration.imitation import Cloning, Dagger, ObjectiveWeights, Optimization
+    from agents.imitation import aggregate, clone
 
     export_to_minari(demonstrations, ID, feedback_gains=False)
     read = prepare_demonstrations(DemonstrationSource(minari=ID), demonstrations.scene, tmp_path / "copied")
@@ -84,6 +84,8 @@ def test_without_gains_they_can_be_cloned_plainly_only(demonstrations, datasets,
     with pytest.raises(ValueError, match="have no feedback gains, which gain_weight"):
         clone(read, Cloning(optimization=few))
     plain = Cloning(objective=ObjectiveWeights(gain_weight=0.0), optimization=few)
+    with pytest.raises(ValueError, match="have no feedback gains, which labels: gains follows"):
+        aggregate(clone(read, plain), read, Dagger(cloning=plain, labels="gains", rounds=1))
     ours, theirs = clone(read, plain).export(), clone(demonstrations, plain).export()
     for one, other in zip(ours.weights, theirs.weights, strict=True):
         np.testing.assert_array_equal(one, other)

@@ -1,6 +1,7 @@
 """A correction trains for some thousand steps, begins as the plan, and resumes and exports what it is."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,6 +56,13 @@ def configuration(small_file, demonstrations):
 
 def trained_parameters(run):
     return {name: array.numpy().copy() for name, array in run.model.policy.state_dict().items()}
+
+
+def test_plans_without_gains_are_refused(configuration, demonstrations, tmp_path, monkeypatch):
+    bare = [replace(each, feedback_gains=np.zeros_like(each.feedback_gains)) for each in demonstrations[:2]]
+    monkeypatch.setattr(type(demonstrations), "__getitem__", lambda self, index: bare[index])
+    with pytest.raises(ValueError, match="have no feedback gains, which corrected plans fly with"):
+        train_residual(configuration(), tmp_path)
 
 
 def test_demonstrations_report_their_progress(configuration, tmp_path, monkeypatch):
