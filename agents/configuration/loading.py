@@ -73,6 +73,11 @@ def load_configuration(source: str | Path | Mapping[str, Any] | AgentConfigurati
         return _validated(type(source), source, f"configuration {source.name!r}")
     if isinstance(source, Mapping):
         return _of_its_class(source, f"configuration {shortened(source.get('name'))}")
+    if not isinstance(source, str | Path):
+        raise ConfigurationError(
+            f"{shortened(source)} is no configuration: give a name, the path of a YAML file, a mapping or an "
+            "AgentConfiguration"
+        )
     if isinstance(source, Path) or "/" in source or "\\" in source or source.endswith(_SUFFIXES):
         return _read(Path(source))
     names = list_configurations()

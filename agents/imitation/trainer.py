@@ -33,6 +33,8 @@ VALIDATION_BATCHES = 32  # at most; the same time steps every time
 UPDATES_BETWEEN_MESSAGES = 20
 FINAL_RATE = 1e-3  # learning rate at the end, relative to its peak
 
+_DAMAGED = "{} cannot be read ({}); remove it to restart the training"
+
 Record = dict[str, float]
 Progress = Callable[[Advance], None]
 Watch = Callable[[NormalizedNetwork, Record, bool], Record]
@@ -142,7 +144,7 @@ class Trainer(Generic[N]):
         With validation data, the network ends with the weights of the lowest validation loss.
         """
         if folder is not None:
-            self._resume(_load_checkpoint(folder, identity))
+            self._resume(folder / CHECKPOINT, _load_checkpoint(folder, identity))
         self._begin = perf_counter() - self._seconds
         reporter = _Reporter(self._optimization.updates, self._updates, self._part, progress)
         while self._updates < self._optimization.updates:
@@ -241,9 +243,16 @@ class Trainer(Generic[N]):
             "history": self.history,
         }
 
-    def _resume(self, content: dict[str, Any] | None) -> None:
+    def _resume(self, path: Path, content: dict[str, Any] | None) -> None:
         if content is None:
             return
+        try:
+            self._restore(content)
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            reason = f"it has no {error}" if isinstance(error, KeyError) else error
+            raise CheckpointError(_DAMAGED.format(path, reason)) from error
+
+    def _restore(self, content: dict[str, Any]) -> None:
         self._network.load_state_dict(content["network"])
         self._optimizer.load_state_dict(content["optimizer"])
         self._best_weights, self._best = content["best_weights"], content["best"]
@@ -295,12 +304,9 @@ def _load_checkpoint(folder: Path, identity: dict[str, Any]) -> dict[str, Any] |
         return None
     try:
         content = read_tensors(read_bytes(path, MOST_BYTES))
-        there = content["identity"]
+        found = differences(content["identity"], identity)
     except Exception as error:  # damaged bytes make the reader raise anything
-        raise CheckpointError(
-            f"{path} cannot be read ({error}); remove it to restart the training"
-        ) from error
-    found = differences(there, identity)
+        raise CheckpointError(_DAMAGED.format(path, error)) from error
     if found:
         raise CheckpointError(f"{path} is of another training: {'; '.join(found)}. Use another folder")
     return dict(content)

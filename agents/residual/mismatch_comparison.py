@@ -39,7 +39,7 @@ from agents.zoo.finding import PolicyError, policy_path
 from agents.zoo.shelf import file_hash
 from dq_space_arm_env import Scene, load_scene
 from dq_space_arm_env.common.results import Destination
-from dq_space_arm_env.environment.rollouts import StateFeedback
+from dq_space_arm_env.environment.rollouts import Rollout, StateFeedback
 from experts.demonstrations import Demonstrations, generate_demonstrations
 from experts.executors import Executor
 
@@ -259,7 +259,7 @@ class _Work:
                 seeds=seeds,
                 flights=Flights.of(flown),
                 optimal=optimal.first(starts),
-                action_seconds=_typical(alone.action_seconds),
+                action_seconds=typical_seconds(alone),
                 wall_seconds=wall_seconds,
                 metadata={} if policy is None else dict(policy[0].metadata),
             )
@@ -272,11 +272,12 @@ class _Work:
         return lambda done, total: self.progress(Advance(stage, done, total))
 
 
-def _typical(seconds: FloatArray) -> float:
-    """Mean over the places in a block of the median time of an action there, s.
+def typical_seconds(flown: Rollout) -> float:
+    """Mean over the places in a block of the median time of an action there, s, of a single flight.
 
     A correction that is held counts as often as it is chosen, and an interruption of the process does not.
     """
+    seconds = flown.action_seconds[: flown.length[0]]
     blocks = max(1, len(seconds) // _BLOCK)
     return float(np.mean(np.median(np.reshape(seconds[: blocks * _BLOCK], (blocks, -1)), axis=0)))
 

@@ -182,6 +182,9 @@ def test_wrong_values_for_imitation_are_named(changes, sentence):
 
 
 def test_what_cannot_be_found_or_read_is_named(tmp_path):
+    for wrong in (3, None, ["ppo"]):
+        with pytest.raises(ConfigurationError, match="is no configuration: give a name"):
+            load_configuration(wrong)
     with pytest.raises(ConfigurationError, match="no configuration is named 'pppo'; did you mean 'ppo'"):
         load_configuration("pppo")
     with pytest.raises(ConfigurationError, match=r"nothing\.yaml: there is no such file"):

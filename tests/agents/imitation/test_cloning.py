@@ -99,6 +99,24 @@ def test_a_damaged_checkpoint_and_that_of_another_training_are_refused(demonstra
         learn(demonstrations, short, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"seconds": None}, "it has no 'seconds'"),
+        ({"identity": [1]}, "cannot be read"),
+        ({"network": {"layers.0.weight": torch.zeros(3)}}, "cannot be read"),
+    ],
+)
+def test_a_checkpoint_that_lacks_something_is_named(changes, said, demonstrations, tmp_path):
+    short = cloning(updates=2)
+    learn(demonstrations, short, tmp_path)
+    content = torch.load(tmp_path / CHECKPOINT, weights_only=True) | changes
+    torch.save({name: part for name, part in content.items() if part is not None}, tmp_path / CHECKPOINT)
+    with pytest.raises(CheckpointError, match=said) as caught:
+        learn(demonstrations, short, tmp_path)
+    assert "remove it to restart the training" in str(caught.value)
+
+
 def test_demonstrations_may_be_stricter_than_the_scene(demonstrations):
     looser = demonstrations.scene.replace(name="looser", success={"position_error": 0.5})
     facts = learn(demonstrations, cloning(updates=2), scene=looser).facts

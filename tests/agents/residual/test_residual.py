@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from agents.residual.corrections import (
     correction_settings,
 )
 from agents.residual.mismatch import Condition, Worlds, fly_mismatched
-from agents.residual.mismatch_comparison import compare_under_mismatch, read_corrections
+from agents.residual.mismatch_comparison import compare_under_mismatch, read_corrections, typical_seconds
 from dq_space_arm_env import DQSpaceArmVectorEnv, compile_scene, load_scene
 from dq_space_arm_env.command_line import main
 from dq_space_arm_env.common.console import UNUSABLE
@@ -42,6 +43,11 @@ SETTINGS = {"repeat": 10, "memory": 0.5, "full_authority": 0.1}
 @pytest.fixture(scope="module")
 def plans(demonstrations):
     return Plans.of(demonstrations)
+
+
+def test_steps_after_an_early_end_are_no_actions():
+    seconds = np.r_[np.full(90, 2e-6), np.zeros(910)]
+    assert typical_seconds(SimpleNamespace(action_seconds=seconds, length=np.array([90]))) == 2e-6
 
 
 def test_no_demonstrations_make_no_plans(demonstrations):
