@@ -139,6 +139,11 @@ def _look_up(
 
 def evaluation_settings(scene: Scene) -> Settings:
     """Settings of demonstrations from the evaluation starts; ValueError if the scene does not suit them."""
+    if not any(scene.spread.model_dump().values()):
+        raise ValueError(
+            f"scene {scene.name!r} has no spread, so all evaluation starts are the same: give it a spread, "
+            "or evaluate without the expert (expert=False, --no-expert)"
+        )
     return Settings.of(scene, EVALUATION_SEEDS, RESERVED_SEED, GROUP)
 
 

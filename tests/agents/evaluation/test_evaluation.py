@@ -95,6 +95,13 @@ def test_evaluation_seeds_are_fixed_and_their_own():
             evaluation_seeds(PAPER, n)
 
 
+def test_a_scene_whose_starts_are_all_the_same_is_refused_with_what_helps():
+    """Whatever the number of starts."""
+    still = SHORT.replace(spread=dict.fromkeys(type(SHORT.spread).model_fields, 0.0) | {"observed": False})
+    with pytest.raises(ValueError, match=r"all evaluation starts are the same: give it a spread, or .*--no"):
+        optimal_costs(still, 1)
+
+
 @pytest.mark.slow
 def test_optimal_costs_are_those_of_demonstrations(cache, tmp_path, quick):
     costs = optimal_costs(quick, 30, executor=SerialExecutor())
