@@ -66,7 +66,7 @@ def saved_state(options: dict[str, Any]) -> Any:
     """The option "state", which excludes the others; None without it."""
     state = options.get("state")
     if state is not None and len(options) > 1:
-        others = ", ".join(sorted(set(options) - {"state"}))
+        others = ", ".join(sorted(map(str, set(options) - {"state"})))
         raise ValueError(f"options: state holds the whole episode, it excludes {others}")
     return state
 
@@ -82,7 +82,7 @@ def given_start(kernels: Kernels, options: dict[str, Any]) -> GivenStart:
     """
     unknown = set(options) - set(_OPTIONS)
     if unknown:
-        raise ValueError(f"options: {sorted(unknown)} unknown; choose from {', '.join(_OPTIONS)}")
+        raise ValueError(f"options: {sorted(unknown, key=str)} unknown; choose from {', '.join(_OPTIONS)}")
     state, target, parameters = (options.get(name) for name in ("initial_state", "target", "parameters"))
     nominal = options.get("nominal")
     if not isinstance(nominal, bool | np.bool_ | None):

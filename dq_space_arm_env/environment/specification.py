@@ -1,10 +1,14 @@
-"""Specifications of environments that `to_json` can write: scenes as mappings, paths as text."""
+"""Specifications of environments that `to_json` can write: scenes as mappings, paths and modes as text."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from enum import Enum
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from dq_space_arm_env.scene import Scene
 
@@ -28,7 +32,15 @@ class PlainSpec:
 
 
 def _plain(value: Any) -> Any:
-    """A scene as a mapping, and a path as text."""
+    """A scene as a mapping, a path as text, a mode as its name, and NumPy's numbers as Python's."""
     if isinstance(value, Scene):
         return value.model_dump(mode="json")
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Enum):
+        return value.value
     return str(value) if isinstance(value, Path) else value

@@ -13,6 +13,7 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 from short_scenes import diverging, short
 
 import dq_space_arm_env
@@ -205,6 +206,10 @@ def test_options_are_a_mapping_and_nominal_a_bool(make_one):
     for bad in (["nominal"], "nominal", 3):
         with pytest.raises(ValueError, match=r"options: .*, should be a mapping from names"):
             env.reset(options=bad)
+    with pytest.raises(ValueError, match=r"options: \[1, 'a'\] unknown; choose from"):
+        env.reset(options={"a": 3, 1: 2})
+    with pytest.raises(ValueError, match="state holds the whole episode, it excludes 1, nominal"):
+        env.reset(options={"state": {}, 1: 2, "nominal": True})
     for bad in ("no", 1, [True]):
         with pytest.raises(ValueError, match=r"options: nominal .*, should be True or False"):
             env.reset(options={"nominal": bad})
@@ -363,3 +368,11 @@ def test_environments_are_made_again_from_their_specification_as_json(name, kind
     again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.scene == env.unwrapped.scene
     assert gymnasium.make_vec("DQSpaceArm-v0", 2, scene=given).spec.to_json()
+
+
+def test_modes_cameras_and_numpys_numbers_are_in_the_specification_as_json():
+    mode, camera = AutoresetMode.SAME_STEP, {"lookat": np.arange(3.0), "azimuth": np.float64(3.0)}
+    pictures = {"width": np.int64(64), "default_camera_config": camera}
+    venv = gymnasium.make_vec("DQSpaceArm-v0", 2, scene="planar", autoreset_mode=mode, **pictures)
+    again = gymnasium.make_vec(EnvSpec.from_json(venv.spec.to_json()))
+    assert (again.autoreset_mode, again._picture) == (mode, venv._picture)
