@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from dq_space_arm_env.common.real_arrays import real_array
+from dq_space_arm_env.common.shown_text import shortened
 from dq_space_arm_env.environment.disturbances import Disturbance, Disturbances
 from dq_space_arm_env.environment.vector import DQSpaceArmVectorEnv
 from dq_space_arm_env.kernels import compile_scene
@@ -178,13 +179,16 @@ def rollout(
 
     Raises:
         TypeError: If actions are masked, or not of real numbers.
-        ValueError: If actions have a wrong shape, delay is negative, steps are no whole number of at least 1,
-            disturbances are those of another number of episodes, or both seeds and starts are given.
+        ValueError: If actions or starts have a wrong shape, there is no episode, seeds are no whole numbers,
+            delay is none of at least 0 or steps none of at least 1, disturbances are those of another number
+            of episodes, or both seeds and starts are given.
     """
     if seeds is not None and starts is not None:
         raise ValueError("seeds and starts exclude each other")
-    if delay < 0:
-        raise ValueError(f"delay: {delay}, should be at least 0 steps")
+    if not isinstance(delay, int | np.integer) or delay < 0:
+        raise ValueError(f"delay: {delay}, should be a whole number of at least 0 steps")
+    if not all(isinstance(seed, int | np.integer) for seed in (() if seeds is None else seeds)):
+        raise ValueError(f"seeds: {shortened(seeds)}, should be whole numbers")
     if steps is None:
         steps = scene.simulation.steps
     elif isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
@@ -231,10 +235,14 @@ def _begin(
     options: dict[str, Any] = {} if parameters is None else {"parameters": np.asarray(parameters)}
     if starts is not None:
         options["initial_state"] = np.asarray(starts)
+        if options["initial_state"].ndim != 2:
+            raise ValueError(f"starts: shape {options['initial_state'].shape}, should be (B, n_x)")
     elif seeds is None:
         options["nominal"] = True
-    drawn = [0] if seeds is None else [int(seed) for seed in seeds]
+    drawn = [0] if seeds is None else list(seeds)
     count = len(drawn) if starts is None else len(options["initial_state"])
+    if not count:
+        raise ValueError(f"{'seeds' if starts is None else 'starts'}: none, should be one for each episode")
     # What diverges restarts at the next step and flies along without being counted.
     environment = DQSpaceArmVectorEnv(count, scene, autoreset_mode=AutoresetMode.NEXT_STEP)
     return environment, *environment.reset(seed=0 if seeds is None else drawn, options=options)

@@ -193,6 +193,21 @@ def test_a_rollout_takes_a_step_at_least(scene, steps):
         rollout(wave, scene, [0], steps=steps)
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"seeds": []}, "seeds: none, should be one for each episode"),
+        ({"seeds": [1.5]}, r"seeds: \[1.5\], should be whole numbers"),
+        ({"starts": np.zeros(14)}, r"starts: shape \(14,\), should be \(B, n_x\)"),
+        ({"starts": np.zeros((0, 14))}, "starts: none, should be one for each episode"),
+        ({"delay": 1.5}, "delay: 1.5, should be a whole number of at least 0 steps"),
+    ],
+)
+def test_episodes_are_counted_by_seeds_or_rows_of_starts(scene, given, message):
+    with pytest.raises(ValueError, match=message):
+        rollout(wave, scene, **given)
+
+
 @pytest.mark.parametrize("actions", [np.ma.masked_array(np.ones((1, 6)), mask=True), [[None] * 6]])
 def test_actions_of_policies_are_real_numbers(scene, actions):
     with pytest.raises(TypeError, match=r"actions of the policy: .*, should be real numbers"):
