@@ -168,16 +168,20 @@ def caches() -> dict[str, Any]:
     from dq_space_arm_env.common.code_cache import cache_directory
 
     folder = cache_directory()
-    nearest = next(path for path in (folder, *folder.parents) if path.exists())
+    # Path.exists would fail below a folder that may not be entered.
+    nearest = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
     return {
         "folder": str(folder),
         "writable": os.access(nearest, os.W_OK),
-        "compiled kernels": _size(folder.glob("*.kernel")),
-        "optimal costs": _size((folder / "optimal-costs").rglob("*")),
+        "compiled kernels": _size(folder, ".kernel"),
+        "optimal costs": _size(folder / "optimal-costs"),
     }
 
 
-def _size(paths: Any) -> dict[str, Any]:
+def _size(folder: Path, ending: str = "") -> dict[str, Any]:
+    """Count files and their bytes in a folder; none where it cannot be read."""
+    found = ((inner, name) for inner, _, names in os.walk(folder) for name in names)
+    paths = (Path(inner, name) for inner, name in found if name.endswith(ending))
     sizes = [path.stat().st_size for path in paths if path.is_file()]
     return {"files": len(sizes), "MB": round(sum(sizes) / 1e6, 1)}
 

@@ -47,7 +47,7 @@ def cache_key(*parts: str) -> str:
 
 def is_kept(name: str, key: str) -> bool:
     """Tell whether there is a file for code, which `read_code` may still refuse."""
-    return _file(name, key).is_file()
+    return os.path.isfile(_file(name, key))  # noqa: PTH113 - False below a folder that may not be entered
 
 
 def read_code(name: str, key: str) -> bytes | None:

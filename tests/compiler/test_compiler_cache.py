@@ -10,6 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from dq_space_arm_env.command_line.info import caches
 from dq_space_arm_env.common import code_cache
 from dq_space_arm_env.common.code_cache import cache_key
 from dq_space_arm_env.compiler import native
@@ -137,6 +138,14 @@ def test_what_is_no_regular_file_is_replaced(cache, kind):
         assert value(load(builder)) == 6.0
     assert path.is_file()
     assert not path.is_symlink()
+
+
+def test_where_the_folder_cannot_be_looked_into_there_is_no_code(tmp_path, monkeypatch):
+    # Like a folder that may not be entered, which is none for the superuser.
+    monkeypatch.setenv("DQ_SPACE_ARM_CACHE", str(tmp_path / ("long" * 100)))
+    assert not code_cache.is_kept("code", "0" * 64)
+    found = caches()
+    assert (found["writable"], found["compiled kernels"]["files"]) == (True, 0)
 
 
 @posix
